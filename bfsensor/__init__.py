@@ -1,0 +1,35 @@
+"""Device physics of thick CCDs: from a device file to the brighter-fatter effect in images."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+__version__ = "0.1.0"
+
+_PUBLIC = {
+    "BFSensorError": "errors",
+    "ConvergenceError": "errors",
+    "DeviceError": "errors",
+    "MeasurementError": "errors",
+    "TableError": "errors",
+    "Device": "device",
+    "builtin_devices": "device",
+    "import_poisson_ccd": "device_import",
+    "DistortionTable": "table",
+    "build_table": "build",
+    "plan_table": "build",
+}
+
+__all__ = ["__version__", *sorted(_PUBLIC)]
+
+
+def __getattr__(name: str) -> Any:
+    """Import public names when they are first used: numba and astropy are slow to load."""
+    if name in _PUBLIC:
+        return getattr(import_module(f"bfsensor.{_PUBLIC[name]}"), name)
+    raise AttributeError(f"module 'bfsensor' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,1 @@
+"""Compiled loops on plain arrays; imports numpy and numba only."""

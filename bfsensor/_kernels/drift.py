@@ -1,0 +1,313 @@
+"""Field lines in an interpolated potential.
+
+The potential is interpolated by cubic Hermite polynomials in each direction, slopes at
+the nodes from the parabola through three neighbours (non-uniform mesh): the field is
+continuous and third-order accurate.  ``phi`` is ``[y, z, x]``, padded by at least two
+nodes on every side, and ``xs, ys, zs`` are the padded node positions.  Electrons move up
+the gradient of the potential.
+"""
+
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True, inline="always")
+def _cell(nodes, value, guess):
+    """Index of the interval that holds ``value``, searched from the last one."""
+    i = guess
+    last = nodes.size - 3
+    while i < last and value > nodes[i + 1]:
+        i += 1
+    while i > 1 and value < nodes[i]:
+        i -= 1
+    return i
+
+
+@numba.njit(cache=True, inline="always")
+def _weights(nodes, i, value, w, d):
+    """Weights of nodes i-1 .. i+2 for the value (``w``) and the derivative (``d``)."""
+    h0 = nodes[i] - nodes[i - 1]
+    h1 = nodes[i + 1] - nodes[i]
+    h2 = nodes[i + 2] - nodes[i + 1]
+    t = (value - nodes[i]) / h1
+    t2 = t * t
+    t3 = t2 * t
+    # Hermite basis: values, and slopes times the interval.
+    v0 = 2.0 * t3 - 3.0 * t2 + 1.0
+    v1 = 1.0 - v0
+    s0 = (t3 - 2.0 * t2 + t) * h1
+    s1 = (t3 - t2) * h1
+    e0 = 6.0 * (t2 - t) / h1
+    g0 = 3.0 * t2 - 4.0 * t + 1.0
+    g1 = 3.0 * t2 - 2.0 * t
+    # Slopes from parabolas: m = a f[-1] + b f[0] + c f[1].
+    a0 = -h1 / (h0 * (h0 + h1))
+    c0 = h0 / (h1 * (h0 + h1))
+    b0 = -a0 - c0
+    a1 = -h2 / (h1 * (h1 + h2))
+    c1 = h1 / (h2 * (h1 + h2))
+    b1 = -a1 - c1
+    w[0] = s0 * a0
+    w[1] = v0 + s0 * b0 + s1 * a1
+    w[2] = v1 + s0 * c0 + s1 * b1
+    w[3] = s1 * c1
+    d[0] = g0 * a0
+    d[1] = e0 + g0 * b0 + g1 * a1
+    d[2] = -e0 + g0 * c0 + g1 * b1
+    d[3] = g1 * c1
+
+
+@numba.njit(cache=True)
+def gradient(phi, xs, ys, zs, x, y, z, cell, weights, out):
+    """Gradient of the potential [V/um] at a point, to ``out``; ``cell`` remembers the place."""
+    i = _cell(xs, x, cell[0])
+    j = _cell(ys, y, cell[1])
+    k = _cell(zs, z, cell[2])
+    cell[0] = i
+    cell[1] = j
+    cell[2] = k
+    wx = weights[0]
+    dx = weights[1]
+    wy = weights[2]
+    dy = weights[3]
+    wz = weights[4]
+    dz = weights[5]
+    _weights(xs, i, x, wx, dx)
+    _weights(ys, j, y, wy, dy)
+    _weights(zs, k, z, wz, dz)
+    gx = 0.0
+    gy = 0.0
+    gz = 0.0
+    for b in range(4):
+        pv = 0.0
+        px = 0.0
+        pz = 0.0
+        for c in range(4):
+            f0 = phi[j - 1 + b, k - 1 + c, i - 1]
+            f1 = phi[j - 1 + b, k - 1 + c, i]
+            f2 = phi[j - 1 + b, k - 1 + c, i + 1]
+            f3 = phi[j - 1 + b, k - 1 + c, i + 2]
+            v = wx[0] * f0 + wx[1] * f1 + wx[2] * f2 + wx[3] * f3
+            s = dx[0] * f0 + dx[1] * f1 + dx[2] * f2 + dx[3] * f3
+            pv += wz[c] * v
+            px += wz[c] * s
+            pz += dz[c] * v
+        gx += wy[b] * px
+        gz += wy[b] * pz
+        gy += dy[b] * pv
+    out[0] = gx
+    out[1] = gy
+    out[2] = gz
+
+
+@numba.njit(cache=True)
+def _slope_along(phi, xs, ys, zs, p, sign, cell, weights, g, out):
+    """Unit vector along (``sign`` = 1) or against the electron drift."""
+    gradient(phi, xs, ys, zs, p[0], p[1], p[2], cell, weights, g)
+    norm = sign / max(np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2]), 1e-12)
+    out[0] = g[0] * norm
+    out[1] = g[1] * norm
+    out[2] = g[2] * norm
+
+
+@numba.njit(cache=True)
+def find_well(phi, xs, ys, zs, start, zone, coarseness, max_steps, scratch, cell, out):
+    """Follow an electron from ``start`` to its well; write where it ended to ``out``.
+
+    ``zone`` is (pitch_x, pitch_y, half width, half height, top): the electron has arrived
+    when it is below ``top`` and within the half width and height of a pixel centre.  Steps
+    are Runge-Kutta of fourth order in arc length.  Returns True if it arrived.
+    """
+    p = scratch[0]
+    q = scratch[1]
+    a = scratch[2]
+    b = scratch[3]
+    c = scratch[4]
+    d = scratch[5]
+    g = scratch[6]
+    weights = scratch[7:13]
+    for m in range(3):
+        p[m] = start[m]
+    for _ in range(max_steps):
+        if p[2] < zone[4]:
+            ox = p[0] - zone[0] * np.round(p[0] / zone[0])
+            oy = p[1] - zone[1] * np.round(p[1] / zone[1])
+            if abs(ox) < zone[2] and abs(oy) < zone[3]:
+                break
+        h = coarseness * (0.3 + 0.12 * max(p[2] - 1.0, 0.0))
+        _slope_along(phi, xs, ys, zs, p, 1.0, cell, weights, g, a)
+        for m in range(3):
+            q[m] = p[m] + 0.5 * h * a[m]
+        _slope_along(phi, xs, ys, zs, q, 1.0, cell, weights, g, b)
+        for m in range(3):
+            q[m] = p[m] + 0.5 * h * b[m]
+        _slope_along(phi, xs, ys, zs, q, 1.0, cell, weights, g, c)
+        for m in range(3):
+            q[m] = p[m] + h * c[m]
+        _slope_along(phi, xs, ys, zs, q, 1.0, cell, weights, g, d)
+        for m in range(3):
+            p[m] += h / 6.0 * (a[m] + 2.0 * b[m] + 2.0 * c[m] + d[m])
+    for m in range(3):
+        out[m] = p[m]
+
+
+@numba.njit(cache=True)
+def bisect_edge(
+    phi,
+    xs,
+    ys,
+    zs,
+    seeds,
+    axis,
+    edge,
+    low,
+    high,
+    tolerance,
+    zone,
+    coarseness,
+    max_steps,
+    out,
+):
+    """Find, for every seed, where the well that an electron reaches changes across an edge.
+
+    ``seeds`` (n, 3) are points on the nominal edge; the coordinate ``axis`` (0: x, 1: y) is
+    searched from ``edge + low`` to ``edge + high``, which are widened while both ends reach
+    the same side.  ``out`` (n,) gets the position; returns the number of seeds that failed
+    (nan in ``out``).
+    """
+    scratch = np.zeros((13, 4))
+    cell = np.ones(3, np.int64)
+    point = np.zeros(3)
+    end = np.zeros(3)
+    failed = 0
+    for n in range(seeds.shape[0]):
+        for m in range(3):
+            point[m] = seeds[n, m]
+        nominal = edge[n]
+        a = low[n]
+        b = high[n]
+        found = False
+        for _ in range(8):
+            point[axis] = nominal + a
+            find_well(
+                phi, xs, ys, zs, point, zone, coarseness, max_steps, scratch, cell, end
+            )
+            below = end[axis] < nominal
+            point[axis] = nominal + b
+            find_well(
+                phi, xs, ys, zs, point, zone, coarseness, max_steps, scratch, cell, end
+            )
+            above = end[axis] > nominal
+            if below and above:
+                found = True
+                break
+            width = b - a
+            if not below:
+                a -= 2.0 * width
+            if not above:
+                b += 2.0 * width
+        if not found:
+            out[n] = np.nan
+            failed += 1
+            continue
+        while b - a > tolerance:
+            middle = 0.5 * (a + b)
+            point[axis] = nominal + middle
+            find_well(
+                phi, xs, ys, zs, point, zone, coarseness, max_steps, scratch, cell, end
+            )
+            if end[axis] < nominal:
+                a = middle
+            else:
+                b = middle
+        out[n] = nominal + 0.5 * (a + b)
+    return failed
+
+
+@numba.njit(cache=True)
+def trace_up(phi, xs, ys, zs, seeds, depths, ratio, out):
+    """Follow field lines from seeds up to each depth, against the electron drift.
+
+    Integrates x and y over z with Runge-Kutta of fourth order, in steps that grow by
+    ``ratio`` of the height, and lands on every depth.  ``depths`` ascend and lie above
+    the seeds; ``out`` (n, depths, 2) gets x and y.
+    """
+    cell = np.ones(3, np.int64)
+    weights = np.zeros((6, 4))
+    g = np.zeros(3)
+    for n in range(seeds.shape[0]):
+        x = seeds[n, 0]
+        y = seeds[n, 1]
+        z = seeds[n, 2]
+        for m in range(depths.size):
+            gap = depths[m] - z
+            if gap > 0.0:
+                steps = int(np.ceil(np.log(depths[m] / z) / np.log(1.0 + ratio)))
+                steps = max(steps, 1)
+                factor = (depths[m] / z) ** (1.0 / steps)
+                for s in range(steps):
+                    h = z * (factor - 1.0) if s < steps - 1 else depths[m] - z
+                    gradient(phi, xs, ys, zs, x, y, z, cell, weights, g)
+                    ax = g[0] / g[2]
+                    ay = g[1] / g[2]
+                    gradient(
+                        phi,
+                        xs,
+                        ys,
+                        zs,
+                        x + 0.5 * h * ax,
+                        y + 0.5 * h * ay,
+                        z + 0.5 * h,
+                        cell,
+                        weights,
+                        g,
+                    )
+                    bx = g[0] / g[2]
+                    by = g[1] / g[2]
+                    gradient(
+                        phi,
+                        xs,
+                        ys,
+                        zs,
+                        x + 0.5 * h * bx,
+                        y + 0.5 * h * by,
+                        z + 0.5 * h,
+                        cell,
+                        weights,
+                        g,
+                    )
+                    cx = g[0] / g[2]
+                    cy = g[1] / g[2]
+                    gradient(
+                        phi, xs, ys, zs, x + h * cx, y + h * cy, z + h, cell, weights, g
+                    )
+                    dx = g[0] / g[2]
+                    dy = g[1] / g[2]
+                    x += h / 6.0 * (ax + 2.0 * bx + 2.0 * cx + dx)
+                    y += h / 6.0 * (ay + 2.0 * by + 2.0 * cy + dy)
+                    z += h
+            out[n, m, 0] = x
+            out[n, m, 1] = y
+
+
+@numba.njit(cache=True)
+def trace_down(phi, xs, ys, zs, starts, zone, coarseness, max_steps, out_path, out_length):
+    """Follow electrons down and keep every point: ``out_path`` (n, max_steps, 3)."""
+    scratch = np.zeros((13, 4))
+    cell = np.ones(3, np.int64)
+    p = np.zeros(3)
+    end = np.zeros(3)
+    for n in range(starts.shape[0]):
+        for m in range(3):
+            p[m] = starts[n, m]
+        count = 0
+        for s in range(max_steps):
+            for m in range(3):
+                out_path[n, s, m] = p[m]
+            count = s + 1
+            find_well(phi, xs, ys, zs, p, zone, coarseness, 1, scratch, cell, end)
+            if end[0] == p[0] and end[1] == p[1] and end[2] == p[2]:
+                break
+            for m in range(3):
+                p[m] = end[m]
+        out_length[n] = count

@@ -1,0 +1,744 @@
+"""The device: what a sensor is made of and how it is operated.
+
+A device file is TOML in which every quantity is a string with its unit, or an inline
+table with ``value`` and what is known about it (``uncertainty``, ``origin``, ``source``).
+Inside, all values are floats: um, V, K, electron/um^3, electron/um^2; doses and densities
+of donors are positive, of acceptors negative.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import os
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+from bfsensor.errors import DeviceError
+from bfsensor.resources import tables_dir
+from bfsensor.units import BOLTZMANN, from_internal, to_internal
+
+ORIGINS = ("measured", "published", "fitted", "guessed")
+
+
+def _quantity(kind: str, unit: str, low: float | None = None, high: float | None = None,
+              *, above: bool = False, default: Any = dataclasses.MISSING) -> Any:  # fmt: skip
+    """A field read from a quantity: its kind, the unit it is written in, its range."""
+    metadata = {"kind": kind, "unit": unit, "low": low, "high": high, "above": above}
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What is known about a value: its uncertainty (internal unit), origin and source."""
+
+    uncertainty: float | None = None
+    origin: str | None = None
+    source: str | None = None
+
+
+@dataclass(frozen=True)
+class Pixel:
+    """Pixel pitch along the gates (x) and along the channel stops (y) [um]."""
+
+    pitch_x: float = _quantity("length", "um", 0.0, 200.0, above=True)
+    pitch_y: float = _quantity("length", "um", 0.0, 200.0, above=True)
+
+
+@dataclass(frozen=True)
+class Material:
+    """Constants of silicon and oxide; published devices carry the ones they were tuned with.
+
+    ``thermal_voltage_300K`` [V], where given, replaces kT/q of CODATA.
+    """
+
+    permittivity_silicon: float = _quantity("number", "", 1.0, 100.0, default=11.7)
+    permittivity_oxide: float = _quantity("number", "", 1.0, 100.0, default=3.9)
+    band_gap: float = _quantity("potential", "V", 0.1, 5.0, default=1.12)
+    density_of_states: float = _quantity(
+        "density", "cm-3", 0.0, None, above=True, default=2.5e7
+    )
+    thermal_voltage_300K: float | None = _quantity(
+        "potential", "V", 0.0, 1.0, above=True, default=None
+    )  # noqa: N815
+
+    def thermal_voltage(self, temperature: float) -> float:
+        """Thermal voltage kT/q [V] at ``temperature`` [K]."""
+        if self.thermal_voltage_300K is not None:
+            return self.thermal_voltage_300K * temperature / 300.0
+        return BOLTZMANN * temperature
+
+    def intrinsic_density(self, temperature: float) -> float:
+        r"""Intrinsic density [electron/um^3] at ``temperature`` [K].
+
+        :math:`n_i = N_s (T/300)^{3/2} e^{-E_g/2kT}`; only its product with the exponential of
+        a quasi-Fermi level matters, so its error is a shift of that level.
+        """
+        kt = BOLTZMANN * temperature
+        return float(
+            self.density_of_states
+            * (temperature / 300.0) ** 1.5
+            * np.exp(-self.band_gap / (2 * kt))
+        )
+
+
+@dataclass(frozen=True)
+class Ripple:
+    """Relative modulation of the background doping (tree rings).
+
+    ``kind`` 'plane': cos(2 pi s / period + phase) with s along ``direction`` from x;
+    'radial': s is the distance from (``centre_x``, ``centre_y``) [um].
+    """
+
+    kind: Literal["plane", "radial"]
+    amplitude: float = _quantity("number", "", 0.0, 1.0)
+    period: float = _quantity("length", "um", 0.0, None, above=True)
+    phase: float = _quantity("angle", "deg", default=0.0)
+    direction: float = _quantity("angle", "deg", default=0.0)
+    centre_x: float = _quantity("length", "um", default=0.0)
+    centre_y: float = _quantity("length", "um", default=0.0)
+
+    def factor(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Relative doping at points (x, y) [um]."""
+        if self.kind == "plane":
+            s = x * np.cos(self.direction) + y * np.sin(self.direction)
+        else:
+            s = np.hypot(x - self.centre_x, y - self.centre_y)
+        return np.asarray(
+            1.0 + self.amplitude * np.cos(2 * np.pi * s / self.period + self.phase)
+        )
+
+
+@dataclass(frozen=True)
+class Silicon:
+    """Thickness [um], background doping [e/um^3] and its ripples."""
+
+    thickness: float = _quantity("length", "um", 5.0, 1000.0)
+    background_doping: float = _quantity("density", "cm-3", -1e6, 1e6)
+    ripples: tuple[Ripple, ...] = ()
+
+
+@dataclass(frozen=True)
+class Implant:
+    """Dopants below the silicon surface: ``dose`` [e/um^2], donors positive.
+
+    'gaussian': peak depth and sigma [um], cut at the surface and at peak + 4 sigma as in
+    the published model, and normalised to the dose; 'box': uniform down to ``depth`` [um].
+    """
+
+    shape: Literal["gaussian", "box"]
+    dose: float = _quantity("dose", "cm-2")
+    peak: float | None = _quantity("length", "um", 0.0, default=None)
+    sigma: float | None = _quantity("length", "um", 0.0, above=True, default=None)
+    depth: float | None = _quantity("length", "um", 0.0, above=True, default=None)
+
+    @property
+    def reach(self) -> float:
+        """Depth below the surface [um] where the implant ends."""
+        if self.shape == "box":
+            return float(self.depth or 0.0)
+        return float((self.peak or 0.0) + 4.0 * (self.sigma or 0.0))
+
+    def cumulative(self, depth: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Dose [e/um^2] between the surface and ``depth`` [um] below it."""
+        depth = np.clip(depth, 0.0, self.reach)
+        if self.shape == "box":
+            return np.asarray(self.dose * depth / self.reach)
+        assert self.peak is not None and self.sigma is not None  # checked with the device
+        scale = np.sqrt(2.0) * self.sigma
+        start, end = erf(-self.peak / scale), erf((self.reach - self.peak) / scale)
+        return np.asarray(
+            self.dose * (erf((depth - self.peak) / scale) - start) / (end - start)
+        )
+
+    def density(self, depth: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Density [e/um^3] at ``depth`` [um] below the surface."""
+        depth = np.asarray(depth, float)
+        inside = (depth >= 0) & (depth <= self.reach)
+        if self.shape == "box":
+            return np.where(inside, self.dose / self.reach, 0.0)
+        assert self.peak is not None and self.sigma is not None  # checked with the device
+        scale = np.sqrt(2.0) * self.sigma
+        norm = 0.5 * (erf((self.reach - self.peak) / scale) - erf(-self.peak / scale))
+        shape = np.exp(-0.5 * ((depth - self.peak) / self.sigma) ** 2) / (
+            np.sqrt(2 * np.pi) * self.sigma
+        )
+        return np.where(inside, self.dose * shape / norm, 0.0)
+
+
+@dataclass(frozen=True)
+class GateStack:
+    """Clock phases and the oxides under them [um]."""
+
+    phases: int
+    collecting_phases: int
+    gate_oxide: float = _quantity("length", "um", 0.0, 5.0, above=True)
+    field_oxide: float = _quantity("length", "um", 0.0, 5.0, above=True)
+    field_oxide_taper: float = _quantity("length", "um", 0.0, 20.0, default=0.0)
+
+    def edges_y(self, pitch_y: float) -> tuple[float, float]:
+        """Edges of the collecting gates relative to the pixel centre [um]."""
+        half = 0.5 * pitch_y * self.collecting_phases / self.phases
+        return -half, half
+
+
+@dataclass(frozen=True)
+class Channel:
+    """The buried channel: implants, and charge at the oxide interface [e/um^2]."""
+
+    surface_charge: float = _quantity("dose", "cm-2", default=0.0)
+    implants: tuple[Implant, ...] = ()
+
+
+@dataclass(frozen=True)
+class ChannelStopDots:
+    """Implants in part of each channel stop: centre above the pixel's lower edge, height [um]."""
+
+    centre: float = _quantity("length", "um", 0.0)
+    height: float = _quantity("length", "um", 0.0, above=True)
+    surface_charge: float = _quantity("dose", "cm-2", default=0.0)
+    implants: tuple[Implant, ...] = ()
+
+
+@dataclass(frozen=True)
+class ChannelStop:
+    """The stop between columns: width centred on the pixel edge, side diffusion [um]."""
+
+    width: float = _quantity("length", "um", 0.0)
+    side_diffusion: float = _quantity("length", "um", 0.0, default=0.0)
+    surface_charge: float = _quantity("dose", "cm-2", default=0.0)
+    implants: tuple[Implant, ...] = ()
+    dots: ChannelStopDots | None = None
+
+
+@dataclass(frozen=True)
+class OperatingPoint:
+    """Voltages [V] and temperature [K]."""
+
+    gate_low: float = _quantity("potential", "V", -50.0, 50.0)
+    gate_high: float = _quantity("potential", "V", -50.0, 50.0)
+    back_bias: float = _quantity("potential", "V", -500.0, 0.0)
+    temperature: float = _quantity("temperature", "K", 77.0, 350.0)
+    hole_quasi_fermi_level: float = _quantity("potential", "V", -50.0, 50.0, default=0.0)
+
+
+@dataclass(frozen=True)
+class Well:
+    """Barrier along the column [V] at which charge spills."""
+
+    spill_barrier: float = _quantity("potential", "V", 0.0, 10.0, above=True, default=1.1)
+
+
+@dataclass(frozen=True)
+class EdgeStrip:
+    """A strip beyond the last pixel: at a voltage [V], or field-free where that is None."""
+
+    width: float = _quantity("length", "um", 0.0, above=True)
+    voltage: float | None = _quantity("potential", "V", default=None)
+    oxide: Literal["none", "gate", "field"] = "field"
+    implants: tuple[Implant, ...] = ()
+
+
+@dataclass(frozen=True)
+class Edge:
+    """Strips (a guard ring) beyond the last pixel, along x or y, innermost first."""
+
+    side: Literal["x", "y"]
+    strips: tuple[EdgeStrip, ...] = ()
+
+
+_CHOICES = {
+    (Ripple, "kind"): ("plane", "radial"),
+    (Implant, "shape"): ("gaussian", "box"),
+    (EdgeStrip, "oxide"): ("none", "gate", "field"),
+    (Edge, "side"): ("x", "y"),
+}
+_LISTS = {
+    (Silicon, "ripples"): ("ripple", Ripple),
+    (Channel, "implants"): ("implant", Implant),
+    (ChannelStop, "implants"): ("implant", Implant),
+    (ChannelStopDots, "implants"): ("implant", Implant),
+    (EdgeStrip, "implants"): ("implant", Implant),
+    (Edge, "strips"): ("strip", EdgeStrip),
+}
+_SECTIONS: dict[str, type] = {
+    "pixel": Pixel,
+    "material": Material,
+    "silicon": Silicon,
+    "gates": GateStack,
+    "channel": Channel,
+    "channel_stop": ChannelStop,
+    "operating_point": OperatingPoint,
+    "well": Well,
+    "edge": Edge,
+}
+_OPTIONAL = ("material", "well", "edge")
+
+
+@dataclass(frozen=True)
+class Device:
+    """A sensor and its operating point.
+
+    Attributes
+    ----------
+    name : str
+        Short name, used for files.
+    pixel, material, silicon, gates, channel, channel_stop, operating_point, well, edge
+        The sections of the device file.
+    provenance : mapping of str to Provenance
+        What is known about single values, by dotted key.
+
+    Examples
+    --------
+    >>> device = Device.load("itl_sta3800c").with_value("back_bias", "-60 V")
+    >>> device.operating_point.back_bias
+    -60.0
+    """
+
+    name: str
+    pixel: Pixel
+    silicon: Silicon
+    gates: GateStack
+    channel: Channel
+    channel_stop: ChannelStop
+    operating_point: OperatingPoint
+    material: Material = Material()
+    well: Well = Well()
+    edge: Edge | None = None
+    provenance: Mapping[str, Provenance] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
+        _check(self)
+
+    def __reduce__(self) -> tuple[Any, tuple[str]]:
+        return _from_text, (self.to_toml(),)
+
+    @property
+    def is_mirror_symmetric(self) -> bool:
+        """Whether a pixel's centre lines are mirror planes in x and in y."""
+        dots = self.channel_stop.dots
+        centred = dots is None or abs(dots.centre - self.pixel.pitch_y / 2) < 1e-9
+        return self.edge is None and not self.silicon.ripples and centred
+
+    @classmethod
+    def load(cls, name: str | os.PathLike[str]) -> Device:
+        """Read a built-in device by name, or a device file by path.
+
+        Raises
+        ------
+        DeviceError
+            Neither; names the built-in devices.
+        """
+        text = os.fspath(name)
+        if text in builtin_devices():
+            return cls.from_toml(tables_dir() / text / "device.toml")
+        path = Path(text)
+        if path.suffix == ".toml":
+            return cls.from_toml(path)
+        raise DeviceError(
+            f"{text!r} is neither a built-in device ({', '.join(builtin_devices())}) nor a .toml file"
+        )
+
+    @classmethod
+    def from_toml(cls, source: str | os.PathLike[str]) -> Device:
+        """Read a device file, given its path or its text.
+
+        Raises
+        ------
+        DeviceError
+            Names the file, section, key and limit.
+        """
+        if isinstance(source, str) and "\n" in source:
+            label, text = "device", source
+        else:
+            path = Path(source)
+            label = path.name
+            try:
+                text = path.read_text(encoding="utf-8")
+            except (OSError, UnicodeDecodeError) as error:
+                raise DeviceError(f"{path}: cannot be read: {error}") from None
+        try:
+            data = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise DeviceError(f"{label}: not TOML: {error}") from None
+        try:
+            return _parse(data)
+        except DeviceError as error:
+            raise DeviceError(f"{label}: {error}") from None
+
+    def to_toml(self) -> str:
+        """Write as the text of a device file, provenance included."""
+        lines = [f'name = "{self.name}"']
+        for section, _ in _SECTIONS.items():
+            part = getattr(self, section)
+            if part is not None:
+                lines += ["", *_lines(part, section, section, self.provenance)]
+        return "\n".join(lines) + "\n"
+
+    def write(self, path: str | os.PathLike[str]) -> None:
+        """Write a device file (beside, then renamed)."""
+        path = Path(path)
+        beside = path.with_name(path.name + ".part")
+        beside.write_text(self.to_toml(), encoding="utf-8")
+        os.replace(beside, path)
+
+    def with_value(self, key: str, value: str) -> Device:
+        """A copy with one quantity changed.
+
+        Parameters
+        ----------
+        key : str
+            Dotted (``'operating_point.back_bias'``) or short where that is unique.
+        value : str
+            Quantity with unit, as in a device file.
+        """
+        section, _, name = self._resolve(key).partition(".")
+        part = getattr(self, section)
+        spec = {f.name: f for f in dataclasses.fields(part)}[name]
+        try:
+            converted: Any = (
+                int(value)
+                if not spec.metadata
+                else to_internal(value, spec.metadata["kind"])
+            )
+        except ValueError as error:
+            raise DeviceError(f"{section}: {name}: {error}") from None
+        changed = dataclasses.replace(part, **{name: converted})
+        kept = {k: v for k, v in self.provenance.items() if k != f"{section}.{name}"}
+        return dataclasses.replace(self, **{section: changed}, provenance=kept)
+
+    def with_operating_point(self, **values: str) -> Device:
+        """A copy with voltages or temperature changed, e.g. ``back_bias='-60 V'``."""
+        device = self
+        for key, value in values.items():
+            device = device.with_value(f"operating_point.{key}", value)
+        return device
+
+    def _resolve(self, key: str) -> str:
+        """Dotted name of a scalar quantity."""
+        known = [
+            f"{section}.{f.name}"
+            for section, kind in _SECTIONS.items()
+            if getattr(self, section) is not None
+            for f in dataclasses.fields(kind)
+            if f.metadata or f.type == "int"
+        ]
+        if key in known:
+            return key
+        short = [k for k in known if k.split(".")[1] == key]
+        if len(short) == 1:
+            return short[0]
+        hint = short or difflib.get_close_matches(
+            key, [*known, *(k.split(".")[1] for k in known)], 3
+        )
+        means = f"; did you mean {' or '.join(hint)}?" if hint else ""
+        raise DeviceError(f"no quantity {key!r} in a device{means}")
+
+
+def _from_text(text: str) -> Device:
+    return Device.from_toml(text)
+
+
+def builtin_devices() -> tuple[str, ...]:
+    """Names of the devices that come with the package.
+
+    Examples
+    --------
+    >>> "itl_sta3800c" in builtin_devices()
+    True
+    """
+    return tuple(sorted(p.parent.name for p in tables_dir().glob("*/device.toml")))
+
+
+# -- reading ---------------------------------------------------------------------------
+
+
+def _unknown(given: str, allowed: list[str], where: str) -> DeviceError:
+    close = difflib.get_close_matches(given, allowed, 1)
+    hint = (
+        f"; did you mean {close[0]!r}?" if close else f"; allowed are {', '.join(allowed)}"
+    )
+    return DeviceError(f"{where}unknown key {given!r}{hint}")
+
+
+def _parse(data: dict[str, Any]) -> Device:
+    provenance: dict[str, Provenance] = {}
+    allowed = ["name", *_SECTIONS]
+    for key in data:
+        if key not in allowed:
+            raise _unknown(key, allowed, "")
+    if not isinstance(data.get("name"), str) or not data["name"]:
+        raise DeviceError("name must be given as a string")
+    parts: dict[str, Any] = {}
+    for section, kind in _SECTIONS.items():
+        if section not in data:
+            if section not in _OPTIONAL:
+                raise DeviceError(f"section [{section}] is missing")
+            continue
+        parts[section] = _parse_section(kind, data[section], section, provenance)
+    return Device(name=data["name"], **parts, provenance=provenance)
+
+
+def _parse_section(
+    kind: type, data: Any, where: str, provenance: dict[str, Provenance]
+) -> Any:
+    if not isinstance(data, dict):
+        raise DeviceError(f"{where} must be a section")
+    fields = {f.name: f for f in dataclasses.fields(kind)}
+    aliases = {entry: name for (owner, name), (entry, _) in _LISTS.items() if owner is kind}
+    allowed = [n for n in fields if (kind, n) not in _LISTS] + list(aliases)
+    values: dict[str, Any] = {}
+    for key, given in data.items():
+        if key not in allowed:
+            raise _unknown(key, allowed, f"{where}: ")
+        name = aliases.get(key, key)
+        spec = fields[name]
+        path = f"{where}.{key}"
+        if key in aliases:
+            if not isinstance(given, list):
+                raise DeviceError(f"{where}: {key} must be a list of sections, [[{path}]]")
+            element = _LISTS[kind, name][1]
+            values[name] = tuple(
+                _parse_section(element, g, f"{path}[{i}]", provenance)
+                for i, g in enumerate(given)
+            )
+        elif key == "dots":
+            values[name] = _parse_section(ChannelStopDots, given, path, provenance)
+        elif (kind, name) in _CHOICES:
+            values[name] = given
+        elif spec.metadata:
+            values[name] = _parse_quantity(given, spec.metadata, where, key, provenance)
+        else:
+            if not isinstance(given, int) or isinstance(given, bool):
+                raise DeviceError(f"{where}: {key} = {given!r} must be a whole number")
+            values[name] = given
+    for name, spec in fields.items():
+        required = (
+            spec.default is dataclasses.MISSING
+            and spec.default_factory is dataclasses.MISSING
+        )
+        if required and name not in values:
+            raise DeviceError(f"{where}: {name} is missing")
+    return kind(**values)
+
+
+def _parse_quantity(
+    given: Any,
+    metadata: Mapping[str, Any],
+    where: str,
+    key: str,
+    provenance: dict[str, Provenance],
+) -> float:
+    text = given
+    if isinstance(given, dict):
+        for name in given:
+            if name not in ("value", "uncertainty", "origin", "source"):
+                raise _unknown(
+                    name, ["value", "uncertainty", "origin", "source"], f"{where}: {key}: "
+                )
+        if "value" not in given:
+            raise DeviceError(f"{where}: {key}: value is missing")
+        text = given["value"]
+        origin = given.get("origin")
+        if origin is not None and origin not in ORIGINS:
+            raise DeviceError(
+                f"{where}: {key}: origin = {origin!r} must be one of {', '.join(ORIGINS)}"
+            )
+        try:
+            uncertainty = (
+                to_internal(str(given["uncertainty"]), metadata["kind"])
+                if "uncertainty" in given
+                else None
+            )
+        except DeviceError as error:
+            raise DeviceError(f"{where}: {key}: uncertainty: {error}") from None
+        provenance[f"{where}.{key}"] = Provenance(uncertainty, origin, given.get("source"))
+    if not isinstance(text, str):
+        raise DeviceError(
+            f"{where}: {key} = {text!r} must be a string with a unit, such as '{text} {metadata['unit']}'"
+        )
+    try:
+        value = to_internal(text, metadata["kind"])
+    except DeviceError as error:
+        raise DeviceError(f"{where}: {key}: {error}") from None
+    _check_range(value, metadata, where, key, text)
+    return value
+
+
+def _check_range(
+    value: float, metadata: Mapping[str, Any], where: str, key: str, given: str
+) -> None:
+    kind, unit = metadata["kind"], metadata["unit"]
+    low, high = metadata["low"], metadata["high"]
+
+    def limit(number: float) -> str:
+        return from_internal(number, kind, unit)
+
+    if not np.isfinite(value):
+        raise DeviceError(f"{where}: {key} = {given!r} must be finite")
+    if low is not None and (value < low or (metadata["above"] and value <= low)):
+        raise DeviceError(
+            f"{where}: {key} = {given!r} must be {'above' if metadata['above'] else 'at least'} {limit(low)}"
+        )
+    if high is not None and value > high:
+        raise DeviceError(f"{where}: {key} = {given!r} must be at most {limit(high)}")
+
+
+# -- writing ---------------------------------------------------------------------------
+
+
+def _lines(
+    part: Any,
+    header: str,
+    path: str,
+    provenance: Mapping[str, Provenance],
+    *,
+    element: bool = False,
+) -> list[str]:
+    out = [f"[[{header}]]" if element else f"[{header}]"]
+    nested: list[str] = []
+    for spec in dataclasses.fields(part):
+        value = getattr(part, spec.name)
+        if value is None or value == ():
+            continue
+        if (type(part), spec.name) in _LISTS:
+            entry = _LISTS[type(part), spec.name][0]
+            for i, item in enumerate(value):
+                nested += [
+                    "",
+                    *_lines(
+                        item,
+                        f"{header}.{entry}",
+                        f"{path}.{entry}[{i}]",
+                        provenance,
+                        element=True,
+                    ),
+                ]
+        elif dataclasses.is_dataclass(value):
+            nested += [
+                "",
+                *_lines(value, f"{header}.{spec.name}", f"{path}.{spec.name}", provenance),
+            ]
+        elif spec.metadata:
+            kind, unit = spec.metadata["kind"], spec.metadata["unit"]
+            text = from_internal(value, kind, unit)
+            known = provenance.get(f"{path}.{spec.name}")
+            if known is None:
+                out.append(f'{spec.name} = "{text}"')
+            else:
+                entries = [f'value = "{text}"']
+                if known.uncertainty is not None:
+                    entries.append(
+                        f'uncertainty = "{from_internal(known.uncertainty, kind, unit)}"'
+                    )
+                if known.origin is not None:
+                    entries.append(f'origin = "{known.origin}"')
+                if known.source is not None:
+                    entries.append(f'source = "{known.source}"')
+                out.append(f"{spec.name} = {{ {', '.join(entries)} }}")
+        else:
+            out.append(
+                f'{spec.name} = "{value}"'
+                if isinstance(value, str)
+                else f"{spec.name} = {value}"
+            )
+    return out + nested
+
+
+# -- checking --------------------------------------------------------------------------
+
+
+def _check(device: Device) -> None:
+    """Refuse what cannot be built; every message names section, key and limit."""
+    for section in _SECTIONS:
+        part = getattr(device, section)
+        if part is not None:
+            _check_part(part, section)
+    pixel, gates, stop = device.pixel, device.gates, device.channel_stop
+    if not 2 <= gates.phases <= 8:
+        raise DeviceError(f"gates: phases = {gates.phases} must be from 2 to 8")
+    if not 1 <= gates.collecting_phases < gates.phases:
+        raise DeviceError(
+            f"gates: collecting_phases = {gates.collecting_phases} must be from 1 to phases - 1 = {gates.phases - 1}"
+        )
+    if gates.field_oxide < gates.gate_oxide:
+        raise DeviceError(
+            f"gates: field_oxide = '{gates.field_oxide:g} um' must be at least gate_oxide = '{gates.gate_oxide:g} um'"
+        )
+    room = pixel.pitch_x / 2
+    for key, extra in (
+        ("field_oxide_taper", gates.field_oxide_taper),
+        ("side_diffusion", stop.side_diffusion),
+    ):
+        if stop.width / 2 + extra >= room:
+            raise DeviceError(
+                f"channel_stop: width / 2 + {key} = {stop.width / 2 + extra:g} um must be below half the pixel, {room:g} um"
+            )
+    if device.operating_point.gate_high <= device.operating_point.gate_low:
+        raise DeviceError(
+            f"operating_point: gate_high = '{device.operating_point.gate_high:g} V' must be above "
+            f"gate_low = '{device.operating_point.gate_low:g} V'"
+        )
+    depth = device.silicon.thickness - gates.field_oxide
+    groups = {
+        "channel.implant": device.channel.implants,
+        "channel_stop.implant": stop.implants,
+    }
+    if stop.dots is not None:
+        groups["channel_stop.dots.implant"] = stop.dots.implants
+        if stop.dots.height >= pixel.pitch_y or stop.dots.centre > pixel.pitch_y:
+            raise DeviceError(
+                f"channel_stop.dots: centre = '{stop.dots.centre:g} um' and height = '{stop.dots.height:g} um' must lie "
+                f"within the pixel, {pixel.pitch_y:g} um"
+            )
+    for where, implants in groups.items():
+        for i, implant in enumerate(implants):
+            if implant.reach > depth:
+                raise DeviceError(
+                    f"{where}[{i}]: the implant ends {implant.reach:g} um below the surface, outside the silicon of {depth:g} um"
+                )
+
+
+def _check_part(part: Any, where: str) -> None:
+    for spec in dataclasses.fields(part):
+        value = getattr(part, spec.name)
+        if value is None:
+            continue
+        if (type(part), spec.name) in _CHOICES:
+            choices = _CHOICES[type(part), spec.name]
+            if value not in choices:
+                raise DeviceError(
+                    f"{where}: {spec.name} = {value!r} must be one of {', '.join(choices)}"
+                )
+        elif isinstance(value, tuple):
+            entry = _LISTS[type(part), spec.name][0]
+            for i, item in enumerate(value):
+                _check_part(item, f"{where}.{entry}[{i}]")
+        elif dataclasses.is_dataclass(value):
+            _check_part(value, f"{where}.{spec.name}")
+        elif spec.metadata:
+            text = (
+                from_internal(value, spec.metadata["kind"], spec.metadata["unit"])
+                if np.isfinite(value)
+                else str(value)
+            )
+            _check_range(value, spec.metadata, where, spec.name, text)
+    if isinstance(part, Implant):
+        needed = ("peak", "sigma") if part.shape == "gaussian" else ("depth",)
+        for name in needed:
+            if getattr(part, name) is None:
+                raise DeviceError(f"{where}: {name} is missing for a {part.shape} implant")
+        for name in {"peak", "sigma", "depth"} - set(needed):
+            if getattr(part, name) is not None:
+                raise DeviceError(
+                    f"{where}: {name} does not belong to a {part.shape} implant"
+                )

@@ -1,0 +1,23 @@
+"""Where the files that come with the package lie."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from bfsensor.errors import BFSensorError
+
+
+def tables_dir() -> Path:
+    """Folder of the built-in devices and tables: inside a wheel, or beside it in a checkout.
+
+    Returns
+    -------
+    folder : Path
+    """
+    package = Path(__file__).resolve().parent
+    for folder in (package / "tables", package.parent / "tables"):
+        if folder.is_dir():
+            return folder
+    raise BFSensorError(
+        f"the tables of bfsensor are missing beside {package}: reinstall the package"
+    )

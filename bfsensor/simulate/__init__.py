@@ -1,0 +1,1 @@
+"""The device simulator: mesh, electrostatics, pixel boundaries."""

@@ -1,0 +1,467 @@
+"""Pixel boundaries: the surfaces between the electrons of neighbouring wells.
+
+Without diffusion an electron follows a field line, and the pixel boundary is where the
+well that it reaches changes (a separatrix).  Forward traces are bisected at a height
+just above the front structure; one backward trace from there, along which errors
+shrink, passes every conversion depth.
+
+Boundaries between columns are lines x(y) and those between rows lines y(x), each
+continuous across the whole array: electrons on either side differ in the column (row)
+that they reach, whatever the row (column).  Neighbouring pixels share these lines, so
+their polygons tile the plane.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bfsensor._kernels import drift
+from bfsensor.errors import ConvergenceError, TableError
+from bfsensor.simulate.mesh import Surfaces
+from bfsensor.simulate.poisson import Potential
+
+SPLIT_HEIGHT = 4.0
+"""Boundaries are bisected this far above the silicon surface [um].
+
+Below it field lines bend sharply towards the wells; above they are smooth, rise steadily
+and a backward trace is stable."""
+
+BISECTION = 1e-5  # um; a thirtieth of the tracing error that is promised
+_COARSENESS = 0.25  # step of the forward trace relative to the local scale
+_RATIO = 0.10  # step of the backward trace relative to the height
+_MAX_STEPS = 3000
+_CORNER_PASSES = 20
+_CORNER_TOLERANCE = 1e-7  # um
+
+
+@dataclass(frozen=True)
+class Field:
+    """A potential padded for interpolation: ``phi`` [y, z, x] and its node positions."""
+
+    phi: NDArray[np.float64]
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    z: NDArray[np.float64]
+    zone: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, potential: Potential) -> Field:
+        """Pad a potential by its symmetry in x and y and by extrapolation in z."""
+        mesh = potential.mesh
+        phi = np.moveaxis(potential.phi, 0, 1)
+        phi, y = _pad(phi, mesh.y, 0, mesh.side_y, mesh.period[1], mesh.cells)
+        phi, x = _pad(phi, mesh.x, 2, mesh.side_x, mesh.period[0], mesh.cells)
+        phi, z = _pad_z(phi, mesh.z)
+        device = potential.device
+        surfaces = Surfaces.of(device)
+        half_x, half_y = mesh.pitch[0] / 2, mesh.pitch[1] / 2
+        channel = half_x - surfaces.stop_half_width - surfaces.taper
+        collecting = max(device.gates.edges_y(mesh.pitch[1]))
+        zone = np.array(
+            [
+                mesh.pitch[0],
+                mesh.pitch[1],
+                0.9 * channel,
+                0.9 * collecting,
+                surfaces.silicon_channel + 1.0,
+            ]
+        )
+        return cls(np.ascontiguousarray(phi), x, y, z, zone)
+
+
+def _pad(
+    phi: NDArray[np.float64],
+    nodes: NDArray[np.float64],
+    axis: int,
+    side: str,
+    period: float,
+    cells: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    count = len(nodes)
+    if side == "mirror":
+        width = min(cells, count - 1)
+        before, after = np.arange(width, 0, -1), np.arange(count - 2, count - 2 - width, -1)
+        low, high = 2 * nodes[0] - nodes[before], 2 * nodes[-1] - nodes[after]
+    else:
+        width = min(cells, count)
+        before, after = np.arange(count - width, count), np.arange(width)
+        low, high = nodes[before] - period, nodes[after] + period
+    order = np.concatenate([before, np.arange(count), after])
+    return np.take(phi, order, axis=axis), np.concatenate([low, nodes, high])
+
+
+def _pad_z(
+    phi: NDArray[np.float64], z: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two planes more at either end, from the parabola through the last three."""
+
+    def beyond(
+        target: float, nodes: NDArray[np.float64], values: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        a, b, c = nodes
+        return (
+            values[:, 0] * (target - b) * (target - c) / ((a - b) * (a - c))
+            + values[:, 1] * (target - a) * (target - c) / ((b - a) * (b - c))
+            + values[:, 2] * (target - a) * (target - b) / ((c - a) * (c - b))
+        )
+
+    step0, step1 = z[1] - z[0], z[-1] - z[-2]
+    low = [z[0] - 2 * step0, z[0] - step0]
+    high = [z[-1] + step1, z[-1] + 2 * step1]
+    first = [beyond(t, z[:3], phi[:, :3]) for t in low]
+    last = [beyond(t, z[-3:], phi[:, -3:]) for t in high]
+    padded = np.concatenate([np.stack(first, 1), phi, np.stack(last, 1)], axis=1)
+    return padded, np.array([*low, *z, *high])
+
+
+@dataclass(frozen=True)
+class PixelBoundaries:
+    """Boundary lines around the pixels at offsets up to ``reach`` from pixel (0, 0).
+
+    Attributes
+    ----------
+    depths : ndarray, shape (nd,)
+        Heights above the gates [um] at which the lines were taken.
+    pitch : tuple of float
+        Pixel pitch [um].
+    reach : int
+        Offsets -reach..reach are bounded.
+    columns : ndarray, shape (nd, 2 reach + 2, ns, 2)
+        Points (x, y) of the lines between columns, ordered along y, the lowest line first.
+    rows : ndarray, shape (nd, 2 reach + 2, ns, 2)
+        Points (x, y) of the lines between rows, ordered along x.
+    symmetric : bool
+        Computed in one quadrant and mirrored.
+    """
+
+    depths: NDArray[np.float64]
+    pitch: tuple[float, float]
+    reach: int
+    columns: NDArray[np.float64]
+    rows: NDArray[np.float64]
+    symmetric: bool
+
+    def vertices(
+        self, vertices: int, fractions: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Displacements of polygon vertices that keep the area of every pixel.
+
+        The vertices of a line are the least-squares polyline through it under the
+        condition that the area between line and nominal edge is kept in each pixel.
+        Areas then do not depend on the number of vertices, and where the boundary ends
+        in a cusp at a corner the corner is the best common point of the four edges.
+
+        Parameters
+        ----------
+        vertices : int
+            Vertices a side between the corners.
+        fractions : ndarray, shape (vertices,)
+            Their nominal positions along the side, 0 to 1.
+
+        Returns
+        -------
+        corners : ndarray, shape (nd, 2 reach + 2, 2 reach + 2, 2)
+            Displacement (dx, dy) [um] of the corners, rows then columns.
+        horizontal : ndarray, shape (nd, 2 reach + 2, 2 reach + 1, vertices, 2)
+            Of the vertices on edges between rows.
+        vertical : ndarray, shape (nd, 2 reach + 1, 2 reach + 2, vertices, 2)
+            Of the vertices on edges between columns.
+        """
+        n_pixels = 2 * self.reach + 1
+        fit = _line_fit(n_pixels, vertices, tuple(fractions))
+        grid_x = (np.arange(n_pixels + 1) - self.reach - 0.5) * self.pitch[0]
+        grid_y = (np.arange(n_pixels + 1) - self.reach - 0.5) * self.pitch[1]
+        nd, n_lines = self.rows.shape[:2]
+        corners = np.zeros((nd, n_lines, n_lines, 2))
+        horizontal = np.zeros((nd, n_lines, n_pixels, vertices, 2))
+        vertical = np.zeros((nd, n_pixels, n_lines, vertices, 2))
+        for d in range(nd):
+            # A side is measured between its corners, which the lines across move in turn.
+            for _ in range(_CORNER_PASSES):
+                new = np.zeros((n_lines, n_lines, 2))
+                for m in range(n_lines):
+                    ends = grid_x + corners[d, m, :, 0]
+                    fitted = fit.apply(self.rows[d, m], 0, ends) - grid_y[m]
+                    new[m, :, 1] = fitted[:: vertices + 1]
+                    horizontal[d, m, :, :, 1] = _between(fitted, vertices)
+                    ends = grid_y + corners[d, :, m, 1]
+                    fitted = fit.apply(self.columns[d, m], 1, ends) - grid_x[m]
+                    new[:, m, 0] = fitted[:: vertices + 1]
+                    vertical[d, :, m, :, 0] = _between(fitted, vertices)
+                moved = np.abs(new - corners[d]).max()
+                corners[d] = new
+                if moved < _CORNER_TOLERANCE:
+                    break
+            u = fractions[None, None, :]
+            dx, dy = corners[d, :, :, 0], corners[d, :, :, 1]
+            horizontal[d, ..., 0] = dx[:, :-1, None] * (1 - u) + dx[:, 1:, None] * u
+            vertical[d, ..., 1] = dy[:-1, :, None] * (1 - u) + dy[1:, :, None] * u
+        if self.symmetric:
+            mirror_quadrant(corners, horizontal, vertical)
+        return corners, horizontal, vertical
+
+
+def _between(fitted: NDArray[np.float64], vertices: int) -> NDArray[np.float64]:
+    """The values of a fitted line at the vertices between the corners, pixel by pixel."""
+    return fitted[:-1].reshape(-1, vertices + 1)[:, 1:]
+
+
+def mirror_quadrant(
+    corners: NDArray[np.float64],
+    horizontal: NDArray[np.float64],
+    vertical: NDArray[np.float64],
+) -> None:
+    """Copy the quadrant of positive offsets to the other three, in place.
+
+    Arrays as :meth:`PixelBoundaries.vertices` gives them; what lies on an axis keeps its
+    positive half.  Symmetry then holds bit for bit.
+    """
+    for a, along in ((corners, None), (horizontal, "x"), (vertical, "y")):
+        vertex_x = a[..., ::-1, :] if along == "x" else a
+        nx = a.shape[2] // 2
+        a[:, :, :nx] = (vertex_x[:, :, ::-1] * np.array([-1.0, 1.0]))[:, :, :nx]
+        if along == "x" and a.shape[2] % 2:
+            middle = a[:, :, nx]
+            half = middle.shape[-2] // 2
+            middle[:, :, :half] = (middle[:, :, ::-1] * np.array([-1.0, 1.0]))[:, :, :half]
+            if middle.shape[-2] % 2:
+                middle[:, :, half, 0] = 0.0
+        elif a.shape[2] % 2:
+            a[:, :, nx, ..., 0] = 0.0
+        vertex_y = a[..., ::-1, :] if along == "y" else a
+        ny = a.shape[1] // 2
+        a[:, :ny] = (vertex_y[:, ::-1] * np.array([1.0, -1.0]))[:, :ny]
+        if along == "y" and a.shape[1] % 2:
+            middle = a[:, ny]
+            half = middle.shape[-2] // 2
+            middle[:, :, :half] = (middle[:, :, ::-1] * np.array([1.0, -1.0]))[:, :, :half]
+            if middle.shape[-2] % 2:
+                middle[:, :, half, 1] = 0.0
+        elif a.shape[1] % 2:
+            a[:, ny, ..., 1] = 0.0
+
+
+@dataclass(frozen=True)
+class _LineFit:
+    """Linear map from a line's values at quadrature points to its vertices."""
+
+    points: NDArray[np.float64]
+    matrix: NDArray[np.float64]
+
+    def apply(
+        self, line: NDArray[np.float64], along: int, ends: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Vertices of ``line`` (points (x, y)) whose corners lie at ``ends`` along it."""
+        values = np.empty((len(ends) - 1, len(self.points)))
+        for p in range(len(ends) - 1):
+            # A line between rows jumps where it crosses a boundary between columns: only
+            # points of this pixel count, the outermost one up to the corner.
+            a, b = np.searchsorted(line[:, along], ends[p : p + 2])
+            where = ends[p] + (ends[p + 1] - ends[p]) * self.points
+            values[p] = np.interp(where, line[a:b, along], line[a:b, 1 - along])
+        return self.matrix @ values.ravel()
+
+
+@lru_cache(maxsize=8)
+def _line_fit(n_pixels: int, vertices: int, fractions: tuple[float, ...]) -> _LineFit:
+    """Build the constrained least-squares map (Gauss-Legendre points in every interval)."""
+    knots = np.array([0.0, *fractions, 1.0])
+    per_interval = max(2, int(np.ceil(64 / (vertices + 1))))
+    node, weight = np.polynomial.legendre.leggauss(per_interval)
+    points, weights = [], []
+    for a, b in zip(knots[:-1], knots[1:], strict=True):
+        points.append(a + 0.5 * (node + 1) * (b - a))
+        weights.append(0.5 * weight * (b - a))
+    points_, weights_ = np.concatenate(points), np.concatenate(weights)
+    n_knots = n_pixels * (vertices + 1) + 1
+    n_points = len(points_)
+    basis = np.zeros((n_pixels * n_points, n_knots))
+    for p in range(n_pixels):
+        interval = np.clip(np.searchsorted(knots, points_) - 1, 0, vertices)
+        t = (points_ - knots[interval]) / (knots[interval + 1] - knots[interval])
+        rows = p * n_points + np.arange(n_points)
+        basis[rows, p * (vertices + 1) + interval] = 1 - t
+        basis[rows, p * (vertices + 1) + interval + 1] = t
+    w = np.tile(weights_, n_pixels)
+    mass = basis.T @ (w[:, None] * basis)
+    load = basis.T * w
+    integral = np.zeros((n_pixels, n_pixels * n_points))
+    for p in range(n_pixels):
+        integral[p, p * n_points : (p + 1) * n_points] = weights_
+    constraint = integral @ basis
+    kkt = np.block([[mass, constraint.T], [constraint, np.zeros((n_pixels, n_pixels))]])
+    solution = np.linalg.solve(kkt, np.vstack([load, integral]))
+    return _LineFit(points_, solution[:n_knots])
+
+
+def find_boundaries(
+    potential: Potential,
+    depths: ArrayLike,
+    *,
+    reach: int = 4,
+    samples: int = 24,
+    coarseness: float = _COARSENESS,
+    ratio: float = _RATIO,
+) -> PixelBoundaries:
+    """Trace the boundaries of the pixels around pixel (0, 0).
+
+    Parameters
+    ----------
+    potential : Potential
+        Solved on a domain that holds the pixels up to ``reach`` and one more.
+    depths : array_like
+        Heights above the gates [um], ascending, in the silicon above the stored charge.
+    reach : int
+        Largest pixel offset.
+    samples : int
+        Points of a line per pixel, denser towards the corners.
+    coarseness, ratio : float
+        Step lengths of the forward and backward traces; the defaults give a tracing
+        error below 3e-4 um.
+
+    Returns
+    -------
+    PixelBoundaries
+
+    Raises
+    ------
+    TableError
+        A depth outside the silicon, or the domain is too small.
+    ConvergenceError
+        A boundary was not found (a well that no longer holds its charge).
+    """
+    mesh = potential.mesh
+    depths = np.atleast_1d(np.asarray(depths, float))
+    surfaces = Surfaces.of(potential.device)
+    lowest = lowest_depth(potential)
+    if np.any(np.diff(depths) <= 0):
+        raise TableError(f"conversion depths {depths.tolist()} um must ascend")
+    if depths[0] < lowest - 1e-9 or depths[-1] > mesh.z[-1] + 1e-9:
+        raise TableError(
+            f"conversion depth {depths[0] if depths[0] < lowest else depths[-1]:g} um must lie in "
+            f"the silicon, from {lowest:.3g} um (where charge is stored) to {mesh.z[-1]:g} um "
+            "(back surface)"
+        )
+    field = Field.of(potential)
+    symmetric = mesh.side_x == "mirror" and mesh.side_y == "mirror"
+    if symmetric and (abs(mesh.x[0]) > 1e-9 or abs(mesh.y[0]) > 1e-9):
+        raise TableError(
+            "boundaries need the mirror planes through the centre of pixel (0, 0)"
+        )
+    split = max(surfaces.silicon_channel, surfaces.silicon_stop) + SPLIT_HEIGHT
+    lines = []
+    for axis in (0, 1):
+        pitch, along = mesh.pitch[axis], mesh.pitch[1 - axis]
+        first = 0 if symmetric else -reach - 1
+        edges = (np.arange(first, reach + 1) + 0.5) * pitch
+        seeds = _seed_positions(reach, along, samples, symmetric)
+        half_period = mesh.period[axis] / 2
+        if (
+            edges[-1] + pitch / 2 > half_period + 1e-9
+            or seeds[-1] > mesh.period[1 - axis] / 2
+        ):
+            raise TableError(
+                f"reach = {reach} pixels does not fit a period of {mesh.period} um"
+            )
+        lines.append(
+            _trace_lines(field, axis, edges, seeds, depths, split, coarseness, ratio)
+        )
+    columns, rows = lines
+    if symmetric:
+        columns, rows = _unfold(columns, 0), _unfold(rows, 1)
+    return PixelBoundaries(depths, mesh.pitch, reach, columns, rows, symmetric)
+
+
+def lowest_depth(potential: Potential) -> float:
+    """Height above the gates [um] where charge is stored, below which nothing moves.
+
+    The mean height of the electrons; without any, of the potential's maximum.
+    """
+    if potential.electrons.sum() > 0:
+        z = potential.mesh.z[: potential.electrons.shape[0]]
+        return float(
+            np.tensordot(z, potential.electrons.sum(axis=(1, 2)), 1)
+            / potential.electrons.sum()
+        )
+    return float(potential.mesh.z[np.argmax(potential.phi.max(axis=(1, 2)))])
+
+
+def _seed_positions(
+    reach: int, pitch: float, samples: int, symmetric: bool
+) -> NDArray[np.float64]:
+    """Positions along a line: Chebyshev points in each pixel, so denser at the corners."""
+    cheb = -0.5 * np.cos(np.pi * (np.arange(samples) + 0.5) / samples) * pitch
+    pixels = np.arange(-reach, reach + 1)
+    # A little of the next pixel, for the corner and its displacement.
+    margin = np.array([0.15, 0.4]) * pitch / 2 + (reach + 0.5) * pitch
+    out = np.concatenate(
+        [-margin[::-1], (pixels[:, None] * pitch + cheb[None, :]).ravel(), margin]
+    )
+    return out[out >= 0] if symmetric else out
+
+
+def _trace_lines(
+    field: Field,
+    axis: int,
+    edges: NDArray[np.float64],
+    along: NDArray[np.float64],
+    depths: NDArray[np.float64],
+    split: float,
+    coarseness: float,
+    ratio: float,
+) -> NDArray[np.float64]:
+    """Points of the lines across ``axis`` at every depth: (nd, lines, seeds, 2)."""
+    shape = (len(edges), len(along))
+    out = np.zeros((len(depths), *shape, 2))
+    high = depths >= split
+    heights = [split] if high.any() else []
+    heights += list(depths[~high])
+    guess = np.zeros(shape)
+    for number, z in enumerate(heights):
+        seeds = np.zeros((*shape, 3))
+        seeds[..., axis] = edges[:, None]
+        seeds[..., 1 - axis] = along[None, :]
+        seeds[..., 2] = z
+        margin = 0.05
+        position = np.zeros(shape[0] * shape[1])
+        failed = drift.bisect_edge(
+            field.phi, field.x, field.y, field.z, seeds.reshape(-1, 3), axis,
+            np.broadcast_to(edges[:, None], shape).ravel().copy(),
+            (guess - margin).ravel(), (guess + margin).ravel(),
+            BISECTION, field.zone, coarseness, _MAX_STEPS, position,
+        )  # fmt: skip
+        if failed:
+            raise ConvergenceError(
+                f"{failed} of {position.size} boundary points at z = {z:g} um were not found: no "
+                "well on one side (is a pixel near its full well?)",
+                [],
+            )
+        seeds[..., axis] = position.reshape(shape)
+        if number == 0 and high.any():
+            traced = np.zeros((position.size, int(high.sum()), 2))
+            drift.trace_up(
+                field.phi,
+                field.x,
+                field.y,
+                field.z,
+                seeds.reshape(-1, 3),
+                depths[high],
+                ratio,
+                traced,
+            )
+            out[high] = np.moveaxis(traced.reshape(*shape, -1, 2), 2, 0)
+        else:
+            out[int(np.argmin(np.abs(depths - z)))] = seeds[..., :2]
+    return out
+
+
+def _unfold(lines: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    """Mirror the lines of a quadrant to the whole neighbourhood."""
+    flip_across = np.array([-1.0, 1.0]) if axis == 0 else np.array([1.0, -1.0])
+    full = np.concatenate([lines[:, ::-1] * flip_across, lines], axis=1)
+    reverse = full[:, :, ::-1] * -flip_across
+    return np.concatenate([reverse, full], axis=2)

@@ -1,0 +1,116 @@
+"""The far field of a charged pixel, and the periodic images taken out with it.
+
+Many pixels away a stored charge and what it induces on gates and holes act as a dipole
+on a grounded plane, facing the back contact at the other end of the silicon.  Its
+lateral field is the mode sum (Jackson, Classical Electrodynamics, section 3.11)
+
+.. math::
+    E_\\rho(\\rho, z) = C \\sum_n \\kappa_n^2 \\sin(\\kappa_n (T - z)) K_1(\\kappa_n \\rho)
+    (-1)^{n + 1}, \\qquad \\kappa_n = n \\pi / (T - z_0),
+
+and shifts a boundary by the integral of :math:`E_\\rho / E_z` over the path of the
+electrons.  A solution with periodic sides is the sum over all images; those at other
+lattice points lie at least half a period and more away, where this form holds, so they
+can be subtracted.  Only the amplitude C is unknown; the outermost boundaries give it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import k1
+
+from bfsensor.simulate.poisson import Potential
+
+_MODES = 40
+_STEPS = 200
+_IMAGES = 3
+
+
+@dataclass(frozen=True)
+class FarField:
+    """Shift of boundaries far from a unit dipole, ``shift(rho, depth)``, tabulated.
+
+    Attributes
+    ----------
+    distances : ndarray, shape (nr,)
+        Distances from the dipole [um].
+    depths : ndarray, shape (nd,)
+        Heights above the gates [um].
+    shifts : ndarray, shape (nd, nr)
+        Outward shift of a boundary, in arbitrary units.
+    """
+
+    distances: NDArray[np.float64]
+    depths: NDArray[np.float64]
+    shifts: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls, unit: Potential, depths: NDArray[np.float64], ground: float, reach: float
+    ) -> FarField:
+        """Compute for the mean field of a unit cell.
+
+        Parameters
+        ----------
+        unit : Potential
+            The uniform array without the charge; its laterally averaged field carries
+            the electrons.
+        depths : ndarray
+            Heights above the gates [um].
+        ground : float
+            Height of the effective grounded plane [um]: the silicon surface.
+        reach : float
+            Largest distance wanted [um].
+        """
+        mesh = unit.mesh
+        weight_x = np.gradient(mesh.x)
+        weight_y = np.gradient(mesh.y)
+        mean = np.tensordot(unit.phi, np.outer(weight_y, weight_x), 2) / (
+            weight_x.sum() * weight_y.sum()
+        )
+        top = mesh.z[-1]
+        low = ground + 4.0  # above the front structure, where the mean field is the field
+        z = np.linspace(low, top, _STEPS)
+        field = -np.interp(
+            z, 0.5 * (mesh.z[1:] + mesh.z[:-1]), np.diff(mean) / np.diff(mesh.z)
+        )
+        n = np.arange(1, _MODES + 1)
+        kappa = n * np.pi / (top - ground)
+        distances = np.geomspace(20.0, max(reach, 40.0), 200)
+        sign = np.where(n % 2 == 1, 1.0, -1.0)
+        modes = (kappa**2 * sign)[:, None] * np.sin(kappa[:, None] * (top - z[None, :]))
+        bessel = k1(np.minimum(kappa[:, None] * distances[None, :], 600.0))
+        slope = (modes.T @ bessel) / field[:, None]
+        steps = 0.5 * (slope[1:] + slope[:-1]) * np.diff(z)[:, None]
+        total = np.concatenate([np.zeros((1, len(distances))), np.cumsum(steps, axis=0)])
+        shifts = np.array(
+            [[np.interp(d, z, total[:, r]) for r in range(len(distances))] for d in depths]
+        )
+        return cls(distances, np.asarray(depths, float), shifts)
+
+    def vectors(self, points: NDArray[np.float64], depth: int) -> NDArray[np.float64]:
+        """Outward shift vectors at ``points`` (..., 2) relative to the dipole."""
+        rho = np.hypot(points[..., 0], points[..., 1])
+        size = np.exp(
+            np.interp(
+                np.log(rho),
+                np.log(self.distances),
+                np.log(np.maximum(self.shifts[depth], 1e-300)),
+            )
+        )
+        return points * (size / rho)[..., None]
+
+
+def image_shifts(
+    far: FarField, points: NDArray[np.float64], depth: int, period: tuple[float, float]
+) -> NDArray[np.float64]:
+    """Summed unit shifts at ``points`` (..., 2) from all images but the one at the origin."""
+    out = np.zeros_like(points)
+    for a in range(-_IMAGES, _IMAGES + 1):
+        for b in range(-_IMAGES, _IMAGES + 1):
+            if a or b:
+                out += far.vectors(points - np.array([a * period[0], b * period[1]]), depth)
+    return out

@@ -1,0 +1,236 @@
+"""One symmetric multigrid V-cycle as a preconditioner, in single precision.
+
+Columns are relaxed exactly along z, red and black in x and y, and only x and y are
+coarsened: near the gates cells are far thinner than wide, deep in the bulk the reverse,
+and this smoother does not care (Trottenberg et al. 2001, Multigrid, section 5.1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor._kernels import relaxation
+from bfsensor.simulate.mesh import Coefficients, dual_widths, link_factors
+
+_COARSEST_SWEEPS = 6
+_PINNED = 1e12  # a link strong enough to hold a coarse node inside a conductor at zero
+
+
+@dataclass
+class _Level:
+    coefficients: dict[str, NDArray]
+    carriers: NDArray[np.float32]
+    solution: NDArray[np.float32]
+    charge: NDArray[np.float32]
+    residual: NDArray[np.float32]
+    mask: NDArray[np.float32]
+    work: NDArray[np.float32]
+    pivot: NDArray[np.float32]
+    weight_x: NDArray[np.float32]
+    weight_y: NDArray[np.float32]
+    periodic: tuple[bool, bool]
+
+
+class Multigrid:
+    """The hierarchy of one :class:`~bfsensor.simulate.mesh.Coefficients`.
+
+    Parameters
+    ----------
+    fine : Coefficients
+        The finest operator, without carriers.
+    """
+
+    def __init__(self, fine: Coefficients) -> None:
+        self.levels: list[_Level] = []
+        level: Coefficients | None = fine
+        while level is not None:
+            coarser = _coarsen(level)
+            self.levels.append(_make_level(level))
+            level = coarser
+        self.cycles = 0
+
+    def set_carriers(self, carriers: NDArray[np.float64]) -> None:
+        """Take the derivative of the mobile charge [e-/V], front planes of the finest level."""
+        self.levels[0].carriers[...] = carriers
+        for upper, lower in zip(self.levels[:-1], self.levels[1:], strict=True):
+            relaxation.fill_halo(upper.carriers, *upper.periodic)
+            relaxation.restrict(
+                upper.carriers, upper.weight_x, upper.weight_y, lower.carriers
+            )
+
+    def cycle(self, charge: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+        """Write the approximate solution of ``A out = charge`` to ``out``."""
+        self.cycles += 1
+        top = self.levels[0]
+        top.charge[...] = charge
+        self._cycle(0)
+        out[...] = top.solution
+
+    def _relax(self, level: _Level, colour: int) -> None:
+        c = level.coefficients
+        relaxation.relax_columns(
+            level.solution, level.charge, level.carriers, c["cx"], c["cy"], c["cz"],
+            c["centre"], c["kind"], c["north"], c["south"], c["inverse_dy"], colour,
+            level.mask, level.work, level.pivot,
+        )  # fmt: skip
+        relaxation.fill_halo(level.solution, *level.periodic)
+
+    def _cycle(self, depth: int) -> None:
+        level = self.levels[depth]
+        level.solution[...] = 0.0
+        if depth == len(self.levels) - 1:
+            for first in (0, 1):
+                for _ in range(_COARSEST_SWEEPS):
+                    self._relax(level, first)
+                    self._relax(level, 1 - first)
+            return
+        self._relax(level, 0)
+        self._relax(level, 1)
+        c = level.coefficients
+        relaxation.residual(
+            level.solution, level.charge, level.carriers, c["cx"], c["cy"], c["cz"],
+            c["cd"], c["kind"], c["north"], c["south"], c["dy"], level.residual,
+        )  # fmt: skip
+        relaxation.fill_halo(level.residual, *level.periodic)
+        lower = self.levels[depth + 1]
+        relaxation.restrict(level.residual, level.weight_x, level.weight_y, lower.charge)
+        self._cycle(depth + 1)
+        relaxation.prolong_add(
+            lower.solution, level.weight_x, level.weight_y, level.solution
+        )
+        relaxation.fill_halo(level.solution, *level.periodic)
+        self._relax(level, 1)
+        self._relax(level, 0)
+
+
+def _make_level(fine: Coefficients) -> _Level:
+    mesh = fine.mesh
+    nz, ny, nx = mesh.shape
+    shape = (ny + 2, nz, nx + 2)
+    single = np.float32
+    cz_below = np.zeros_like(fine.cz)
+    cz_below[:, 1:] = fine.cz[:, :-1]
+    cx_left = np.zeros_like(fine.cx)
+    cx_left[:, :, 1:] = fine.cx[:, :, :-1]
+    centre = fine.cx + cx_left + fine.cz + cz_below + fine.cd
+    parity = (np.arange(nx + 2) % 2).astype(single)
+    inverse_dy = np.zeros(ny + 2, single)
+    inverse_dy[1:-1] = 1.0 / fine.dy[1:-1]
+    coefficients = {
+        "cx": fine.cx.astype(single),
+        "cy": fine.cy.astype(single),
+        "cz": fine.cz.astype(single),
+        "cd": fine.cd.astype(single),
+        "centre": centre.astype(single),
+        "kind": fine.kind,
+        "north": fine.north.astype(single),
+        "south": fine.south.astype(single),
+        "dy": fine.dy.astype(single),
+        "inverse_dy": inverse_dy,
+    }
+    return _Level(
+        coefficients=coefficients,
+        carriers=np.zeros((ny + 2, fine.n_front, nx + 2), single),
+        solution=np.zeros(shape, single),
+        charge=np.zeros(shape, single),
+        residual=np.zeros(shape, single),
+        mask=np.stack([parity, 1 - parity]),
+        work=np.zeros((nz, nx + 2), single),
+        pivot=np.zeros((nz, nx + 2), single),
+        weight_x=interpolation_weights(mesh.x, mesh.side_x, mesh.period[0]).astype(single),
+        weight_y=interpolation_weights(mesh.y, mesh.side_y, mesh.period[1]).astype(single),
+        periodic=(mesh.side_x == "periodic", mesh.side_y == "periodic"),
+    )
+
+
+def interpolation_weights(
+    nodes: NDArray[np.float64], side: str, period: float
+) -> NDArray[np.float64]:
+    """Weight of the upper coarse neighbour of every fine node between two, with halo.
+
+    Fine node ``f`` (counted from the halo) is coarse where ``f`` is odd; the halo gets
+    the weight of its periodic image, or none.
+    """
+    out = np.zeros(len(nodes) + 2)
+    extended = np.concatenate([nodes, [nodes[0] + period]]) if side == "periodic" else nodes
+    middle = extended[1:-1:2]
+    lower, upper = extended[0:-2:2], extended[2::2]
+    count = min(len(middle), len(upper))
+    out[2 : 2 * count + 1 : 2] = (middle[:count] - lower[:count]) / (
+        upper[:count] - lower[:count]
+    )
+    if side == "periodic":
+        out[0] = out[-2]
+    else:
+        # Nothing lies beyond a mirror plane: its halo must not be interpolated from.
+        out[0] = 0.0
+        if len(nodes) % 2 == 0:
+            out[-2] = 0.0
+        out[-1] = 1.0
+    return out
+
+
+def _can_halve(count: int, side: str) -> bool:
+    return (
+        count % 2 == 0 and count >= 8
+        if side == "periodic"
+        else count % 2 == 1 and count >= 5
+    )
+
+
+def _coarsen(fine: Coefficients) -> Coefficients | None:
+    """The operator on every second node in x and y; None where that is not possible."""
+    mesh = fine.mesh
+    nz, ny, nx = mesh.shape
+    if not (_can_halve(nx, mesh.side_x) and _can_halve(ny, mesh.side_y)):
+        return None
+    coarse_mesh = replace(mesh, x=mesh.x[::2], y=mesh.y[::2], cells=mesh.cells // 2)
+    weights = interpolation_weights(mesh.x, mesh.side_x, mesh.period[0])
+    conductor = np.zeros((fine.cx.shape[0], nz, len(coarse_mesh.x) + 2), bool)
+    conductor[:, :, 1:-1] = fine.conductor[:, :, 1:-1][:, :, ::2]
+    if mesh.side_x == "periodic":
+        conductor[:, :, 0], conductor[:, :, -1] = conductor[:, :, -2], conductor[:, :, 1]
+    free = ~conductor
+
+    def gather(a: NDArray[np.float64]) -> NDArray[np.float64]:
+        out = np.zeros_like(conductor, dtype=float)
+        centre = a[:, :, 1:-1][:, :, ::2]
+        n = centre.shape[2]
+        left = (weights * a)[:, :, 0:-2:2][:, :, :n]
+        right = ((1.0 - weights) * a)[:, :, 2::2][:, :, :n]
+        out[:, :, 1:-1] = centre + left + right
+        if mesh.side_x == "periodic":
+            out[:, :, 0], out[:, :, -1] = out[:, :, -2], out[:, :, 1]
+        return out
+
+    first = fine.cx[:, :, 1:-1][:, :, ::2]
+    second = fine.cx[:, :, 1:-1][:, :, 1::2]
+    n = second.shape[2]
+    series = np.zeros_like(conductor, dtype=float)
+    total = first[:, :, :n] + second
+    np.divide(first[:, :, :n] * second, total, out=series[:, :, 1 : n + 1], where=total > 0)
+    if mesh.side_x == "periodic":
+        series[:, :, 0] = series[:, :, n]
+    cz = gather(fine.cz)
+    cd = gather(np.where(fine.conductor, 0.0, fine.cd))
+    # Where the coarse node below lies in the gate, the columns beside it still conduct.
+    cd[:, 1:] += np.where(conductor[:, :-1] & free[:, 1:], cz[:, :-1], 0.0)
+    cz[:, :-1] *= free[:, :-1] & free[:, 1:]
+    cd = np.where(conductor, _PINNED, cd)
+    south, north, dy = dual_widths(coarse_mesh.y, coarse_mesh.side_y, mesh.period[1])
+    return replace(
+        fine,
+        mesh=coarse_mesh,
+        cx=series,
+        cy=gather(fine.cy) * free,
+        cz=cz,
+        cd=cd,
+        kind=np.concatenate([[0], fine.kind[1:-1][::2], [0]]),
+        north=link_factors(north, dy),
+        south=link_factors(south, dy),
+        dy=np.concatenate([[0.0], dy, [0.0]]),
+        conductor=conductor,
+    )

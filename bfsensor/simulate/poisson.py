@@ -1,0 +1,507 @@
+"""Non-linear electrostatics of a sensor: potential, free holes, stored electrons.
+
+Solves, in electron per node,
+
+.. math::
+    A \\phi = Q_{fixed} + p(\\phi) - n(\\phi)
+
+with holes :math:`p = n_i V e^{(\\phi_h - \\phi)/kT}` at one quasi-Fermi level and, in every
+pixel, electrons :math:`n = N e^{\\phi/kT} / \\sum e^{\\phi/kT}` of the prescribed number N.
+Newton's method; each linear system by conjugate gradients with one multigrid cycle as
+preconditioner.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bfsensor._kernels import carriers as carrier_kernels
+from bfsensor._kernels import relaxation
+from bfsensor.errors import ConvergenceError, DeviceError
+from bfsensor.simulate.mesh import Mesh, discretise, make_mesh
+from bfsensor.simulate.multigrid import Multigrid
+
+if TYPE_CHECKING:
+    from bfsensor.device import Device
+
+TOLERANCE = 1e-6
+"""Iteration error [V] at which a solution counts as converged.
+
+A smooth error of 1 V moves boundaries by at most about L / (E p) = 100 um / (0.5 V/um x
+10 um) = 20 um, an area by 800 um^2: 1e-6 V is below 1e-3 um^2 in the worst case."""
+
+_MAX_NEWTON = 60
+_MAX_CG = 200
+_DENSE = 10.0  # carriers/um^3 above which a Newton step is damped: far below any doping
+_WELL_PER_ELECTRON = 3.0e-5  # V; how far a well's level sinks, only to start the iteration
+
+
+@dataclass(frozen=True)
+class NewtonStep:
+    """One line of a convergence history."""
+
+    asked: float
+    taken: float
+    linear_iterations: int
+    residual: float
+
+
+@dataclass(frozen=True)
+class Potential:
+    """A converged solution.
+
+    Attributes
+    ----------
+    device, mesh : Device, Mesh
+        What was solved, and where.
+    charges : ndarray, shape (pixels in y, pixels in x)
+        Electrons stored in each (whole) pixel of the domain [e-].
+    phi : ndarray, shape (nz, ny, nx)
+        Potential [V] at the nodes.
+    electrons, holes : ndarray, shape (n_front, ny, nx)
+        Number of carriers of each node's cell [e-]; deeper planes hold none.
+    silicon : ndarray, shape (n_front, ny, nx)
+        Silicon volume of each node's cell [um^3].
+    quasi_fermi : ndarray, shape of ``charges``
+        Electron quasi-Fermi level of each pixel [V]; nan where empty.
+    error_volts : float
+        Bound on the iteration error that is left [V].
+    history : tuple of NewtonStep
+        How it converged.
+    """
+
+    device: Device
+    mesh: Mesh
+    charges: NDArray[np.float64]
+    phi: NDArray[np.float64] = field(repr=False)
+    electrons: NDArray[np.float64] = field(repr=False)
+    holes: NDArray[np.float64] = field(repr=False)
+    silicon: NDArray[np.float64] = field(repr=False)
+    quasi_fermi: NDArray[np.float64] = field(repr=False)
+    error_volts: float
+    history: tuple[NewtonStep, ...] = field(repr=False)
+
+    @property
+    def linear_iterations(self) -> int:
+        """Conjugate-gradient iterations of all Newton steps."""
+        return sum(step.linear_iterations for step in self.history)
+
+
+class Electrostatics:
+    """The electrostatics of one device on one mesh, for any number of charge patterns.
+
+    Coefficients and multigrid hierarchy are built once and kept; results do not depend
+    on what was solved before, apart from the start that is passed in.
+
+    Parameters
+    ----------
+    device : Device
+        The sensor.
+    mesh : Mesh
+        From :func:`~bfsensor.simulate.mesh.make_mesh`.
+    """
+
+    def __init__(self, device: Device, mesh: Mesh) -> None:
+        self.device = device
+        self.mesh = mesh
+        self.coefficients = discretise(device, mesh)
+        self.multigrid = Multigrid(self.coefficients)
+        temperature = device.operating_point.temperature
+        self._kt = device.material.thermal_voltage(temperature)
+        self._ni = device.material.intrinsic_density(temperature)
+        self._fermi_h = device.operating_point.hole_quasi_fermi_level
+        self._pixels_x, self._share_x = _pixel_of_node(
+            mesh.x, mesh.pitch[0], mesh.pixels("x"), mesh.side_x
+        )
+        self._pixels_y, self._share_y = _pixel_of_node(
+            mesh.y, mesh.pitch[1], mesh.pixels("y"), mesh.side_y
+        )
+        nz, ny, nx = mesh.shape
+        self._shape = (ny + 2, nz, nx + 2)
+        front = (ny + 2, self.coefficients.n_front, nx + 2)
+        self._electrons = np.zeros(front)
+        self._holes = np.zeros(front)
+        self._stiffness = np.zeros(front)
+        self._residual = np.zeros(self._shape)
+        self._step = np.zeros(self._shape)
+        self._direction = np.zeros(self._shape)
+        self._product = np.zeros(self._shape)
+        self._preconditioned = np.zeros(self._shape)
+
+    @property
+    def pixel_shape(self) -> tuple[int, int]:
+        """Number of pixels of the domain in y and in x."""
+        return len(self._share_y), len(self._share_x)
+
+    def solve(
+        self,
+        charges: ArrayLike,
+        *,
+        start: NDArray[np.float64] | None = None,
+        tolerance: float = TOLERANCE,
+    ) -> Potential:
+        """Solve for given electrons in each pixel.
+
+        Parameters
+        ----------
+        charges : array_like, shape ``pixel_shape`` or scalar
+            Electrons in each pixel [e-], counted for the whole pixel even where a mirror
+            plane cuts it.
+        start : ndarray, shape (nz, ny, nx), optional
+            Potential to start from [V]; by default an empty pixel, solved and repeated.
+        tolerance : float
+            Iteration error that may be left [V].
+
+        Returns
+        -------
+        Potential
+
+        Raises
+        ------
+        ConvergenceError
+            Newton did not get there; carries the history.
+        DeviceError
+            A negative number of electrons, or free holes at the end of their region.
+        """
+        charges = np.array(np.broadcast_to(np.asarray(charges, float), self.pixel_shape))
+        if not np.all(charges >= 0):
+            raise DeviceError(f"stored charge {charges.min():g} e- must not be negative")
+        count = (charges * self._share_y[:, None] * self._share_x[None, :]).ravel()
+        if start is None:
+            start = self._empty_start()
+        phi = np.zeros(self._shape)
+        phi[1:-1, :, 1:-1] = np.moveaxis(start, 0, 1)
+        self._fill_halo(phi)
+        history: list[NewtonStep] = []
+        new = self._open_wells(phi, charges.ravel())
+        if new is not None:
+            self._newton(phi, count, history, 1.0, fermi=new)
+        error = self._newton(phi, count, history, tolerance)
+        self._check_hole_region()
+        fermi = self._fermi_levels(phi, count)
+
+        def inner(a: NDArray[np.float64]) -> NDArray[np.float64]:
+            return np.moveaxis(a[1:-1, :, 1:-1], 1, 0).copy()
+
+        c = self.coefficients
+        silicon = c.silicon[c.kind[1:-1]][:, : c.n_front] * c.dy[1:-1, None, None]
+        return Potential(
+            device=self.device,
+            mesh=self.mesh,
+            charges=charges,
+            phi=inner(phi),
+            electrons=inner(self._electrons),
+            holes=inner(self._holes),
+            silicon=np.moveaxis(silicon[:, :, 1:-1], 1, 0).copy(),
+            quasi_fermi=np.where(count > 0, fermi, np.nan).reshape(self.pixel_shape),
+            error_volts=error,
+            history=tuple(history),
+        )
+
+    # -- the pieces ------------------------------------------------------------------
+
+    def _fill_halo(self, a: NDArray[np.float64]) -> None:
+        relaxation.fill_halo(
+            a, self.mesh.side_x == "periodic", self.mesh.side_y == "periodic"
+        )
+
+    def _empty_start(self) -> NDArray[np.float64]:
+        """A first guess without carriers: linear solution, held above the hole level."""
+        nz, ny, nx = self.mesh.shape
+        c = self.coefficients
+        self._stiffness[...] = 0.0
+        phi = np.zeros(self._shape)
+        conductor = c.conductor[c.kind[1:-1]]
+        phi[1:-1] = np.where(conductor, c.source[1:-1] / c.dy[1:-1, None, None], 0.0)
+        self._electrons[...] = 0.0
+        relaxation.residual(
+            phi,
+            c.source,
+            self._stiffness,
+            c.cx,
+            c.cy,
+            c.cz,
+            c.cd,
+            c.kind,
+            c.north,
+            c.south,
+            c.dy,
+            self._residual,
+        )
+        self._linear_solve(np.zeros(1), 1e-3)
+        phi += self._step
+        floor = self._fermi_h - self._kt * np.log(1e3 / self._ni)
+        front = phi[:, : c.n_front]
+        silicon = c.silicon[c.kind][:, : c.n_front] > 0
+        front[silicon] = np.maximum(front[silicon], floor)
+        return np.moveaxis(phi[1:-1, :, 1:-1], 1, 0).copy()
+
+    def _open_wells(
+        self, phi: NDArray[np.float64], charges: NDArray[np.float64]
+    ) -> NDArray[np.float64] | None:
+        """Make room in wells that the start has empty; their levels, or None if none is new.
+
+        An empty well's maximum lies far above any electron level.  The potential is cut
+        where a plausible number of electrons would hold it.
+        """
+        c = self.coefficients
+        n_px = len(self._share_x)
+        top = np.zeros(charges.size)
+        carrier_kernels.highest_potential(
+            phi,
+            c.silicon[:, : c.n_front],
+            c.kind,
+            self._pixels_y,
+            self._pixels_x,
+            n_px,
+            top,
+        )
+        level = top - self._kt * np.log(1e4 / self._ni)
+        # A cloud is a plateau: its maximum is within a few kT of the level.  An empty well
+        # would hold many times its charge at the level that this density needs.
+        count = charges * (self._share_y[:, None] * self._share_x[None, :]).ravel()
+        held = np.zeros(charges.size)
+        carrier_kernels.count_electrons(
+            phi, c.silicon[:, : c.n_front], c.kind, c.dy, self._pixels_y, self._pixels_x, n_px,
+            level, self._kt, held,
+        )  # fmt: skip
+        held *= self._ni
+        new = (charges > 0) & (held < 0.2 * count)
+        if not new.any():
+            return None
+        fermi = self._fermi_levels(phi, count)
+        level = top - _WELL_PER_ELECTRON * charges
+        fermi = np.where(new, level, fermi)
+        ceiling = level + self._kt * np.log(3e3 / self._ni)
+        py, px = self._pixels_y, self._pixels_x
+        for p in np.nonzero(new)[0]:
+            rows = np.nonzero(py == p // n_px)[0]
+            columns = np.nonzero(px == p % n_px)[0]
+            block = np.ix_(rows, np.arange(c.n_front), columns)
+            here = (c.silicon[c.kind[rows]][:, : c.n_front][:, :, columns]) > 0
+            values = phi[block]
+            phi[block] = np.where(here, np.minimum(values, ceiling[p]), values)
+        self._fill_halo(phi)
+        return fermi
+
+    def _fermi_levels(
+        self, phi: NDArray[np.float64], count: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Quasi-Fermi level [V] at which each pixel holds its count."""
+        c = self.coefficients
+        n_px = len(self._share_x)
+        reference = np.zeros(count.size)
+        front = c.silicon[:, : c.n_front]
+        carrier_kernels.highest_potential(
+            phi, front, c.kind, self._pixels_y, self._pixels_x, n_px, reference
+        )
+        total = np.zeros(count.size)
+        carrier_kernels.count_electrons(
+            phi,
+            front,
+            c.kind,
+            c.dy,
+            self._pixels_y,
+            self._pixels_x,
+            n_px,
+            reference,
+            self._kt,
+            total,
+        )
+        filled = count > 0
+        out = np.full(count.size, 1e30)
+        out[filled] = reference[filled] + self._kt * np.log(
+            self._ni * total[filled] / count[filled]
+        )
+        return out
+
+    def _newton(
+        self,
+        phi: NDArray[np.float64],
+        count: NDArray[np.float64],
+        history: list[NewtonStep],
+        tolerance: float,
+        fermi: NDArray[np.float64] | None = None,
+    ) -> float:
+        """Newton's method in place; with ``fermi`` at fixed levels, else at fixed counts."""
+        c = self.coefficients
+        n_px = len(self._share_x)
+        front = c.silicon[:, : c.n_front]
+        fixed = fermi is not None
+        conserved = np.zeros(count.size) if fixed else count
+        filled = count > 0
+        shift = np.zeros(count.size)
+        for _ in range(_MAX_NEWTON):
+            levels = fermi if fermi is not None else self._fermi_levels(phi, count)
+            carrier_kernels.mobile_charge(
+                phi, front, c.kind, c.dy, self._pixels_y, self._pixels_x, n_px, levels, filled,
+                self._fermi_h, self._ni, self._kt, self._electrons, self._holes,
+            )  # fmt: skip
+            self._stiffness[...] = 0.0
+            relaxation.residual(
+                phi, c.source, self._stiffness, c.cx, c.cy, c.cz, c.cd, c.kind, c.north,
+                c.south, c.dy, self._residual,
+            )  # fmt: skip
+            self._residual[:, : c.n_front] += self._holes - self._electrons
+            norm = float(np.sqrt(np.sum(self._residual**2)))
+            np.add(self._electrons, self._holes, out=self._stiffness)
+            self._stiffness /= self._kt
+            self.multigrid.set_carriers(self._stiffness)
+            forcing = 0.1 if not history or history[-1].asked > 0.1 else 1e-3
+            iterations = self._linear_solve(conserved, forcing)
+            shift[...] = 0.0
+            if not fixed and filled.any():
+                weighted = np.zeros((len(self._share_y), len(self._share_x)))
+                moved = np.einsum(
+                    "jki,jki->ji", self._electrons, self._step[:, : c.n_front]
+                )
+                rows, columns = self._pixels_y >= 0, self._pixels_x >= 0
+                np.add.at(
+                    weighted,
+                    (self._pixels_y[rows][:, None], self._pixels_x[columns][None, :]),
+                    moved[np.ix_(rows, columns)],
+                )
+                np.divide(weighted.ravel(), count, out=shift, where=filled)
+            taken, asked = carrier_kernels.damped_update(
+                phi, self._step, self._electrons, self._holes, front, c.kind, c.dy,
+                self._pixels_y, self._pixels_x, n_px, shift, self._kt, _DENSE,
+            )  # fmt: skip
+            self._fill_halo(phi)
+            history.append(NewtonStep(asked, taken, iterations, norm))
+            if not np.isfinite(asked):
+                break
+            # What is left: the linear system's error, and the quadratic term of Newton.
+            error = asked * max(forcing, asked / self._kt)
+            if error < tolerance:
+                return error
+        raise ConvergenceError(
+            f"the potential did not converge to {tolerance:g} V in {len(history)} Newton steps "
+            f"(last step {history[-1].asked:.3g} V)",
+            [step.asked for step in history],
+        )
+
+    def _linear_solve(self, conserved: NDArray[np.float64], forcing: float) -> int:
+        """Conjugate gradients for the Newton step; residual is consumed."""
+        c = self.coefficients
+        n_px = len(self._share_x)
+        self._step[...] = 0.0
+        work = np.zeros(max(conserved.size, 1))
+        residual, direction, product, z = (
+            self._residual,
+            self._direction,
+            self._product,
+            self._preconditioned,
+        )
+        self.multigrid.cycle(residual, z)
+        rz = carrier_kernels.inner(residual, z)
+        if rz <= 0.0:
+            return 0
+        direction[...] = z
+        first = rz
+        has_electrons = bool(np.any(conserved > 0))
+        for iteration in range(1, _MAX_CG + 1):
+            self._fill_halo(direction)
+            curvature = relaxation.apply_operator(
+                direction, self._stiffness, c.cx, c.cy, c.cz, c.cd, c.kind, c.north, c.south,
+                c.dy, product,
+            )  # fmt: skip
+            if has_electrons:
+                curvature -= carrier_kernels.subtract_common_shift(
+                    self._electrons, self._pixels_y, self._pixels_x, n_px, conserved, self._kt,
+                    direction, work, product,
+                )  # fmt: skip
+            carrier_kernels.step_solution(
+                self._step, direction, residual, product, rz / curvature
+            )
+            self.multigrid.cycle(residual, z)
+            new = carrier_kernels.inner(residual, z)
+            if new <= forcing**2 * first:
+                return iteration
+            carrier_kernels.next_direction(direction, z, new / rz)
+            rz = new
+        return _MAX_CG
+
+    def _check_hole_region(self) -> None:
+        """Refuse holes that reach the plane where they are no longer counted."""
+        c = self.coefficients
+        edge = self._holes[:, -1].max(initial=0.0)
+        if edge > 1e-3 * max(self._holes.max(), 1e-3):
+            raise DeviceError(
+                f"free holes reach z = {self.mesh.z[c.n_front - 1]:.2f} um: the silicon between "
+                "channel stops and back contact is not depleted (raise the back bias or lower "
+                "the background doping)"
+            )
+
+
+def _pixel_of_node(
+    nodes: NDArray[np.float64], pitch: float, pixels: NDArray[np.int64], side: str
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Pixel number of every node (with halo; -1 on borders) and each pixel's share inside."""
+    offset = nodes / pitch + 0.5
+    border = np.abs(offset - np.round(offset)) < 1e-6
+    index = np.where(border, -1, np.floor(offset).astype(np.int64) - pixels[0])
+    if side == "periodic":
+        share = np.ones(len(pixels))
+    else:
+        low = np.maximum(nodes[0], (pixels - 0.5) * pitch)
+        high = np.minimum(nodes[-1], (pixels + 0.5) * pitch)
+        share = (high - low) / pitch
+    return np.concatenate([[-1], index, [-1]]), share
+
+
+def solve_unit_cell(
+    device: Device, charge: float, *, cells: int = 16, refine_z: int = 0
+) -> Potential:
+    """Solve one pixel of a uniform array, every pixel with the same charge.
+
+    Parameters
+    ----------
+    device : Device
+        A mirror-symmetric device.
+    charge : float
+        Electrons in every pixel [e-].
+    cells : int
+        Cells a pixel.
+    refine_z : int
+        Halvings of the z mesh.
+
+    Returns
+    -------
+    Potential
+        On a quarter pixel.
+    """
+    mesh = make_mesh(device, pixels=(1, 1), cells=cells, refine_z=refine_z, symmetric=True)
+    solver = Electrostatics(device, mesh)
+    empty = solver.solve(0.0)
+    return solver.solve(charge, start=empty.phi) if charge > 0 else empty
+
+
+def tile(unit: Potential, mesh: Mesh) -> NDArray[np.float64]:
+    """Repeat the potential of a unit cell over a mesh with the same pixel nodes.
+
+    Parameters
+    ----------
+    unit : Potential
+        From :func:`solve_unit_cell`, same device and cells.
+    mesh : Mesh
+        Where the potential is wanted.
+
+    Returns
+    -------
+    phi : ndarray, shape (nz, ny, nx)
+        Potential [V].
+    """
+
+    def index(
+        nodes: NDArray[np.float64], pitch: float, cell: NDArray[np.float64]
+    ) -> NDArray[np.int64]:
+        folded = np.abs(nodes - pitch * np.round(nodes / pitch))
+        return np.argmin(np.abs(folded[:, None] - cell[None, :]), axis=1)
+
+    ix = index(mesh.x, mesh.pitch[0], unit.mesh.x)
+    iy = index(mesh.y, mesh.pitch[1], unit.mesh.y)
+    return unit.phi[:, iy[:, None], ix[None, :]]

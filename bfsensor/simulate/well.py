@@ -1,0 +1,96 @@
+"""The well of a pixel: how much charge it holds before it spills along the column."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.optimize import brentq
+
+from bfsensor.errors import ConvergenceError, DeviceError
+from bfsensor.simulate.mesh import make_mesh
+from bfsensor.simulate.poisson import Electrostatics, Potential, solve_unit_cell, tile
+
+if TYPE_CHECKING:
+    from bfsensor.device import Device
+
+_PERIOD = 4
+_LARGEST_WELL = 2e6  # e-: no pixel of a science CCD holds more
+
+
+def barrier(potential: Potential) -> float:
+    """Height of the barrier along the column between pixel (0, 0) and its y-neighbour [V].
+
+    The potential of the well less that of the pass to the next one: of all rows between
+    the two pixel centres, the one whose highest potential is lowest.
+
+    Parameters
+    ----------
+    potential : Potential
+        On a domain that holds half of pixel (0, 0) and of pixel (0, 1) at least.
+
+    Returns
+    -------
+    height : float
+        Barrier [V]; zero or less where the well overflows.
+    """
+    mesh = potential.mesh
+    n_front = potential.silicon.shape[0]
+    in_column = np.abs(mesh.x) <= mesh.pitch[0] / 2 + 1e-9
+    front = np.where(potential.silicon > 0, potential.phi[:n_front], -np.inf)[
+        :, :, in_column
+    ]
+    highest = front.max(axis=(0, 2))
+    own = np.abs(mesh.y) <= mesh.pitch[1] / 2 + 1e-9
+    path = (mesh.y >= -1e-9) & (mesh.y <= mesh.pitch[1] + 1e-9)
+    return float(highest[own].max() - highest[path].min())
+
+
+def full_well(device: Device, *, cells: int = 16) -> float:
+    """Charge at which the barrier along the column falls to the spill barrier [e-].
+
+    One pixel is filled and its neighbours are empty, as in a bright star on dark sky.
+
+    Parameters
+    ----------
+    device : Device
+        Its ``well.spill_barrier`` sets the height [V].
+    cells : int
+        Cells a pixel.
+
+    Returns
+    -------
+    charge : float
+        Full well [e-], to 0.1 %.
+
+    Raises
+    ------
+    DeviceError
+        The empty well is already shallower than the spill barrier.
+    """
+    solver = Electrostatics(
+        device, make_mesh(device, pixels=(_PERIOD, _PERIOD), cells=cells)
+    )
+    start = tile(solve_unit_cell(device, 0.0, cells=cells), solver.mesh)
+
+    def excess(charge: float) -> float:
+        charges = np.zeros(solver.pixel_shape)
+        charges[0, 0] = charge
+        return (
+            barrier(solver.solve(charges, start=start, tolerance=1e-3))
+            - device.well.spill_barrier
+        )
+
+    if excess(0.0) <= 0:
+        raise DeviceError(
+            f"well: spill_barrier = {device.well.spill_barrier:g} V is not below the barrier of "
+            f"the empty pixel, {excess(0.0) + device.well.spill_barrier:.3g} V"
+        )
+    low, high = 0.0, 5e4
+    while excess(high) > 0:
+        low, high = high, 1.6 * high
+        if high > _LARGEST_WELL:
+            raise ConvergenceError(
+                f"the barrier is still above its spill value at {low:.3g} e-", []
+            )
+    return float(brentq(excess, low, high, rtol=1e-3))

@@ -1,0 +1,549 @@
+"""Distortion tables: how far every vertex of the pixel boundaries moves.
+
+The source pixel holds a charge, all other pixels a uniform background, and the light
+converts at some depth; the table holds the total displacement of the vertices around the
+source pixel for levels of all three.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline, PchipInterpolator
+
+from bfsensor.errors import TableError
+from bfsensor.simulate.boundaries import mirror_quadrant
+
+SCHEMA = "bfsensor distortion table"
+SCHEMA_VERSION = 1
+
+
+def vertex_fractions(vertices: int) -> NDArray[np.float64]:
+    """Nominal positions of the vertices along a side, 0 to 1, denser at the middle.
+
+    Equal steps of the angle seen from the pixel centre, as in GalSim's tables, so that a
+    table can be exported without resampling.
+
+    Parameters
+    ----------
+    vertices : int
+        Vertices between the corners.
+
+    Returns
+    -------
+    fractions : ndarray, shape (vertices,)
+
+    Examples
+    --------
+    >>> vertex_fractions(1)
+    array([0.5])
+    """
+    angle = -np.pi / 4 + (np.arange(vertices) + 1) * np.pi / (2 * (vertices + 1))
+    return np.asarray((np.tan(angle) + 1) / 2)
+
+
+@dataclass(frozen=True)
+class Displacements:
+    """Displacements (dx, dy) [um] of corners and side vertices at one point of a table."""
+
+    corners: NDArray[np.float64]
+    horizontal: NDArray[np.float64]
+    vertical: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class DistortionTable:
+    """Total displacement of the pixel vertices around a source pixel.
+
+    Attributes
+    ----------
+    charges : ndarray, shape (nq,)
+        Charge of the source pixel [e-], ascending.
+    backgrounds : ndarray, shape (nb,)
+        Charge of every other pixel [e-], ascending.
+    depths : ndarray, shape (nd,)
+        Conversion depths [um above the gates], ascending.
+    pitch : tuple of float
+        Pixel pitch in x and y [um].
+    thickness : float
+        Height of the back surface [um].
+    vertices : int
+        Vertices a side between the corners, at :func:`vertex_fractions`.
+    reach : int
+        Pixel offsets -reach..reach.
+    corners : ndarray, shape (nq, nb, nd, 2 reach + 2, 2 reach + 2, 2)
+        Displacement (dx, dy) [um] of the corners, by edge line in y, then x.
+    horizontal : ndarray, shape (nq, nb, nd, 2 reach + 2, 2 reach + 1, vertices, 2)
+        Of vertices on edges along x: edge line in y, pixel in x.
+    vertical : ndarray, shape (nq, nb, nd, 2 reach + 1, 2 reach + 2, vertices, 2)
+        Of vertices on edges along y: pixel in y, edge line in x.
+    full_well : float
+        Charge at which a pixel spills along its column [e-]; nan where not known.
+    errors : mapping of str to float
+        Estimated errors, units in the names.
+    provenance : mapping of str to str
+        How it was made.
+    device_text : str
+        The device file, empty where not known.
+    symmetric : bool
+        Whether x and y through the source pixel's centre are mirror lines.
+
+    Notes
+    -----
+    Where the source charge equals the background nothing moves.  Between levels the
+    response D / (Q - B) is interpolated (cubic splines in charge and background, monotone
+    cubics in the logarithm of depth) and multiplied by Q - B, so that this holds everywhere.
+    Arrays are kept in single precision (1e-7 of a displacement) so that reading what was
+    written gives the same bits.
+
+    Examples
+    --------
+    >>> from bfsensor.resources import tables_dir
+    >>> table = DistortionTable.read(tables_dir() / "itl_sta3800c" / "table.fits")
+    >>> change = table.area_changes(charge=50000.0, depth=95.0)
+    >>> bool(change[4, 4] < 0 < change[4, 5] < change[5, 4])
+    True
+    """
+
+    charges: NDArray[np.float64]
+    backgrounds: NDArray[np.float64]
+    depths: NDArray[np.float64]
+    pitch: tuple[float, float]
+    thickness: float
+    vertices: int
+    reach: int
+    corners: NDArray[np.float64] = field(repr=False)
+    horizontal: NDArray[np.float64] = field(repr=False)
+    vertical: NDArray[np.float64] = field(repr=False)
+    full_well: float = float("nan")
+    errors: Mapping[str, float] = field(default_factory=dict, repr=False)
+    provenance: Mapping[str, str] = field(default_factory=dict, repr=False)
+    device_text: str = field(default="", repr=False)
+    symmetric: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("charges", "backgrounds", "depths"):
+            axis = np.array(getattr(self, name), float)
+            if (
+                axis.ndim != 1
+                or not len(axis)
+                or not np.all(np.isfinite(axis))
+                or np.any(np.diff(axis) <= 0)
+            ):
+                raise TableError(f"{name} = {axis.tolist()} must be finite and ascend")
+            axis.flags.writeable = False
+            object.__setattr__(self, name, axis)
+        if self.charges[0] < 0 or self.backgrounds[0] < 0:
+            raise TableError("charges and backgrounds must not be negative")
+        n, nv = 2 * self.reach + 1, self.vertices
+        levels = (len(self.charges), len(self.backgrounds), len(self.depths))
+        shapes = {
+            "corners": (*levels, n + 1, n + 1, 2),
+            "horizontal": (*levels, n + 1, n, nv, 2),
+            "vertical": (*levels, n, n + 1, nv, 2),
+        }
+        for name, shape in shapes.items():
+            array = np.array(getattr(self, name), np.float32).astype(float)
+            if array.shape != shape:
+                raise TableError(f"{name} has the shape {array.shape}, not {shape}")
+            if not np.all(np.isfinite(array)):
+                raise TableError(f"{name} holds values that are not finite")
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        object.__setattr__(self, "pitch", (float(self.pitch[0]), float(self.pitch[1])))
+        for name in ("errors", "provenance"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, DistortionTable):
+            return NotImplemented
+        for name in self.__dataclass_fields__:
+            a, b = getattr(self, name), getattr(other, name)
+            same = (
+                np.array_equal(a, b, equal_nan=True)
+                if isinstance(a, np.ndarray | float)
+                else a == b
+            )
+            if not same:
+                return False
+        return True
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        values["errors"], values["provenance"] = dict(self.errors), dict(self.provenance)
+        return _make, (values,)
+
+    # -- questions ---------------------------------------------------------------------
+
+    @cached_property
+    def _responses(self) -> tuple[NDArray[np.float64], ...]:
+        """D / (Q - B) on the grid; where Q = B, from its neighbours in charge."""
+        step = self.charges[:, None] - self.backgrounds[None, :]
+        out = []
+        for array in (self.corners, self.horizontal, self.vertical):
+            flat = array.reshape(*step.shape, -1)
+            response = np.divide(
+                flat, step[..., None], out=np.zeros_like(flat), where=step[..., None] != 0
+            )
+            for b in range(step.shape[1]):
+                known = step[:, b] != 0
+                if known.all() or not known.any():
+                    continue
+                missing = int(np.nonzero(~known)[0][0])
+                order = np.argsort(np.abs(self.charges[known] - self.charges[missing]))[:3]
+                near = np.nonzero(known)[0][np.sort(order)]
+                weights = _lagrange(self.charges[near], self.charges[missing])
+                response[missing, b] = weights @ response[near, b]
+            out.append(response.reshape(array.shape))
+        return tuple(out)
+
+    def displacements(
+        self, *, charge: float, background: float = 0.0, depth: float
+    ) -> Displacements:
+        """Displacements between the levels of the table.
+
+        Parameters
+        ----------
+        charge, background : float
+            Source charge and charge of all other pixels [e-].
+        depth : float
+            Conversion depth [um above the gates].
+
+        Returns
+        -------
+        Displacements
+
+        Raises
+        ------
+        TableError
+            A value outside the table; names the range.
+        """
+        low = 0.0 if len(self.charges) == 1 else self.charges[0]
+        well = "" if np.isnan(self.full_well) else f" (full well {self.full_well:,.0f} e-)"
+        self._inside("charge", charge, low, self.charges[-1], f"e-{well}")
+        self._inside(
+            "background", background, self.backgrounds[0], self.backgrounds[-1], "e-"
+        )
+        self._inside("depth", depth, self.depths[0], self.depths[-1], "um")
+        wq, wb = (
+            _spline_weights(self.charges, charge),
+            _spline_weights(self.backgrounds, background),
+        )
+        out = []
+        for response in self._responses:
+            at = np.tensordot(wq, np.tensordot(wb, response, (0, 1)), (0, 0))
+            if len(self.depths) == 1:
+                value = at[0]
+            else:
+                value = PchipInterpolator(np.log(self.depths), at, axis=0)(np.log(depth))
+            out.append((charge - background) * value)
+        return Displacements(*out)
+
+    @staticmethod
+    def _inside(name: str, value: float, low: float, high: float, unit: str) -> None:
+        margin = 1e-9 * max(abs(low), abs(high))
+        if not low - margin <= value <= high + margin:
+            allowed = f"{low:g}" if low == high else f"from {low:g} to {high:g}"
+            raise TableError(
+                f"{name} = {value:g} is outside the table, which holds {allowed} {unit}"
+            )
+
+    def nominal(self) -> Displacements:
+        """Positions (x, y) [um] of all vertices of undistorted pixels, source centre at 0."""
+        n = 2 * self.reach + 1
+        x = (np.arange(n + 1) - self.reach - 0.5) * self.pitch[0]
+        y = (np.arange(n + 1) - self.reach - 0.5) * self.pitch[1]
+        f = vertex_fractions(self.vertices)
+        corners = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), -1)
+        along_x = (x[:-1, None] + f * self.pitch[0])[None]
+        along_y = (y[:-1, None] + f * self.pitch[1])[:, None]
+        horizontal = np.stack(np.broadcast_arrays(along_x, y[:, None, None]), -1)
+        vertical = np.stack(np.broadcast_arrays(x[None, :, None], along_y), -1)
+        return Displacements(corners, horizontal, vertical)
+
+    def _outlines(self, moved: Displacements) -> NDArray[np.float64]:
+        """Polygons of all pixels, (n, n, 4 nv + 4, 2), counter-clockwise from lower left."""
+        at = self.nominal()
+        c = at.corners + moved.corners
+        h = at.horizontal + moved.horizontal
+        v = at.vertical + moved.vertical
+        return np.concatenate(
+            [
+                c[:-1, :-1, None], h[:-1], c[:-1, 1:, None], v[:, 1:],
+                c[1:, 1:, None], h[1:, :, ::-1], c[1:, :-1, None], v[:, :-1, ::-1],
+            ],
+            axis=2,
+        )  # fmt: skip
+
+    def polygon(
+        self, i: int, j: int, *, charge: float, background: float = 0.0, depth: float
+    ) -> NDArray[np.float64]:
+        """Boundary of the pixel at offset (i, j) from the source.
+
+        Parameters
+        ----------
+        i, j : int
+            Offset in x and in y [pixel].
+        charge, background, depth : float
+            As in :meth:`displacements`.
+
+        Returns
+        -------
+        points : ndarray, shape (4 vertices + 4, 2)
+            Vertices (x, y) [um], the source pixel's centre at 0, counter-clockwise from the
+            middle of the left side as in GalSim's tables.
+        """
+        if max(abs(i), abs(j)) > self.reach:
+            raise TableError(
+                f"offset ({i}, {j}) is outside the table, which reaches {self.reach} pixels"
+            )
+        moved = self.displacements(charge=charge, background=background, depth=depth)
+        outline = self._outlines(moved)[j + self.reach, i + self.reach]
+        return np.roll(
+            outline, self.vertices - self.vertices // 2 - self.vertices % 2, axis=0
+        )
+
+    def areas(
+        self, *, charge: float, background: float = 0.0, depth: float
+    ) -> NDArray[np.float64]:
+        """Areas of all pixels [um^2].
+
+        Returns
+        -------
+        areas : ndarray, shape (2 reach + 1, 2 reach + 1)
+            ``areas[j + reach, i + reach]`` for offset i in x and j in y.
+        """
+        p = self._outlines(
+            self.displacements(charge=charge, background=background, depth=depth)
+        )
+        q = np.roll(p, -1, axis=2)
+        return np.asarray(
+            0.5 * np.sum(p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0], axis=2)
+        )
+
+    def area_changes(
+        self, *, charge: float, background: float = 0.0, depth: float
+    ) -> NDArray[np.float64]:
+        """Areas less the nominal area [um^2], see :meth:`areas`."""
+        return (
+            self.areas(charge=charge, background=background, depth=depth)
+            - self.pitch[0] * self.pitch[1]
+        )
+
+    # -- files -------------------------------------------------------------------------
+
+    def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Write a FITS file (beside, then renamed).
+
+        Raises
+        ------
+        TableError
+            The file exists and ``overwrite`` is not set.
+        """
+        from astropy.io import fits
+
+        path = Path(path)
+        if path.exists() and not overwrite:
+            raise TableError(f"{path} exists; say overwrite to replace it")
+        arrays = {
+            "CORNERS": self.corners,
+            "HORIZONTAL": self.horizontal,
+            "VERTICAL": self.vertical,
+        }
+        quadrant = self.symmetric and self._expand(
+            {k: _quadrant(k, v) for k, v in arrays.items()}
+        ) == arrays_key(arrays)
+        if quadrant:
+            arrays = {k: _quadrant(k, v) for k, v in arrays.items()}
+        primary = fits.PrimaryHDU()
+        header = primary.header
+        header["SCHEMA"] = (SCHEMA, "what this file is")
+        header["SCHEMAV"] = (SCHEMA_VERSION, "version of the schema")
+        header["BUNIT"] = ("um", "unit of all displacements")
+        header["VERTICES"] = (self.vertices, "vertices a side between the corners")
+        header["REACH"] = (self.reach, "largest pixel offset")
+        header["QUADRANT"] = (quadrant, "only offsets >= 0 are stored, the rest mirrored")
+        header["SYMMETRC"] = (self.symmetric, "mirror-symmetric about the source pixel")
+        header["PITCHX"] = (self.pitch[0], "[um] pixel pitch along the gates")
+        header["PITCHY"] = (self.pitch[1], "[um] pixel pitch along the channel stops")
+        header["THICKNSS"] = (self.thickness, "[um] height of the back surface")
+        if np.isfinite(self.full_well):
+            header["FULLWELL"] = (
+                self.full_well,
+                "[electron] charge at which a pixel spills",
+            )
+        hdus = [primary]
+        for name, array in arrays.items():
+            hdu = fits.ImageHDU(array.astype(np.float32), name=name)
+            hdu.header["BUNIT"] = "um"
+            hdus.append(hdu)
+        for name, axis, unit in (
+            ("CHARGES", self.charges, "electron"),
+            ("BACKGROUNDS", self.backgrounds, "electron"),
+            ("DEPTHS", self.depths, "um"),
+        ):
+            hdu = fits.ImageHDU(axis.astype(float), name=name)
+            hdu.header["BUNIT"] = unit
+            hdus.append(hdu)
+        meta = json.dumps(
+            {"errors": dict(self.errors), "provenance": dict(self.provenance)},
+            sort_keys=True,
+        )
+        for name, text in (("META", meta), ("DEVICE", self.device_text)):
+            hdus.append(
+                fits.ImageHDU(np.frombuffer(text.encode() or b"\n", np.uint8), name=name)
+            )
+        beside = path.with_name(f"{path.name}.{os.getpid()}.part")
+        try:
+            fits.HDUList(hdus).writeto(beside, checksum=True, overwrite=True)
+            os.replace(beside, path)
+        finally:
+            beside.unlink(missing_ok=True)
+
+    def _expand(self, quadrant: dict[str, NDArray[np.float64]]) -> bytes:
+        return arrays_key(_whole(quadrant, self.reach, self.vertices))
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> DistortionTable:
+        """Read what :meth:`write` wrote.
+
+        Raises
+        ------
+        TableError
+            Not such a file, an unknown schema, or damaged; names the file.
+        """
+        from astropy.io import fits
+        from astropy.utils.exceptions import AstropyUserWarning
+
+        path = Path(path)
+        if not path.exists():
+            raise TableError(f"{path}: no such file")
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", AstropyUserWarning)
+                with fits.open(path, checksum=True, memmap=False) as hdus:
+                    header = hdus[0].header
+                    if header.get("SCHEMA") != SCHEMA:
+                        raise TableError(
+                            f"{path}: not a distortion table (no SCHEMA = '{SCHEMA}')"
+                        )
+                    if header.get("SCHEMAV") != SCHEMA_VERSION:
+                        raise TableError(
+                            f"{path}: schema version {header.get('SCHEMAV')} is not {SCHEMA_VERSION}, the one "
+                            "this version of bfsensor reads"
+                        )
+                    data = {hdu.name: np.array(hdu.data) for hdu in hdus[1:]}
+        except (OSError, AstropyUserWarning, ValueError, KeyError, TypeError) as error:
+            if isinstance(error, TableError):
+                raise
+            raise TableError(f"{path}: not a FITS file, or damaged: {error}") from None
+        needed = {
+            "CORNERS",
+            "HORIZONTAL",
+            "VERTICAL",
+            "CHARGES",
+            "BACKGROUNDS",
+            "DEPTHS",
+            "META",
+            "DEVICE",
+        }
+        if missing := needed - set(data):
+            raise TableError(f"{path}: truncated: {', '.join(sorted(missing))} is missing")
+        arrays = {k: data[k].astype(float) for k in ("CORNERS", "HORIZONTAL", "VERTICAL")}
+        reach, vertices = int(header["REACH"]), int(header["VERTICES"])
+        if header["QUADRANT"]:
+            arrays = _whole(arrays, reach, vertices)
+        meta = json.loads(data["META"].astype(np.uint8).tobytes())
+        return cls(
+            charges=data["CHARGES"].astype(float),
+            backgrounds=data["BACKGROUNDS"].astype(float),
+            depths=data["DEPTHS"].astype(float),
+            pitch=(header["PITCHX"], header["PITCHY"]),
+            thickness=header["THICKNSS"],
+            vertices=vertices,
+            reach=reach,
+            corners=arrays["CORNERS"],
+            horizontal=arrays["HORIZONTAL"],
+            vertical=arrays["VERTICAL"],
+            full_well=header.get("FULLWELL", float("nan")),
+            errors=meta["errors"],
+            provenance=meta["provenance"],
+            device_text=data["DEVICE"]
+            .astype(np.uint8)
+            .tobytes()
+            .decode()
+            .removeprefix("\n"),
+            symmetric=bool(header["SYMMETRC"]),
+        )
+
+
+def _make(values: dict[str, Any]) -> DistortionTable:
+    return DistortionTable(**values)
+
+
+def arrays_key(arrays: dict[str, NDArray[np.float64]]) -> bytes:
+    """The arrays as bytes, signs of zero aside, to compare them bit for bit."""
+    return b"".join(
+        (arrays[k].astype(np.float32) + np.float32(0)).tobytes() for k in sorted(arrays)
+    )
+
+
+def _quadrant(name: str, array: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The part of an array with offsets from the source pixel's centre on."""
+    ny, nx = array.shape[3:5]
+    return array[:, :, :, ny // 2 :, nx // 2 :]
+
+
+def _whole(
+    quadrant: dict[str, NDArray[np.float64]], reach: int, vertices: int
+) -> dict[str, NDArray[np.float64]]:
+    """Mirror quadrants to whole arrays."""
+    n = 2 * reach + 1
+    levels = quadrant["CORNERS"].shape[:3]
+    flat = int(np.prod(levels))
+    shapes = {
+        "CORNERS": (n + 1, n + 1, 2),
+        "HORIZONTAL": (n + 1, n, vertices, 2),
+        "VERTICAL": (n, n + 1, vertices, 2),
+    }
+    out = {}
+    for name, shape in shapes.items():
+        whole = np.zeros((flat, *shape))
+        part = quadrant[name].reshape(flat, *quadrant[name].shape[3:])
+        whole[:, -part.shape[1] :, -part.shape[2] :] = part
+        out[name] = whole
+    mirror_quadrant(out["CORNERS"], out["HORIZONTAL"], out["VERTICAL"])
+    return {name: whole.reshape(*levels, *whole.shape[1:]) for name, whole in out.items()}
+
+
+def _lagrange(nodes: NDArray[np.float64], at: float) -> NDArray[np.float64]:
+    """Weights of the polynomial through ``nodes`` at ``at``."""
+    out = np.ones(len(nodes))
+    for i in range(len(nodes)):
+        for k in range(len(nodes)):
+            if i != k:
+                out[i] *= (at - nodes[k]) / (nodes[i] - nodes[k])
+    return out
+
+
+def _spline_weights(nodes: NDArray[np.float64], at: float) -> NDArray[np.float64]:
+    """Weights of the cubic spline through ``nodes`` at ``at`` (a polynomial below four)."""
+    if len(nodes) < 4:
+        return (
+            _lagrange(nodes, float(np.clip(at, nodes[0], nodes[-1])))
+            if len(nodes) > 1
+            else np.ones(1)
+        )
+    return np.asarray(CubicSpline(nodes, np.eye(len(nodes)))(at))
