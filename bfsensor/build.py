@@ -354,6 +354,7 @@ def build_table(
     executor: Executor | None = None,
     checkpoint: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
+    errors: Callable[[], dict[str, float]] | None = None,
     provenance: dict[str, str] | None = None,
 ) -> DistortionTable:
     """Solve every level of a plan and assemble the table.
@@ -369,6 +370,9 @@ def build_table(
         is left behind only by an interrupted run.
     progress : callable, optional
         Called with (levels done, levels in all).
+    errors : callable, optional
+        Called once all levels are there; gives error estimates for the header, such as
+        :func:`bfsensor.assess.assess`.
     provenance : dict, optional
         Further entries for the header.
 
@@ -417,7 +421,12 @@ def build_table(
             [[getattr(levels[q, b], name) for b in plan.backgrounds] for q in plan.charges]
         )
 
+    nz, ny, nx = make_mesh(
+        plan.device, pixels=(PERIOD, PERIOD), cells=plan.cells, refine_z=plan.refine_z
+    ).shape
     cost = {
+        "nodes": str(nx * ny * nz),
+        "levels cpu [s]": f"{sum(level.cpu_seconds for level in levels.values()):.1f}",
         "newton steps": str(sum(level.newton for level in levels.values())),
         "linear iterations": str(sum(level.linear_iterations for level in levels.values())),
     }
@@ -432,7 +441,11 @@ def build_table(
         corners=gather("corners"),
         horizontal=gather("horizontal"),
         vertical=gather("vertical"),
-        errors={},
+        errors={
+            "iteration [V]": max(level.error_volts for level in levels.values()),
+            "images removed at the corner [%]": 100 * max(lv.image_share for lv in levels.values()),
+            **(errors() if errors is not None else {}),
+        },
         device_text=plan.device.to_toml(),
         provenance={
             "version": bfsensor.__version__,

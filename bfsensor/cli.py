@@ -6,7 +6,7 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -152,6 +152,11 @@ def _print_table(rows: Sequence[dict[str, Any]]) -> None:
               help="Write STEM.cfg and STEM.dat for galsim.SiliconSensor instead: one charge, no "
               "background, one depth.")  # fmt: skip
 @click.option(
+    "--assess/--no-assess",
+    default=None,
+    help="Measure mesh, tracing and superposition errors for the header [for whole tables].",
+)
+@click.option(
     "--figure/--no-figure", default=True, help="Draw the table beside it (needs [plots])."
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
@@ -168,6 +173,7 @@ def table(
     workers: int,
     output: Path | None,
     galsim: Path | None,
+    assess: bool | None,
     figure: bool,
     overwrite: bool,
     as_json: bool,
@@ -226,19 +232,18 @@ def table(
         bar.refresh()
 
     provenance = {"command": " ".join(["bfsensor", *sys.argv[1:]])}
-    if workers > 1:
-        with ProcessPoolExecutor(workers) as executor:
-            result = build_table(
-                plan,
-                executor=executor,
-                checkpoint=checkpoint,
-                progress=progress,
-                provenance=provenance,
-            )
-    else:
+    executor = ProcessPoolExecutor(workers) if workers > 1 else None
+    try:
+        errors = None
+        if assess if assess is not None else galsim is None:
+            errors = _start_assessment(plan, executor, checkpoint)
         result = build_table(
-            plan, checkpoint=checkpoint, progress=progress, provenance=provenance
-        )
+            plan, executor=executor, checkpoint=checkpoint, progress=progress, errors=errors,
+            provenance=provenance,
+        )  # fmt: skip
+    finally:
+        if executor is not None:
+            executor.shutdown(cancel_futures=True)
     bar.close()
     if galsim is not None:
         write_galsim(
@@ -272,6 +277,27 @@ def table(
     else:
         for key, value in summary.items():
             click.echo(f"{key:18} {_plain(value)}")
+
+
+def _start_assessment(
+    plan: Any, executor: ProcessPoolExecutor | None, checkpoint: Path
+) -> Callable[[], dict[str, float]]:
+    """Begin to measure the errors of a table; the answer is kept like its levels."""
+    from bfsensor.assess import assess
+
+    kept = checkpoint / plan.key / "errors.json"
+    if kept.exists():
+        return lambda: dict(json.loads(kept.read_text()))
+    pending = executor.submit(assess, plan) if executor is not None else None
+
+    def finish() -> dict[str, float]:
+        errors = pending.result() if pending is not None else assess(plan)
+        beside = kept.with_suffix(".part")
+        beside.write_text(json.dumps(errors))
+        beside.replace(kept)
+        return errors
+
+    return finish
 
 
 def _plain(value: Any) -> str:

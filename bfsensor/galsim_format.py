@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from bfsensor.device import Device
 from bfsensor.device_import import import_poisson_ccd, read_configuration
 from bfsensor.errors import DeviceError, TableError
-from bfsensor.table import DistortionTable
+from bfsensor.simulate.boundaries import PixelBoundaries
+from bfsensor.table import DistortionTable, vertex_fractions
 
 
 def write_galsim(
@@ -128,7 +129,8 @@ def read_galsim(stem: str | os.PathLike[str]) -> DistortionTable:
     """Read a GalSim stem as a table of one charge, no background, one depth.
 
     Of the two copies of a shared side the one of the pixel nearer to the charge counts, as
-    in GalSim; of the copies of a corner, which GalSim keeps apart, the mean.
+    in GalSim.  GalSim keeps two copies of each corner; here the sides are joined at one
+    common corner, with the area of every pixel kept.
 
     Parameters
     ----------
@@ -178,30 +180,26 @@ def read_galsim(stem: str | os.PathLike[str]) -> DistortionTable:
     points = rows[:, 3:5].reshape(nx, ny, 4 * nv + 4, 2).transpose(1, 0, 2, 3)
     centre = rows[:, :2].reshape(nx, ny, 4 * nv + 4, 2)[reach, reach, 0]
     outlines = np.roll(points - centre, -(nv // 2), axis=2)
-    corners, horizontal, vertical = _shared(outlines, nx, nv)
-    empty = DistortionTable(
+    columns, rows_ = _lines(outlines, nx, nv)
+    lines = PixelBoundaries(
+        np.zeros(1), (pitch, float(data.get("PixelSizeY", pitch))), reach, columns[None], rows_[None], False
+    )
+    corners, horizontal, vertical = lines.vertices(nv, vertex_fractions(nv))
+    return DistortionTable(
         charges=np.array([number("CollectedCharge_0_0")]),
         backgrounds=np.zeros(1),
         depths=np.array([number("ElectronZ0Area") if "ElectronZ0Area" in data else 95.0]),
-        pitch=(pitch, float(data.get("PixelSizeY", pitch))),
+        pitch=lines.pitch,
         thickness=number("SensorThickness"),
         vertices=nv,
         reach=reach,
-        corners=np.zeros((1, 1, 1, *corners.shape)),
-        horizontal=np.zeros((1, 1, 1, *horizontal.shape)),
-        vertical=np.zeros((1, 1, 1, *vertical.shape)),
+        corners=corners[None, None],
+        horizontal=horizontal[None, None],
+        vertical=vertical[None, None],
         symmetric=False,
         provenance={"source": stem.name},
         device_text=_device_text(cfg),
     )
-    at = empty.nominal()
-    values = {name: getattr(empty, name) for name in empty.__dataclass_fields__}
-    values |= {
-        "corners": (corners - at.corners)[None, None, None],
-        "horizontal": (horizontal - at.horizontal)[None, None, None],
-        "vertical": (vertical - at.vertical)[None, None, None],
-    }
-    return DistortionTable(**values)
 
 
 def _device_text(cfg: Path) -> str:
@@ -212,33 +210,22 @@ def _device_text(cfg: Path) -> str:
         return ""
 
 
-def _shared(
-    outlines: NDArray[np.float64], n: int, nv: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """One copy of every side and corner, from the pixel nearest to the centre."""
+def _lines(outlines: NDArray[np.float64], n: int, nv: int) -> tuple[NDArray[np.float64], ...]:
+    """Lines between columns and between rows, from the pixel nearer to the charge."""
     reach = n // 2
-    lower_left, lower = 0, slice(1, nv + 1)
-    lower_right, right = nv + 1, slice(nv + 2, 2 * nv + 2)
-    upper_right, upper = 2 * nv + 2, slice(2 * nv + 3, 3 * nv + 3)
-    upper_left, left = 3 * nv + 3, slice(3 * nv + 4, 4 * nv + 4)
-    corners = np.zeros((n + 1, n + 1, 2))
-    horizontal = np.zeros((n + 1, n, nv, 2))
-    vertical = np.zeros((n, n + 1, nv, 2))
+    closed = np.concatenate([outlines, outlines[:, :, :1]], axis=2)
+    side = nv + 1
+    lower, right, upper, left = (closed[:, :, s * side : (s + 1) * side + 1] for s in range(4))
+    rows, columns = [], []
     for line in range(n + 1):
-        below = line > reach  # beyond the centre the pixel on the inner side is nearer
-        for p in range(n):
-            own = outlines[line - 1 if below else line, p]
-            horizontal[line, p] = own[upper][::-1] if below else own[lower]
-            own = outlines[p, line - 1 if below else line]
-            vertical[p, line] = own[right] if below else own[left][::-1]
-    # The copies of a corner differ by the cusp in which the boundaries end there: their mean.
-    count = np.zeros((n + 1, n + 1, 1))
-    for dj, di, which in (
-        (0, 0, lower_left),
-        (0, 1, lower_right),
-        (1, 1, upper_right),
-        (1, 0, upper_left),
-    ):
-        corners[dj : n + dj, di : n + di] += outlines[:, :, which]
-        count[dj : n + dj, di : n + di] += 1
-    return corners / count, horizontal, vertical
+        # Beyond the centre the pixel on the inner side is the nearer one.
+        own = line - 1 if line > reach else line
+        across = upper[own, :, ::-1] if line > reach else lower[own]
+        along = right[:, own] if line > reach else left[:, own, ::-1]
+        rows.append(across.reshape(-1, 2))
+        columns.append(along.reshape(-1, 2))
+    ordered = [
+        np.array([line[np.argsort(line[:, axis], kind="stable")] for line in lines])
+        for lines, axis in ((columns, 1), (rows, 0))
+    ]
+    return ordered[0], ordered[1]
