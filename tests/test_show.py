@@ -1,8 +1,9 @@
-"""Figures: what they print and draw is what the data hold, and labels carry units."""
+"""Figures of tables: they print and draw what the table holds, and labels carry units."""
 
 from __future__ import annotations
 
 import builtins
+import dataclasses
 
 import numpy as np
 import pytest
@@ -10,8 +11,6 @@ import pytest
 from bfsensor import show
 from bfsensor.device import Device
 from bfsensor.errors import BFSensorError, TableError
-from bfsensor.simulate.mesh import make_mesh
-from bfsensor.simulate.poisson import Electrostatics, solve_unit_cell, tile
 from bfsensor.table import DistortionTable, vertex_fractions
 
 matplotlib = pytest.importorskip("matplotlib")
@@ -66,18 +65,6 @@ def table():
         full_well=150_000.0,
         symmetric=True,
     )
-
-
-@pytest.fixture(scope="module")
-def solved():
-    """An empty and a filled pixel on a coarse small period: (empty, filled)."""
-    device = Device.load("itl_sta3800c")
-    mesh = make_mesh(device, pixels=(4, 4), cells=16)
-    solver = Electrostatics(device, mesh)
-    empty = solver.solve(0.0, start=tile(solve_unit_cell(device, 0.0, cells=16), mesh))
-    charges = np.zeros(solver.pixel_shape)
-    charges[0, 0] = 80_000.0
-    return empty, solver.solve(charges, start=empty.phi)
 
 
 @pytest.fixture
@@ -154,6 +141,49 @@ def test_exaggeration_scales_displacements_not_areas(table, background):
     assert np.abs(moved[0]).max() > 0.05
 
 
+def test_boundaries_of_a_table_without_a_level_of_no_charge(table, ax):
+    """An imported table: one charge, one background, one depth, not symmetric."""
+    level, n = (slice(2, 3), slice(0, 1), slice(2, 3)), 2 * REACH + 1
+    skewed = np.random.default_rng(5108).normal(0.0, 0.02, (1, 1, 1, n, n + 1, VERTICES, 2))
+    single = dataclasses.replace(
+        table, charges=CHARGES[2:], backgrounds=BACKGROUNDS[:1], depths=DEPTHS[2:],
+        corners=table.corners[level], horizontal=table.horizontal[level],
+        vertical=table.vertical[level] + skewed, symmetric=False,
+    )  # fmt: skip
+    show.draw_pixel_boundaries(single, ax, charge=80_000, depth=100.0, exaggerate=3.0)
+    polygons = polygons_of(ax)
+    for index, (i, j) in enumerate(np.ndindex(n, n)):
+        row, column = i - REACH, j - REACH
+        at = {"charge": 80_000, "depth": 100.0}
+        moved = single.polygon(column, row, **at) - single.polygon(
+            column, row, charge=0.0, depth=100.0
+        )
+        nominal = single.polygon(column, row, charge=0.0, depth=100.0)
+        np.testing.assert_allclose(polygons[index], nominal + 3.0 * moved, atol=1e-12)
+    show.figure_for_table(single).canvas.draw()
+
+
+@pytest.mark.parametrize("size", [(3.5, 3.0), (8.0, 8.0)])
+@pytest.mark.parametrize("levels", [1, 3])
+def test_legend_of_the_response_lies_above_the_data(table, size, levels):
+    from matplotlib.figure import Figure
+
+    level = (slice(3 - levels, 3), slice(0, 1), slice(2, 3))
+    few = dataclasses.replace(
+        table, charges=CHARGES[3 - levels :], backgrounds=BACKGROUNDS[:1], depths=DEPTHS[2:],
+        corners=table.corners[level], horizontal=table.horizontal[level],
+        vertical=table.vertical[level],
+    )  # fmt: skip
+    figure = Figure(figsize=size, layout="constrained")
+    ax = figure.subplots()
+    show.draw_response(few, ax, depth=100.0)
+    figure.canvas.draw()
+    highest = max(
+        ax.transData.transform(line.get_xydata())[:, 1].max() for line in ax.lines[:4]
+    )
+    assert ax.get_legend().get_window_extent().y0 > highest
+
+
 def test_response_is_area_change_per_excess_charge(table, ax):
     show.draw_response(table, ax, depth=100.0)
     assert has_units(ax)
@@ -213,105 +243,6 @@ def test_figure_for_table_fills_four_panels(table):
     assert len(figure.axes) == 4
     assert all("[" in ax.get_xlabel() for ax in figure.axes)
     figure.canvas.draw()
-
-
-def test_profiles_hold_the_potential_and_carriers(solved):
-    empty, filled = solved
-    axes = new_figure().subplots(2, 3)
-    show.draw_potential_profiles(filled, axes, empty=empty)
-    assert all(has_units(ax) for ax in axes.ravel())
-    full, hollow = axes[0, 0].lines[:2]
-    z = filled.mesh.z
-    np.testing.assert_array_equal(
-        full.get_ydata(), filled.phi[np.isin(z, full.get_xdata()), 0, 0]
-    )
-    # Stored electrons pull the well down by volts.
-    assert hollow.get_ydata().max() > full.get_ydata().max() + 1.0
-    inset = axes[0, 0].child_axes[0].lines[0]
-    assert inset.get_xdata()[-1] == pytest.approx(filled.device.silicon.thickness)
-    assert inset.get_ydata()[-1] == pytest.approx(filled.device.operating_point.back_bias)
-
-    densities = [
-        {line.get_label(): line.get_ydata() for line in ax.lines} for ax in axes[1]
-    ]
-    collecting, stop, barrier = densities
-    volume = filled.silicon[:, 0, 0]
-    wanted = (filled.electrons[:, 0, 0] / np.where(volume > 0, volume, np.inf)).max()
-    assert collecting["electrons"].min() == pytest.approx(-wanted, rel=1e-12)
-    assert stop["electrons"].min() == barrier["electrons"].min() == 0.0
-    # Donors in the channel, acceptors and the holes that answer them in the stop.
-    assert collecting["dopants"].max() > 1e3 and stop["dopants"].min() < -1e3
-    assert stop["holes"].max() > 1e3 > collecting["holes"].max()
-
-
-def test_drawn_dopants_are_those_of_the_solver(solved):
-    """Neutral stop: where holes are many, they equal the acceptors that are drawn."""
-    _, filled = solved
-    axes = new_figure().subplots(2, 3)
-    show.draw_potential_profiles(filled, axes)
-    lines = {line.get_label(): line for line in axes[1, 1].lines}
-    z, holes = lines["holes"].get_data()
-    acceptors = -np.interp(z, *lines["dopants"].get_data())
-    many = holes > 0.5 * holes.max()
-    assert many.sum() > 3
-    # The potential is flat there to kT over the width; node cells average a few percent.
-    np.testing.assert_allclose(holes[many], acceptors[many], rtol=0.1)
-
-
-def test_cross_sections_show_holes_and_electrons_over_the_pixel(solved):
-    _, filled = solved
-    figure = new_figure()
-    show.draw_charge_cross_sections(filled, figure)
-    panels, bars = figure.axes[:3], figure.axes[3:]
-    assert len(bars) == 2
-    assert all("µm⁻³" in bar.get_ylabel() for bar in bars)
-    assert all(has_units(ax) for ax in panels)
-    assert [ax.get_xlabel()[0] for ax in panels] == ["x", "x", "y"]
-    from matplotlib.collections import QuadMesh
-
-    for ax, has_electrons in zip(panels, (True, False, True), strict=True):
-        meshes = [c for c in ax.collections if isinstance(c, QuadMesh)]
-        holes, electrons = (c.get_array() for c in meshes)
-        assert (electrons.count() > 0) == has_electrons
-        # Mirrored about the centre of the pixel.
-        np.testing.assert_array_equal(electrons.filled(0), electrons.filled(0)[:, ::-1])
-        assert ax is panels[2] or holes.count() > 0
-        assert ax.get_xlim() == pytest.approx((-15.0, 15.0))
-
-
-@pytest.mark.parametrize("plane", ["x", "y"])
-def test_paths_run_from_the_light_side_to_a_well(solved, plane):
-    ends = []
-    for potential in solved:
-        ax = new_figure().subplots()
-        show.draw_electron_paths(potential, ax, plane=plane, paths=8)
-        assert has_units(ax) and ax.get_xlabel().startswith(plane)
-        segments = ax.collections[0].get_segments()
-        assert len(segments) == 3 * 8
-        for path in segments:
-            assert path[0, 1] == pytest.approx(potential.mesh.z[-1] - 1.0)
-            assert path[-1, 1] < 2.5
-            # Arrived within a gate's or channel's width of a pixel centre.
-            offset = path[-1, 0] - PITCH * round(path[-1, 0] / PITCH)
-            assert abs(offset) < 0.4 * PITCH
-        ends.append([np.interp(8.0, s[::-1, 1], s[::-1, 0]) for s in segments])
-    # Stored charge repels: paths of the central pixel are farther out at 8 um.
-    out = np.abs(ends[1][:8]) - np.abs(ends[0][:8])
-    assert out.min() > 0
-
-
-def test_paths_refuse_another_plane(solved, ax):
-    with pytest.raises(BFSensorError, match="plane = 'z' must be 'x' or 'y'"):
-        show.draw_electron_paths(solved[0], ax, plane="z")
-
-
-def test_figure_for_device_draws_three_pages():
-    figures = show.figure_for_device(Device.load("itl_sta3800c"))
-    assert list(figures) == ["profiles", "sections", "paths"]
-    for figure in figures.values():
-        figure.canvas.draw()
-    assert len(figures["profiles"].axes) == 6
-    assert len(figures["paths"].axes) == 6
 
 
 def test_missing_matplotlib_is_named(table, monkeypatch):

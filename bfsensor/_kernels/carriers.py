@@ -9,7 +9,6 @@ borders between pixels, where no electron is stored).
 import math
 
 import numba
-import numpy as np
 
 _NEGLIGIBLE = -80.0
 
@@ -95,20 +94,6 @@ def mobile_charge(
 
 
 @numba.njit(cache=True)
-def charge_residual(linear, electrons, holes, out):
-    """``out = linear + holes - electrons`` in the front planes (``linear`` = b - A phi)."""
-    ny, n_front, nx = electrons.shape
-    for j in range(1, ny - 1):
-        for k in range(linear.shape[1]):
-            if k < n_front:
-                for i in range(1, nx - 1):
-                    out[j, k, i] = linear[j, k, i] + (holes[j, k, i] - electrons[j, k, i])
-            else:
-                for i in range(1, nx - 1):
-                    out[j, k, i] = linear[j, k, i]
-
-
-@numba.njit(cache=True)
 def subtract_common_shift(electrons, pixel_y, pixel_x, n_px, count, kt, v, work, out):
     """Take the response at constant electron number off ``out``, in place.
 
@@ -145,7 +130,20 @@ def subtract_common_shift(electrons, pixel_y, pixel_x, n_px, count, kt, v, work,
 
 @numba.njit(cache=True)
 def damped_update(
-    phi, step, electrons, holes, silicon, kind, dy, pixel_y, pixel_x, n_px, shift, kt, dense
+    phi,
+    step,
+    silicon,
+    kind,
+    pixel_y,
+    pixel_x,
+    n_px,
+    fermi_e,
+    filled,
+    fermi_h,
+    shift,
+    ni,
+    kt,
+    dense,
 ):
     """Add a Newton step to ``phi`` in place; where carriers would explode, logarithmically.
 
@@ -155,7 +153,8 @@ def damped_update(
     largest change that was asked for.
     """
     ny, nz, nx = phi.shape
-    n_front = electrons.shape[1]
+    n_front = silicon.shape[1]
+    reach = kt * math.log(dense / ni)
     largest = 0.0
     asked = 0.0
     for j in range(1, ny - 1):
@@ -165,18 +164,17 @@ def damped_update(
                 d = step[j, k, i]
                 asked = max(asked, abs(d))
                 if k < n_front and silicon[g, k, i] > 0.0:
-                    v = silicon[g, k, i] * dy[j]
-                    if d < 0.0 and holes[j, k, i] > 0.0:
-                        free = max(0.0, kt * math.log(dense * v / holes[j, k, i]))
+                    if d < 0.0:
+                        free = max(0.0, phi[j, k, i] - fermi_h + reach)
                         if -d > free:
                             d = -(free + kt * math.log1p((-d - free) / kt))
-                    elif electrons[j, k, i] > 0.0:
-                        s = shift[pixel_y[j] * n_px + pixel_x[i]]
-                        r = d - s
-                        if r > 0.0:
-                            free = max(0.0, kt * math.log(dense * v / electrons[j, k, i]))
-                            if r > free:
-                                d = s + free + kt * math.log1p((r - free) / kt)
+                    if pixel_y[j] >= 0 and pixel_x[i] >= 0:
+                        p = pixel_y[j] * n_px + pixel_x[i]
+                        if filled[p]:
+                            s = shift[p]
+                            free = max(0.0, fermi_e[p] - phi[j, k, i] + reach)
+                            if d - s > free:
+                                d = s + free + kt * math.log1p((d - s - free) / kt)
                 largest = max(largest, abs(d))
                 phi[j, k, i] += d
     return largest, asked

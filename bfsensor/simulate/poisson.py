@@ -181,13 +181,18 @@ class Electrostatics:
         if new is not None:
             self._newton(phi, count, history, 1.0, fermi=new)
         error = self._newton(phi, count, history, tolerance)
-        self._check_hole_region()
         fermi = self._fermi_levels(phi, count)
+        c = self.coefficients
+        carrier_kernels.mobile_charge(
+            phi, c.silicon[:, : c.n_front], c.kind, c.dy, self._pixels_y, self._pixels_x,
+            len(self._share_x), fermi, count > 0, self._fermi_h, self._ni, self._kt,
+            self._electrons, self._holes,
+        )  # fmt: skip
+        self._check_hole_region()
 
         def inner(a: NDArray[np.float64]) -> NDArray[np.float64]:
             return np.moveaxis(a[1:-1, :, 1:-1], 1, 0).copy()
 
-        c = self.coefficients
         silicon = c.silicon[c.kind[1:-1]][:, : c.n_front] * c.dy[1:-1, None, None]
         return Potential(
             device=self.device,
@@ -367,8 +372,8 @@ class Electrostatics:
                 )
                 np.divide(weighted.ravel(), count, out=shift, where=filled)
             taken, asked = carrier_kernels.damped_update(
-                phi, self._step, self._electrons, self._holes, front, c.kind, c.dy,
-                self._pixels_y, self._pixels_x, n_px, shift, self._kt, _DENSE,
+                phi, self._step, front, c.kind, self._pixels_y, self._pixels_x, n_px, levels, filled,
+                self._fermi_h, shift, self._ni, self._kt, _DENSE,
             )  # fmt: skip
             self._fill_halo(phi)
             history.append(NewtonStep(asked, taken, iterations, norm))
