@@ -51,7 +51,12 @@ def mesh_errors(plan: Plan) -> dict[str, float]:
     changes = []
     for cells in (plan.cells // 2, plan.cells):
         one = replace(
-            plan, charges=(charge,), backgrounds=(0.0,), depths=plan.depths[-1:], vertices=_VERTICES, cells=cells
+            plan,
+            charges=(charge,),
+            backgrounds=(0.0,),
+            depths=plan.depths[-1:],
+            vertices=_VERTICES,
+            cells=cells,
         )
         level = solve_level(one, charge, 0.0)
         table = DistortionTable(
@@ -87,17 +92,25 @@ def tracing_error(plan: Plan) -> float:
     fractions = vertex_fractions(_VERTICES)
     depths = np.array(plan.depths[1:] if len(plan.depths) > 1 else plan.depths)
     usual = find_boundaries(potential, depths, reach=1)
-    finer = find_boundaries(potential, depths, reach=1, coarseness=0.25 / _FINER, ratio=0.1 / _FINER)
+    finer = find_boundaries(
+        potential, depths, reach=1, coarseness=0.25 / _FINER, ratio=0.1 / _FINER
+    )
     return max(
         float(np.abs(a - b).max())
         for a, b in zip(
-            usual.vertices(_VERTICES, fractions), finer.vertices(_VERTICES, fractions), strict=True
+            usual.vertices(_VERTICES, fractions),
+            finer.vertices(_VERTICES, fractions),
+            strict=True,
         )
     )
 
 
-def _solve(plan: Plan, charges: dict[tuple[int, int], float], *, symmetric: bool) -> Potential:
-    mesh = make_mesh(plan.device, pixels=(_PERIOD, _PERIOD), cells=_CELLS, symmetric=symmetric)
+def _solve(
+    plan: Plan, charges: dict[tuple[int, int], float], *, symmetric: bool
+) -> Potential:
+    mesh = make_mesh(
+        plan.device, pixels=(_PERIOD, _PERIOD), cells=_CELLS, symmetric=symmetric
+    )
     solver = Electrostatics(plan.device, mesh)
     start = tile(solve_unit_cell(plan.device, 0.0, cells=_CELLS), mesh)
     pattern = np.zeros(solver.pixel_shape)
@@ -126,7 +139,10 @@ def superposition_error(plan: Plan, charges: dict[tuple[int, int], float]) -> fl
     """
     depths = np.array(plan.depths[-1:])
     fractions = vertex_fractions(_VERTICES)
-    even = all(charges.get((-i, -j), 0) == q and charges.get((i, -j), 0) == q for (i, j), q in charges.items())
+    even = all(
+        charges.get((-i, -j), 0) == q and charges.get((i, -j), 0) == q
+        for (i, j), q in charges.items()
+    )
     lines = find_boundaries(_solve(plan, charges, symmetric=even), depths, reach=_REACH)
     true = lines.vertices(_VERTICES, fractions)
     furthest = max(max(abs(i), abs(j)) for i, j in charges)
@@ -136,12 +152,16 @@ def superposition_error(plan: Plan, charges: dict[tuple[int, int], float]) -> fl
         key = round(charge, 3)
         if key not in singles:
             alone: PixelBoundaries = find_boundaries(
-                _solve(plan, {(0, 0): charge}, symmetric=True), depths, reach=_REACH + furthest
+                _solve(plan, {(0, 0): charge}, symmetric=True),
+                depths,
+                reach=_REACH + furthest,
             )
             singles[key] = alone.vertices(_VERTICES, fractions)
         for total, single in zip(summed, singles[key], strict=True):
             ny, nx = total.shape[1:3]
-            total += single[:, furthest - j : furthest - j + ny, furthest - i : furthest - i + nx]
+            total += single[
+                :, furthest - j : furthest - j + ny, furthest - i : furthest - i + nx
+            ]
     wrong = sum(float(np.sum((s - t) ** 2)) for s, t in zip(summed, true, strict=True))
     size = sum(float(np.sum(t**2)) for t in true)
     return float(np.sqrt(wrong / size))

@@ -443,7 +443,8 @@ def build_table(
         vertical=gather("vertical"),
         errors={
             "iteration [V]": max(level.error_volts for level in levels.values()),
-            "images removed at the corner [%]": 100 * max(lv.image_share for lv in levels.values()),
+            "images removed at the corner [%]": 100
+            * max(lv.image_share for lv in levels.values()),
             **(errors() if errors is not None else {}),
         },
         device_text=plan.device.to_toml(),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import json
 import os
 import tomllib
 from collections.abc import Mapping
@@ -29,9 +30,16 @@ from bfsensor.units import BOLTZMANN, from_internal, to_internal
 ORIGINS = ("measured", "published", "fitted", "guessed")
 
 
-def _quantity(kind: str, unit: str, low: float | None = None, high: float | None = None,
-              *, above: bool = False, default: Any = dataclasses.MISSING) -> Any:  # fmt: skip
-    """A field read from a quantity: its kind, the unit it is written in, its range."""
+def _quantity(
+    kind: str,
+    unit: str,
+    low: float | None = None,
+    high: float | None = None,
+    *,
+    above: bool = False,
+    default: Any = dataclasses.MISSING,
+) -> Any:
+    """Make a field read from a quantity: its kind, the unit it is written in, its range."""
     metadata = {"kind": kind, "unit": unit, "low": low, "high": high, "above": above}
     return field(default=default, metadata=metadata)
 
@@ -55,7 +63,7 @@ class Pixel:
 
 @dataclass(frozen=True)
 class Material:
-    """Constants of silicon and oxide; published devices carry the ones they were tuned with.
+    """Constants of silicon and oxide; published devices carry those they were tuned with.
 
     ``thermal_voltage_300K`` [V], where given, replaces kT/q of CODATA.
     """
@@ -66,9 +74,9 @@ class Material:
     density_of_states: float = _quantity(
         "density", "cm-3", 0.0, None, above=True, default=2.5e7
     )
-    thermal_voltage_300K: float | None = _quantity(
+    thermal_voltage_300K: float | None = _quantity(  # noqa: N815
         "potential", "V", 0.0, 1.0, above=True, default=None
-    )  # noqa: N815
+    )
 
     def thermal_voltage(self, temperature: float) -> float:
         """Thermal voltage kT/q [V] at ``temperature`` [K]."""
@@ -79,8 +87,8 @@ class Material:
     def intrinsic_density(self, temperature: float) -> float:
         r"""Intrinsic density [electron/um^3] at ``temperature`` [K].
 
-        :math:`n_i = N_s (T/300)^{3/2} e^{-E_g/2kT}`; only its product with the exponential of
-        a quasi-Fermi level matters, so its error is a shift of that level.
+        :math:`n_i = N_s (T/300)^{3/2} e^{-E_g/2kT}`; only its product with the exponential
+        of a quasi-Fermi level matters, so its error is a shift of that level.
         """
         kt = BOLTZMANN * temperature
         return float(
@@ -152,7 +160,8 @@ class Implant:
         depth = np.clip(depth, 0.0, self.reach)
         if self.shape == "box":
             return np.asarray(self.dose * depth / self.reach)
-        assert self.peak is not None and self.sigma is not None  # checked with the device
+        assert self.peak is not None  # checked with the device
+        assert self.sigma is not None
         scale = np.sqrt(2.0) * self.sigma
         start, end = erf(-self.peak / scale), erf((self.reach - self.peak) / scale)
         return np.asarray(
@@ -165,7 +174,8 @@ class Implant:
         inside = (depth >= 0) & (depth <= self.reach)
         if self.shape == "box":
             return np.where(inside, self.dose / self.reach, 0.0)
-        assert self.peak is not None and self.sigma is not None  # checked with the device
+        assert self.peak is not None  # checked with the device
+        assert self.sigma is not None
         scale = np.sqrt(2.0) * self.sigma
         norm = 0.5 * (erf((self.reach - self.peak) / scale) - erf(-self.peak / scale))
         shape = np.exp(-0.5 * ((depth - self.peak) / self.sigma) ** 2) / (
@@ -200,7 +210,7 @@ class Channel:
 
 @dataclass(frozen=True)
 class ChannelStopDots:
-    """Implants in part of each channel stop: centre above the pixel's lower edge, height [um]."""
+    """Implants in part of each channel stop: centre above the pixel's edge, height [um]."""
 
     centre: float = _quantity("length", "um", 0.0)
     height: float = _quantity("length", "um", 0.0, above=True)
@@ -313,7 +323,7 @@ class Device:
     material: Material = Material()
     well: Well = Well()
     edge: Edge | None = None
-    provenance: Mapping[str, Provenance] = field(default_factory=dict)
+    provenance: Mapping[str, Provenance] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
@@ -345,7 +355,8 @@ class Device:
         if path.suffix == ".toml":
             return cls.from_toml(path)
         raise DeviceError(
-            f"{text!r} is neither a built-in device ({', '.join(builtin_devices())}) nor a .toml file"
+            f"{text!r} is neither a built-in device ({', '.join(builtin_devices())}) "
+            "nor a .toml file"
         )
 
     @classmethod
@@ -364,7 +375,7 @@ class Device:
             label = path.name
             try:
                 text = path.read_text(encoding="utf-8")
-            except (OSError, UnicodeDecodeError) as error:
+            except (OSError, ValueError) as error:
                 raise DeviceError(f"{path}: cannot be read: {error}") from None
         try:
             data = tomllib.loads(text)
@@ -377,8 +388,8 @@ class Device:
 
     def to_toml(self) -> str:
         """Write as the text of a device file, provenance included."""
-        lines = [f'name = "{self.name}"']
-        for section, _ in _SECTIONS.items():
+        lines = [f"name = {_string(self.name)}"]
+        for section in _SECTIONS:
             part = getattr(self, section)
             if part is not None:
                 lines += ["", *_lines(part, section, section, self.provenance)]
@@ -392,7 +403,7 @@ class Device:
         os.replace(beside, path)
 
     def with_value(self, key: str, value: str) -> Device:
-        """A copy with one quantity changed.
+        """Give a copy with one quantity changed.
 
         Parameters
         ----------
@@ -404,20 +415,26 @@ class Device:
         section, _, name = self._resolve(key).partition(".")
         part = getattr(self, section)
         spec = {f.name: f for f in dataclasses.fields(part)}[name]
-        try:
-            converted: Any = (
-                int(value)
-                if not spec.metadata
-                else to_internal(value, spec.metadata["kind"])
-            )
-        except ValueError as error:
-            raise DeviceError(f"{section}: {name}: {error}") from None
+        converted: float
+        if not spec.metadata:
+            try:
+                converted = int(value)
+            except ValueError:
+                raise DeviceError(
+                    f"{section}: {name} = {value!r} must be a whole number"
+                ) from None
+        else:
+            try:
+                converted = to_internal(value, spec.metadata["kind"])
+            except DeviceError as error:
+                raise DeviceError(f"{section}: {name}: {error}") from None
+            _check_range(converted, spec.metadata, section, name, value)
         changed = dataclasses.replace(part, **{name: converted})
         kept = {k: v for k, v in self.provenance.items() if k != f"{section}.{name}"}
         return dataclasses.replace(self, **{section: changed}, provenance=kept)
 
     def with_operating_point(self, **values: str) -> Device:
-        """A copy with voltages or temperature changed, e.g. ``back_bias='-60 V'``."""
+        """Give a copy with voltages or temperature changed: ``back_bias='-60 V'``."""
         device = self
         for key, value in values.items():
             device = device.with_value(f"operating_point.{key}", value)
@@ -489,14 +506,17 @@ def _parse(data: dict[str, Any]) -> Device:
 
 
 def _parse_section(
-    kind: type, data: Any, where: str, provenance: dict[str, Provenance]
+    kind: type[Any], data: Any, where: str, provenance: dict[str, Provenance]
 ) -> Any:
     if not isinstance(data, dict):
         raise DeviceError(f"{where} must be a section")
     fields = {f.name: f for f in dataclasses.fields(kind)}
-    aliases = {entry: name for (owner, name), (entry, _) in _LISTS.items() if owner is kind}
+    aliases: dict[str, str] = {
+        entry: name for (owner, name), (entry, _) in _LISTS.items() if owner is kind
+    }
     allowed = [n for n in fields if (kind, n) not in _LISTS] + list(aliases)
     values: dict[str, Any] = {}
+    key: str
     for key, given in data.items():
         if key not in allowed:
             raise _unknown(key, allowed, f"{where}: ")
@@ -553,6 +573,9 @@ def _parse_quantity(
             raise DeviceError(
                 f"{where}: {key}: origin = {origin!r} must be one of {', '.join(ORIGINS)}"
             )
+        source = given.get("source")
+        if source is not None and not isinstance(source, str):
+            raise DeviceError(f"{where}: {key}: source = {source!r} must be a string")
         try:
             uncertainty = (
                 to_internal(str(given["uncertainty"]), metadata["kind"])
@@ -561,10 +584,16 @@ def _parse_quantity(
             )
         except DeviceError as error:
             raise DeviceError(f"{where}: {key}: uncertainty: {error}") from None
-        provenance[f"{where}.{key}"] = Provenance(uncertainty, origin, given.get("source"))
+        if uncertainty is not None and not 0 <= uncertainty < np.inf:
+            raise DeviceError(
+                f"{where}: {key}: uncertainty = {given['uncertainty']!r} must be finite and "
+                "at least 0"
+            )
+        provenance[f"{where}.{key}"] = Provenance(uncertainty, origin, source)
     if not isinstance(text, str):
         raise DeviceError(
-            f"{where}: {key} = {text!r} must be a string with a unit, such as '{text} {metadata['unit']}'"
+            f"{where}: {key} = {text!r} must be a string with a unit, such as "
+            f"'{text} {metadata['unit']}'"
         )
     try:
         value = to_internal(text, metadata["kind"])
@@ -586,14 +615,18 @@ def _check_range(
     if not np.isfinite(value):
         raise DeviceError(f"{where}: {key} = {given!r} must be finite")
     if low is not None and (value < low or (metadata["above"] and value <= low)):
-        raise DeviceError(
-            f"{where}: {key} = {given!r} must be {'above' if metadata['above'] else 'at least'} {limit(low)}"
-        )
+        bound = "above" if metadata["above"] else "at least"
+        raise DeviceError(f"{where}: {key} = {given!r} must be {bound} {limit(low)}")
     if high is not None and value > high:
         raise DeviceError(f"{where}: {key} = {given!r} must be at most {limit(high)}")
 
 
 # -- writing ---------------------------------------------------------------------------
+
+
+def _string(text: str) -> str:
+    """Write a TOML basic string; JSON's differ only in that they may hold DEL."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _lines(
@@ -641,16 +674,13 @@ def _lines(
                         f'uncertainty = "{from_internal(known.uncertainty, kind, unit)}"'
                     )
                 if known.origin is not None:
-                    entries.append(f'origin = "{known.origin}"')
+                    entries.append(f"origin = {_string(known.origin)}")
                 if known.source is not None:
-                    entries.append(f'source = "{known.source}"')
+                    entries.append(f"source = {_string(known.source)}")
                 out.append(f"{spec.name} = {{ {', '.join(entries)} }}")
         else:
-            out.append(
-                f'{spec.name} = "{value}"'
-                if isinstance(value, str)
-                else f"{spec.name} = {value}"
-            )
+            text = _string(value) if isinstance(value, str) else str(value)
+            out.append(f"{spec.name} = {text}")
     return out + nested
 
 
@@ -668,11 +698,13 @@ def _check(device: Device) -> None:
         raise DeviceError(f"gates: phases = {gates.phases} must be from 2 to 8")
     if not 1 <= gates.collecting_phases < gates.phases:
         raise DeviceError(
-            f"gates: collecting_phases = {gates.collecting_phases} must be from 1 to phases - 1 = {gates.phases - 1}"
+            f"gates: collecting_phases = {gates.collecting_phases} must be from 1 to "
+            f"phases - 1 = {gates.phases - 1}"
         )
     if gates.field_oxide < gates.gate_oxide:
         raise DeviceError(
-            f"gates: field_oxide = '{gates.field_oxide:g} um' must be at least gate_oxide = '{gates.gate_oxide:g} um'"
+            f"gates: field_oxide = '{gates.field_oxide:g} um' must be at least "
+            f"gate_oxide = '{gates.gate_oxide:g} um'"
         )
     room = pixel.pitch_x / 2
     for key, extra in (
@@ -681,12 +713,13 @@ def _check(device: Device) -> None:
     ):
         if stop.width / 2 + extra >= room:
             raise DeviceError(
-                f"channel_stop: width / 2 + {key} = {stop.width / 2 + extra:g} um must be below half the pixel, {room:g} um"
+                f"channel_stop: width / 2 + {key} = {stop.width / 2 + extra:g} um must be "
+                f"below half the pixel, {room:g} um"
             )
     if device.operating_point.gate_high <= device.operating_point.gate_low:
         raise DeviceError(
-            f"operating_point: gate_high = '{device.operating_point.gate_high:g} V' must be above "
-            f"gate_low = '{device.operating_point.gate_low:g} V'"
+            f"operating_point: gate_high = '{device.operating_point.gate_high:g} V' must "
+            f"be above gate_low = '{device.operating_point.gate_low:g} V'"
         )
     depth = device.silicon.thickness - gates.field_oxide
     groups = {
@@ -697,14 +730,18 @@ def _check(device: Device) -> None:
         groups["channel_stop.dots.implant"] = stop.dots.implants
         if stop.dots.height >= pixel.pitch_y or stop.dots.centre > pixel.pitch_y:
             raise DeviceError(
-                f"channel_stop.dots: centre = '{stop.dots.centre:g} um' and height = '{stop.dots.height:g} um' must lie "
-                f"within the pixel, {pixel.pitch_y:g} um"
+                f"channel_stop.dots: centre = '{stop.dots.centre:g} um' and height = "
+                f"'{stop.dots.height:g} um' must lie within the pixel, {pixel.pitch_y:g} um"
             )
+    if device.edge is not None:
+        for k, strip in enumerate(device.edge.strips):
+            groups[f"edge.strip[{k}].implant"] = strip.implants
     for where, implants in groups.items():
         for i, implant in enumerate(implants):
             if implant.reach > depth:
                 raise DeviceError(
-                    f"{where}[{i}]: the implant ends {implant.reach:g} um below the surface, outside the silicon of {depth:g} um"
+                    f"{where}[{i}]: the implant ends {implant.reach:g} um below the "
+                    f"surface, outside the silicon of {depth:g} um"
                 )
 
 

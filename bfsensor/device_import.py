@@ -27,7 +27,7 @@ PUBLISHED_MATERIAL = Material(
     density_of_states=2.5e7,
     thermal_voltage_300K=0.026,
 )
-"""Constants compiled into Poisson_CCD (commit 036cbef); configurations were tuned with them."""
+"""Constants compiled into Poisson_CCD (commit 036cbef), with which devices were tuned."""
 
 _PER_CM2 = 1e-8
 _PER_CM3 = 1e-12
@@ -83,27 +83,33 @@ def import_poisson_ccd(path: str | os.PathLike[str]) -> Device:
     """
     path = Path(path)
     data = read_configuration(path)
+    try:
+        return _device(path.stem, data)
+    except DeviceError as error:
+        raise DeviceError(f"{path.name}: {error}") from None
+
+
+def _device(name: str, data: dict[str, str]) -> Device:
+    """Build the device that a configuration describes."""
 
     def number(key: str, default: float | None = None) -> float:
         if key not in data:
             if default is None:
-                raise DeviceError(f"{path.name}: {key} is missing")
+                raise DeviceError(f"{key} is missing")
             return default
         try:
             return float(data[key])
         except ValueError:
-            raise DeviceError(
-                f"{path.name}: {key} = {data[key]!r} is not a number"
-            ) from None
+            raise DeviceError(f"{key} = {data[key]!r} is not a number") from None
 
-    def whole(key: str) -> int:
-        value = number(key)
-        if value != int(value):
-            raise DeviceError(f"{path.name}: {key} = {data[key]!r} is not a whole number")
+    def whole(key: str, default: float | None = None) -> int:
+        value = number(key, default)
+        if not value.is_integer():
+            raise DeviceError(f"{key} = {data[key]!r} is not a whole number")
         return int(value)
 
     def implants(prefix: str) -> tuple[Implant, ...]:
-        count = int(number(f"{prefix}Profile", 0.0))
+        count = whole(f"{prefix}Profile", 0.0)
         if count == 0:
             doping, depth = number(f"{prefix}Doping", 0.0), number(f"{prefix}Depth", 0.0)
             return (
@@ -123,17 +129,17 @@ def import_poisson_ccd(path: str | os.PathLike[str]) -> Device:
 
     if number("TreeRingAmplitude", 0.0):
         raise DeviceError(
-            f"{path.name}: TreeRingAmplitude = {data['TreeRingAmplitude']}: its period lacks a "
-            "factor 2 pi there; give the ripple in the device file instead"
+            f"TreeRingAmplitude = {data['TreeRingAmplitude']}: its period lacks a factor "
+            "2 pi there; give the ripple in the device file instead"
         )
     if number("GateGap", 0.0):
         raise DeviceError(
-            f"{path.name}: GateGap = {data['GateGap']}: gaps between gates are not modelled"
+            f"GateGap = {data['GateGap']}: gaps between gates are not modelled"
         )
     if number("NumberofFixedRegions", 0.0):
         raise DeviceError(
-            f"{path.name}: NumberofFixedRegions = {data['NumberofFixedRegions']}: fixed regions are "
-            "not taken over; describe a guard ring as [edge] in the device file"
+            f"NumberofFixedRegions = {data['NumberofFixedRegions']}: fixed regions are not "
+            "taken over; describe a guard ring as [edge] in the device file"
         )
     dots = None
     if implants("ChannelStopDot"):
@@ -143,38 +149,33 @@ def import_poisson_ccd(path: str | os.PathLike[str]) -> Device:
             number("ChannelStopDotSurfaceCharge", 0.0) * _PER_CM2,
             implants("ChannelStopDot"),
         )
-    try:
-        return Device(
-            name=path.stem,
-            pixel=Pixel(number("PixelSizeX"), number("PixelSizeY", number("PixelSizeX"))),
-            material=PUBLISHED_MATERIAL,
-            silicon=Silicon(
-                number("SensorThickness"), number("BackgroundDoping") * _PER_CM3
-            ),
-            gates=GateStack(
-                whole("NumPhases"),
-                whole("CollectingPhases"),
-                number("GateOxide"),
-                number("FieldOxide"),
-                number("FieldOxideTaper", 0.0),
-            ),
-            channel=Channel(
-                number("ChannelSurfaceCharge", 0.0) * _PER_CM2, implants("Channel")
-            ),
-            channel_stop=ChannelStop(
-                number("ChannelStopWidth"),
-                number("ChannelStopSideDiff", 0.0),
-                number("ChannelStopSurfaceCharge", 0.0) * _PER_CM2,
-                implants("ChannelStop"),
-                dots,
-            ),
-            operating_point=OperatingPoint(
-                gate_low=number("Vparallel_lo"),
-                gate_high=number("Vparallel_hi"),
-                back_bias=number("Vbb"),
-                temperature=number("CCDTemperature"),
-                hole_quasi_fermi_level=number("qfh", 0.0),
-            ),
-        )
-    except DeviceError as error:
-        raise DeviceError(f"{path.name}: {error}") from None
+    return Device(
+        name=name,
+        pixel=Pixel(number("PixelSizeX"), number("PixelSizeY", number("PixelSizeX"))),
+        material=PUBLISHED_MATERIAL,
+        silicon=Silicon(number("SensorThickness"), number("BackgroundDoping") * _PER_CM3),
+        gates=GateStack(
+            whole("NumPhases"),
+            whole("CollectingPhases"),
+            number("GateOxide"),
+            number("FieldOxide"),
+            number("FieldOxideTaper", 0.0),
+        ),
+        channel=Channel(
+            number("ChannelSurfaceCharge", 0.0) * _PER_CM2, implants("Channel")
+        ),
+        channel_stop=ChannelStop(
+            number("ChannelStopWidth"),
+            number("ChannelStopSideDiff", 0.0),
+            number("ChannelStopSurfaceCharge", 0.0) * _PER_CM2,
+            implants("ChannelStop"),
+            dots,
+        ),
+        operating_point=OperatingPoint(
+            gate_low=number("Vparallel_lo"),
+            gate_high=number("Vparallel_hi"),
+            back_bias=number("Vbb"),
+            temperature=number("CCDTemperature"),
+            hole_quasi_fermi_level=number("qfh", 0.0),
+        ),
+    )

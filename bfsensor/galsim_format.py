@@ -8,6 +8,7 @@ the left side: pixel centre x and y, angle, vertex x and y.
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -161,19 +162,25 @@ def read_galsim(stem: str | os.PathLike[str]) -> DistortionTable:
         except ValueError:
             raise TableError(f"{cfg}: {key} = {data[key]!r} is not a number") from None
 
-    nx, ny, nv = (
-        int(number(k)) for k in ("PixelBoundaryNx", "PixelBoundaryNy", "NumVertices")
-    )
+    def whole(key: str) -> int:
+        value = number(key)
+        if not value.is_integer() or value < 1:
+            raise TableError(f"{cfg}: {key} = {data[key]!r} is not a whole number above 0")
+        return int(value)
+
+    nx, ny, nv = (whole(k) for k in ("PixelBoundaryNx", "PixelBoundaryNy", "NumVertices"))
     if nx != ny or nx % 2 == 0:
         raise TableError(f"{cfg}: {nx} x {ny} pixels must be square and odd")
     try:
-        rows = np.loadtxt(dat, skiprows=1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of an empty file: refused below
+            rows = np.loadtxt(dat, skiprows=1, ndmin=2)
     except (OSError, ValueError) as error:
         raise TableError(f"{dat}: not a vertex file: {error}") from None
     if rows.shape != (nx * ny * (4 * nv + 4), 5):
         raise TableError(
-            f"{dat}: {rows.shape[0]} rows are not the {nx * ny * (4 * nv + 4)} of {nx} x {ny} pixels "
-            f"with {nv} vertices a side (truncated, or another table's)"
+            f"{dat}: {rows.shape[0]} rows are not the {nx * ny * (4 * nv + 4)} of {nx} x "
+            f"{ny} pixels with {nv} vertices a side (truncated, or another table's)"
         )
     pitch = number("PixelSizeX")
     reach = nx // 2
@@ -182,7 +189,12 @@ def read_galsim(stem: str | os.PathLike[str]) -> DistortionTable:
     outlines = np.roll(points - centre, -(nv // 2), axis=2)
     columns, rows_ = _lines(outlines, nx, nv)
     lines = PixelBoundaries(
-        np.zeros(1), (pitch, float(data.get("PixelSizeY", pitch))), reach, columns[None], rows_[None], False
+        np.zeros(1),
+        (pitch, float(data.get("PixelSizeY", pitch))),
+        reach,
+        columns[None],
+        rows_[None],
+        False,
     )
     corners, horizontal, vertical = lines.vertices(nv, vertex_fractions(nv))
     return DistortionTable(
@@ -203,19 +215,23 @@ def read_galsim(stem: str | os.PathLike[str]) -> DistortionTable:
 
 
 def _device_text(cfg: Path) -> str:
-    """The device of a configuration, or nothing where it holds only what GalSim reads."""
+    """Give the device of a configuration, or nothing if it holds only what GalSim reads."""
     try:
         return import_poisson_ccd(cfg).to_toml()
     except DeviceError:
         return ""
 
 
-def _lines(outlines: NDArray[np.float64], n: int, nv: int) -> tuple[NDArray[np.float64], ...]:
-    """Lines between columns and between rows, from the pixel nearer to the charge."""
+def _lines(
+    outlines: NDArray[np.float64], n: int, nv: int
+) -> tuple[NDArray[np.float64], ...]:
+    """Find the lines between columns and between rows, from the pixel nearer the charge."""
     reach = n // 2
     closed = np.concatenate([outlines, outlines[:, :, :1]], axis=2)
     side = nv + 1
-    lower, right, upper, left = (closed[:, :, s * side : (s + 1) * side + 1] for s in range(4))
+    lower, right, upper, left = (
+        closed[:, :, s * side : (s + 1) * side + 1] for s in range(4)
+    )
     rows, columns = [], []
     for line in range(n + 1):
         # Beyond the centre the pixel on the inner side is the nearer one.

@@ -272,7 +272,8 @@ def draw_charge_cross_sections(
         for a, z in sorted(map(tuple, tops), key=lambda top: -top[1]):
             visible = (
                 abs(a) < 0.9 * extent * pitch
-                and np.interp(a, fine, silicon) < z < height - 0.2
+                # Lines crowd at the edges of gates: no labels there.
+                and np.interp(a, fine, silicon) + 0.06 * height < z < height - 0.2
             )
             if visible and all(
                 abs(a - b) > 0.2 * pitch or q - z > 0.06 * height for b, q in places

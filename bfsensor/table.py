@@ -145,6 +145,10 @@ class DistortionTable:
             object.__setattr__(self, name, axis)
         if self.charges[0] < 0 or self.backgrounds[0] < 0:
             raise TableError("charges and backgrounds must not be negative")
+        if self.depths[0] <= 0:
+            raise TableError(
+                f"depths = {self.depths.tolist()} must be above the gates, 0 um"
+            )
         n, nv = 2 * self.reach + 1, self.vertices
         levels = (len(self.charges), len(self.backgrounds), len(self.depths))
         shapes = {
@@ -158,6 +162,11 @@ class DistortionTable:
                 raise TableError(f"{name} has the shape {array.shape}, not {shape}")
             if not np.all(np.isfinite(array)):
                 raise TableError(f"{name} holds values that are not finite")
+            if np.any(array[self.charges[:, None] == self.backgrounds]):
+                raise TableError(
+                    f"{name} holds shifts where the charge equals the background and "
+                    "nothing moves"
+                )
             array.flags.writeable = False
             object.__setattr__(self, name, array)
         object.__setattr__(self, "pitch", (float(self.pitch[0]), float(self.pitch[1])))
@@ -230,7 +239,7 @@ class DistortionTable:
         TableError
             A value outside the table; names the range.
         """
-        low = 0.0 if len(self.charges) == 1 else self.charges[0]
+        low = 0.0 if len(self.charges) == 1 else float(self.charges[0])
         well = "" if np.isnan(self.full_well) else f" (full well {self.full_well:,.0f} e-)"
         self._inside("charge", charge, low, self.charges[-1], f"e-{well}")
         self._inside(
@@ -433,7 +442,11 @@ class DistortionTable:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("error", AstropyUserWarning)
-                with fits.open(path, checksum=True, memmap=False) as hdus:
+                # Opened here: astropy leaves a file open in which it finds a fault.
+                with (
+                    path.open("rb") as stream,
+                    fits.open(stream, checksum=True, memmap=False) as hdus,
+                ):
                     header = hdus[0].header
                     if header.get("SCHEMA") != SCHEMA:
                         raise TableError(
@@ -441,8 +454,8 @@ class DistortionTable:
                         )
                     if header.get("SCHEMAV") != SCHEMA_VERSION:
                         raise TableError(
-                            f"{path}: schema version {header.get('SCHEMAV')} is not {SCHEMA_VERSION}, the one "
-                            "this version of bfsensor reads"
+                            f"{path}: schema version {header.get('SCHEMAV')} is not "
+                            f"{SCHEMA_VERSION}, the one this version of bfsensor reads"
                         )
                     data = {hdu.name: np.array(hdu.data) for hdu in hdus[1:]}
         except (OSError, AstropyUserWarning, ValueError, KeyError, TypeError) as error:
@@ -466,6 +479,7 @@ class DistortionTable:
         if header["QUADRANT"]:
             arrays = _whole(arrays, reach, vertices)
         meta = json.loads(data["META"].astype(np.uint8).tobytes())
+        device_text = data["DEVICE"].astype(np.uint8).tobytes().decode()
         return cls(
             charges=data["CHARGES"].astype(float),
             backgrounds=data["BACKGROUNDS"].astype(float),
@@ -480,11 +494,7 @@ class DistortionTable:
             full_well=header.get("FULLWELL", float("nan")),
             errors=meta["errors"],
             provenance=meta["provenance"],
-            device_text=data["DEVICE"]
-            .astype(np.uint8)
-            .tobytes()
-            .decode()
-            .removeprefix("\n"),
+            device_text="" if device_text == "\n" else device_text,
             symmetric=bool(header["SYMMETRC"]),
         )
 
@@ -494,14 +504,14 @@ def _make(values: dict[str, Any]) -> DistortionTable:
 
 
 def arrays_key(arrays: dict[str, NDArray[np.float64]]) -> bytes:
-    """The arrays as bytes, signs of zero aside, to compare them bit for bit."""
+    """Give the arrays as bytes, signs of zero aside, to compare them bit for bit."""
     return b"".join(
         (arrays[k].astype(np.float32) + np.float32(0)).tobytes() for k in sorted(arrays)
     )
 
 
 def _quadrant(name: str, array: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The part of an array with offsets from the source pixel's centre on."""
+    """Take the part of an array with offsets from the source pixel's centre on."""
     ny, nx = array.shape[3:5]
     return array[:, :, :, ny // 2 :, nx // 2 :]
 

@@ -7,10 +7,11 @@ K, densities in electron/um^3 and doses in electron/um^2.
 from __future__ import annotations
 
 import astropy.units as u
+import numpy as np
 
 from bfsensor.errors import DeviceError
 
-VACUUM_PERMITTIVITY = 55.26349406
+VACUUM_PERMITTIVITY = 55.26349362
 """Vacuum permittivity [electron / (V um)]: 8.8541878188e-12 F/m / 1.602176634e-19 C
 (CODATA 2022)."""
 
@@ -56,22 +57,44 @@ def to_internal(text: str, kind: str) -> float:
     try:
         quantity = u.Quantity(text)
     except (TypeError, ValueError):
-        raise DeviceError(
-            f"{text!r} is not a number with a unit, such as '100 um'"
-        ) from None
+        quantity = None
+    if quantity is None or not quantity.isscalar:
+        raise DeviceError(f"{text!r} is not a number with a unit, such as '100 um'")
     unit = INTERNAL[kind]
     if quantity.unit == u.dimensionless_unscaled and kind != "number":
-        raise DeviceError(f"{text!r} has no unit; expected one of {kind}, such as {unit}")
-    try:
-        return float(quantity.to_value(unit))
-    except u.UnitConversionError:
         raise DeviceError(
-            f"{text!r} is not a {kind}; expected a unit such as {unit}"
-        ) from None
+            f"{text!r} has no unit; expected one of {kind}, such as {_name(kind)}"
+        )
+    try:
+        times, over = _ratio(quantity.unit, unit)
+        return float(quantity.value) * times / over
+    except u.UnitConversionError:
+        expected = f"a unit such as {_name(kind)}" if kind != "number" else "no unit"
+        raise DeviceError(f"{text!r} is not a {kind}; expected {expected}") from None
+
+
+def _ratio(given: u.UnitBase, wanted: u.UnitBase) -> tuple[float, float]:
+    """Give the size of a unit in another as a fraction, so that powers of ten are exact.
+
+    1e-8 is not a float, 1e8 is: '1e12 cm-2' becomes 1e4 only by a division.
+    """
+    size = float(given.to(wanted))
+    power = round(np.log10(size))
+    if abs(power) <= 22 and np.isclose(size, 10.0**power, rtol=1e-13, atol=0):
+        return (10.0**power, 1.0) if power >= 0 else (1.0, 10.0**-power)
+    return size, 1.0
+
+
+def _name(kind: str) -> str:
+    """Give the internal unit of a kind as it is written, e.g. 'um-2'."""
+    return str(INTERNAL[kind].to_string(fraction=False))
 
 
 def from_internal(value: float, kind: str, unit: str) -> str:
-    """Write a float in internal units as a quantity in ``unit``.
+    """Write a float in internal units as the shortest text that reads as the same float.
+
+    In ``unit``; the few floats that no number in that unit gives back are written in the
+    internal unit.
 
     Parameters
     ----------
@@ -91,9 +114,15 @@ def from_internal(value: float, kind: str, unit: str) -> str:
     >>> from_internal(10000.0, "dose", "cm-2")
     '1e+12 cm-2'
     """
-    number = (value * INTERNAL[kind]).to_value(u.Unit(unit))
+    times, over = _ratio(u.Unit(unit), INTERNAL[kind])
+    number = float(value) * over / times
+    if not np.isfinite(number):
+        return f"{number} {unit}".strip()
     for digits in range(1, 18):
-        text = f"{number:.{digits}g}"
-        if to_internal(f"{text} {unit}", kind) == value:
-            break
-    return f"{text} {unit}".strip()
+        mantissa, exponent = f"{number:.{digits - 1}e}".split("e")
+        plain = f"{number:.{max(digits - 1 - int(exponent), 0)}f}"
+        text = plain if -5 <= int(exponent) < 6 else f"{mantissa}e{exponent}"
+        quantity = f"{text} {unit}".strip()
+        if to_internal(quantity, kind) == value:
+            return quantity
+    return f"{float(value)!r} {_name(kind)}".strip()

@@ -148,7 +148,9 @@ def any_device(draw):
             ITL.channel, surface_charge=draw(finite(-1e5, 1e5)), implants=draw(implants)
         ),
         channel_stop=replace(
-            ITL.channel_stop, width=draw(finite(0, 4)), implants=draw(implants),
+            ITL.channel_stop,
+            width=draw(finite(0, 4)),
+            implants=draw(implants),
             dots=draw(dots),
         ),  # fmt: skip
         operating_point=replace(
@@ -244,7 +246,7 @@ def test_with_value_takes_whole_numbers():
             "60 V",
             "operating_point: back_bias = '60 V' must be at most 0 V",
         ),
-        ("pitch_x", "nan um", "pixel: pitch_x = 'nan' must be finite"),
+        ("pitch_x", "nan um", "pixel: pitch_x = 'nan um' must be finite"),
     ],
 )
 def test_with_value_refuses(key, value, message):
@@ -465,7 +467,9 @@ SHAPES = [
 @pytest.mark.parametrize("implant", SHAPES, ids=lambda i: f"{i.shape} {i.dose:g}")
 def test_cumulative_integrates_density(implant):
     at = np.linspace(0, implant.reach, 14)
-    expected = [quad(lambda d: float(implant.density(d)), 0, z, epsrel=1e-12)[0] for z in at]
+    expected = [
+        quad(lambda d: float(implant.density(d)), 0, z, epsrel=1e-12)[0] for z in at
+    ]
     # Smooth integrands on [0, reach]: the quadrature is good to 1e-12 of the dose.
     np.testing.assert_allclose(
         implant.cumulative(at), expected, rtol=0, atol=1e-11 * abs(implant.dose)
@@ -490,7 +494,11 @@ def test_plane_ripple():
     ripple = Ripple("plane", 0.25, 40.0, phase=0.3, direction=math.pi / 2)
     x, y = np.array([0.0, 17.0, -3.0]), np.array([0.0, 10.0, 40.0])
     # Along y; by hand: a quarter period on, cos becomes -sin.
-    expected = [1 + 0.25 * math.cos(0.3), 1 - 0.25 * math.sin(0.3), 1 + 0.25 * math.cos(0.3)]
+    expected = [
+        1 + 0.25 * math.cos(0.3),
+        1 - 0.25 * math.sin(0.3),
+        1 + 0.25 * math.cos(0.3),
+    ]
     np.testing.assert_allclose(ripple.factor(x, y), expected, rtol=1e-14)
 
 
@@ -550,7 +558,9 @@ def changed_cfg(folder, key, value):
     lines = (SENSORS / "lsst_itl_50_8.cfg").read_text().splitlines()
     kept = [line for line in lines if line.split("=")[0].strip() != key]
     path = folder / "itl.cfg"
-    path.write_text("\n".join([*kept, *([f"{key} = {value}"] if value is not None else [])]))
+    path.write_text(
+        "\n".join([*kept, *([f"{key} = {value}"] if value is not None else [])])
+    )
     return path
 
 
