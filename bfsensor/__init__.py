@@ -1,4 +1,4 @@
-"""Device physics of thick CCDs: from a device file to the brighter-fatter effect in images."""
+"""Device physics of thick CCDs: from a device file to the brighter-fatter effect."""
 
 from __future__ import annotations
 

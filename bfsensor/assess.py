@@ -60,7 +60,8 @@ def mesh_errors(plan: Plan) -> dict[str, float]:
         )
         level = solve_level(one, charge, 0.0)
         table = DistortionTable(
-            charges=np.array([charge]), backgrounds=np.zeros(1), depths=np.array(one.depths),
+            charges=np.array([charge]), backgrounds=np.zeros(1),
+            depths=np.array(one.depths),
             pitch=(plan.device.pixel.pitch_x, plan.device.pixel.pitch_y),
             thickness=plan.device.silicon.thickness, vertices=_VERTICES, reach=plan.reach,
             corners=level.corners[None, None], horizontal=level.horizontal[None, None],

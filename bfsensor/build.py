@@ -12,10 +12,12 @@ import json
 import os
 import resource
 import time
+import zipfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -104,10 +106,15 @@ class Level:
     @classmethod
     def read(cls, path: Path) -> Level:
         """Read what :meth:`write` wrote."""
-        with np.load(path) as data:
-            values = {name: data[name] for name in data.files}
-        scalars = {k: v.item() for k, v in values.items() if v.ndim == 0}
-        return cls(**{**values, **scalars})
+        try:
+            with path.open("rb") as stream, np.load(stream) as data:
+                values = {name: data[name] for name in data.files}
+            scalars = {k: v.item() for k, v in values.items() if v.ndim == 0}
+            return cls(**{**values, **scalars})
+        except (ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            raise TableError(
+                f"{path}: not a finished level; delete it to solve it again ({error})"
+            ) from None
 
 
 def default_depths(device: Device) -> tuple[float, ...]:
@@ -197,11 +204,11 @@ def plan_table(
         for value in values:
             if not 0 <= value <= well:
                 raise TableError(
-                    f"{name} = {value:g} e- must be from 0 to the full well of {device.name}, "
-                    f"{well:.6g} e-, where the barrier along the column falls to "
-                    f"{device.well.spill_barrier:g} V"
+                    f"{name} = {value:g} e- must be from 0 to the full well of "
+                    f"{device.name}, {well:.6g} e-, where the barrier along the column "
+                    f"falls to {device.well.spill_barrier:g} V"
                 )
-        if len(values) < 1 or any(b <= a for a, b in zip(values, values[1:], strict=False)):
+        if len(values) < 1 or any(b <= a for a, b in pairwise(values)):
             raise TableError(f"{name}s {list(values)} must ascend")
     if depths is None:
         depths = default_depths(device)
@@ -209,10 +216,10 @@ def plan_table(
     for depth in depths:
         if not low - 1e-9 <= depth <= high:
             raise TableError(
-                f"depth = {depth:g} um must lie in the silicon of {device.name}, from {low:g} um, "
-                f"where charge is stored, to {high:g} um, the back surface"
+                f"depth = {depth:g} um must lie in the silicon of {device.name}, from "
+                f"{low:g} um, where charge is stored, to {high:g} um, the back surface"
             )
-    if any(b <= a for a, b in zip(depths, depths[1:], strict=False)):
+    if any(b <= a for a, b in pairwise(depths)):
         raise TableError(f"depths {list(depths)} must ascend")
     return Plan(
         device, tuple(map(float, charges)), tuple(map(float, backgrounds)),
@@ -230,7 +237,7 @@ def _round(charge: float) -> float:
 
 @lru_cache(maxsize=1)
 def _workshop(device_text: str, cells: int, refine_z: int) -> tuple[Any, Any, Any]:
-    """The solver and empty unit cell of a process, built once for all its levels."""
+    """Build the device, solver and mesh of a process, once for all its levels."""
     from bfsensor.device import Device
 
     device = Device.from_toml(device_text)
@@ -264,8 +271,9 @@ def solve_level(plan: Plan, charge: float, background: float) -> Level:
         (nd, n, n + 1, plan.vertices, 2),
     )
     if charge == background:
+        corners, horizontal, vertical = (np.zeros(s) for s in shapes)
         return Level(
-            *(np.zeros(s) for s in shapes), 0, 0, 0.0, time.process_time() - began, 0.0
+            corners, horizontal, vertical, 0, 0, 0.0, time.process_time() - began, 0.0
         )
     charges = np.full(solver.pixel_shape, background)
     charges[0, 0] = charge
@@ -283,9 +291,10 @@ def solve_level(plan: Plan, charge: float, background: float) -> Level:
             whole[~fixed] = found
     far = FarField.of(unit, depths, Surfaces.of(device).silicon_stop, 5 * max(mesh.period))
     moved, share = _without_images(far, moved, mesh.pitch, mesh.period, fractions)
+    corners, horizontal, vertical = moved
     return Level(
-        *moved, len(potential.history), potential.linear_iterations, potential.error_volts,
-        time.process_time() - began, share,
+        corners, horizontal, vertical, len(potential.history), potential.linear_iterations,
+        potential.error_volts, time.process_time() - began, share,
     )  # fmt: skip
 
 

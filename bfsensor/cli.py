@@ -85,7 +85,7 @@ def _load(name: str, settings: Sequence[tuple[str, str]]) -> Any:
 @main.command()
 @click.option("--json", "as_json", is_flag=True, help="Print JSON for a program to read.")
 def devices(as_json: bool) -> None:
-    """List the built-in devices.
+    r"""List the built-in devices.
 
     \b
     Example:
@@ -128,7 +128,7 @@ def _print_table(rows: Sequence[dict[str, Any]]) -> None:
 @main.command()
 @click.argument("device")
 @click.option("--set", "settings", multiple=True, callback=_settings, metavar="KEY=VALUE",
-              help="Change a device quantity, e.g. --set back_bias=-60V (repeatable).")  # fmt: skip
+              help="Change a quantity: --set back_bias=-60V (repeatable).")  # fmt: skip
 @click.option(
     "--charges", callback=_numbers, metavar="Q,Q,...", help="Source charges [e-]."
 )
@@ -143,18 +143,19 @@ def _print_table(rows: Sequence[dict[str, Any]]) -> None:
     "--pixels", default=9, show_default=True, help="Width of the table [pixel], odd."
 )
 @click.option("--accuracy", default=0.01, show_default=True,
-              help="Mesh accuracy of area changes, relative to the largest of their kind.")  # fmt: skip
-@click.option("--workers", default=2, show_default=True, help="Processes.")
+              help="Mesh accuracy of area changes, relative to the largest.")  # fmt: skip
+@click.option("--workers", type=click.IntRange(min=1), default=2, show_default=True,
+              help="Processes.")  # fmt: skip
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), help="Table to write [DEVICE.fits]."
 )
 @click.option("--galsim", type=click.Path(path_type=Path), metavar="STEM",
-              help="Write STEM.cfg and STEM.dat for galsim.SiliconSensor instead: one charge, no "
-              "background, one depth.")  # fmt: skip
+              help="Write STEM.cfg and STEM.dat for galsim.SiliconSensor instead: one "
+              "charge, no background, one depth.")  # fmt: skip
 @click.option(
     "--assess/--no-assess",
     default=None,
-    help="Measure mesh, tracing and superposition errors for the header [for whole tables].",
+    help="Measure mesh, tracing and superposition errors for the header [whole tables].",
 )
 @click.option(
     "--figure/--no-figure", default=True, help="Draw the table beside it (needs [plots])."
@@ -178,7 +179,7 @@ def table(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Solve a DEVICE (name or .toml) and write its distortion table.
+    r"""Solve a DEVICE (name or .toml) and write its distortion table.
 
     The table holds the displacement of every vertex of the pixel boundaries against the
     charge of a source pixel, the uniform charge of all others, and the conversion depth.
@@ -203,7 +204,8 @@ def table(
         depths = depths or (95.0 / 100.0 * loaded.silicon.thickness,)
         if len(charges) != 1 or len(depths) != 1:
             raise TableError(
-                f"a GalSim table holds one charge and one depth, not {len(charges)} and {len(depths)}"
+                f"a GalSim table holds one charge and one depth, not {len(charges)} and "
+                f"{len(depths)}"
             )
         targets = [galsim.with_name(galsim.name + ending) for ending in (".cfg", ".dat")]
     else:
@@ -219,7 +221,8 @@ def table(
     )  # fmt: skip
     click.echo(
         f"{loaded.name}: full well {plan.full_well:,.0f} e-, {len(plan.charges)} charges x "
-        f"{len(plan.backgrounds)} backgrounds x {len(plan.depths)} depths, {plan.cells} cells a pixel",
+        f"{len(plan.backgrounds)} backgrounds x {len(plan.depths)} depths, {plan.cells} "
+        "cells a pixel",
         err=True,
     )
     checkpoint = targets[0].with_name(targets[0].name + ".levels")
@@ -238,13 +241,13 @@ def table(
         if assess if assess is not None else galsim is None:
             errors = _start_assessment(plan, executor, checkpoint)
         result = build_table(
-            plan, executor=executor, checkpoint=checkpoint, progress=progress, errors=errors,
-            provenance=provenance,
+            plan, executor=executor, checkpoint=checkpoint, progress=progress,
+            errors=errors, provenance=provenance,
         )  # fmt: skip
     finally:
+        bar.close()  # ends its line, before any message
         if executor is not None:
             executor.shutdown(cancel_futures=True)
-    bar.close()
     if galsim is not None:
         write_galsim(
             result,
@@ -343,7 +346,7 @@ def device() -> None:
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 def import_(cfg: Path, output: Path | None, overwrite: bool) -> None:
-    """Turn a Poisson_CCD or GalSim configuration CFG into a device file.
+    r"""Turn a Poisson_CCD or GalSim configuration CFG into a device file.
 
     \b
     Example:
@@ -368,7 +371,7 @@ def import_(cfg: Path, output: Path | None, overwrite: bool) -> None:
     "-o", "--output", type=click.Path(path_type=Path), help="Figure [SOURCE.png]."
 )
 def show(source: str, settings: list[tuple[str, str]], output: Path | None) -> None:
-    """Draw a table (.fits, GalSim stem) or a DEVICE (name or .toml).
+    r"""Draw a table (.fits, GalSim stem) or a DEVICE (name or .toml).
 
     A table: distorted pixel boundaries with their areas, the response against charge,
     background and depth.  A device: potentials, carriers and electron paths of an empty and

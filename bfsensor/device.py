@@ -586,8 +586,8 @@ def _parse_quantity(
             raise DeviceError(f"{where}: {key}: uncertainty: {error}") from None
         if uncertainty is not None and not 0 <= uncertainty < np.inf:
             raise DeviceError(
-                f"{where}: {key}: uncertainty = {given['uncertainty']!r} must be finite and "
-                "at least 0"
+                f"{where}: {key}: uncertainty = {given['uncertainty']!r} must be finite "
+                "and at least 0"
             )
         provenance[f"{where}.{key}"] = Provenance(uncertainty, origin, source)
     if not isinstance(text, str):
@@ -774,7 +774,7 @@ def _check_part(part: Any, where: str) -> None:
         for name in needed:
             if getattr(part, name) is None:
                 raise DeviceError(f"{where}: {name} is missing for a {part.shape} implant")
-        for name in {"peak", "sigma", "depth"} - set(needed):
+        for name in sorted({"peak", "sigma", "depth"} - set(needed)):
             if getattr(part, name) is not None:
                 raise DeviceError(
                     f"{where}: {name} does not belong to a {part.shape} implant"

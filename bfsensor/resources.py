@@ -8,7 +8,7 @@ from bfsensor.errors import BFSensorError
 
 
 def tables_dir() -> Path:
-    """Folder of the built-in devices and tables: inside a wheel, or beside it in a checkout.
+    """Find the built-in devices and tables: in a wheel, or beside it in a checkout.
 
     Returns
     -------

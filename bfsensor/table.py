@@ -102,7 +102,7 @@ class DistortionTable:
     -----
     Where the source charge equals the background nothing moves.  Between levels the
     response D / (Q - B) is interpolated (cubic splines in charge and background, monotone
-    cubics in the logarithm of depth) and multiplied by Q - B, so that this holds everywhere.
+    cubics in the logarithm of depth) and multiplied by Q - B: this holds everywhere.
     Arrays are kept in single precision (1e-7 of a displacement) so that reading what was
     written gives the same bits.
 
@@ -270,7 +270,7 @@ class DistortionTable:
             )
 
     def nominal(self) -> Displacements:
-        """Positions (x, y) [um] of all vertices of undistorted pixels, source centre at 0."""
+        """Give the vertices (x, y) [um] of undistorted pixels, the source's centre at 0."""
         n = 2 * self.reach + 1
         x = (np.arange(n + 1) - self.reach - 0.5) * self.pitch[0]
         y = (np.arange(n + 1) - self.reach - 0.5) * self.pitch[1]
@@ -283,7 +283,7 @@ class DistortionTable:
         return Displacements(corners, horizontal, vertical)
 
     def _outlines(self, moved: Displacements) -> NDArray[np.float64]:
-        """Polygons of all pixels, (n, n, 4 nv + 4, 2), counter-clockwise from lower left."""
+        """Join polygons, (n, n, 4 nv + 4, 2), counter-clockwise from the lower left."""
         at = self.nominal()
         c = at.corners + moved.corners
         h = at.horizontal + moved.horizontal
@@ -462,6 +462,16 @@ class DistortionTable:
             if isinstance(error, TableError):
                 raise
             raise TableError(f"{path}: not a FITS file, or damaged: {error}") from None
+        try:
+            return cls._from_file(header, data)
+        except TableError as error:
+            raise TableError(f"{path}: {error}") from None
+        except (ValueError, KeyError, TypeError) as error:
+            raise TableError(f"{path}: not a FITS file, or damaged: {error}") from None
+
+    @classmethod
+    def _from_file(cls, header: Any, data: dict[str, NDArray[Any]]) -> DistortionTable:
+        """Assemble a table from the primary header and the arrays of its file."""
         needed = {
             "CORNERS",
             "HORIZONTAL",
@@ -473,7 +483,7 @@ class DistortionTable:
             "DEVICE",
         }
         if missing := needed - set(data):
-            raise TableError(f"{path}: truncated: {', '.join(sorted(missing))} is missing")
+            raise TableError(f"truncated: {', '.join(sorted(missing))} is missing")
         arrays = {k: data[k].astype(float) for k in ("CORNERS", "HORIZONTAL", "VERTICAL")}
         reach, vertices = int(header["REACH"]), int(header["VERTICES"])
         if header["QUADRANT"]:

@@ -152,7 +152,7 @@ def any_device(draw):
             width=draw(finite(0, 4)),
             implants=draw(implants),
             dots=draw(dots),
-        ),  # fmt: skip
+        ),
         operating_point=replace(
             ITL.operating_point,
             gate_low=low,
@@ -239,7 +239,8 @@ def test_with_value_takes_whole_numbers():
         (
             "back_bias",
             "-60",
-            "operating_point: back_bias: '-60' has no unit; expected one of potential, such as V",
+            "operating_point: back_bias: '-60' has no unit; expected one of potential, "
+            "such as V",
         ),
         (
             "back_bias",
@@ -357,7 +358,8 @@ LIMITS = [
     *(
         (
             edited("gate_high", f'gate_high = "{value} V"'),
-            f"device: operating_point: gate_high = '{value} V' must be above gate_low = '-8 V'",
+            f"device: operating_point: gate_high = '{value} V' must be above gate_low = "
+            "'-8 V'",
         )
         for value in ("-8", "-9")
     ),
@@ -381,8 +383,9 @@ LIMITS = [
     ),
     *(
         (
-            edited("pitch_x", f'pitch_x = {{ value = "10 um", uncertainty = "{value} um" }}'),
-            f"device: pixel: pitch_x: uncertainty = '{value} um' must be finite and at least 0",
+            edited("pitch_y", f'pitch_y = {{ value = "9 um", uncertainty = "{value} um" }}'),
+            f"device: pixel: pitch_x: uncertainty = '{value} um' must be finite and "
+            "at least 0",
         )
         for value in ("-1", "nan")
     ),

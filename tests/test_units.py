@@ -88,13 +88,17 @@ def test_written_for_people(value, kind, text):
         ("100 V", "length", "'100 V' is not a length; expected a unit such as um"),
         ("1 cm-3", "dose", "'1 cm-3' is not a dose; expected a unit such as um-2"),
         ("1 um", "number", "'1 um' is not a number; expected no unit"),
-        ("20 deg_C", "temperature", "'20 deg_C' is not a temperature; expected a unit such as K"),
+        (
+            "20 deg_C",
+            "temperature",
+            "'20 deg_C' is not a temperature; expected a unit such as K",
+        ),
         *(
             (text, "length", f"{text!r} is not a number with a unit, such as '100 um'")
             for text in ("", "um", "a lot", "5 smoots", "[1, 2] um", "1 um; 2 um")
         ),
     ],
-)  # fmt: skip
+)
 def test_refusals(text, kind, message):
     with pytest.raises(DeviceError) as caught:
         to_internal(text, kind)

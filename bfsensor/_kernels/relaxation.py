@@ -182,7 +182,7 @@ def restrict(fine, wx, wy, out):
     transpose of :func:`prolong_add`.
     """
     nyc, nz, nxc = out.shape
-    nyf, _, nxf = fine.shape
+    nyf = fine.shape[0]
     for jc in range(1, nyc - 1):
         jf = 2 * jc - 1
         for k in range(nz):

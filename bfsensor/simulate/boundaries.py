@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -58,8 +59,7 @@ class Field:
         phi, z = _pad_z(phi, mesh.z)
         device = potential.device
         surfaces = Surfaces.of(device)
-        half_x, half_y = mesh.pitch[0] / 2, mesh.pitch[1] / 2
-        channel = half_x - surfaces.stop_half_width - surfaces.taper
+        channel = mesh.pitch[0] / 2 - surfaces.stop_half_width - surfaces.taper
         collecting = max(device.gates.edges_y(mesh.pitch[1]))
         zone = np.array(
             [
@@ -273,7 +273,7 @@ def _line_fit(n_pixels: int, vertices: int, fractions: tuple[float, ...]) -> _Li
     per_interval = max(2, int(np.ceil(64 / (vertices + 1))))
     node, weight = np.polynomial.legendre.leggauss(per_interval)
     points, weights = [], []
-    for a, b in zip(knots[:-1], knots[1:], strict=True):
+    for a, b in pairwise(knots):
         points.append(a + 0.5 * (node + 1) * (b - a))
         weights.append(0.5 * weight * (b - a))
     points_, weights_ = np.concatenate(points), np.concatenate(weights)
@@ -335,7 +335,7 @@ def find_boundaries(
         A boundary was not found (a well that no longer holds its charge).
     """
     mesh = potential.mesh
-    depths = np.atleast_1d(np.asarray(depths, float))
+    depths = np.array(depths, dtype=np.float64, ndmin=1)
     surfaces = Surfaces.of(potential.device)
     lowest = lowest_depth(potential)
     if np.any(np.diff(depths) <= 0):

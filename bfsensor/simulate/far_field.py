@@ -1,4 +1,4 @@
-"""The far field of a charged pixel, and the periodic images taken out with it.
+r"""The far field of a charged pixel, and the periodic images taken out with it.
 
 Many pixels away a stored charge and what it induces on gates and holes act as a dipole
 on a grounded plane, facing the back contact at the other end of the silicon.  Its

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor._kernels import relaxation
-from bfsensor.simulate.mesh import Coefficients, dual_widths, link_factors
+from bfsensor.simulate.discretise import Coefficients, dual_widths, link_factors
 
 _COARSEST_SWEEPS = 6
 _PINNED = 1e12  # a link strong enough to hold a coarse node inside a conductor at zero
@@ -35,7 +35,7 @@ class _Level:
 
 
 class Multigrid:
-    """The hierarchy of one :class:`~bfsensor.simulate.mesh.Coefficients`.
+    """The hierarchy of one :class:`~bfsensor.simulate.discretise.Coefficients`.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def _make_level(fine: Coefficients) -> _Level:
     parity = (np.arange(nx + 2) % 2).astype(single)
     inverse_dy = np.zeros(ny + 2, single)
     inverse_dy[1:-1] = 1.0 / fine.dy[1:-1]
-    coefficients = {
+    coefficients: dict[str, NDArray] = {
         "cx": fine.cx.astype(single),
         "cy": fine.cy.astype(single),
         "cz": fine.cz.astype(single),

@@ -1,4 +1,4 @@
-"""Non-linear electrostatics of a sensor: potential, free holes, stored electrons.
+r"""Non-linear electrostatics of a sensor: potential, free holes, stored electrons.
 
 Solves, in electron per node,
 
@@ -22,7 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 from bfsensor._kernels import carriers as carrier_kernels
 from bfsensor._kernels import relaxation
 from bfsensor.errors import ConvergenceError, DeviceError
-from bfsensor.simulate.mesh import Mesh, discretise, make_mesh
+from bfsensor.simulate.discretise import discretise
+from bfsensor.simulate.mesh import Mesh, make_mesh
 from bfsensor.simulate.multigrid import Multigrid
 
 if TYPE_CHECKING:
@@ -216,7 +217,6 @@ class Electrostatics:
 
     def _empty_start(self) -> NDArray[np.float64]:
         """A first guess without carriers: linear solution, held above the hole level."""
-        nz, ny, nx = self.mesh.shape
         c = self.coefficients
         self._stiffness[...] = 0.0
         phi = np.zeros(self._shape)

@@ -83,18 +83,36 @@ def main() -> None:
     parser.add_argument("-o", "--output")
     args = parser.parse_args()
     began = cpu()
-    tiny = plan_table(Device.load("itl_sta3800c"), charges=[5e4], backgrounds=[0.0], depths=[95.0], accuracy=0.05)
+    tiny = plan_table(
+        Device.load("itl_sta3800c"),
+        charges=[5e4],
+        backgrounds=[0.0],
+        depths=[95.0],
+        accuracy=0.05,
+    )
     solve_level(tiny, 5e4, 0.0)
     print(f"first call with compilation or its cache: {cpu() - began:.1f} CPU s")
     bandwidth = memory_bandwidth()
     print(f"memory bandwidth, one thread: {bandwidth / 1e9:.1f} GB/s")
-    rows = [bench(name, cells, bandwidth) for cells in args.cells for name in ("itl_sta3800c", "e2v_ccd250")]
+    rows = [
+        bench(name, cells, bandwidth)
+        for cells in args.cells
+        for name in ("itl_sta3800c", "e2v_ccd250")
+    ]
     table = Table(rows)
     print("\n".join(table.pformat(max_width=-1)))
     print(f"peer: {PEER_CPU:.0f} CPU s and {PEER_MEMORY} GB a level, not converged")
     if args.output:
-        commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-        table.meta = {"command": "python tests/benchmarks/bench_table.py", "commit": commit.stdout.strip()}
+        commit = subprocess.run(
+            ["git", "rev-parse", "--short", "HEAD"],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        table.meta = {
+            "command": "python tests/benchmarks/bench_table.py",
+            "commit": commit.stdout.strip(),
+        }
         table.write(args.output, format="ascii.ecsv", overwrite=True)
 
 

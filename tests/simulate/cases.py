@@ -8,13 +8,18 @@ from bfsensor.device import Channel, ChannelStop, Device, GateStack, Implant
 
 
 def flat_device(
-    *, implants: tuple[Implant, ...] = (), surface_charge: float = 0.0, same_permittivity: bool = False
+    *,
+    implants: tuple[Implant, ...] = (),
+    surface_charge: float = 0.0,
+    same_permittivity: bool = False,
 ) -> Device:
     """A capacitor: flat oxide, one gate voltage, depleted silicon, no carriers."""
     device = Device.load("e2v_ccd250")
     material = device.material
     if same_permittivity:
-        material = dataclasses.replace(material, permittivity_oxide=material.permittivity_silicon)
+        material = dataclasses.replace(
+            material, permittivity_oxide=material.permittivity_silicon
+        )
     return dataclasses.replace(
         device,
         name="flat",
@@ -23,7 +28,10 @@ def flat_device(
         channel_stop=ChannelStop(0.0),
         gates=GateStack(4, 2, 0.15, 0.15),
         operating_point=dataclasses.replace(
-            device.operating_point, gate_low=3.0 - 1e-9, gate_high=3.0, hole_quasi_fermi_level=-49.0
+            device.operating_point,
+            gate_low=3.0 - 1e-9,
+            gate_high=3.0,
+            hole_quasi_fermi_level=-49.0,
         ),
         provenance={},
     )

@@ -21,7 +21,9 @@ def solve(device, period, cells, charges, *, symmetric=True):
     columns, rows = list(mesh.pixels("x")), list(mesh.pixels("y"))
     for (i, j), charge in charges.items():
         pattern[rows.index(j), columns.index(i)] = charge
-    return solver.solve(pattern, start=tile(solve_unit_cell(device, 0.0, cells=cells), mesh))
+    return solver.solve(
+        pattern, start=tile(solve_unit_cell(device, 0.0, cells=cells), mesh)
+    )
 
 
 def table_of(lines, vertices=16):
@@ -85,7 +87,9 @@ def test_the_effect_has_the_sign_and_the_anisotropy_of_a_ccd(lines):
 
 
 def test_areas_do_not_depend_on_the_number_of_vertices(lines):
-    few, many = (table_of(lines, n).area_changes(charge=CHARGE, depth=95.0) for n in (4, 32))
+    few, many = (
+        table_of(lines, n).area_changes(charge=CHARGE, depth=95.0) for n in (4, 32)
+    )
     # What is left is the cusp at the corners, where four lines share one point.
     assert np.abs(few - many).max() < 6e-3
 
@@ -94,14 +98,22 @@ def test_tracing_error_is_below_its_bound(solution, lines):
     finer = find_boundaries(
         solution, [5.0, 10.0, 95.0], reach=3, samples=24, coarseness=0.25 / 6, ratio=0.1 / 6
     )
-    for usual, fine in zip(lines.vertices(16, vertex_fractions(16)), finer.vertices(16, vertex_fractions(16)), strict=True):
+    for usual, fine in zip(
+        lines.vertices(16, vertex_fractions(16)),
+        finer.vertices(16, vertex_fractions(16)),
+        strict=True,
+    ):
         assert np.abs(usual - fine).max() < 3e-4
 
 
 def test_whole_and_mirrored_domains_give_the_same_boundaries(device, solution, lines):
     whole = solve(device, 8, 8, {(0, 0): CHARGE}, symmetric=False)
     other = find_boundaries(whole, [5.0, 10.0, 95.0], reach=3)
-    for a, b in zip(lines.vertices(8, vertex_fractions(8)), other.vertices(8, vertex_fractions(8)), strict=True):
+    for a, b in zip(
+        lines.vertices(8, vertex_fractions(8)),
+        other.vertices(8, vertex_fractions(8)),
+        strict=True,
+    ):
         # Bisections to 1e-5 um of potentials that agree to 1e-6 V.
         assert np.abs(a - b).max() < 3e-5
 
@@ -134,13 +146,26 @@ def test_periodic_images_are_taken_out(device):
     at = table.nominal()
     facing = table.vertical[0, 0, 0, 3, -1, :, 0]
     points = at.vertical[3, -1]
-    amplitude = np.mean(facing / (far.vectors(points, 0) + image_shifts(far, points, 0, (100.0, 100.0)))[:, 0])
+    amplitude = np.mean(
+        facing
+        / (far.vectors(points, 0) + image_shifts(far, points, 0, (100.0, 100.0)))[:, 0]
+    )
     arrays = [
-        (getattr(table, name)[0, 0, 0] - amplitude * image_shifts(far, getattr(at, name), 0, (100.0, 100.0)))
+        (
+            getattr(table, name)[0, 0, 0]
+            - amplitude * image_shifts(far, getattr(at, name), 0, (100.0, 100.0))
+        )
         for name in ("corners", "horizontal", "vertical")
     ]
     corrected = DistortionTable(
-        np.array([CHARGE]), np.zeros(1), depth, table.pitch, 100.0, 16, 3, *(a[None, None, None] for a in arrays)
+        np.array([CHARGE]),
+        np.zeros(1),
+        depth,
+        table.pitch,
+        100.0,
+        16,
+        3,
+        *(a[None, None, None] for a in arrays),
     ).area_changes(charge=CHARGE, depth=95.0)[6, 6]
     # Within 2 % of the pixel three columns and rows away, from an image share of 60 %.
     assert corrected == pytest.approx(truth, rel=0.02)
@@ -151,7 +176,9 @@ def test_lowest_depth_is_where_the_charge_is(solution):
 
 
 def test_refusals(solution):
-    with pytest.raises(TableError, match=r"conversion depth 0.1 um must lie in the silicon"):
+    with pytest.raises(
+        TableError, match=r"conversion depth 0.1 um must lie in the silicon"
+    ):
         find_boundaries(solution, [0.1], reach=1)
     with pytest.raises(TableError, match=r"conversion depth 101 um"):
         find_boundaries(solution, [50.0, 101.0], reach=1)

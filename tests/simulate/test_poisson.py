@@ -9,7 +9,8 @@ from scipy.integrate import quad
 from bfsensor.device import Device, Implant
 from bfsensor.errors import ConvergenceError, DeviceError
 from bfsensor.simulate import poisson
-from bfsensor.simulate.mesh import Surfaces, discretise, make_mesh
+from bfsensor.simulate.discretise import discretise
+from bfsensor.simulate.mesh import Surfaces, make_mesh
 from bfsensor.simulate.multigrid import Multigrid
 from bfsensor.simulate.poisson import Electrostatics, solve_unit_cell, tile
 from bfsensor.units import VACUUM_PERMITTIVITY
@@ -26,18 +27,24 @@ def exact_flat_potential(device, z):
     top = device.silicon.thickness
 
     def charge_above_surface(depth):
-        implanted = sum(float(i.cumulative(np.array(depth))) for i in device.channel.implants)
+        implanted = sum(
+            float(i.cumulative(np.array(depth))) for i in device.channel.implants
+        )
         return device.silicon.background_doping * depth + implanted
 
     def integral(depth):
         breaks = [i.reach for i in device.channel.implants if i.reach < depth]
-        return quad(charge_above_surface, 0.0, depth, points=breaks or None, limit=400, epsabs=1e-9)[0]
+        return quad(
+            charge_above_surface, 0.0, depth, points=breaks or None, limit=400, epsabs=1e-9
+        )[0]
 
     # D = eps dphi/dz falls with the charge passed: D(z) = D0 - sheet - Q(z).
     sheet = device.channel.surface_charge
     thick = top - surface
     drop = device.operating_point.back_bias - device.operating_point.gate_high
-    d0 = (drop + sheet * thick / eps_si + integral(thick) / eps_si) / (surface / eps_ox + thick / eps_si)
+    d0 = (drop + sheet * thick / eps_si + integral(thick) / eps_si) / (
+        surface / eps_ox + thick / eps_si
+    )
     out = []
     for value in z:
         if value <= surface:
@@ -45,7 +52,11 @@ def exact_flat_potential(device, z):
         else:
             depth = value - surface
             field_part = (d0 - sheet) * depth - integral(depth)
-            out.append(device.operating_point.gate_high + d0 * surface / eps_ox + field_part / eps_si)
+            out.append(
+                device.operating_point.gate_high
+                + d0 * surface / eps_ox
+                + field_part / eps_si
+            )
     return np.array(out)
 
 
@@ -138,13 +149,25 @@ def test_multigrid_cycle_halves_the_error(name, cells):
     rng = np.random.default_rng(918)
     nz, ny, nx = mesh.shape
     error = np.zeros((ny + 2, nz, nx + 2))
-    error[1:-1, :, 1:-1] = rng.normal(size=(ny, nz, nx)) * ~coefficients.conductor[0][None, :, 1:-1]
+    error[1:-1, :, 1:-1] = (
+        rng.normal(size=(ny, nz, nx)) * ~coefficients.conductor[0][None, :, 1:-1]
+    )
     charge, correction = np.zeros_like(error), np.zeros_like(error)
     c = coefficients
     norms = []
     for _ in range(8):
         energy = poisson.relaxation.apply_operator(
-            error, solver._stiffness, c.cx, c.cy, c.cz, c.cd, c.kind, c.north, c.south, c.dy, charge
+            error,
+            solver._stiffness,
+            c.cx,
+            c.cy,
+            c.cz,
+            c.cd,
+            c.kind,
+            c.north,
+            c.south,
+            c.dy,
+            charge,
         )
         norms.append(np.sqrt(energy))
         multigrid.cycle(charge, correction)
@@ -170,7 +193,9 @@ def test_charge_is_conserved_pixel_by_pixel(charged):
     _, _, solution = charged
     # A quarter of the source pixel lies in the domain.
     assert solution.electrons.sum() == pytest.approx(1e5 / 4, rel=1e-6)
-    inside = np.ix_(np.arange(solution.electrons.shape[0]), solution.mesh.y <= 5, solution.mesh.x <= 5)
+    inside = np.ix_(
+        np.arange(solution.electrons.shape[0]), solution.mesh.y <= 5, solution.mesh.x <= 5
+    )
     assert solution.electrons[inside].sum() == pytest.approx(1e5 / 4, rel=1e-6)
 
 
@@ -192,7 +217,7 @@ def test_gauss_law_holds_for_the_whole_sensor(charged):
 
 
 def test_electrons_are_in_equilibrium_at_the_reported_level(charged):
-    solver, _, solution = charged
+    _, _, solution = charged
     kt = solution.device.material.thermal_voltage(173.0)
     ni = solution.device.material.intrinsic_density(173.0)
     dense = solution.electrons > 1e-3 * solution.electrons.max()
@@ -204,7 +229,7 @@ def test_electrons_are_in_equilibrium_at_the_reported_level(charged):
 
 
 def test_mirrored_and_whole_domains_agree(charged):
-    solver, _, mirrored = charged
+    _, _, mirrored = charged
     device = mirrored.device
     mesh = make_mesh(device, pixels=(6, 6), cells=8, symmetric=False)
     whole = Electrostatics(device, mesh)
@@ -213,8 +238,12 @@ def test_mirrored_and_whole_domains_agree(charged):
     charges[middle, middle] = 1e5
     start = tile(solve_unit_cell(device, 0.0, cells=8), mesh)
     solution = whole.solve(charges, start=start)
-    ix = [int(np.argmin(np.abs(mesh.x - x))) for x in mirrored.mesh.x if x < mesh.x[-1] + 1e-9]
-    iy = [int(np.argmin(np.abs(mesh.y - y))) for y in mirrored.mesh.y if y < mesh.y[-1] + 1e-9]
+    ix = [
+        int(np.argmin(np.abs(mesh.x - x))) for x in mirrored.mesh.x if x < mesh.x[-1] + 1e-9
+    ]
+    iy = [
+        int(np.argmin(np.abs(mesh.y - y))) for y in mirrored.mesh.y if y < mesh.y[-1] + 1e-9
+    ]
     same = solution.phi[:, iy][:, :, ix] - mirrored.phi[:, : len(iy), : len(ix)]
     # Both are converged to 1e-6 V by independent iterations.
     assert np.abs(same).max() < 4e-6
@@ -262,7 +291,9 @@ def test_a_large_step_in_charge_does_not_raise_holes_in_the_channel():
     solver = Electrostatics(device, mesh)
     charges = np.full(solver.pixel_shape, 58000.0)
     charges[0, 0] = 170000.0
-    solution = solver.solve(charges, start=tile(solve_unit_cell(device, 58000.0, cells=16), mesh))
+    solution = solver.solve(
+        charges, start=tile(solve_unit_cell(device, 58000.0, cells=16), mesh)
+    )
     assert solution.error_volts < poisson.TOLERANCE
 
 

@@ -17,9 +17,15 @@ from bfsensor.simulate.mesh import make_mesh
 from bfsensor.simulate.poisson import Electrostatics, solve_unit_cell, tile
 from bfsensor.units import VACUUM_PERMITTIVITY
 
-ANCHOR = Path(__file__).resolve().parents[3] / "shared/reference/poisson_ccd_converged/phi_64x64x160.npz"
+ANCHOR = (
+    Path(__file__).resolve().parents[3]
+    / "shared/reference/poisson_ccd_converged/phi_64x64x160.npz"
+)
 
-pytestmark = pytest.mark.skipif(not ANCHOR.exists(), reason="the converged Poisson_CCD potential is not beside the checkout")
+pytestmark = pytest.mark.skipif(
+    not ANCHOR.exists(),
+    reason="the converged Poisson_CCD potential is not beside the checkout",
+)
 
 THICKNESS, EXPONENT = 100.0, 10
 
@@ -27,14 +33,19 @@ THICKNESS, EXPONENT = 100.0, 10
 def anchor_heights():
     """Node heights of the peer: uniform in z' = -T (n - 1) (z / T)^((n + 1) / n) + n z."""
     z = np.linspace(0, THICKNESS, 200001)
-    stretched = -THICKNESS * (EXPONENT - 1) * (z / THICKNESS) ** ((EXPONENT + 1) / EXPONENT) + EXPONENT * z
+    stretched = (
+        -THICKNESS * (EXPONENT - 1) * (z / THICKNESS) ** ((EXPONENT + 1) / EXPONENT)
+        + EXPONENT * z
+    )
     return np.interp(np.linspace(0, THICKNESS, 161), stretched, z)
 
 
 @pytest.fixture(scope="module")
 def anchor():
     data = np.load(ANCHOR)
-    return np.moveaxis(data["phi"].astype(float)[:64, :64], 2, 0), np.moveaxis(data["elec"].astype(float)[:64, :64], 2, 0)
+    return np.moveaxis(data["phi"].astype(float)[:64, :64], 2, 0), np.moveaxis(
+        data["elec"].astype(float)[:64, :64], 2, 0
+    )
 
 
 @pytest.fixture(scope="module")
@@ -57,10 +68,16 @@ def exact_bulk(plane, z0, z, period, doping, top, eps):
     out = np.zeros((len(z), n, n))
     for number, value in enumerate(z):
         with np.errstate(invalid="ignore", over="ignore"):
-            decay = np.exp(-kk * (value - z0)) * (1 - np.exp(-2 * kk * (THICKNESS - value))) / (1 - np.exp(-2 * kk * thick))
+            decay = (
+                np.exp(-kk * (value - z0))
+                * (1 - np.exp(-2 * kk * (THICKNESS - value)))
+                / (1 - np.exp(-2 * kk * thick))
+            )
         decay[0, 0] = (THICKNESS - value) / thick
         parabola = -doping / (2 * eps) * (value - z0) * (value - THICKNESS)
-        out[number] = np.fft.ifft2(modes * decay).real + top * (value - z0) / thick - parabola * -1
+        out[number] = (
+            np.fft.ifft2(modes * decay).real + top * (value - z0) / thick - parabola * -1
+        )
     return out
 
 
@@ -109,9 +126,17 @@ def test_the_field_in_the_bulk_agrees(anchor, ours):
     fields = []
     for phi, heights, weights in (
         (theirs, z, None),
-        (ours.phi, ours.mesh.z, np.outer(np.gradient(ours.mesh.y), np.gradient(ours.mesh.x))),
+        (
+            ours.phi,
+            ours.mesh.z,
+            np.outer(np.gradient(ours.mesh.y), np.gradient(ours.mesh.x)),
+        ),
     ):
-        mean = phi.mean(axis=(1, 2)) if weights is None else np.tensordot(phi, weights, 2) / weights.sum()
+        mean = (
+            phi.mean(axis=(1, 2))
+            if weights is None
+            else np.tensordot(phi, weights, 2) / weights.sum()
+        )
         fields.append(np.interp([10.0, 20.0, 60.0], heights, np.gradient(mean, heights)))
     # The wells differ by 0.7 V of mesh error (module docstring), of 100 um: 0.007 V/um.
     assert np.abs(np.diff(fields, axis=0)).max() < 0.012
