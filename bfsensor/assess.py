@@ -107,14 +107,19 @@ def tracing_error(plan: Plan) -> float:
 
 
 def _solve(
-    plan: Plan, charges: dict[tuple[int, int], float], *, symmetric: bool
+    plan: Plan,
+    charges: dict[tuple[int, int], float],
+    *,
+    symmetric: bool,
+    background: float = 0.0,
 ) -> Potential:
+    """Solve a pattern of charges; all other pixels hold the background."""
     mesh = make_mesh(
         plan.device, pixels=(_PERIOD, _PERIOD), cells=_CELLS, symmetric=symmetric
     )
     solver = Electrostatics(plan.device, mesh)
-    start = tile(solve_unit_cell(plan.device, 0.0, cells=_CELLS), mesh)
-    pattern = np.zeros(solver.pixel_shape)
+    start = tile(solve_unit_cell(plan.device, background, cells=_CELLS), mesh)
+    pattern = np.full(solver.pixel_shape, background)
     columns, rows = list(mesh.pixels("x")), list(mesh.pixels("y"))
     for (i, j), charge in charges.items():
         if i in columns and j in rows:
@@ -122,7 +127,9 @@ def _solve(
     return solver.solve(pattern, start=start)
 
 
-def superposition_error(plan: Plan, charges: dict[tuple[int, int], float]) -> float:
+def superposition_error(
+    plan: Plan, charges: dict[tuple[int, int], float], background: float = 0.0
+) -> float:
     """Error of adding the shifts of single pixels, relative to the shifts.
 
     Parameters
@@ -130,7 +137,9 @@ def superposition_error(plan: Plan, charges: dict[tuple[int, int], float]) -> fl
     plan : Plan
         Gives device and top depth.
     charges : dict
-        Electrons by pixel offset, on empty neighbours.
+        Electrons by pixel offset.
+    background : float
+        Electrons in all other pixels.
 
     Returns
     -------
@@ -144,7 +153,9 @@ def superposition_error(plan: Plan, charges: dict[tuple[int, int], float]) -> fl
         charges.get((-i, -j), 0) == q and charges.get((i, -j), 0) == q
         for (i, j), q in charges.items()
     )
-    lines = find_boundaries(_solve(plan, charges, symmetric=even), depths, reach=_REACH)
+    lines = find_boundaries(
+        _solve(plan, charges, symmetric=even, background=background), depths, reach=_REACH
+    )
     true = lines.vertices(_VERTICES, fractions)
     furthest = max(max(abs(i), abs(j)) for i, j in charges)
     singles: dict[float, tuple[NDArray[np.float64], ...]] = {}
@@ -191,4 +202,8 @@ def assess(plan: Plan) -> dict[str, float]:
         "superposition, y pair at half full well [%]": 100
         * superposition_error(plan, {(0, 0): charge, (0, 1): charge}),
         "superposition, star at half full well [%]": 100 * superposition_error(plan, star),
+        "superposition, star on a quarter full well [%]": 100
+        * superposition_error(
+            plan, {o: 0.5 * charge + q for o, q in star.items()}, background=0.5 * charge
+        ),
     }

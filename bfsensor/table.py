@@ -12,6 +12,7 @@ import os
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -22,10 +23,12 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from bfsensor.errors import TableError
-from bfsensor.simulate.boundaries import mirror_quadrant
 
 SCHEMA = "bfsensor distortion table"
 SCHEMA_VERSION = 1
+
+_ARRAYS = ("corners", "horizontal", "vertical")
+_AXES = ("charges", "backgrounds", "depths")
 
 
 def vertex_fractions(vertices: int) -> NDArray[np.float64]:
@@ -72,7 +75,7 @@ class DistortionTable:
     backgrounds : ndarray, shape (nb,)
         Charge of every other pixel [e-], ascending.
     depths : ndarray, shape (nd,)
-        Conversion depths [um above the gates], ascending.
+        Conversion depths [um above the gates], ascending, above 0 up to the thickness.
     pitch : tuple of float
         Pixel pitch in x and y [um].
     thickness : float
@@ -90,7 +93,7 @@ class DistortionTable:
     full_well : float
         Charge at which a pixel spills along its column [e-]; nan where not known.
     errors : mapping of str to float
-        Estimated errors, units in the names.
+        Estimated errors, units in the names; nan where an estimate failed.
     provenance : mapping of str to str
         How it was made.
     device_text : str
@@ -101,8 +104,12 @@ class DistortionTable:
     Notes
     -----
     Where the source charge equals the background nothing moves.  Between levels the
-    response D / (Q - B) is interpolated (cubic splines in charge and background, monotone
-    cubics in the logarithm of depth) and multiplied by Q - B: this holds everywhere.
+    response D / (Q - B) is interpolated and multiplied by Q - B, so that this holds
+    everywhere: cubic splines in charge and background (below four levels the polynomial
+    through them), monotone cubics in the logarithm of depth.  At a node with Q = B the
+    response is that of the polynomial through the three nearest charges.  Nodes come back
+    to round-off.  A table of one charge is linear in charge from 0 on, as GalSim's are.
+
     Arrays are kept in single precision (1e-7 of a displacement) so that reading what was
     written gives the same bits.
 
@@ -132,7 +139,8 @@ class DistortionTable:
     symmetric: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("charges", "backgrounds", "depths"):
+        self._check_numbers()
+        for name in _AXES:
             axis = np.array(getattr(self, name), float)
             if (
                 axis.ndim != 1
@@ -141,23 +149,27 @@ class DistortionTable:
                 or np.any(np.diff(axis) <= 0)
             ):
                 raise TableError(f"{name} = {axis.tolist()} must be finite and ascend")
-            axis.flags.writeable = False
-            object.__setattr__(self, name, axis)
+            _keep(self, name, axis)
         if self.charges[0] < 0 or self.backgrounds[0] < 0:
             raise TableError("charges and backgrounds must not be negative")
         if self.depths[0] <= 0:
             raise TableError(
                 f"depths = {self.depths.tolist()} must be above the gates, 0 um"
             )
-        n, nv = 2 * self.reach + 1, self.vertices
-        levels = (len(self.charges), len(self.backgrounds), len(self.depths))
-        shapes = {
-            "corners": (*levels, n + 1, n + 1, 2),
-            "horizontal": (*levels, n + 1, n, nv, 2),
-            "vertical": (*levels, n, n + 1, nv, 2),
-        }
-        for name, shape in shapes.items():
-            array = np.array(getattr(self, name), np.float32).astype(float)
+        if self.depths[-1] > self.thickness * (1 + 1e-9):
+            raise TableError(
+                f"depths = {self.depths.tolist()} um must not be above the thickness, "
+                f"{self.thickness:g} um"
+            )
+        if len(self.charges) == 1 and self.charges[0] in self.backgrounds:
+            raise TableError(
+                f"charges = {self.charges.tolist()} e- must hold one that differs from the "
+                f"background, {self.charges[0]:g} e-: where they are equal nothing moves"
+            )
+        for name, shape in self._shapes().items():
+            with np.errstate(over="ignore"):
+                # Adding 0 turns -0 into 0, so that mirrored arrays are equal in their bits.
+                array = np.array(getattr(self, name), np.float32).astype(float) + 0.0
             if array.shape != shape:
                 raise TableError(f"{name} has the shape {array.shape}, not {shape}")
             if not np.all(np.isfinite(array)):
@@ -167,22 +179,58 @@ class DistortionTable:
                     f"{name} holds shifts where the charge equals the background and "
                     "nothing moves"
                 )
-            array.flags.writeable = False
-            object.__setattr__(self, name, array)
+            _keep(self, name, array)
+        errors = {str(k): float(v) for k, v in self.errors.items()}
+        provenance = {str(k): str(v) for k, v in self.provenance.items()}
+        object.__setattr__(self, "errors", MappingProxyType(errors))
+        object.__setattr__(self, "provenance", MappingProxyType(provenance))
+
+    def _check_numbers(self) -> None:
+        for name, low in (("vertices", 1), ("reach", 0)):
+            value = getattr(self, name)
+            if int(value) != value or value < low:
+                raise TableError(f"{name} = {value} must be a whole number from {low}")
+            object.__setattr__(self, name, int(value))
+        if len(self.pitch) != 2:
+            raise TableError(f"pitch = {self.pitch} um must be the pitch in x and in y")
         object.__setattr__(self, "pitch", (float(self.pitch[0]), float(self.pitch[1])))
-        for name in ("errors", "provenance"):
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+        for name in ("thickness", "full_well"):
+            object.__setattr__(self, name, float(getattr(self, name)))
+        object.__setattr__(self, "symmetric", bool(self.symmetric))
+        for name, value in (
+            ("pitch x", self.pitch[0]),
+            ("pitch y", self.pitch[1]),
+            ("thickness", self.thickness),
+        ):
+            if not 0 < value < np.inf:
+                raise TableError(f"{name} = {value} um must be finite and above 0 um")
+        if not (np.isnan(self.full_well) or 0 < self.full_well < np.inf):
+            raise TableError(
+                f"full_well = {self.full_well} e- must be above 0 e- (nan: not known)"
+            )
+
+    def _shapes(self) -> dict[str, tuple[int, ...]]:
+        levels = (len(self.charges), len(self.backgrounds), len(self.depths))
+        n, nv = 2 * self.reach + 1, self.vertices
+        return {
+            "corners": (*levels, n + 1, n + 1, 2),
+            "horizontal": (*levels, n + 1, n, nv, 2),
+            "vertical": (*levels, n, n + 1, nv, 2),
+        }
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, DistortionTable):
             return NotImplemented
         for name in self.__dataclass_fields__:
             a, b = getattr(self, name), getattr(other, name)
-            same = (
-                np.array_equal(a, b, equal_nan=True)
-                if isinstance(a, np.ndarray | float)
-                else a == b
-            )
+            if name == "errors":
+                same = a.keys() == b.keys() and all(
+                    np.array_equal(a[k], b[k], equal_nan=True) for k in a
+                )
+            elif isinstance(a, np.ndarray | float):
+                same = np.array_equal(a, b, equal_nan=True)
+            else:
+                same = a == b
             if not same:
                 return False
         return True
@@ -208,7 +256,7 @@ class DistortionTable:
             )
             for b in range(step.shape[1]):
                 known = step[:, b] != 0
-                if known.all() or not known.any():
+                if known.all():
                     continue
                 missing = int(np.nonzero(~known)[0][0])
                 order = np.argsort(np.abs(self.charges[known] - self.charges[missing]))[:3]
@@ -237,7 +285,7 @@ class DistortionTable:
         Raises
         ------
         TableError
-            A value outside the table; names the range.
+            A value outside the table; names the range, and for the charge the full well.
         """
         low = 0.0 if len(self.charges) == 1 else float(self.charges[0])
         well = "" if np.isnan(self.full_well) else f" (full well {self.full_well:,.0f} e-)"
@@ -270,7 +318,7 @@ class DistortionTable:
             )
 
     def nominal(self) -> Displacements:
-        """Give the vertices (x, y) [um] of undistorted pixels, the source's centre at 0."""
+        """Give the positions (x, y) [um] of undistorted vertices, source centre at 0."""
         n = 2 * self.reach + 1
         x = (np.arange(n + 1) - self.reach - 0.5) * self.pitch[0]
         y = (np.arange(n + 1) - self.reach - 0.5) * self.pitch[1]
@@ -283,7 +331,7 @@ class DistortionTable:
         return Displacements(corners, horizontal, vertical)
 
     def _outlines(self, moved: Displacements) -> NDArray[np.float64]:
-        """Join polygons, (n, n, 4 nv + 4, 2), counter-clockwise from the lower left."""
+        """Polygons of all pixels, (n, n, 4 nv + 4, 2), anticlockwise from lower left."""
         at = self.nominal()
         c = at.corners + moved.corners
         h = at.horizontal + moved.horizontal
@@ -304,7 +352,7 @@ class DistortionTable:
         Parameters
         ----------
         i, j : int
-            Offset in x and in y [pixel].
+            Offset in x and in y [pixel], whole numbers from -reach to reach.
         charge, background, depth : float
             As in :meth:`displacements`.
 
@@ -312,7 +360,12 @@ class DistortionTable:
         -------
         points : ndarray, shape (4 vertices + 4, 2)
             Vertices (x, y) [um], the source pixel's centre at 0, counter-clockwise from the
-            middle of the left side as in GalSim's tables.
+            middle of the left side, just below the pixel's centre, as in GalSim's tables.
+
+        Raises
+        ------
+        TableError
+            An offset or a value outside the table.
         """
         if max(abs(i), abs(j)) > self.reach:
             raise TableError(
@@ -320,9 +373,7 @@ class DistortionTable:
             )
         moved = self.displacements(charge=charge, background=background, depth=depth)
         outline = self._outlines(moved)[j + self.reach, i + self.reach]
-        return np.roll(
-            outline, self.vertices - self.vertices // 2 - self.vertices % 2, axis=0
-        )
+        return np.roll(outline, self.vertices // 2, axis=0)
 
     def areas(
         self, *, charge: float, background: float = 0.0, depth: float
@@ -356,26 +407,33 @@ class DistortionTable:
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write a FITS file (beside, then renamed).
 
+        Of a table that is mirror-symmetric bit for bit only a quadrant is stored.
+
+        Parameters
+        ----------
+        path : path-like
+            Where to.
+        overwrite : bool
+            Replace an existing file.
+
         Raises
         ------
         TableError
-            The file exists and ``overwrite`` is not set.
+            The file exists and ``overwrite`` is not set, or it cannot be written.
         """
         from astropy.io import fits
 
         path = Path(path)
         if path.exists() and not overwrite:
             raise TableError(f"{path} exists; say overwrite to replace it")
-        arrays = {
-            "CORNERS": self.corners,
-            "HORIZONTAL": self.horizontal,
-            "VERTICAL": self.vertical,
-        }
-        quadrant = self.symmetric and self._expand(
-            {k: _quadrant(k, v) for k, v in arrays.items()}
-        ) == arrays_key(arrays)
+        arrays = {name: getattr(self, name) for name in self._shapes()}
+        quadrants = {name: _quadrant(array) for name, array in arrays.items()}
+        quadrant = self.symmetric and all(
+            np.array_equal(_whole(name, quadrants[name]), array)
+            for name, array in arrays.items()
+        )
         if quadrant:
-            arrays = {k: _quadrant(k, v) for k, v in arrays.items()}
+            arrays = quadrants
         primary = fits.PrimaryHDU()
         header = primary.header
         header["SCHEMA"] = (SCHEMA, "what this file is")
@@ -393,17 +451,22 @@ class DistortionTable:
                 self.full_well,
                 "[electron] charge at which a pixel spills",
             )
+        header["DATE"] = (
+            datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"),
+            "[UTC] when this file was written",
+        )
+        # For people who look at the header; META is what is read back.
+        for key, text in self.provenance.items():
+            header["HISTORY"] = _printable(f"{key} = {text}")
+        for key, error in self.errors.items():
+            header["COMMENT"] = _printable(f"error: {key} = {error:.3g}")
         hdus = [primary]
         for name, array in arrays.items():
-            hdu = fits.ImageHDU(array.astype(np.float32), name=name)
+            hdu = fits.ImageHDU(array.astype(np.float32), name=name.upper())
             hdu.header["BUNIT"] = "um"
             hdus.append(hdu)
-        for name, axis, unit in (
-            ("CHARGES", self.charges, "electron"),
-            ("BACKGROUNDS", self.backgrounds, "electron"),
-            ("DEPTHS", self.depths, "um"),
-        ):
-            hdu = fits.ImageHDU(axis.astype(float), name=name)
+        for name, unit in zip(_AXES, ("electron", "electron", "um"), strict=True):
+            hdu = fits.ImageHDU(getattr(self, name), name=name.upper())
             hdu.header["BUNIT"] = unit
             hdus.append(hdu)
         meta = json.dumps(
@@ -411,18 +474,16 @@ class DistortionTable:
             sort_keys=True,
         )
         for name, text in (("META", meta), ("DEVICE", self.device_text)):
-            hdus.append(
-                fits.ImageHDU(np.frombuffer(text.encode() or b"\n", np.uint8), name=name)
-            )
+            data = np.frombuffer(text.encode(), np.uint8) if text else None
+            hdus.append(fits.ImageHDU(data, name=name))
         beside = path.with_name(f"{path.name}.{os.getpid()}.part")
         try:
             fits.HDUList(hdus).writeto(beside, checksum=True, overwrite=True)
             os.replace(beside, path)
+        except OSError as error:
+            raise TableError(f"{path}: cannot be written: {error}") from None
         finally:
             beside.unlink(missing_ok=True)
-
-    def _expand(self, quadrant: dict[str, NDArray[np.float64]]) -> bytes:
-        return arrays_key(_whole(quadrant, self.reach, self.vertices))
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> DistortionTable:
@@ -434,78 +495,61 @@ class DistortionTable:
             Not such a file, an unknown schema, or damaged; names the file.
         """
         from astropy.io import fits
-        from astropy.utils.exceptions import AstropyUserWarning
+        from astropy.utils.exceptions import AstropyWarning
 
         path = Path(path)
         if not path.exists():
             raise TableError(f"{path}: no such file")
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("error", AstropyUserWarning)
-                # Opened here: astropy leaves a file open in which it finds a fault.
-                with (
-                    path.open("rb") as stream,
-                    fits.open(stream, checksum=True, memmap=False) as hdus,
-                ):
+                # astropy only warns of a wrong checksum or a short file.
+                warnings.simplefilter("error", AstropyWarning)
+                # Opened here: astropy leaves a file open in whose headers it fails.
+                with open(path, "rb") as stream, fits.open(stream, checksum=True) as hdus:
                     header = hdus[0].header
-                    if header.get("SCHEMA") != SCHEMA:
-                        raise TableError(
-                            f"{path}: not a distortion table (no SCHEMA = '{SCHEMA}')"
-                        )
-                    if header.get("SCHEMAV") != SCHEMA_VERSION:
-                        raise TableError(
-                            f"{path}: schema version {header.get('SCHEMAV')} is not "
-                            f"{SCHEMA_VERSION}, the one this version of bfsensor reads"
-                        )
-                    data = {hdu.name: np.array(hdu.data) for hdu in hdus[1:]}
-        except (OSError, AstropyUserWarning, ValueError, KeyError, TypeError) as error:
-            if isinstance(error, TableError):
-                raise
-            raise TableError(f"{path}: not a FITS file, or damaged: {error}") from None
+                    _check_schema(header, path)
+                    data = {hdu.name: hdu.data for hdu in hdus[1:]}
+                    hdus[0].verify("exception")
+        except TableError:
+            raise
+        # Damaged headers end in many kinds of exception inside astropy.
+        except Exception as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise TableError(f"{path}: not a FITS file, or damaged: {reason}") from None
+        needed = [name.upper() for name in (*_ARRAYS, *_AXES, "meta", "device")]
+        missing = [name for name in needed if name not in data]
+        if missing:
+            raise TableError(f"{path}: truncated: {', '.join(missing)} is missing")
         try:
-            return cls._from_file(header, data)
-        except TableError as error:
+            return cls._from_parts(header, data)
+        except KeyError as error:
+            raise TableError(
+                f"{path}: not a FITS file, or damaged: {error.args[0]}"
+            ) from None
+        except (ValueError, TypeError, AttributeError, IndexError) as error:
             raise TableError(f"{path}: {error}") from None
-        except (ValueError, KeyError, TypeError) as error:
-            raise TableError(f"{path}: not a FITS file, or damaged: {error}") from None
 
     @classmethod
-    def _from_file(cls, header: Any, data: dict[str, NDArray[Any]]) -> DistortionTable:
-        """Assemble a table from the primary header and the arrays of its file."""
-        needed = {
-            "CORNERS",
-            "HORIZONTAL",
-            "VERTICAL",
-            "CHARGES",
-            "BACKGROUNDS",
-            "DEPTHS",
-            "META",
-            "DEVICE",
-        }
-        if missing := needed - set(data):
-            raise TableError(f"truncated: {', '.join(sorted(missing))} is missing")
-        arrays = {k: data[k].astype(float) for k in ("CORNERS", "HORIZONTAL", "VERTICAL")}
-        reach, vertices = int(header["REACH"]), int(header["VERTICES"])
-        if header["QUADRANT"]:
-            arrays = _whole(arrays, reach, vertices)
-        meta = json.loads(data["META"].astype(np.uint8).tobytes())
-        device_text = data["DEVICE"].astype(np.uint8).tobytes().decode()
+    def _from_parts(
+        cls, header: Mapping[str, Any], data: dict[str, Any]
+    ) -> DistortionTable:
+        arrays = {}
+        for name in _ARRAYS:
+            array = np.array(data[name.upper()], float)
+            arrays[name] = _whole(name, array) if header["QUADRANT"] else array
+        meta = json.loads(_text(data["META"]))
         return cls(
-            charges=data["CHARGES"].astype(float),
-            backgrounds=data["BACKGROUNDS"].astype(float),
-            depths=data["DEPTHS"].astype(float),
+            **{name: np.array(data[name.upper()], float) for name in _AXES},
             pitch=(header["PITCHX"], header["PITCHY"]),
             thickness=header["THICKNSS"],
-            vertices=vertices,
-            reach=reach,
-            corners=arrays["CORNERS"],
-            horizontal=arrays["HORIZONTAL"],
-            vertical=arrays["VERTICAL"],
+            vertices=header["VERTICES"],
+            reach=header["REACH"],
             full_well=header.get("FULLWELL", float("nan")),
             errors=meta["errors"],
             provenance=meta["provenance"],
-            device_text="" if device_text == "\n" else device_text,
-            symmetric=bool(header["SYMMETRC"]),
+            device_text=_text(data["DEVICE"]),
+            symmetric=header["SYMMETRC"],
+            **arrays,
         )
 
 
@@ -513,57 +557,60 @@ def _make(values: dict[str, Any]) -> DistortionTable:
     return DistortionTable(**values)
 
 
-def arrays_key(arrays: dict[str, NDArray[np.float64]]) -> bytes:
-    """Give the arrays as bytes, signs of zero aside, to compare them bit for bit."""
-    return b"".join(
-        (arrays[k].astype(np.float32) + np.float32(0)).tobytes() for k in sorted(arrays)
-    )
+def _keep(table: DistortionTable, name: str, array: NDArray[np.float64]) -> None:
+    """Set a frozen attribute, read-only."""
+    array.flags.writeable = False
+    object.__setattr__(table, name, array)
 
 
-def _quadrant(name: str, array: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Take the part of an array with offsets from the source pixel's centre on."""
+def _check_schema(header: Mapping[str, Any], path: Path) -> None:
+    """Refuse what is not a table of the schema that this version reads."""
+    if header.get("SCHEMA") != SCHEMA:
+        raise TableError(f"{path}: not a distortion table (no SCHEMA = '{SCHEMA}')")
+    if header.get("SCHEMAV") != SCHEMA_VERSION:
+        raise TableError(
+            f"{path}: schema version {header.get('SCHEMAV')} is not {SCHEMA_VERSION}, the "
+            "one this version of bfsensor reads"
+        )
+
+
+def _printable(text: str) -> str:
+    """Turn text into what a FITS header may hold."""
+    return text.encode("unicode_escape").decode("ascii")
+
+
+def _text(data: NDArray[np.uint8] | None) -> str:
+    """Decode the text of an extension; none where it has no data."""
+    return "" if data is None else data.astype(np.uint8).tobytes().decode()
+
+
+def _quadrant(array: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cut out the offsets from the source pixel's centre on."""
     ny, nx = array.shape[3:5]
     return array[:, :, :, ny // 2 :, nx // 2 :]
 
 
-def _whole(
-    quadrant: dict[str, NDArray[np.float64]], reach: int, vertices: int
-) -> dict[str, NDArray[np.float64]]:
-    """Mirror quadrants to whole arrays."""
-    n = 2 * reach + 1
-    levels = quadrant["CORNERS"].shape[:3]
-    flat = int(np.prod(levels))
-    shapes = {
-        "CORNERS": (n + 1, n + 1, 2),
-        "HORIZONTAL": (n + 1, n, vertices, 2),
-        "VERTICAL": (n, n + 1, vertices, 2),
-    }
-    out = {}
-    for name, shape in shapes.items():
-        whole = np.zeros((flat, *shape))
-        part = quadrant[name].reshape(flat, *quadrant[name].shape[3:])
-        whole[:, -part.shape[1] :, -part.shape[2] :] = part
-        out[name] = whole
-    mirror_quadrant(out["CORNERS"], out["HORIZONTAL"], out["VERTICAL"])
-    return {name: whole.reshape(*levels, *whole.shape[1:]) for name, whole in out.items()}
+def _whole(name: str, quadrant: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mirror a quadrant to the whole array; the source's own row and column stay."""
+    x, y, vertex = 4, 3, 5
+    for axis, sides, sign in ((x, "horizontal", (-1.0, 1.0)), (y, "vertical", (1.0, -1.0))):
+        mirrored = np.flip(quadrant, axis) * np.array(sign)
+        if name == sides:  # its vertices run along the axis, and it counts pixels there
+            mirrored = np.flip(mirrored, vertex)
+            mirrored = np.delete(mirrored, -1, axis)
+        quadrant = np.concatenate([mirrored, quadrant], axis) + 0.0
+    return quadrant
 
 
 def _lagrange(nodes: NDArray[np.float64], at: float) -> NDArray[np.float64]:
     """Weights of the polynomial through ``nodes`` at ``at``."""
-    out = np.ones(len(nodes))
-    for i in range(len(nodes)):
-        for k in range(len(nodes)):
-            if i != k:
-                out[i] *= (at - nodes[k]) / (nodes[i] - nodes[k])
-    return out
+    ratios = (at - nodes) / (nodes[:, None] - nodes + np.eye(len(nodes)))
+    np.fill_diagonal(ratios, 1.0)
+    return np.asarray(ratios.prod(axis=1))
 
 
 def _spline_weights(nodes: NDArray[np.float64], at: float) -> NDArray[np.float64]:
     """Weights of the cubic spline through ``nodes`` at ``at`` (a polynomial below four)."""
     if len(nodes) < 4:
-        return (
-            _lagrange(nodes, float(np.clip(at, nodes[0], nodes[-1])))
-            if len(nodes) > 1
-            else np.ones(1)
-        )
+        return _lagrange(nodes, at)
     return np.asarray(CubicSpline(nodes, np.eye(len(nodes)))(at))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bfsensor.errors import DeviceError
@@ -56,6 +56,7 @@ def test_conversions(text, kind, value):
 
 
 @pytest.mark.parametrize("kind", WRITTEN)
+@settings(deadline=None)
 @given(value=st.floats(-1e12, 1e12))
 def test_what_is_written_reads_as_the_same_float(kind, value):
     assert to_internal(from_internal(value, kind, WRITTEN[kind]), kind) == value

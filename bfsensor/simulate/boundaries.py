@@ -335,14 +335,14 @@ def find_boundaries(
         A boundary was not found (a well that no longer holds its charge).
     """
     mesh = potential.mesh
-    depths = np.array(depths, dtype=np.float64, ndmin=1)
+    levels: NDArray[np.float64] = np.array(depths, dtype=np.float64, ndmin=1)
     surfaces = Surfaces.of(potential.device)
     lowest = lowest_depth(potential)
-    if np.any(np.diff(depths) <= 0):
-        raise TableError(f"conversion depths {depths.tolist()} um must ascend")
-    if depths[0] < lowest - 1e-9 or depths[-1] > mesh.z[-1] + 1e-9:
+    if np.any(np.diff(levels) <= 0):
+        raise TableError(f"conversion depths {levels.tolist()} um must ascend")
+    if levels[0] < lowest - 1e-9 or levels[-1] > mesh.z[-1] + 1e-9:
         raise TableError(
-            f"conversion depth {depths[0] if depths[0] < lowest else depths[-1]:g} um must lie in "
+            f"conversion depth {levels[0] if levels[0] < lowest else levels[-1]:g} um must lie in "
             f"the silicon, from {lowest:.3g} um (where charge is stored) to {mesh.z[-1]:g} um "
             "(back surface)"
         )
@@ -357,7 +357,7 @@ def find_boundaries(
     for axis in (0, 1):
         pitch, along = mesh.pitch[axis], mesh.pitch[1 - axis]
         first = 0 if symmetric else -reach - 1
-        edges = (np.arange(first, reach + 1) + 0.5) * pitch
+        edges = np.array((np.arange(first, reach + 1) + 0.5) * pitch, np.float64)
         seeds = _seed_positions(reach, along, samples, symmetric)
         half_period = mesh.period[axis] / 2
         if (
@@ -368,12 +368,12 @@ def find_boundaries(
                 f"reach = {reach} pixels does not fit a period of {mesh.period} um"
             )
         lines.append(
-            _trace_lines(field, axis, edges, seeds, depths, split, coarseness, ratio)
+            _trace_lines(field, axis, edges, seeds, levels, split, coarseness, ratio)
         )
     columns, rows = lines
     if symmetric:
         columns, rows = _unfold(columns, 0), _unfold(rows, 1)
-    return PixelBoundaries(depths, mesh.pitch, reach, columns, rows, symmetric)
+    return PixelBoundaries(levels, mesh.pitch, reach, columns, rows, symmetric)
 
 
 def lowest_depth(potential: Potential) -> float:

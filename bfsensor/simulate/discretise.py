@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor.errors import DeviceError
 from bfsensor.simulate.mesh import Mesh, Side, Surfaces
 from bfsensor.units import VACUUM_PERMITTIVITY
 
@@ -94,7 +95,16 @@ def discretise(device: Device, mesh: Mesh) -> Coefficients:
     Returns
     -------
     Coefficients
+
+    Raises
+    ------
+    DeviceError
+        The device has an edge.
     """
+    if device.edge is not None:
+        raise DeviceError(
+            f"{device.name}: edge: strips beyond the last pixel are described but not solved yet"
+        )
     surfaces = Surfaces.of(device)
     material = device.material
     eps_si = material.permittivity_silicon * VACUUM_PERMITTIVITY

@@ -128,6 +128,11 @@ def make_mesh(
     DeviceError
         ``cells`` or ``pixels`` do not fit the device or its symmetry.
     """
+    if symmetric and not device.is_mirror_symmetric:
+        raise DeviceError(
+            f"{device.name}: ripples, an edge or dots off centre leave no mirror planes; solve "
+            "the whole period (symmetric=False)"
+        )
     if cells < 8 or cells % 2:
         raise DeviceError(
             f"cells = {cells} must be an even number of at least 8 cells a pixel"

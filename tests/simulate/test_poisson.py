@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from bfsensor.device import Device, Implant
+from bfsensor.device import Device, Edge, EdgeStrip, Implant, Ripple
 from bfsensor.errors import ConvergenceError, DeviceError
 from bfsensor.simulate import poisson
 from bfsensor.simulate.discretise import discretise
@@ -297,6 +297,28 @@ def test_a_large_step_in_charge_does_not_raise_holes_in_the_channel():
     assert solution.error_volts < poisson.TOLERANCE
 
 
+def test_a_doping_ripple_is_solved_on_the_whole_period():
+    device = Device.load("itl_sta3800c")
+    ripple = Ripple("plane", amplitude=0.1, period=40.0)
+    rippled = dataclasses.replace(
+        device, silicon=dataclasses.replace(device.silicon, ripples=(ripple,))
+    )
+    mesh = make_mesh(rippled, pixels=(4, 4), cells=8, symmetric=False)
+    solver = Electrostatics(rippled, mesh)
+    phi = solver.solve(0.0).phi
+    k = int(np.argmin(np.abs(mesh.z - 50.0)))
+    column = phi[k].mean(axis=0)
+    n = len(mesh.x)
+    # More acceptors lower the potential: the ripple is seen in antiphase, with the amplitude
+    # of one Fourier mode between grounded planes, dn / (eps k^2) away from them.
+    wave = 2 / n * np.sum((column - column.mean()) * np.cos(2 * np.pi * mesh.x / 40.0))
+    eps = device.material.permittivity_silicon * VACUUM_PERMITTIVITY
+    k2 = (2 * np.pi / 40.0) ** 2
+    assert wave == pytest.approx(-2.4 * 0.1 / (eps * k2), rel=0.03)
+    with pytest.raises(DeviceError, match="leave no mirror planes"):
+        make_mesh(rippled, pixels=(4, 4), cells=8)
+
+
 def test_refusals():
     device = Device.load("itl_sta3800c")
     solver = Electrostatics(device, make_mesh(device, pixels=(1, 1), cells=8))
@@ -304,6 +326,9 @@ def test_refusals():
         solver.solve(-5.0)
     with pytest.raises(DeviceError, match=r"cells = 7 must be an even number"):
         make_mesh(device, cells=7)
+    edged = dataclasses.replace(device, edge=Edge("x", (EdgeStrip(20.0, voltage=5.0),)))
+    with pytest.raises(DeviceError, match="described but not solved yet"):
+        discretise(edged, make_mesh(edged, pixels=(2, 2), cells=8, symmetric=False))
     shallow = device.with_value("back_bias", "-1 V")
     with pytest.raises(DeviceError, match="free holes reach"):
         solve_unit_cell(shallow.with_value("background_doping", "-4e13 cm-3"), 0.0, cells=8)
