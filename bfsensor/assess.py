@@ -32,10 +32,11 @@ STAR = {
 
 
 def mesh_errors(plan: Plan) -> dict[str, float]:
-    """Estimate the mesh error of the nearest area changes at one charge.
+    """Estimate the mesh error of the nearest area changes, on an empty and a filled array.
 
-    Solves at the plan's mesh and at half of it; for an error of second order a third of the
-    difference is left.
+    Solves half a full well at the plan's mesh and at half of it; for an error of second
+    order a third of the difference is left.  On the background the difference of two
+    charge clouds counts, and where their edges fall between nodes the error is not smooth.
 
     Parameters
     ----------
@@ -45,35 +46,48 @@ def mesh_errors(plan: Plan) -> dict[str, float]:
     Returns
     -------
     errors : dict
-        ``mesh (i,j) [%]`` for the centre and the three nearest lags.
+        ``mesh (i,j) [%]`` for the centre and the three nearest lags, and
+        ``mesh (0,0) on a background [%]`` for a quarter of the full well.
     """
-    charge = max(plan.charges) / 2
-    changes = []
-    for cells in (plan.cells // 2, plan.cells):
-        one = replace(
-            plan,
-            charges=(charge,),
-            backgrounds=(0.0,),
-            depths=plan.depths[-1:],
-            vertices=_VERTICES,
-            cells=cells,
-        )
-        level = solve_level(one, charge, 0.0)
-        table = DistortionTable(
-            charges=np.array([charge]), backgrounds=np.zeros(1),
-            depths=np.array(one.depths),
-            pitch=(plan.device.pixel.pitch_x, plan.device.pixel.pitch_y),
-            thickness=plan.device.silicon.thickness, vertices=_VERTICES, reach=plan.reach,
-            corners=level.corners[None, None], horizontal=level.horizontal[None, None],
-            vertical=level.vertical[None, None],
-        )  # fmt: skip
-        changes.append(table.area_changes(charge=charge, depth=one.depths[0]))
-    r = plan.reach
+    charge = plan.full_well / 2
     out = {}
-    for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        coarse, fine = (a[r + j, r + i] for a in changes)
-        out[f"mesh ({i},{j}) [%]"] = float(100 * abs(fine - coarse) / 3 / abs(fine))
+    for background, label in ((0.0, ""), (plan.full_well / 4, " on a background")):
+        changes = [
+            _area_changes(replace(plan, cells=cells), charge, background)
+            for cells in (plan.cells // 2, plan.cells)
+        ]
+        lags = ((0, 0), (1, 0), (0, 1), (1, 1)) if background == 0 else ((0, 0),)
+        for i, j in lags:
+            coarse, fine = (a[plan.reach + j, plan.reach + i] for a in changes)
+            out[f"mesh ({i},{j}){label} [%]"] = float(
+                100 * abs(fine - coarse) / 3 / abs(fine)
+            )
     return out
+
+
+def _area_changes(plan: Plan, charge: float, background: float) -> NDArray[np.float64]:
+    """Area changes [um^2] of one level at the top depth of a plan."""
+    one = replace(
+        plan,
+        charges=(charge,),
+        backgrounds=(background,),
+        depths=plan.depths[-1:],
+        vertices=_VERTICES,
+    )
+    level = solve_level(one, charge, background)
+    table = DistortionTable(
+        charges=np.array([charge]),
+        backgrounds=np.array([background]),
+        depths=np.array(one.depths),
+        pitch=(plan.device.pixel.pitch_x, plan.device.pixel.pitch_y),
+        thickness=plan.device.silicon.thickness,
+        vertices=_VERTICES,
+        reach=plan.reach,
+        corners=level.corners[None, None],
+        horizontal=level.horizontal[None, None],
+        vertical=level.vertical[None, None],
+    )
+    return table.area_changes(charge=charge, background=background, depth=one.depths[0])
 
 
 def tracing_error(plan: Plan) -> float:
@@ -164,7 +178,7 @@ def superposition_error(
         key = round(charge, 3)
         if key not in singles:
             alone: PixelBoundaries = find_boundaries(
-                _solve(plan, {(0, 0): charge}, symmetric=True),
+                _solve(plan, {(0, 0): charge}, symmetric=True, background=background),
                 depths,
                 reach=_REACH + furthest,
             )

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+import bfsensor
 from bfsensor.errors import TableError
 from bfsensor.simulate.boundaries import SPLIT_HEIGHT, find_boundaries
 from bfsensor.simulate.far_field import FarField, image_shifts
@@ -79,6 +80,7 @@ class Plan:
         """Digest that changes with anything that would change a level."""
         text = json.dumps(
             [
+                bfsensor.__version__,
                 self.device.to_toml(),
                 self.charges,
                 self.backgrounds,
@@ -127,17 +129,21 @@ class Level:
 
 
 def default_depths(device: Device) -> tuple[float, ...]:
-    """Six conversion depths [um above the gates], from the stored charge to the light side.
+    """Seven conversion depths [um above the gates], from the stored charge to the light side.
 
     At the first, the height of the charge (0.3 um into the silicon of the channel), nothing
-    moves; the response rises over one pixel pitch and is nearly flat beyond four.
+    moves; the second is the lowest at which every electron's well is well defined.  The
+    response rises over one pixel pitch and is nearly flat beyond four.
     """
     surfaces = Surfaces.of(device)
     thickness = device.silicon.thickness
     pitch = 0.5 * (device.pixel.pitch_x + device.pixel.pitch_y)
-    low = max(surfaces.silicon_channel, surfaces.silicon_stop) + SPLIT_HEIGHT
-    inner = [d for d in (pitch, 2.0 * pitch, 4.0 * pitch) if low + 1 < d < 0.8 * thickness]
-    return (storage_height(device), low, *inner, thickness)
+    deepest = max(surfaces.silicon_channel, surfaces.silicon_stop)
+    low = (deepest + 2.0, deepest + SPLIT_HEIGHT)
+    inner = [
+        d for d in (pitch, 2.0 * pitch, 4.0 * pitch) if low[1] + 1 < d < 0.8 * thickness
+    ]
+    return (storage_height(device), *low, *inner, thickness)
 
 
 def storage_height(device: Device) -> float:
@@ -299,7 +305,7 @@ def solve_level(plan: Plan, charge: float, background: float) -> Level:
         ):
             whole[~fixed] = found
     far = FarField.of(unit, depths, Surfaces.of(device).silicon_stop, 5 * max(mesh.period))
-    moved, share = _without_images(far, moved, mesh.pitch, mesh.period, fractions)
+    moved, share = without_images(far, moved, mesh.pitch, mesh.period, fractions)
     corners, horizontal, vertical = moved
     return Level(
         corners, horizontal, vertical, len(potential.history), potential.linear_iterations,
@@ -307,7 +313,7 @@ def solve_level(plan: Plan, charge: float, background: float) -> Level:
     )  # fmt: skip
 
 
-def _without_images(
+def without_images(
     far: FarField,
     moved: tuple[NDArray[np.float64], ...],
     pitch: tuple[float, float],
@@ -398,8 +404,6 @@ def build_table(
     -------
     DistortionTable
     """
-    import bfsensor
-
     wanted = [(q, b) for b in plan.backgrounds for q in plan.charges]
     levels: dict[tuple[float, float], Level] = {}
     folder = None

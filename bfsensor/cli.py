@@ -143,7 +143,7 @@ def _print_table(rows: Sequence[dict[str, Any]]) -> None:
     "--pixels", default=9, show_default=True, help="Width of the table [pixel], odd."
 )
 @click.option("--accuracy", default=0.01, show_default=True,
-              help="Mesh accuracy of area changes, relative to the largest.")  # fmt: skip
+              help="Mesh accuracy aimed at (measured errors go to the header).")  # fmt: skip
 @click.option("--workers", type=click.IntRange(min=1), default=2, show_default=True,
               help="Processes.")  # fmt: skip
 @click.option(

@@ -59,6 +59,30 @@ def read_configuration(path: str | os.PathLike[str]) -> dict[str, str]:
     return out
 
 
+_DEVICE_KEYS = re.compile(
+    r"(SensorThickness|PixelSize[XY]|BackgroundDoping|GateOxide|FieldOxide(Taper)?|GateGap|NumPhases"
+    r"|CollectingPhases|Vbb|Vparallel_(lo|hi)|qfh|CCDTemperature|NumberofFixedRegions"
+    r"|TreeRing(Amplitude|Period|Angle)"
+    r"|Channel(Stop|StopDot)?(Profile|Doping|Depth|SurfaceCharge|(Dose|Peak|Sigma)_\d+)"
+    r"|ChannelStop(Width|SideDiff|DotCenter|DotHeight))"
+)
+_DEVICE_LIKE = re.compile(
+    r"(Channel|Gate|Field|Background|Vbb|Vpar|qf|Top|TreeRing|CCDTemp)"
+)
+
+
+def _refuse_unknown(data: dict[str, str]) -> None:
+    """Refuse keys that look like part of the device and are not known."""
+    for key in data:
+        if _DEVICE_LIKE.match(key) and not _DEVICE_KEYS.fullmatch(key):
+            if key in ("GatePotential", "TopAbsorptionProb", "GateGapPotential"):
+                continue  # they act on tracking, or on gaps that are refused themselves
+            raise DeviceError(
+                f"{key} is not a key that a device file can hold (misspelt, or of another "
+                "version of the program)"
+            )
+
+
 def import_poisson_ccd(path: str | os.PathLike[str]) -> Device:
     """Read a Poisson_CCD configuration as a device.
 
@@ -127,6 +151,7 @@ def _device(name: str, data: dict[str, str]) -> Device:
             for i in range(count)
         )
 
+    _refuse_unknown(data)
     if number("TreeRingAmplitude", 0.0):
         raise DeviceError(
             f"TreeRingAmplitude = {data['TreeRingAmplitude']}: its period lacks a factor "
