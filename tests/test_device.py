@@ -640,3 +640,15 @@ def test_import_of_other_files(tmp_path):
     assert refusal(import_poisson_ccd, path).startswith(f"{path}: cannot be read: ")
     missing = tmp_path / "missing.cfg"
     assert refusal(import_poisson_ccd, missing).startswith(f"{missing}: cannot be read: ")
+
+
+@pytest.mark.parametrize(
+    "line", ["qfh1 = 1.0", "TopSurfaceDoping = 1e12", "ChannelStopDopng = -1e12"]
+)
+def test_import_refuses_device_keys_that_it_does_not_know(tmp_path, line):
+    source = Path(galsim.meta_data.share_dir) / "sensors" / "lsst_itl_50_8.cfg"
+    path = tmp_path / "other.cfg"
+    path.write_text(f"{source.read_text()}\n{line}\n")
+    key = line.split()[0]
+    with pytest.raises(DeviceError, match=rf"other\.cfg: {key} is not a key"):
+        import_poisson_ccd(path)

@@ -94,3 +94,14 @@ def test_unknown_names_are_refused():
         AttributeError, match=r"^module 'bfsensor' has no attribute 'Devise'$"
     ):
         bfsensor.Devise  # noqa: B018
+
+
+def test_unfinished_tables_do_not_ship():
+    # force-include would pack what .gitignore names; the wheel's own selection must not.
+    import tomllib
+
+    settings = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())
+    wheel = settings["tool"]["hatch"]["build"]["targets"]["wheel"]
+    assert "force-include" not in wheel
+    ignored = (Path(__file__).parents[1] / ".gitignore").read_text().splitlines()
+    assert "*.levels/" in ignored
