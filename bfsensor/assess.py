@@ -36,7 +36,7 @@ def mesh_errors(plan: Plan) -> dict[str, float]:
 
     Solves half a full well at the plan's mesh and at half of it; for an error of second
     order a third of the difference is left.  On the background the difference of two
-    charge clouds counts, and where their edges fall between nodes the error is not smooth.
+    charge clouds counts, and the error need not be smooth.
 
     Parameters
     ----------
