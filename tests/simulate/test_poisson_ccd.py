@@ -76,7 +76,7 @@ def exact_bulk(plane, z0, z, period, doping, top, eps):
         decay[0, 0] = (THICKNESS - value) / thick
         parabola = -doping / (2 * eps) * (value - z0) * (value - THICKNESS)
         out[number] = (
-            np.fft.ifft2(modes * decay).real + top * (value - z0) / thick - parabola * -1
+            np.fft.ifft2(modes * decay).real + top * (value - z0) / thick + parabola
         )
     return out
 
