@@ -85,7 +85,7 @@ def _load(name: str, settings: Sequence[tuple[str, str]]) -> Any:
 @main.command()
 @click.option("--json", "as_json", is_flag=True, help="Print JSON for a program to read.")
 def devices(as_json: bool) -> None:
-    r"""List the built-in devices.
+    """List the built-in devices.
 
     \b
     Example:
@@ -179,7 +179,7 @@ def table(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    r"""Solve a DEVICE (name or .toml) and write its distortion table.
+    """Solve a DEVICE (name or .toml) and write its distortion table.
 
     The table holds the displacement of every vertex of the pixel boundaries against the
     charge of a source pixel, the uniform charge of all others, and the conversion depth.
@@ -346,7 +346,7 @@ def device() -> None:
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 def import_(cfg: Path, output: Path | None, overwrite: bool) -> None:
-    r"""Turn a Poisson_CCD or GalSim configuration CFG into a device file.
+    """Turn a Poisson_CCD or GalSim configuration CFG into a device file.
 
     \b
     Example:
@@ -371,7 +371,7 @@ def import_(cfg: Path, output: Path | None, overwrite: bool) -> None:
     "-o", "--output", type=click.Path(path_type=Path), help="Figure [SOURCE.png]."
 )
 def show(source: str, settings: list[tuple[str, str]], output: Path | None) -> None:
-    r"""Draw a table (.fits, GalSim stem) or a DEVICE (name or .toml).
+    """Draw a table (.fits, GalSim stem) or a DEVICE (name or .toml).
 
     A table: distorted pixel boundaries with their areas, the response against charge,
     background and depth.  A device: potentials, carriers and electron paths of an empty and

@@ -327,3 +327,14 @@ def test_a_damaged_level_is_refused_by_name(run, tmp_path):
     assert result.stderr.splitlines()[-1].startswith(
         f"bfsensor: {path.relative_to(tmp_path)}: not a finished level"
     )
+
+
+@pytest.mark.parametrize(
+    "command", [["devices"], ["table"], ["device", "import"], ["show"]]
+)
+def test_help_shows_an_example_on_lines_of_its_own(command):
+    text = CliRunner().invoke(main, [*command, "--help"]).output
+    assert "\\b" not in text
+    lines = [line.strip() for line in text.splitlines()]
+    start = next(i for i, line in enumerate(lines) if line in ("Example:", "Examples:"))
+    assert lines[start + 1].startswith(f"bfsensor {' '.join(command)}")
