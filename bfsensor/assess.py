@@ -12,7 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.build import Plan, _workshop, solve_level
-from bfsensor.simulate.boundaries import PixelBoundaries, find_boundaries
+from bfsensor.simulate.boundaries import (
+    COARSENESS,
+    RATIO,
+    PixelBoundaries,
+    find_boundaries,
+)
 from bfsensor.simulate.mesh import make_mesh
 from bfsensor.simulate.poisson import Electrostatics, Potential, solve_unit_cell, tile
 from bfsensor.table import DistortionTable, vertex_fractions
@@ -108,7 +113,7 @@ def tracing_error(plan: Plan) -> float:
     depths = np.array(plan.depths[1:] if len(plan.depths) > 1 else plan.depths)
     usual = find_boundaries(potential, depths, reach=1)
     finer = find_boundaries(
-        potential, depths, reach=1, coarseness=0.25 / _FINER, ratio=0.1 / _FINER
+        potential, depths, reach=1, coarseness=COARSENESS / _FINER, ratio=RATIO / _FINER
     )
     return max(
         float(np.abs(a - b).max())

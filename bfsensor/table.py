@@ -20,9 +20,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline, PchipInterpolator
+from scipy.interpolate import PchipInterpolator
 
 from bfsensor.errors import TableError
+from bfsensor.interpolation import polynomial_weights, spline_weights
 
 SCHEMA = "bfsensor distortion table"
 SCHEMA_VERSION = 1
@@ -62,6 +63,21 @@ class Displacements:
     corners: NDArray[np.float64]
     horizontal: NDArray[np.float64]
     vertical: NDArray[np.float64]
+
+
+def nominal_positions(
+    pitch: tuple[float, float], reach: int, fractions: NDArray[np.float64]
+) -> Displacements:
+    """Positions (x, y) [um] of the vertices of undistorted pixels around (0, 0)."""
+    n = 2 * reach + 1
+    x = (np.arange(n + 1) - reach - 0.5) * pitch[0]
+    y = (np.arange(n + 1) - reach - 0.5) * pitch[1]
+    corners = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), -1)
+    along_x = (x[:-1, None] + fractions * pitch[0])[None]
+    along_y = (y[:-1, None] + fractions * pitch[1])[:, None]
+    horizontal = np.stack(np.broadcast_arrays(along_x, y[:, None, None]), -1)
+    vertical = np.stack(np.broadcast_arrays(x[None, :, None], along_y), -1)
+    return Displacements(corners, horizontal, vertical)
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,7 +277,7 @@ class DistortionTable:
                 missing = int(np.nonzero(~known)[0][0])
                 order = np.argsort(np.abs(self.charges[known] - self.charges[missing]))[:3]
                 near = np.nonzero(known)[0][np.sort(order)]
-                weights = _lagrange(self.charges[near], self.charges[missing])
+                weights = polynomial_weights(self.charges[near], self.charges[missing])
                 response[missing, b] = weights @ response[near, b]
             out.append(response.reshape(array.shape))
         return tuple(out)
@@ -295,8 +311,8 @@ class DistortionTable:
         )
         self._inside("depth", depth, self.depths[0], self.depths[-1], "um")
         wq, wb = (
-            _spline_weights(self.charges, charge),
-            _spline_weights(self.backgrounds, background),
+            spline_weights(self.charges, charge),
+            spline_weights(self.backgrounds, background),
         )
         out = []
         for response in self._responses:
@@ -319,16 +335,7 @@ class DistortionTable:
 
     def nominal(self) -> Displacements:
         """Give the positions (x, y) [um] of undistorted vertices, source centre at 0."""
-        n = 2 * self.reach + 1
-        x = (np.arange(n + 1) - self.reach - 0.5) * self.pitch[0]
-        y = (np.arange(n + 1) - self.reach - 0.5) * self.pitch[1]
-        f = vertex_fractions(self.vertices)
-        corners = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), -1)
-        along_x = (x[:-1, None] + f * self.pitch[0])[None]
-        along_y = (y[:-1, None] + f * self.pitch[1])[:, None]
-        horizontal = np.stack(np.broadcast_arrays(along_x, y[:, None, None]), -1)
-        vertical = np.stack(np.broadcast_arrays(x[None, :, None], along_y), -1)
-        return Displacements(corners, horizontal, vertical)
+        return nominal_positions(self.pitch, self.reach, vertex_fractions(self.vertices))
 
     def _outlines(self, moved: Displacements) -> NDArray[np.float64]:
         """Polygons of all pixels, (n, n, 4 nv + 4, 2), anticlockwise from lower left."""
@@ -600,17 +607,3 @@ def _whole(name: str, quadrant: NDArray[np.float64]) -> NDArray[np.float64]:
             mirrored = np.delete(mirrored, -1, axis)
         quadrant = np.concatenate([mirrored, quadrant], axis) + 0.0
     return quadrant
-
-
-def _lagrange(nodes: NDArray[np.float64], at: float) -> NDArray[np.float64]:
-    """Weights of the polynomial through ``nodes`` at ``at``."""
-    ratios = (at - nodes) / (nodes[:, None] - nodes + np.eye(len(nodes)))
-    np.fill_diagonal(ratios, 1.0)
-    return np.asarray(ratios.prod(axis=1))
-
-
-def _spline_weights(nodes: NDArray[np.float64], at: float) -> NDArray[np.float64]:
-    """Weights of the cubic spline through ``nodes`` at ``at`` (a polynomial below four)."""
-    if len(nodes) < 4:
-        return _lagrange(nodes, at)
-    return np.asarray(CubicSpline(nodes, np.eye(len(nodes)))(at))

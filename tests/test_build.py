@@ -7,9 +7,18 @@ import pytest
 
 from bfsensor import build
 from bfsensor.assess import assess, superposition_error
-from bfsensor.build import Level, build_table, default_depths, plan_table, solve_level
-from bfsensor.device import Device, Ripple
+from bfsensor.build import (
+    Level,
+    build_table,
+    default_depths,
+    plan_table,
+    solve_level,
+    storage_height,
+)
+from bfsensor.device import Device, Ripple, builtin_devices
 from bfsensor.errors import DeviceError, TableError
+from bfsensor.simulate.boundaries import lowest_depth
+from bfsensor.simulate.poisson import solve_unit_cell
 from bfsensor.simulate.well import barrier, full_well
 
 
@@ -65,6 +74,15 @@ def test_barrier_falls_as_the_well_fills(device):
         charges[0, 0] = charge
         heights.append(barrier(solver.solve(charges)))
     assert heights[0] > heights[1] > heights[2] > 0
+
+
+@pytest.mark.parametrize("name", builtin_devices())
+def test_the_lowest_level_is_where_the_charge_is_stored(name):
+    device = Device.load(name)
+    for charge in (2e4, 1.5e5):
+        found = lowest_depth(solve_unit_cell(device, charge, cells=16))
+        # The mean height of the electrons falls by 0.09 um as the well fills.
+        assert storage_height(device) == pytest.approx(found, abs=0.07)
 
 
 def test_default_plan_covers_the_well(device):

@@ -19,6 +19,7 @@ from bfsensor.device import Device
 from bfsensor.galsim_format import read_galsim
 from bfsensor.resources import tables_dir
 from bfsensor.table import DistortionTable
+from validation.write_results import write_results
 
 LAGS = (
     (0, 0),
@@ -101,8 +102,7 @@ def main() -> None:
     result = Table(rows)
     print("\n".join(result.pformat(max_lines=-1, max_width=-1)))
     if args.output:
-        result.meta = {"command": "python -m validation.compare_published"}
-        result.write(args.output, format="ascii.ecsv", overwrite=True)
+        write_results(result, args.output, "python -m validation.compare_published")
 
 
 def _row(

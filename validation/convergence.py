@@ -8,7 +8,6 @@ taken out (up to 32), on up to three z meshes, prints the table and writes it.
 from __future__ import annotations
 
 import argparse
-import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -22,6 +21,7 @@ from bfsensor.simulate.boundaries import find_boundaries
 from bfsensor.simulate.mesh import make_mesh
 from bfsensor.simulate.poisson import Electrostatics, solve_unit_cell, tile
 from bfsensor.table import DistortionTable, vertex_fractions
+from validation.write_results import write_results
 
 CHARGE = 1e5
 DEPTHS = (10.0, 50.0, 95.0)
@@ -108,17 +108,7 @@ def main() -> None:
     for name in args.device:
         _orders(table[table["device"] == name])
     if args.output:
-        commit = subprocess.run(
-            ["git", "rev-parse", "--short", "HEAD"],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        table.meta = {
-            "command": "python -m validation.convergence",
-            "commit": commit.stdout.strip(),
-        }
-        table.write(args.output, format="ascii.ecsv", overwrite=True)
+        write_results(table, args.output, "python -m validation.convergence")
 
 
 def _orders(table: Table) -> None:

@@ -32,8 +32,12 @@ Below it field lines bend sharply towards the wells; above they are smooth, rise
 and a backward trace is stable."""
 
 BISECTION = 1e-5  # um; a thirtieth of the tracing error that is promised
-_COARSENESS = 0.25  # step of the forward trace relative to the local scale
-_RATIO = 0.10  # step of the backward trace relative to the height
+COARSENESS = 0.25
+"""Step of the forward trace relative to the local scale."""
+
+RATIO = 0.10
+"""Step of the backward trace relative to the height."""
+
 _MAX_STEPS = 3000
 _CORNER_PASSES = 20
 _CORNER_TOLERANCE = 1e-7  # um
@@ -304,8 +308,8 @@ def find_boundaries(
     *,
     reach: int = 4,
     samples: int = 24,
-    coarseness: float = _COARSENESS,
-    ratio: float = _RATIO,
+    coarseness: float = COARSENESS,
+    ratio: float = RATIO,
 ) -> PixelBoundaries:
     """Trace the boundaries of the pixels around pixel (0, 0).
 
