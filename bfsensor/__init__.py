@@ -12,6 +12,7 @@ _PUBLIC = {
     "ConvergenceError": "errors",
     "DeviceError": "errors",
     "MeasurementError": "errors",
+    "SensorError": "errors",
     "TableError": "errors",
     "Device": "device",
     "builtin_devices": "device",
@@ -19,6 +20,9 @@ _PUBLIC = {
     "DistortionTable": "table",
     "build_table": "build",
     "plan_table": "build",
+    "BrighterFatterSensor": "sensor",
+    "SiliconSensor": "sensor",
+    "ShiftMap": "sensor",
 }
 
 __all__ = ["__version__", *sorted(_PUBLIC)]
@@ -33,3 +37,12 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return __all__
+
+
+def _register() -> None:
+    from bfsensor._register import register_when_loaded
+
+    register_when_loaded()
+
+
+_register()

@@ -21,6 +21,10 @@ class MeasurementError(BFSensorError, ValueError):
     """Data do not allow the measurement."""
 
 
+class SensorError(BFSensorError, ValueError):
+    """A sensor for image simulation was given what it cannot use."""
+
+
 class ConvergenceError(BFSensorError, RuntimeError):
     """An iteration did not reach its tolerance; nothing unconverged is returned.
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from bfsensor.device import Device
 from bfsensor.device_import import import_poisson_ccd, read_configuration
 from bfsensor.errors import DeviceError, TableError
-from bfsensor.table import DistortionTable
+from bfsensor.table import DistortionTable, nominal_positions, vertex_fractions
 
 
 def write_galsim(
@@ -185,31 +185,9 @@ def read_galsim(stem: str | os.PathLike[str]) -> DistortionTable:
     """
     stem = Path(stem)
     cfg, dat = stem.with_name(stem.name + ".cfg"), stem.with_name(stem.name + ".dat")
-    try:
-        data = read_configuration(cfg)
-    except DeviceError as error:
-        raise TableError(str(error)) from None
-
-    def number(key: str, default: float | None = None) -> float:
-        if key not in data:
-            if default is None:
-                raise TableError(f"{cfg}: {key} is missing")
-            return default
-        try:
-            return float(data[key])
-        except ValueError:
-            raise TableError(f"{cfg}: {key} = {data[key]!r} is not a number") from None
-
-    def whole(key: str) -> int:
-        value = number(key)
-        if not value.is_integer() or value < 1:
-            raise TableError(f"{cfg}: {key} = {data[key]!r} is not a whole number above 0")
-        return int(value)
-
-    n, ny, nv = (whole(k) for k in ("PixelBoundaryNx", "PixelBoundaryNy", "NumVertices"))
-    if n != ny or n % 2 == 0:
-        raise TableError(f"{cfg}: {n} x {ny} pixels must be square and odd")
-    pitch = (number("PixelSizeX"), number("PixelSizeY", number("PixelSizeX")))
+    numbers = _Numbers(cfg)
+    number = numbers.number
+    n, nv, pitch = numbers.layout()
     charge = number("CollectedCharge_0_0")
     if not charge > 0:
         raise TableError(f"{cfg}: CollectedCharge_0_0 = {charge:g} must be above 0 e-")
@@ -240,6 +218,80 @@ def read_galsim(stem: str | os.PathLike[str]) -> DistortionTable:
         )
     except TableError as error:
         raise TableError(f"{cfg}: {error}") from None
+
+
+def read_sides(
+    cfg: str | os.PathLike[str], dat: str | os.PathLike[str]
+) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]:
+    """Read the shifts of all sides of a GalSim table, each with its own copies of the corners.
+
+    Of the two copies of a side the one of the pixel nearer to the charge counts.
+
+    Parameters
+    ----------
+    cfg, dat : path-like
+        The two files.
+
+    Returns
+    -------
+    vertical, horizontal : ndarray, shapes (n, n + 1, vertices + 2, 2), \
+(n + 1, n, vertices + 2, 2)
+        Shifts (dx, dy) [um] for the charge of the file, by row and column.
+    points : ndarray
+        Nominal positions along a side, 0 to 1.
+
+    Raises
+    ------
+    TableError
+        A file is missing, foreign or truncated; names it.
+    """
+    numbers = _Numbers(Path(cfg))
+    n, nv, pitch = numbers.layout()
+    along_x, along_y = _share(_read_outlines(Path(dat), n, nv, pitch))[0]
+    fractions = np.concatenate([[0.0], vertex_fractions(nv), [1.0]])
+    at = nominal_positions(pitch, n // 2, fractions)
+    return (along_y - at.vertical, along_x - at.horizontal), fractions
+
+
+class _Numbers:
+    """The numbers of a configuration, with errors that name it."""
+
+    def __init__(self, cfg: Path) -> None:
+        self.cfg = cfg
+        try:
+            self.data = read_configuration(cfg)
+        except DeviceError as error:
+            raise TableError(str(error)) from None
+
+    def number(self, key: str, default: float | None = None) -> float:
+        if key not in self.data:
+            if default is None:
+                raise TableError(f"{self.cfg}: {key} is missing")
+            return default
+        try:
+            return float(self.data[key])
+        except ValueError:
+            raise TableError(
+                f"{self.cfg}: {key} = {self.data[key]!r} is not a number"
+            ) from None
+
+    def whole(self, key: str) -> int:
+        value = self.number(key)
+        if not value.is_integer() or value < 1:
+            raise TableError(
+                f"{self.cfg}: {key} = {self.data[key]!r} is not a whole number above 0"
+            )
+        return int(value)
+
+    def layout(self) -> tuple[int, int, tuple[float, float]]:
+        """Give pixels and vertices a side, and the pitch."""
+        n, ny, nv = (
+            self.whole(k) for k in ("PixelBoundaryNx", "PixelBoundaryNy", "NumVertices")
+        )
+        if n != ny or n % 2 == 0:
+            raise TableError(f"{self.cfg}: {n} x {ny} pixels must be square and odd")
+        pitch = self.number("PixelSizeX")
+        return n, nv, (pitch, self.number("PixelSizeY", pitch))
 
 
 def _read_outlines(

@@ -1,0 +1,247 @@
+"""Areas of all pixels: by convolution, or polygons through the displaced points.
+
+Of polygons the area is the contour integral of -y dx; every side is integrated once, about its
+nominal place.  Shifts of one point of all sides of a line are found together, so that the
+inner loop runs along the row.
+"""
+
+import numba
+import numpy as np
+
+from bfsensor._kernels.photons import fixed_shift
+
+
+@numba.njit(cache=True, fastmath={"contract"}, _nrt=False)
+def _add_rows(weights, start, lanes, rows, columns, charges, at, stride, out, count):
+    """Add to ``out`` the weighted charges of the window that begins at ``at``, and on."""
+    for r in range(rows):
+        row = np.uint64(at + r * stride)
+        first = start + r * lanes
+        c = 0
+        while c + 4 <= columns:
+            a = weights[np.uint64(first + c)]
+            b = weights[np.uint64(first + c + 1)]
+            d = weights[np.uint64(first + c + 2)]
+            e = weights[np.uint64(first + c + 3)]
+            q = row + np.uint64(c)
+            for n in range(np.uint64(count)):
+                out[n] += (
+                    a * charges[q + n]
+                    + b * charges[q + n + np.uint64(1)]
+                    + d * charges[q + n + np.uint64(2)]
+                    + e * charges[q + n + np.uint64(3)]
+                )
+            c += 4
+        while c < columns:
+            a = weights[np.uint64(first + c)]
+            q = row + np.uint64(c)
+            for n in range(np.uint64(count)):
+                out[n] += a * charges[q + n]
+            c += 1
+
+
+@numba.njit(cache=True, _nrt=False)
+def _line_shifts(edges, charges, upright, layer, point, line, low, low_second, out):
+    """Shifts (x, y) of one point of every side of a row; ``line``: row or line."""
+    q = edges.reach
+    side = 0 if upright else 1
+    count = charges.nx + 1 - side
+    for component in range(2):
+        to = out[component if upright else 1 - component]
+        place = (layer * 2 + component) * edges.points.size + point
+        total = 2 * (side * edges.layers * edges.points.size * 2 + place)
+        constant = -edges.sums[total] * low
+        if edges.modes == 2:
+            constant -= edges.sums[total + 1] * low_second
+        for n in range(count):
+            to[n] = constant
+        row = line - q - side
+        column = -q - 1 + side
+        rows = 2 * q + 1 + side
+        columns = 2 * q + 2 - side
+        _add_rows(
+            edges.weights, edges.starts[side] + place * rows * edges.lanes, edges.lanes,
+            rows, columns, charges.first,
+            (row + charges.pad) * charges.stride + column + charges.pad, charges.stride,
+            to, count,
+        )  # fmt: skip
+        if edges.modes == 2:
+            _add_rows(
+                edges.weights, edges.starts[2 + side] + place * (3 + side) * 8, 8,
+                3 + side, 4 - side, charges.second,
+                (line - 1 - side + charges.pad) * charges.stride + side - 2 + charges.pad,
+                charges.stride, to, count,
+            )  # fmt: skip
+
+
+@numba.njit(cache=True, _nrt=False)
+def _integrate(edges, charges, pattern, flux, upright, line, low, low_second, now, before,
+               out):  # fmt: skip
+    """Integral of y dx along every side of a row, and its ends.
+
+    ``out`` [5, sides]: the integral about the nominal place of the line (of the row's
+    middle for vertical sides), then the shifts (x, y) of both ends.
+    """
+    count = charges.nx + 1 if upright else charges.nx
+    last = edges.points.size - 1
+    fixed = pattern.rings.size > 0 or pattern.map_x.size > 0
+    for n in range(count):
+        out[0, n] = 0.0
+    for point in range(last + 1):
+        if flux:
+            _line_shifts(
+                edges, charges, upright, edges.layers - 1, point, line, low, low_second, now
+            )
+        else:
+            for n in range(count):
+                now[0, n] = 0.0
+                now[1, n] = 0.0
+        t = edges.points[point]
+        if fixed:
+            for n in range(count):
+                if upright:
+                    dx, dy = fixed_shift(pattern, float(n), line + t, 1.0)
+                else:
+                    dx, dy = fixed_shift(pattern, n + t, float(line), 1.0)
+                now[0, n] += dx
+                now[1, n] += dy
+        if point > 0:
+            step = t - edges.points[point - 1]
+            if upright:
+                middle = 0.5 * (t + edges.points[point - 1]) - 0.5
+                for n in range(count):
+                    out[0, n] += (middle + 0.5 * (now[1, n] + before[1, n])) * (
+                        now[0, n] - before[0, n]
+                    )
+            else:
+                for n in range(count):
+                    out[0, n] += (
+                        0.5 * (now[1, n] + before[1, n]) * (step + now[0, n] - before[0, n])
+                    )
+        first = 1 if point == 0 else 3
+        if point == 0 or point == last:
+            for n in range(count):
+                out[first, n] = now[0, n]
+                out[first + 1, n] = now[1, n]
+        for n in range(count):
+            before[0, n] = now[0, n]
+            before[1, n] = now[1, n]
+
+
+@numba.njit(cache=True, inline="always")
+def _join(x0, y0, x1, y1):
+    """Integral of y dx from one end to the next, where two sides do not quite meet."""
+    return 0.5 * (y0 + y1) * (x1 - x0)
+
+
+@numba.njit(cache=True, nogil=True)
+def pixel_areas(edges, charges, pattern, flux, low, low_second, first_row, last_row, out):
+    """Areas [nominal area] of the rows ``first_row`` to ``last_row``, to ``out`` [ny, nx].
+
+    ``low``, ``low_second``: charges taken off, a uniform charge moves nothing.  With
+    ``flux`` False only the fixed pattern counts.
+    """
+    nx = charges.nx
+    now = np.zeros((2, nx + 1), np.float32)
+    before = np.zeros((2, nx + 1), np.float32)
+    bottom = np.zeros((5, nx + 1))
+    top = np.zeros((5, nx + 1))
+    sides = np.zeros((5, nx + 1))
+    _integrate(
+        edges, charges, pattern, flux, False, first_row, low, low_second, now, before, top
+    )
+    for j in range(first_row, last_row):
+        bottom[:] = top
+        _integrate(
+            edges, charges, pattern, flux, False, j + 1, low, low_second, now, before, top
+        )
+        _integrate(
+            edges, charges, pattern, flux, True, j, low, low_second, now, before, sides
+        )
+        for i in range(nx):
+            # Counter-clockwise about the pixel's middle: bottom, right, top, left.
+            around = bottom[0, i] - 0.5 * (1.0 + bottom[3, i] - bottom[1, i])
+            around += sides[0, i + 1]
+            around -= top[0, i] + 0.5 * (1.0 + top[3, i] - top[1, i])
+            around -= sides[0, i]
+            around += _join(
+                bottom[3, i] + 0.5,
+                bottom[4, i] - 0.5,
+                sides[1, i + 1] + 0.5,
+                sides[2, i + 1] - 0.5,
+            )
+            around += _join(
+                sides[3, i + 1] + 0.5,
+                sides[4, i + 1] + 0.5,
+                top[3, i] + 0.5,
+                top[4, i] + 0.5,
+            )
+            around += _join(
+                top[1, i] - 0.5, top[2, i] + 0.5, sides[3, i] - 0.5, sides[4, i] + 0.5
+            )
+            around += _join(
+                sides[1, i] - 0.5, sides[2, i] - 0.5, bottom[1, i] - 0.5, bottom[2, i] - 0.5
+            )
+            out[j, i] = -around
+
+
+@numba.njit(cache=True, nogil=True, _nrt=False)
+def convolved_areas(
+    charges,
+    first,
+    second,
+    values,
+    count,
+    low,
+    low_second,
+    bottom,
+    top,
+    left,
+    right,
+    row,
+    out,
+):
+    """Areas [nominal area] by convolution with the first ``count`` kernels.
+
+    Of the rows ``bottom`` to ``top`` and the columns ``left`` to ``right``.
+
+    ``first`` [1 + kernels, width, width] and ``second`` (5 x 5; width 0: none), flat,
+    begin with the linear kernel; the squares of the other sums count by ``values``.
+    ``row``: room for a row.
+    """
+    width = first.shape[1]
+    near = second.shape[1]
+    flat = first.reshape(-1)
+    flat_near = second.reshape(-1)
+    nx = right - left
+    corner = charges.pad * charges.stride + charges.pad + left
+    for j in range(bottom, top):
+        for i in range(left, right):
+            out[j, i] = 1.0
+        for k in range(count + 1):
+            total = np.float32(0.0)
+            for n in range(k * width * width, (k + 1) * width * width):
+                total -= flat[n] * low
+            for n in range(k * near * near, (k + 1) * near * near):
+                total -= flat_near[n] * low_second
+            for i in range(nx):
+                row[i] = total
+            half = width // 2
+            _add_rows(
+                flat, k * width * width, width, width, width, charges.first,
+                corner + (j - half) * charges.stride - half,
+                charges.stride, row, nx,
+            )  # fmt: skip
+            if near > 0:
+                _add_rows(
+                    flat_near, k * near * near, near, near, near, charges.second,
+                    corner + (j - 2) * charges.stride - 2,
+                    charges.stride, row, nx,
+                )  # fmt: skip
+            if k == 0:
+                for i in range(nx):
+                    out[j, left + i] += row[i]
+            else:
+                value = values[k - 1]
+                for i in range(nx):
+                    out[j, left + i] += value * np.float64(row[i]) * np.float64(row[i])

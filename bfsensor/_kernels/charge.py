@@ -1,0 +1,474 @@
+"""Charge: electrons into pixels, spilling, and the charge that moves the boundaries.
+
+The image is the truth.  While a block of photons lasts, the charge that moves boundaries
+is frozen; electrons go into the image at once, in the order of the photons, and the first
+in a pixel notes it in a list.  When the block ends the listed pixels are taken over, with
+half of what they gained in the block added again: the mean charge of the next one.
+"""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from bfsensor._kernels.edges import cool, heat
+
+TILE = 16
+REFRESH = 256
+"""Changes of a tile's pixels after which its range is found anew: once for its size."""
+STALE = np.float32(512.0)
+"""Electrons [e-] a pixel may gain before the background of its neighbours is found anew."""
+
+# Counters, int64.
+LISTED, LISTED_BEFORE, DENSE, DENSE_BEFORE, FLAGGED, PHOTONS, BEYOND, OPENED = range(8)
+N_COUNTERS = 8
+# Sums, float64.
+IN_BLOCK, BEFORE, TOTAL, ADDED, SPILLED, SPILLED_OFF, CROSSED, OFF_IMAGE = range(8)
+N_SUMS = 8
+
+
+class Response(NamedTuple):
+    """Effective charge of both modes against charge and background, on equal steps.
+
+    Sizes 0 for a sensor that is linear: the effective charge is the charge.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    charge_step: float
+    background_step: float
+    last_charge: float
+    last_background: float
+
+
+class Ledger(NamedTuple):
+    """What an exposure keeps: see the module.  Arrays are changed in place."""
+
+    charge: np.ndarray
+    carry: np.ndarray
+    listed: np.ndarray
+    gained: np.ndarray
+    listed_before: np.ndarray
+    high_first: np.ndarray
+    high_second: np.ndarray
+    changes: np.ndarray
+    flags: np.ndarray
+    flagged: np.ndarray
+    spill_from: np.ndarray
+    spill_to: np.ndarray
+    counters: np.ndarray
+    sums: np.ndarray
+
+
+@numba.njit(cache=True, inline="always")
+def _effective(response, charge, background):
+    """Effective charges of a pixel; beyond the grid the last values are held."""
+    q = charge / response.charge_step
+    b = min(
+        max(background, np.float32(0.0)) / response.background_step,
+        response.last_background,
+    )
+    q = min(q, response.last_charge)
+    m = np.uint64(min(max(int(q), 0), response.first.shape[0] - 2))
+    n = np.uint64(min(int(b), response.first.shape[1] - 2))
+    u = np.float32(q - m)
+    v = np.float32(b - n)
+    one = np.float32(1.0)
+    up = np.uint64(1)
+    a, c = (one - u) * (one - v), u * (one - v)
+    d, e = (one - u) * v, u * v
+    f = response.first
+    s = response.second
+    first = a * f[m, n] + c * f[m + up, n] + d * f[m, n + up] + e * f[m + up, n + up]
+    second = a * s[m, n] + c * s[m + up, n] + d * s[m, n + up] + e * s[m + up, n + up]
+    return first, second
+
+
+@numba.njit(cache=True, _nrt=False)
+def _flag(ledger, tile):
+    if not ledger.flags[tile]:
+        ledger.flags[tile] = True
+        ledger.flagged[ledger.counters[FLAGGED]] = tile
+        ledger.counters[FLAGGED] += 1
+
+
+@numba.njit(cache=True, inline="always")
+def _set_pixel(charges, ledger, response, j, i, ahead):
+    """Find the effective charge of a pixel anew, ``ahead`` electrons on."""
+    at = np.uint64((j + charges.pad) * charges.stride + i + charges.pad)
+    q = ledger.charge[at]
+    second = np.float32(0.0)
+    if response.first.size > 0:
+        s = np.uint64(charges.stride)
+        one = np.uint64(1)
+        c = ledger.charge
+        around = (
+            (c[at - s - one] + c[at - s] + c[at - s + one])
+            + (c[at - one] + c[at + one])
+            + (c[at + s - one] + c[at + s] + c[at + s + one])
+        ) * np.float32(0.125)
+        if q + ahead > response.last_charge * response.charge_step:
+            ledger.counters[BEYOND] += 1
+        first, second = _effective(response, q + ahead, around)
+        charges.second[at] = second
+    else:
+        first = q + ahead
+    charges.first[at] = first
+    tile = (j // TILE) * ((charges.nx + TILE - 1) // TILE) + i // TILE
+    charges.low_first[tile] = min(charges.low_first[tile], first)
+    ledger.high_first[tile] = max(ledger.high_first[tile], first)
+    charges.low_second[tile] = min(charges.low_second[tile], second)
+    ledger.high_second[tile] = max(ledger.high_second[tile], second)
+    ledger.changes[tile] += 1
+    _flag(ledger, tile)
+
+
+@numba.njit(cache=True, _nrt=False)
+def _find_range(charges, ledger, tile):
+    """Find the lowest and highest effective charge of a tile; outside the image is 0."""
+    tiles_x = (charges.nx + TILE - 1) // TILE
+    tiles_y = (charges.ny + TILE - 1) // TILE
+    row = tile // tiles_x
+    column = tile - row * tiles_x
+    border = row == 0 or column == 0 or row == tiles_y - 1 or column == tiles_x - 1
+    low = np.float32(0.0 if border else np.inf)
+    high = np.float32(0.0 if border else -np.inf)
+    low_second = low
+    high_second = high
+    for j in range(row * TILE, min((row + 1) * TILE, charges.ny)):
+        start = (j + charges.pad) * charges.stride + charges.pad
+        for i in range(column * TILE, min((column + 1) * TILE, charges.nx)):
+            at = np.uint64(start + i)
+            low = min(low, charges.first[at])
+            high = max(high, charges.first[at])
+            if charges.second.size > 0:
+                low_second = min(low_second, charges.second[at])
+                high_second = max(high_second, charges.second[at])
+    charges.low_first[tile] = low
+    ledger.high_first[tile] = high
+    if charges.second.size > 0:
+        charges.low_second[tile] = low_second
+        ledger.high_second[tile] = high_second
+    else:
+        charges.low_second[tile] = np.float32(0.0)
+        ledger.high_second[tile] = np.float32(0.0)
+    ledger.changes[tile] = 0
+
+
+@numba.njit(cache=True, _nrt=False)
+def _find_margin(charges, ledger, edges, tile):
+    """Bound the shift of edges in a tile, and the error of that of the nearest point."""
+    tiles_x = (charges.nx + TILE - 1) // TILE
+    tiles_y = (charges.ny + TILE - 1) // TILE
+    row = tile // tiles_x
+    column = tile - row * tiles_x
+    low = charges.low_first[tile]
+    high = ledger.high_first[tile]
+    low_second = charges.low_second[tile]
+    high_second = ledger.high_second[tile]
+    for j in range(max(row - 1, 0), min(row + 2, tiles_y)):
+        for i in range(max(column - 1, 0), min(column + 2, tiles_x)):
+            other = j * tiles_x + i
+            low = min(low, charges.low_first[other])
+            high = max(high, ledger.high_first[other])
+            low_second = min(low_second, charges.low_second[other])
+            high_second = max(high_second, ledger.high_second[other])
+    size = max(high - low, high_second - low_second)
+    # Single precision: rounding of the shift, and of what cancels in its sum.
+    margin = np.float32(edges.normal) * (
+        size + np.float32(1e-6) * max(abs(low), abs(high))
+    ) + np.float32(2e-6)
+    charges.margins[tile] = margin if margin < 0.5 else np.float32(1.0)
+    level = 0
+    if size > 250.0:
+        level = int(np.ceil(8.0 * np.log2(size / 250.0)))
+    charges.ranges[tile] = min(level, edges.doubts.shape[1] - 1)
+
+
+@numba.njit(cache=True, _nrt=False)
+def _find_margins(charges, ledger, edges):
+    """Renew ranges and margins of the flagged tiles and their neighbours."""
+    tiles_x = (charges.nx + TILE - 1) // TILE
+    tiles_y = (charges.ny + TILE - 1) // TILE
+    count = ledger.counters[FLAGGED]
+    for n in range(count):
+        if ledger.changes[ledger.flagged[n]] >= REFRESH:
+            _find_range(charges, ledger, ledger.flagged[n])
+    for n in range(count):
+        row = ledger.flagged[n] // tiles_x
+        column = ledger.flagged[n] - row * tiles_x
+        for j in range(max(row - 1, 0), min(row + 2, tiles_y)):
+            for i in range(max(column - 1, 0), min(column + 2, tiles_x)):
+                _flag(ledger, j * tiles_x + i)
+    count = ledger.counters[FLAGGED]
+    for n in range(count):
+        tile = ledger.flagged[n]
+        _find_margin(charges, ledger, edges, tile)
+        ledger.flags[tile] = False
+    ledger.counters[FLAGGED] = 0
+
+
+@numba.njit(cache=True, _nrt=False)
+def _respond(response, charge, first, second, stride, start, count):
+    """Find the effective charge of a row; ``first`` holds what is to be added ahead."""
+    f, s = response.first, response.second
+    last_q = np.float32(response.last_charge)
+    last_b = np.float32(response.last_background)
+    per_q = np.float32(1.0 / response.charge_step)
+    per_b = np.float32(0.125 / response.background_step)
+    rows = np.int32(f.shape[0] - 2)
+    columns = np.int32(f.shape[1] - 2)
+    zero = np.float32(0.0)
+    one = np.float32(1.0)
+    up = np.uint64(1)
+    beyond = 0
+    for n in range(np.uint64(count)):
+        at = start + n
+        q = (charge[at] + first[at]) * per_q
+        b = (
+            (charge[at - stride - up] + charge[at - stride] + charge[at - stride + up])
+            + (charge[at - up] + charge[at + up])
+            + (charge[at + stride - up] + charge[at + stride] + charge[at + stride + up])
+        ) * per_b
+        beyond += q > last_q
+        q = min(q, last_q)
+        b = min(max(b, zero), last_b)
+        m = np.int32(min(max(np.int32(q), np.int32(0)), rows))
+        k = np.int32(min(np.int32(b), columns))
+        u = q - np.float32(m)
+        v = b - np.float32(k)
+        i = np.uint64(m)
+        j = np.uint64(k)
+        a, c = (one - u) * (one - v), u * (one - v)
+        d, e = (one - u) * v, u * v
+        first[at] = (
+            a * f[i, j] + c * f[i + up, j] + d * f[i, j + up] + e * f[i + up, j + up]
+        )
+        second[at] = (
+            a * s[i, j] + c * s[i + up, j] + d * s[i, j + up] + e * s[i + up, j + up]
+        )
+    return beyond
+
+
+@numba.njit(cache=True, nogil=True, _nrt=False)
+def take_image(image, charges, ledger, response, edges, ahead):
+    """Take the charge of the whole image over, ``ahead`` of each pixel's gain in advance."""
+    modes = response.first.size > 0
+    first = charges.first
+    charge = ledger.charge
+    apart = modes or ahead > 0
+    anything = False
+    for j in range(charges.ny):
+        start = (j + charges.pad) * charges.stride + charges.pad
+        for i in range(charges.nx):
+            at = np.uint64(start + i)
+            now = np.float32(image[j, i])
+            before = charge[at]
+            if now == np.float32(0.0) and before == np.float32(0.0):
+                # Untouched pages of an empty image cost neither time nor memory.
+                if apart and first[at] != np.float32(0.0):
+                    first[at] = np.float32(0.0)
+                    anything = True
+                continue
+            anything = True
+            if apart:
+                # The gain waits where the effective charge will be.
+                first[at] = ahead * (now - before)
+            charge[at] = now
+    if modes and anything:
+        for j in range(charges.ny):
+            start = np.uint64((j + charges.pad) * charges.stride + charges.pad)
+            ledger.counters[BEYOND] += _respond(
+                response, charge, first, charges.second, np.uint64(charges.stride), start,
+                charges.nx,
+            )  # fmt: skip
+    elif apart and anything:
+        for j in range(charges.ny):
+            start = (j + charges.pad) * charges.stride + charges.pad
+            for i in range(charges.nx):
+                at = np.uint64(start + i)
+                first[at] += charge[at]
+    ledger.counters[FLAGGED] = 0
+    tiles = ledger.flags.size
+    for tile in range(tiles):
+        if anything:
+            _find_range(charges, ledger, tile)
+        ledger.flags[tile] = False
+    for tile in range(tiles):
+        _find_margin(charges, ledger, edges, tile)
+
+
+@numba.njit(cache=True, nogil=True, _nrt=False)
+def close_block(image, charges, ledger, response, edges, hot, ahead, crowd):
+    """Take over what the block brought, ``ahead`` of each pixel's gain in advance.
+
+    The edges of pixels where ``crowd`` electrons or more came near one are evaluated
+    beforehand.
+    """
+    cool(hot)
+    if ledger.counters[DENSE] or ledger.counters[DENSE_BEFORE]:
+        take_image(image, charges, ledger, response, edges, ahead)
+        ledger.counters[DENSE_BEFORE] = ledger.counters[DENSE] and ahead > 0
+        ledger.counters[DENSE] = 0
+        ledger.counters[LISTED_BEFORE] = 0
+        ledger.counters[LISTED] = 0
+        return
+    nx = charges.nx
+    count = ledger.counters[LISTED]
+    for n in range(count):
+        j = ledger.listed[n] // nx
+        i = ledger.listed[n] - j * nx
+        at = np.uint64((j + charges.pad) * charges.stride + i + charges.pad)
+        now = np.float32(image[j, i])
+        gain = now - ledger.charge[at]
+        ledger.gained[n] = gain
+        ledger.charge[at] = now
+    for n in range(ledger.counters[LISTED_BEFORE]):
+        j = ledger.listed_before[n] // nx
+        _set_pixel(
+            charges, ledger, response, j, ledger.listed_before[n] - j * nx, np.float32(0.0)
+        )
+    if response.first.size > 0:
+        for n in range(count):
+            j = ledger.listed[n] // nx
+            i = ledger.listed[n] - j * nx
+            at = np.uint64((j + charges.pad) * charges.stride + i + charges.pad)
+            now = ledger.charge[at]
+            if np.floor(now / STALE) != np.floor((now - ledger.gained[n]) / STALE):
+                for m in range(max(j - 1, 0), min(j + 2, charges.ny)):
+                    for k in range(max(i - 1, 0), min(i + 2, nx)):
+                        _set_pixel(charges, ledger, response, m, k, np.float32(0.0))
+    for n in range(count):
+        j = ledger.listed[n] // nx
+        _set_pixel(
+            charges, ledger, response, j, ledger.listed[n] - j * nx,
+            ahead * ledger.gained[n],
+        )  # fmt: skip
+    ledger.counters[LISTED_BEFORE] = 0
+    if ahead > 0:
+        for n in range(count):
+            ledger.listed_before[n] = ledger.listed[n]
+        ledger.counters[LISTED_BEFORE] = count
+    ledger.counters[LISTED] = 0
+    _find_margins(charges, ledger, edges)
+    tiles_x = (nx + TILE - 1) // TILE
+    for n in range(count):
+        if ledger.gained[n] < crowd:
+            continue
+        j = ledger.listed[n] // nx
+        i = ledger.listed[n] - j * nx
+        margin = charges.margins[(j // TILE) * tiles_x + i // TILE]
+        # So many come near an edge.
+        if ledger.gained[n] * min(np.float32(4.0) * margin, np.float32(1.0)) >= crowd:
+            heat(edges, charges, hot, 0, i, j)
+            heat(edges, charges, hot, 0, i + 1, j)
+            heat(edges, charges, hot, 1, j, i)
+            heat(edges, charges, hot, 1, j + 1, i)
+
+
+@numba.njit(cache=True, inline="always")
+def _put(image, charge, carry, listed, counters, at, nx, j, i, flux):
+    """Add electrons to a pixel; what single precision loses is carried."""
+    before = image[j, i]
+    if np.float32(before) == charge[np.uint64(at)] and counters[DENSE] == 0:
+        count = counters[LISTED]
+        if count < listed.size:
+            listed[np.uint64(count)] = j * nx + i
+            counters[LISTED] = count + 1
+        else:
+            counters[DENSE] = 1
+    if carry.size > 0:
+        carried = carry[j, i]
+        total = np.float64(before) + np.float64(carried) + flux
+        now = np.float32(total)
+        image[j, i] = now
+        rest = np.float32(total - np.float64(now))
+        # Not written where nothing is carried: untouched pages cost no memory.
+        if rest != carried:
+            carry[j, i] = rest
+    else:
+        image[j, i] = before + flux
+
+
+@numba.njit(cache=True, _nrt=False)
+def _spill(image, charges, ledger, j, i, flux, full_well, along_y, up):
+    """Fill a pixel, then those beyond it along its column; returns what stays inside."""
+    charge, carry = ledger.charge, ledger.carry
+    listed, counters = ledger.listed, ledger.counters
+    corner = charges.pad * charges.stride + charges.pad
+    room = full_well - image[j, i]
+    kept = 0.0
+    if room > 0:
+        part = min(room, flux)
+        _put(image, charge, carry, listed, counters, corner + j * charges.stride + i,
+             charges.nx, j, i, part)  # fmt: skip
+        flux -= part
+        kept += part
+    ledger.sums[SPILLED] += flux
+    step = 1 if up else -1
+    column = i if along_y else j
+    place = j if along_y else i
+    last = charges.ny if along_y else charges.nx
+    side = 1 if up else 0
+    # A column remembers from where to where it was full when it last spilled.
+    start = ledger.spill_from[side, column]
+    end = ledger.spill_to[side, column]
+    to = place + step
+    if start >= 0 and (start - place) * step <= 0 and (end - place) * step > 0:
+        to = end
+    else:
+        ledger.spill_from[side, column] = place
+    while flux > 0 and 0 <= to < last:
+        tj = to if along_y else j
+        ti = i if along_y else to
+        room = full_well - image[tj, ti]
+        if room > 0:
+            part = min(room, flux)
+            _put(image, charge, carry, listed, counters,
+                 corner + tj * charges.stride + ti, charges.nx, tj, ti, part)  # fmt: skip
+            flux -= part
+            kept += part
+            if flux <= 0:
+                break
+        to += step
+    ledger.spill_to[side, column] = to
+    if flux > 0:
+        ledger.sums[SPILLED_OFF] += flux
+    return kept
+
+
+@numba.njit(cache=True, nogil=True, _nrt=False)
+def deposit(
+    image, charges, ledger, flux, first, i, j, z, words, lo, hi, full_well, along_y
+):
+    """Put the electrons lo to hi into the image in their order; returns what stays.
+
+    ``flux`` is indexed from ``first``, all else from 0.
+    """
+    charge, carry = ledger.charge, ledger.carry
+    listed, counters = ledger.listed, ledger.counters
+    nx, stride = charges.nx, charges.stride
+    corner = charges.pad * stride + charges.pad
+    added = 0.0
+    crossed = 0.0
+    off = 0.0
+    for n in range(np.uint64(lo), np.uint64(hi)):
+        w = flux[np.uint64(first) + n]
+        ci = np.int64(i[n])
+        cj = np.int64(j[n])
+        if ci < 0:
+            if z[n] < 0:
+                crossed += w
+            else:
+                off += w
+            continue
+        if w > 0 and image[cj, ci] + w > full_well:
+            up = (words[n] & np.uint32(1)) == np.uint32(1)
+            added += _spill(image, charges, ledger, cj, ci, w, full_well, along_y, up)
+        else:
+            _put(image, charge, carry, listed, counters, corner + cj * stride + ci, nx,
+                 cj, ci, w)  # fmt: skip
+            added += w
+    ledger.sums[CROSSED] += crossed
+    ledger.sums[OFF_IMAGE] += off
+    return added

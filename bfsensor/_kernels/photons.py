@@ -1,0 +1,285 @@
+"""From photons at the surface to electrons above the wells: depth, angle, diffusion.
+
+Positions out are in pixels from the lower left corner of the image: pixel (j, i) holds
+x from i to i + 1 and y from j to j + 1.
+"""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from bfsensor._kernels.counter_rng import deviates
+
+BUFFER = 1024
+LOST = np.float32(-1.0)
+
+
+class Light(NamedTuple):
+    """What the photons bring; arrays that are not allocated have size 0."""
+
+    x: np.ndarray
+    y: np.ndarray
+    flux: np.ndarray
+    slope_x: np.ndarray
+    slope_y: np.ndarray
+    wavelength: np.ndarray
+
+
+class Medium(NamedTuple):
+    """The silicon: heights in um above the gates.
+
+    ``lengths`` [um] at wavelengths ``wavelength_0 + n wavelength_step`` [nm], the ends held
+    beyond; ``variance`` [um^2] of the diffusion at heights ``n thickness / (size - 1)``.
+    ``kept_path`` [um]: deeper photons convert there (inf: they are lost); with
+    ``kept_slanted`` only those that carry angles do.
+    """
+
+    thickness: float
+    pitch_x: float
+    pitch_y: float
+    lengths: np.ndarray
+    wavelength_0: float
+    wavelength_step: float
+    surface_path: float
+    kept_path: float
+    kept_slanted: bool
+    variance: np.ndarray
+    diffuse: bool
+
+
+class Pattern(NamedTuple):
+    """Fixed shifts of the pixel boundaries [pixel]: rings and a map, each by height.
+
+    ``rings`` at radii ``n ring_step`` from (``ring_x``, ``ring_y``) in the coordinates of
+    the positions out; none beyond the last.  ``map_x, map_y`` at the points
+    (``map_0x`` + i, ``map_0y`` + j); none outside.  The factors belong to heights
+    ``n thickness / (size - 1)``.
+    """
+
+    rings: np.ndarray
+    ring_step: float
+    ring_x: float
+    ring_y: float
+    ring_factor: np.ndarray
+    map_x: np.ndarray
+    map_y: np.ndarray
+    map_0x: float
+    map_0y: float
+    map_factor: np.ndarray
+
+
+@numba.njit(cache=True, inline="always")
+def _at(table, position):
+    """Linear interpolation at ``position`` in units of the spacing, the ends held."""
+    last = table.size - 1
+    position = min(max(position, 0.0), float(last))
+    n = np.uint64(min(int(position), last - 1))
+    part = position - n
+    return table[n] + part * (table[n + np.uint64(1)] - table[n])
+
+
+@numba.njit(cache=True, _nrt=False)
+def fixed_shift(pattern, x, y, part):
+    """Shift (dx, dy) [pixel] of a boundary at (x, y), for ``part`` of the thickness."""
+    dx = 0.0
+    dy = 0.0
+    if pattern.rings.size > 0:
+        rx = x - pattern.ring_x
+        ry = y - pattern.ring_y
+        r = np.sqrt(rx * rx + ry * ry)
+        at = r / pattern.ring_step
+        if 0.0 < at < pattern.rings.size - 1:
+            factor = _at(pattern.ring_factor, part * (pattern.ring_factor.size - 1))
+            size = factor * _at(pattern.rings, at) / r
+            dx += size * rx
+            dy += size * ry
+    if pattern.map_x.size > 0:
+        u = x - pattern.map_0x
+        v = y - pattern.map_0y
+        ny, nx = pattern.map_x.shape
+        if 0.0 <= u <= nx - 1 and 0.0 <= v <= ny - 1:
+            i = min(int(u), nx - 2)
+            j = min(int(v), ny - 2)
+            u -= i
+            v -= j
+            factor = _at(pattern.map_factor, part * (pattern.map_factor.size - 1))
+            a = factor * (1 - u) * (1 - v)
+            b = factor * u * (1 - v)
+            c = factor * (1 - u) * v
+            d = factor * u * v
+            dx += (
+                a * pattern.map_x[j, i]
+                + b * pattern.map_x[j, i + 1]
+                + c * pattern.map_x[j + 1, i]
+                + d * pattern.map_x[j + 1, i + 1]
+            )
+            dy += (
+                a * pattern.map_y[j, i]
+                + b * pattern.map_y[j, i + 1]
+                + c * pattern.map_y[j + 1, i]
+                + d * pattern.map_y[j + 1, i + 1]
+            )
+    return dx, dy
+
+
+@numba.njit(cache=True, _nrt=False)
+def _shift_all(positions, first, spread, normal, origin, out, to, count):
+    if spread == 0.0:
+        for m in range(np.uint64(count)):
+            out[to + m] = positions[first + m] - origin
+    else:
+        for m in range(np.uint64(count)):
+            out[to + m] = positions[first + m] - origin + spread * normal[m]
+
+
+@numba.njit(cache=True, _nrt=False)
+def _absorb(wavelength, first, lengths, start, per_step, path, out, count):
+    """Paths [um] from exponential deviates and absorption lengths."""
+    last = np.float64(lengths.size - 1)
+    for m in range(np.uint64(count)):
+        at = min(max((wavelength[first + m] - start) * per_step, 0.0), last)
+        n = np.int32(min(at, last - 1.0))
+        here = lengths[np.uint64(n)]
+        there = lengths[np.uint64(n) + np.uint64(1)]
+        out[m] = np.float32((here + (at - n) * (there - here)) * path[m])
+
+
+@numba.njit(cache=True, _nrt=False)
+def _tilt(slope_x, slope_y, first, kept, out, count):
+    """Depths [um] of paths along the slopes."""
+    for m in range(np.uint64(count)):
+        sx = slope_x[first + m]
+        sy = slope_y[first + m]
+        out[m] = np.float32(min(out[m] / np.sqrt(1.0 + sx * sx + sy * sy), kept))
+
+
+@numba.njit(cache=True, _nrt=False)
+def _widths(depth, thickness, variance, out_z, to, out, count):
+    """Heights [um], LOST below the gates, and widths of the diffusion [um] from there."""
+    last = np.float32(variance.size - 1)
+    per_um = np.float32(last / np.float32(thickness))
+    for m in range(np.uint64(count)):
+        z = np.float32(thickness) - depth[m]
+        out_z[to + m] = z if z >= np.float32(0.0) else LOST
+        at = min(max(z * per_um, np.float32(0.0)), last)
+        n = np.int32(min(at, last - np.float32(1.0)))
+        here = np.float32(variance[np.uint64(n)])
+        there = np.float32(variance[np.uint64(n) + np.uint64(1)])
+        out[m] = np.sqrt(here + (at - np.float32(n)) * (there - here))
+
+
+@numba.njit(cache=True, _nrt=False)
+def _place(positions, slopes, slanted, first, depth, width, normal, pitch, origin, out, to,
+           count):  # fmt: skip
+    """Landing positions along one axis [pixel]."""
+    per_um = 1.0 / pitch
+    for m in range(np.uint64(count)):
+        x = positions[first + m] - origin + np.float64(width[m] * normal[m]) * per_um
+        if slanted:
+            x += slopes[first + m] * depth[m] * per_um
+        out[to + m] = x
+
+
+@numba.njit(cache=True, nogil=True)
+def land(
+    light,
+    medium,
+    pattern,
+    lo,
+    hi,
+    number,
+    key0,
+    key1,
+    x0,
+    y0,
+    out_x,
+    out_y,
+    out_z,
+    out_word,
+):
+    """Send the photons lo to hi to where their electrons start to feel the wells.
+
+    ``number`` is the count of photon ``lo`` in the exposure; positions less (``x0``,
+    ``y0``) are written.  ``out_z`` [um] is the height of conversion, -1 for a photon that
+    crossed the silicon.  Only ``out_*`` from 0 to ``hi - lo`` is changed.
+    """
+    coloured = light.wavelength.size > 0
+    slanted = light.slope_x.size > 0
+    fixed = pattern.rings.size > 0 or pattern.map_x.size > 0
+    kept = np.inf
+    if slanted or not medium.kept_slanted:
+        kept = medium.kept_path
+    normal_x = np.empty(BUFFER, np.float32)
+    normal_y = np.empty(BUFFER, np.float32)
+    depth = np.empty(BUFFER, np.float32)
+    width = np.empty(BUFFER, np.float32)
+    draw = medium.diffuse or coloured
+    steps = medium.variance.size - 1
+    plain = min(medium.surface_path, kept)
+    for start in range(lo, hi, BUFFER):
+        count = min(BUFFER, hi - start)
+        done = start - lo
+        first = np.uint64(start)
+        to = np.uint64(done)
+        deviates(
+            number + done,
+            key0,
+            key1,
+            normal_x[:count] if draw else normal_x[:0],
+            normal_y,
+            depth,
+            out_word[done : done + count],
+        )
+        if not coloured and not slanted:
+            # All convert at one depth.
+            z = medium.thickness - plain
+            spread = np.sqrt(_at(medium.variance, z / medium.thickness * steps))
+            spread = spread if medium.diffuse else 0.0
+            _shift_all(
+                light.x, first, spread / medium.pitch_x, normal_x, x0, out_x, to, count
+            )
+            _shift_all(
+                light.y, first, spread / medium.pitch_y, normal_y, y0, out_y, to, count
+            )
+            out_z[done : done + count] = np.float32(z)
+        else:
+            if coloured:
+                _absorb(
+                    light.wavelength, first, medium.lengths, medium.wavelength_0,
+                    1.0 / medium.wavelength_step, depth, depth, count,
+                )  # fmt: skip
+            else:
+                depth[:count] = np.float32(medium.surface_path)
+            if slanted:
+                _tilt(light.slope_x, light.slope_y, first, kept, depth, count)
+            elif kept < np.inf:
+                for m in range(count):
+                    depth[m] = min(depth[m], np.float32(kept))
+            _widths(depth, medium.thickness, medium.variance, out_z, to, width, count)
+            if not medium.diffuse:
+                width[:count] = np.float32(0.0)
+                normal_x[:count] = np.float32(0.0)
+                normal_y[:count] = np.float32(0.0)
+            _place(
+                light.x, light.slope_x, slanted, first, depth, width, normal_x,
+                medium.pitch_x, x0, out_x, to, count,
+            )  # fmt: skip
+            _place(
+                light.y, light.slope_y, slanted, first, depth, width, normal_y,
+                medium.pitch_y, y0, out_y, to, count,
+            )  # fmt: skip
+        if fixed:
+            for m in range(done, done + count):
+                # The boundary now at (x, y) belongs to the point that was shifted there.
+                part = np.float64(out_z[m]) / medium.thickness
+                if part < 0.0:
+                    continue
+                px = out_x[m]
+                py = out_y[m]
+                for _ in range(4):
+                    dx, dy = fixed_shift(pattern, px, py, part)
+                    px = out_x[m] - dx
+                    py = out_y[m] - dy
+                out_x[m] = px
+                out_y[m] = py

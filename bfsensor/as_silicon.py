@@ -1,0 +1,9 @@
+"""Importing this lets GalSim's sensor type Silicon mean :class:`bfsensor.SiliconSensor`.
+
+With ``modules: [bfsensor.as_silicon]`` a configuration that says ``type: Silicon``, such as
+imSim's, needs no other change.
+"""
+
+from bfsensor._register import register
+
+register(silicon=True)

@@ -1,0 +1,365 @@
+"""What both sensors share: GalSim's calls, on our engine."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import galsim
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor._kernels.areas import convolved_areas, pixel_areas
+from bfsensor._kernels.edges import Charges
+from bfsensor._kernels.photons import Light
+from bfsensor.errors import SensorError
+from bfsensor.sensor.areas import AreaKernels, area_kernels
+from bfsensor.sensor.exposure import Exposure, Physics
+from bfsensor.sensor.pattern import ShiftMap, make_pattern, sample_rings
+
+_EMPTY = np.zeros(0)
+_SMALL_AREA = 2e-8
+"""Kernels are left out that matter less [nominal area]; single precision ends at 6e-8."""
+
+
+class EngineSensor(galsim.SiliconSensor):
+    """GalSim's sensor calls on bfsensor's engine; see the two sensors made of it.
+
+    A subclass sets the attributes of ``galsim.SiliconSensor`` and gives
+    :meth:`_make_physics` and :meth:`_key`.
+    """
+
+    threads: int = 1
+    shift_map: ShiftMap | None = None
+    treering_func: Any
+    rng: Any
+
+    # -- what a subclass gives ---------------------------------------------------------
+
+    def _make_physics(self) -> tuple[Physics, NDArray[np.float64]]:
+        """Give the sensor for the engine and the factor of fixed shifts by height."""
+        raise NotImplementedError
+
+    def _key(self) -> tuple[Any, ...]:
+        """Give what tells one sensor from another, apart from the generator."""
+        raise NotImplementedError
+
+    def _check_charge(self, image: NDArray[np.floating]) -> None:
+        """Refuse charge that the sensor was told to refuse."""
+
+    # -- set up ------------------------------------------------------------------------
+
+    def _init_silicon(self) -> None:
+        """Build what is not pickled."""
+        self._physics, self._factor = self._make_physics()
+        self._rings = None
+        if self._has_rings():
+            self._rings = sample_rings(self.treering_func)
+        self._kernels: AreaKernels | None = None
+        self._exposure: Exposure | None = None
+        self._last_image = None
+
+    def _has_rings(self) -> bool:
+        return self.treering_func is not None
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = self.__dict__.copy()
+        for name in ("_physics", "_factor", "_rings", "_kernels"):
+            state.pop(name, None)
+        state["_last_image"] = None
+        state["_exposure"] = None
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__ = state
+        self._init_silicon()
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (
+            type(self) is type(other)
+            and self._key() == other._key()
+            and self.rng == other.rng
+        )
+
+    def __ne__(self, other: object) -> bool:
+        return not self == other
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def updateRNG(self, rng: galsim.BaseDeviate) -> None:  # noqa: N802
+        """Restart the sensor's generator from another one."""
+        self.rng.reset(rng)
+
+    @property
+    def diagnostics(self) -> dict[str, float]:
+        """What happened since the last call of :meth:`accumulate` without ``resume``.
+
+        ``photons``: their number; ``spilled`` electrons beyond the full well,
+        ``spilled_off_image`` those of them that left along the column; ``off_image``: flux
+        beside the image; ``crossed``: flux that crossed the silicon unconverted;
+        ``beyond_table``: renewals of a pixel with more charge than table and full well
+        reach, for which the response of the last level was held.
+        """
+        if self._exposure is None:
+            return {}
+        return self._exposure.diagnostics
+
+    # -- photons -----------------------------------------------------------------------
+
+    def accumulate(
+        self,
+        photons: galsim.PhotonArray,
+        image: galsim.Image,
+        orig_center: galsim.PositionI = galsim.PositionI(0, 0),  # noqa: B008
+        resume: bool = False,
+        recalc: bool = False,
+    ) -> float:
+        """Collect photons in an image.
+
+        Parameters
+        ----------
+        photons : galsim.PhotonArray
+            Positions [pixel], flux [e-]; wavelengths [nm] and slopes in the silicon count
+            where they are allocated.
+        image : galsim.Image
+            float32 or float64 [e-]; the charge in it acts.
+        orig_center : galsim.PositionI
+            Position of (0, 0) in original image coordinates, for rings and maps.
+        resume : bool
+            Go on with the image of the last call: the same bits as one call with all
+            photons.
+        recalc : bool
+            With ``resume``: renew the boundaries first.
+
+        Returns
+        -------
+        added_flux : float
+            Flux that stays in the image.
+
+        Raises
+        ------
+        galsim.GalSimError
+            ``resume`` without a previous call, or with another image.
+        galsim.GalSimUndefinedBoundsError
+            The image has no bounds.
+        TypeError
+            An image of integers.
+        SensorError
+            Photons that are not finite.  The image is unchanged after any error.
+        """
+        if resume:
+            if self._last_image is None or self._exposure is None:
+                raise galsim.GalSimError(
+                    "accumulate was called with resume, but not without it before"
+                )
+            if image is not self._last_image:
+                raise galsim.GalSimError(
+                    "accumulate was called with resume, but with an image other than that of "
+                    "the call before"
+                )
+        array = _pixels(image)
+        light = _light(photons)
+        if resume and array.shape != (self._exposure.charges.ny, self._exposure.charges.nx):
+            raise galsim.GalSimError(
+                "accumulate was called with resume, but the image has another shape now"
+            )
+        if not resume:
+            self._check_finite(array)
+            self._check_charge(array)
+            self._exposure = self._expose(image, array, orig_center)
+            self._last_image = image
+        assert self._exposure is not None
+        if resume and recalc:
+            self._exposure.renew(array)
+        return self._exposure.add(array, light)
+
+    def _expose(
+        self,
+        image: galsim.Image,
+        array: NDArray[np.floating],
+        orig_center: galsim.PositionI,
+    ) -> Exposure:
+        origin = (image.bounds.xmin - 0.5, image.bounds.ymin - 0.5)
+        # Drawn once an exposure: chunks of photons continue by count.
+        key = (int(self.rng.raw()) & 0xFFFFFFFF, int(self.rng.raw()) & 0xFFFFFFFF)
+        return Exposure(
+            array, self._physics, self._place_pattern(image, orig_center), origin, key,
+            self.threads,
+        )  # fmt: skip
+
+    def _place_pattern(self, image: galsim.Image, orig_center: galsim.PositionI) -> Any:
+        corner = (
+            image.bounds.xmin - 0.5 + orig_center.x,
+            image.bounds.ymin - 0.5 + orig_center.y,
+        )
+        centre = (self.treering_center.x, self.treering_center.y)
+        return make_pattern(self._rings, centre, self._factor, self.shift_map, corner)
+
+    @staticmethod
+    def _check_finite(array: NDArray[np.floating]) -> None:
+        if not np.isfinite(array.sum(dtype=float)) and not np.isfinite(array).all():
+            raise SensorError("the image holds values that are not finite")
+
+    # -- areas -------------------------------------------------------------------------
+
+    def calculate_pixel_areas(
+        self,
+        image: galsim.Image,
+        orig_center: galsim.PositionI = galsim.PositionI(0, 0),  # noqa: B008
+        use_flux: bool = True,
+    ) -> galsim.Image:
+        """Areas of the pixels for photons that convert at the back surface.
+
+        Parameters
+        ----------
+        image : galsim.Image
+            Charge [e-].
+        orig_center : galsim.PositionI
+            Position of (0, 0) in original image coordinates.
+        use_flux : bool
+            Let the charge act; otherwise only rings and maps do.
+
+        Returns
+        -------
+        areas : galsim.Image
+            In units of the nominal area, same bounds and type.
+        """
+        array = _pixels(image)
+        self._check_finite(array)
+        pattern = self._place_pattern(image, orig_center)
+        out = np.empty(array.shape)
+        fixed = pattern.rings.size > 0 or pattern.map_x.size > 0
+        if not use_flux:
+            charges = _no_charges(array.shape, self._physics)
+        else:
+            charges = Exposure(array, self._physics, pattern, (0.0, 0.0), (0, 0)).charges
+        if fixed:
+            low, low_second = _lowest(charges) if use_flux else (np.float32(0),) * 2
+            pixel_areas(
+                self._physics.edges, charges, pattern, use_flux, low, low_second, 0,
+                array.shape[0], out,
+            )  # fmt: skip
+        elif use_flux:
+            self._convolve(charges, out)
+        else:
+            out[...] = 1.0
+        return galsim.Image(
+            out.astype(array.dtype, copy=False), xmin=image.bounds.xmin,
+            ymin=image.bounds.ymin, wcs=galsim.PixelScale(1.0),
+        )  # fmt: skip
+
+    def _convolve(self, charges: Charges, out: NDArray[np.float64]) -> None:
+        """Areas by convolution, with as many kernels as matter for these charges."""
+        if self._kernels is None:
+            self._kernels = area_kernels(self._physics.edges)
+        kernels = self._kernels
+        low, low_second = _lowest(charges)
+        inner = max(
+            float(_inside(charges, charges.first).max() - low),
+            float(_inside(charges, charges.second).max(initial=low_second) - low_second),
+        )
+        ny, nx = out.shape
+        row = np.empty(nx, np.float32)
+        # Next to the image there is no charge: its border sees a larger spread.
+        reach = kernels.linear[0].shape[0] // 2
+        y0, x0 = min(reach, ny), min(reach, nx)
+        y1, x1 = max(ny - reach, y0), max(nx - reach, x0)
+        outer = max(inner, abs(float(low)), float(low) + inner)
+        for spread, area in (
+            (inner, (y0, y1, x0, x1)), (outer, (0, y0, 0, nx)), (outer, (y1, ny, 0, nx)),
+            (outer, (y0, y1, 0, x0)), (outer, (y0, y1, x1, nx)),
+        ):  # fmt: skip
+            count = int(np.sum(np.abs(kernels.values) * (0.5 * spread) ** 2 > _SMALL_AREA))
+            first, second = (
+                np.concatenate([linear[None], squares[:count]]).astype(np.float32)
+                for linear, squares in zip(kernels.linear, kernels.squares, strict=True)
+            )
+            convolved_areas(
+                charges, first, second, kernels.values, count, low, low_second, *area, row,
+                out,
+            )  # fmt: skip
+
+
+def _inside(charges: Charges, array: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Give the pixels of the image of a padded array."""
+    if not array.size:
+        return array
+    pad, rows = charges.pad, charges.ny + 2 * charges.pad
+    grid = array[: rows * charges.stride].reshape(rows, charges.stride)
+    return grid[pad : pad + charges.ny, pad : pad + charges.nx]
+
+
+def _lowest(charges: Charges) -> tuple[np.float32, np.float32]:
+    """Lowest effective charge of both modes in the image."""
+    first, second = (_inside(charges, a) for a in (charges.first, charges.second))
+    return first.min(), second.min() if second.size else np.float32(0)
+
+
+def _no_charges(shape: tuple[int, int], physics: Physics) -> Charges:
+    """Give the geometry of an image without room for its charge."""
+    none = np.zeros(0, np.float32)
+    return Charges(
+        none, none, 1, 0, shape[1], shape[0], none, none, none, np.zeros(0, np.int64)
+    )
+
+
+def _pixels(image: galsim.Image) -> NDArray[np.floating]:
+    """Give the array of an image that can be written to."""
+    if not image.bounds.isDefined():
+        raise galsim.GalSimUndefinedBoundsError(
+            "the image of a sensor must have defined bounds"
+        )
+    array: NDArray[np.floating] = image.array
+    if array.dtype not in (np.float32, np.float64):
+        raise TypeError(
+            f"the image of a sensor must be float32 or float64, not {array.dtype}"
+        )
+    if image.isconst:
+        raise galsim.GalSimImmutableError("the image of a sensor must be writeable", image)
+    return array
+
+
+def _light(photons: galsim.PhotonArray) -> Light:
+    """Take the arrays of photons, refusing what is not finite."""
+    has_angles = photons.hasAllocatedAngles()
+    arrays = {
+        "x": photons.x,
+        "y": photons.y,
+        "flux": photons.flux,
+        "slope_x": photons.dxdz if has_angles else _EMPTY,
+        "slope_y": photons.dydz if has_angles else _EMPTY,
+        "wavelength": photons.wavelength if photons.hasAllocatedWavelengths() else _EMPTY,
+    }
+    for name, array in arrays.items():
+        arrays[name] = np.ascontiguousarray(array, float)
+        # The sum is finite for nearly all, and costs a tenth of looking at each.
+        if np.isfinite(arrays[name].sum()):
+            continue
+        # Infinitely long waves are not absorbed: a number that means something.
+        good = ~np.isnan(array) if name == "wavelength" else np.isfinite(array)
+        if not good.all():
+            first = int(np.argmin(good))
+            raise SensorError(
+                f"photon {first}: {name} = {array[first]} is not a finite number "
+                f"({np.count_nonzero(~good)} of {len(array)} photons)"
+            )
+    return Light(**arrays)
+
+
+def read_numbers(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read a configuration of ``key = value`` lines; numbers become numbers."""
+    from bfsensor.device_import import read_configuration
+
+    out: dict[str, Any] = {}
+    for key, text in read_configuration(path).items():
+        out[key] = _number(text)
+    return out
+
+
+def _number(text: str) -> Any:
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text.strip("'\"")

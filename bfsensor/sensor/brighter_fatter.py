@@ -1,0 +1,374 @@
+"""The sensor of bfsensor's own tables, with the physics GalSim's lacks."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from pathlib import Path
+from typing import Any, Literal
+
+import galsim
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor._kernels.photons import Medium
+from bfsensor.device import Device
+from bfsensor.errors import SensorError, TableError
+from bfsensor.resources import tables_dir
+from bfsensor.sensor.base import EngineSensor
+from bfsensor.sensor.drift import MEASURED, STEPS, solve_drift
+from bfsensor.sensor.edges import make_edges, transpose_sides
+from bfsensor.sensor.exposure import Physics
+from bfsensor.sensor.pattern import ShiftMap
+from bfsensor.sensor.response import factor_table
+from bfsensor.sensor.silicon_sensor import check_rings
+from bfsensor.table import DistortionTable
+
+_SURFACE_PATH = 1.0  # um; conversion depth without wavelengths, as in GalSim
+_WAVELENGTHS = np.arange(250.0, 1451.0, 1.0)  # nm
+_DRAW_STEPS = 1e30  # um; length of light that is not absorbed
+
+
+class BrighterFatterSensor(EngineSensor):
+    r"""A thick CCD: photons become electrons where the stored charge lets them land.
+
+    Every pixel's charge moves the boundaries around it by what the distortion table of the
+    device says for that charge, for the charge of its neighbours, and for the height at
+    which each photon converts.  Boundaries are evaluated where electrons land; nothing but
+    the charge is stored.  The charge used is the one expected in the middle of each block
+    of ``nrecalc`` electrons.  Wavelengths and angles count where photons carry them.
+
+    Every piece of physics can be switched off: ``charge_response=False``,
+    ``background=False``, ``depth=False``, ``red='kept'``, ``diffusion_factor=0``,
+    ``full_well=inf``, ``predict=False``, ``strength=0``.
+
+    Parameters
+    ----------
+    name : str
+        A built-in device (``bfsensor devices``) or the path of a table made by
+        ``bfsensor table``.
+    strength : float
+        Multiplies the shifts.
+    rng : galsim.BaseDeviate, optional
+        Source of the key of the random numbers.  The same key and photons give the same
+        bits for any number of threads and any chunking with ``resume``.
+    diffusion_factor : float
+        Multiplies the width of the diffusion; 0 switches it off.
+    qdist : int, optional
+        Charge so many pixels away acts; by default all of the table.
+    nrecalc : float
+        Electrons in the image between two renewals of the charge that acts, 0: only by
+        ``recalc``.  Blocks begin at a 64th of it.
+    treering_func : galsim.LookupTable, optional
+        Radial shift of the boundaries [pixel], for conversion at the back surface.
+    treering_center : galsim.PositionD
+        Centre of the rings in original image coordinates.
+    transpose : bool
+        The columns of the device run along x.
+    shift_map : ShiftMap or str, optional
+        Fixed shifts of any shape, or the file that holds them.
+    charge_response : bool
+        The response depends on the charge; otherwise that of a small charge holds.
+    background : bool
+        The response depends on the charge of the neighbours.
+    depth : bool
+        Shifts depend on the height of conversion; otherwise those of the back surface hold.
+    red : {'lost', 'kept'}
+        Photons that would cross the silicon are lost, or convert 1 um above the gates.
+    absorption : {'law', 'galsim'}
+        Absorption length by wavelength and temperature (:mod:`bfsensor.silicon`), or
+        GalSim's table at one temperature.
+    temperature : float, optional
+        [K], by default the device's.
+    diffusion : {'einstein', 'measured'}
+        Width by Einstein's relation in the device's drift field, or 1.92 times that, which
+        Fe55 clusters of LSST sensors ask for (:data:`bfsensor.sensor.drift.MEASURED`).
+    full_well : float, optional
+        Electrons at which a pixel spills along its column; by default the table's, inf:
+        never.
+    beyond : {'hold', 'error'}
+        More charge than the table and no full well: hold the last level (one warning, see
+        :attr:`diagnostics`), or refuse.
+    predict : bool
+        Use the charge expected in the middle of a block instead of that at its start.
+    threads : int
+        Threads of one call.
+    table : DistortionTable, optional
+        A table in memory, in place of ``name``.
+
+    Raises
+    ------
+    SensorError
+        A value that is not allowed; a table that cannot serve.
+
+    Examples
+    --------
+    >>> import galsim
+    >>> sensor = BrighterFatterSensor("e2v_ccd250", rng=galsim.BaseDeviate(4171))
+    >>> star = galsim.Gaussian(sigma=0.2, flux=5e5)
+    >>> def size(sensor):
+    ...     image = star.drawImage(nx=25, ny=25, scale=0.2, method="phot", sensor=sensor,
+    ...                            rng=galsim.BaseDeviate(4172))
+    ...     return galsim.utilities.unweighted_moments(image)["Myy"]
+    >>> off = BrighterFatterSensor("e2v_ccd250", strength=0.0, rng=galsim.BaseDeviate(4171))
+    >>> bool(1.015 < size(sensor) / size(off) < 1.03)
+    True
+    """
+
+    _opt_params = {  # noqa: RUF012
+        "name": str, "strength": float, "diffusion_factor": float, "qdist": int,
+        "nrecalc": float, "treering_func": galsim.LookupTable,
+        "treering_center": galsim.PositionD, "transpose": bool, "shift_map": str,
+        "charge_response": bool, "background": bool, "depth": bool, "red": str,
+        "absorption": str, "temperature": float, "diffusion": str, "full_well": float,
+        "beyond": str, "predict": bool, "threads": int,
+    }  # fmt: skip
+    _takes_rng = True
+
+    def __init__(
+        self,
+        name: str = "itl_sta3800c",
+        strength: float = 1.0,
+        rng: galsim.BaseDeviate | None = None,
+        diffusion_factor: float = 1.0,
+        qdist: int | None = None,
+        nrecalc: float = 10000,
+        treering_func: galsim.LookupTable | None = None,
+        treering_center: galsim.PositionD = galsim.PositionD(0, 0),  # noqa: B008
+        transpose: bool = False,
+        *,
+        shift_map: ShiftMap | str | None = None,
+        charge_response: bool = True,
+        background: bool = True,
+        depth: bool = True,
+        red: Literal["lost", "kept"] = "lost",
+        absorption: Literal["law", "galsim"] = "law",
+        temperature: float | None = None,
+        diffusion: Literal["einstein", "measured"] = "einstein",
+        full_well: float | None = None,
+        beyond: Literal["hold", "error"] = "hold",
+        predict: bool = True,
+        threads: int = 1,
+        table: DistortionTable | None = None,
+    ) -> None:
+        self.name = str(name) if table is None else "table"
+        self.table = _load(name) if table is None else table
+        self.strength = _finite("strength", strength)
+        self.rng = galsim.UniformDeviate(rng)
+        self.diffusion_factor = _finite("diffusion_factor", diffusion_factor, low=0.0)
+        reach = self.table.reach
+        self.qdist = reach if qdist is None else int(qdist)
+        if not 0 <= self.qdist <= reach:
+            raise SensorError(
+                f"qdist = {qdist} must be from 0 to {reach}: the table of {self.name} holds "
+                "charge no further away"
+            )
+        self.nrecalc = _finite("nrecalc", nrecalc, low=0.0)
+        check_rings(treering_func, treering_center)
+        self.treering_func = treering_func
+        self.treering_center = treering_center
+        self.transpose = bool(transpose)
+        self.shift_map = (
+            ShiftMap.read(shift_map) if isinstance(shift_map, str) else shift_map
+        )
+        self.charge_response = bool(charge_response)
+        self.background = bool(background)
+        self.depth = bool(depth)
+        self.red = _one_of("red", red, ("lost", "kept"))
+        self.absorption = _one_of("absorption", absorption, ("law", "galsim"))
+        self.diffusion = _one_of("diffusion", diffusion, ("einstein", "measured"))
+        self.beyond = _one_of("beyond", beyond, ("hold", "error"))
+        self.predict = bool(predict)
+        self.threads = int(threads)
+        if self.threads < 1:
+            raise SensorError(f"threads = {threads} must be at least 1")
+        if not self.table.device_text:
+            raise SensorError(
+                f"the table of {self.name} holds no device, which gives drift field and "
+                "temperature"
+            )
+        self._device = Device.from_toml(self.table.device_text)
+        if temperature is None:
+            temperature = self._device.operating_point.temperature
+        self.temperature = _finite("temperature", temperature, low=77.0, high=400.0)
+        well = self.table.full_well if full_well is None else float(full_well)
+        if not (math.isnan(well) or well > 0):
+            raise SensorError(f"full_well = {full_well} must be above 0 e- (inf: none)")
+        self.full_well = math.inf if math.isnan(well) else well
+        self._warned = False
+        self._init_silicon()
+
+    @property
+    def effective_nrecalc(self) -> float:
+        """Electrons between renewals."""
+        return self.nrecalc
+
+    def _make_physics(self) -> tuple[Physics, NDArray[np.float64]]:
+        table = self.table
+        factors = factor_table(
+            table, linear=not self.charge_response, background=self.background,
+            top=not self.depth,
+        )  # fmt: skip
+        self.residual = factors.residual
+        modes = []
+        for sides in (factors.first, factors.second):
+            if sides is not None:
+                turned = transpose_sides(*sides) if self.transpose else sides
+                modes.append((self.strength * turned[0], self.strength * turned[1]))
+        edges = make_edges(
+            modes[0], modes[1] if len(modes) > 1 else None, factors.points, factors.heights,
+            self.qdist,
+        )  # fmt: skip
+        # Below the lowest height that was traced the wells hold the electrons.
+        start = table.depths[1] if len(table.depths) > 1 else 0.0
+        drift = solve_drift(table.device_text, self.temperature, float(start))
+        sigma = self.diffusion_factor * (MEASURED if self.diffusion == "measured" else 1.0)
+        pitch = table.pitch[::-1] if self.transpose else table.pitch
+        lengths, first, step = self._lengths()
+        medium = Medium(
+            thickness=table.thickness,
+            pitch_x=pitch[0],
+            pitch_y=pitch[1],
+            lengths=lengths,
+            wavelength_0=first,
+            wavelength_step=step,
+            surface_path=_SURFACE_PATH,
+            kept_path=table.thickness - 1.0 if self.red == "kept" else math.inf,
+            kept_slanted=False,
+            variance=sigma**2 * drift.variance,
+            diffuse=sigma > 0,
+        )
+        # Whole electrons, so that images of whole electrons stay such.
+        well = math.floor(self.full_well) if math.isfinite(self.full_well) else math.inf
+        physics = Physics(
+            edges, factors.response, medium, float(well), not self.transpose, self.nrecalc,
+            self.predict,
+        )  # fmt: skip
+        return physics, drift.ripple if self.depth else np.ones(STEPS + 1)
+
+    def _lengths(self) -> tuple[NDArray[np.float64], float, float]:
+        """Absorption lengths [um] on equal steps of the wavelength [nm]."""
+        if self.absorption == "law":
+            from bfsensor.silicon import absorption_length
+
+            lengths = np.asarray(absorption_length(_WAVELENGTHS, self.temperature), float)
+            return np.minimum(lengths, _DRAW_STEPS), float(_WAVELENGTHS[0]), 1.0
+        path = Path(galsim.meta_data.share_dir) / "sensors" / "abs_length.dat"
+        data = np.loadtxt(path, skiprows=1)
+        return data[:, 1].copy(), float(data[0, 0]), float(data[1, 0] - data[0, 0])
+
+    def _check_charge(self, image: NDArray[np.floating]) -> None:
+        self._refuse_beyond(float(image.max(initial=0.0)))
+
+    def _refuse_beyond(self, highest: float) -> None:
+        last = float(self.table.charges[-1])
+        if self.beyond == "error" and highest > max(last, self._table_well()):
+            raise SensorError(
+                f"a pixel holds {highest:.0f} e-; the table of {self.name} ends at "
+                f"{max(last, self._table_well()):.0f} e-"
+            )
+
+    def _table_well(self) -> float:
+        well = self.table.full_well
+        return well if math.isfinite(well) else 0.0
+
+    def accumulate(
+        self,
+        photons: galsim.PhotonArray,
+        image: galsim.Image,
+        orig_center: galsim.PositionI = galsim.PositionI(0, 0),  # noqa: B008
+        resume: bool = False,
+        recalc: bool = False,
+    ) -> float:
+        """Collect photons in an image; see :meth:`EngineSensor.accumulate`.
+
+        Raises
+        ------
+        SensorError
+            Besides: with ``beyond='error'``, a pixel would exceed the table; the image is
+            as before.
+        """
+        if self.beyond == "hold":
+            added = super().accumulate(photons, image, orig_center, resume, recalc)
+            self._warn_beyond()
+            return added
+        before = image.array.copy()
+        kept = None if self._exposure is None else self._exposure.copy()
+        last = self._last_image
+        try:
+            added = super().accumulate(photons, image, orig_center, resume, recalc)
+            self._refuse_beyond(float(image.array.max(initial=0.0)))
+        except SensorError:
+            image.array[...] = before
+            self._exposure, self._last_image = kept, last
+            raise
+        return added
+
+    def _warn_beyond(self) -> None:
+        assert self._exposure is not None
+        if self._warned or not self._exposure.diagnostics["beyond_table"]:
+            return
+        if math.isfinite(self.full_well) and self.full_well <= self._table_well():
+            return
+        self._warned = True
+        warnings.warn(
+            f"pixels hold more charge than the table of {self.name}, which ends at "
+            f"{max(self.table.charges[-1], self._table_well()):.0f} e-: the last level is held "
+            "(see diagnostics; beyond='error' refuses)",
+            galsim.GalSimWarning,
+            stacklevel=3,
+        )
+
+    def _key(self) -> tuple[Any, ...]:
+        return (self.table, *(getattr(self, key) for key in _COMPARED))
+
+    def __str__(self) -> str:
+        return f"bfsensor.BrighterFatterSensor({self.name!r})"
+
+    def __repr__(self) -> str:
+        parts = [f"{k}={getattr(self, k)!r}" for k in ("name", *_COMPARED)]
+        parts.insert(2, f"rng={self.rng!r}")
+        return f"bfsensor.BrighterFatterSensor({', '.join(parts)})"
+
+
+_COMPARED = (
+    "strength", "diffusion_factor", "qdist", "nrecalc", "treering_func", "treering_center",
+    "transpose", "shift_map", "charge_response", "background", "depth", "red", "absorption",
+    "temperature", "diffusion", "full_well", "beyond", "predict", "threads",
+)  # fmt: skip
+
+
+def _load(name: str) -> DistortionTable:
+    """Read a built-in table or a file."""
+    folder = tables_dir()
+    if str(name).endswith((".fits", ".fits.gz")) or Path(name).is_file():
+        path = Path(name)
+    else:
+        path = folder / str(name) / "table.fits"
+        if not path.is_file():
+            known = sorted(p.parent.name for p in folder.glob("*/table.fits"))
+            raise SensorError(
+                f"name = {str(name)!r} is neither a built-in table ({', '.join(known)}) nor "
+                "a .fits file"
+            )
+    try:
+        return DistortionTable.read(path)
+    except TableError as error:
+        raise SensorError(str(error)) from None
+
+
+def _finite(
+    name: str, value: float, *, low: float = -math.inf, high: float = math.inf
+) -> float:
+    number = float(value)
+    if not (math.isfinite(number) and low <= number <= high):
+        allowed = f" from {low:g}" if math.isfinite(low) else ""
+        allowed += f" to {high:g}" if math.isfinite(high) else ""
+        raise SensorError(f"{name} = {value} must be a finite number{allowed}")
+    return number
+
+
+def _one_of(name: str, value: str, allowed: tuple[str, ...]) -> str:
+    if value not in allowed:
+        raise SensorError(f"{name} = {value!r} must be one of {', '.join(allowed)}")
+    return value

@@ -1,0 +1,191 @@
+"""Fixed shifts of pixel boundaries: tree rings, and maps of any shape."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor._kernels.photons import Pattern
+from bfsensor.errors import SensorError
+
+_FINER = 16
+_NOTHING = np.zeros(0)
+_NO_MAP = np.zeros((0, 0))
+
+
+@dataclass(frozen=True, eq=False)
+class ShiftMap:
+    """A map of fixed boundary shifts, such as annealing or lithography patterns.
+
+    Attributes
+    ----------
+    dx, dy : ndarray, shape (ny, nx)
+        Shift of the boundaries [pixel] at pixel corners and between them, linearly
+        interpolated; zero outside.  ``dx[j, i]`` belongs to the corner at
+        (``x0`` + i, ``y0`` + j) in image coordinates, the pixel centres at whole numbers.
+    x0, y0 : float
+        Where the map begins, by default at the lower left corner of pixel (1, 1).
+    depth : {'bulk', 'uniform'}
+        'bulk': the shift grows with the height of conversion like that of tree rings;
+        'uniform': it is the same for all, as of boundaries that lie elsewhere.
+
+    Examples
+    --------
+    >>> ripple = 0.01 * np.sin(np.arange(65) / 5.0)
+    >>> bamboo = ShiftMap(dx=np.zeros((65, 65)), dy=np.repeat(ripple[:, None], 65, 1))
+    >>> bamboo.dy.shape
+    (65, 65)
+    """
+
+    dx: NDArray[np.float64] = field(repr=False)
+    dy: NDArray[np.float64] = field(repr=False)
+    x0: float = 0.5
+    y0: float = 0.5
+    depth: Literal["bulk", "uniform"] = "bulk"
+
+    def __post_init__(self) -> None:
+        for name in ("dx", "dy"):
+            array = np.array(getattr(self, name), float)
+            if array.ndim != 2 or min(array.shape) < 2:
+                raise SensorError(
+                    f"{name} of a shift map has the shape {array.shape}; it must be two-"
+                    "dimensional, with at least 2 x 2 corners"
+                )
+            if not np.all(np.isfinite(array)):
+                raise SensorError(f"{name} of a shift map holds values that are not finite")
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        if self.dx.shape != self.dy.shape:
+            raise SensorError(
+                f"dx and dy of a shift map have the shapes {self.dx.shape} and {self.dy.shape}"
+            )
+        if self.depth not in ("bulk", "uniform"):
+            raise SensorError(f"depth = {self.depth!r} must be 'bulk' or 'uniform'")
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, ShiftMap):
+            return NotImplemented
+        return (
+            np.array_equal(self.dx, other.dx)
+            and np.array_equal(self.dy, other.dy)
+            and (self.x0, self.y0, self.depth) == (other.x0, other.y0, other.depth)
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> ShiftMap:
+        """Read a FITS file with images DX and DY, and X0, Y0 and DEPTH in the header.
+
+        Raises
+        ------
+        SensorError
+            Not such a file; names it.
+        """
+        from astropy.io import fits
+
+        path = Path(path)
+        try:
+            with fits.open(path) as hdus:
+                header = hdus[0].header
+                return cls(
+                    hdus["DX"].data, hdus["DY"].data, float(header.get("X0", 0.5)),
+                    float(header.get("Y0", 0.5)), header.get("DEPTH", "bulk"),
+                )  # fmt: skip
+        except SensorError as error:
+            raise SensorError(f"{path}: {error}") from None
+        except (OSError, KeyError, TypeError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise SensorError(
+                f"{path}: not a shift map (a FITS file with images DX and DY): {reason}"
+            ) from None
+
+    def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Write what :meth:`read` reads (beside, then renamed)."""
+        from astropy.io import fits
+
+        path = Path(path)
+        if path.exists() and not overwrite:
+            raise SensorError(f"{path} exists; say overwrite to replace it")
+        primary = fits.PrimaryHDU()
+        primary.header["X0"] = (self.x0, "[pixel] image coordinate of DX[0, 0]")
+        primary.header["Y0"] = self.y0
+        primary.header["DEPTH"] = self.depth
+        primary.header["BUNIT"] = "pixel"
+        hdus = [primary] + [
+            fits.ImageHDU(getattr(self, n), name=n.upper()) for n in ("dx", "dy")
+        ]
+        beside = path.with_name(f"{path.name}.{os.getpid()}.part")
+        try:
+            fits.HDUList(hdus).writeto(beside, overwrite=True)
+            os.replace(beside, path)
+        finally:
+            beside.unlink(missing_ok=True)
+
+
+def sample_rings(function: Any) -> tuple[NDArray[np.float64], float]:
+    """Sample a radial LookupTable on equal steps, a sixteenth of its own.
+
+    Returns
+    -------
+    values : ndarray
+        Shift [pixel] at radii ``n step``; beyond the last nothing moves.
+    step : float
+        [pixel]
+    """
+    x = np.asarray(function.getArgs(), float)
+    steps = np.diff(x)
+    step = float(max(steps.min() / _FINER, x[-1] / 4e6))
+    count = int(np.ceil(x[-1] / step))
+    radius = np.linspace(0.0, x[-1], count + 1)
+    values = np.zeros(count + 1)
+    inside = radius >= x[0]
+    values[inside] = function(np.clip(radius[inside], x[0], x[-1]))
+    return values, float(x[-1] / count)
+
+
+def make_pattern(
+    rings: tuple[NDArray[np.float64], float] | None,
+    ring_centre: tuple[float, float],
+    ring_factor: NDArray[np.float64],
+    shift_map: ShiftMap | None,
+    corner: tuple[float, float],
+) -> Pattern:
+    """Place rings and map in the frame of an image.
+
+    Parameters
+    ----------
+    rings : tuple, optional
+        From :func:`sample_rings`.
+    ring_centre : tuple of float
+        In original image coordinates [pixel].
+    ring_factor : ndarray
+        Size of the shift by height, equal steps from the gates to the back.
+    shift_map : ShiftMap, optional
+        In original image coordinates.
+    corner : tuple of float
+        Original coordinates of the lower left corner of the image.
+
+    Returns
+    -------
+    Pattern
+    """
+    values, step = (_NOTHING, 1.0) if rings is None else rings
+    uniform = shift_map is not None and shift_map.depth == "uniform"
+    return Pattern(
+        rings=values,
+        ring_step=step,
+        ring_x=ring_centre[0] - corner[0],
+        ring_y=ring_centre[1] - corner[1],
+        ring_factor=ring_factor,
+        map_x=_NO_MAP if shift_map is None else shift_map.dx,
+        map_y=_NO_MAP if shift_map is None else shift_map.dy,
+        map_0x=0.0 if shift_map is None else shift_map.x0 - corner[0],
+        map_0y=0.0 if shift_map is None else shift_map.y0 - corner[1],
+        map_factor=np.ones(2) if uniform else ring_factor,
+    )

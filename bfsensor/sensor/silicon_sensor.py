@@ -1,0 +1,228 @@
+"""GalSim's SiliconSensor on our engine."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import galsim
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor._kernels.charge import Response
+from bfsensor._kernels.photons import Medium
+from bfsensor.errors import SensorError, TableError
+from bfsensor.galsim_format import read_sides
+from bfsensor.sensor.base import EngineSensor, read_numbers
+from bfsensor.sensor.drift import MEASURED, STEPS
+from bfsensor.sensor.edges import make_edges, transpose_sides
+from bfsensor.sensor.exposure import Physics
+
+_DEPTH_SCALE = 12.0  # um; GalSim: shifts grow as tanh(z / 12 um), an empirical fit
+_SURFACE_PATH = 1.0  # um; depth of conversion in GalSim where there are no wavelengths
+_EXTRA_COLLECT, _EXTRA_BARRIER = 12.0, 15.0  # V; GalSim's estimates of the channel
+_KEYS = (
+    "NumVertices", "PixelBoundaryNx", "PixelBoundaryNy", "PixelSizeX", "SensorThickness",
+    "CollectedCharge_0_0", "NumPhases", "CollectingPhases", "ChannelStopWidth",
+    "FieldOxideTaper", "Vbb", "Vparallel_lo", "Vparallel_hi", "qfh", "CCDTemperature",
+)  # fmt: skip
+
+
+class SiliconSensor(EngineSensor):
+    r"""A drop-in for ``galsim.SiliconSensor``: its signature, files and documented physics.
+
+    Shifts are linear in charge and do not depend on the background; they scale with the
+    height of conversion as :math:`\tanh(z / 12\,\mu m)`; boundaries are renewed every
+    ``nrecalc`` electrons; photons with angles that would cross the silicon convert 1 um
+    above the gates, others are lost.  Unlike GalSim's, the edges at the right and the top
+    of an image move as well, the depth scaling acts on all photons and on tree rings,
+    files are read without evaluating them, and ``qdist`` beyond the table is refused.
+    Random numbers are our own: images agree with GalSim's in distribution.
+
+    Parameters
+    ----------
+    name : str
+        Stem of the .cfg and .dat files: a path, or one of those shipped with GalSim.
+    strength : float
+        Multiplies the shifts.
+    rng : galsim.BaseDeviate, optional
+        Source of the key of the random numbers.
+    diffusion_factor : float
+        Multiplies the diffusion.
+    qdist : int
+        Charge so many pixels away acts, at most what the table holds (4).
+    nrecalc : float
+        Electrons in the image between renewals of the boundaries; 0: only by ``recalc``.
+    treering_func : galsim.LookupTable, optional
+        Radial shift of the boundaries [pixel].
+    treering_center : galsim.PositionD
+        Centre of the rings in original image coordinates.
+    transpose : bool
+        Exchange x and y of the table.
+
+    Examples
+    --------
+    >>> import galsim
+    >>> sensor = SiliconSensor(rng=galsim.BaseDeviate(815))
+    >>> star = galsim.Gaussian(sigma=0.4, flux=1e5)
+    >>> image = star.drawImage(nx=17, ny=17, scale=0.3, method="phot", sensor=sensor,
+    ...                        rng=galsim.BaseDeviate(816))
+    >>> bool(abs(image.array.sum() / 1e5 - 1) < 0.02)
+    True
+    """
+
+    def __init__(
+        self,
+        name: str = "lsst_itl_50_8",
+        strength: float = 1.0,
+        rng: galsim.BaseDeviate | None = None,
+        diffusion_factor: float = 1.0,
+        qdist: int = 3,
+        nrecalc: float = 10000,
+        treering_func: galsim.LookupTable | None = None,
+        treering_center: galsim.PositionD = galsim.PositionD(0, 0),  # noqa: B008
+        transpose: bool = False,
+    ) -> None:
+        self.name = name
+        self.strength = float(strength)
+        self.rng = galsim.UniformDeviate(rng)
+        self.diffusion_factor = float(diffusion_factor)
+        self.qdist = int(qdist)
+        self.nrecalc = float(nrecalc)
+        check_rings(treering_func, treering_center)
+        self.treering_func = treering_func
+        self.treering_center = treering_center
+        self.transpose = bool(transpose)
+        self.config_file, self.vertex_file = _find(name)
+        try:
+            self.config = read_numbers(self.config_file)
+            self.config.update(_defaults(self.config, self.config_file))
+            sides, points = read_sides(self.config_file, self.vertex_file)
+        except (TableError, SensorError) as error:
+            raise OSError(str(error)) from None
+        self._sides = sides
+        self._points = points
+        reach = sides[0].shape[0] // 2
+        if not 0 <= self.qdist <= reach:
+            raise galsim.GalSimRangeError(
+                f"qdist: the table of {name} holds charge up to {reach} pixels away",
+                self.qdist, 0, reach,
+            )  # fmt: skip
+        self._read_absorption()
+        self._init_silicon()
+
+    def _read_absorption(self) -> None:
+        path = os.path.join(galsim.meta_data.share_dir, "sensors", "abs_length.dat")
+        data = np.loadtxt(path, skiprows=1)
+        self.abs_length_table = galsim.LookupTable(
+            x=data[:, 0], f=data[:, 1], interpolant="linear"
+        )
+
+    @property
+    def effective_nrecalc(self) -> float:
+        """Electrons between renewals, for the strength."""
+        return self.nrecalc / self.strength if self.strength else self.nrecalc
+
+    def _diffusion(self) -> float:
+        """Diffusion of an electron from the back surface [um], with GalSim's estimate.
+
+        Einstein's relation in a uniform field, times the measured factor.
+        """
+        c = self.config
+        stop = (c["ChannelStopWidth"] + 2 * c["FieldOxideTaper"]) / c["PixelSizeX"]
+        collecting = c["CollectingPhases"] / c["NumPhases"]
+        front = stop * c["qfh"] + (1 - stop) * (
+            collecting * (c["Vparallel_hi"] + _EXTRA_COLLECT)
+            + (1 - collecting) * (c["Vparallel_lo"] + _EXTRA_BARRIER)
+        )
+        voltage = max(front - c["Vbb"], 1.0)
+        # GalSim's kT/q, 0.026 V at 298 K.
+        kt = 0.026 * c["CCDTemperature"] / 298.0
+        return float(MEASURED * np.sqrt(2 * kt / voltage) * c["SensorThickness"])
+
+    def _make_physics(self) -> tuple[Physics, NDArray[np.float64]]:
+        c = self.config
+        thickness = float(c["SensorThickness"])
+        per_electron = self.strength / (float(c["CollectedCharge_0_0"]) * c["PixelSizeX"])
+        sides = transpose_sides(*self._sides) if self.transpose else self._sides
+        weights = [per_electron * s[None] for s in sides]
+        steps = np.linspace(0.0, 1.0, STEPS + 1)
+        scale = np.tanh(steps * thickness / _DEPTH_SCALE)
+        edges = make_edges(
+            (weights[0], weights[1]), None, self._points, np.array([thickness]), self.qdist,
+            scale=scale,
+        )  # fmt: skip
+        lengths = np.asarray(self.abs_length_table.f, float)
+        wavelengths = np.asarray(self.abs_length_table.x, float)
+        sigma = self.diffusion_factor * self._diffusion()
+        medium = Medium(
+            thickness=thickness,
+            pitch_x=float(c["PixelSizeX"]),
+            pitch_y=float(c["PixelSizeX"]),
+            lengths=lengths,
+            wavelength_0=float(wavelengths[0]),
+            wavelength_step=float(wavelengths[1] - wavelengths[0]),
+            surface_path=_SURFACE_PATH,
+            kept_path=thickness - 1.0,
+            kept_slanted=True,
+            variance=sigma**2 * steps,
+            diffuse=sigma > 0,
+        )
+        none = np.zeros((0, 0), np.float32)
+        physics = Physics(
+            edges, Response(none, none, 1.0, 1.0, np.inf, np.inf), medium, np.inf,
+            not self.transpose, self.effective_nrecalc, False,
+        )  # fmt: skip
+        return physics, scale
+
+    def _key(self) -> tuple[Any, ...]:
+        return (
+            self.config, self.strength, self.diffusion_factor, self.qdist, self.nrecalc,
+            self.treering_func, self.treering_center, self.transpose,
+        )  # fmt: skip
+
+    def __str__(self) -> str:
+        parts = [repr(self.name)]
+        for key, neutral in (("strength", 1.0), ("diffusion_factor", 1.0)):
+            if getattr(self, key) != neutral:
+                parts.append(f"{key}={getattr(self, key):g}")
+        if self.transpose:
+            parts.append("transpose=True")
+        return f"bfsensor.SiliconSensor({', '.join(parts)})"
+
+    def __repr__(self) -> str:
+        keys = (
+            "name", "strength", "rng", "diffusion_factor", "qdist", "nrecalc",
+            "treering_func", "treering_center", "transpose",
+        )  # fmt: skip
+        parts = [f"{key}={getattr(self, key)!r}" for key in keys]
+        return f"bfsensor.SiliconSensor({', '.join(parts)})"
+
+
+def check_rings(function: Any, centre: Any) -> None:
+    """Refuse what is not a ring pattern, as GalSim does."""
+    if function is not None and not isinstance(function, galsim.LookupTable):
+        raise TypeError("treering_func must be a galsim.LookupTable")
+    if not isinstance(centre, galsim.PositionD):
+        raise TypeError("treering_center must be a galsim.PositionD")
+
+
+def _find(name: str) -> tuple[str, str]:
+    """Find the two files of a stem, here or among those of GalSim."""
+    shipped = os.path.join(galsim.meta_data.share_dir, "sensors", name)
+    for stem in (name, shipped):
+        if os.path.isfile(stem + ".cfg"):
+            if not os.path.isfile(stem + ".dat"):
+                raise OSError(f"cannot find the vertex file {stem}.dat")
+            return stem + ".cfg", stem + ".dat"
+    raise OSError(f"cannot find {name}.cfg, here or as {shipped}.cfg")
+
+
+def _defaults(config: dict[str, Any], path: str) -> dict[str, Any]:
+    """Check the keys that count."""
+    if "PixelSizeX" not in config and "PixelSize" in config:
+        config["PixelSizeX"] = config["PixelSize"]
+    for key in _KEYS:
+        if not isinstance(config.get(key), int | float):
+            raise SensorError(f"{path}: {key} = {config.get(key)!r} is not a number")
+    return {}
