@@ -256,7 +256,8 @@ def take_image(image, charges, ledger, response, edges, ahead):
     modes = response.first.size > 0
     first = charges.first
     charge = ledger.charge
-    apart = modes or ahead > 0
+    # Without a second mode and without prediction the charge itself is the effective one.
+    apart = modes or ledger.listed_before.size > 0
     anything = False
     for j in range(charges.ny):
         start = (j + charges.pad) * charges.stride + charges.pad

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,6 +12,7 @@ import galsim
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor._kernels.edges import Edges
 from bfsensor._kernels.photons import Medium
 from bfsensor.device import Device
 from bfsensor.errors import SensorError, TableError
@@ -20,13 +22,12 @@ from bfsensor.sensor.drift import MEASURED, STEPS, solve_drift
 from bfsensor.sensor.edges import make_edges, transpose_sides
 from bfsensor.sensor.exposure import Physics
 from bfsensor.sensor.pattern import ShiftMap
-from bfsensor.sensor.response import factor_table
+from bfsensor.sensor.response import EffectiveCharge, factor_table
 from bfsensor.sensor.silicon_sensor import check_rings
 from bfsensor.table import DistortionTable
 
-_SURFACE_PATH = 1.0  # um; conversion depth without wavelengths, as in GalSim
 _WAVELENGTHS = np.arange(250.0, 1451.0, 1.0)  # nm
-_DRAW_STEPS = 1e30  # um; length of light that is not absorbed
+_TRANSPARENT = 1e30  # um; length of light that is not absorbed
 
 
 class BrighterFatterSensor(EngineSensor):
@@ -91,6 +92,9 @@ class BrighterFatterSensor(EngineSensor):
         :attr:`diagnostics`), or refuse.
     predict : bool
         Use the charge expected in the middle of a block instead of that at its start.
+    conversion_depth : float
+        Depth below the back surface [um] at which photons without wavelengths convert; 1 um
+        as in GalSim.
     threads : int
         Threads of one call.
     table : DistortionTable, optional
@@ -121,7 +125,7 @@ class BrighterFatterSensor(EngineSensor):
         "treering_center": galsim.PositionD, "transpose": bool, "shift_map": str,
         "charge_response": bool, "background": bool, "depth": bool, "red": str,
         "absorption": str, "temperature": float, "diffusion": str, "full_well": float,
-        "beyond": str, "predict": bool, "threads": int,
+        "beyond": str, "predict": bool, "conversion_depth": float, "threads": int,
     }  # fmt: skip
     _takes_rng = True
 
@@ -148,6 +152,7 @@ class BrighterFatterSensor(EngineSensor):
         full_well: float | None = None,
         beyond: Literal["hold", "error"] = "hold",
         predict: bool = True,
+        conversion_depth: float = 1.0,
         threads: int = 1,
         table: DistortionTable | None = None,
     ) -> None:
@@ -179,6 +184,9 @@ class BrighterFatterSensor(EngineSensor):
         self.diffusion = _one_of("diffusion", diffusion, ("einstein", "measured"))
         self.beyond = _one_of("beyond", beyond, ("hold", "error"))
         self.predict = bool(predict)
+        self.conversion_depth = _finite(
+            "conversion_depth", conversion_depth, low=0.0, high=self.table.thickness
+        )
         self.threads = int(threads)
         if self.threads < 1:
             raise SensorError(f"threads = {threads} must be at least 1")
@@ -205,20 +213,8 @@ class BrighterFatterSensor(EngineSensor):
 
     def _make_physics(self) -> tuple[Physics, NDArray[np.float64]]:
         table = self.table
-        factors = factor_table(
-            table, linear=not self.charge_response, background=self.background,
-            top=not self.depth,
-        )  # fmt: skip
+        factors, edges = self._factors()
         self.residual = factors.residual
-        modes = []
-        for sides in (factors.first, factors.second):
-            if sides is not None:
-                turned = transpose_sides(*sides) if self.transpose else sides
-                modes.append((self.strength * turned[0], self.strength * turned[1]))
-        edges = make_edges(
-            modes[0], modes[1] if len(modes) > 1 else None, factors.points, factors.heights,
-            self.qdist,
-        )  # fmt: skip
         # Below the lowest height that was traced the wells hold the electrons.
         start = table.depths[1] if len(table.depths) > 1 else 0.0
         drift = solve_drift(table.device_text, self.temperature, float(start))
@@ -232,7 +228,7 @@ class BrighterFatterSensor(EngineSensor):
             lengths=lengths,
             wavelength_0=first,
             wavelength_step=step,
-            surface_path=_SURFACE_PATH,
+            surface_path=self.conversion_depth,
             kept_path=table.thickness - 1.0 if self.red == "kept" else math.inf,
             kept_slanted=False,
             variance=sigma**2 * drift.variance,
@@ -246,13 +242,38 @@ class BrighterFatterSensor(EngineSensor):
         )  # fmt: skip
         return physics, drift.ripple if self.depth else np.ones(STEPS + 1)
 
+    def _factors(self) -> tuple[EffectiveCharge, Edges]:
+        """Factor the table; kept with it, for it takes half a second."""
+        table = self.table
+        kept = table.__dict__.setdefault("_kept_factors", {})
+        key = (
+            self.charge_response, self.background, self.depth, self.strength,
+            self.transpose, self.qdist,
+        )  # fmt: skip
+        if key not in kept:
+            factors = factor_table(
+                table, linear=not self.charge_response, background=self.background,
+                top=not self.depth,
+            )  # fmt: skip
+            modes = []
+            for sides in (factors.first, factors.second):
+                if sides is not None:
+                    turned = transpose_sides(*sides) if self.transpose else sides
+                    modes.append((self.strength * turned[0], self.strength * turned[1]))
+            edges = make_edges(
+                modes[0], modes[1] if len(modes) > 1 else None, factors.points,
+                factors.heights, self.qdist,
+            )  # fmt: skip
+            kept[key] = factors, edges
+        return kept[key]
+
     def _lengths(self) -> tuple[NDArray[np.float64], float, float]:
         """Absorption lengths [um] on equal steps of the wavelength [nm]."""
         if self.absorption == "law":
             from bfsensor.silicon import absorption_length
 
             lengths = np.asarray(absorption_length(_WAVELENGTHS, self.temperature), float)
-            return np.minimum(lengths, _DRAW_STEPS), float(_WAVELENGTHS[0]), 1.0
+            return np.minimum(lengths, _TRANSPARENT), float(_WAVELENGTHS[0]), 1.0
         path = Path(galsim.meta_data.share_dir) / "sensors" / "abs_length.dat"
         data = np.loadtxt(path, skiprows=1)
         return data[:, 1].copy(), float(data[0, 0]), float(data[1, 0] - data[0, 0])
@@ -334,7 +355,7 @@ class BrighterFatterSensor(EngineSensor):
 _COMPARED = (
     "strength", "diffusion_factor", "qdist", "nrecalc", "treering_func", "treering_center",
     "transpose", "shift_map", "charge_response", "background", "depth", "red", "absorption",
-    "temperature", "diffusion", "full_well", "beyond", "predict", "threads",
+    "temperature", "diffusion", "full_well", "beyond", "predict", "conversion_depth", "threads",
 )  # fmt: skip
 
 
@@ -352,9 +373,16 @@ def _load(name: str) -> DistortionTable:
                 "a .fits file"
             )
     try:
-        return DistortionTable.read(path)
+        changed = path.stat().st_mtime_ns if path.exists() else 0
+        return _read(str(path), changed)
     except TableError as error:
         raise SensorError(str(error)) from None
+
+
+@lru_cache(maxsize=8)
+def _read(path: str, changed: int) -> DistortionTable:
+    """Read a table once for all sensors of a process."""
+    return DistortionTable.read(path)
 
 
 def _finite(
