@@ -1,0 +1,169 @@
+"""Areas of pixels, against those of polygons drawn in full."""
+
+import numpy as np
+import pytest
+
+from bfsensor._kernels.areas import pixel_areas
+from tests.kernels.test_edges import (
+    IMAGES,
+    NO_PATTERN,
+    displace,
+    draw_sides,
+    expose,
+    make_image,
+    polygon,
+    silicon_sensor,
+    table_sensor,
+)
+from tests.kernels.test_photons import PATTERNS, plain_shift
+
+
+def find_areas(sensor, image, *, pattern=NO_PATTERN, flux=True, lows=None, rows=None):
+    charges = expose(sensor, image).charges
+    if lows is None:
+        lows = charges.low_first.min(), charges.low_second.min()
+    out = np.full(image.shape, np.nan)
+    first, last = (0, image.shape[0]) if rows is None else rows
+    pixel_areas(
+        sensor.physics.edges, charges, pattern, flux, np.float32(lows[0]),
+        np.float32(lows[1]), first, last, out,
+    )  # fmt: skip
+    return out, (float(lows[0]), float(lows[1]))
+
+
+def area(corners):
+    """Shoelace formula about the first corner."""
+    x, y = (corners - corners[0]).T
+    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+
+
+def plain_areas(sides, shape):
+    return np.array(
+        [[area(polygon(sides, j, i)) for i in range(shape[1])] for j in range(shape[0])]
+    )
+
+
+def sides_of(sensor, image, lows):
+    # Photons that convert at the back surface: the topmost layer, the whole shift.
+    return draw_sides(sensor, displace(sensor, image, sensor.layers - 1, lows))
+
+
+@pytest.mark.kernels
+def test_a_few_areas_are_those_of_the_polygons():
+    sensor = silicon_sensor()
+    image = np.zeros((3, 4))
+    image[1, 2] = 1.2e5
+    found, lows = find_areas(sensor, image)
+    expected = plain_areas(sides_of(sensor, image, lows), image.shape)
+    assert np.abs(found - expected).max() < 1e-6
+    assert found[1, 2] < 0.9
+
+
+@pytest.mark.parametrize("make", [silicon_sensor, table_sensor])
+@pytest.mark.parametrize("name", IMAGES)
+def test_areas_are_those_of_the_polygons(make, name):
+    sensor = make()
+    image = make_image(name)
+    found, lows = find_areas(sensor, image)
+    expected = plain_areas(sides_of(sensor, image, lows), image.shape)
+    # Shifts of 0.2 pixel, sums of 90 terms in single precision: 2e-7 each; four sides,
+    # of which neighbouring points share most of the error.
+    assert np.abs(found - expected).max() < 1e-6
+    assert np.abs(found - 1).max() > 0.05
+
+
+@pytest.mark.parametrize("make", [silicon_sensor, table_sensor])
+def test_rows_can_be_found_by_themselves(make):
+    sensor = make()
+    image = make_image("random")
+    whole, lows = find_areas(sensor, image)
+    part, _ = find_areas(sensor, image, lows=lows, rows=(5, 9))
+    assert np.array_equal(part[5:9], whole[5:9])
+    assert np.isnan(part[:5]).all() and np.isnan(part[9:]).all()
+
+
+@pytest.mark.parametrize("make", [silicon_sensor, table_sensor])
+def test_a_uniform_charge_changes_no_area(make):
+    sensor = make()
+    image = np.full((24, 22), 1e5)
+    charges = expose(sensor, image).charges
+    inner = (slice(6, -6), slice(6, -6))
+    at = 12 * charges.stride + 12
+    lows = charges.first[at], charges.second[at] if charges.second.size else 0.0
+    found, _ = find_areas(sensor, image, lows=lows)
+    # Taken off, it leaves rounding: shifts of 1e5 x 1.2e-6 that cancel, 1e-8 each.
+    assert np.abs(found[inner] - 1).max() < 1e-6
+    # At the border it is not uniform: electrons are drawn to where there is no charge.
+    assert found[0].max() < 0.97
+    # Not taken off, corners move apart along the edges by t = 1e5 x (sum of the weights of
+    # a corner along an edge), for the windows of edges that meet there differ: a pixel
+    # then lacks at most four triangles of t x t / 2.
+    edges = sensor.physics.edges
+    sums = edges.sums.reshape(2, edges.layers, 2, edges.points.size, 2)[:, -1, ..., 0]
+    t = 1e5 * np.abs(sums).max()
+    found, _ = find_areas(sensor, image, lows=(0.0, 0.0))
+    assert np.abs(found[inner] - 1).max() < 2 * t**2 + 1e-6
+
+
+@pytest.mark.parametrize("make", [silicon_sensor, table_sensor])
+def test_pixels_share_all_of_the_area(make):
+    sensor = make()
+    image = np.zeros((30, 32))
+    image[6:-6, 6:-6] = make_image("random", (18, 20))
+    found, lows = find_areas(sensor, image)
+    # Pixels overlap or leave gaps where sides do not meet in their corners: polygons
+    # through the ends that meet there, of the sign of what the pixels miss.
+    sides = sides_of(sensor, image, lows)
+    vertical, horizontal = sides
+    gaps = 0.0
+    for j in range(1, image.shape[0]):
+        for i in range(1, image.shape[1]):
+            ends = [
+                vertical[j - 1, i, -1], horizontal[j, i, 0], vertical[j, i, 0],
+                horizontal[j, i - 1, -1],
+            ]  # fmt: skip
+            gaps += area(np.array(ends))
+    # 960 pixels, rounding of 2e-7 at random signs; the outermost sides stay in place.
+    assert abs(found.sum() + gaps - image.size) < 1e-5
+    assert abs(gaps) < 0.05
+    assert np.abs(found - 1).max() > 0.05
+
+
+@pytest.mark.parametrize("make", [silicon_sensor, table_sensor])
+def test_a_lone_pixel_loses_what_its_neighbours_gain(make):
+    # One source lies in the middle of all windows it is in; few corners do not meet.
+    sensor = make()
+    image = np.zeros((15, 15))
+    image[7, 7] = 5e4
+    found, _ = find_areas(sensor, image)
+    assert found[7, 7] < 0.98
+    assert found[7, 8] > 1.001 and found[8, 7] > 1.001
+    # Gaps open at corners at the reach alone: 5e4 x (last weights, some 1e-8) squared.
+    assert abs(found.sum() - 225) < 1e-5
+
+
+@pytest.mark.parametrize("name", PATTERNS)
+@pytest.mark.parametrize("flux", [False, True])
+def test_fixed_patterns_move_the_corners_as_well(name, flux):
+    sensor = silicon_sensor()
+    pattern = PATTERNS[name]()
+    image = make_image("bright pixel", (8, 9))
+    found, lows = find_areas(sensor, image, pattern=pattern, flux=flux)
+    if not flux:
+        image = np.zeros_like(image)
+    vertical, horizontal = sides_of(sensor, image, lows)
+    t = sensor.points
+    nominal = draw_sides(sensor, (0 * vertical, 0 * horizontal))
+    for side, places in zip((vertical, horizontal), nominal, strict=True):
+        for index in np.ndindex(side.shape[:3]):
+            side[index] += plain_shift(pattern, *places[index], 1.0)
+    assert t[0] == 0 and t[-1] == 1
+    expected = plain_areas((vertical, horizontal), image.shape)
+    assert np.abs(found - expected).max() < 1e-6
+    assert np.abs(found - find_areas(sensor, image, flux=flux)[0]).max() > 1e-3
+
+
+def test_without_flux_no_charge_is_looked_at():
+    sensor = silicon_sensor()
+    found, _ = find_areas(sensor, make_image("random"), flux=False)
+    assert np.array_equal(found, np.ones((18, 20)))

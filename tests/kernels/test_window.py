@@ -1,0 +1,117 @@
+"""Sums over windows, written with vectors, against plain ones."""
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bfsensor._kernels import window
+
+pytestmark = pytest.mark.kernels
+
+
+@numba.njit
+def sum_8(w, first, step, c, start, stride, rows):
+    return window.sum_8(w, first, step, c, start, stride, rows)
+
+
+@numba.njit
+def sum_16(w, first, step, c, start, stride, rows):
+    return window.sum_16(w, first, step, c, start, stride, rows)
+
+
+@numba.njit
+def two_sums_8(w, first, step, c, start, stride, rows):
+    return window.two_sums_8(w, first, step, c, start, stride, rows)
+
+
+@numba.njit
+def two_sums_16(w, first, step, c, start, stride, rows):
+    return window.two_sums_16(w, first, step, c, start, stride, rows)
+
+
+def plain(w, first, c, start, stride, rows, lanes):
+    """Sum, and sum of the sizes, in double precision."""
+    total = size = 0.0
+    for r in range(rows):
+        for lane in range(lanes):
+            term = float(w[first + r * lanes + lane]) * float(c[start + r * stride + lane])
+            total += term
+            size += abs(term)
+    return total, size
+
+
+def arrays(first, step, start, stride, rows, lanes, streams, seed):
+    """Flat arrays that end where the last number read lies."""
+    rng = np.random.default_rng(seed)
+    weights = rng.normal(0, 1e-6, first + (streams - 1) * step + rows * lanes)
+    charges = rng.uniform(-1e3, 1.5e5, start + max(rows - 1, 0) * stride + lanes)
+    return weights.astype(np.float32), charges.astype(np.float32)
+
+
+def bound(rows, size):
+    # One rounding a product, one a row, at most four between lanes and blocks.
+    return (rows + 5) * 2.0**-24 * size * 1.001
+
+
+WHOLE = {
+    "first": st.integers(0, 40),
+    "step": st.integers(0, 200),
+    "start": st.integers(0, 60),
+    "stride": st.integers(0, 50),
+    "rows": st.integers(0, 11),
+    "seed": st.integers(43, 2**31),
+}
+
+
+@pytest.mark.parametrize(("function", "lanes"), [(sum_8, 8), (sum_16, 16)])
+@settings(max_examples=60, deadline=None)
+@given(**WHOLE)
+def test_one_sum(function, lanes, first, step, start, stride, rows, seed):
+    w, c = arrays(first, step, start, stride, rows, lanes, 1, seed)
+    whole = (np.uint64(n) for n in (first, step))
+    found = function(w, *whole, c, np.uint64(start), np.uint64(stride), np.uint64(rows))
+    total, size = plain(w, first, c, start, stride, rows, lanes)
+    assert abs(found - total) <= bound(rows, size)
+
+
+@pytest.mark.parametrize(("function", "lanes"), [(two_sums_8, 8), (two_sums_16, 16)])
+@settings(max_examples=60, deadline=None)
+@given(**WHOLE)
+def test_two_sums(function, lanes, first, step, start, stride, rows, seed):
+    w, c = arrays(first, step, start, stride, rows, lanes, 2, seed)
+    whole = (np.uint64(n) for n in (first, step))
+    found = function(w, *whole, c, np.uint64(start), np.uint64(stride), np.uint64(rows))
+    for k in (0, 1):
+        total, size = plain(w, first + k * step, c, start, stride, rows, lanes)
+        assert abs(found[k] - total) <= bound(rows, size)
+
+
+@pytest.mark.parametrize(("function", "lanes"), [(sum_8, 8), (sum_16, 16)])
+def test_every_lane_counts_once(function, lanes):
+    # Powers of two tell which numbers were multiplied: all sums are exact.
+    rows, stride, start, first = 3, lanes + 3, 5, 2
+    for r in range(rows):
+        for lane in range(lanes):
+            w = np.zeros(first + rows * lanes, np.float32)
+            c = np.full(start + (rows - 1) * stride + lanes, 64, np.float32)
+            w[first + r * lanes + lane] = 0.5
+            c[start + r * stride + lane] = 8
+            found = function(
+                w, np.uint64(first), np.uint64(0), c, np.uint64(start), np.uint64(stride),
+                np.uint64(rows),
+            )  # fmt: skip
+            assert found == 4
+
+
+def test_two_sums_equal_one_sum_each():
+    # The same order of additions: what is decided fast or exactly may not differ by bits.
+    rows, first, step, start, stride = 9, 16, 160, 7, 31
+    for one, two, lanes in ((sum_8, two_sums_8, 8), (sum_16, two_sums_16, 16)):
+        w, c = arrays(first, step, start, stride, rows, lanes, 2, 55021)
+        rest = (c, *(np.uint64(n) for n in (start, stride, rows)))
+        both = two(w, np.uint64(first), np.uint64(step), *rest)
+        for k in (0, 1):
+            alone = one(w, np.uint64(first + k * step), np.uint64(0), *rest)
+            assert alone == both[k]
