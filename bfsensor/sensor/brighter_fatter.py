@@ -157,7 +157,9 @@ class BrighterFatterSensor(EngineSensor):
         table: DistortionTable | None = None,
     ) -> None:
         self.name = str(name) if table is None else "table"
-        self.table = _load(name) if table is None else table
+        # Where the table came from: it is pickled by that, not by its 18 MB.
+        self._source = _find(name) if table is None else None
+        self.table = _load(*self._source) if self._source else _checked(table)
         self.strength = _finite("strength", strength)
         self.rng = galsim.UniformDeviate(rng)
         self.diffusion_factor = _finite("diffusion_factor", diffusion_factor, low=0.0)
@@ -210,6 +212,17 @@ class BrighterFatterSensor(EngineSensor):
     def effective_nrecalc(self) -> float:
         """Electrons between renewals."""
         return self.nrecalc
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = super().__getstate__()
+        if self._source is not None:
+            del state["table"]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        if "table" not in state:
+            state["table"] = _load(*state["_source"])
+        super().__setstate__(state)
 
     def _make_physics(self) -> tuple[Physics, NDArray[np.float64]]:
         table = self.table
@@ -359,8 +372,8 @@ _COMPARED = (
 )  # fmt: skip
 
 
-def _load(name: str) -> DistortionTable:
-    """Read a built-in table or a file."""
+def _find(name: str) -> tuple[str, int]:
+    """Find a built-in table or a file, and when it was changed."""
     folder = tables_dir()
     if str(name).endswith((".fits", ".fits.gz")) or Path(name).is_file():
         path = Path(name)
@@ -372,11 +385,22 @@ def _load(name: str) -> DistortionTable:
                 f"name = {str(name)!r} is neither a built-in table ({', '.join(known)}) nor "
                 "a .fits file"
             )
+    return str(path.resolve()), path.stat().st_mtime_ns if path.exists() else 0
+
+
+def _load(path: str, changed: int) -> DistortionTable:
+    """Read a table; another than when the sensor was made is refused."""
     try:
-        changed = path.stat().st_mtime_ns if path.exists() else 0
-        return _read(str(path), changed)
+        table = _read(path, changed)
     except TableError as error:
         raise SensorError(str(error)) from None
+    return table
+
+
+def _checked(table: DistortionTable | None) -> DistortionTable:
+    if not isinstance(table, DistortionTable):
+        raise SensorError(f"table must be a DistortionTable, not {type(table).__name__}")
+    return table
 
 
 @lru_cache(maxsize=8)

@@ -190,9 +190,18 @@ def _bounds(
                 ends += float(_largest(jump[:, None]).max())
         top[side] = normal.max()
         doubts[side, -1] = np.inf
+        # Three edges in a row: what is looked up may lie beyond a corner.
+        at = np.concatenate([points - 1, points, points + 1])
+        move = np.tile(tangential, 3)
+        climb = np.concatenate([[*slope, 0.0]] * 3)[:-1]
+        way = np.concatenate([[0.0], np.cumsum(climb * np.diff(at))])
+        between = np.array([
+            np.maximum.accumulate(np.where(np.arange(len(at)) < k, 0.0, move))
+            for k in range(len(at))
+        ])  # fmt: skip
         for n, r in enumerate(RANGES[:-1]):
             doubts[side, n] = _doubt(
-                r * tangential, r * slope, r * layer, r * ends, points, nearest
+                r * between, r * way, r * layer, r * ends, at, points, nearest
             )
     return 1.00001 * top, 1.00001 * doubts
 
@@ -224,30 +233,31 @@ def _largest(weights: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _doubt(
-    tangential: NDArray[np.float64],
-    slope: NDArray[np.float64],
+    between: NDArray[np.float64],
+    way: NDArray[np.float64],
     layer: NDArray[np.float64],
     ends: float,
+    at: NDArray[np.float64],
     points: NDArray[np.float64],
     nearest: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Bound of the error of the nearest point's shift, by place along the edge."""
-    # Three edges in a row: what is looked up may lie beyond a corner.
-    at = np.concatenate([points - 1, points, points + 1])
-    move = np.tile(tangential, 3)
-    climb = np.concatenate([[*slope, 0.0]] * 3)[:-1]
-    way = np.concatenate([[0.0], np.cumsum(climb * np.diff(at))])
+    """Bound of the error of the nearest point's shift, by place along the edge.
+
+    ``between[a, b]``: largest tangential shift of the points ``at`` from a to b; ``way``:
+    the normal shift's largest change up to each.
+    """
+    most = between[0, -1]
+    if most >= 0.9:
+        return np.full(_BINS, np.inf)
     low = np.arange(_BINS) / _BINS
     high = low + 1 / _BINS
-    reach = np.full(_BINS, min(tangential.max(), 0.9))
+    reach = np.full(_BINS, most)
     for _ in range(8):
         first = np.clip(np.searchsorted(at, low - reach) - 1, 0, len(at) - 1)
         last = np.clip(np.searchsorted(at, high + reach), 0, len(at) - 1)
-        found = [move[a : b + 1].max() for a, b in zip(first, last, strict=True)]
-        reach = np.minimum(reach, found)
+        reach = np.minimum(reach, between[first, last])
     here = points[nearest]
     up = np.interp(high + reach, at, way) - np.interp(here, at, way)
     down = np.interp(here, at, way) - np.interp(low - reach, at, way)
     crosses = (low - reach < 0) | (high + reach > 1)
-    doubt = np.maximum(np.maximum(up, down), 0) + layer[nearest] + ends * crosses
-    return np.where(tangential.max() < 0.9, doubt, np.inf)
+    return np.maximum(np.maximum(up, down), 0) + layer[nearest] + ends * crosses

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import galsim
@@ -10,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor._kernels.charge import Response
+from bfsensor._kernels.edges import Edges
 from bfsensor._kernels.photons import Medium
 from bfsensor.errors import SensorError, TableError
 from bfsensor.galsim_format import read_sides
@@ -97,11 +100,12 @@ class SiliconSensor(EngineSensor):
         try:
             self.config = read_numbers(self.config_file)
             self.config.update(_defaults(self.config, self.config_file))
-            sides, points = read_sides(self.config_file, self.vertex_file)
+            self._changed = tuple(
+                Path(p).stat().st_mtime_ns for p in (self.config_file, self.vertex_file)
+            )
+            sides, _points = _read(self.config_file, self.vertex_file, self._changed)
         except (TableError, SensorError) as error:
             raise OSError(str(error)) from None
-        self._sides = sides
-        self._points = points
         reach = sides[0].shape[0] // 2
         if not 0 <= self.qdist <= reach:
             raise galsim.GalSimRangeError(
@@ -143,14 +147,12 @@ class SiliconSensor(EngineSensor):
     def _make_physics(self) -> tuple[Physics, NDArray[np.float64]]:
         c = self.config
         thickness = float(c["SensorThickness"])
-        per_electron = self.strength / (float(c["CollectedCharge_0_0"]) * c["PixelSizeX"])
-        sides = transpose_sides(*self._sides) if self.transpose else self._sides
-        weights = [per_electron * s[None] for s in sides]
         steps = np.linspace(0.0, 1.0, STEPS + 1)
         scale = np.tanh(steps * thickness / _DEPTH_SCALE)
-        edges = make_edges(
-            (weights[0], weights[1]), None, self._points, np.array([thickness]), self.qdist,
-            scale=scale,
+        edges = _edges(
+            self.config_file, self.vertex_file, self._changed,
+            self.strength / (float(c["CollectedCharge_0_0"]) * c["PixelSizeX"]),
+            self.transpose, self.qdist, thickness,
         )  # fmt: skip
         lengths = np.asarray(self.abs_length_table.f, float)
         wavelengths = np.asarray(self.abs_length_table.x, float)
@@ -197,6 +199,30 @@ class SiliconSensor(EngineSensor):
         )  # fmt: skip
         parts = [f"{key}={getattr(self, key)!r}" for key in keys]
         return f"bfsensor.SiliconSensor({', '.join(parts)})"
+
+
+@lru_cache(maxsize=16)
+def _read(
+    cfg: str, dat: str, changed: tuple[int, ...]
+) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]:
+    """Read a table once for all sensors of a process."""
+    return read_sides(cfg, dat)
+
+
+@lru_cache(maxsize=16)
+def _edges(
+    cfg: str, dat: str, changed: tuple[int, ...], per_electron: float, transpose: bool,
+    reach: int, thickness: float,
+) -> Edges:  # fmt: skip
+    """Pack a table for the engine, once for all sensors alike."""
+    sides, points = _read(cfg, dat, changed)
+    if transpose:
+        sides = transpose_sides(*sides)
+    steps = np.linspace(0.0, 1.0, STEPS + 1)
+    return make_edges(
+        (per_electron * sides[0][None], per_electron * sides[1][None]), None, points,
+        np.array([thickness]), reach, scale=np.tanh(steps * thickness / _DEPTH_SCALE),
+    )  # fmt: skip
 
 
 def check_rings(function: Any, centre: Any) -> None:
