@@ -143,7 +143,17 @@ def main() -> None:
         model = predict(DistortionTable.read(folder), level)
         model[0, 0] -= level
         print(f"{device}: a_ij = C_ij / level^2 [1e-6 / e-] at {level:.0f} e-")
-        for j, i in ((0, 0), (0, 1), (1, 0), (1, 1), (0, 2), (2, 0), (1, 2), (2, 1), (2, 2)):
+        for j, i in (
+            (0, 0),
+            (0, 1),
+            (1, 0),
+            (1, 1),
+            (0, 2),
+            (2, 0),
+            (1, 2),
+            (2, 1),
+            (2, 2),
+        ):
             scale = 1e6 / level**2
             print(
                 f"  ({i},{j}) {found[j, i] * scale:8.4f} +- {error[j, i] * scale:.4f}  "

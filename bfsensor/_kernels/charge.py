@@ -315,15 +315,20 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd):
         ledger.counters[LISTED] = 0
         return
     nx = charges.nx
-    count = ledger.counters[LISTED]
-    for n in range(count):
+    count = 0
+    for n in range(ledger.counters[LISTED]):
         j = ledger.listed[n] // nx
         i = ledger.listed[n] - j * nx
         at = np.uint64((j + charges.pad) * charges.stride + i + charges.pad)
         now = np.float32(image[j, i])
         gain = now - ledger.charge[at]
-        ledger.gained[n] = gain
+        if gain == np.float32(0.0):
+            # Listed twice, for negative flux had brought it back; or nothing came of it.
+            continue
+        ledger.listed[count] = ledger.listed[n]
+        ledger.gained[count] = gain
         ledger.charge[at] = now
+        count += 1
     for n in range(ledger.counters[LISTED_BEFORE]):
         j = ledger.listed_before[n] // nx
         _set_pixel(
@@ -467,6 +472,11 @@ def deposit(
             up = (words[n] & np.uint32(1)) == np.uint32(1)
             added += _spill(image, charges, ledger, cj, ci, w, full_well, along_y, up)
         else:
+            if w < 0.0:
+                # A full column may have a hole now.
+                column = ci if along_y else cj
+                ledger.spill_from[0, column] = -1
+                ledger.spill_from[1, column] = -1
             _put(image, charge, carry, listed, counters, corner + cj * stride + ci, nx,
                  cj, ci, w)  # fmt: skip
             added += w

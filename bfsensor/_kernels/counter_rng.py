@@ -102,3 +102,18 @@ def deviates(first, key0, key1, out_x, out_y, out_path, out_word):
         out_y[n] = radius * sine
         out_path[n] = -log_uniform(c)
         out_word[n] = d
+
+
+@numba.njit(cache=True, nogil=True)
+def words(first, key0, key1, out):
+    """The word of :func:`deviates` alone, where nothing else is drawn."""
+    for n in range(out.size):
+        count = np.uint64(first) + np.uint64(n)
+        out[n] = philox(
+            np.uint32(count & np.uint64(0xFFFFFFFF)),
+            np.uint32(count >> np.uint64(32)),
+            np.uint32(0),
+            np.uint32(0),
+            key0,
+            key1,
+        )[3]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from bfsensor._kernels.counter_rng import deviates
+from bfsensor._kernels.counter_rng import deviates, words
 
 BUFFER = 1024
 LOST = np.float32(-1.0)
@@ -222,15 +222,13 @@ def land(
         done = start - lo
         first = np.uint64(start)
         to = np.uint64(done)
-        deviates(
-            number + done,
-            key0,
-            key1,
-            normal_x[:count] if draw else normal_x[:0],
-            normal_y,
-            depth,
-            out_word[done : done + count],
-        )
+        if draw:
+            deviates(
+                number + done, key0, key1, normal_x[:count], normal_y, depth,
+                out_word[done : done + count],
+            )  # fmt: skip
+        else:
+            words(number + done, key0, key1, out_word[done : done + count])
         if not coloured and not slanted:
             # All convert at one depth.
             z = medium.thickness - plain

@@ -73,6 +73,20 @@ def test_areas_are_those_of_the_polygons(make, name):
 
 
 @pytest.mark.parametrize("make", [silicon_sensor, table_sensor])
+def test_areas_less_a_sheet_of_charge_are_those_of_the_polygons(make):
+    sensor = make()
+    image = make_image("random", (9, 10))
+    # Not the lowest charge: next to corners it moves points along the edges by 1e-2.
+    lows = 1.1e5, -3e4 * (sensor.layers > 1)
+    found, _ = find_areas(sensor, image, lows=lows)
+    expected = plain_areas(sides_of(sensor, image, lows), image.shape)
+    # As above.
+    assert np.abs(found - expected).max() < 1e-6
+    plain = plain_areas(sides_of(sensor, image, (0.0, 0.0)), image.shape)
+    assert np.abs(found - plain).max() > 1e-4
+
+
+@pytest.mark.parametrize("make", [silicon_sensor, table_sensor])
 def test_rows_can_be_found_by_themselves(make):
     sensor = make()
     image = make_image("random")

@@ -126,9 +126,6 @@ def test_photons_land_where_the_plain_twin_says(variant, coloured, slanted):
 
 
 @pytest.mark.kernels
-@pytest.mark.xfail(
-    strict=True, reason="land leaves out_word as it was where no deviate is drawn"
-)
 @pytest.mark.parametrize("slanted", [False, True])
 def test_words_are_written_where_nothing_else_is_drawn(slanted):
     # They say to which side an electron spills.
