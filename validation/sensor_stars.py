@@ -226,7 +226,8 @@ def depth(device: str, count: int, path: Path) -> None:
             sensors = {
                 "ours": BrighterFatterSensor(
                     table=table, conversion_depth=table.thickness - height,
-                    rng=galsim.BaseDeviate(91), **quiet,
+                    # What is captured must not spill.
+                    rng=galsim.BaseDeviate(91), full_well=np.inf, **quiet,
                 ),
                 "galsim": galsim.SiliconSensor(
                     stem, rng=galsim.BaseDeviate(92), qdist=4, **quiet

@@ -219,7 +219,7 @@ def convolved_areas(
         for i in range(left, right):
             out[j, i] = 1.0
         for k in range(count + 1):
-            total = np.float32(0.0)
+            total = flat[0] * 0
             for n in range(k * width * width, (k + 1) * width * width):
                 total -= flat[n] * low
             for n in range(k * near * near, (k + 1) * near * near):
