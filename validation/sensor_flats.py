@@ -78,11 +78,13 @@ def predict(table: DistortionTable, level: float, *, steps: int = 40) -> NDArray
         a = table.area_changes(
             charge=background + 100.0, background=background, depth=depth
         ) / (100.0 * area)
-        # The table ends: what it does not hold keeps the sum at zero.
-        a[table.reach, table.reach] -= a.sum()
+        # The sensor's shifts end with the table: the next ring of pixels gains what the
+        # table's pixels lose, for shifted boundaries only share charge out anew.
+        r = table.reach + 1
         wide = np.zeros((n, n))
-        r = table.reach
-        wide[: 2 * r + 1, : 2 * r + 1] = a
+        ring = np.ones((2 * r + 1, 2 * r + 1))
+        ring[1:-1, 1:-1] = 0.0
+        wide[: 2 * r + 1, : 2 * r + 1] = np.pad(a, 1) - a.sum() * ring / ring.sum()
         wide = np.fft.fft2(np.roll(wide, (-r, -r), (0, 1))).real
         exponent = 2 * wide * step
         small = np.abs(exponent) < 1e-12
