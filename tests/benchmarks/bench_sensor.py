@@ -42,7 +42,7 @@ def make_sensor(which: str, threads: int = 1):
         sensor = bfsensor.SiliconSensor(rng=rng)
         sensor.threads = threads
         return sensor
-    return bfsensor.BrighterFatterSensor(rng=rng, threads=threads, absorption="galsim")
+    return bfsensor.BrighterFatterSensor(rng=rng, threads=threads)
 
 
 def photons_for(case: str):
