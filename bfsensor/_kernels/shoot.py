@@ -4,6 +4,7 @@ A block ends with the photon at which the flux since its start reaches its size.
 depend on the photons' order and flux alone.
 """
 
+from types import FunctionType
 from typing import NamedTuple
 
 import numba
@@ -124,4 +125,8 @@ def _shoot(
 
 
 shoot = numba.njit(cache=True, nogil=True)(_shoot)
-shoot_on_threads = numba.njit(cache=True, nogil=True, parallel=True)(_shoot)
+# Under a name of its own: numba's cache knows functions by name and line, and would give
+# back the code for one thread.
+_shoot_on_threads = FunctionType(_shoot.__code__, globals(), "_shoot_on_threads")
+_shoot_on_threads.__qualname__ = "_shoot_on_threads"
+shoot_on_threads = numba.njit(cache=True, nogil=True, parallel=True)(_shoot_on_threads)

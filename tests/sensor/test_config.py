@@ -243,7 +243,11 @@ def test_rings_come_from_a_file_or_an_expression(tmp_path):
         {"type": "File", "file_name": str(file)}, "@image.table", "$@image.table", table,
     ):  # fmt: skip
         sensor = build(
-            {"type": "BrighterFatter", "treering_func": function, "treering_center": center},
+            {
+                "type": "BrighterFatter",
+                "treering_func": function,
+                "treering_center": center,
+            },
             table=table,
         )
         np.testing.assert_array_equal(sensor.treering_func(radius), shift)

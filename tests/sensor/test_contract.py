@@ -82,7 +82,10 @@ def test_silicon_sensor_has_the_signature_of_galsim():
 
 @BOTH
 def test_pickle_copy_and_repr(kind):
-    for options in ({}, {"treering_func": RINGS, "treering_center": galsim.PositionD(3, 4)}):
+    for options in (
+        {},
+        {"treering_func": RINGS, "treering_center": galsim.PositionD(3, 4)},
+    ):
         sensor = make(kind, **options)
         galsim.utilities.check_pickle(sensor)
         # Drawing with a copy gives the same pixels.
@@ -104,7 +107,11 @@ def test_pickle_copy_and_repr(kind):
 def test_copies_begin_a_new_exposure(kind):
     sensor, image = make(kind), blank()
     sensor.accumulate(photons(), image)
-    for other in (pickle.loads(pickle.dumps(sensor)), copy.copy(sensor), copy.deepcopy(sensor)):
+    for other in (
+        pickle.loads(pickle.dumps(sensor)),
+        copy.copy(sensor),
+        copy.deepcopy(sensor),
+    ):
         assert other == sensor
         with pytest.raises(galsim.GalSimError, match="not without it before"):
             other.accumulate(photons(), image, resume=True)
@@ -129,7 +136,6 @@ def test_sensors_differ_by_every_option(kind, key):
     assert getattr(sensor, key) == value
     assert sensor == make(kind, **{key: value})
     assert sensor != make(kind)
-    assert not sensor == make(kind)
 
 
 @BOTH
@@ -147,10 +153,10 @@ def test_sensors_differ_by_kind_and_generator(kind):
 @BOTH
 def test_rings_must_be_tables_and_positions(kind):
     for wrong in (lambda r: r, 0.3, np.zeros(4), "rings.txt"):
-        with pytest.raises(TypeError, match="treering_func must be a galsim.LookupTable"):
+        with pytest.raises(TypeError, match=r"treering_func must be a galsim.LookupTable"):
             kind(treering_func=wrong)
     for wrong in ((3.0, 4.0), None, galsim.PositionI(3, 4), "here"):
-        with pytest.raises(TypeError, match="treering_center must be a galsim.PositionD"):
+        with pytest.raises(TypeError, match=r"treering_center must be a galsim.PositionD"):
             kind(treering_func=RINGS, treering_center=wrong)
 
 
@@ -278,7 +284,7 @@ def test_refusals_change_nothing(kind, options):
         integers = galsim.Image(9, 9, dtype=dtype)
         refuse(TypeError, "float32 or float64", good, integers)
         assert not np.any(integers.array)
-    refuse(galsim.GalSimImmutableError, "", good, image.view(make_const=True))
+    refuse(galsim.GalSimImmutableError, "writeable", good, image.view(make_const=True))
     assert np.all(image.array == 3.0)
 
     # And it works as if nothing had been, also between the pieces of an exposure.
@@ -326,8 +332,7 @@ def test_infinite_wavelengths_are_not_absorbed(kind):
     light = galsim.PhotonArray(100, np.zeros(100), np.zeros(100), np.ones(100),
                                wavelength=np.full(100, np.inf))  # fmt: skip
     added = make(kind).accumulate(light, blank())
-    # Infinitely long waves: ours lose them, GalSim's table is held at its end, 1450 nm,
-    # where 0.1 mm of silicon absorb nothing either.
+    # Lengths are held at the end of the tables, 1450 nm: 0.1 mm absorb less than 1e-5.
     assert added == 0.0
 
 
@@ -446,8 +451,7 @@ def test_bounds_do_not_matter(kind):
     image = blank()
     make(kind, **options).accumulate(here, image)
     for dx, dy in ((1000, -77), (-4095, 3)):
-        moved = copy.copy(here)
-        moved.x, moved.y = here.x + dx, here.y + dy
+        moved = galsim.PhotonArray(len(here), here.x + dx, here.y + dy, here.flux)
         other = galsim.ImageF(image.bounds.shift(galsim.PositionI(dx, dy)))
         center = galsim.PositionI(-dx, -dy)
         make(kind, **options).accumulate(moved, other, orig_center=center)
@@ -598,26 +602,33 @@ def test_areas_leave_image_exposure_and_generator(kind):
 @pytest.mark.parametrize("method", ["phot", "fft"])
 @pytest.mark.parametrize("dtype", [np.float32, np.int32])
 def test_draw_image(kind, method, dtype):
-    """Both methods, all at once and in batches: nothing is lost, and the star is larger."""
+    """Nothing is lost, the star is larger than with strength 0, batches change nothing."""
     star = galsim.Gaussian(sigma=0.5, flux=8e5)
-    batches = ({}, {"maxN": 100_000}) if method == "phot" else ({},)
-    for batch in batches:
-        sizes = []
-        for strength in (1.0, 0.0):
-            image = star.drawImage(
-                galsim.Image(33, 33, dtype=dtype), scale=0.3, method=method,
-                sensor=make(kind, strength=strength), rng=galsim.BaseDeviate(41), **batch,
-            )  # fmt: skip
-            # Integers are rounded: 1089 pixels, 0.29 each, 5 sigma; FFT has fractions.
-            assert image.added_flux == pytest.approx(image.array.sum(dtype=float), abs=50)
-            # Poisson: 5 sigma are 4500; by FFT there are only ripples at the edge.
-            assert image.added_flux == pytest.approx(8e5, abs=4500)
-            moments = galsim.utilities.unweighted_moments(image)
-            sizes.append(moments["Mxx"] + moments["Myy"])
-        # With a peak of 46,000 e- (0.25 to 0.29 %) and 0.41 to 0.46 % measured: the same
-        # photons and random numbers; some 2000 electrons move by a pixel: good to 3 %.
-        # Batches recalculate the same way; integers round evenly.
-        assert 0.0015 < sizes[0] / sizes[1] - 1 < 0.006
+
+    def image(strength=1.0, **batch):
+        return star.drawImage(
+            galsim.Image(33, 33, dtype=dtype), scale=0.3, method=method,
+            sensor=make(kind, strength=strength), rng=galsim.BaseDeviate(41), **batch,
+        )  # fmt: skip
+
+    def size(some):
+        moments = galsim.utilities.unweighted_moments(some)
+        return moments["Mxx"] + moments["Myy"]
+
+    drawn, still = image(), image(strength=0.0)
+    # By FFT 800,000 e- come in photons of fractional flux: single precision of 1089 pixels
+    # of 46,000 e- at most (2e-3 each), and integers that are rounded (0.29 each, 5 sigma).
+    error = {"phot": 0.0, "fft": 5 * 0.29 * 33 if dtype == np.int32 else 2.2}[method]
+    assert drawn.added_flux == pytest.approx(drawn.array.sum(dtype=float), abs=error)
+    # 5 sigma of Poisson; nothing is lost, 10 sigma of the star from the edge.
+    assert drawn.added_flux == pytest.approx(8e5, abs=5 * np.sqrt(8e5))
+    # GalSim's sensor gives 0.27 %, the table of itl_sta3800c more (diffusion is smaller, so
+    # the star is).  Of the same photons some 2000 electrons end a pixel further out: the
+    # growth is good to 3 %.
+    assert 0.002 < size(drawn) / size(still) - 1 < 0.006
+    if method == "phot" and dtype == np.float32:
+        # GalSim draws integers batch by batch on fresh images: no charge is left to act.
+        np.testing.assert_array_equal(image(maxN=70_000).array, drawn.array)
 
 
 @BOTH
