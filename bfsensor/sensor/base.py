@@ -198,7 +198,9 @@ class EngineSensor(galsim.SiliconSensor):
 
     @staticmethod
     def _check_finite(array: NDArray[np.floating]) -> None:
-        if not np.isfinite(array.sum(dtype=float)) and not np.isfinite(array).all():
+        with np.errstate(all="ignore"):
+            total = array.sum(dtype=float)
+        if not np.isfinite(total) and not np.isfinite(array).all():
             raise SensorError("the image holds values that are not finite")
 
     # -- areas -------------------------------------------------------------------------
@@ -225,7 +227,7 @@ class EngineSensor(galsim.SiliconSensor):
         areas : galsim.Image
             In units of the nominal area, same bounds and type.
         """
-        array = _pixels(image)
+        array = _pixels(image, write=False)
         self._check_finite(array)
         pattern = self._place_pattern(image, orig_center)
         out = np.empty(array.shape)
@@ -314,8 +316,8 @@ def _no_charges(shape: tuple[int, int], physics: Physics) -> Charges:
     )
 
 
-def _pixels(image: galsim.Image) -> NDArray[np.floating]:
-    """Give the array of an image that can be written to."""
+def _pixels(image: galsim.Image, *, write: bool = True) -> NDArray[np.floating]:
+    """Give the array of an image that the engine can use."""
     if not image.bounds.isDefined():
         raise galsim.GalSimUndefinedBoundsError(
             "the image of a sensor must have defined bounds"
@@ -325,7 +327,7 @@ def _pixels(image: galsim.Image) -> NDArray[np.floating]:
         raise TypeError(
             f"the image of a sensor must be float32 or float64, not {array.dtype}"
         )
-    if image.isconst:
+    if write and image.isconst:
         raise galsim.GalSimImmutableError("the image of a sensor must be writeable", image)
     return array
 
@@ -344,7 +346,9 @@ def _light(photons: galsim.PhotonArray) -> Light:
     for name, array in arrays.items():
         arrays[name] = np.ascontiguousarray(array, float)
         # The sum is finite for nearly all, and costs a tenth of looking at each.
-        if np.isfinite(arrays[name].sum()):
+        with np.errstate(all="ignore"):
+            total = arrays[name].sum()
+        if np.isfinite(total):
             continue
         # Infinitely long waves are not absorbed: a number that means something.
         good = ~np.isnan(array) if name == "wavelength" else np.isfinite(array)

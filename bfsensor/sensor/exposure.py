@@ -114,6 +114,10 @@ class Exposure:
             return float(_shoot.shoot(*arguments))
         import numba
 
+        if numba.config.THREADING_LAYER == "default":
+            # GNU OpenMP ends a process that is forked after its use, as GalSim's
+            # configuration does, and waits by spinning.
+            numba.config.THREADING_LAYER = "workqueue"
         before = numba.get_num_threads()
         numba.set_num_threads(min(self.threads, numba.config.NUMBA_NUM_THREADS))
         try:

@@ -222,7 +222,6 @@ def _edges(
     return make_edges(
         (per_electron * sides[0][None], per_electron * sides[1][None]), None, points,
         np.array([thickness]), reach, scale=np.tanh(steps * thickness / _DEPTH_SCALE),
-        plain=True,
     )  # fmt: skip
 
 
