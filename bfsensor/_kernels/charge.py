@@ -174,7 +174,6 @@ def _find_margin(charges, ledger, edges, tile):
             low_second = min(low_second, charges.low_second[other])
             high_second = max(high_second, ledger.high_second[other])
     size = max(high - low, high_second - low_second)
-    size += np.float32(edges.uniform) * max(abs(low), abs(high))
     # Single precision: rounding of the shift, and of what cancels in its sum.
     margin = np.float32(edges.normal) * (
         size + np.float32(1e-6) * max(abs(low), abs(high))

@@ -34,8 +34,7 @@ class Edges(NamedTuple):
     line - reach - 1 .. line + reach; horizontal edges [layers, 2, points, 2 reach + 2,
     lanes]: rows line - reach - 1 .. line + reach, columns column - reach on; the lanes
     beyond are zero.  Then the second mode of both, of sources within one pixel (8 lanes).
-    ``sums`` [2, layers, 2, points, 2]: sums over the window by side and mode (zero where
-    charges count as they are); ``uniform``: part of the charge that then counts as range.
+    ``sums`` [2, layers, 2, points, 2]: sums over the window by side and mode.
 
     ``points``: nominal positions along the edge, 0 to 1; ``nearest``: the nearest point
     for equal steps of the position.  ``normal``: bound of the normal shift by the range of
@@ -56,7 +55,6 @@ class Edges(NamedTuple):
     nearest: np.ndarray
     doubts: np.ndarray
     alike: np.ndarray
-    uniform: float
     shares: np.ndarray
     normal: float
     reach: int

@@ -266,12 +266,6 @@ class EngineSensor(galsim.SiliconSensor):
         # in double precision, as GalSim's.
         kind = np.float64 if out.size < _LARGE else np.float32
         row = np.empty(nx, kind)
-        level, whole = 0.0, np.zeros(len(kernels.values))
-        if self._physics.edges.uniform > 0:
-            # Charges count as they are, and a uniform charge with them.
-            level = float(np.abs(_inside(charges, charges.first)).max())
-            whole = np.abs(kernels.squares[0].sum((-2, -1)))
-            low, low_second = np.float32(0), np.float32(0)
         # Next to the image there is no charge: its border sees a larger spread.
         reach = kernels.linear[0].shape[0] // 2
         y0, x0 = min(reach, ny), min(reach, nx)
@@ -281,8 +275,7 @@ class EngineSensor(galsim.SiliconSensor):
             (inner, (y0, y1, x0, x1)), (outer, (0, y0, 0, nx)), (outer, (y1, ny, 0, nx)),
             (outer, (y0, y1, 0, x0)), (outer, (y0, y1, x1, nx)),
         ):  # fmt: skip
-            most = np.maximum(0.5 * spread, level * whole)
-            count = int(np.sum(np.abs(kernels.values) * most**2 > _SMALL_AREA))
+            count = int(np.sum(np.abs(kernels.values) * (0.5 * spread) ** 2 > _SMALL_AREA))
             first, second = (
                 np.concatenate([linear[None], squares[:count]]).astype(kind)
                 for linear, squares in zip(kernels.linear, kernels.squares, strict=True)

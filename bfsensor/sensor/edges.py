@@ -84,7 +84,6 @@ def make_edges(
     reach: int,
     *,
     scale: NDArray[np.float64] | None = None,
-    plain: bool = False,
 ) -> Edges:
     """Pack the shifts of both modes for the kernels, with bounds of what they can do.
 
@@ -101,9 +100,6 @@ def make_edges(
         Sources up to so many pixels away.
     scale : ndarray, optional
         Factor of all shifts on equal steps from the gates to the height of the one layer.
-    plain : bool
-        Sum the charges as they are, as GalSim does; otherwise a uniform charge is taken off,
-        which moves nothing but for the cut of the window.
 
     Returns
     -------
@@ -125,8 +121,6 @@ def make_edges(
     centres = (np.arange(_BINS) + 0.5) / _BINS
     nearest = np.abs(centres[:, None] - points).argmin(1)
     normal, doubts = _bounds(modes, points, nearest)
-    if plain:
-        sums[...] = 0.0
     return Edges(
         weights=np.concatenate(blocks),
         scale=np.zeros(0, np.float32) if scale is None else scale.astype(np.float32),
@@ -137,7 +131,6 @@ def make_edges(
         nearest=nearest.astype(np.int64),
         doubts=doubts,
         alike=_alike(modes),
-        uniform=_uniform(modes) if plain else 0.0,
         shares=(normal / normal.max() if normal.max() > 0 else np.ones(2)).astype(
             np.float32
         ),
@@ -211,19 +204,6 @@ def _bounds(
                 r * between, r * way, r * layer, r * ends, at, points, nearest
             )
     return 1.00001 * top, 1.00001 * doubts
-
-
-def _uniform(modes: list[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> float:
-    """Part of a uniform charge that counts as range, where it is not taken off."""
-    part = 0.0
-    for sides in modes:
-        for weights in sides:
-            for a in (
-                weights[:, :, 0], weights[:, :, 1], np.diff(weights[:, :, 0], axis=1),
-            ):  # fmt: skip
-                offset = np.abs(a.sum((-2, -1)))
-                part = max(part, float((offset / np.maximum(_largest(a), 1e-30)).max()))
-    return part
 
 
 def _alike(
