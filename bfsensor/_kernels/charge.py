@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from bfsensor._kernels.edges import cool, heat
+from bfsensor._kernels.hot import cool, heat
 
 TILE = 16
 REFRESH = 256
@@ -20,8 +20,10 @@ STALE = np.float32(512.0)
 """Electrons [e-] a pixel may gain before the background of its neighbours is found anew."""
 
 # Counters, int64.
-LISTED, LISTED_BEFORE, DENSE, DENSE_BEFORE, FLAGGED, PHOTONS, BEYOND, OPENED = range(8)
-N_COUNTERS = 8
+(
+    LISTED, LISTED_BEFORE, DENSE, DENSE_BEFORE, FLAGGED, PHOTONS, BEYOND, OPENED, STRUCK,
+) = range(9)  # fmt: skip
+N_COUNTERS = 9
 # Sums, float64.
 IN_BLOCK, BEFORE, TOTAL, ADDED, SPILLED, SPILLED_OFF, CROSSED, OFF_IMAGE = range(8)
 N_SUMS = 8
@@ -42,7 +44,11 @@ class Response(NamedTuple):
 
 
 class Ledger(NamedTuple):
-    """What an exposure keeps: see the module.  Arrays are changed in place."""
+    """What an exposure keeps: see the module.  Arrays are changed in place.
+
+    ``strikes`` [rows, columns] counts the electrons that met a full pixel in the block,
+    ``struck`` lists these pixels.
+    """
 
     charge: np.ndarray
     carry: np.ndarray
@@ -56,6 +62,8 @@ class Ledger(NamedTuple):
     flagged: np.ndarray
     spill_from: np.ndarray
     spill_to: np.ndarray
+    strikes: np.ndarray
+    struck: np.ndarray
     counters: np.ndarray
     sums: np.ndarray
 
@@ -299,12 +307,23 @@ def take_image(image, charges, ledger, response, edges, ahead):
         _find_margin(charges, ledger, edges, tile)
 
 
+@numba.njit(cache=True, _nrt=False)
+def _heat_pixel(edges, charges, hot, j, i, electrons, crowd):
+    """Note the edges of a pixel as hot if ``crowd`` electrons come near one."""
+    margin = charges.margins[(j // TILE) * ((charges.nx + TILE - 1) // TILE) + i // TILE]
+    if electrons * min(np.float32(4.0) * margin, np.float32(1.0)) >= crowd:
+        heat(edges, charges, hot, 0, i, j)
+        heat(edges, charges, hot, 0, i + 1, j)
+        heat(edges, charges, hot, 1, j, i)
+        heat(edges, charges, hot, 1, j + 1, i)
+
+
 @numba.njit(cache=True, nogil=True, _nrt=False)
-def close_block(image, charges, ledger, response, edges, hot, ahead, crowd):
+def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_photon):
     """Take over what the block brought, ``ahead`` of each pixel's gain in advance.
 
-    The edges of pixels where ``crowd`` electrons or more came near one are evaluated
-    beforehand.
+    The edges of pixels where ``crowd`` electrons or more came near one are noted as
+    hot; ``per_photon``: electrons per photon.
     """
     cool(hot)
     if ledger.counters[DENSE] or ledger.counters[DENSE_BEFORE]:
@@ -313,6 +332,11 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd):
         ledger.counters[DENSE] = 0
         ledger.counters[LISTED_BEFORE] = 0
         ledger.counters[LISTED] = 0
+        for n in range(ledger.counters[STRUCK]):
+            ledger.strikes[
+                ledger.struck[n] // charges.nx, ledger.struck[n] % charges.nx
+            ] = 0
+        ledger.counters[STRUCK] = 0
         return
     nx = charges.nx
     count = 0
@@ -357,19 +381,19 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd):
         ledger.counters[LISTED_BEFORE] = count
     ledger.counters[LISTED] = 0
     _find_margins(charges, ledger, edges)
-    tiles_x = (nx + TILE - 1) // TILE
     for n in range(count):
-        if ledger.gained[n] < crowd:
-            continue
-        j = ledger.listed[n] // nx
-        i = ledger.listed[n] - j * nx
-        margin = charges.margins[(j // TILE) * tiles_x + i // TILE]
-        # So many come near an edge.
-        if ledger.gained[n] * min(np.float32(4.0) * margin, np.float32(1.0)) >= crowd:
-            heat(edges, charges, hot, 0, i, j)
-            heat(edges, charges, hot, 0, i + 1, j)
-            heat(edges, charges, hot, 1, j, i)
-            heat(edges, charges, hot, 1, j + 1, i)
+        if ledger.gained[n] >= crowd:
+            j = ledger.listed[n] // nx
+            i = ledger.listed[n] - j * nx
+            _heat_pixel(edges, charges, hot, j, i, ledger.gained[n], crowd)
+    # Full pixels gain nothing, yet electrons come.
+    for n in range(ledger.counters[STRUCK]):
+        j = ledger.struck[n] // nx
+        i = ledger.struck[n] - j * nx
+        electrons = np.float32(ledger.strikes[j, i]) * per_photon
+        _heat_pixel(edges, charges, hot, j, i, electrons, crowd)
+        ledger.strikes[j, i] = 0
+    ledger.counters[STRUCK] = 0
 
 
 @numba.njit(cache=True, inline="always")
@@ -443,6 +467,21 @@ def _spill(image, charges, ledger, j, i, flux, full_well, along_y, up):
     return kept
 
 
+@numba.njit(cache=True, _nrt=False)
+def _strike(ledger, j, i, nx):
+    """Count an electron that meets a full pixel."""
+    if ledger.strikes.size == 0:
+        return
+    before = ledger.strikes[j, i]
+    if before == 0:
+        count = ledger.counters[STRUCK]
+        if count >= ledger.struck.size:
+            return
+        ledger.struck[count] = j * nx + i
+        ledger.counters[STRUCK] = count + 1
+    ledger.strikes[j, i] = before + 1
+
+
 @numba.njit(cache=True, nogil=True, _nrt=False)
 def deposit(
     image, charges, ledger, flux, first, i, j, z, words, lo, hi, full_well, along_y
@@ -470,6 +509,7 @@ def deposit(
             continue
         if w > 0 and image[cj, ci] + w > full_well:
             up = (words[n] & np.uint32(1)) == np.uint32(1)
+            _strike(ledger, cj, ci, nx)
             added += _spill(image, charges, ledger, cj, ci, w, full_well, along_y, up)
         else:
             if w < 0.0:

@@ -11,6 +11,7 @@ import numba
 import numpy as np
 
 from bfsensor._kernels.charge import (
+    ADDED,
     BEFORE,
     IN_BLOCK,
     OPENED,
@@ -20,9 +21,10 @@ from bfsensor._kernels.charge import (
     deposit,
 )
 from bfsensor._kernels.edges import collect
+from bfsensor._kernels.hot import evaluate, fence
 from bfsensor._kernels.photons import land
 
-BATCH = 16384
+BATCH = 65536
 PIECE = 2048
 
 
@@ -52,7 +54,7 @@ def _size(plan, total):
 
 @numba.njit(cache=True, nogil=True)
 def finish_block(image, plan, edges, charges, hot, ledger, response):
-    """End the open block: its charge is taken over."""
+    """End the open block: its charge is taken over, hot edges are noted."""
     ahead = np.float32(0.0)
     if plan.predict and ledger.sums[IN_BLOCK] > 0:
         ahead = np.float32(0.5)
@@ -61,40 +63,65 @@ def finish_block(image, plan, edges, charges, hot, ledger, response):
             ahead = np.float32(0.5 * size / ledger.sums[IN_BLOCK])
     # As many electrons as make it worth while: an edge costs about so many lookups.
     photons = ledger.counters[PHOTONS] - ledger.counters[OPENED]
-    crowd = np.float32(np.inf)
+    per_photon = np.float32(np.inf)
     if photons > 0:
-        crowd = np.float32(
-            0.05 * edges.points.size * edges.lanes * ledger.sums[IN_BLOCK] / photons
-        )
+        per_photon = np.float32(ledger.sums[IN_BLOCK] / photons)
+    crowd = np.float32(0.05) * per_photon * np.float32(edges.points.size * edges.lanes)
     ledger.counters[OPENED] = ledger.counters[PHOTONS]
-    close_block(image, charges, ledger, response, edges, hot, ahead, crowd)
+    close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_photon)
     ledger.sums[BEFORE] = ledger.sums[IN_BLOCK]
     ledger.sums[IN_BLOCK] = 0.0
 
 
+@numba.njit(cache=True, nogil=True)
+def renew(image, plan, edges, charges, hot, ledger, response):
+    """End the open block by hand."""
+    finish_block(image, plan, edges, charges, hot, ledger, response)
+    evaluate(edges, charges, hot, 0, hot.used[1])
+    fence(edges, charges, hot, 0, hot.used[1])
+
+
+@numba.njit(cache=True, nogil=True)
+def _settle(
+    image, plan, edges, charges, hot, ledger, response, flux, start, z, words, i, j, lo,
+    hi, size,
+):  # fmt: skip
+    """Deposit the electrons lo to hi of a batch; a block that is full ends."""
+    ledger.sums[ADDED] += deposit(
+        image, charges, ledger, flux, start, i, j, z, words, lo, hi, plan.full_well,
+        plan.spill_along_y,
+    )  # fmt: skip
+    ledger.counters[PHOTONS] += hi - lo
+    if ledger.sums[IN_BLOCK] >= size:
+        finish_block(image, plan, edges, charges, hot, ledger, response)
+
+
 def _shoot(
-    image, light, medium, pattern, plan, edges, charges, hot, ledger, response,
+    image, light, medium, pattern, plan, edges, charges, hot, ledger, response, threads,
     x, y, z, words, i, j, near_x, near_y,
 ):  # fmt: skip
     """Accumulate all photons; returns the flux that stays in the image.
 
-    ``x`` to ``near_y`` are buffers for BATCH photons.  ``image``, ``charges`` and ``ledger``
-    are changed.
+    ``x`` to ``words`` are pairs of buffers for BATCH photons, ``i`` to ``near_y`` buffers:
+    one batch lands while the one before is deposited, which only one thread can do.
+    ``image``, ``charges`` and ``ledger`` are changed.
     """
-    added = 0.0
+    ledger.sums[ADDED] = 0.0
     total = light.x.size
+    number = ledger.counters[PHOTONS]
+    count = min(BATCH, total)
+    pieces = threads * ((count + threads * PIECE - 1) // (threads * PIECE))
+    for piece in numba.prange(pieces):
+        lo = piece * count // pieces
+        hi = (piece + 1) * count // pieces
+        land(
+            light, medium, pattern, lo, hi, number + lo, plan.key0, plan.key1, plan.x0,
+            plan.y0, x[0, lo:hi], y[0, lo:hi], z[0, lo:hi], words[0, lo:hi],
+        )  # fmt: skip
     for start in range(0, total, BATCH):
+        now = start // BATCH % 2
         count = min(BATCH, total - start)
-        number = ledger.counters[PHOTONS]
-        pieces = (count + PIECE - 1) // PIECE
-        for piece in numba.prange(pieces):
-            lo = piece * PIECE
-            hi = min(lo + PIECE, count)
-            land(
-                light, medium, pattern, start + lo, start + hi, number + lo,
-                plan.key0, plan.key1, plan.x0, plan.y0,
-                x[lo:hi], y[lo:hi], z[lo:hi], words[lo:hi],
-            )  # fmt: skip
+        after = min(BATCH, total - start - count)
         done = 0
         while done < count:
             size = np.inf
@@ -106,22 +133,42 @@ def _shoot(
                 ledger.sums[IN_BLOCK] += flux
                 ledger.sums[TOTAL] += flux
                 end += 1
-            parts = (end - done + PIECE - 1) // PIECE
+            parts = threads * ((end - done + threads * PIECE - 1) // (threads * PIECE))
             for part in numba.prange(parts):
-                lo = done + part * PIECE
-                hi = min(lo + PIECE, end)
+                lo = done + part * (end - done) // parts
+                hi = done + (part + 1) * (end - done) // parts
                 collect(
-                    edges, charges, hot, x, y, z, lo, hi, near_x[lo:hi], near_y[lo:hi], i, j
-                )
-            added += deposit(
-                image, charges, ledger, light.flux, start, i, j, z, words, done, end,
-                plan.full_well, plan.spill_along_y,
-            )  # fmt: skip
-            ledger.counters[PHOTONS] = number + end
-            if ledger.sums[IN_BLOCK] >= size:
-                finish_block(image, plan, edges, charges, hot, ledger, response)
+                    edges, charges, hot, x[now], y[now], z[now], lo, hi, near_x[lo:hi],
+                    near_y[lo:hi], i, j,
+                )  # fmt: skip
+            # The same share of the next batch.
+            first = min(done, after)
+            room = min(end, after) - first
+            others = 2 * threads if threads > 1 else 1
+            for task in numba.prange(others + 1):
+                if task == 0:
+                    _settle(
+                        image, plan, edges, charges, hot, ledger, response, light.flux,
+                        start, z[now], words[now], i, j, done, end, size,
+                    )  # fmt: skip
+                else:
+                    lo = first + (task - 1) * room // others
+                    hi = first + task * room // others
+                    at = start + count
+                    land(
+                        light, medium, pattern, at + lo, at + hi, number + at + lo,
+                        plan.key0, plan.key1, plan.x0, plan.y0, x[1 - now, lo:hi],
+                        y[1 - now, lo:hi], z[1 - now, lo:hi], words[1 - now, lo:hi],
+                    )  # fmt: skip
+            if ledger.sums[IN_BLOCK] == 0.0 and hot.used[1] > 0:
+                for part in numba.prange(threads):
+                    lo = part * hot.used[1] // threads
+                    evaluate(edges, charges, hot, lo, (part + 1) * hot.used[1] // threads)
+                for part in numba.prange(threads):
+                    lo = part * hot.used[1] // threads
+                    fence(edges, charges, hot, lo, (part + 1) * hot.used[1] // threads)
             done = end
-    return added
+    return ledger.sums[ADDED]
 
 
 shoot = numba.njit(cache=True, nogil=True)(_shoot)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor._kernels.edges import Edges
+from bfsensor._kernels.shifts import Edges
 
 
 @dataclass(frozen=True)

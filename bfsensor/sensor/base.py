@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor._kernels.areas import convolved_areas, pixel_areas
-from bfsensor._kernels.edges import Charges
 from bfsensor._kernels.photons import Light
+from bfsensor._kernels.shifts import Charges
 from bfsensor.errors import SensorError
 from bfsensor.sensor.areas import AreaKernels, area_kernels
 from bfsensor.sensor.exposure import Exposure, Physics

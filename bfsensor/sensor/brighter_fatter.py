@@ -12,8 +12,8 @@ import galsim
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor._kernels.edges import Edges
 from bfsensor._kernels.photons import Medium
+from bfsensor._kernels.shifts import Edges
 from bfsensor.device import Device
 from bfsensor.errors import SensorError, TableError
 from bfsensor.resources import tables_dir

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor._kernels.edges import Edges
+from bfsensor._kernels.shifts import Edges
 
 _BINS = 128
 _NEAR = 1

@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 from bfsensor._kernels import charge as _charge
 from bfsensor._kernels import shoot as _shoot
 from bfsensor._kernels.charge import TILE, Ledger, Response
-from bfsensor._kernels.edges import Charges, Edges, Hot
+from bfsensor._kernels.hot import FENCES, Hot
 from bfsensor._kernels.photons import Light, Medium, Pattern
+from bfsensor._kernels.shifts import Charges, Edges
+from bfsensor.sensor.threads import threads_to_use
 
 _HOT_PAGES, _HOT_EDGES = 256, 4096
 _EMPTY = np.zeros(0, np.float32)
 _EMPTY_2 = np.zeros((0, 0), np.float32)
+_NO_STRIKES = np.zeros((0, 0), np.int32)
 
 
 @dataclass(frozen=True)
@@ -93,10 +96,7 @@ class Exposure:
         )
         batch = _shoot.BATCH
         self._buffers = (
-            np.empty(batch),
-            np.empty(batch),
-            np.empty(batch, np.float32),
-            np.empty(batch, np.uint32),
+            *(np.empty((2, batch), kind) for kind in (float, float, np.float32, np.uint32)),
             *(np.empty(batch, np.int32) for _ in range(4)),
         )
         _charge.take_image(
@@ -106,29 +106,19 @@ class Exposure:
     def add(self, image: NDArray[np.floating], light: Light) -> float:
         """Collect photons; returns the flux that stays in the image."""
         p = self.physics
-        arguments = (
+        arguments: Any = (
             image, light, p.medium, self.pattern, self.plan, p.edges, self.charges,
-            self.hot, self.ledger, p.response, *self._buffers,
+            self.hot, self.ledger, p.response,
         )  # fmt: skip
         if self.threads == 1:
-            return float(_shoot.shoot(*arguments))
-        import numba
-
-        if numba.config.THREADING_LAYER == "default":
-            # GNU OpenMP ends a process that is forked after its use, as GalSim's
-            # configuration does, and waits by spinning.
-            numba.config.THREADING_LAYER = "workqueue"
-        before = numba.get_num_threads()
-        numba.set_num_threads(min(self.threads, numba.config.NUMBA_NUM_THREADS))
-        try:
-            return float(_shoot.shoot_on_threads(*arguments))
-        finally:
-            numba.set_num_threads(before)
+            return float(_shoot.shoot(*arguments, 1, *self._buffers))
+        with threads_to_use(self.threads) as threads:
+            return float(_shoot.shoot_on_threads(*arguments, threads, *self._buffers))
 
     def renew(self, image: NDArray[np.floating]) -> None:
         """Renew the boundaries now."""
         p = self.physics
-        _shoot.finish_block(
+        _shoot.renew(
             image, self.plan, p.edges, self.charges, self.hot, self.ledger, p.response
         )
 
@@ -163,6 +153,8 @@ def _no_hot_edges(edges: Edges, tiles: int) -> Hot:
         page_of=np.full(tiles, -1, np.int32),
         pages=np.empty((pages, 2, TILE * TILE), np.int32),
         lines=np.empty((_HOT_EDGES, edges.points.size, 2), np.float32),
+        fences=np.empty((_HOT_EDGES, FENCES, 2), np.float32),
+        edge=np.empty((_HOT_EDGES, 3), np.int32),
         used=np.zeros(2 + pages, np.int64),
     )
 
@@ -213,6 +205,9 @@ def _allocate(image: NDArray[np.floating], physics: Physics) -> tuple[Charges, L
         flagged=by_tile(np.int64),
         spill_from=np.full((2, max(nx, ny)), -1, np.int64),
         spill_to=np.full((2, max(nx, ny)), -1, np.int64),
+        # Zeros of which nothing is touched cost no memory.
+        strikes=np.zeros((ny, nx), np.int32) if physics.full_well < np.inf else _NO_STRIKES,
+        struck=np.empty(_HOT_EDGES, np.int32),
         counters=np.zeros(_charge.N_COUNTERS, np.int64),
         sums=np.zeros(_charge.N_SUMS),
     )

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor._kernels.charge import Response
-from bfsensor._kernels.edges import Edges
 from bfsensor._kernels.photons import Medium
+from bfsensor._kernels.shifts import Edges
 from bfsensor.errors import SensorError, TableError
 from bfsensor.galsim_format import read_sides
 from bfsensor.sensor.base import EngineSensor, read_numbers
@@ -218,10 +218,12 @@ def _edges(
     sides, points = _read(cfg, dat, changed)
     if transpose:
         sides = transpose_sides(*sides)
-    steps = np.linspace(0.0, 1.0, STEPS + 1)
+    scale = np.tanh(np.linspace(0.0, 1.0, STEPS + 1) * thickness / _DEPTH_SCALE)
+    # Where it is constant to single precision edges are looked up faster.
+    scale[scale > 1 - 5e-7] = 1.0
     return make_edges(
         (per_electron * sides[0][None], per_electron * sides[1][None]), None, points,
-        np.array([thickness]), reach, scale=np.tanh(steps * thickness / _DEPTH_SCALE),
+        np.array([thickness]), reach, scale=scale,
     )  # fmt: skip
 
 

@@ -1,9 +1,13 @@
 """Electrons into pixels, spilling, and the charge that moves the boundaries."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from bfsensor._kernels import charge as kernel
+from bfsensor._kernels.charge import TILE
 from tests.kernels.test_edges import (
     effective_charges,
     expose,
@@ -28,11 +32,11 @@ def put(
     )  # fmt: skip
 
 
-def close(sensor, exposure, image, ahead=0.0):
+def close(sensor, exposure, image, ahead=0.0, crowd=np.inf):
     p = sensor.physics
     kernel.close_block(
         image, exposure.charges, exposure.ledger, p.response, p.edges, exposure.hot,
-        np.float32(ahead), np.float32(np.inf),
+        np.float32(ahead), np.float32(crowd), np.float32(1.0),
     )  # fmt: skip
 
 
@@ -524,3 +528,25 @@ def test_a_hole_in_a_trail_is_filled_again():
     put(exposure, image, [1] * 4, [8] * 4, flux=-1.0, full_well=10)
     put(exposure, image, [1] * 4, [5] * 4, words=[1] * 4, full_well=10)
     assert image[5:12, 1].tolist() == [10] * 6 + [0]
+
+
+def test_edges_of_full_pixels_are_hot_though_they_gain_nothing():
+    sensor = replace(table_sensor().physics, full_well=100.0)
+    image = np.zeros((40, 40))
+    image[5:35, 20] = 100.0
+    exposure = expose(SimpleNamespace(physics=sensor), image)
+    count = 400
+    i, j = np.full(count, 20), np.full(count, 20)
+    put(exposure, image, i, j, full_well=100.0)
+    assert exposure.ledger.strikes[20, 20] == count
+    before = image[20, 20]
+    close(SimpleNamespace(physics=sensor), exposure, image, crowd=1e-3)
+    assert image[20, 20] == before == 100.0
+    hot, tiles_x = exposure.hot, 3
+    page = hot.page_of[(20 // TILE) * tiles_x + 20 // TILE]
+    assert page >= 0
+    at = (20 % TILE) * TILE + 20 % TILE
+    for side, place in ((0, at), (0, at + 1), (1, at), (1, at + TILE)):
+        assert hot.pages[page, side, place] >= 0
+    assert not exposure.ledger.strikes.any()
+    assert exposure.ledger.counters[kernel.STRUCK] == 0

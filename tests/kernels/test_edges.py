@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from bfsensor._kernels import edges as kernel
+from bfsensor._kernels import hot as hot_kernel
 from bfsensor._kernels.charge import TILE
 from bfsensor._kernels.photons import Pattern
 from bfsensor.galsim_format import read_sides
@@ -596,9 +597,12 @@ def test_hot_edges_are_the_same_polylines(sensor, name):
     ny, nx = image.shape
     for j in range(2, ny, 1):
         for i in range(nx - 3):
-            kernel.heat(edges, charges, hot, 0, i, j)
-            kernel.heat(edges, charges, hot, 1, j, i)
-    assert hot.used[1] == 2 * (ny - 2) * (nx - 3)
+            hot_kernel.heat(edges, charges, hot, 0, i, j)
+            hot_kernel.heat(edges, charges, hot, 1, j, i)
+    count = hot.used[1]
+    assert count == 2 * (ny - 2) * (nx - 3)
+    hot_kernel.evaluate(edges, charges, hot, 0, count)
+    hot_kernel.fence(edges, charges, hot, 0, count)
     z = 99.0 if sensor.layers > 1 else 31.0
     layer = sensor.layers - 1
     sides = draw_sides(sensor, displaced(sensor, image, layer), sensor.factor(z))
@@ -612,13 +616,14 @@ def test_hot_edges_are_the_same_polylines(sensor, name):
     assert truth.agrees(*given)[clear].all()
     # They were looked at: with their shifts off the answers are the nominal pixels.
     hot.lines[:] = 0.0
+    hot_kernel.fence(edges, charges, hot, 0, count)
     given = find_pixels(sensor, exposure, x, y, np.full(len(x), z))
     inner = (x > 0.5) & (x < nx - 4) & (y > 2.5) & (y < ny - 0.5)
     inner &= (abs(x - np.round(x)) > 1e-4) & (abs(y - np.round(y)) > 1e-4)
     assert np.array_equal(given[0][inner], np.floor(x[inner]))
     assert np.array_equal(given[1][inner], np.floor(y[inner]))
     # Cooled, they are forgotten.
-    kernel.cool(hot)
+    hot_kernel.cool(hot)
     assert (hot.page_of == -1).all()
     again = find_pixels(sensor, exposure, x, y, np.full(len(x), z))
     assert np.array_equal(again[0], i)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import inspect
-import multiprocessing
 import pickle
 from concurrent.futures import ProcessPoolExecutor
 from itertools import pairwise
@@ -215,19 +214,6 @@ def test_an_exposure_keeps_its_random_numbers(kind):
         )
         sensor.updateRNG(galsim.BaseDeviate(500 + n))
     np.testing.assert_array_equal(image.array, draw(make(kind)))
-
-
-@BOTH
-def test_threads_do_not_matter(kind):
-    everything = photons(300_000, full=True)
-    images = []
-    for threads in (1, 2):
-        sensor = make(kind)
-        sensor.threads = threads
-        images.append(draw(sensor, everything))
-    np.testing.assert_array_equal(*images)
-    if kind is BrighterFatterSensor:
-        np.testing.assert_array_equal(draw(make(kind, threads=2), everything), images[0])
 
 
 # -- refusals ------------------------------------------------------------------------------
@@ -675,17 +661,3 @@ def test_photon_pooling_in_processes(kind):
     # The renewals are what makes stars wider: without them the charge does not act.
     still, _ = pool(make(kind, nrecalc=0), recalc=False)
     assert here.max() < still.max()
-
-
-@BOTH
-def test_threads_survive_a_fork(kind):
-    """A process that is forked after threads were used may use threads as well."""
-    # FAILS: numba takes its layer omp here, and GNU OpenMP ends a forked process that
-    # starts threads ("fork() called from a process already using GNU OpenMP").  GalSim's
-    # configuration forks for nproc.
-    sensor = make(kind)
-    sensor.threads = 2
-    here = draw(copy.deepcopy(sensor))
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("fork")) as executor:
-        away = executor.submit(draw, sensor).result()
-    np.testing.assert_array_equal(away, here)

@@ -1,0 +1,209 @@
+"""Shifts of the points of pixel edges: sums of weights times charges in a window.
+
+Boundaries are kept nowhere: what moves them is evaluated where it is needed.
+
+A vertical edge runs along y between two pixels of a row, a horizontal edge along x.  The
+line of vertical edges ``line`` lies left of the pixels in column ``line``.
+"""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from bfsensor._kernels.counter_rng import log_single
+from bfsensor._kernels.window import sum_8, sum_16, two_sums_8, two_sums_16
+
+NORMAL = 0
+TANGENTIAL = 1
+
+
+class Edges(NamedTuple):
+    """Shifts [pixel per electron] of the points of an edge, by source and height.
+
+    ``weights`` holds four blocks, flat, that begin at ``starts``.  Vertical edges [layers,
+    2, points, 2 reach + 1, lanes]: sources in rows row - reach .. row + reach and columns
+    line - reach - 1 .. line + reach; horizontal edges [layers, 2, points, 2 reach + 2,
+    lanes]: rows line - reach - 1 .. line + reach, columns column - reach on; the lanes
+    beyond are zero.  Then the second mode of both, of sources within one pixel (8 lanes).
+    ``sums`` [2, layers, 2, points, 2]: sums over the window by side and mode.
+
+    ``points``: nominal positions along the edge, 0 to 1; ``nearest``: the nearest point
+    for equal steps of the position.  ``normal``: bound of the normal shift by the range of
+    effective charges [pixel per electron], ``shares``: of it by side; ``doubts`` [2,
+    ranges, steps]: bound of the error of the nearest point's shift, vertical and
+    horizontal.  ``alike``: row of the first range for which a layer and the next differ by
+    more than 5e-5 pixel (mean over the points).  Layers lie at heights
+    with equal steps of the logarithm, ``log_z0 + n log_step``.  ``scale``: factor of all
+    shifts at heights ``n / per_um`` [um], where one layer serves all (size 0: none).
+    """
+
+    weights: np.ndarray
+    starts: np.ndarray
+    scale: np.ndarray
+    per_um: float
+    sums: np.ndarray
+    points: np.ndarray
+    nearest: np.ndarray
+    doubts: np.ndarray
+    alike: np.ndarray
+    shares: np.ndarray
+    normal: float
+    reach: int
+    lanes: int
+    layers: int
+    modes: int
+    log_z0: float
+    log_step: float
+
+
+class Charges(NamedTuple):
+    """Effective charges, each [rows, stride] flat with ``pad`` empty pixels before.
+
+    ``first`` and ``second`` mode (size 0 where there is none); ``low_*`` by tile of
+    16 x 16 pixels, subtracted in sums that start from it: a uniform charge moves nothing.
+    ``margins`` [pixel] and ``ranges`` (row of ``Edges.doubts``) bound what edges of a tile do.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    stride: int
+    pad: int
+    nx: int
+    ny: int
+    low_first: np.ndarray
+    low_second: np.ndarray
+    margins: np.ndarray
+    ranges: np.ndarray
+
+
+class Grid(NamedTuple):
+    """The numbers that say where a window lies: all that is not an array."""
+
+    reach: int
+    lanes: int
+    layers: int
+    modes: int
+    stride: int
+    pad: int
+    vertical: int
+    horizontal: int
+    vertical_near: int
+    horizontal_near: int
+    points: int
+
+
+@numba.njit(cache=True, inline="always")
+def grid(edges, charges):
+    return Grid(
+        edges.reach, edges.lanes, edges.layers, edges.modes, charges.stride, charges.pad,
+        edges.starts[0], edges.starts[1], edges.starts[2], edges.starts[3],
+        edges.points.size,
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, inline="always")
+def _places(g, upright, layer, point, component, line, other):
+    """Where the weights of a point and its window begin, in both modes, and their rows."""
+    q = g.reach
+    side = 0 if upright else 1
+    place = (layer * 2 + component) * g.points + point
+    total = 2 * ((side * g.layers * g.points * 2) + place)
+    rows = 2 * q + 1 + side
+    if upright:
+        begin = g.vertical + place * rows * g.lanes
+        at = (other - q + g.pad) * g.stride + line - q - 1 + g.pad
+        begin_near = g.vertical_near + place * 24
+        at_near = (other - 1 + g.pad) * g.stride + line - 2 + g.pad
+    else:
+        begin = g.horizontal + place * rows * g.lanes
+        at = (line - q - 1 + g.pad) * g.stride + other - q + g.pad
+        begin_near = g.horizontal_near + place * 32
+        at_near = (line - 2 + g.pad) * g.stride + other - 1 + g.pad
+    return (
+        np.uint64(begin), np.uint64(at), np.uint64(rows), np.uint64(begin_near),
+        np.uint64(at_near), np.uint64(3 + side), np.uint64(total),
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, inline="always")
+def shift_of(weights, sums, first, second, g, upright, layer, point, component, line, other,
+           low_first, low_second):  # fmt: skip
+    """Shift of a point of an edge in one layer."""
+    begin, at, rows, begin_near, at_near, rows_near, total = _places(
+        g, upright, layer, point, component, line, other
+    )
+    none = np.uint64(0)
+    stride = np.uint64(g.stride)
+    if g.lanes == 8:
+        shift = sum_8(weights, begin, none, first, at, stride, rows)
+    else:
+        shift = sum_16(weights, begin, none, first, at, stride, rows)
+    shift -= sums[total] * low_first
+    if g.modes == 2:
+        shift += sum_8(weights, begin_near, none, second, at_near, stride, rows_near)
+        shift -= sums[total + np.uint64(1)] * low_second
+    return shift
+
+
+@numba.njit(cache=True, inline="always")
+def both_shifts(weights, sums, first, second, g, upright, layer, point, line, other, low_first,
+          low_second):  # fmt: skip
+    """Normal and tangential shift of a point in one layer."""
+    begin, at, rows, begin_near, at_near, rows_near, total = _places(
+        g, upright, layer, point, 0, line, other
+    )
+    stride = np.uint64(g.stride)
+    apart = np.uint64(g.points) * rows * np.uint64(g.lanes)
+    if g.lanes == 8:
+        normal, tangential = two_sums_8(weights, begin, apart, first, at, stride, rows)
+    else:
+        normal, tangential = two_sums_16(weights, begin, apart, first, at, stride, rows)
+    to = total + np.uint64(2 * g.points)
+    normal -= sums[total] * low_first
+    tangential -= sums[to] * low_first
+    if g.modes == 2:
+        apart = np.uint64(g.points * 8) * rows_near
+        n, t = two_sums_8(weights, begin_near, apart, second, at_near, stride, rows_near)
+        normal += n - sums[total + np.uint64(1)] * low_second
+        tangential += t - sums[to + np.uint64(1)] * low_second
+    return normal, tangential
+
+
+@numba.njit(cache=True, _nrt=False)
+def point_shift(weights, sums, first, second, g, upright, layer, part, point, line, other,
+           scale, low_first, low_second):  # fmt: skip
+    """Shift (normal, tangential) of a point, between two layers."""
+    normal, tangential = both_shifts(
+        weights, sums, first, second, g, upright, layer, point, line, other, low_first,
+        low_second,
+    )  # fmt: skip
+    if part > np.float32(0.0):
+        n, t = both_shifts(
+            weights, sums, first, second, g, upright, layer + 1, point, line, other,
+            low_first, low_second,
+        )  # fmt: skip
+        normal += part * (n - normal)
+        tangential += part * (t - tangential)
+    return scale * normal, scale * tangential
+
+
+@numba.njit(cache=True, inline="always")
+def find_layer(log_z0, per_log, layers, z):
+    """Layer below the height ``z`` [um] and the part of the way to the next."""
+    if layers == 1:
+        return 0, np.float32(0.0)
+    at = (log_single(max(z, np.float32(1e-3))) - log_z0) * per_log
+    at = min(max(at, np.float32(0.0)), np.float32(layers - 1))
+    layer = min(int(at), layers - 2)
+    return layer, at - np.float32(layer)
+
+
+@numba.njit(cache=True, inline="always")
+def scale_at(scale, per_um, z):
+    """Factor of the shifts at a height."""
+    if scale.size == 0:
+        return np.float32(1.0)
+    at = min(max(z * per_um, np.float32(0.0)), np.float32(scale.size - 1))
+    n = np.uint64(min(np.int32(at), np.int32(scale.size - 2)))
+    return scale[n] + (at - np.float32(n)) * (scale[n + np.uint64(1)] - scale[n])
