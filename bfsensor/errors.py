@@ -25,6 +25,14 @@ class SensorError(BFSensorError, ValueError):
     """A sensor for image simulation was given what it cannot use."""
 
 
+class SimulationError(BFSensorError, ValueError):
+    """A simulation of electrons was asked for something it cannot do."""
+
+
+class SweepError(BFSensorError, ValueError):
+    """Work cannot be spread as asked."""
+
+
 class ConvergenceError(BFSensorError, RuntimeError):
     """An iteration did not reach its tolerance; nothing unconverged is returned.
 

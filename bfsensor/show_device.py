@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bfsensor._kernels import drift
 from bfsensor.errors import BFSensorError
-from bfsensor.simulate.boundaries import Field
+from bfsensor.simulate.field import Field
 from bfsensor.simulate.mesh import Surfaces, make_mesh
 from bfsensor.simulate.poisson import Electrostatics, Potential, solve_unit_cell, tile
 

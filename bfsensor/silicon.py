@@ -177,7 +177,19 @@ def mobility(field: ArrayLike, temperature: float) -> NDArray[np.float64]:
     if bad.size:
         raise DeviceError(f"field = {bad.flat[0]} V/um must be a number from 0 V/um")
     _check_temperature(temperature)
+    low, critical, beta = mobility_law(temperature)
+    return np.asarray(low / (1 + (e / critical) ** beta) ** (1 / beta))
+
+
+def mobility_law(temperature: float) -> tuple[float, float, float]:
+    """Constants of :func:`mobility` at a temperature.
+
+    Returns
+    -------
+    low, critical, exponent : float
+        Mobility in weak fields [um^2 / (V s)], critical field [V/um], exponent.
+    """
+    _check_temperature(temperature)
     velocity = 1.53e9 * temperature**-0.87 * 1e4  # um/s
     critical = 1.01 * temperature**1.55 * 1e-4  # V/um
-    beta = 2.57e-2 * temperature**0.66
-    return np.asarray(velocity / critical / (1 + (e / critical) ** beta) ** (1 / beta))
+    return velocity / critical, critical, 2.57e-2 * temperature**0.66

@@ -18,6 +18,10 @@ VACUUM_PERMITTIVITY = 55.26349362
 BOLTZMANN = 8.617333262e-5
 """Boltzmann constant [eV/K] (CODATA 2022, exact), so kT/q in volts."""
 
+ELECTRON_MASS = 5.685630e-24
+"""Free electron's mass by its charge [V s^2 / um^2]: 9.1093837e-31 kg / 1.602176634e-19 C
+(CODATA 2022)."""
+
 INTERNAL = {
     "length": u.um,
     "potential": u.V,

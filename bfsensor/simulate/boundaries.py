@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bfsensor._kernels import drift
 from bfsensor.errors import ConvergenceError, TableError
+from bfsensor.simulate.field import Field
 from bfsensor.simulate.mesh import Surfaces
 from bfsensor.simulate.poisson import Potential
 
@@ -41,85 +42,6 @@ RATIO = 0.10
 _MAX_STEPS = 3000
 _CORNER_PASSES = 20
 _CORNER_TOLERANCE = 1e-7  # um
-
-
-@dataclass(frozen=True)
-class Field:
-    """A potential padded for interpolation: ``phi`` [y, z, x] and its node positions."""
-
-    phi: NDArray[np.float64]
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    z: NDArray[np.float64]
-    zone: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, potential: Potential) -> Field:
-        """Pad a potential by its symmetry in x and y and by extrapolation in z."""
-        mesh = potential.mesh
-        phi = np.moveaxis(potential.phi, 0, 1)
-        phi, y = _pad(phi, mesh.y, 0, mesh.side_y, mesh.period[1], mesh.cells)
-        phi, x = _pad(phi, mesh.x, 2, mesh.side_x, mesh.period[0], mesh.cells)
-        phi, z = _pad_z(phi, mesh.z)
-        device = potential.device
-        surfaces = Surfaces.of(device)
-        channel = mesh.pitch[0] / 2 - surfaces.stop_half_width - surfaces.taper
-        collecting = max(device.gates.edges_y(mesh.pitch[1]))
-        zone = np.array(
-            [
-                mesh.pitch[0],
-                mesh.pitch[1],
-                0.9 * channel,
-                0.9 * collecting,
-                surfaces.silicon_channel + 1.0,
-            ]
-        )
-        return cls(np.ascontiguousarray(phi), x, y, z, zone)
-
-
-def _pad(
-    phi: NDArray[np.float64],
-    nodes: NDArray[np.float64],
-    axis: int,
-    side: str,
-    period: float,
-    cells: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    count = len(nodes)
-    if side == "mirror":
-        width = min(cells, count - 1)
-        before, after = np.arange(width, 0, -1), np.arange(count - 2, count - 2 - width, -1)
-        low, high = 2 * nodes[0] - nodes[before], 2 * nodes[-1] - nodes[after]
-    else:
-        width = min(cells, count)
-        before, after = np.arange(count - width, count), np.arange(width)
-        low, high = nodes[before] - period, nodes[after] + period
-    order = np.concatenate([before, np.arange(count), after])
-    return np.take(phi, order, axis=axis), np.concatenate([low, nodes, high])
-
-
-def _pad_z(
-    phi: NDArray[np.float64], z: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Two planes more at either end, from the parabola through the last three."""
-
-    def beyond(
-        target: float, nodes: NDArray[np.float64], values: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        a, b, c = nodes
-        return (
-            values[:, 0] * (target - b) * (target - c) / ((a - b) * (a - c))
-            + values[:, 1] * (target - a) * (target - c) / ((b - a) * (b - c))
-            + values[:, 2] * (target - a) * (target - b) / ((c - a) * (c - b))
-        )
-
-    step0, step1 = z[1] - z[0], z[-1] - z[-2]
-    low = [z[0] - 2 * step0, z[0] - step0]
-    high = [z[-1] + step1, z[-1] + 2 * step1]
-    first = [beyond(t, z[:3], phi[:, :3]) for t in low]
-    last = [beyond(t, z[-3:], phi[:, -3:]) for t in high]
-    padded = np.concatenate([np.stack(first, 1), phi, np.stack(last, 1)], axis=1)
-    return padded, np.array([*low, *z, *high])
 
 
 @dataclass(frozen=True)
