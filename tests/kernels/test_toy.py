@@ -55,7 +55,7 @@ def test_pairs_equal_their_plain_twin(alpha):
 def test_arrays_equal_their_plain_twin():
     partners = np.array([[0, 1, 2], [1, 2, 0], [2, 0, 1]])
     weights = np.array([-0.05, 0.01, 0.04])  # no mirror: the order of partners counts
-    darts = np.array([140, 0, 1, 155])
+    darts = np.array([700, 0, 1, 555])
     found = np.full((4, 3), -1, np.int32)
     least, largest = toy.throw_array(partners, weights, darts, *keys(), found)
     for r, count in enumerate(darts):
