@@ -93,6 +93,11 @@ def test_first_order_and_sum():
     assert theory.covariance == pytest.approx(alpha * level**2, rel=1e-4)
     assert theory.variance + theory.covariance == pytest.approx(level, rel=1e-14)
     assert theory.covariance[1] / theory.covariance[0] == pytest.approx(10, rel=1e-3)
+    # The paper's equality of correlation and area change holds to alpha level / 3.
+    x = np.array([0.01, 0.02])
+    moments = predict_pair(x / level, level)
+    lack = 1 - moments.covariance / moments.variance / x
+    assert lack == pytest.approx(x / 3, rel=0.05)
 
 
 # -- the printed formula -------------------------------------------------------------------
