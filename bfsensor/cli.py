@@ -13,6 +13,8 @@ from typing import Any
 
 import click
 
+from bfsensor.cli_common import load_device, parse_settings
+from bfsensor.cli_spots import spots
 from bfsensor.errors import BFSensorError
 
 
@@ -57,29 +59,6 @@ def _numbers(
         raise click.BadParameter(
             f"{value!r} is not a list of numbers such as 0,25000,50000"
         ) from None
-
-
-def _settings(
-    ctx: click.Context, param: click.Parameter, values: Sequence[str]
-) -> list[tuple[str, str]]:
-    out = []
-    for value in values:
-        key, sign, text = value.partition("=")
-        if not sign or not key or not text:
-            raise click.BadParameter(
-                f"{value!r} is not of the form KEY=VALUE, such as back_bias=-60V"
-            )
-        out.append((key.strip(), text.strip()))
-    return out
-
-
-def _load(name: str, settings: Sequence[tuple[str, str]]) -> Any:
-    from bfsensor.device import Device
-
-    device = Device.load(name)
-    for key, value in settings:
-        device = device.with_value(key, value)
-    return device
 
 
 @main.command()
@@ -127,7 +106,7 @@ def _print_table(rows: Sequence[dict[str, Any]]) -> None:
 
 @main.command()
 @click.argument("device")
-@click.option("--set", "settings", multiple=True, callback=_settings, metavar="KEY=VALUE",
+@click.option("--set", "settings", multiple=True, callback=parse_settings, metavar="KEY=VALUE",
               help="Change a quantity: --set back_bias=-60V (repeatable).")  # fmt: skip
 @click.option(
     "--charges", callback=_numbers, metavar="Q,Q,...", help="Source charges [e-]."
@@ -197,7 +176,7 @@ def table(
     from bfsensor.galsim_format import write_galsim
 
     began, cpu_began = time.perf_counter(), _cpu_seconds()
-    loaded = _load(device, settings)
+    loaded = load_device(device, settings)
     if galsim is not None:
         charges = charges or (100000.0,)
         backgrounds = (0.0,)
@@ -365,7 +344,7 @@ def import_(cfg: Path, output: Path | None, overwrite: bool) -> None:
 
 @main.command()
 @click.argument("source")
-@click.option("--set", "settings", multiple=True, callback=_settings, metavar="KEY=VALUE",
+@click.option("--set", "settings", multiple=True, callback=parse_settings, metavar="KEY=VALUE",
               help="Change a device quantity (repeatable).")  # fmt: skip
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), help="Figure [SOURCE.png]."
@@ -396,13 +375,16 @@ def show(source: str, settings: list[tuple[str, str]], output: Path | None) -> N
         drawn = {"": figures.figure_for_table(result)}
         target = output or path.with_suffix(".png")
     else:
-        loaded = _load(source, settings)
+        loaded = load_device(source, settings)
         drawn = figures.figure_for_device(loaded)
         target = output or Path(f"{loaded.name}.png")
     for name, figure in drawn.items():
         where = target.with_name(f"{target.stem}_{name}{target.suffix}") if name else target
         figure.savefig(where, dpi=120)
         click.echo(str(where))
+
+
+main.add_command(spots)
 
 
 if __name__ == "__main__":

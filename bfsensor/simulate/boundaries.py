@@ -32,6 +32,10 @@ SPLIT_HEIGHT = 4.0
 Below it field lines bend sharply towards the wells; above they are smooth, rise steadily
 and a backward trace is stable."""
 
+RIDGE_MARGIN, RIDGE_CLEARANCE = 0.1, 1.5
+"""If the ridge over the stops comes that near to it, boundaries are bisected this far above
+the ridge instead [um]."""
+
 BISECTION = 1e-5  # um; a thirtieth of the tracing error that is promised
 COARSENESS = 0.25
 """Step of the forward trace relative to the local scale."""
@@ -278,7 +282,7 @@ def find_boundaries(
         raise TableError(
             "boundaries need the mirror planes through the centre of pixel (0, 0)"
         )
-    split = max(surfaces.silicon_channel, surfaces.silicon_stop) + SPLIT_HEIGHT
+    split = _split_height(potential, surfaces)
     lines = []
     for axis in (0, 1):
         pitch, along = mesh.pitch[axis], mesh.pitch[1 - axis]
@@ -300,6 +304,21 @@ def find_boundaries(
     if symmetric:
         columns, rows = _unfold(columns, 0), _unfold(rows, 1)
     return PixelBoundaries(levels, mesh.pitch, reach, columns, rows, symmetric)
+
+
+def _split_height(potential: Potential, surfaces: Surfaces) -> float:
+    """Height [um] above which field lines rise steadily everywhere.
+
+    Below the ridge of the potential over the stops, which rises as the back bias falls,
+    electrons move up first, and a backward trace runs away.
+    """
+    split = max(surfaces.silicon_channel, surfaces.silicon_stop) + SPLIT_HEIGHT
+    z = potential.mesh.z
+    rises = np.diff(potential.phi, axis=0).max(axis=(1, 2)) >= 0
+    ridge = float(z[np.flatnonzero(rises)[-1] + 1])
+    if ridge + RIDGE_MARGIN > split:
+        split = ridge + RIDGE_CLEARANCE
+    return split
 
 
 def lowest_depth(potential: Potential) -> float:

@@ -1,0 +1,33 @@
+"""What several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import click
+
+
+def parse_settings(
+    ctx: click.Context, param: click.Parameter, values: Sequence[str]
+) -> list[tuple[str, str]]:
+    """Split ``KEY=VALUE`` options."""
+    out = []
+    for value in values:
+        key, sign, text = value.partition("=")
+        if not sign or not key or not text:
+            raise click.BadParameter(
+                f"{value!r} is not of the form KEY=VALUE, such as back_bias=-60V"
+            )
+        out.append((key.strip(), text.strip()))
+    return out
+
+
+def load_device(name: str, settings: Sequence[tuple[str, str]]) -> Any:
+    """Load a device and change its values."""
+    from bfsensor.device import Device
+
+    device = Device.load(name)
+    for key, value in settings:
+        device = device.with_value(key, value)
+    return device
