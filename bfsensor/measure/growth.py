@@ -1,0 +1,142 @@
+"""Growth of spots that were drawn twice, with the brighter-fatter effect and without.
+
+Both images hold the same electrons: the ratio of their widths has a fraction of the error
+of either.  Errors come from leaving out one spot at a time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bfsensor.errors import MeasurementError
+from bfsensor.measure.spot_fit import fit_spots
+from bfsensor.measure.spots import Stamps
+
+UNIT = 50_000.0
+"""Electrons in the peak for which slopes are given [e-]."""
+
+
+@dataclass(frozen=True)
+class Growth:
+    """How much wider spots are with the effect than without.
+
+    Attributes
+    ----------
+    peak : ndarray, shape (levels,)
+        Signal in the peak without the effect [e-]: of the fitted model in a pixel at whose
+        middle the spot stands.
+    sigma : ndarray, shape (levels, 2)
+        Widths in x and y without the effect [pixel].
+    growth, growth_error : ndarray, shape (levels, 2)
+        Of the widths in x and y [%].
+    slope, slope_error : ndarray, shape (2,)
+        Of the growth in x and y against the peak, through the origin [% per 50,000 e-].
+    spots : int
+        How many were measured.
+    """
+
+    peak: NDArray[np.float64]
+    sigma: NDArray[np.float64] = field(repr=False)
+    growth: NDArray[np.float64]
+    growth_error: NDArray[np.float64] = field(repr=False)
+    slope: NDArray[np.float64]
+    slope_error: NDArray[np.float64]
+    spots: int
+
+
+def measure_growth(
+    on: ArrayLike, off: ArrayLike, *, stamp: int = 9, weights: str = "equal"
+) -> Growth:
+    """Measure the growth of spots level by level, and its slope.
+
+    Parameters
+    ----------
+    on, off : array_like, shape (spots, levels, ny, nx)
+        Images of each spot with the effect and without [e-], a spot in the middle of each;
+        2 spots at least.
+    stamp : int
+        Side of the postage stamp that is fitted [pixel], odd.
+    weights : {'equal', 'noise'}
+        Of the pixels, see :func:`~bfsensor.measure.spot_fit.fit_spots`.
+
+    Returns
+    -------
+    Growth
+        Every level has the same weight per electron squared: the slope is the least squares
+        line through the origin with errors that do not depend on the level.
+
+    Raises
+    ------
+    MeasurementError
+        Shapes that do not fit, or fewer than two spots.
+
+    Examples
+    --------
+    >>> from bfsensor.measure.spot_model import Shape, integrate_gaussian
+    >>> rng = np.random.default_rng(77)
+    >>> x, y = rng.uniform(-0.5, 0.5, (2, 6))
+    >>> off = 3e5 * integrate_gaussian(x, y, Shape(1.0, 1.0), 11)[:, None]
+    >>> on = 3e5 * integrate_gaussian(x, y, Shape(1.005, 1.01), 11)[:, None]
+    >>> found = measure_growth(on, off)
+    >>> (found.growth.round(3) + 0.0).tolist()
+    [[0.5, 1.0]]
+    """
+    on, off = np.asarray(on, float), np.asarray(off, float)
+    if on.shape != off.shape or on.ndim != 4:
+        raise MeasurementError(
+            f"images with the effect {on.shape} and without {off.shape} must both be "
+            "(spots, levels, rows, columns)"
+        )
+    spots, levels, ny, nx = on.shape
+    if spots < 2:
+        raise MeasurementError(f"{spots} spots: errors need 2 at least")
+    if stamp % 2 == 0 or not 3 <= stamp <= min(ny, nx):
+        raise MeasurementError(
+            f"stamp = {stamp} must be odd, from 3 to the side of the images, {min(ny, nx)}"
+        )
+    rows = slice(ny // 2 - stamp // 2, ny // 2 + stamp // 2 + 1)
+    columns = slice(nx // 2 - stamp // 2, nx // 2 + stamp // 2 + 1)
+    whole = _measure(on[..., rows, columns], off[..., rows, columns], weights)
+    parts = []
+    for left_out in range(spots):
+        keep = np.arange(spots) != left_out
+        parts.append(
+            _measure(on[keep][..., rows, columns], off[keep][..., rows, columns], weights)
+        )
+    growth = np.array([p[2] for p in parts])
+    slopes = np.array([p[3] for p in parts])
+    factor = (spots - 1) / spots
+
+    def error(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.sqrt(factor * np.sum((values - values.mean(0)) ** 2, axis=0))
+
+    return Growth(
+        peak=whole[0], sigma=whole[1], growth=whole[2], growth_error=error(growth),
+        slope=whole[3], slope_error=error(slopes), spots=spots,
+    )  # fmt: skip
+
+
+def _measure(
+    on: NDArray[np.float64], off: NDArray[np.float64], weights: str
+) -> tuple[NDArray[np.float64], ...]:
+    """Peak, width, growth by level, and slope of the growth."""
+    peak, sigma, growth = [], [], []
+    for level in range(on.shape[1]):
+        wide, plain = (
+            fit_spots(Stamps(images[:, level]), weights=weights, background=0.0)
+            for images in (on, off)
+        )
+        peak.append(float(np.mean(plain.peak)))
+        sigma.append((plain.sigma_x, plain.sigma_y))
+        growth.append(
+            (
+                100 * (wide.sigma_x / plain.sigma_x - 1),
+                100 * (wide.sigma_y / plain.sigma_y - 1),
+            )
+        )
+    q, g = np.array(peak), np.array(growth)
+    slope = UNIT * (q[:, None] * g).sum(0) / (q**2).sum()
+    return q, np.array(sigma), g, slope
