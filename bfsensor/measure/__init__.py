@@ -1,0 +1,1 @@
+"""Measurements on arrays in electrons, and the models that say what they should give."""
