@@ -1,0 +1,149 @@
+r"""The normal equations of a region's spots: an arrow.
+
+The shape's few parameters meet those of every spot, the spots' own never meet each other.
+Each spot's own parameters are eliminated from its own block, which leaves a system of two or
+three equations for the shape, at a cost that grows with the number of spots and no faster.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.measure.spot_model import Shape, gradients
+from bfsensor.measure.spots import Stamps
+
+LEAST_VARIANCE = 1.0
+"""Least variance of a pixel [e-^2].  Without it, where noise is left out, the far wings with
+their hundredths of an electron would decide on chi2."""
+
+
+class Spots(NamedTuple):
+    """Each spot's own parameters, changed in place: shape (n,)."""
+
+    flux: NDArray[np.float64]
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    background: NDArray[np.float64]
+
+
+class Normal(NamedTuple):
+    """Normal equations of n spots with ``own`` parameters each and ``shared`` ones.
+
+    ``own_inverse`` (n, own, own) and ``cross`` (n, own, shared) are blocks; ``rest``
+    (n, shared, shared) and ``score`` (n, shared) what each spot leaves of the shape's
+    block and right side once its own parameters are eliminated; ``own_score`` (n, own).
+    ``weighted`` (n, own + shared, pixels): derivatives times weights.  ``own_covariance``
+    of each spot's own parameters at the fitted shape and ``score_variance`` of its score, from
+    the noise of its pixels; where weights are the inverse variances they are ``own_inverse`` and
+    ``rest``.  ``chi2`` (n,) of each spot, by its noise.
+    """
+
+    own_inverse: NDArray[np.float64]
+    cross: NDArray[np.float64]
+    rest: NDArray[np.float64]
+    own_score: NDArray[np.float64]
+    score: NDArray[np.float64]
+    weighted: NDArray[np.float64]
+    own_covariance: NDArray[np.float64]
+    score_variance: NDArray[np.float64]
+    chi2: NDArray[np.float64]
+
+
+class Problem:
+    """Stamps, their noise and weights, and what is free."""
+
+    def __init__(
+        self,
+        stamps: Stamps,
+        read_noise: float,
+        *,
+        equal_weights: bool,
+        free_background: bool,
+        free_tilt: bool,
+    ) -> None:
+        self.stamps = stamps
+        self.ny, self.nx = stamps.electrons.shape[1:]
+        self.data = stamps.electrons.reshape(len(stamps), -1)
+        self.good = stamps.good.reshape(len(stamps), -1)
+        self.known = (
+            None if stamps.variance is None else stamps.variance.reshape(len(stamps), -1)
+        )
+        self.read_noise = read_noise
+        self.equal_weights = equal_weights
+        self.own = 4 if free_background else 3
+        self.shared = 3 if free_tilt else 2
+
+    def derivatives(self, spots: Spots, shape: Shape) -> NDArray[np.float64]:
+        """Fractions of the flux in each pixel and their gradients, (6, n, pixels)."""
+        slopes = gradients(spots.x, spots.y, shape, self.ny, self.nx)
+        return slopes.reshape(6, len(self.data), -1)
+
+    def variance(self, model: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Variance of each pixel [e-^2]."""
+        if self.known is not None:
+            return self.known
+        # Of the model, not of the data: low pixels must not count for more.
+        return np.maximum(np.maximum(model, 0.0) + self.read_noise**2, LEAST_VARIANCE)
+
+    def linearise(
+        self, spots: Spots, slopes: NDArray[np.float64], *, with_noise: bool = False
+    ) -> Normal:
+        """Normal equations at the present parameters; noise is right only if asked for."""
+        model = spots.flux[:, None] * slopes[0] + spots.background[:, None]
+        variance = self.variance(model)
+        by_noise = self.good / variance
+        weight = self.good.astype(float) if self.equal_weights else by_noise
+        residual = self.data - model
+        # A spot without flux would leave its centre without an equation.
+        flux = np.maximum(spots.flux, 1.0)[:, None]
+        rows = [slopes[0], flux * slopes[1], flux * slopes[2]]
+        if self.own == 4:
+            rows.append(np.ones_like(model))
+        rows += [flux * slopes[3 + k] for k in range(self.shared)]
+        jacobian = np.stack(rows, axis=1)
+        weighted = jacobian * weight[:, None]
+        blocks = weighted @ jacobian.transpose(0, 2, 1)
+        scores = (weighted @ residual[:, :, None])[:, :, 0]
+        own = self.own
+        inverse = invert(blocks[:, :own, :own])
+        cross = blocks[:, :own, own:]
+        eliminate = np.einsum("nai,nab->nib", cross, inverse)
+        rest = blocks[:, own:, own:] - eliminate @ cross
+        own_covariance, score_variance = inverse, rest
+        chi2 = np.einsum("np,np->n", by_noise * residual, residual)
+        if self.equal_weights and with_noise:
+            noise = (weighted * variance[:, None]) @ weighted.transpose(0, 2, 1)
+            own_covariance = inverse @ noise[:, :own, :own] @ inverse
+            turn = np.concatenate(
+                [-eliminate, np.broadcast_to(np.eye(self.shared), rest.shape)], axis=2
+            )
+            score_variance = turn @ noise @ turn.transpose(0, 2, 1)
+            # Equal weights leave each spot's own parameters where chi2 is not least, and its
+            # excess has a long tail.  What the best ones would take off is known.
+            closer = jacobian[:, :own] * by_noise[:, None]
+            gain = np.einsum("nap,np->na", closer, residual)
+            best = invert(closer @ jacobian[:, :own].transpose(0, 2, 1))
+            chi2 = chi2 - np.einsum("na,nab,nb->n", gain, best, gain)
+        return Normal(
+            inverse,
+            cross,
+            rest,
+            scores[:, :own],
+            scores[:, own:] - np.einsum("nib,nb->ni", eliminate, scores[:, :own]),
+            weighted,
+            own_covariance,
+            score_variance,
+            chi2,
+        )
+
+
+def invert(blocks: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverses of small positive matrices, scaled to a unit diagonal before."""
+    size = np.sqrt(np.maximum(np.einsum("naa->na", blocks), 1e-300))
+    scaled = blocks / (size[:, :, None] * size[:, None, :])
+    # Far below what noise leaves; it keeps a spot without pixels from stopping all others.
+    scaled += 1e-12 * np.eye(blocks.shape[1])
+    return np.asarray(np.linalg.inv(scaled) / (size[:, :, None] * size[:, None, :]))

@@ -1,0 +1,311 @@
+"""Spots on an image: found, and cut out as postage stamps.
+
+The road: :func:`find_spots` gives the pixels, :func:`cut_stamps` the stamps,
+:func:`bfsensor.measure.spot_fit.fit_spots` the sizes,
+:func:`bfsensor.measure.slopes.bf_slopes` the brighter-fatter slope of a ladder of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import maximum_filter, uniform_filter
+
+from bfsensor.errors import MeasurementError
+
+STAMP = 9
+"""Pixels of a stamp a side, as in Lage et al. (2017), section 2.1: 4 sigma of their spots."""
+
+
+@dataclass(frozen=True, eq=False)
+class SpotList:
+    """Pixels with spots, and how many candidates were rejected and why.
+
+    Parameters
+    ----------
+    x, y : ndarray of int
+        Column and row of the brightest pixel.
+    rejected : mapping of str to int
+        Candidates by the first reason that holds: ``border`` (the stamp does not fit),
+        ``neighbour`` (a brighter one is too near), ``saturated``, ``masked``.
+    """
+
+    x: NDArray[np.int64]
+    y: NDArray[np.int64]
+    rejected: Mapping[str, int]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rejected", MappingProxyType(dict(self.rejected)))
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return SpotList, (self.x, self.y, dict(self.rejected))
+
+
+@dataclass(frozen=True, eq=False)
+class Stamps:
+    """Postage stamps of spots, each with its brightest pixel in the middle.
+
+    Parameters
+    ----------
+    electrons : ndarray, shape (n, ny, nx)
+        Signals [e-], both sides odd.
+    good : ndarray of bool, shape (n, ny, nx), optional
+        Pixels to be used; all where left out.  Values that are not finite never are.
+    variance : ndarray, shape (n, ny, nx), optional
+        Known variance of each pixel [e-^2]; otherwise it follows from the model.
+    x, y : ndarray of int, shape (n,), optional
+        Column and row of the central pixels on the image; 0 where left out.
+
+    Raises
+    ------
+    MeasurementError
+        Arrays that do not fit together, even sides, variances that are not above 0.
+
+    Examples
+    --------
+    >>> stamps = Stamps(np.ones((3, 9, 9)))
+    >>> len(stamps), bool(stamps.good.all())
+    (3, True)
+    """
+
+    electrons: NDArray[np.float64]
+    good: NDArray[np.bool_] | Any = None
+    variance: NDArray[np.float64] | None = None
+    x: NDArray[np.int64] | Any = None
+    y: NDArray[np.int64] | Any = None
+
+    def __post_init__(self) -> None:
+        electrons = np.array(self.electrons, float)
+        if electrons.ndim != 3 or len(electrons) == 0:
+            raise MeasurementError(
+                f"stamps of shape {electrons.shape} must be (spots, rows, columns)"
+            )
+        ny, nx = electrons.shape[1:]
+        if ny % 2 == 0 or nx % 2 == 0 or min(ny, nx) < 3:
+            raise MeasurementError(f"{ny} x {nx} pixels of a stamp must be odd, 3 or more")
+        good = np.isfinite(electrons)
+        if self.good is not None:
+            good &= _fitting("good", np.asarray(self.good, bool), electrons.shape)
+        if self.variance is not None:
+            variance = _fitting("variance", np.array(self.variance, float), electrons.shape)
+            if not np.all(variance[good] > 0):
+                raise MeasurementError("variance of used pixels must be above 0 e-^2")
+            # Any number serves where the pixel is not used.
+            object.__setattr__(self, "variance", np.where(good, variance, 1.0))
+        object.__setattr__(self, "electrons", np.where(good, electrons, 0.0))
+        object.__setattr__(self, "good", good)
+        for name in ("x", "y"):
+            given = getattr(self, name)
+            place = np.zeros(len(electrons)) if given is None else np.asarray(given)
+            place = _fitting(name, place, (len(electrons),)).astype(np.int64)
+            object.__setattr__(self, name, place)
+
+    def __len__(self) -> int:
+        return len(self.electrons)
+
+    def select(self, which: NDArray[Any]) -> Stamps:
+        """Give some of the stamps, by a mask or by indices."""
+        variance = None if self.variance is None else self.variance[which]
+        return Stamps(
+            self.electrons[which], self.good[which], variance, self.x[which], self.y[which]
+        )
+
+
+def _fitting(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """Give the array if it has the shape that the others ask for."""
+    if array.shape != shape:
+        raise MeasurementError(f"{name} has the shape {array.shape}, not {shape}")
+    return array
+
+
+def find_spots(
+    image: ArrayLike,
+    *,
+    threshold: float,
+    separation: int = STAMP,
+    saturation: float = np.inf,
+    mask: ArrayLike | None = None,
+    stamp: int = STAMP,
+) -> SpotList:
+    """Find the brightest pixels of spots.
+
+    A candidate is a pixel above the threshold that no other of the eight around it exceeds
+    (of equal ones the first in reading order).  It gives only the pixel; the centre is
+    for the fit to find.
+
+    Parameters
+    ----------
+    image : array_like, shape (ny, nx)
+        Signals [e-].
+    threshold : float
+        Least signal of the brightest pixel, background included [e-].
+    separation : int
+        Of two candidates less than this apart in x and in y [pixel] the fainter is
+        rejected; by default stamps of kept spots do not contain one another's centres.
+        The brighter one stays: the fit decides whether it is disturbed.
+    saturation : float
+        A spot with a pixel of its stamp at this signal or above is rejected [e-].
+    mask : array_like of bool, shape (ny, nx), optional
+        Bad pixels, True; so are values that are not finite.  A spot with a bad pixel in
+        the 3 x 3 about its centre is rejected; elsewhere the fit does without them.
+    stamp : int
+        Pixels of the stamps a side; spots whose stamp leaves the image are rejected.
+
+    Returns
+    -------
+    SpotList
+        In reading order, with the rejected by reason.
+
+    Raises
+    ------
+    MeasurementError
+        An argument outside its range.
+
+    Examples
+    --------
+    >>> from bfsensor.measure.spot_model import Shape, integrate_gaussian
+    >>> image = np.zeros((40, 40))
+    >>> image[6:15, 16:25] = 1e5 * integrate_gaussian([0.1], [0.2], Shape(1.0, 1.0), 9)[0]
+    >>> image[0, 3] = 9e4
+    >>> spots = find_spots(image, threshold=1000.0)
+    >>> spots.x.tolist(), spots.y.tolist(), spots.rejected["border"]
+    ([20], [10], 1)
+    """
+    data = np.asarray(image, float)
+    _check_search(data, threshold, separation, saturation, stamp)
+    bad = ~np.isfinite(data)
+    if mask is not None:
+        bad |= _fitting("mask", np.asarray(mask, bool), data.shape)
+    clean = np.where(bad, -np.inf, data)
+    top = (clean > threshold) & (clean == maximum_filter(clean, 3, mode="nearest"))
+    y, x = np.nonzero(top)
+    # Brightest first, of equal ones the first in reading order.
+    order = np.argsort(-clean[y, x], kind="stable")
+    y, x = y[order], x[order]
+    alone = _leave_brighter(x, y, separation, data.shape)
+    half = stamp // 2
+    ny, nx = data.shape
+    inside = (x >= half) & (x < nx - half) & (y >= half) & (y < ny - half)
+    # uniform_filter rounds: one bad pixel of nine is 0.111.
+    spoilt = uniform_filter(bad.astype(float), 3, mode="nearest")[y, x] > 0.05
+    highest = maximum_filter(clean, stamp, mode="nearest")[y, x]
+    reasons = {
+        "neighbour": ~alone,
+        "border": ~inside,
+        "saturated": highest >= saturation,
+        "masked": spoilt,
+    }
+    kept = np.ones(len(x), bool)
+    rejected = {}
+    for reason, holds in reasons.items():
+        rejected[reason] = int(np.sum(kept & holds))
+        kept &= ~holds
+    x, y = x[kept], y[kept]
+    order = np.lexsort((x, y))
+    return SpotList(x[order].astype(np.int64), y[order].astype(np.int64), rejected)
+
+
+def _check_search(
+    data: NDArray[np.float64],
+    threshold: float,
+    separation: int,
+    saturation: float,
+    stamp: int,
+) -> None:
+    if data.ndim != 2:
+        raise MeasurementError(f"an image has rows and columns, not the shape {data.shape}")
+    if not np.isfinite(threshold):
+        raise MeasurementError(f"threshold = {threshold} e- must be finite")
+    if not saturation > threshold:
+        raise MeasurementError(
+            f"saturation = {saturation:g} e- must be above the threshold, {threshold:g} e-"
+        )
+    if separation < 2:
+        raise MeasurementError(f"separation = {separation} pixels must be 2 or more")
+    if stamp < 3 or stamp % 2 == 0:
+        raise MeasurementError(f"stamp = {stamp} pixels must be odd, 3 or more")
+    if min(data.shape) < stamp:
+        raise MeasurementError(
+            f"an image of {data.shape} pixels holds no stamp of {stamp} x {stamp}"
+        )
+
+
+def _leave_brighter(
+    x: NDArray[Any], y: NDArray[Any], separation: int, shape: tuple[int, ...]
+) -> NDArray[np.bool_]:
+    """Which of the candidates, brightest first, have no brighter kept one too near."""
+    taken = np.zeros(shape, bool)
+    alone = np.zeros(len(x), bool)
+    for n, (i, j) in enumerate(zip(x, y, strict=True)):
+        if not taken[j, i]:
+            alone[n] = True
+            low_j, low_i = max(j - separation + 1, 0), max(i - separation + 1, 0)
+            taken[low_j : j + separation, low_i : i + separation] = True
+    return alone
+
+
+def cut_stamps(
+    image: ArrayLike,
+    spots: SpotList,
+    *,
+    size: int = STAMP,
+    mask: ArrayLike | None = None,
+    variance: ArrayLike | None = None,
+) -> Stamps:
+    """Cut the postage stamps of spots out of an image.
+
+    Parameters
+    ----------
+    image : array_like, shape (ny, nx)
+        Signals [e-].
+    spots : SpotList
+        From :func:`find_spots`, with the same or a larger stamp.
+    size : int
+        Pixels a side, odd.
+    mask : array_like of bool, shape (ny, nx), optional
+        Bad pixels, True.
+    variance : array_like, shape (ny, nx), optional
+        Known variance of each pixel [e-^2].
+
+    Returns
+    -------
+    Stamps
+        In the order of the spots.
+
+    Raises
+    ------
+    MeasurementError
+        No spots, or a stamp that leaves the image.
+    """
+    data = np.asarray(image, float)
+    if data.ndim != 2:
+        raise MeasurementError(f"an image has rows and columns, not the shape {data.shape}")
+    if len(spots) == 0:
+        raise MeasurementError(f"no spots to cut out; rejected: {dict(spots.rejected)}")
+    if size < 3 or size % 2 == 0:
+        raise MeasurementError(f"size = {size} pixels of a stamp must be odd, 3 or more")
+    step = np.arange(size) - size // 2
+    rows, columns = spots.y[:, None, None] + step[:, None], spots.x[:, None, None] + step
+    ny, nx = data.shape
+    if rows.min() < 0 or columns.min() < 0 or rows.max() >= ny or columns.max() >= nx:
+        raise MeasurementError(
+            f"stamps of {size} x {size} pixels leave the image of {ny} x {nx}"
+        )
+    at = (rows, columns)
+    return Stamps(
+        data[at],
+        None if mask is None else ~_fitting("mask", np.asarray(mask, bool), data.shape)[at],
+        None
+        if variance is None
+        else _fitting("variance", np.asarray(variance, float), data.shape)[at],
+        spots.x,
+        spots.y,
+    )
