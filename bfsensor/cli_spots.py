@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from functools import partial
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import click
 
 from bfsensor.cli_common import load_device, parse_settings
+from bfsensor.errors import BFSensorError
 
 
 def _spot_path(folder: Path, key: str, number: int) -> Path:
@@ -107,3 +109,61 @@ def spots(
 
 def _report(plan: Any, made: list[Any], output: Path, as_json: bool) -> None:
     """Measure, print and draw."""
+    import numpy as np
+    from astropy.table import Table
+
+    from bfsensor.measure.growth import measure_growth
+
+    on, off = (np.array([getattr(spot, name) for spot in made]) for name in ("on", "off"))
+    levels = np.unique(np.round(np.linspace(0, plan.steps, 9)[1:]).astype(int)) - 1
+    summary: dict[str, Any] = {
+        "folder": str(output),
+        "spots": len(made),
+        "electrons_a_spot": plan.electrons,
+        "cpu_s_a_spot": round(float(np.mean([spot.cpu_seconds for spot in made])), 1),
+    }
+    if len(made) > 1:
+        growth = measure_growth(on[:, levels], off[:, levels], stamp=min(9, plan.pixels))
+        table = Table(
+            {
+                "steps": levels + 1, "peak": growth.peak,
+                **{
+                    f"{name}_{axis}": getattr(growth, name)[:, n]
+                    for name in ("sigma", "growth", "growth_error")
+                    for n, axis in enumerate("xy")
+                },
+            }
+        )  # fmt: skip
+        summary["slope_percent_per_50000e"] = {
+            axis: f"{growth.slope[n]:.4f} +- {growth.slope_error[n]:.4f}"
+            for n, axis in enumerate("xy")
+        }
+        table.meta = {"device": plan.device.name, "key": plan.key, **summary}
+        part = output / "growth.ecsv.part"
+        table.write(part, format="ascii.ecsv", overwrite=True)
+        part.replace(output / "growth.ecsv")
+        _draw(plan, made, growth, output / "growth.png")
+    else:
+        summary["slope_percent_per_50000e"] = "needs 2 spots for an error"
+    if as_json:
+        click.echo(json.dumps(summary, indent=1))
+        return
+    for key, value in summary.items():
+        text = (
+            ", ".join(f"{k} {v}" for k, v in value.items())
+            if isinstance(value, dict)
+            else value
+        )
+        click.echo(f"{key:26} {text}")
+
+
+def _draw(plan: Any, made: list[Any], growth: Any, path: Path) -> None:
+    """Draw the growth and how charge builds up; says so where matplotlib is missing."""
+    from bfsensor.show_spots import figure_for_spots
+
+    try:
+        figure = figure_for_spots(plan, made, growth)
+    except BFSensorError as error:
+        click.echo(f"bfsensor: no figure: {error}", err=True)
+        return
+    figure.savefig(path, dpi=120)

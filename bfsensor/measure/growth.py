@@ -90,7 +90,7 @@ def measure_growth(
             f"images with the effect {on.shape} and without {off.shape} must both be "
             "(spots, levels, rows, columns)"
         )
-    spots, levels, ny, nx = on.shape
+    spots, _, ny, nx = on.shape
     if spots < 2:
         raise MeasurementError(f"{spots} spots: errors need 2 at least")
     if stamp % 2 == 0 or not 3 <= stamp <= min(ny, nx):

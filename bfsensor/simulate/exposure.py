@@ -135,6 +135,11 @@ class SpotPlan:
         return round(self.peak / share)
 
     @property
+    def step_ends(self) -> NDArray[np.int64]:
+        """How many electrons have come after each step, from 0 before the first."""
+        return np.round(np.linspace(0, self.electrons, self.steps + 1)).astype(np.int64)
+
+    @property
     def key(self) -> str:
         """What tells the results of one plan from those of another."""
         text = "\n".join([
@@ -255,12 +260,9 @@ def simulate_spot(
     solver, empty, empty_tracer = _empty_sensor(
         _Sensor(plan.device, plan.pixels, plan.cells)
     )
-    pitch = np.array([plan.device.pixel.pitch_x, plan.device.pixel.pitch_y])
-    rng = np.random.default_rng([plan.seed, number, _SPOT_STREAM])
-    centre = (rng.random(2) - 0.5) * pitch
-    seed = int(rng.integers(2**63))
+    centre, seed = _choose(plan, number)
     shape = (plan.pixels, plan.pixels)
-    edges = np.round(np.linspace(0, plan.electrons, plan.steps + 1)).astype(int)
+    edges = plan.step_ends
     on = np.zeros((plan.steps, *shape), np.int32)
     off = np.zeros_like(on)
     collected = np.zeros(shape, np.int64)
@@ -294,6 +296,37 @@ def simulate_spot(
         number, (float(centre[0]), float(centre[1])), on, off, plan.key,
         time.process_time() - begin,
     )  # fmt: skip
+
+
+def spot_electrons(
+    plan: SpotPlan, number: int, electrons: NDArray[np.int64]
+) -> tuple[tuple[float, float], NDArray[np.float64]]:
+    """Give the centre of a spot and where its light sets electrons free.
+
+    Parameters
+    ----------
+    plan, number
+        As for :func:`simulate_spot`.
+    electrons : ndarray of int, shape (n,)
+        Consecutive numbers of the electrons.
+
+    Returns
+    -------
+    centre : tuple of float
+        (x, y) [um] from the middle of the central pixel.
+    starts : ndarray, shape (n, 3)
+        [um].
+    """
+    centre, seed = _choose(plan, number)
+    return (float(centre[0]), float(centre[1])), _starts(plan, seed, electrons, centre)
+
+
+def _choose(plan: SpotPlan, number: int) -> tuple[NDArray[np.float64], int]:
+    """Centre of a spot [um] and the seed of its electrons."""
+    pitch = np.array([plan.device.pixel.pitch_x, plan.device.pixel.pitch_y])
+    rng = np.random.default_rng([plan.seed, number, _SPOT_STREAM])
+    centre = (rng.random(2) - 0.5) * pitch
+    return centre, int(rng.integers(2**63))
 
 
 @dataclass(frozen=True, eq=False)
