@@ -1,0 +1,553 @@
+"""The analytic engine against closed forms that share nothing with its image series."""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.special import k0, k1
+
+from bfsensor.errors import DeviceError, TableError
+from bfsensor.simulate import charge_field as fields
+from bfsensor.simulate import image_charge as engine
+from bfsensor.simulate.far_field import FarField
+from bfsensor.simulate.image_charge import (
+    ImageCharge,
+    area_changes,
+    charge_field,
+    displace_boundaries,
+    edge_shifts,
+    trace_boundaries,
+)
+from bfsensor.table import vertex_fractions
+from bfsensor.units import VACUUM_PERMITTIVITY
+
+MODEL = ImageCharge(
+    0.5,
+    1.4,
+    3.2,
+    1.5,
+    3.0,
+    pitch_x=10.0,
+    pitch_y=12.0,
+    drift_field=((0, 0.75), (100, 0.37)),
+)
+HIGH = ImageCharge(
+    40.0, 42.0, 45.0, 2.0, 3.0
+)  # a charge half way up, where both planes count
+POINT = ImageCharge(2.0, 4.0, 4.0, 0.05, 0.05)
+EPSILON = MODEL.permittivity * VACUUM_PERMITTIVITY
+T = 100.0
+
+
+def points_between(seed, count=40, lateral=40.0, low=0.0, high=T):
+    rng = np.random.default_rng(seed)
+    at = rng.uniform(-lateral, lateral, (count, 3))
+    at[:, 2] = rng.uniform(low, high, count)
+    return at
+
+
+# -- the field ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model", [MODEL, HIGH])
+@pytest.mark.parametrize("plane", [0.0, T])
+def test_planes_are_conductors(model, plane):
+    at = points_between(911)
+    at[:, 2] = plane
+    field = charge_field(model, at)
+    assert np.abs(field[:, :2]).max() < fields.TOLERANCE
+    assert np.abs(field[:, 2]).min() > 10 * fields.TOLERANCE  # the charge is felt there
+
+
+@pytest.mark.parametrize("model", [MODEL, HIGH])
+@pytest.mark.parametrize("place", [(7.0, 2.0), (0.0, 9.0), (30.0, -30.0)])
+def test_both_planes_are_at_one_potential(model, place):
+    """From plane to plane the field along z integrates to zero, beside the charge."""
+
+    def along(z):
+        return 1e6 * charge_field(model, [*place, z])[2]
+
+    q = model.charge_height
+    parts = [
+        quad(along, *ends, epsrel=1e-11, epsabs=0)[0]
+        for ends in ((0, q), (q, T / 2), (T / 2, T))
+    ]
+    # The tolerance of the series over the thickness, and that of the quadrature.
+    assert abs(sum(parts)) < 1e6 * fields.TOLERANCE * T + 1e-10 * np.abs(parts).max()
+
+
+def flux(model, low, high, faces=range(6), n=48):
+    """Outward flux of the field through faces of a box [V um per electron]."""
+    node, weight = np.polynomial.legendre.leggauss(n)
+    total = 0.0
+    for face in faces:
+        axis, side = divmod(face, 2)
+        u, v = [k for k in range(3) if k != axis]
+        half = 0.5 * (np.array(high) - low)
+        middle = 0.5 * (np.array(high) + low)
+        at = np.zeros((n, n, 3))
+        at[..., axis] = (low, high)[side][axis]
+        at[..., u] = middle[u] + half[u] * node[:, None]
+        at[..., v] = middle[v] + half[v] * node[None]
+        value = charge_field(model, at)[..., axis]
+        total += (2 * side - 1) * half[u] * half[v] * (weight @ value @ weight)
+    return total
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "inside"),
+    [
+        ((-6, -8, 38), (7, 9, 43), 1),
+        ((-20, -15, 33), (25, 30, 60), 1),
+        ((-6, -8, 43), (7, 9, 60), 0),
+        ((6, 2, 30), (15, 20, 50), 0),
+    ],
+)
+def test_gauss_law(low, high, inside):
+    # 48 points a side, 2 um and more from the charge: 1e-8 of its flux.
+    assert flux(HIGH, low, high) * EPSILON == pytest.approx(-inside, abs=1e-7)
+
+
+def test_no_flux_beyond_the_planes():
+    """All of the flux of a charge low down ends on the planes: on the far one z_q / T of it."""
+    node, weight = np.polynomial.legendre.leggauss(200)
+    side = 600.0  # six thicknesses; beyond it exp(-6 pi), 1e-8, is left
+    at = np.zeros((200, 200, 3))
+    at[..., 0], at[..., 1], at[..., 2] = side * node[:, None], side * node, T
+    field = charge_field(MODEL, at, tolerance=1e-18)[..., 2]
+    through = side**2 * (weight @ field @ weight)
+    assert -through * EPSILON == pytest.approx(MODEL.charge_height / T, rel=1e-6)
+
+
+def mode_sum(model, rho, z):
+    """Field (E_rho, E_z) of one electron as a point, by modes between the planes.
+
+    phi = -(1 / pi eps T) sum_n sin(n pi z / T) sin(n pi z_q / T) K_0(n pi rho / T).
+    """
+    n = np.arange(1, 2000)
+    k = n * np.pi / T
+    use = k * rho < 600
+    k = k[use]
+    scale = -1 / (np.pi * EPSILON * T) * np.sin(k * model.charge_height)
+    return (
+        (scale * k * np.sin(k * z) * k1(k * rho)).sum(),
+        -(scale * k * np.cos(k * z) * k0(k * rho)).sum(),
+    )
+
+
+@pytest.mark.parametrize("rho", [3.0, 10.0, 45.0, 120.0])
+@pytest.mark.parametrize("z", [2.5, 20.0, 70.0, 99.0])
+@pytest.mark.parametrize("height", [2.0, 55.0])
+def test_a_small_rectangle_is_the_mode_sum_of_a_point(rho, z, height):
+    model = dataclasses.replace(
+        POINT, charge_height=height, row_height=60, column_height=60
+    )
+    angle = 0.7
+    field = charge_field(model, [rho * np.cos(angle), rho * np.sin(angle), z])
+    across = field[0] * np.cos(angle) + field[1] * np.sin(angle)
+    # The mean over a square is phi + a^2 / 6 (d^2/dx^2 + d^2/dy^2) phi: a few times the square
+    # of half side over distance.
+    wanted = np.array(mode_sum(model, rho, z))
+    distance = np.hypot(rho, z - height)
+    limit = 4 * (0.05 / distance) ** 2 * np.hypot(*wanted) + fields.TOLERANCE
+    np.testing.assert_allclose([across, field[2]], wanted, rtol=0, atol=limit)
+
+
+def lattice_sum(model, x, y, z, period=500.0, modes=420):
+    """Field of rectangles repeated in x and y, by Fourier's series of their charge density.
+
+    A mode k varies in height as sinh(k z) below the charge and sinh(k (T - z)) above.
+    """
+    k = 2 * np.pi * np.arange(-modes, modes + 1) / period
+    kx, ky = k[None, :], k[:, None]
+    kr = np.hypot(kx, ky)
+    kr[modes, modes] = 1e-9  # the mean: linear in height
+    density = -np.sinc(kx * model.half_width_x / np.pi) * np.sinc(
+        ky * model.half_width_y / np.pi
+    )
+    q = model.charge_height
+    low, high = min(z, q), max(z, q)
+    # sinh(k low) sinh(k (T - high)) / (k sinh(k T)), without overflow.
+    rise, fall = -np.expm1(-2 * kr * low), -np.expm1(-2 * kr * (T - high))
+    scale = np.exp(-kr * (high - low)) / (2 * kr * -np.expm1(-2 * kr * T))
+    height = scale * rise * fall
+    slope = scale * kr * (-rise * (2 - fall) if z > q else fall * (2 - rise))
+    wave = density * np.exp(1j * (kx * x + ky * y)) / (EPSILON * period**2)
+    return (
+        -(1j * kx * wave * height).sum().real,
+        -(1j * ky * wave * height).sum().real,
+        -(wave * slope).sum().real,
+    )
+
+
+@pytest.mark.parametrize(
+    "place", [(5.0, 0.0, 6.0), (1.0, 4.0, 8.0), (15.0, 25.0, 50.0), (0.0, 0.0, 100.0)]
+)
+def test_the_rectangle_is_its_fourier_series(place):
+    # Waves up to 5.3 /um are dropped beyond, exp(-5.3 * 5.5), 1e-13 of the field of a sheet;
+    # the next rectangles are five thicknesses away, exp(-5 pi), 2e-7 of their field near by.
+    found = charge_field(MODEL, place, tolerance=1e-18)
+    size = np.linalg.norm(found)
+    np.testing.assert_allclose(found, lattice_sum(MODEL, *place), rtol=0, atol=1e-5 * size)
+
+
+@pytest.mark.parametrize("model", [MODEL, HIGH])
+def test_the_series_keeps_its_tolerance(model):
+    """Against so many pairs that nothing is left, at the farthest points allowed."""
+    at = points_between(3127, lateral=60.0)
+    distance = fields.farthest(at[:, :2], model)
+    exact = fields.sum_field(model, at, fields.image_series(model, distance, 1e-24))
+    counts = []
+    for tolerance in (1e-10, 1e-12, 1e-14, 1e-17):
+        series = fields.image_series(model, distance, tolerance)
+        counts.append(len(series.heights))
+        error = np.abs(fields.sum_field(model, at, series) - exact).max()
+        # Round-off of 1e2 images of 1e-4 V/um / um^2 at 1e-16 over 4 a b.
+        assert error < tolerance + 1e-19
+        if tolerance < 1e-10:
+            # Not wasteful: the bound is a worst case, but two pairs less miss it by far.
+            fewer = fields._sum_images(model, max(len(series.heights) // 4 - 4, 0))
+            assert (
+                np.abs(fields.sum_field(model, at, fewer) - exact).max() > 0.1 * tolerance
+            )
+    assert counts == sorted(set(counts))
+
+
+def test_without_its_tail_the_series_converges_slowly():
+    """What the two terms of the tail are worth: three orders at four pairs."""
+    at = points_between(3127, lateral=60.0)
+    series = fields.image_series(MODEL, fields.farthest(at[:, :2], MODEL), 1e-14)
+    exact = fields.sum_field(MODEL, at, fields.image_series(MODEL, 200.0, 1e-24))
+    bare = dataclasses.replace(series, tail=np.zeros(2))
+    error = np.abs(fields.sum_field(MODEL, at, series) - exact).max()
+    assert np.abs(fields.sum_field(MODEL, at, bare) - exact).max() > 1e3 * error
+
+
+# -- displacements -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("depth", [6.0, 30.0, T])
+def test_shifts_are_the_integral_of_the_field(axis, depth):
+    """Adaptive quadrature of the field over the drift field, straight down."""
+    lines = displace_boundaries(MODEL, [depth], charge=1.0, reach=1)
+    line = (lines.columns, lines.rows)[axis][0, 2]
+    seal = (MODEL.column_height, MODEL.row_height)[axis]
+    pitch = (MODEL.pitch_x, MODEL.pitch_y)[axis]
+    for point in line[:: len(line) // 5]:
+        at = np.array([0.0, 0.0, 0.0])
+        at[axis], at[1 - axis] = pitch / 2, point[1 - axis]
+
+        def slope(z, at=at):
+            at[2] = z
+            return 1e9 * charge_field(MODEL, at)[axis] / MODEL.drift_at(z)
+
+        wanted = quad(slope, seal, depth, epsrel=1e-10, epsabs=0, limit=200)[0]
+        # Positions of 5 um hold 1e-15 um, 1e-9 of shifts of 1e-6 um.
+        assert 1e9 * (point[axis] - pitch / 2) == pytest.approx(wanted, rel=1e-8, abs=2e-6)
+
+
+def test_edges_are_the_mean_of_their_lines():
+    shifts = edge_shifts(MODEL, depth=T, reach=1)
+    lines = displace_boundaries(MODEL, [T], charge=1.0, reach=1, samples=400)
+    for line, axis, across, along, found in (
+        (lines.columns[0, 2], 0, 10.0, 12.0, shifts.east[1, 1]),
+        (lines.rows[0, 2], 1, 12.0, 10.0, shifts.north[1, 1]),
+    ):
+        at, moved = line[:, 1 - axis], line[:, axis] - across / 2
+        use = np.abs(at) < along / 2
+        mean = np.trapezoid(moved[use], at[use]) / np.ptp(at[use])
+        # Ends left out: 1e-5 of the side; trapezoids of 400 points.
+        assert mean / across == pytest.approx(found, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("depth", "moved"), [(1.4, (0, 0)), (2.0, (0, 1)), (3.2, (0, 1)), (4.0, (1, 1))]
+)
+def test_nothing_moves_below_the_sealed_heights(depth, moved):
+    shifts = edge_shifts(MODEL, depth=depth, reach=1)
+    assert np.any(shifts.east != 0) == moved[0]
+    assert np.any(shifts.north != 0) == moved[1]
+
+
+def test_repulsion_and_the_order_of_the_lags():
+    """The source shrinks, all others grow, more along the columns, sealed lower."""
+    a = area_changes(MODEL, depth=T, reach=4)[4:, 4:]
+    assert a[0, 0] < 0
+    assert np.all(np.delete(a.ravel(), 0) > 0)
+    assert a[1, 0] > a[0, 1]
+    # Without charge nearer to the rows, and sealed alike, the order turns with the pitch.
+    even = dataclasses.replace(
+        MODEL,
+        column_height=1.4,
+        half_width_x=2.0,
+        half_width_y=2.0,
+        pitch_x=12.0,
+        pitch_y=12.0,
+    )
+    even = area_changes(even, depth=T, reach=2)
+    assert even[3, 2] == even[2, 3]
+
+
+@pytest.mark.parametrize("depth", [5.0, 20.0, T])
+@pytest.mark.parametrize("reach", [2, 4])
+def test_areas_sum_to_the_flux_through_the_rim(depth, reach):
+    """Pixels share edges: only the rim of the window is left, and Gauss has that flux.
+
+    The slab from the sealed height to the conversion depth holds no charge: what leaves
+    through its rim comes in through its faces.  It is the field that the missing pixels
+    would have gained from.
+    """
+    model = dataclasses.replace(MODEL, column_height=1.4, drift_field=0.6)
+    a = area_changes(model, depth=depth, reach=reach)
+    x, y = (reach + 0.5) * 10.0, (reach + 0.5) * 12.0
+
+    def through(z, n=240):
+        # Half points are within 10 um, where the field is steep: node = t^3 there.
+        t, weight = np.polynomial.legendre.leggauss(n)
+        node, weight = t**3, 3 * t**2 * weight
+        at = np.zeros((n, n, 3))
+        at[..., 0], at[..., 1], at[..., 2] = x * node[:, None], y * node, z
+        field = charge_field(model, at, tolerance=1e-18)[..., 2]
+        return x * y * (weight @ field @ weight)
+
+    wanted = (through(1.4) - through(depth)) / 0.6 / 120.0
+    assert a.sum() == pytest.approx(wanted, rel=1e-5)
+    assert a.sum() < 0
+
+
+def test_areas_of_a_whole_sensor_sum_to_zero():
+    # Thousands of edges add up what is left of the series: 1e-18 of it is below 1e-8.
+    sums = [
+        area_changes(MODEL, depth=T, reach=reach, tolerance=1e-18).sum()
+        for reach in (0, 4, 40)
+    ]
+    assert 0.1 < sums[1] / sums[0] < 0.2  # nine pixels regain most of the source's loss
+    assert 0 < sums[2] / sums[0] < 5e-6  # exp(-pi rho / T) of it is missing at 405 um
+
+
+def test_columns_lose_what_passes_their_rim():
+    """The areas of whole columns add up to the flux through two planes, known in modes.
+
+    Summed over y the charge is a line along y:
+    int E_x dy = -(1 / eps T) sum_n sin(k z_q) sin(k z) sinh(k a) / (k a) exp(-k x), k = n pi / T.
+    """
+    model = dataclasses.replace(MODEL, drift_field=0.6)
+    # 40 rows either way: exp(-15) of the flux leaves through their ends.
+    a = area_changes(model, depth=T, reach=40, tolerance=1e-18)
+    n = np.arange(1, 3000)
+    k = n * np.pi / T
+    path = (np.cos(k * 3.2) - np.where(n % 2, -1.0, 1.0)) / k
+    for reach in (0, 1, 4, 10):
+        x = (reach + 0.5) * 10.0
+        wide = (np.exp(-k * (x - 1.5)) - np.exp(-k * (x + 1.5))) / (2 * k * 1.5)
+        flux = -(np.sin(k * 0.5) * wide * path).sum() / (EPSILON * T) / 0.6
+        found = a[:, 40 - reach : 41 + reach].sum()
+        assert found == pytest.approx(2 * flux / 120.0, rel=2e-6)
+
+
+def test_mirrored_pixels_are_equal_bit_for_bit():
+    shifts = edge_shifts(MODEL, depth=[10.0, T], reach=3)
+    a = shifts.area_changes
+    assert a.shape == (2, 7, 7)
+    np.testing.assert_array_equal(a, a[:, ::-1])
+    np.testing.assert_array_equal(a, a[:, :, ::-1])
+    np.testing.assert_array_equal(shifts.north[:, :-1], -shifts.south[:, 1:])
+    np.testing.assert_array_equal(shifts.east[..., :-1], -shifts.west[..., 1:])
+    lines = displace_boundaries(MODEL, [T], charge=5e4, reach=2)
+    np.testing.assert_array_equal(lines.columns[..., 0], -lines.columns[:, ::-1, :, 0])
+    np.testing.assert_array_equal(lines.rows[..., 1], lines.rows[:, :, ::-1, 1])
+
+
+def test_exchanged_axes_exchange_the_lags():
+    turned = ImageCharge(
+        0.5, 3.2, 1.4, 3.0, 1.5, pitch_x=12.0, pitch_y=10.0, drift_field=MODEL.drift_field
+    )
+    there, here = (edge_shifts(m, depth=T, reach=3) for m in (turned, MODEL))
+    # Distances are summed as squares of x and y in the other order.
+    np.testing.assert_allclose(there.north, here.east.T, rtol=1e-9)
+    np.testing.assert_allclose(there.area_changes, here.area_changes.T, rtol=1e-9)
+
+
+def test_drift_fields_scale_shifts():
+    uniform = dataclasses.replace(MODEL, drift_field=0.5)
+    double = dataclasses.replace(MODEL, drift_field=((0, 1.0), (30, 1.0), (T, 1.0)))
+    a, b = (area_changes(m, depth=T, reach=2) for m in (uniform, double))
+    np.testing.assert_allclose(a, 2 * b, rtol=1e-8)  # panels end elsewhere
+
+
+def test_depths_in_any_order_and_shape():
+    depths = np.array([[40.0, 5.0], [T, 5.0]])
+    a = area_changes(MODEL, depth=depths, reach=1)
+    assert a.shape == (2, 2, 3, 3)
+    for where, depth in np.ndenumerate(depths):
+        alone = area_changes(MODEL, depth=depth, reach=1)
+        np.testing.assert_allclose(a[where], alone, rtol=1e-7)  # panels end elsewhere
+    np.testing.assert_array_equal(a[0, 1], a[1, 1])
+
+
+def test_traced_rays_agree_in_first_order():
+    """The difference to straight paths goes as the charge squared."""
+    differences = []
+    for charge in (1e3, 1e4):
+        first, traced = (
+            make(MODEL, [5.0, T], charge=charge, reach=2, samples=8)
+            for make in (displace_boundaries, trace_boundaries)
+        )
+        rows = traced.rows[..., 1] - first.rows[..., 1]
+        columns = traced.columns[..., 0] - first.columns[..., 0]
+        differences.append(max(np.abs(rows).max(), np.abs(columns).max()))
+        moved = np.abs(first.rows[:, 3, :, 1] - 6.0).max()
+        # In units of the shift, twice the field of the charge over the drift field.
+        assert differences[-1] < 0.05 * moved * charge / 1e4
+    # Third order: 0.1 of the second at 1e5 e-, 0.01 at 1e4.
+    assert differences[1] / differences[0] == pytest.approx(100, rel=0.03)
+
+
+def test_rays_are_traced_to_their_order(monkeypatch):
+    coarse = trace_boundaries(MODEL, [T], charge=1e5, reach=1, samples=4)
+    monkeypatch.setattr(engine, "_RAY_STEPS", 24)
+    fine = trace_boundaries(MODEL, [T], charge=1e5, reach=1, samples=4)
+    assert np.abs(fine.rows - coarse.rows).max() < 1e-5  # um; four times the steps, 1/256
+
+
+def test_the_far_field_of_the_poisson_engine_has_the_same_shape():
+    """Of a dipole on the plane, here a charge just above it, shifts by distance and depth."""
+    z = np.linspace(0.0, T, 2001)
+    half_cell = np.array([0.0, 1.0])
+    mesh = SimpleNamespace(x=half_cell, y=half_cell, z=z)
+    unit = SimpleNamespace(mesh=mesh, phi=(-0.5 * z)[:, None, None] * np.ones((1, 2, 2)))
+    depths = np.array([20.0, 60.0, T])
+    far = FarField.of(unit, depths, 0.0, 200.0)
+    model = ImageCharge(0.01, 4.0, 4.0, 0.05, 0.05, drift_field=0.5)
+    rho = np.array([25.0, 40.0, 60.0, 100.0])
+    at = np.column_stack([rho, np.zeros(4)])
+    ours = -engine._shifts(model, at, 0, depths, 1e-20)
+    theirs = np.array([far.vectors(at, d)[:, 0] for d in range(3)])
+    # Theirs: 200 steps by trapezoids, 40 modes, interpolated between 200 distances.
+    ratio = theirs / ours
+    np.testing.assert_allclose(ratio / ratio[-1, -1], 1.0, atol=0.01)
+
+
+def test_vertices_keep_the_areas():
+    """Through the lines and the resampling of the Poisson engine to polygons."""
+    charge = 100.0
+    lines = displace_boundaries(MODEL, [6.0, T], charge=charge, reach=2)
+    corners, horizontal, _ = lines.vertices(16, vertex_fractions(16))
+    north = edge_shifts(MODEL, depth=[6.0, T], reach=2).north
+    at = np.concatenate([[0.0], vertex_fractions(16), [1.0]])
+    for d in range(2):
+        for i in range(5):
+            side = np.concatenate(
+                [
+                    corners[d, 3, i : i + 1, 1],
+                    horizontal[d, 3, i, :, 1],
+                    corners[d, 3, i + 1 : i + 2, 1],
+                ]
+            )
+            mean = np.trapezoid(side, at) / (12.0 * charge)
+            # Lines of 48 points a pixel, linear in between; second order in 100 e-.
+            assert mean == pytest.approx(north[d, 2, i], rel=2e-3)
+
+
+# -- refusals ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"charge_height": 0.0}, "image charge: charge_height = 0.0 um must be "
+         "a finite number above 0 um"),
+        ({"half_width_x": np.nan}, "image charge: half_width_x = nan um must be "
+         "a finite number above 0 um"),
+        ({"pitch_x": "10 um"}, "image charge: pitch_x = '10 um' um must be a finite "
+         "number above 0 um"),
+        ({"permittivity": 0.5}, "image charge: permittivity = 0.5 must be at least 1"),
+        (
+            {"row_height": 0.4},
+            "image charge: row_height = 0.4 um must be above charge_height = 0.5 um and below "
+            "thickness = 100 um",
+        ),
+        (
+            {"column_height": 100.0},
+            "image charge: column_height = 100 um must be above charge_height = 0.5 um and "
+            "below thickness = 100 um",
+        ),
+        (
+            {"half_width_y": 6.5},
+            "image charge: half_width_y = 6.5 um must be at most half of pitch_y, 6 um",
+        ),
+        (
+            {"drift_field": -0.5},
+            "image charge: drift_field = -0.5 V/um must be finite and above 0 V/um everywhere",
+        ),
+        (
+            {"drift_field": "strong"},
+            "image charge: drift_field = 'strong' must be a number or pairs (height, field)",
+        ),
+        (
+            {"drift_field": ((2.0, 0.5), (100.0, 0.5))},
+            "image charge: heights of drift_field, [2.0, 100.0] um, must ascend from at most "
+            "1.4 um to at least thickness = 100 um",
+        ),
+    ],
+)  # fmt: skip
+def test_wrong_parameters_are_refused(changes, message):
+    with pytest.raises(DeviceError) as caught:
+        dataclasses.replace(MODEL, **changes)
+    assert str(caught.value) == message
+
+
+def test_wrong_questions_are_refused():
+    for call, message in (
+        (
+            lambda: charge_field(MODEL, [0.0, 0.0, 101.0]),
+            "height 101 um must be from 0 to 100 um, the two planes",
+        ),
+        (
+            lambda: charge_field(MODEL, [1.5, 0.0, 0.5]),
+            "point [1.5, 0.0, 0.5] um is on the rim of the charge",
+        ),
+        (
+            lambda: charge_field(MODEL, [1.5, 0.0]),
+            "points of the shape (2,) must be finite, with (x, y, z) on the last axis",
+        ),
+        (
+            lambda: charge_field(MODEL, [1.5, 0.0, 5.0], tolerance=0.0),
+            "tolerance = 0.0 V/um must be above 0 V/um",
+        ),
+        (
+            lambda: area_changes(MODEL, depth=0.0),
+            "conversion depth 0 um must be above 0 um, the gates, and at most 100 um, the back "
+            "surface",
+        ),
+        (
+            lambda: area_changes(MODEL, depth=5.0, reach=-1),
+            "reach = -1 must be a whole number of pixels from 0",
+        ),
+        (
+            lambda: displace_boundaries(MODEL, [5.0, 5.0], charge=1.0),
+            "conversion depths [5.0, 5.0] um must ascend",
+        ),
+        (
+            lambda: trace_boundaries(MODEL, [5.0], charge=1e7, reach=1, samples=4),
+            "charge = 1e+07 e- turns the drift field round at z = 3.35 um: no electron passes",
+        ),
+    ):
+        with pytest.raises(TableError) as caught:
+            call()
+        assert str(caught.value) == message
+
+
+def test_parameters_are_values():
+    again = pickle.loads(pickle.dumps(MODEL))
+    assert again == MODEL
+    assert hash(again) == hash(MODEL)
+    assert dataclasses.replace(MODEL, drift_field=[[0, 0.75], [100, 0.37]]) == MODEL
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        MODEL.thickness = 50.0
