@@ -15,12 +15,8 @@ from numpy.typing import NDArray
 
 import bfsensor
 from bfsensor.errors import TableError
-from bfsensor.simulate.image_charge import (
-    TOLERANCE,
-    ImageCharge,
-    displace_boundaries,
-    trace_boundaries,
-)
+from bfsensor.simulate.charge_field import TOLERANCE, ImageCharge
+from bfsensor.simulate.image_charge import displace_boundaries, trace_boundaries
 from bfsensor.table import DistortionTable, vertex_fractions
 
 ENGINE = "image charges (Astier & Regnault 2023), first order: linear in charge"
@@ -85,7 +81,7 @@ def build_image_charge_table(
 
     Examples
     --------
-    >>> from bfsensor.simulate.image_charge import ImageCharge
+    >>> from bfsensor.simulate.charge_field import ImageCharge
     >>> table = build_image_charge_table(ImageCharge(0.5, 1.4, 3.2, 1.5, 3.0), pixels=3)
     >>> table.provenance["engine"]
     'image charges (Astier & Regnault 2023), first order: linear in charge'
@@ -117,7 +113,7 @@ def build_image_charge_table(
         else excess[:, :, None, None, None, None, None] * array
         for array in unit
     )
-    slowest = float(model.drift_at(np.linspace(0, model.thickness, 201)).min())
+    slowest = float(model.drift_at(np.linspace(levels[0], model.thickness, 201)).min())
     return DistortionTable(
         charges=np.array(charges, float),
         backgrounds=np.array(backgrounds, float),

@@ -10,7 +10,8 @@ import pytest
 
 from bfsensor.build_image_charge import ENGINE, build_image_charge_table, default_depths
 from bfsensor.errors import TableError
-from bfsensor.simulate.image_charge import ImageCharge, area_changes
+from bfsensor.simulate.charge_field import ImageCharge
+from bfsensor.simulate.image_charge import area_changes
 from bfsensor.table import DistortionTable
 
 MODEL = ImageCharge(0.5, 1.4, 3.2, 1.5, 3.0, drift_field=((0, 0.75), (100, 0.37)))

@@ -1,7 +1,7 @@
 r"""The field of a charged rectangle between two conducting planes, by images.
 
-The planes z = 0 and z = T are met by images of alternate sign, :math:`\pm 1` at heights
-:math:`2 n T \pm z_q` for all whole n.
+The planes, a distance T apart, are met by images of alternate sign, :math:`\pm 1` at heights
+:math:`2 n T \pm z_q` above the lower one for all whole n.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _MOST_PAIRS = 1000
 
 @dataclass(frozen=True)
 class ImageCharge:
-    """Parameters of the analytic engine, all in um and V/um.
+    """Parameters of the analytic engine, all in um and V/um; heights are above the gates.
 
     Attributes
     ----------
     charge_height : float
-        Height :math:`z_q` of the stored charge above the gates' effective plane.
+        Height :math:`z_q` of the stored charge, above the effective plane.
     row_height, column_height : float
         Heights :math:`z_{sh}`, :math:`z_{sv}` at which boundaries between rows and between
         columns are sealed, above the charge.  The lower one moves more: rows in CCDs.
@@ -41,7 +41,7 @@ class ImageCharge:
         Half sides a, b of the charged rectangle, at most half a pitch.  The closed form loses
         digits as 1 / (a b): 1e-3 um each leave 1e-13 V/um of round-off.
     thickness : float
-        Distance T of the two planes.
+        Height of the back surface, the upper plane.
     pitch_x, pitch_y : float
         Pixel pitch.
     drift_field : float or sequence of (height, field)
@@ -50,6 +50,10 @@ class ImageCharge:
         Silicon of uniform doping needs two pairs.
     permittivity : float
         Relative permittivity of silicon; the default is that of a device file.
+    plane_height : float
+        Height of the lower plane, which stands for gates, oxide and the holes of channel
+        stops together.  An oxide alone puts it below the gates (negative), holes above
+        them.  Zero in Astier & Regnault (2023).
 
     Raises
     ------
@@ -77,6 +81,7 @@ class ImageCharge:
     pitch_y: float = 10.0
     drift_field: float | tuple[tuple[float, float], ...] = 0.5
     permittivity: float = Material.permittivity_silicon
+    plane_height: float = 0.0
 
     def __post_init__(self) -> None:
         for spec in dataclasses.fields(self):
@@ -84,19 +89,25 @@ class ImageCharge:
                 continue
             given = getattr(self, spec.name)
             unit = "" if spec.name == "permittivity" else " um"
+            low = -np.inf if spec.name == "plane_height" else 0.0
             try:
                 value = float(given)
             except (TypeError, ValueError):
                 value = np.nan
-            if not 0 < value < np.inf:
+            if not low < value < np.inf:
+                above = f" above 0{unit}" if low == 0 else ""
                 raise DeviceError(
-                    f"image charge: {spec.name} = {given!r}{unit} must be a finite number above "
-                    f"0{unit}"
+                    f"image charge: {spec.name} = {given!r}{unit} must be a finite number{above}"
                 )
             object.__setattr__(self, spec.name, value)
         if self.permittivity < 1:
             raise DeviceError(
                 f"image charge: permittivity = {self.permittivity:g} must be at least 1"
+            )
+        if self.charge_height <= self.plane_height:
+            raise DeviceError(
+                f"image charge: charge_height = {self.charge_height:g} um must be above "
+                f"plane_height = {self.plane_height:g} um"
             )
         for name in ("row_height", "column_height"):
             value = getattr(self, name)
@@ -155,6 +166,11 @@ class ImageCharge:
         return np.full(z.shape, self.drift_field)
 
     @property
+    def gap(self) -> float:
+        """Distance T of the two planes [um]."""
+        return self.thickness - self.plane_height
+
+    @property
     def unit_field(self) -> float:
         """Field of one electron 1 um away without planes [V/um]: negative, towards it."""
         return -1 / (4 * np.pi * self.permittivity * VACUUM_PERMITTIVITY)
@@ -162,30 +178,30 @@ class ImageCharge:
 
 @dataclass(frozen=True)
 class ImageSeries:
-    """Images summed one by one, and the tail of all others."""
+    """Images summed one by one, and the tail of all others; heights above the lower plane."""
 
     heights: NDArray[np.float64]
     signs: NDArray[np.float64]
     tail: NDArray[np.float64]
 
 
-def _tail_terms(height: float, thickness: float, pairs: int) -> NDArray[np.float64]:
+def _tail_terms(model: ImageCharge, pairs: int) -> NDArray[np.float64]:
     """Coefficients of r^l P_l, l = 1, 3, 5, ..., of the images beyond ``pairs``.
 
     Even terms cancel between images above and below.  Exact for a point charge.
     """
     order = 2.0 * np.arange(1, _TAIL_TERMS + 1)  # l + 1
-    shift = height / (2 * thickness)
+    shift = (model.charge_height - model.plane_height) / (2 * model.gap)
     difference = zeta(order, pairs + 1 + shift) - zeta(order, pairs + 1 - shift)
-    return np.asarray(2 * difference / (2 * thickness) ** order)
+    return np.asarray(2 * difference / (2 * model.gap) ** order)
 
 
 def _bound(model: ImageCharge, pairs: int, distance: float) -> float:
     """Error of the field [V/um per electron] within ``distance`` of the origin."""
     radius = distance + np.hypot(model.half_width_x, model.half_width_y)
-    if radius >= (pairs + 1) * model.thickness:
+    if radius >= (pairs + 1) * model.gap:
         return np.inf  # kept away from 2 (pairs + 1) T - z_q, where the tail diverges
-    terms = _tail_terms(model.charge_height, model.thickness, pairs)[2:]
+    terms = _tail_terms(model, pairs)[2:]
     degree = 5 + 2 * np.arange(len(terms))
     # |grad r^l P_l| <= sqrt(l (l + 1)) r^(l - 1); from term to term the sizes more than halve.
     sizes = np.sqrt(degree * (degree + 1)) * radius ** (degree - 1) * np.abs(terms)
@@ -211,8 +227,9 @@ def image_series(model: ImageCharge, distance: float, tolerance: float) -> Image
 def _sum_images(model: ImageCharge, pairs: int) -> ImageSeries:
     n = np.arange(-pairs, pairs + 1)[:, None]
     signs = np.array([1.0, -1.0])
-    heights = 2 * n * model.thickness + signs * model.charge_height
-    terms = _tail_terms(model.charge_height, model.thickness, pairs)
+    height = model.charge_height - model.plane_height
+    heights = 2 * n * model.gap + signs * height
+    terms = _tail_terms(model, pairs)
     return ImageSeries(heights.ravel(), np.tile(signs, len(n)), terms[:2])
 
 
@@ -230,8 +247,8 @@ def charge_field(
     model : ImageCharge
         The parameters.
     points : array_like, shape (..., 3)
-        Positions (x, y, z) [um], the centre of the charge at x = y = 0, z from 0 to the
-        thickness.
+        Positions (x, y, z) [um], the centre of the charge at x = y = 0, z above the gates
+        from plane_height to the thickness.
     tolerance : float
         Largest error of the series [V/um per electron].
 
@@ -262,10 +279,11 @@ def charge_field(
         raise TableError(
             f"points of the shape {at.shape} must be finite, with (x, y, z) on the last axis"
         )
-    outside = (at[..., 2] < 0) | (at[..., 2] > model.thickness)
+    outside = (at[..., 2] < model.plane_height) | (at[..., 2] > model.thickness)
     if np.any(outside):
         raise TableError(
-            f"height {at[outside][0, 2]:g} um must be from 0 to {model.thickness:g} um, the two planes"
+            f"height {at[outside][0, 2]:g} um must be from {model.plane_height:g} to "
+            f"{model.thickness:g} um, the two planes"
         )
     flat = np.ascontiguousarray(at.reshape(-1, 3))
     series = image_series(model, farthest(flat[:, :2], model), tolerance)
@@ -280,6 +298,7 @@ def sum_field(
     model: ImageCharge, points: NDArray[np.float64], series: ImageSeries
 ) -> NDArray[np.float64]:
     """Field at points (n, 3) [V/um per electron] of one series, without any check."""
+    points = points - np.array([0.0, 0.0, model.plane_height])
     out = np.zeros_like(points)
     half = np.array([model.half_width_x, model.half_width_y])
     kernel.add_fields(points, series.heights, series.signs, half, series.tail, out)
@@ -287,13 +306,13 @@ def sum_field(
 
 
 def farthest(points: NDArray[np.float64], model: ImageCharge) -> float:
-    """Largest distance from the origin of a place or of the back surface above it [um].
+    """Largest distance from the lower plane's origin of a place or the back above it [um].
 
     Rounded up to a pitch, for the sake of the series that are kept.
     """
     if not points.size:
-        return model.thickness
+        return model.gap
     # Points (u, v), or edges (u, v, v): the farther end.
     lateral = float(np.hypot(points[:, 0], np.abs(points[:, 1:]).max(axis=1)).max())
     step = model.pitch_x
-    return float(np.hypot(np.ceil(lateral / step) * step, model.thickness))
+    return float(np.hypot(np.ceil(lateral / step) * step, model.gap))

@@ -1,10 +1,9 @@
 r"""The analytic second engine: a charged rectangle between two conducting planes.
 
-The stored charge of a pixel is spread evenly over a rectangle of half sides a, b at
-height :math:`z_q` above an effective plane of the gates, z = 0; the back surface is the
-plane z = T.  Both are met by images of alternate sign, :math:`\pm 1` at
-:math:`2 n T \pm z_q`.  Electrons drift down in :math:`E_z(z)`, and a boundary whose fate
-is sealed at height :math:`z_s` is displaced at the conversion depth z by
+The stored charge of a pixel is spread evenly over a rectangle of half sides a, b at height
+:math:`z_q`, between an effective plane of the gates and the back surface, both conductors
+(``charge_field``).  Electrons drift down in :math:`E_z(z)`, and a boundary whose fate is
+sealed at height :math:`z_s` is displaced at the conversion depth z by
 
 .. math:: D(z) = \int_{z_s}^{z} \frac{E_\perp(z')}{E_z(z')}\,dz'
 
@@ -14,9 +13,9 @@ at :math:`z_{sh}`, those between columns at :math:`z_{sv}` (Astier & Regnault 20
 The engine is linear in charge: one solution serves all.  It knows nothing of gates,
 channel stops and holes but these two heights, and shares no code with the Poisson
 solver, which it therefore checks; only the type of the result is the same.  A uniform
-background displaces nothing here; in truth its mean field, below
-:math:`n z_q / (\epsilon T)` for n electrons/um^2 (0.008 V/um for 100,000 e- in 10 x 10 um
-at 0.5 um), weakens the drift field, and the stored charge changes the wells.
+background displaces nothing here; in truth its mean field, :math:`n z_q / (\epsilon T)` for n
+electrons/um^2 (0.008 V/um for 100,000 e- in 10 x 10 um at 0.5 um), weakens the drift field,
+and stored charge changes the wells: heights fitted at one level of charge belong to it.
 """
 
 from __future__ import annotations
@@ -33,22 +32,10 @@ from bfsensor.simulate.boundaries import PixelBoundaries
 from bfsensor.simulate.charge_field import (
     TOLERANCE,
     ImageCharge,
-    charge_field,
     farthest,
     image_series,
     sum_field,
 )
-
-__all__ = [
-    "TOLERANCE",
-    "EdgeShifts",
-    "ImageCharge",
-    "area_changes",
-    "charge_field",
-    "displace_boundaries",
-    "edge_shifts",
-    "trace_boundaries",
-]
 
 SAMPLES = 48
 """Points of a boundary line per pixel; areas of tables are then good to 5e-4."""
@@ -108,8 +95,8 @@ def _shifts(
         half = np.array([model.half_width_x, model.half_width_y])[:: 1 - 2 * axis]
         add = kernel.add_edge_shifts if places.shape[1] == 3 else kernel.add_point_shifts
         add(
-            places, nodes, weights, np.searchsorted(depths, nodes), series.heights,
-            series.signs, half.copy(), series.tail, steps,
+            places, nodes - model.plane_height, weights, np.searchsorted(depths, nodes),
+            series.heights, series.signs, half.copy(), series.tail, steps,
         )  # fmt: skip
     return np.cumsum(steps, axis=0)
 
