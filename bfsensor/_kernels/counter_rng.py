@@ -117,3 +117,23 @@ def words(first, key0, key1, out):
             key0,
             key1,
         )[3]
+
+
+@numba.njit(cache=True, nogil=True)
+def uniforms(first, stream, key0, key1, out):
+    """Two uniform deviates (0 to 1, both ends out) for each of the photons first, first + 1, ...
+
+    ``stream`` sets them apart from other numbers of the same photons.
+    """
+    for n in range(out.shape[0]):
+        count = np.uint64(first) + np.uint64(n)
+        a, b, _, _ = philox(
+            np.uint32(count & np.uint64(0xFFFFFFFF)),
+            np.uint32(count >> np.uint64(32)),
+            np.uint32(0),
+            np.uint32(stream),
+            key0,
+            key1,
+        )
+        out[n, 0] = (np.float64(a) + 0.5) * 2.0**-32
+        out[n, 1] = (np.float64(b) + 0.5) * 2.0**-32

@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from bfsensor import silicon
-from bfsensor._kernels.counter_rng import deviates
 from bfsensor.errors import DeviceError, SimulationError
+from bfsensor.simulate import light
 from bfsensor.simulate.mesh import make_mesh
 from bfsensor.simulate.poisson import Electrostatics, Potential, solve_unit_cell, tile
 from bfsensor.simulate.transport import ABSORBED, Electrons, Tracer, Transport
@@ -366,15 +366,10 @@ def _starts(
     plan: SpotPlan, seed: int, numbers: NDArray[np.int64], centre: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Where the light sets electrons free [um]: a Gaussian spot."""
-    count = len(numbers)
-    x, y, path = (np.empty(count, np.float32) for _ in range(3))
-    deviates(
-        int(numbers[0]) if count else 0, np.uint32(seed & 0xFFFFFFFF), np.uint32(seed >> 32),
-        x, y, path, np.empty(count, np.uint32),
-    )  # fmt: skip
-    out = np.empty((count, 3))
-    out[:, 0] = centre[0] + plan.sigma * x
-    out[:, 1] = centre[1] + plan.sigma * y
+    out = np.empty((len(numbers), 3))
+    out[:, :2] = light.spot(
+        numbers, seed=seed, centre=(centre[0], centre[1]), sigma=plan.sigma
+    )
     if plan.wavelength is None:
         out[:, 2] = plan.conversion_height
         return out
@@ -383,9 +378,8 @@ def _starts(
         silicon.absorption_length(plan.wavelength, plan.device.operating_point.temperature)
     )
     # Light that crosses the silicon is not collected: depths are those of the rest.
-    # The deviate's uniform, brought into the part of the distribution that is absorbed.
-    lowest = np.exp(-(thickness - 2.0) / length)
-    uniform = np.exp(-path.astype(float))
+    lowest = np.exp(-(thickness - light.LOWEST) / length)
+    uniform = np.exp(-light.paths(numbers, seed=seed))
     out[:, 2] = thickness + length * np.log(lowest + uniform * (1.0 - lowest))
     return out
 
