@@ -166,6 +166,33 @@ class Tracer:
         self._temperature = float(device.operating_point.temperature)
         self._kt = float(device.material.thermal_voltage(self._temperature))
 
+    @property
+    def field_arrays(self) -> tuple[NDArray[np.float64], ...]:
+        """The padded potential and its nodes, as kernels take them."""
+        return self.field.phi, self.field.x, self.field.y, self.field.z
+
+    def prepare(
+        self, starts: ArrayLike, transport: Transport
+    ) -> tuple[NDArray[np.float64], kernels.Room, float]:
+        """Check starts; give them, the room and kT [V] as kernels take them."""
+        starts = np.ascontiguousarray(np.atleast_2d(starts), float)
+        if starts.shape[1] != 3 or not np.isfinite(starts).all():
+            raise DeviceError("starts must be finite numbers of shape (n, 3)")
+        room = self._room._replace(absorbed=float(transport.back_absorption))
+        low, high = float(room.surface[0]), room.thickness
+        wrong = (starts[:, 2] < low) | (starts[:, 2] > high)
+        if wrong.any():
+            raise DeviceError(
+                f"starts: z = {starts[wrong][0, 2]:g} um is not in the silicon, {low:g} to "
+                f"{high:g} um"
+            )
+        return starts, room, self._kt
+
+    def pixels_of(self, positions: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Pixels (i, j) of positions, shape (n, 2)."""
+        pitch = np.array(self.potential.mesh.pitch)
+        return np.round(positions[:, :2] / pitch).astype(np.int64)
+
     def trace(
         self,
         starts: ArrayLike,
@@ -203,17 +230,7 @@ class Tracer:
             An electron found no well.
         """
         transport = transport or Transport()
-        starts = np.ascontiguousarray(np.atleast_2d(starts), float)
-        if starts.shape[1] != 3 or not np.isfinite(starts).all():
-            raise DeviceError("starts must be finite numbers of shape (n, 3)")
-        room = self._room._replace(absorbed=float(transport.back_absorption))
-        low, high = float(room.surface[0]), room.thickness
-        wrong = (starts[:, 2] < low) | (starts[:, 2] > high)
-        if wrong.any():
-            raise DeviceError(
-                f"starts: z = {starts[wrong][0, 2]:g} um is not in the silicon, {low:g} to "
-                f"{high:g} um"
-            )
+        starts, room, kt = self.prepare(starts, transport)
         count = len(starts)
         names = np.arange(count) if numbers is None else np.asarray(numbers)
         key0, key1 = np.uint32(seed & 0xFFFFFFFF), np.uint32(seed >> 32 & 0xFFFFFFFF)
@@ -222,7 +239,7 @@ class Tracer:
         most = _MOST_FLIGHTS if transport.engine == "scattering" else _MOST_STEPS
         paths = np.empty((count, most + 1, 3) if keep_paths else (0, 0, 3))
         length = np.zeros(count if keep_paths else 0, np.int64)
-        field = (self.field.phi, self.field.x, self.field.y, self.field.z)
+        field = self.field_arrays
         tail = (starts, names.astype(np.uint64), key0, key1, out, fates, paths, length)
         if transport.engine == "steps":
             pace = kernels.Pace(
@@ -231,12 +248,12 @@ class Tracer:
                 float(transport.longest),
                 most,
             )
-            kernels.walk(*field, room, pace, self._kt * transport.diffusion**2, *tail)
+            kernels.walk(*field, room, pace, kt * transport.diffusion**2, *tail)
         else:
             mass = ELECTRON_MASS
             kernels.scatter(
                 *field, room, most,
-                transport.diffusion * float(np.sqrt(3.0 * self._kt / mass)), mass,
+                transport.diffusion * float(np.sqrt(3.0 * kt / mass)), mass,
                 silicon.mobility_law(self._temperature), transport.free_time == "start", *tail,
             )  # fmt: skip
         if (fates == kernels.LOST).any():
@@ -247,14 +264,7 @@ class Tracer:
                 f"{most} steps; the first stands at ({x:.3g}, {y:.3g}, {z:.3g}) um",
                 [],
             )
-        pixels = np.stack(
-            [
-                np.round(out[:, axis] / self.potential.mesh.pitch[axis]).astype(np.int64)
-                for axis in (0, 1)
-            ],
-            axis=1,
-        )
         return Electrons(
-            out, pixels, fates,
+            out, self.pixels_of(out), fates,
             tuple(paths[n, : length[n]].copy() for n in range(count)) if keep_paths else (),
         )  # fmt: skip
