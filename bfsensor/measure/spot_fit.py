@@ -310,9 +310,9 @@ def _judge(
         "masked": never,
         "faint": ~(spots.flux > 5 * error),
         "centre": far,
-        "diverged": wild,
         "chi2": uneven,
         "width": odd,
+        "diverged": wild,
     }
     for reason, holds in reversed(reasons.items()):
         status[holds] = reason
