@@ -235,6 +235,21 @@ def test_bad_spots_are_dropped_and_named(weights):
     assert abs(loose.sigma_x - SHAPE.sigma_x) > 5 * loose.sigma_x_error
 
 
+@pytest.mark.parametrize("weights", WEIGHTS)
+@pytest.mark.parametrize("seed", [2, 12, 17])
+def test_a_third_of_the_spots_may_be_struck_by_anything(weights, seed):
+    rng = np.random.default_rng(seed)
+    mean, _, _ = expect(60, 1.3e5, seed=seed)
+    data = rng.poisson(mean).astype(float)
+    for k in range(20):
+        # Up to twenty times the light of a spot, in one pixel.
+        data[k, rng.integers(0, 9), rng.integers(0, 9)] += 10 ** rng.uniform(4, 6.5)
+    fit = fit_spots(Stamps(data), weights=weights)
+    assert np.nonzero(fit.used)[0].tolist() == list(range(20, 60))
+    assert abs(fit.sigma_x - SHAPE.sigma_x) < 3.5 * fit.sigma_x_error
+    assert abs(fit.sigma_y - SHAPE.sigma_y) < 3.5 * fit.sigma_y_error
+
+
 def test_a_spot_that_is_a_little_wider_is_dropped_for_its_width():
     mean, _, _ = expect(80, 3e4, background=0.0, seed=21)
     # Seven errors of one spot, 1.02 / sqrt(2 * 3e4): 49 in chi2, where 6 sigma are 74.

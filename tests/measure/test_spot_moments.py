@@ -98,6 +98,24 @@ def test_errors_are_the_scatter_of_mocks():
     assert known.xx_error.mean() == pytest.approx(found.xx_error.mean(), rel=0.01)
 
 
+@pytest.mark.parametrize("pixel", [(6, 6), (5, 8), (8, 3)])
+def test_errors_are_the_derivatives_by_each_pixel(pixel):
+    spot = 5e4 * integrate_gaussian([0.2], [-0.3], Shape(1.2, 1.5, 0.2), 13)
+    # All the noise is in one pixel.
+    variance = np.full_like(spot, 1e-30)
+    variance[0, *pixel] = 1.0
+    step = np.zeros_like(spot)
+    step[0, *pixel] = 0.1
+    found = measure_moments(Stamps(spot, variance=variance))
+    high, low = (measure_moments(Stamps(one)) for one in (spot + step, spot - step))
+    for name in NAMES:
+        slope = (getattr(high, name)[0] - getattr(low, name)[0]) / 0.2
+        # Second order: (0.1 / 5e4)^2; moments rest to 1e-10.
+        assert getattr(found, f"{name}_error")[0] == pytest.approx(
+            abs(slope), rel=1e-4, abs=1e-9
+        )
+
+
 def test_background_left_in_widens_by_as_much_as_stated():
     spots = 1e5 * integrate_gaussian([0.0], [0.0], Shape(1.0, 1.0), 9)
     left = measure_moments(Stamps(spots + 0.001 * spots.max())).mean_widths().sigma_x
