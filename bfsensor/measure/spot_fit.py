@@ -1,7 +1,8 @@
 r"""The forward model of a region's spots: one shape, and each spot's own flux and centre.
 
-The normal equations are those of :mod:`bfsensor.measure.spot_normal`; here they are solved,
-spots that do not belong are dropped, and errors and the bias of noise are found.
+The normal equations are those of :mod:`bfsensor.measure.spot_normal`, solved in
+:mod:`bfsensor.measure.spot_solve`; here spots that do not belong are dropped, and errors and
+the bias of noise are found.
 """
 
 from __future__ import annotations
@@ -13,12 +14,10 @@ from bfsensor.errors import ConvergenceError, MeasurementError
 from bfsensor.measure.spot_model import Shape, check_shape, curvatures
 from bfsensor.measure.spot_normal import Normal, Problem, Spots, invert
 from bfsensor.measure.spot_result import SpotFit
+from bfsensor.measure.spot_solve import approach, solve, start
 from bfsensor.measure.spots import Stamps
 
-_LARGEST_STEPS = 60
 _ROUNDS = 10
-# Where a step ends: a thousandth of the smallest errors in use.
-_WIDTH_TOLERANCE, _CENTRE_TOLERANCE = 1e-8, 1e-6  # [pixel]
 
 
 def fit_spots(
@@ -117,27 +116,34 @@ def fit_spots(
         free_background=background is None,
         free_tilt=correlation is None,
     )
-    spots, shape = _start(stamps, background, correlation or 0.0)
+    spots, shape = start(stamps, background, correlation or 0.0)
     never = _masked(problem)
-    used = ~never
+    _check_enough(~never, never)
+    shape = approach(problem, spots, shape, ~never, largest_offset)
+    used, wild = ~never, np.zeros(len(stamps), bool)
     seen: list[NDArray[np.bool_]] = []
     # Why each spot was dropped last; a spot may come back if a worse one made it look bad,
     # but not once sets begin to take turns.
     last = np.full(len(stamps), "masked", dtype="<U8")
     closed = False
-    for _ in range(_ROUNDS):
-        _check_enough(used, never)
-        shape, normal, wild = _solve(problem, spots, shape, used, largest_offset)
+    for count in range(_ROUNDS):
+        # First beside the shape that most spots ask for, then beside the fitted one.
+        if count:
+            shape, wild = solve(problem, spots, shape, used, largest_offset)
+        normal = problem.linearise(
+            spots, problem.derivatives(spots, shape), with_noise=True
+        )
         status = _judge(problem, spots, normal, used, never, wild, largest_offset, limit)
         last = np.where(status == "used", last, status)
         if closed:
             status = np.where(used, status, last)
         again = status == "used"
-        if np.array_equal(again, used):
+        if count and np.array_equal(again, used):
             break
         closed |= any(np.array_equal(again, before) for before in seen)
         seen.append(used)
         used = again & used if closed else again
+        _check_enough(used, never)
     else:
         raise ConvergenceError(
             f"which of {len(stamps)} spots to use did not settle in {_ROUNDS} rounds",
@@ -183,99 +189,6 @@ def _masked(problem: Problem) -> NDArray[np.bool_]:
     return ~(core & enough)
 
 
-def _start(
-    stamps: Stamps, background: float | None, correlation: float
-) -> tuple[Spots, Shape]:
-    """Rough fluxes, centres and widths, none of which a few bad pixels can carry off."""
-    data, good = stamps.electrons, stamps.good
-    n, ny, nx = data.shape
-    rim = np.ones((ny, nx), bool)
-    rim[1:-1, 1:-1] = False
-    below = np.zeros(n)
-    for k in range(n):
-        outer = data[k][rim & good[k]]
-        below[k] = np.median(outer) if outer.size else 0.0
-    if background is not None:
-        below[:] = background
-    light = np.where(good, data - below[:, None, None], 0.0)
-    j, i = ny // 2, nx // 2
-    core = light[:, j - 1 : j + 2, i - 1 : i + 2]
-    inner = np.maximum(core.sum(axis=(1, 2)), 1.0)
-    # Three pixels hold part of the light: their centroid falls short of the centre.
-    x = np.clip(1.6 * (core[:, :, 2] - core[:, :, 0]).sum(axis=1) / inner, -0.5, 0.5)
-    y = np.clip(1.6 * (core[:, 2] - core[:, 0]).sum(axis=1) / inner, -0.5, 0.5)
-    typical = np.median(light / inner[:, None, None], axis=0)
-    total = max(float(typical.sum()), 1e-3)
-    widths = []
-    for axis, size, centre in ((0, nx, x), (1, ny, y)):
-        place = np.arange(size) - size // 2
-        spread = float(typical.sum(axis=axis) @ place**2) / total - np.mean(centre**2)
-        # The pixel itself has the variance 1/12.
-        widths.append(float(np.sqrt(np.clip(spread - 1 / 12, 0.2, (size / 4) ** 2))))
-    flux = np.maximum(light.sum(axis=(1, 2)), inner)
-    return Spots(flux, x, y, below), Shape(widths[0], widths[1], correlation)
-
-
-def _solve(
-    problem: Problem,
-    spots: Spots,
-    shape: Shape,
-    used: NDArray[np.bool_],
-    largest_offset: float,
-) -> tuple[Shape, Normal, NDArray[np.bool_]]:
-    """Gauss-Newton steps until the used spots rest; the others follow the shape.
-
-    Weights follow the model, so the sum of squares is not what falls; steps are bounded
-    instead.  Returns also which spots did not settle.
-    """
-    bound = largest_offset + 0.5
-    history = []
-    for _ in range(_LARGEST_STEPS):
-        normal = problem.linearise(spots, problem.derivatives(spots, shape))
-        step = np.linalg.solve(
-            normal.rest[used].sum(axis=0), normal.score[used].sum(axis=0)
-        )
-        largest = 0.2 * min(shape.sigma_x, shape.sigma_y)
-        step = np.clip(step, -largest, largest)
-        own = np.einsum(
-            "nab,nb->na", normal.own_inverse, normal.own_score - normal.cross @ step
-        )
-        before = spots.x.copy(), spots.y.copy()
-        spots.flux[...] += own[:, 0]
-        spots.x[...] = np.clip(spots.x + np.clip(own[:, 1], -0.3, 0.3), -bound, bound)
-        spots.y[...] = np.clip(spots.y + np.clip(own[:, 2], -0.3, 0.3), -bound, bound)
-        if problem.own == 4:
-            spots.background[...] += own[:, 3]
-        shape = Shape(
-            shape.sigma_x + step[0],
-            shape.sigma_y + step[1],
-            # The edge of what is allowed; no spot on a CCD is there.
-            float(np.clip(shape.correlation + step[2], -0.75, 0.75))
-            if problem.shared == 3
-            else shape.correlation,
-        )
-        moved = np.maximum(np.abs(spots.x - before[0]), np.abs(spots.y - before[1]))
-        history.append(float(np.max(np.abs(step))))
-        unsettled = ~(moved < _CENTRE_TOLERANCE)
-        if history[-1] < _WIDTH_TOLERANCE and not np.any(unsettled & used):
-            break
-        if not (0.15 < shape.sigma_x < problem.nx and 0.15 < shape.sigma_y < problem.ny):
-            raise ConvergenceError(
-                f"the widths ran to {shape.sigma_x:.3g} x {shape.sigma_y:.3g} pixel in "
-                f"stamps of {problem.nx} x {problem.ny}",
-                history,
-            )
-    else:
-        if not np.any(unsettled & used):
-            raise ConvergenceError(
-                f"the widths still moved by {history[-1]:.2g} pixel after "
-                f"{_LARGEST_STEPS} steps",
-                history,
-            )
-    normal = problem.linearise(spots, problem.derivatives(spots, shape), with_noise=True)
-    return shape, normal, unsettled
-
-
 def _judge(
     problem: Problem,
     spots: Spots,
@@ -310,9 +223,9 @@ def _judge(
         "masked": never,
         "faint": ~(spots.flux > 5 * error),
         "centre": far,
-        "diverged": wild,
         "chi2": uneven,
         "width": odd,
+        "diverged": wild,
     }
     for reason, holds in reversed(reasons.items()):
         status[holds] = reason

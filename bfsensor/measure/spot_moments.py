@@ -77,8 +77,9 @@ class SpotMoments:
     centre_x_error, centre_y_error, xx_error, xy_error, yy_error, flux_error : ndarray
         From the noise of the pixels, to first order.
     status : ndarray of str
-        ``used``, ``masked`` (a bad pixel in the stamp), ``diverged`` or ``faint`` (flux below
-        5 times its error); moments are nan unless used.
+        ``used``, ``masked`` (a bad pixel in the stamp), ``diverged`` (no solution, or one wider
+        than a quarter of the stamp) or ``faint`` (flux below 5 times its error); moments are
+        nan unless used.
     """
 
     x: NDArray[np.int64]
@@ -107,7 +108,7 @@ class SpotMoments:
 
         :math:`\sigma_x^2 = \langle M_{xx} \rangle - 1/12`.  Weights by the moments' own
         errors would favour spots that noise made small.  The pixel's box is no Gaussian: a
-        width of 1 pixel comes out as 1.0011, of 2 pixels as 2.0001.
+        width of 1 pixel comes out as 1.0010, of 2 pixels as 2.0001.
 
         Raises
         ------
@@ -324,7 +325,7 @@ def _sane(theta: NDArray[np.float64], size: int) -> NDArray[np.bool_]:
         (np.abs(cx) < half)
         & (np.abs(cy) < half)
         & (np.minimum(xx, yy) > 0.01)
-        & (np.maximum(xx, yy) < half**2)
+        & (np.maximum(xx, yy) < (half / 2) ** 2)
         & (xx * yy - xy * xy > 1e-4)
     )
 

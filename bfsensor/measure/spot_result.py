@@ -18,11 +18,11 @@ from bfsensor.measure.spot_model import Shape, integrate_gaussian
 
 REASONS: Mapping[str, str] = {
     "masked": "too few good pixels, or a bad one in the 3 x 3 about the centre",
-    "diverged": "centre or flux did not settle",
     "faint": "flux below 5 times its error",
     "centre": "centre too far from the brightest pixel",
     "chi2": "residuals far above those of the region's other spots",
     "width": "own widths far from those of the region's other spots",
+    "diverged": "centre did not settle",
 }
 """Why a spot was dropped, in the order in which the reasons are asked."""
 
