@@ -13,7 +13,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2 as chi2_distribution
 
 from bfsensor.errors import MeasurementError
-from bfsensor.measure.ecsv import read_ecsv, write_ecsv
+from bfsensor.measure.spot_files import read_ecsv, write_ecsv
 
 UNIT_PEAK = 50_000.0
 """Slopes are per this many electrons in the peak, as published."""

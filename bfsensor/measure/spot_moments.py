@@ -22,7 +22,7 @@ from astropy.table import Column, Table
 from numpy.typing import ArrayLike, NDArray
 
 from bfsensor.errors import MeasurementError
-from bfsensor.measure.ecsv import read_ecsv, write_ecsv
+from bfsensor.measure.spot_files import read_ecsv, write_ecsv
 from bfsensor.measure.spots import Stamps
 
 SCHEMA = "bfsensor.SpotMoments 1"

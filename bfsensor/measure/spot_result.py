@@ -13,7 +13,7 @@ from astropy.table import Column, Table
 from numpy.typing import NDArray
 
 from bfsensor.errors import MeasurementError
-from bfsensor.measure.ecsv import read_ecsv, write_ecsv
+from bfsensor.measure.spot_files import read_ecsv, write_ecsv
 from bfsensor.measure.spot_model import Shape, integrate_gaussian
 
 REASONS: Mapping[str, str] = {

@@ -1,15 +1,4 @@
-"""The direct simulation: electrons one by one, charge fed back into Poisson's equation.
-
-A spot is built up in steps (Lage, Bradshaw & Tyson 2017, section 4): solve for the charge
-that is there, send the next electrons through that field, add them to the wells they
-reach, solve again.  The same electrons, with the same random numbers, also go through the
-field of the empty sensor: differences between both images are the brighter-fatter effect,
-with a fraction of the noise of either.
-
-The charge that the field is solved for is that of the middle of the step, half of what
-the step brings to the empty sensor added: without it the field lags behind the charge by
-half a step.
-"""
+"""Spots of the direct simulation: what to build up, and what comes of it."""
 
 from __future__ import annotations
 
@@ -19,7 +8,6 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,17 +19,13 @@ from scipy.special import erf
 from bfsensor import silicon
 from bfsensor.errors import DeviceError, SimulationError
 from bfsensor.simulate import light
-from bfsensor.simulate.mesh import make_mesh
-from bfsensor.simulate.poisson import Electrostatics, Potential, solve_unit_cell, tile
-from bfsensor.simulate.transport import ABSORBED, Electrons, Tracer, Transport
+from bfsensor.simulate.build_up import build_up
+from bfsensor.simulate.transport import Transport
 
 if TYPE_CHECKING:
     from bfsensor.device import Device
 
 SCHEMA = "bfsensor spot 1"
-TOLERANCE = 1e-4
-"""Iteration error [V] of a step's field: 1 % of what 100 electrons in a pixel do to it."""
-
 _SPOT_STREAM = 0x5B0750
 
 
@@ -257,41 +241,12 @@ def simulate_spot(
         From the solver or the tracer.
     """
     begin = time.process_time()
-    solver, empty, empty_tracer = _empty_sensor(
-        _Sensor(plan.device, plan.pixels, plan.cells)
-    )
     centre, seed = _choose(plan, number)
-    shape = (plan.pixels, plan.pixels)
-    edges = plan.step_ends
-    on = np.zeros((plan.steps, *shape), np.int32)
-    off = np.zeros_like(on)
-    collected = np.zeros(shape, np.int64)
-    reference = np.zeros(shape, np.int64)
-    past: list[NDArray[np.float64]] = []
-    for step in range(plan.steps):
-        numbers = np.arange(edges[step], edges[step + 1])
-        starts = _starts(plan, seed, numbers, centre)
-        plain = empty_tracer.trace(
-            starts, seed=seed, numbers=numbers, transport=plan.transport
-        )
-        plain_image = _image(plain, plan.pixels)
-        start = empty.phi if not past else past[-1]
-        if len(past) == 2:
-            # Charge grows steadily, and so does its potential.
-            start = 2.0 * past[-1] - past[-2]
-        potential = solver.solve(
-            collected + 0.5 * plain_image, start=start, tolerance=TOLERANCE
-        )
-        past = [*past[-1:], potential.phi]
-        electrons = Tracer(potential).trace(
-            starts, seed=seed, numbers=numbers, transport=plan.transport
-        )
-        collected += _image(electrons, plan.pixels)
-        reference += plain_image
-        on[step] = collected
-        off[step] = reference
-        if progress is not None:
-            progress(step + 1)
+    on, off = build_up(
+        plan.device, plan.step_ends,
+        lambda numbers: _starts(plan, seed, numbers, centre), pixels=plan.pixels,
+        cells=plan.cells, transport=plan.transport, seed=seed, progress=progress,
+    )  # fmt: skip
     return Spot(
         number, (float(centre[0]), float(centre[1])), on, off, plan.key,
         time.process_time() - begin,
@@ -329,39 +284,6 @@ def _choose(plan: SpotPlan, number: int) -> tuple[NDArray[np.float64], int]:
     return centre, int(rng.integers(2**63))
 
 
-@dataclass(frozen=True, eq=False)
-class _Sensor:
-    """A device on a mesh, known by its text."""
-
-    device: Device
-    pixels: int
-    cells: int
-
-    def __hash__(self) -> int:
-        return hash((self.device.to_toml(), self.pixels, self.cells))
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Sensor) and (
-            (self.device.to_toml(), self.pixels, self.cells)
-            == (other.device.to_toml(), other.pixels, other.cells)
-        )
-
-
-@lru_cache(maxsize=2)
-def _empty_sensor(sensor: _Sensor) -> tuple[Electrostatics, Potential, Tracer]:
-    """Solve the sensor without charge, once a process."""
-    mesh = make_mesh(
-        sensor.device, pixels=(sensor.pixels, sensor.pixels), cells=sensor.cells,
-        symmetric=False,
-    )  # fmt: skip
-    solver = Electrostatics(sensor.device, mesh)
-    start = None
-    if sensor.device.is_mirror_symmetric:
-        start = tile(solve_unit_cell(sensor.device, 0.0, cells=sensor.cells), mesh)
-    empty = solver.solve(0.0, start=start, tolerance=TOLERANCE)
-    return solver, empty, Tracer(empty)
-
-
 def _starts(
     plan: SpotPlan, seed: int, numbers: NDArray[np.int64], centre: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -382,11 +304,3 @@ def _starts(
     uniform = np.exp(-light.paths(numbers, seed=seed))
     out[:, 2] = thickness + length * np.log(lowest + uniform * (1.0 - lowest))
     return out
-
-
-def _image(electrons: Electrons, pixels: int) -> NDArray[np.int64]:
-    """Count electrons by pixel, as an image [y, x]; the array is periodic."""
-    index = (electrons.pixels[electrons.fates != ABSORBED] + pixels // 2) % pixels
-    return np.bincount(
-        index[:, 1] * pixels + index[:, 0], minlength=pixels * pixels
-    ).reshape(pixels, pixels)

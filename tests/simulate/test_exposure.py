@@ -7,7 +7,7 @@ import pytest
 
 from bfsensor import Device
 from bfsensor.errors import DeviceError, SimulationError
-from bfsensor.simulate import exposure
+from bfsensor.simulate import build_up, exposure
 from bfsensor.simulate.exposure import Spot, SpotPlan, simulate_spot
 from bfsensor.simulate.transport import Transport
 
@@ -60,9 +60,9 @@ def test_without_feedback_both_images_are_equal(monkeypatch):
     plan = small(peak=30_000.0)
     with_effect = simulate_spot(plan, 1)
     assert not np.array_equal(with_effect.on, with_effect.off)
-    solve = exposure.Electrostatics.solve
+    solve = build_up.Electrostatics.solve
     monkeypatch.setattr(
-        exposure.Electrostatics, "solve", lambda self, charges, **k: solve(self, 0.0, **k)
+        build_up.Electrostatics, "solve", lambda self, charges, **k: solve(self, 0.0, **k)
     )
     without = simulate_spot(plan, 1)
     assert np.array_equal(without.on, without.off)
