@@ -30,7 +30,10 @@ def test_electrons_are_conserved_and_poisson(flat):
 
 
 def test_pixels_that_are_ahead_fall_behind(flat):
-    """Without diffusion's noise what a pixel loses is half the level times a_ij times the charges ahead, summed."""
+    """What a pixel loses is half the level times a_ij times the charges ahead, summed.
+
+    Without diffusion, whose noise hides it in so few pixels.
+    """
     off = flat.off[-1].astype(float)
     ahead = off - off.mean()
     change = flat.on[-1] - off
