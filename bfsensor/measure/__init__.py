@@ -1,0 +1,1 @@
+"""Measurements on plain arrays: spots, flats, and the toy model."""
