@@ -79,8 +79,9 @@ def solve(
     free_c: bool,
     powers: int,
     bound: float | None = None,
+    prior: NDArray[np.float64] | None = None,
 ) -> Solution:
-    """Fit by Gauss and Newton, each pair with the inverse of its full error matrix.
+    """Fit by damped Gauss-Newton, each pair with the inverse of its full error matrix.
 
     Parameters
     ----------
@@ -94,49 +95,81 @@ def solve(
         Highest power of the level.
     bound : float, optional
         Chi-square of a pair above which its pull grows no further (Huber).
+    prior : ndarray, shape (3 n + 1,), optional
+        Inverse variances of a Gaussian prior about zero.
 
     Raises
     ------
     ConvergenceError
         No minimum found.
+    MeasurementError
+        Parameters that the levels do not fix.
     """
     n = start.a.size
     free = np.ones(3 * n + 1, bool)
     free[n : 2 * n] = free_c
     free[-1] = free_gain
+    about = np.zeros(3 * n + 1) if prior is None else prior
     parameters = start.parameters.copy()
-    inverse = _inverse_errors(curve, parameters, powers)
-    history: list[float] = []
-    for outer in range(30):
-        # Errors follow the fitted covariances; two rounds settle them to (2 / N).
+    damping, history = 1e-3, []
+    for outer in range(60):
+        # Errors follow the fitted covariances; that settles with the parameters.
+        inverse = _inverse_errors(curve, parameters, powers)
         normal, gradient, each = _normal_equations(
             curve, parameters, inverse, powers, bound
         )
-        step = np.zeros_like(parameters)
-        scale = 1 / np.sqrt(np.diag(normal)[free])
+        normal[np.diag_indices_from(normal)] += about
+        gradient -= about * parameters
+        diagonal = np.diag(normal)[free]
+        if not np.all(diagonal > 0):
+            raise MeasurementError(_UNFIXED)
+        scale = 1 / np.sqrt(diagonal)
         part = normal[np.ix_(free, free)] * scale[:, None] * scale
-        try:
-            step[free] = np.linalg.solve(part, gradient[free] * scale) * scale
-        except np.linalg.LinAlgError:
-            raise MeasurementError(
-                "the levels do not fix the model's parameters: too few, or all alike"
-            ) from None
-        decrement = float(gradient @ step)
-        history.append(decrement)
-        size = 1.0
-        while size > 1e-4 and not parameters[-1] + size * step[-1] > 0.3 * parameters[-1]:
-            size /= 2
-        parameters = parameters + size * step
-        # Newton's decrement is the drop of chi-square still to come.
-        if decrement < 1e-6 and outer >= 3:
+        if np.linalg.cond(part) > 1e13:
+            raise MeasurementError(_UNFIXED)
+        slope = gradient[free] * scale
+        # Newton's decrement: the drop of chi-square still to come.
+        history.append(float(slope @ np.linalg.solve(part, slope)))
+        if history[-1] < 1e-6 and outer >= 3:
             break
-        inverse = _inverse_errors(curve, parameters, powers)
+        before = _bounded(each, bound) + about @ parameters**2
+        while damping < 1e8:
+            step = np.zeros_like(parameters)
+            step[free] = np.linalg.solve(part + damping * np.eye(len(part)), slope) * scale
+            tried = parameters + step
+            if tried[-1] > 0:
+                *_, model = _evaluate(curve.levels, tried, powers, slopes=False)
+                after = _bounded(_chi_squares(curve, model, inverse), bound)
+                if after + about @ tried**2 < before * (1 + 1e-12) + 1e-9:
+                    parameters, damping = tried, max(0.1 * damping, 1e-12)
+                    break
+            damping = max(10 * damping, 1e-6)
+        else:
+            raise ConvergenceError("the covariance fit found no way down", history)
     else:
-        raise ConvergenceError("the covariance fit did not settle in 30 steps", history)
-    _, _, each = _normal_equations(curve, parameters, inverse, powers, None)
+        raise ConvergenceError("the covariance fit did not settle in 60 steps", history)
     matrix = np.zeros((3 * n + 1, 3 * n + 1))
     matrix[np.ix_(free, free)] = np.linalg.inv(part) * scale[:, None] * scale
     return _solution(parameters, matrix, each, start.a.shape)
+
+
+_UNFIXED = "the levels do not fix the model's parameters: too few, or all alike"
+
+
+def _chi_squares(
+    curve: CovarianceCurve, model: NDArray[np.float64], inverse: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Chi-square of each pair."""
+    residual = curve.covariances.reshape(len(curve), -1) - model
+    return np.asarray(np.einsum("pi,pij,pj->p", residual, inverse, residual))
+
+
+def _bounded(each: NDArray[np.float64], bound: float | None) -> float:
+    """Sum of chi-squares, growing as their root only above the bound."""
+    if bound is None:
+        return float(each.sum())
+    root = 2 * np.sqrt(bound * np.maximum(each, bound)) - bound
+    return float(np.where(each > bound, root, each).sum())
 
 
 def _solution(
@@ -199,7 +232,7 @@ def _normal_equations(
     """Normal matrix, right-hand side, and chi-square of each pair."""
     series, monomials, model = _evaluate(curve.levels, parameters, powers, slopes=True)
     residual = curve.covariances.reshape(len(curve), -1) - model
-    each = np.einsum("pi,pij,pj->p", residual, inverse, residual)
+    each = _chi_squares(curve, model, inverse)
     pull = (
         np.ones(len(curve)) if bound is None else np.sqrt(bound / np.maximum(each, bound))
     )
@@ -226,6 +259,9 @@ def find_turnoff(
     single failures are left to the search for outliers.  A turnoff so gentle that b takes
     it up is not found.
 
+    Low levels alone do not fix a and c: a prior says that areas do not change by more than
+    about themselves up to the highest level.  It is used nowhere else.
+
     Returns
     -------
     level : float
@@ -243,10 +279,12 @@ def find_turnoff(
     kept = list(range(first))
     group = max(1, len(curve) // 20)
     found = start_values(near.select(kept), gain)
+    n, top = found.a.size, found.gain * curve.levels[-1]
+    prior = np.repeat([top**2, top**4, 0.0], [n, n, n + 1])
     for begin in range(first, len(curve), group):
         found = solve(
             near.select(kept), found, free_gain=gain is None, free_c=not constant_a,
-            powers=powers, bound=limit,
+            powers=powers, bound=limit, prior=prior,
         )  # fmt: skip
         series, monomials, model = _evaluate(
             near.levels, found.parameters, powers, slopes=True
