@@ -58,7 +58,7 @@ class Truth:
 
 
 def make_truth(lags: int = 2, *, strength: float = 1.0) -> Truth:
-    """Make a sensor like the E2V CCD250: a_00 = -3.1e-6, more to the y neighbour.
+    """Make a sensor twice as strong as the E2V CCD250: a_00 = -3.1e-6, more to y.
 
     The sum over the lags is zero; b is a growth of 3 % at 1e5 e-, less for the centre.
     """
