@@ -156,7 +156,7 @@ def read_raw(
                 f"{path}: sections are for a single image; name one of its {len(images)} by "
                 "extensions"
             )
-        names = [hdu.name for hdu in images]
+        names = [str(hdu.header.get("EXTNAME", "")) for hdu in images]
         amplifiers: list[AmplifierImage] = []
         for number, hdu in enumerate(images):
             cards = {**_cards(hdus[0].header), **_cards(hdu.header)}

@@ -235,16 +235,35 @@ class BrighterFatterKernel(CalibrationTable):
         return [first, second]
 
     @staticmethod
-    def larger_axis(kernel: NDArray[np.float64]) -> str:
-        """Give the axis along which the nearer neighbour is stronger, 'x' or 'y'.
+    def area_changes(kernel: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Give the a_ij [1/e-] that a kernel stands for: minus its Laplacian.
 
         Parameters
         ----------
         kernel : ndarray, shape (ny, nx)
-            Of odd sides; [j, i].
+            [j, i], of odd sides, zero beyond them.
+
+        Returns
+        -------
+        a : ndarray, shape (ny // 2, nx // 2)
+            By lag [j, i] from (0, 0), up to where the kernel still has neighbours.
+
+        References
+        ----------
+        Coulton et al. 2018, AJ 155, 258, section 2.
         """
         y, x = kernel.shape[0] // 2, kernel.shape[1] // 2
-        return "y" if abs(kernel[y + 1, x]) > abs(kernel[y, x + 1]) else "x"
+        k = kernel[y - 1 :, x - 1 :]
+        around = k[2:, 1:-1] + k[:-2, 1:-1] + k[1:-1, 2:] + k[1:-1, :-2]
+        return np.asarray(4 * k[1:-1, 1:-1] - around)
+
+    def larger_axis(self, kernel: NDArray[np.float64]) -> str:
+        """Give the axis, 'x' or 'y', whose next pixel gains the larger area.
+
+        The kernel itself may be the deeper along the other one.
+        """
+        a = self.area_changes(kernel)
+        return "y" if a[1, 0] > a[0, 1] else "x"
 
 
 _FITTED = ("A_MATRIX_MODEL", "ATH", "ATH_MINUS_BETA", "A_N", "A_S", "A_E", "A_W")

@@ -83,7 +83,8 @@ def photon_transfer_table(version=2.6):
 
 def kernel_tables(shape=(7, 7)):
     i, j = np.indices(shape)
-    kernel = -1e-7 / (1 + (i - shape[0] // 2) ** 2 * 2.0 + (j - shape[1] // 2) ** 2)
+    x, y = i - shape[0] // 2, j - shape[1] // 2
+    kernel = -1e-7 / (1 + x**2 + 2.0 * y**2)
     side = (shape[0] - 1) // 2
     meta = {"OBSTYPE": "bfk", "bfk_SCHEMA": "Brighter-fatter kernel", "bfk_VERSION": 1.1,
             "LEVEL": "AMP", "KERNEL_DX": shape[0], "KERNEL_DY": shape[1]}  # fmt: skip
@@ -198,7 +199,7 @@ def test_what_is_written_has_the_pipelines_layout(tmp_path):
 def test_kernels(tmp_path, shape):
     kernel, tables = kernel_tables(shape)
     found = BrighterFatterKernel.read(write_as_lsst(tmp_path / "bfk.fits", *tables))
-    # LSST's second axis is ours along y, where this kernel is wider.
+    # LSST's second axis is y; this kernel is steeper along it.
     np.testing.assert_array_equal(found.columns["KERNEL"][0], kernel.T)
     np.testing.assert_array_equal(found.detectors["R22_S11"], kernel.T)
     assert found.larger_axis(found.detectors["R22_S11"]) == "y"
