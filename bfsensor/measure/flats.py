@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_dilation
+from scipy.stats import norm
 
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.bartlett import bartlett_matrix
@@ -24,9 +25,6 @@ from bfsensor.measure.products import (
 
 UNITS = ("electron", "adu")
 KIND = "bfsensor flat covariances"
-
-MAD_TO_SIGMA = 1.4826022185056018
-"""Standard deviation of a Gaussian over its median absolute deviation: 1 / norm.ppf(3/4)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,18 +249,21 @@ def flat_covariances(
             )
     edges = box_edges(a.shape, box)
     # Outliers pull the means by which they are found; a few rounds settle that.
+    cut = np.inf
     for last in (False, False, False, True):
         difference = subtract_box_means(a / means[0] - b / means[1], good, edges)
         if last or not np.isfinite(clip):
             break
-        sigma = MAD_TO_SIGMA * float(np.median(np.abs(difference[good])))
+        # Half of what is left of a Gaussian cut at so many sigma lies below the median.
+        median = norm.ppf(0.5 + 0.25 * (2 * norm.cdf(cut) - 1))
+        sigma = float(np.median(np.abs(difference[good]))) / median
         outliers = good & (np.abs(difference) > clip * sigma)
         if not outliers.any():
             break
         if grow:
             ring = np.ones((2 * grow + 1, 2 * grow + 1), bool)
             outliers = good & binary_dilation(outliers, ring)
-        good = good & ~outliers
+        good, cut = good & ~outliers, clip
         means = (float(a[good].mean()), float(b[good].mean()))
     weights = means[0] ** -2, means[1] ** -2
     products, pairs = sum_products(difference, good, lags)

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.stats import norm
 
-from bfsensor.measure.bartlett import image_weights
-
 
 def box_edges(shape: tuple[int, ...], box: int | None) -> list[NDArray[np.int64]]:
     """Edges of boxes of nearly equal size in y and x, the last included."""
@@ -73,21 +71,43 @@ def undo_box_means(
 ) -> NDArray[np.float64]:
     """Put back what the subtraction of box means takes.
 
-    A pair within one box of n pixels loses S / n, where S is the sum of the covariances of
-    a pixel with all of its box; of the pairs at a lag the fraction ``within`` share a box.
-    Covariances beyond the largest lag are taken as zero in S: what they are off by is
-    divided by n again.
+    Of a product d(p) d(q) at the lag L it takes the mean of C(p - r) over the box of q, the
+    mean of C(q - r) over the box of p, and gives the mean of C(r - s) over both: of order
+    S / n for n pixels a box, where S is the sum of all covariances.  That is a matrix on
+    the covariances, known from the boxes, and solved here; covariances beyond the largest
+    lag count as zero.  Bad pixels are taken as scattered at random.
     """
-    lags = np.arange(raw.shape[0])
-    within, inside = [], []
+    lags = raw.shape[0] - 1
+    plane = np.arange(-lags, lags + 1)
+    uses, both, full = [], [], 1.0
     for axis in edges:
-        sizes = np.diff(axis)
-        shared = np.maximum(sizes[None] - lags[:, None], 0).sum(1)
-        within.append(shared / (axis[-1] - lags))
-        inside.append(shared / axis[-1])
-    fraction = within[0][:, None] * within[1][None]
-    signs = image_weights(raw.shape[0] - 1) * inside[0][:, None] * inside[1][None]
+        at = np.repeat(np.arange(len(axis) - 1), np.diff(axis))
+        size = len(at) / (len(axis) - 1)
+        full *= size
+        wide = np.pad(at, lags, constant_values=-1)
+        use, pair = np.empty((2, lags + 1, 2 * lags + 1))
+        for lag in range(lags + 1):
+            inside = at[lag:]
+            for k, m in enumerate(plane):
+                start = lags + m
+                use[lag, k] = np.mean(wide[start : start + len(inside)] == inside)
+            crossed = np.mean(inside != at[: len(inside)])
+            counts = [np.maximum(size - np.abs(plane - b * size), 0) for b in (0, 1)]
+            pair[lag] = ((1 - crossed) * counts[0] + crossed * counts[1]) / size
+        uses.append(use)
+        both.append(pair)
+    taken = 2 * np.einsum("ab,cd->acbd", *uses) - np.einsum("ab,cd->acbd", *both)
+    # The pixels of the pair itself are good for certain, others as often as any.
     boxes = (len(edges[0]) - 1) * (len(edges[1]) - 1)
-    # raw = C - fraction S boxes / pixels, and S = sum(signs C): solved for S.
-    total = (signs * raw).sum() / (1 - (signs * fraction).sum() * boxes / pixels)
-    return np.asarray(raw + fraction * total * boxes / pixels)
+    share = np.full(taken.shape, 1 / full)
+    share[:, :, lags, lags] = boxes / pixels
+    quadrant = np.arange(lags + 1)
+    share[quadrant[:, None], quadrant, lags + quadrant[:, None], lags + quadrant] = (
+        boxes / pixels
+    )
+    taken = (taken * share).reshape((lags + 1) ** 2, -1)
+    fold = (np.abs(plane)[:, None] * (lags + 1) + np.abs(plane)).ravel()
+    matrix = np.eye((lags + 1) ** 2)
+    for column, change in zip(fold, taken.T, strict=True):
+        matrix[:, column] -= change
+    return np.asarray(np.linalg.solve(matrix, raw.ravel()).reshape(raw.shape))
