@@ -122,8 +122,8 @@ def draw_pixel_flat(
     """Collect a flat step by step on a torus, areas by the charge so far [e-].
 
     Charge that a step draws above or below its mean acts on average through half of that
-    step: it is made up for in the next, so that what is left is (step / level)^2 of the
-    effect, not step / level.
+    step.  Without that the covariances lack a part step / level of the effect; put off to
+    the next step, a_ij step^2 at every level, which a fit takes for noise.
     """
     planes = []
     for quadrant in (truth.a, truth.c):
@@ -134,16 +134,15 @@ def draw_pixel_flat(
         planes.append(rfft2(plane))
     steps = int(np.ceil(level / step))
     each = level / steps
-    charge, pending = np.zeros((side, side)), np.zeros((side, side))
+    charge = np.zeros((side, side))
     for n in range(steps):
         middle = (n + 0.5) * each
         kernel = planes[0] + planes[1] * middle
         area = 1 + irfft2(rfft2(charge) * kernel, s=(side, side))
         area = 1 + irfft2(rfft2(charge + 0.5 * each * area) * kernel, s=(side, side))
-        expected = each * area + pending
-        drawn = rng.poisson(expected)
-        charge += drawn
-        pending = 0.5 * each * irfft2(rfft2(drawn - expected) * kernel, s=(side, side))
+        drawn = rng.poisson(each * area)
+        excess = rfft2(drawn - each * area)
+        charge += drawn + 0.5 * each * irfft2(excess * kernel, s=(side, side))
     return charge
 
 
