@@ -64,14 +64,14 @@ def bartlett_matrix(covariances: ArrayLike, pairs: ArrayLike) -> NDArray[np.floa
 
     Parameters
     ----------
-    covariances : array_like, shape (lags + 1, lags + 1)
+    covariances : array_like, shape (..., lags + 1, lags + 1)
         True covariances, or measured ones, zero beyond the largest lag; indexed [j, i].
-    pairs : array_like, shape (lags + 1, lags + 1)
+    pairs : array_like, same shape
         Pairs at each lag, those of (i, -j) not counted.
 
     Returns
     -------
-    matrix : ndarray, shape ((lags + 1)**2, (lags + 1)**2)
+    matrix : ndarray, shape (..., (lags + 1)**2, (lags + 1)**2)
         Lags flattened as ``[j, i]``.
 
     References
@@ -86,16 +86,19 @@ def bartlett_matrix(covariances: ArrayLike, pairs: ArrayLike) -> NDArray[np.floa
     """
     c = np.asarray(covariances, float)
     counts = np.asarray(pairs, float)
-    lags = c.shape[0] - 1
+    lags = c.shape[-1] - 1
     # With the field even in both axes the sum over m is its convolution with itself, g:
     # Cov(L, M) = [g(L - M) + g(L + M)] / N.
-    plane = np.fft.ifftshift(unfold(c, 2 * lags))
+    plane = np.fft.ifftshift(unfold(c, 2 * lags), axes=(-2, -1))
     g = np.fft.ifft2(np.fft.fft2(plane).real ** 2).real
-    j, i = (index.ravel() for index in np.indices(c.shape))
+    j, i = (index.ravel() for index in np.indices(c.shape[-2:]))
     dj, di = j[:, None], i[:, None]
     # g is even too, so the mean over (i, +-j) and (k, +-l) has two different terms each.
     matrix = 0.5 * (
-        g[dj - j, di - i] + g[dj + j, di + i] + g[dj - j, di + i] + g[dj + j, di - i]
+        g[..., dj - j, di - i]
+        + g[..., dj + j, di + i]
+        + g[..., dj - j, di + i]
+        + g[..., dj + j, di - i]
     )
-    root = np.sqrt(counts.ravel())
-    return np.asarray(matrix / (root[:, None] * root))
+    root = np.sqrt(counts.reshape(*counts.shape[:-2], -1))
+    return np.asarray(matrix / (root[..., :, None] * root[..., None, :]))

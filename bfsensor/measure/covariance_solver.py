@@ -149,7 +149,8 @@ def solve(
     else:
         raise ConvergenceError("the covariance fit did not settle in 60 steps", history)
     matrix = np.zeros((3 * n + 1, 3 * n + 1))
-    matrix[np.ix_(free, free)] = np.linalg.inv(part) * scale[:, None] * scale
+    inverted = np.linalg.inv(part) * scale[:, None] * scale
+    matrix[np.ix_(free, free)] = 0.5 * (inverted + inverted.T)
     return _solution(parameters, matrix, each, start.a.shape)
 
 
@@ -202,11 +203,8 @@ def _inverse_errors(
     # A start may give a variance below zero; what was measured then sets the errors.
     wrong = ~(model[:, 0] > 0.1 * curve.covariances[:, 0, 0])
     model[wrong] = curve.covariances[wrong].reshape(-1, model.shape[1])
-    return np.array(
-        [
-            np.linalg.inv(bartlett_matrix(one.reshape(shape), pairs))
-            for one, pairs in zip(model, curve.pairs, strict=True)
-        ]
+    return np.asarray(
+        np.linalg.inv(bartlett_matrix(model.reshape(-1, *shape), curve.pairs))
     )
 
 

@@ -146,11 +146,9 @@ class CovarianceCurve:
         if c.ndim != 3:
             raise MeasurementError(f"covariances of shape {c.shape} are not (n, j, i)")
         pairs = np.full(c.shape, int(pixels))
-        errors = [
-            np.sqrt(np.diag(bartlett_matrix(one, count))).reshape(one.shape)
-            for one, count in zip(c, pairs, strict=True)
-        ]
-        return cls(np.asarray(levels), c, np.array(errors), pairs, unit, region)
+        variance = np.diagonal(bartlett_matrix(c, pairs), axis1=1, axis2=2)
+        errors = np.sqrt(variance).reshape(c.shape)
+        return cls(np.asarray(levels), c, errors, pairs, unit, region)
 
     def select(
         self, keep: ArrayLike | None = None, *, lags: int | None = None
@@ -312,7 +310,8 @@ def fit_correlation_slopes(
         C_{ij} / C_{00} = a_{ij} \mu \left[1 + \mu\left(\tfrac{2}{3}
         \frac{(a \otimes a)_{ij}}{a_{ij}} - a_{00}\right) + \dots\right],
 
-    so the slope lies above a_ij by about mu |a_00| of it where (a x a) is small, and noise
+    so the slope departs from a_ij by some mu a_00 of it, C_00 / level bends too and puts its
+    intercept low, 1 % for a_00 mu = -0.03 to -0.25, and noise
     n_ij that does not grow with the signal adds n_ij / C_00, which falls as 1 / mu and is
     no intercept.  :func:`~bfsensor.measure.covariance_fit.fit_covariances` has neither
     fault.  The gain drops out of the ratio: slopes [1/ADU] divided by the gain [e-/ADU] are
