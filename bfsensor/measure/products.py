@@ -91,9 +91,9 @@ def undo_box_means(
             for k, m in enumerate(plane):
                 start = lags + m
                 use[lag, k] = np.mean(wide[start : start + len(inside)] == inside)
-            crossed = np.mean(inside != at[: len(inside)])
-            counts = [np.maximum(size - np.abs(plane - b * size), 0) for b in (0, 1)]
-            pair[lag] = ((1 - crossed) * counts[0] + crossed * counts[1]) / size
+            # Two boxes share covariances across their edge only, (lags / box)^2 of this.
+            together = np.mean(inside == at[: len(inside)])
+            pair[lag] = together * np.maximum(size - np.abs(plane), 0) / size
         uses.append(use)
         both.append(pair)
     taken = 2 * np.einsum("ab,cd->acbd", *uses) - np.einsum("ab,cd->acbd", *both)

@@ -172,6 +172,14 @@ def pulls_or_none(curve):
         return None
 
 
+def test_no_turnoff_is_found_where_there_is_none():
+    """The next level is far away and the fit below it poor: its error must count."""
+    levels = np.geomspace(3e3, 1.1e5, 18)
+    for seed in range(25):
+        fit = fit_covariances(scattered(4450 + seed, levels=levels, pixels=4_000_000))
+        assert fit.range_reason == "whole curve", seed
+
+
 def test_what_is_held():
     curve = scattered(4500)
     free = fit_covariances(curve)
