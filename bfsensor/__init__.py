@@ -12,6 +12,7 @@ _PUBLIC = {
     "ConvergenceError": "errors",
     "DeviceError": "errors",
     "MeasurementError": "errors",
+    "RecordingError": "errors",
     "SensorError": "errors",
     "TableError": "errors",
     "Device": "device",

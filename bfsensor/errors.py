@@ -21,6 +21,10 @@ class MeasurementError(BFSensorError, ValueError):
     """Data do not allow the measurement."""
 
 
+class RecordingError(BFSensorError, ValueError):
+    """A recording lacks something, or holds what cannot be read as it says."""
+
+
 class SensorError(BFSensorError, ValueError):
     """A sensor for image simulation was given what it cannot use."""
 

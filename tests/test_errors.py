@@ -13,6 +13,7 @@ CLASSES = {
     errors.DeviceError: ValueError,
     errors.TableError: ValueError,
     errors.MeasurementError: ValueError,
+    errors.RecordingError: ValueError,
     errors.SensorError: ValueError,
     errors.ConvergenceError: RuntimeError,
 }

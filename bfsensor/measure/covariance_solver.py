@@ -1,0 +1,301 @@
+"""Least squares for the covariance model, and the level up to which it holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.stats import chi2 as chi2_distribution
+
+from bfsensor.errors import ConvergenceError, MeasurementError
+from bfsensor.measure.bartlett import bartlett_matrix
+from bfsensor.measure.covariance_model import Series, expand
+from bfsensor.measure.curve import CovarianceCurve
+
+REJECT = 1e-4
+"""Chance at which a pair counts as not predicted by those below it."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Parameters, their covariance matrix and the chi-square of each pair.
+
+    ``matrix`` is that of a, c, noise (flattened) and gain, with zero rows for held ones.
+    """
+
+    a: NDArray[np.float64]
+    c: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    gain: float
+    matrix: NDArray[np.float64]
+    chi2: NDArray[np.float64]
+
+    @property
+    def parameters(self) -> NDArray[np.float64]:
+        """All parameters in the order of the matrix."""
+        return np.concatenate(
+            [self.a.ravel(), self.c.ravel(), self.noise.ravel(), [self.gain]]
+        )
+
+
+def start_values(curve: CovarianceCurve, gain: float | None = None) -> Solution:
+    """Start from a robust parabola of the variance, and from C_ij against level squared."""
+    mu, c, error = curve.levels, curve.covariances, curve.errors
+    top = mu.max()
+
+    def residual(p: NDArray[np.float64]) -> NDArray[np.float64]:
+        line = p[0] + p[1] * (mu / top) + p[2] * (mu / top) ** 2
+        return np.asarray((c[:, 0, 0] - top * line) / error[:, 0, 0])
+
+    first = float(np.median(c[:, 0, 0] / mu))
+    parabola = least_squares(residual, [0.0, first, 0.0], loss="soft_l1", x_scale=first)
+    slope = parabola.x[1]
+    if gain is None and not slope > 0:
+        raise MeasurementError(
+            f"the variance does not grow with the level (slope {slope:g}): no flats, or "
+            "all above the turnoff"
+        )
+    g = 1 / slope if gain is None else gain
+    # Weighted lines in level squared, for every lag at once.
+    weight, square = error**-2, (mu**2)[:, None, None]
+    total = weight.sum(0)
+    centre = (weight * square).sum(0) / total
+    mean = (weight * c).sum(0) / total
+    a = (weight * (square - centre) * c).sum(0) / (weight * (square - centre) ** 2).sum(0)
+    noise = (mean - a * centre) * g**2
+    a[0, 0] = parabola.x[2] / top
+    noise[0, 0] = parabola.x[0] * top * g**2
+    n = a.size
+    return Solution(a, np.zeros_like(a), noise, g, np.zeros((3 * n + 1,) * 2), np.empty(0))
+
+
+def solve(
+    curve: CovarianceCurve,
+    start: Solution,
+    *,
+    free_gain: bool,
+    free_c: bool,
+    powers: int,
+    bound: float | None = None,
+    prior: NDArray[np.float64] | None = None,
+) -> Solution:
+    """Fit by damped Gauss-Newton, each pair with the inverse of its full error matrix.
+
+    Parameters
+    ----------
+    curve : CovarianceCurve
+        Pairs to fit, all of them.
+    start : Solution
+        Where to start; gives what is held.
+    free_gain, free_c : bool
+        Whether gain and c are fitted.
+    powers : int
+        Highest power of the level.
+    bound : float, optional
+        Chi-square of a pair above which its pull grows no further (Huber).
+    prior : ndarray, shape (3 n + 1,), optional
+        Inverse variances of a Gaussian prior about zero.
+
+    Raises
+    ------
+    ConvergenceError
+        No minimum found.
+    MeasurementError
+        Parameters that the levels do not fix.
+    """
+    n = start.a.size
+    free = np.ones(3 * n + 1, bool)
+    free[n : 2 * n] = free_c
+    free[-1] = free_gain
+    about = np.zeros(3 * n + 1) if prior is None else prior
+    parameters = start.parameters.copy()
+    damping, history = 1e-3, []
+    for outer in range(60):
+        # Errors follow the fitted covariances; that settles with the parameters.
+        inverse = _inverse_errors(curve, parameters, powers)
+        normal, gradient, each = _normal_equations(
+            curve, parameters, inverse, powers, bound
+        )
+        normal[np.diag_indices_from(normal)] += about
+        gradient -= about * parameters
+        diagonal = np.diag(normal)[free]
+        if not np.all(diagonal > 0):
+            raise MeasurementError(_UNFIXED)
+        scale = 1 / np.sqrt(diagonal)
+        part = normal[np.ix_(free, free)] * scale[:, None] * scale
+        if np.linalg.cond(part) > 1e13:
+            raise MeasurementError(_UNFIXED)
+        slope = gradient[free] * scale
+        # Newton's decrement: the drop of chi-square still to come.
+        history.append(float(slope @ np.linalg.solve(part, slope)))
+        if history[-1] < 1e-6 and outer >= 3:
+            break
+        before = _bounded(each, bound) + about @ parameters**2
+        while damping < 1e8:
+            step = np.zeros_like(parameters)
+            step[free] = np.linalg.solve(part + damping * np.eye(len(part)), slope) * scale
+            tried = parameters + step
+            if tried[-1] > 0:
+                *_, model = _evaluate(curve.levels, tried, powers, slopes=False)
+                after = _bounded(_chi_squares(curve, model, inverse), bound)
+                if after + about @ tried**2 < before * (1 + 1e-12) + 1e-9:
+                    parameters, damping = tried, max(0.1 * damping, 1e-12)
+                    break
+            damping = max(10 * damping, 1e-6)
+        else:
+            raise ConvergenceError("the covariance fit found no way down", history)
+    else:
+        raise ConvergenceError("the covariance fit did not settle in 60 steps", history)
+    matrix = np.zeros((3 * n + 1, 3 * n + 1))
+    inverted = np.linalg.inv(part) * scale[:, None] * scale
+    matrix[np.ix_(free, free)] = 0.5 * (inverted + inverted.T)
+    return _solution(parameters, matrix, each, start.a.shape)
+
+
+_UNFIXED = "the levels do not fix the model's parameters: too few, or all alike"
+
+
+def _chi_squares(
+    curve: CovarianceCurve, model: NDArray[np.float64], inverse: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Chi-square of each pair."""
+    residual = curve.covariances.reshape(len(curve), -1) - model
+    return np.asarray(np.einsum("pi,pij,pj->p", residual, inverse, residual))
+
+
+def _bounded(each: NDArray[np.float64], bound: float | None) -> float:
+    """Sum of chi-squares, growing as their root only above the bound."""
+    if bound is None:
+        return float(each.sum())
+    root = 2 * np.sqrt(bound * np.maximum(each, bound)) - bound
+    return float(np.where(each > bound, root, each).sum())
+
+
+def _solution(
+    parameters: NDArray[np.float64], matrix: NDArray[np.float64],
+    each: NDArray[np.float64], shape: tuple[int, ...],
+) -> Solution:  # fmt: skip
+    a, c, noise = (x.reshape(shape) for x in np.split(parameters[:-1], 3))
+    return Solution(a, c, noise, float(parameters[-1]), matrix, each)
+
+
+def _evaluate(
+    levels: NDArray[np.float64], parameters: NDArray[np.float64], powers: int,
+    *, slopes: bool,
+) -> tuple[Series, NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    """Series, powers of the levels [e-], and covariances [unit^2] with lags flattened."""
+    side = round(((len(parameters) - 1) / 3) ** 0.5)
+    found = _solution(parameters, np.empty(0), np.empty(0), (side, side))
+    series = expand(found.a, found.c, powers, slopes=slopes)
+    monomials = series.monomials(found.gain * levels)
+    flat = np.tensordot(monomials, series.value, 1) + found.noise
+    return series, monomials, flat.reshape(len(levels), -1) / found.gain**2
+
+
+def _inverse_errors(
+    curve: CovarianceCurve, parameters: NDArray[np.float64], powers: int
+) -> NDArray[np.float64]:
+    """Inverse of Bartlett's matrix of the modelled covariances, for each pair."""
+    *_, model = _evaluate(curve.levels, parameters, powers, slopes=False)
+    shape = curve.covariances.shape[1:]
+    # A start may give a variance below zero; what was measured then sets the errors.
+    wrong = ~(model[:, 0] > 0.1 * curve.covariances[:, 0, 0])
+    model[wrong] = curve.covariances[wrong].reshape(-1, model.shape[1])
+    return np.asarray(
+        np.linalg.inv(bartlett_matrix(model.reshape(-1, *shape), curve.pairs))
+    )
+
+
+def _jacobian(
+    series: Series, monomials: NDArray[np.float64], model: NDArray[np.float64],
+    level: float, gain: float,
+) -> NDArray[np.float64]:  # fmt: skip
+    """Derivatives of the covariances at one level by all parameters."""
+    n = len(model)
+    out = np.empty((n, 3 * n + 1))
+    out[:, :n] = np.tensordot(monomials, series.by_a, 1) / gain**2
+    out[:, n : 2 * n] = np.tensordot(monomials, series.by_c, 1) / gain**2
+    out[:, 2 * n : 3 * n] = np.eye(n) / gain**2
+    growth = (monomials * np.arange(1, len(monomials) + 1)) @ series.value.reshape(-1, n)
+    out[:, -1] = growth / gain**3 - 2 * model / gain
+    return out
+
+
+def _normal_equations(
+    curve: CovarianceCurve, parameters: NDArray[np.float64],
+    inverse: NDArray[np.float64], powers: int, bound: float | None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    """Normal matrix, right-hand side, and chi-square of each pair."""
+    series, monomials, model = _evaluate(curve.levels, parameters, powers, slopes=True)
+    residual = curve.covariances.reshape(len(curve), -1) - model
+    each = _chi_squares(curve, model, inverse)
+    pull = (
+        np.ones(len(curve)) if bound is None else np.sqrt(bound / np.maximum(each, bound))
+    )
+    normal = np.zeros((len(parameters), len(parameters)))
+    gradient = np.zeros(len(parameters))
+    for k in range(len(curve)):
+        slopes = _jacobian(
+            series, monomials[k], model[k], curve.levels[k], float(parameters[-1])
+        )
+        weighted = pull[k] * (inverse[k] @ slopes)
+        normal += slopes.T @ weighted
+        gradient += weighted.T @ residual[k]
+    return normal, gradient, each
+
+
+def find_turnoff(
+    curve: CovarianceCurve, *, gain: float | None, constant_a: bool, powers: int
+) -> tuple[float, str]:
+    """Find the highest level up to which the model predicts the nearest covariances.
+
+    From the lowest third (at least ten pairs) on: a fit of the lags up to (1, 1) predicts
+    each next pair, its own errors and the prediction's in the error matrix.  The range
+    ends below the first of three failures (chance below 1e-4) among five pairs in a row;
+    single failures are left to the search for outliers.  A turnoff so gentle that b takes
+    it up is not found.
+
+    Low levels alone do not fix a and c: a prior says that areas do not change by more than
+    about themselves up to the highest level.  It is used nowhere else.
+
+    Returns
+    -------
+    level : float
+        Highest level [unit].
+    reason : str
+        'found', 'whole curve', or 'too few pairs to find it'.
+    """
+    near = curve.select(lags=min(curve.lags, 1))
+    first = max(10, len(curve) // 3)
+    if len(curve) < first + 3 or len(np.unique(curve.levels[:first])) < 5:
+        return float(curve.levels[-1]), "too few pairs to find it"
+    shape = near.covariances.shape[1:]
+    limit = chi2_distribution.isf(REJECT, near.covariances[0].size)
+    failed: list[int] = []
+    kept = list(range(first))
+    group = max(1, len(curve) // 20)
+    found = start_values(near.select(kept), gain)
+    n, top = found.a.size, found.gain * curve.levels[-1]
+    prior = np.repeat([top**2, top**4, 0.0], [n, n, n + 1])
+    for begin in range(first, len(curve), group):
+        found = solve(
+            near.select(kept), found, free_gain=gain is None, free_c=not constant_a,
+            powers=powers, bound=limit, prior=prior,
+        )  # fmt: skip
+        series, monomials, model = _evaluate(
+            near.levels, found.parameters, powers, slopes=True
+        )
+        for k in range(begin, min(begin + group, len(curve))):
+            slopes = _jacobian(series, monomials[k], model[k], near.levels[k], found.gain)
+            error = bartlett_matrix(model[k].reshape(shape), near.pairs[k])
+            error = error + slopes @ found.matrix @ slopes.T
+            residual = near.covariances[k].ravel() - model[k]
+            if residual @ np.linalg.solve(error, residual) <= limit:
+                kept.append(k)
+                continue
+            failed.append(k)
+            if len(failed) >= 3 and failed[-1] - failed[-3] < 5:
+                return float(curve.levels[failed[-3] - 1]), "found"
+    return float(curve.levels[-1]), "whole curve"

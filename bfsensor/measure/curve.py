@@ -1,0 +1,359 @@
+"""Covariances against level: many pairs of one region, and the seed paper's slopes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2 as chi2_distribution
+
+from bfsensor.errors import MeasurementError
+from bfsensor.measure.bartlett import bartlett_matrix
+from bfsensor.measure.ecsv import read_ecsv, same_fields, write_ecsv
+from bfsensor.measure.flats import UNITS, FlatCovariances, flat_covariances
+
+KIND = "bfsensor covariance curve"
+KIND_SLOPES = "bfsensor correlation slopes"
+
+
+@dataclass(frozen=True, eq=False)
+class CovarianceCurve:
+    """C_ij against the level, a row for each pair of flats, sorted by level.
+
+    Attributes
+    ----------
+    levels : ndarray, shape (n,)
+        Mean level of each pair [unit].
+    covariances, errors : ndarray, shape (n, lags + 1, lags + 1)
+        ``covariances[k, j, i]``: C_ij of pair k and its error [unit^2].
+    pairs : ndarray of int, shape (n, lags + 1, lags + 1)
+        Pairs of pixels at each lag, those of (i, -j) not counted.
+    unit : str
+        'electron' or 'adu'.
+    region : str
+        Name of the amplifier or region.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(8233)
+    >>> flats = [rng.poisson(mu, size=(2, 100, 100)) for mu in (5e3, 1e4)]
+    >>> curve = measure_curve(flats, lags=2)
+    >>> curve.levels.round(-3)
+    array([ 5000., 10000.])
+    """
+
+    levels: NDArray[np.float64]
+    covariances: NDArray[np.float64]
+    errors: NDArray[np.float64]
+    pairs: NDArray[np.int64]
+    unit: str = "electron"
+    region: str = ""
+
+    def __post_init__(self) -> None:
+        levels = np.array(self.levels, float)
+        if levels.ndim != 1 or not len(levels) or not np.all(np.isfinite(levels)):
+            raise MeasurementError("levels must be a list of finite numbers, not empty")
+        order = np.argsort(levels, kind="stable")
+        object.__setattr__(self, "levels", levels[order])
+        for name, kind in (("covariances", float), ("errors", float), ("pairs", np.int64)):
+            array = np.array(getattr(self, name), dtype=kind)
+            if (
+                array.ndim != 3
+                or array.shape != np.shape(self.covariances)
+                or len(array) != len(levels)
+                or array.shape[1] != array.shape[2]
+            ):
+                raise MeasurementError(
+                    f"{name} of shape {array.shape} must be (n, lags + 1, lags + 1) for "
+                    f"{len(levels)} levels"
+                )
+            object.__setattr__(self, name, array[order])
+        if not np.all(np.isfinite(self.covariances)):
+            raise MeasurementError("covariances must be finite; leave bad pairs out")
+        if not np.all(self.errors > 0):
+            raise MeasurementError("errors must be above 0")
+        if self.unit not in UNITS:
+            raise MeasurementError(f"unit = {self.unit!r} is not one of {', '.join(UNITS)}")
+        for name in ("levels", "covariances", "errors", "pairs"):
+            getattr(self, name).setflags(write=False)
+
+    def __eq__(self, other: object) -> bool:
+        return same_fields(self, other)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __len__(self) -> int:
+        return len(self.levels)
+
+    @property
+    def lags(self) -> int:
+        """Largest lag."""
+        return self.covariances.shape[-1] - 1
+
+    @classmethod
+    def from_pairs(cls, pairs: Iterable[FlatCovariances]) -> CovarianceCurve:
+        """Put measured pairs of one region together.
+
+        Raises
+        ------
+        MeasurementError
+            None, or pairs of different lags, units or regions.
+        """
+        found = list(pairs)
+        if not found:
+            raise MeasurementError("no pair of flats was given")
+        for name in ("lags", "unit", "region"):
+            values = {getattr(one, name) for one in found}
+            if len(values) > 1:
+                raise MeasurementError(f"pairs differ in {name}: {sorted(values)}")
+        return cls(
+            levels=np.array([one.level for one in found]),
+            covariances=np.array([one.covariances for one in found]),
+            errors=np.array([one.errors for one in found]),
+            pairs=np.array([one.pairs for one in found]),
+            unit=found[0].unit,
+            region=found[0].region,
+        )
+
+    @classmethod
+    def from_arrays(
+        cls,
+        levels: ArrayLike,
+        covariances: ArrayLike,
+        *,
+        pixels: int,
+        unit: str = "electron",
+        region: str = "",
+    ) -> CovarianceCurve:
+        """Make a curve from covariances measured elsewhere, with Bartlett's errors.
+
+        Parameters
+        ----------
+        levels : array_like, shape (n,)
+            [unit].
+        covariances : array_like, shape (n, lags + 1, lags + 1)
+            C_ij of one flat [unit^2], indexed [j, i].
+        pixels : int
+            Pixels of each measurement.
+        unit, region : str
+            As the attributes.
+        """
+        c = np.asarray(covariances, float)
+        if c.ndim != 3:
+            raise MeasurementError(f"covariances of shape {c.shape} are not (n, j, i)")
+        pairs = np.full(c.shape, int(pixels))
+        variance = np.diagonal(bartlett_matrix(c, pairs), axis1=1, axis2=2)
+        errors = np.sqrt(variance).reshape(c.shape)
+        return cls(np.asarray(levels), c, errors, pairs, unit, region)
+
+    def select(
+        self, keep: ArrayLike | None = None, *, lags: int | None = None
+    ) -> CovarianceCurve:
+        """Keep some pairs (mask or indices) and the lags up to ``lags``; all by default."""
+        at = np.arange(len(self)) if keep is None else np.asarray(keep)
+        side = (self.lags if lags is None else lags) + 1
+        return CovarianceCurve(
+            self.levels[at], self.covariances[at, :side, :side],
+            self.errors[at, :side, :side], self.pairs[at, :side, :side],
+            self.unit, self.region,
+        )  # fmt: skip
+
+    def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Write as ECSV, a row for each pair, lags as [j, i] (beside, then renamed)."""
+        text = "[j, i], i the lag in x, j in y"
+        columns: dict[str, tuple[Any, str | None, str]] = {
+            "level": (self.levels, self.unit, "mean level"),
+            "covariances": (self.covariances, f"{self.unit}2", f"C_ij, {text}"),
+            "errors": (self.errors, f"{self.unit}2", f"1 sigma after Bartlett, {text}"),
+            "pairs": (self.pairs, None, f"pairs of pixels, {text}"),
+        }
+        meta = {"unit": self.unit, "region": self.region}
+        write_ecsv(path, KIND, columns, meta, overwrite=overwrite)
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> CovarianceCurve:
+        """Read what :meth:`write` wrote; names the file and what is missing in it."""
+        names = ("level", "covariances", "errors", "pairs")
+        columns, meta = read_ecsv(path, KIND, names, ("unit", "region"))
+        return cls(levels=columns.pop("level"), **columns, **meta)
+
+
+def measure_curve(
+    pairs: Iterable[Sequence[ArrayLike]] | NDArray[Any], **options: Any
+) -> CovarianceCurve:
+    """Measure many pairs of flats of one region.
+
+    Parameters
+    ----------
+    pairs : iterable of (first, second)
+        Each as :func:`~bfsensor.measure.flats.flat_covariances` takes them; read one by
+        one, so a generator needs the memory of one pair.
+    **options
+        Of :func:`~bfsensor.measure.flats.flat_covariances`.
+
+    Returns
+    -------
+    CovarianceCurve
+    """
+    return CovarianceCurve.from_pairs(flat_covariances(a, b, **options) for a, b in pairs)
+
+
+@dataclass(frozen=True, eq=False)
+class CorrelationSlopes:
+    """Growth of the correlations with the level, after the seed paper.
+
+    Attributes
+    ----------
+    slopes, slope_errors : ndarray, shape (lags + 1, lags + 1)
+        [1/unit], indexed [j, i]; (0, 0) is the slope of C_00 / level.
+    intercepts, intercept_errors : ndarray, shape (lags + 1, lags + 1)
+        Correlation at zero level; (0, 0) is C_00 / level there, the inverse of the gain.
+    chi2 : ndarray, shape (lags + 1, lags + 1)
+        Chi-square of each line, for ``dof`` degrees of freedom.
+    dof : int
+        Pairs less two.
+    level_range : tuple of float
+        Lowest and highest level used [unit].
+    unit, region : str
+        As in the curve.
+    """
+
+    slopes: NDArray[np.float64]
+    slope_errors: NDArray[np.float64]
+    intercepts: NDArray[np.float64]
+    intercept_errors: NDArray[np.float64]
+    chi2: NDArray[np.float64]
+    dof: int
+    level_range: tuple[float, float]
+    unit: str = "electron"
+    region: str = ""
+
+    def __eq__(self, other: object) -> bool:
+        return same_fields(self, other)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def correlations_at(self, level: float) -> tuple[NDArray[np.float64], ...]:
+        """Give the correlations at a level with their zero-level part taken off, and errors.
+
+        The paper quotes them at 80,000 electrons and calls them covariances.
+        """
+        return self.slopes * level, self.slope_errors * level
+
+    @property
+    def p_values(self) -> NDArray[np.float64]:
+        """Chance of a chi-square as large, for each lag; small where a line does not fit."""
+        return np.asarray(chi2_distribution.sf(self.chi2, self.dof))
+
+    def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Write as ECSV, a row for each lag (beside, then renamed)."""
+        j, i = np.indices(self.slopes.shape)
+        names = ("slopes", "slope_errors", "intercepts", "intercept_errors", "chi2")
+        columns: dict[str, tuple[Any, str | None, str]] = {
+            "i": (i.ravel(), "pixel", "lag in x, serial"),
+            "j": (j.ravel(), "pixel", "lag in y, parallel"),
+        }
+        for name in names:
+            unit = f"1 / {self.unit}" if name.startswith("slope") else None
+            columns[name] = (getattr(self, name).ravel(), unit, "")
+        meta = {n: getattr(self, n) for n in ("dof", "level_range", "unit", "region")}
+        write_ecsv(path, KIND_SLOPES, columns, meta, overwrite=overwrite)
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> CorrelationSlopes:
+        """Read what :meth:`write` wrote; names the file and what is missing in it."""
+        names = ("slopes", "slope_errors", "intercepts", "intercept_errors", "chi2")
+        columns, meta = read_ecsv(
+            path, KIND_SLOPES, names, ("dof", "level_range", "unit", "region")
+        )
+        side = round(len(columns["chi2"]) ** 0.5)
+        low, high = meta.pop("level_range")
+        arrays = {name: columns[name].reshape(side, side) for name in names}
+        return cls(**arrays, level_range=(low, high), **meta)
+
+
+def fit_correlation_slopes(
+    curve: CovarianceCurve, *, level_range: tuple[float, float] | None = None
+) -> CorrelationSlopes:
+    r"""Fit lines to the correlations against the level, as the seed paper did.
+
+    At each level C_ij is divided by the measured variance; a weighted line in the level
+    gives the intercept at zero, which is noise that the readout correlates, and the slope,
+    which is the brighter-fatter effect.  For the lag (0, 0), where that ratio is one, the
+    line is through C_00 / level instead.
+
+    Parameters
+    ----------
+    curve : CovarianceCurve
+        At least three levels.
+    level_range : tuple of float, optional
+        Lowest and highest level to use [unit]; all by default.
+
+    Returns
+    -------
+    CorrelationSlopes
+
+    Raises
+    ------
+    MeasurementError
+        Fewer than three pairs in the range.
+
+    Notes
+    -----
+    The line is an approximation:
+
+    .. math::
+        C_{ij} / C_{00} = a_{ij} \mu \left[1 + \mu\left(\tfrac{2}{3}
+        \frac{(a \otimes a)_{ij}}{a_{ij}} - a_{00}\right) + \dots\right],
+
+    so the slope departs from a_ij by some mu a_00 of it, C_00 / level bends too and puts its
+    intercept low, 1 % for a_00 mu = -0.03 to -0.25, and noise
+    n_ij that does not grow with the signal adds n_ij / C_00, which falls as 1 / mu and is
+    no intercept.  :func:`~bfsensor.measure.covariance_fit.fit_covariances` has neither
+    fault.  The gain drops out of the ratio: slopes [1/ADU] divided by the gain [e-/ADU] are
+    per electron.
+
+    References
+    ----------
+    Lage, Bradshaw & Tyson 2017, JINST 12, C03091, section 2.2 (the words exchanged:
+    their covariance is our correlation); Antilogus et al. 2014.
+    """
+    low, high = level_range or (curve.levels[0], curve.levels[-1])
+    inside = (curve.levels >= low) & (curve.levels <= high)
+    if inside.sum() < 3:
+        raise MeasurementError(
+            f"fewer than 3 pairs have a level from {low:g} to {high:g} {curve.unit}; a line "
+            "and its error need 3"
+        )
+    used = curve.select(inside)
+    level = used.levels[:, None, None]
+    variance = used.covariances[:, :1, :1]
+    ratio = used.covariances / variance
+    # Relative errors of the variance are those of C_00; they matter where C_ij ~ C_00.
+    error = np.hypot(used.errors, ratio * used.errors[:, :1, :1]) / variance
+    ratio[:, 0, 0] = used.covariances[:, 0, 0] / used.levels
+    error[:, 0, 0] = used.errors[:, 0, 0] / used.levels
+    weight = error**-2
+    total = weight.sum(0)
+    centre = (weight * level).sum(0) / total
+    spread = (weight * (level - centre) ** 2).sum(0)
+    if not np.all(spread > 0):
+        raise MeasurementError(f"all levels are {used.levels[0]:g}: no line to fit")
+    slope = (weight * (level - centre) * ratio).sum(0) / spread
+    middle = (weight * ratio).sum(0) / total
+    residual = ratio - middle - slope * (level - centre)
+    return CorrelationSlopes(
+        slopes=slope,
+        slope_errors=spread**-0.5,
+        intercepts=middle - slope * centre,
+        intercept_errors=np.sqrt(1 / total + centre**2 / spread),
+        chi2=(weight * residual**2).sum(0),
+        dof=len(used) - 2,
+        level_range=(float(used.levels[0]), float(used.levels[-1])),
+        unit=curve.unit,
+        region=curve.region,
+    )

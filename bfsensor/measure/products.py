@@ -1,0 +1,113 @@
+"""Products of a difference image: local means off, pairs counted, biases put back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import irfft2, next_fast_len, rfft2
+from scipy.stats import norm
+
+
+def box_edges(shape: tuple[int, ...], box: int | None) -> list[NDArray[np.int64]]:
+    """Edges of boxes of nearly equal size in y and x, the last included."""
+    counts = [1 if box is None else max(round(n / box), 1) for n in shape]
+    return [
+        np.round(np.linspace(0, n, c + 1)).astype(np.int64)
+        for n, c in zip(shape, counts, strict=True)
+    ]
+
+
+def sum_boxes(image: NDArray[Any], edges: list[NDArray[np.int64]]) -> NDArray[np.float64]:
+    """Sum within each box."""
+    rows = np.add.reduceat(image, edges[0][:-1], axis=0, dtype=float)
+    return np.asarray(np.add.reduceat(rows, edges[1][:-1], axis=1))
+
+
+def subtract_box_means(
+    image: NDArray[np.float64], good: NDArray[np.bool_], edges: list[NDArray[np.int64]]
+) -> NDArray[np.float64]:
+    """Subtract each box's mean over its good pixels; bad pixels become zero."""
+    count = sum_boxes(good, edges)
+    mean = sum_boxes(np.where(good, image, 0.0), edges) / np.maximum(count, 1.0)
+    wide = np.repeat(np.repeat(mean, np.diff(edges[0]), 0), np.diff(edges[1]), 1)
+    return np.where(good, image - wide, 0.0)
+
+
+def sum_products(
+    d: NDArray[np.float64], good: NDArray[np.bool_], lags: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Sums of products and numbers of pairs, [sign of j, j, i]."""
+    # Padding keeps the far sides apart.
+    shape = [next_fast_len(n + lags, real=True) for n in d.shape]
+    out = []
+    for image in (d, good.astype(float)):
+        spectrum = rfft2(image, s=shape)
+        product = irfft2(spectrum.real**2 + spectrum.imag**2, s=shape)
+        j, i = np.arange(lags + 1)[:, None], np.arange(lags + 1)[None]
+        out.append(np.stack([product[j, i], product[-j, i]]))
+    return out[0], np.rint(out[1]).astype(np.int64)
+
+
+def undo_clipping(raw: NDArray[np.float64], clip: float) -> NDArray[np.float64]:
+    """Put back what clipping takes from a Gaussian.
+
+    Cut at k sigma its variance is t = 1 - 2 k phi(k) / (2 Phi(k) - 1) of the whole.  Two
+    pixels correlated by rho have the density phi phi (1 + rho x y + ...) (Mehler), whose
+    first moment of x y, both cut, is rho t^2; the next term is of order rho^3.
+    """
+    if not np.isfinite(clip):
+        return raw
+    kept = 2 * norm.cdf(clip) - 1
+    t = 1 - 2 * clip * norm.pdf(clip) / kept
+    out = raw / t**2
+    out[0, 0] = raw[0, 0] / t
+    return np.asarray(out)
+
+
+def undo_box_means(
+    raw: NDArray[np.float64], pixels: int, edges: list[NDArray[np.int64]]
+) -> NDArray[np.float64]:
+    """Put back what the subtraction of box means takes.
+
+    Of a product d(p) d(q) at the lag L it takes the mean of C(p - r) over the box of q, the
+    mean of C(q - r) over the box of p, and gives the mean of C(r - s) over both: of order
+    S / n for n pixels a box, where S is the sum of all covariances.  That is a matrix on
+    the covariances, known from the boxes, and solved here; covariances beyond the largest
+    lag count as zero.  Bad pixels are taken as scattered at random.
+    """
+    lags = raw.shape[0] - 1
+    plane = np.arange(-lags, lags + 1)
+    uses, both, full = [], [], 1.0
+    for axis in edges:
+        at = np.repeat(np.arange(len(axis) - 1), np.diff(axis))
+        size = len(at) / (len(axis) - 1)
+        full *= size
+        wide = np.pad(at, lags, constant_values=-1)
+        use, pair = np.empty((2, lags + 1, 2 * lags + 1))
+        for lag in range(lags + 1):
+            inside = at[lag:]
+            for k, m in enumerate(plane):
+                start = lags + m
+                use[lag, k] = np.mean(wide[start : start + len(inside)] == inside)
+            # Two boxes share covariances across their edge only, (lags / box)^2 of this.
+            together = np.mean(inside == at[: len(inside)])
+            pair[lag] = together * np.maximum(size - np.abs(plane), 0) / size
+        uses.append(use)
+        both.append(pair)
+    taken = 2 * np.einsum("ab,cd->acbd", *uses) - np.einsum("ab,cd->acbd", *both)
+    # The pixels of the pair itself are good for certain, others as often as any.
+    boxes = (len(edges[0]) - 1) * (len(edges[1]) - 1)
+    share = np.full(taken.shape, 1 / full)
+    share[:, :, lags, lags] = boxes / pixels
+    quadrant = np.arange(lags + 1)
+    share[quadrant[:, None], quadrant, lags + quadrant[:, None], lags + quadrant] = (
+        boxes / pixels
+    )
+    taken = (taken * share).reshape((lags + 1) ** 2, -1)
+    fold = (np.abs(plane)[:, None] * (lags + 1) + np.abs(plane)).ravel()
+    matrix = np.eye((lags + 1) ** 2)
+    for column, change in zip(fold, taken.T, strict=True):
+        matrix[:, column] -= change
+    return np.asarray(np.linalg.solve(matrix, raw.ravel()).reshape(raw.shape))

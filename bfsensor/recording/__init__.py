@@ -1,0 +1,1 @@
+"""Recordings: the only room that reads them, giving arrays with conditions."""
