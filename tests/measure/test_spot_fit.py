@@ -159,13 +159,14 @@ def test_thrown_electrons_give_back_their_width():
     assert abs(fit.sigma_y - 1.05) < 3 * fit.sigma_y_error
 
 
-def test_many_faint_spots_do_not_look_narrower():
+@pytest.mark.parametrize("weights", WEIGHTS)
+def test_many_faint_spots_do_not_look_narrower(weights):
     # Noise in the centres takes more than half an error of 1000 spots.
     pulls, bare = [], []
     for seed in range(30):
         mean, _, _ = expect(1000, 1.2e3, background=10.0, seed=900 + seed)
         stamps = Stamps(make_noisy(mean, 9900 + seed))
-        fit = fit_spots(stamps, read_noise=5.0)
+        fit = fit_spots(stamps, read_noise=5.0, weights=weights)
         assert fit.bias_x > 0
         for width, bias, error, truth in (
             (fit.sigma_x, fit.bias_x, fit.sigma_x_error, 1.02),
