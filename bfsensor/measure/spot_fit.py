@@ -293,7 +293,9 @@ def _bias(
     """What to add to the widths for the curvature of the model in the noisy centres.
 
     The covariance of a spot's own parameters times the second derivatives of its model is
-    a mean residual; half of it, fitted, is the bias with its sign turned.
+    a mean residual; half of it, fitted, is the bias with its sign turned.  Unless weights
+    are the inverse variances, the derivatives at the noisy centres also correlate with
+    what is left of the noise; that mean score is a bias as it stands.
     """
     slopes = problem.derivatives(spots, shape)
     by_xx, by_yy, by_xy = curvatures(slopes, shape)
@@ -303,7 +305,45 @@ def _bias(
         own[:, 1, 1] * by_xx + own[:, 2, 2] * by_yy + 2 * own[:, 1, 2] * by_xy
     )
     scores = np.einsum("nap,np->na", normal.weighted, 0.5 * curved)
+    if problem.equal_weights:
+        scores -= _noisy_derivatives(problem, spots, shape, normal, slopes)
     shift = np.einsum("nab,nb->na", normal.own_inverse, scores[:, : problem.own])
     score = scores[:, problem.own :] - np.einsum("nai,na->ni", normal.cross, shift)
     step = np.linalg.solve(normal.rest[used].sum(axis=0), score[used].sum(axis=0))
     return np.asarray(step[:2])
+
+
+def _noisy_derivatives(
+    problem: Problem,
+    spots: Spots,
+    shape: Shape,
+    normal: Normal,
+    slopes: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Mean score of each spot from derivatives that its noise has changed, (n, own + shared)."""
+    model = spots.flux[:, None] * slopes[0] + spots.background[:, None]
+    jacobian = problem.jacobian(spots.flux, slopes)
+    own = slice(0, problem.own)
+    # Covariance of flux and centre with the residuals.
+    with_noise = normal.own_inverse @ normal.weighted[:, own]
+    with_noise *= problem.variance(model)[:, None]
+    left = with_noise - normal.own_covariance @ jacobian[:, own]
+    left *= problem.good[:, None]
+    by_flux = problem.jacobian(np.ones(len(model)), slopes)
+    # The flux itself and the background enter as they are.
+    by_flux[:, [0, *range(3, problem.own)]] = 0.0
+    scores = np.einsum("nkp,np->nk", by_flux, left[:, 0])
+    step = 1e-4
+    for k, (dx, dy) in enumerate(((step, 0.0), (0.0, step)), 1):
+        ends = [
+            problem.jacobian(
+                spots.flux,
+                problem.derivatives(
+                    spots._replace(x=spots.x + sign * dx, y=spots.y + sign * dy), shape
+                ),
+            )
+            for sign in (1, -1)
+        ]
+        by_centre = (ends[0] - ends[1]) / (2 * step)
+        scores += np.einsum("nkp,np->nk", by_centre, left[:, k])
+    return np.asarray(scores)

@@ -88,6 +88,18 @@ class Problem:
         # Of the model, not of the data: low pixels must not count for more.
         return np.maximum(np.maximum(model, 0.0) + self.read_noise**2, LEAST_VARIANCE)
 
+    def jacobian(
+        self, flux: NDArray[np.float64], slopes: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Derivatives of the model by each spot's own and the shared parameters."""
+        # A spot without flux would leave its centre without an equation.
+        flux = np.maximum(flux, 1.0)[:, None]
+        rows = [slopes[0], flux * slopes[1], flux * slopes[2]]
+        if self.own == 4:
+            rows.append(np.ones_like(slopes[0]))
+        rows += [flux * slopes[3 + k] for k in range(self.shared)]
+        return np.stack(rows, axis=1)
+
     def linearise(
         self, spots: Spots, slopes: NDArray[np.float64], *, with_noise: bool = False
     ) -> Normal:
@@ -97,13 +109,7 @@ class Problem:
         by_noise = self.good / variance
         weight = self.good.astype(float) if self.equal_weights else by_noise
         residual = self.data - model
-        # A spot without flux would leave its centre without an equation.
-        flux = np.maximum(spots.flux, 1.0)[:, None]
-        rows = [slopes[0], flux * slopes[1], flux * slopes[2]]
-        if self.own == 4:
-            rows.append(np.ones_like(model))
-        rows += [flux * slopes[3 + k] for k in range(self.shared)]
-        jacobian = np.stack(rows, axis=1)
+        jacobian = self.jacobian(spots.flux, slopes)
         weighted = jacobian * weight[:, None]
         blocks = weighted @ jacobian.transpose(0, 2, 1)
         scores = (weighted @ residual[:, :, None])[:, :, 0]

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import pickle
+import time
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from bfsensor.errors import BFSensorError, MeasurementError
+from bfsensor.errors import BFSensorError
 from bfsensor.measure.spot_fit import fit_spots
 from bfsensor.measure.spot_model import Shape, integrate_gaussian
 from bfsensor.measure.spot_result import REASONS, SpotFit
@@ -159,13 +160,14 @@ def test_thrown_electrons_give_back_their_width():
     assert abs(fit.sigma_y - 1.05) < 3 * fit.sigma_y_error
 
 
-def test_many_faint_spots_do_not_look_narrower():
+@pytest.mark.parametrize("weights", WEIGHTS)
+def test_many_faint_spots_do_not_look_narrower(weights):
     # Noise in the centres takes more than half an error of 1000 spots.
     pulls, bare = [], []
     for seed in range(30):
         mean, _, _ = expect(1000, 1.2e3, background=10.0, seed=900 + seed)
         stamps = Stamps(make_noisy(mean, 9900 + seed))
-        fit = fit_spots(stamps, read_noise=5.0)
+        fit = fit_spots(stamps, read_noise=5.0, weights=weights)
         assert fit.bias_x > 0
         for width, bias, error, truth in (
             (fit.sigma_x, fit.bias_x, fit.sigma_x_error, 1.02),
@@ -186,8 +188,6 @@ def test_bias_without_background_is_the_textbooks():
 
 
 def test_thousands_of_spots_take_seconds():
-    import time
-
     stamps = Stamps(make_noisy(expect(3000, 1.3e5)[0], 17))
     began = time.process_time()
     fit = fit_spots(stamps, read_noise=5.0)
@@ -395,7 +395,5 @@ def test_wrong_settings_are_refused(change, words):
 
 def test_stamps_without_spots_are_refused():
     noise = np.random.default_rng(5).normal(0.0, 5.0, (20, 9, 9))
-    with pytest.raises((MeasurementError, BFSensorError)):
-        fit_spots(Stamps(noise), read_noise=5.0)
-    with pytest.raises((MeasurementError, BFSensorError)):
-        fit_spots(Stamps(np.zeros((4, 9, 9))))
+    for stamps in (noise, np.zeros((4, 9, 9))):
+        assert "spots agree" in message(fit_spots, Stamps(stamps), read_noise=5.0)
