@@ -15,6 +15,8 @@ CLASSES = {
     errors.MeasurementError: ValueError,
     errors.RecordingError: ValueError,
     errors.SensorError: ValueError,
+    errors.SimulationError: ValueError,
+    errors.SweepError: ValueError,
     errors.ConvergenceError: RuntimeError,
 }
 
