@@ -112,7 +112,7 @@ def test_pixels_that_follow_their_charge():
     assert fit.p_value > 1e-3
     for name, value in known.items():
         if not name.startswith("c_"):
-            # b is held at zero; at 9e4 e- the truth's 5e-7 / e- is 4 % of a_00, 0.8 sigma.
+            # b is held at zero: 3 % of a_00 at 9e4 e-, about one sigma.
             assert abs(values[name] - value) < 4.5 * errors[name], name
 
 
