@@ -4,11 +4,14 @@ import galsim
 import numpy as np
 import pytest
 
-from bfsensor import BrighterFatterSensor, SiliconSensor
+from bfsensor import BrighterFatterSensor, DistortionTable, SiliconSensor
 from bfsensor._kernels.areas import pixel_areas
+from bfsensor.resources import tables_dir
 from bfsensor.sensor.base import _lowest
 from bfsensor.sensor.exposure import Exposure
+from bfsensor.sensor.flats import draw_flat
 from tests.kernels.test_edges import NO_PATTERN
+from validation.sensor_flats import predict
 
 BOTH = pytest.mark.parametrize("kind", [SiliconSensor, BrighterFatterSensor])
 
@@ -67,3 +70,21 @@ def test_tiny_images_have_areas(kind):
         image = np.full(shape, 8e4)
         areas = sensor.calculate_pixel_areas(galsim.ImageD(image)).array
         assert np.abs(areas - polygons(sensor, image)).max() < 1e-6
+
+
+def test_flats_in_few_steps_lack_one_part_in_the_square_of_their_number():
+    """Fluctuations of a step act in the next; left out, four steps would lack a quarter."""
+    sensor = BrighterFatterSensor("e2v_ccd250", rng=galsim.BaseDeviate(3))
+    level, count = 5e4, 8
+    deficits = []
+    for n in range(count):
+        flat = draw_flat(
+            sensor, (256, 256), level, step=level / 4, rng=galsim.BaseDeviate(8100 + n),
+            dtype=np.float64,
+        ).array  # fmt: skip
+        deficits.append((flat.var() - level) / level**2)
+    table = DistortionTable.read(tables_dir() / "e2v_ccd250" / "table.fits")
+    implied = (predict(table, level)[0, 0] - level) / level**2
+    error = np.sqrt(2 / 256**2 / count) / level
+    assert error < 0.02 * abs(implied)
+    assert abs(np.mean(deficits) - (1 - 1 / 16) * implied) < 4 * error
