@@ -34,7 +34,7 @@ class _Group(click.Group):
             ctx.exit(1)
         except KeyboardInterrupt:
             click.echo(
-                "bfsensor: interrupted; finished levels are kept, run again to go on",
+                "bfsensor: interrupted; what is finished is kept, run again to go on",
                 err=True,
             )
             ctx.exit(130)

@@ -74,6 +74,11 @@ def spots(
         for amplifier in read_raw(
             path, gain=gain, overscan=None if overscan == "none" else overscan
         ):
+            if amplifier.unit != "electron":
+                raise MeasurementError(
+                    f"{path}: {amplifier.name}: no gain in the header, and slopes are against "
+                    "electrons: give --gain"
+                )
             found = find_spots(
                 amplifier.image, threshold=threshold, saturation=saturation,
                 separation=stamp, mask=amplifier.mask, stamp=stamp,

@@ -107,6 +107,14 @@ def test_one_clear_line_for_bad_input(tmp_path, arguments, message):
     assert message in result.output and len(result.output.splitlines()) == 1
 
 
+def test_spots_ask_for_the_gain(tmp_path):
+    path = write(tmp_path / "adu.fits", np.full((50, 50), 100.0))
+    with fits.open(path, mode="update") as hdus:
+        del hdus[1].header["GAIN"]
+    result = invoke("spots", path, "--threshold", 10)
+    assert result.exit_code == 1 and "give --gain" in result.output
+
+
 def test_help_shows_examples():
     for name in ("spots", "flats"):
         assert f"bfsensor measure {name}" in invoke(name, "--help").output

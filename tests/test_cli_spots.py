@@ -109,6 +109,7 @@ def test_a_killed_run_goes_on(finished, tmp_path):
         (["--depth", "300"], "depth = 300 must be from 2 to 100"),
         (["--diffusion", "-1"], "diffusion = -1.0 must be from 0"),
         (["--set", "back_bias=-60"], "has no unit"),
+        (["--peak", "400000"], "peak = 400000 e- must be below the full well"),
     ],
 )
 def test_one_clear_line_for_bad_input(tmp_path, arguments, message):

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from bfsensor.device import Device
 
 TOLERANCE = 1e-4
-"""Iteration error [V] of a step's field: 1 % of what 100 electrons in a pixel do to it."""
+"""Iteration error [V] of a step's field: 3 % of what 100 electrons do to the level of a well,
+which sinks by some 3e-5 V an electron."""
 
 
 def build_up(

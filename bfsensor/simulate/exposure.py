@@ -39,7 +39,8 @@ class SpotPlan:
         The sensor at its operating point.
     peak : float
         Electrons that the brightest pixel of a spot centred on it would get without
-        diffusion [e-].
+        diffusion [e-].  Below the full well, which ``bfsensor spots`` checks: the field is
+        solved for any charge, and electrons that spill are not followed.
     sigma : float
         Width of the spot at the back surface [um].
     steps : int
