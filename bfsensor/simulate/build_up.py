@@ -4,7 +4,8 @@ A spot is built up in steps (Lage, Bradshaw & Tyson 2017, section 4): solve for 
 that is there, send the next electrons through that field, add them to the wells they
 reach, solve again.  The same electrons, with the same random numbers, also go through the
 field of the empty sensor: differences between both images are the brighter-fatter effect,
-with a fraction of the noise of either.
+with a fraction of the noise of either.  Flats are held against the field of evenly filled wells:
+what is left is the effect of the pixels' differences alone.
 
 The charge that the field is solved for is that of the middle of the step, half of what
 the step brings to the empty sensor added: without it the field lags behind the charge by
@@ -16,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,7 @@ def build_up(
     cells: int,
     transport: Transport,
     seed: int,
+    reference: Literal["empty", "even"] = "empty",
     progress: Callable[[int], None] | None = None,
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Collect electrons step by step, with the charge fed back and without.
@@ -60,6 +62,9 @@ def build_up(
         How electrons move.
     seed : int
         Of their random numbers.
+    reference : {'empty', 'even'}
+        Field without the effect: of the empty sensor, or in each step of wells that all hold
+        the mean charge.
     progress : callable, optional
         Called with the number of the step that is done.
 
@@ -74,17 +79,21 @@ def build_up(
     ConvergenceError
         From the solver or the tracer.
     """
-    solver, empty, empty_tracer = empty_sensor(Sensor(device, pixels, cells))
+    sensor = Sensor(device, pixels, cells)
+    solver, empty, plain_tracer = empty_sensor(sensor)
     steps, shape = len(step_ends) - 1, (pixels, pixels)
     on = np.zeros((steps, *shape), np.int32)
     off = np.zeros_like(on)
     collected = np.zeros(shape, np.int64)
-    reference = np.zeros(shape, np.int64)
+    plain_sum = np.zeros(shape, np.int64)
     past: list[NDArray[np.float64]] = []
     for step in range(steps):
         numbers = np.arange(step_ends[step], step_ends[step + 1])
         places = starts(numbers)
-        plain = empty_tracer.trace(places, seed=seed, numbers=numbers, transport=transport)
+        if reference == "even":
+            solved = _solve_even(sensor, solver, empty, collected, numbers.size)
+            plain_tracer = Tracer(solved)
+        plain = plain_tracer.trace(places, seed=seed, numbers=numbers, transport=transport)
         plain_image = _image(plain, pixels)
         start = empty.phi if not past else past[-1]
         if len(past) == 2:
@@ -98,9 +107,9 @@ def build_up(
             places, seed=seed, numbers=numbers, transport=transport
         )
         collected += _image(electrons, pixels)
-        reference += plain_image
+        plain_sum += plain_image
         on[step] = collected
-        off[step] = reference
+        off[step] = plain_sum
         if progress is not None:
             progress(step + 1)
     return on, off
@@ -137,6 +146,21 @@ def empty_sensor(sensor: Sensor) -> tuple[Electrostatics, Potential, Tracer]:
         start = tile(solve_unit_cell(sensor.device, 0.0, cells=sensor.cells), mesh)
     empty = solver.solve(0.0, start=start, tolerance=TOLERANCE)
     return solver, empty, Tracer(empty)
+
+
+def _solve_even(
+    sensor: Sensor,
+    solver: Electrostatics,
+    empty: Potential,
+    collected: NDArray[np.int64],
+    coming: int,
+) -> Potential:
+    """Solve for wells that all hold the mean charge of the middle of a step."""
+    mean = float(collected.mean()) + 0.5 * coming / collected.size
+    start = empty.phi
+    if sensor.device.is_mirror_symmetric:
+        start = tile(solve_unit_cell(sensor.device, mean, cells=sensor.cells), solver.mesh)
+    return solver.solve(mean, start=start, tolerance=TOLERANCE)
 
 
 def _image(electrons: Electrons, pixels: int) -> NDArray[np.int64]:

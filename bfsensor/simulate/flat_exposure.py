@@ -1,7 +1,9 @@
 """Flats of the direct simulation: even light on the whole period, charge fed back.
 
-A period holds few pixels; its covariances come from many flats, as the difference with the
-effect on and off, in which the noise of the light cancels.
+A period holds few pixels; its covariances come from many flats.  The same electrons also go
+through wells that all hold the mean charge, where charges of pixels are independent: what
+moves between both images is the effect of the pixels' differences, and
+:func:`measure_response` finds from it what one electron does to the pixels around it.
 """
 
 from __future__ import annotations
@@ -84,7 +86,7 @@ class FlatPlan:
         """What tells the results of one plan from those of another."""
         names = ("level", "steps", "pixels", "cells", "depth", "transport", "seed")
         text = "\n".join(
-            ["bfsensor flat 1", self.device.to_toml()]
+            ["bfsensor flat 2", self.device.to_toml()]
             + [f"{name}={getattr(self, name)!r}" for name in names]
         )
         return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -99,7 +101,8 @@ class Flat:
     number : int
         In its plan.
     on, off : ndarray, shape (steps, pixels, pixels)
-        Electrons collected up to the end of each step, as periodic images [y, x] [e-].
+        Electrons collected up to the end of each step, as periodic images [y, x] [e-]; ``off``
+        with evenly filled wells.
     cpu_seconds : float
         What it took.
     """
@@ -146,7 +149,7 @@ def simulate_flat(
 
     on, off = build_up(
         plan.device, ends, starts, pixels=plan.pixels, cells=plan.cells,
-        transport=plan.transport, seed=seed, progress=progress,
+        transport=plan.transport, seed=seed, reference="even", progress=progress,
     )  # fmt: skip
     return Flat(number, on, off, time.process_time() - begin)
 
