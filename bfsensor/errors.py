@@ -33,6 +33,10 @@ class SimulationError(BFSensorError, ValueError):
     """A simulation of electrons was asked for something it cannot do."""
 
 
+class DiagnosisError(BFSensorError, ValueError):
+    """Recordings and prediction cannot be held against one another as asked."""
+
+
 class SweepError(BFSensorError, ValueError):
     """Work cannot be spread as asked."""
 

@@ -16,6 +16,7 @@ CLASSES = {
     errors.RecordingError: ValueError,
     errors.SensorError: ValueError,
     errors.SimulationError: ValueError,
+    errors.DiagnosisError: ValueError,
     errors.SweepError: ValueError,
     errors.ConvergenceError: RuntimeError,
 }

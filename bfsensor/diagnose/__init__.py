@@ -1,0 +1,1 @@
+"""Recordings against prediction: channels, mismatch, report."""

@@ -1,0 +1,171 @@
+"""What the simulation predicts before anything is found: boundary shifts, their freedom."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.conditions import Condition
+from bfsensor.errors import DiagnosisError
+
+Edges = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+@dataclass(frozen=True, eq=False)
+class Baseline:
+    """Shifts of pixel boundaries per electron, by condition, and how far they may float.
+
+    Attributes
+    ----------
+    name : str
+        Where it comes from.
+    edges : mapping of (wavelength, back_bias) to (kx, ky)
+        Shift of the right and the upper edge of each pixel per electron stored in the pixel
+        in the middle [pixel/e-], [row dy, column dx], odd sides.
+    derivatives : mapping of str to (dkx, dky)
+        Their change for a unit of each device parameter, at ``reference``.
+    spread : mapping of str to float
+        Standard deviation of each parameter about its nominal value.
+    reference : tuple of float
+        Wavelength [nm] and back bias [V] of the derivatives.
+    """
+
+    name: str
+    edges: Mapping[tuple[float, float], Edges]
+    derivatives: Mapping[str, Edges]
+    spread: Mapping[str, float]
+    reference: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        if not self.edges:
+            raise DiagnosisError(f"{self.name}: no boundary shifts")
+        shapes = {a.shape for pair in self.edges.values() for a in pair}
+        shapes |= {a.shape for pair in self.derivatives.values() for a in pair}
+        if len(shapes) != 1 or any(n % 2 == 0 for n in next(iter(shapes))):
+            raise DiagnosisError(
+                f"{self.name}: boundary shifts of shapes {sorted(shapes)} must be alike, with "
+                "odd sides"
+            )
+        missing = set(self.derivatives) - set(self.spread)
+        if missing:
+            raise DiagnosisError(f"{self.name}: no spread for {', '.join(sorted(missing))}")
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Device parameters that may float."""
+        return tuple(self.derivatives)
+
+    def nearest(self, condition: Condition) -> tuple[float, float]:
+        """Wavelength and back bias held that come nearest to a condition.
+
+        An unknown one of a condition is taken as the reference's.
+        """
+        wavelength, bias = (
+            given if np.isfinite(given) else own
+            for given, own in zip(condition[:2], self.reference, strict=True)
+        )
+        return min(
+            self.edges, key=lambda k: (abs(k[1] - bias) / 10, abs(k[0] - wavelength) / 100)
+        )
+
+    def at(
+        self, condition: Condition, change: Mapping[str, float] | None = None
+    ) -> tuple[Edges, bool]:
+        """Shifts at a condition, parameters changed from nominal, and whether it is held.
+
+        Derivatives are known at the reference only; elsewhere they are scaled by the ratio of
+        the shifts' areas a_00, as the effect of every parameter on all of the shifts is.
+        """
+        key = self.nearest(condition)
+        kx, ky = self.edges[key]
+        exact = all(
+            not np.isfinite(given) or abs(given - own) < 0.5
+            for given, own in zip(condition[:2], key, strict=True)
+        )
+        if not change:
+            return (kx, ky), exact
+        reference = self.edges.get(self.reference, (kx, ky))
+        factor = centre(kx, ky) / centre(*reference)
+        for name, value in change.items():
+            dkx, dky = self.derivatives[name]
+            kx = kx + factor * value * dkx
+            ky = ky + factor * value * dky
+        return (kx, ky), exact
+
+
+def area_matrix(kx: NDArray[np.float64], ky: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Change of the areas per electron [1/e-], from the shifts of right and upper edges."""
+    return kx - np.roll(kx, 1, 1) + ky - np.roll(ky, 1, 0)
+
+
+def centre(kx: NDArray[np.float64], ky: NDArray[np.float64]) -> float:
+    """Give a_00 [1/e-]."""
+    a = area_matrix(kx, ky)
+    return float(a[a.shape[0] // 2, a.shape[1] // 2])
+
+
+def read_edges(
+    path: str | os.PathLike[str], *, card: str | os.PathLike[str] | None = None
+) -> Baseline:
+    """Read a file of edge displacements, and the spread of the device card beside it.
+
+    Parameters
+    ----------
+    path : path-like
+        JSON: ``conditions`` by "wavelength_backbias" with kx and ky, and
+        ``derivatives_...`` by parameter with dkx and dky.
+    card : path-like, optional
+        JSON with ``spread_1sigma`` by parameter; without one nothing floats.
+
+    Raises
+    ------
+    DiagnosisError
+        Names the file and what it lacks.
+    """
+    try:
+        text = json.loads(Path(path).read_text())
+        edges = {
+            _key(name, path): (np.array(v["kx"], float), np.array(v["ky"], float))
+            for name, v in text["conditions"].items()
+        }
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise DiagnosisError(
+            f"{path}: not a file of edge displacements: {error!r}"
+        ) from None
+    derivatives: dict[str, Edges] = {}
+    reference = next(iter(edges))
+    for name, block in text.items():
+        if name.startswith("derivatives"):
+            part = name.removeprefix("derivatives_").replace("m", "-")
+            reference = _key(part, path) if "_" in part else reference
+            derivatives = {
+                k: (np.array(v["dkx"], float), np.array(v["dky"], float))
+                for k, v in block.items()
+            }
+    spread: dict[str, float] = {}
+    if card is not None:
+        try:
+            spread = {
+                k: float(v)
+                for k, v in json.loads(Path(card).read_text())["spread_1sigma"].items()
+            }
+        except (OSError, KeyError, ValueError, TypeError) as error:
+            raise DiagnosisError(f"{card}: not a device card: {error!r}") from None
+    derivatives = {k: v for k, v in derivatives.items() if k in spread}
+    return Baseline(str(path), edges, derivatives, spread, reference)
+
+
+def _key(text: str, path: str | os.PathLike[str]) -> tuple[float, float]:
+    try:
+        wavelength, bias = (float(part) for part in text.split("_"))
+    except ValueError:
+        raise DiagnosisError(
+            f"{path}: condition {text!r} is not WAVELENGTH_BACKBIAS, such as 620_-60"
+        ) from None
+    return wavelength, bias

@@ -1,0 +1,246 @@
+"""Frames without light: noise in readout order, bias levels and rows, darks, tracks of particles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.conditions import Axes, Condition, Exposure, Frame
+
+READOUT_LAGS = 32
+"""Largest lag of the noise in readout order [pixel times]."""
+
+OUTLIER = 6.0
+"""Deviation [sigma] from which a pixel of a dark or bias counts as struck: one in 5e8 by noise."""
+
+LEVEL_ERROR = 0.05
+"""How well the overscan's level stands for the image's in a quiet system [ADU] (assumed)."""
+
+
+class BiasChannels:
+    """Takes bias frames one by one; gives their channels, the mean bias and the read noise."""
+
+    def __init__(self, fold: str = "fit") -> None:
+        self._fold = fold
+        self._last: Sequence[NDArray[np.float64]] | None = None
+        self._sum: list[NDArray[np.float64]] = []
+        self._names: list[str] = []
+        self._frames = 0
+        self._spectra: list[list[NDArray[np.float64]]] = []
+        self._cross: list[NDArray[np.float64]] = []
+        self._rows: list[list[tuple[float, float]]] = []
+        self._levels: list[tuple[Exposure, list[tuple[float, float]]]] = []
+        self._size = 0
+        self._condition = Condition(np.nan, np.nan, np.nan)
+
+    def add(self, exposure: Exposure, frames: Sequence[Frame]) -> None:
+        """Add a bias frame."""
+        self._condition = Condition.of(exposure)
+        levelled, levels = [], []
+        for frame in frames:
+            over = frame.serial_overscan.astype(np.float64)
+            zero = float(over.mean()) if over.size else float(frame.data.mean())
+            levelled.append(frame.data.astype(np.float64) - zero)
+            image = frame.image.astype(np.float64)
+            share = image.var() / image.size + (
+                over.var() / over.size if over.size else 0.0
+            )
+            levels.append((float(image.mean()) - zero, share + LEVEL_ERROR**2))
+        self._levels.append((exposure, levels))
+        if not self._sum:
+            self._sum = [np.zeros_like(x) for x in levelled]
+            self._names = [f.name for f in frames]
+        for total, one in zip(self._sum, levelled, strict=True):
+            total += one
+        self._frames += 1
+        if self._last is None:
+            self._last = levelled
+            return
+        # Each frame is used once: differences of frames that follow one another.
+        noise = [
+            _without_outliers((a - b) / np.sqrt(2.0))
+            for a, b in zip(self._last, levelled, strict=True)
+        ]
+        self._last = None
+        self._size = noise[0].size
+        self._spectra.append([_autocovariance(n) for n in noise])
+        self._rows.append([_row_excess(n) for n in noise])
+        flat = np.array([n.ravel() for n in noise])
+        self._cross.append(np.cov(flat) if len(flat) > 1 else np.array([[flat.var()]]))
+
+    @property
+    def mean(self) -> dict[str, NDArray[np.float64]]:
+        """Mean bias of each amplifier's whole frame, its overscan's level taken off [ADU]."""
+        return {
+            name: total / self._frames
+            for name, total in zip(self._names, self._sum, strict=True)
+        }
+
+    @property
+    def read_noise(self) -> dict[str, float]:
+        """Of each amplifier [ADU]; empty with fewer than two frames."""
+        if not self._spectra:
+            return {}
+        variance = np.mean([[s[0] for s in one] for one in self._spectra], axis=0)
+        return {n: float(np.sqrt(v)) for n, v in zip(self._names, variance, strict=True)}
+
+    def channels(self) -> list[Channel]:
+        """Noise by lag in readout order, rows, levels, and what amplifiers share."""
+        if not self._spectra:
+            return []
+        pairs = len(self._spectra)
+        variance = np.array(list(self.read_noise.values())) ** 2
+        values, blocks, axes = [], [], Axes()
+        for amp in range(len(self._names)):
+            mean = np.mean([s[amp] for s in self._spectra], axis=0)
+            error = variance[amp] ** 2 / (self._size * pairs)
+            factor = np.where(np.arange(len(mean)) == 0, 2.0, 1.0)
+            values.append(mean)
+            blocks.append(np.diag(factor * error))
+            axes.add(len(mean), self._condition, amp=amp, lag=np.arange(len(mean)))
+        out = [
+            Channel("bias_cov", np.concatenate(values), tuple(blocks), axes.columns(), "adu2",
+                    self._fold)
+        ]  # fmt: skip
+        out.append(self._bias_levels())
+        if len(self._names) > 1:
+            out.append(self._shared(variance, pairs))
+        return out
+
+    def _bias_levels(self) -> Channel:
+        """Rows' excess variance by pair, and the image's level above the overscan by frame."""
+        values, blocks, axes = [], [], Axes()
+        for n, one in enumerate(self._rows):
+            excess, error = np.array(one).T
+            values.append(excess)
+            blocks.append(np.diag(error**2))
+            axes.add(
+                len(one),
+                self._condition,
+                amp=np.arange(len(one)),
+                exposure=2 * n,
+                what="rows",
+            )
+        for exposure, levels in self._levels:
+            level, variance = np.array(levels).T
+            values.append(level)
+            blocks.append(np.diag(variance))
+            axes.add(len(level), self._condition, amp=np.arange(len(level)),
+                     exposure=exposure.number, what="level")  # fmt: skip
+        return Channel("bias_level", np.concatenate(values), tuple(blocks), axes.columns(), "adu",
+                       self._fold)  # fmt: skip
+
+    def _shared(self, variance: NDArray[np.float64], pairs: int) -> Channel:
+        """Covariance of the noise between amplifiers at the same readout time."""
+        mean = np.mean(self._cross, axis=0)
+        a, b = np.triu_indices(len(mean), 1)
+        axes = Axes()
+        axes.add(len(a), self._condition, amp=a, other=b, what="noise")
+        error = variance[a] * variance[b] / (self._size * pairs)
+        return Channel("amp_cross", mean[a, b], tuple(np.array([[e]]) for e in error),
+                       axes.columns(), "adu2", self._fold)  # fmt: skip
+
+
+class DarkChannels:
+    """Takes darks one by one: level against time and order, columns, struck pixels."""
+
+    def __init__(
+        self,
+        bias: dict[str, NDArray[np.float64]],
+        read_noise: dict[str, float],
+        fold: str = "fit",
+    ) -> None:
+        self._bias, self._noise, self._fold = bias, read_noise, fold
+        self._rows: list[tuple[Exposure, float, list[tuple[float, float, int, int]]]] = []
+        self._columns: list[tuple[float, list[NDArray[np.float64]]]] = []
+        self._condition = Condition(np.nan, np.nan, np.nan)
+
+    def add(
+        self, exposure: Exposure, frames: Sequence[Frame], *, after: float = 0.0
+    ) -> None:
+        """Add a dark; ``after`` is the mean level [ADU] of the exposure before it."""
+        self._condition = Condition.of(exposure)
+        found, columns = [], []
+        for frame in frames:
+            over = frame.serial_overscan
+            zero = float(over[:, over.shape[1] // 2 :].mean()) if over.size else 0.0
+            image = frame.image.astype(np.float64) - zero
+            bias = self._bias.get(frame.name)
+            if bias is not None:
+                image = image - bias
+            sigma = self._noise.get(frame.name) or 1.4826 * float(
+                np.median(np.abs(image - np.median(image)))
+            )
+            struck = np.abs(image - np.median(image)) > OUTLIER * sigma
+            good = image[~struck]
+            error = good.var() / good.size
+            if over.size:
+                error += float(over.var()) / (over.size // 2)
+            found.append((float(good.mean()), float(error), int(struck.sum()), image.size))
+            kept = np.where(struck, np.nan, image)
+            columns.append(
+                np.nanmean(kept, 0) if np.isfinite(kept).any(0).all() else image.mean(0)
+            )
+        self._rows.append((exposure, after, found))
+        self._columns.append((exposure.exposure_time or 0.0, columns))
+
+    def channels(self) -> list[Channel]:
+        """Levels and struck pixels by dark; columns of the longest darks."""
+        if not self._rows:
+            return []
+        values, blocks, axes = [], [], Axes()
+        for exposure, after, found in self._rows:
+            level, variance, struck, _ = (
+                np.array(c, float) for c in zip(*found, strict=True)
+            )
+            amps = np.arange(len(level))
+            common = {"amp": amps, "time": exposure.exposure_time or 0.0,
+                      "exposure": exposure.number, "after": after}  # fmt: skip
+            values.append(level)
+            blocks.append(np.diag(variance))
+            axes.add(len(level), self._condition, what="level", x=-1, **common)
+            # A Poisson number; one is added to its variance, for none was seen of few expected.
+            values.append(struck)
+            blocks.append(np.diag(struck + 1.0))
+            axes.add(len(level), self._condition, what="struck", x=-1, **common)
+        longest = max(t for t, _ in self._columns)
+        chosen = [c for t, c in self._columns if t == longest]
+        for amp, lines in enumerate(zip(*chosen, strict=True)):
+            mean = np.mean(lines, axis=0)
+            noise = self._robust_error(mean)
+            values.append(mean - np.median(mean))
+            blocks.extend([np.array([[noise**2]])] * len(mean))
+            axes.add(len(mean), self._condition, what="column", x=np.arange(len(mean)), amp=amp,
+                     time=longest, exposure=-1, after=0.0)  # fmt: skip
+        return [Channel("dark_map", np.concatenate(values), tuple(blocks), axes.columns(), "adu",
+                        self._fold)]  # fmt: skip
+
+    @staticmethod
+    def _robust_error(mean: NDArray[np.float64]) -> float:
+        return max(1.4826 * float(np.median(np.abs(mean - np.median(mean)))), 1e-6)
+
+
+def _without_outliers(noise: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Set struck pixels to the mean: 6 median deviations, as of a Gaussian."""
+    middle = np.median(noise)
+    sigma = 1.4826 * np.median(np.abs(noise - middle))
+    return np.where(np.abs(noise - middle) > OUTLIER * sigma, 0.0, noise - middle)
+
+
+def _autocovariance(noise: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Covariance at lags 0 to :data:`READOUT_LAGS` of pixels as they are read out."""
+    series = noise.ravel() - noise.mean()
+    n = len(series)
+    return np.array(
+        [series[: n - k] @ series[k:] / (n - k) for k in range(READOUT_LAGS + 1)]
+    )
+
+
+def _row_excess(noise: NDArray[np.float64]) -> tuple[float, float]:
+    """Variance of the rows' means beyond what white noise gives, over that, and its error."""
+    rows, columns = noise.shape
+    share = noise.var() / columns
+    return float(noise.mean(1).var(ddof=1) / share - 1.0), float(np.sqrt(2.0 / (rows - 1)))

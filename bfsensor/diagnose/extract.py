@@ -1,0 +1,256 @@
+# ruff: noqa: D102  (protocol: the class says what its attributes are)
+"""From the exposures of a campaign to channels, one exposure or pair in memory at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.bias_channels import BiasChannels, DarkChannels
+from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.code_channels import CodeChannels, CrosstalkChannels
+from bfsensor.diagnose.conditions import Condition, Exposure, Frame, assign_folds
+from bfsensor.diagnose.flat_channels import FlatChannels
+from bfsensor.diagnose.map_channels import MapChannels
+from bfsensor.diagnose.spot_channels import SpotChannels
+from bfsensor.errors import MeasurementError
+
+
+class Source(Protocol):
+    """What exposures are taken from."""
+
+    @property
+    def exposures(self) -> Sequence[Any]: ...
+    @property
+    def lamp_error(self) -> float: ...
+    @property
+    def shape(self) -> tuple[int, int]: ...
+    def read(self, exposure: Any) -> Sequence[Any]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Channels of a campaign, and what its prediction must know of it.
+
+    Attributes
+    ----------
+    channels : tuple of Channel
+        Of all folds.
+    amplifiers : tuple of str
+        Names, in the order of the axis 'amp'.
+    gains : tuple of float
+        Rough gains [e-/ADU] from variance over mean at low levels.
+    read_noise : tuple of float
+        [ADU].
+    phases : tuple of ndarray
+        Centres of the spots within their pixels, by exposure [pixel].
+    columns : tuple of int
+        Columns of each amplifier, which charge is shifted through.
+    flips : tuple of (bool, bool)
+        Which amplifiers read backwards in x and y.
+    origins : tuple of (int, int)
+        Lower left corner (x, y) of each amplifier on the sensor.
+    notes : tuple of str
+        What could not be measured, and why.
+    """
+
+    channels: tuple[Channel, ...]
+    amplifiers: tuple[str, ...]
+    gains: tuple[float, ...]
+    read_noise: tuple[float, ...]
+    phases: tuple[NDArray[np.float64], ...]
+    columns: tuple[int, ...]
+    flips: tuple[tuple[bool, bool], ...]
+    origins: tuple[tuple[int, int], ...]
+    shape: tuple[int, int]
+    notes: tuple[str, ...] = ()
+    lamp_known: bool = True
+    counts: Mapping[str, int] = field(default_factory=dict)
+
+
+def measure_channels(
+    source: Source, *, lags: int = 4, progress: Callable[[int, int], None] | None = None
+) -> Measured:
+    """Measure all channels that a campaign's exposures allow.
+
+    Parameters
+    ----------
+    source : Source
+        Exposures in order of time, and how each is read.
+    lags : int
+        Largest lag of the flats' covariances [pixel].
+    progress : callable, optional
+        Called with (exposures done, exposures in all).
+
+    Returns
+    -------
+    Measured
+        Pairs of flats are spread over the folds; everything else is in the fold 'fit'.
+
+    Raises
+    ------
+    MeasurementError
+        No exposure can be used.
+    """
+    exposures = list(source.exposures)
+    kinds: dict[str, list[Exposure]] = {}
+    for exposure in exposures:
+        kinds.setdefault(exposure.kind, []).append(exposure)
+    notes: list[str] = []
+    done = 0
+
+    def read(exposure: Exposure) -> Sequence[Frame]:
+        nonlocal done
+        frames = source.read(exposure)
+        done += 1
+        if progress is not None:
+            progress(done, len(exposures))
+        return frames
+
+    biases = BiasChannels()
+    for exposure in kinds.get("bias", []):
+        biases.add(exposure, read(exposure))
+    bias_images: dict[str, NDArray[np.float64]] = {}
+    layout: Sequence[Frame] | None = None
+    pairs = pair_flats(kinds.get("flat", []))
+    if not pairs and not kinds.get("spot") and not kinds.get("bias"):
+        raise MeasurementError("no bias, no pair of flats and no spots: nothing to measure")
+    first = (kinds.get("flat") or kinds.get("spot") or kinds.get("bias") or [])[0]
+    layout = source.read(first)
+    means = biases.mean if kinds.get("bias") else {}
+    for frame in layout:
+        if frame.name in means:
+            bias_images[frame.name] = _data_section(frame, means[frame.name])
+    noise = biases.read_noise
+    flats = FlatChannels(bias_images, noise, lamp_error=source.lamp_error, lags=lags)
+    maps = MapChannels(source.shape)
+    codes = CodeChannels()
+    gains: list[list[float]] = [[] for _ in layout]
+    levels: dict[int, float] = {}
+    for members in _by_level(pairs).values():
+        folds = assign_folds(range(len(members)), shift=len(levels))
+        for (one, two), fold in zip(members, folds, strict=True):
+            frames = read(one), read(two)
+            try:
+                flats.add_pair((one, frames[0]), (two, frames[1]), fold=fold)
+            except MeasurementError as error:
+                notes.append(f"flats {one.number}, {two.number}: {error}")
+                continue
+            whole = []
+            for exposure, each in ((one, frames[0]), (two, frames[1])):
+                images = [flats.clean(f) for f in each]
+                levels[exposure.number] = float(np.mean([i.mean() for i in images]))
+                image = np.full(source.shape, np.nan)
+                for frame, values in zip(each, images, strict=True):
+                    place(image, frame, values / values.mean())
+                whole.append(image)
+                if fold != "held-out":
+                    codes.add(each)
+            if fold != "held-out":
+                maps.add_pair(Condition.of(one), one.exposure_time or 0.0, *whole)
+    for channel in flats.channels():
+        if channel.word == "flat_cov":
+            _rough_gains(channel, gains)
+    rough = tuple(float(np.median(g)) if g else 1.0 for g in gains)
+    darks = DarkChannels(bias_images, noise)
+    before: dict[int, float] = {}
+    last = 0.0
+    for exposure in exposures:
+        before[exposure.number] = last
+        last = levels.get(exposure.number, 0.0)
+    for exposure in kinds.get("dark", []):
+        darks.add(exposure, read(exposure), after=before[exposure.number])
+    mean_noise = float(
+        np.mean([noise.get(f.name, 0.0) * g for f, g in zip(layout, rough, strict=True)])
+    )
+    spots = SpotChannels(read_noise=mean_noise, lamp_error=source.lamp_error)
+    crosstalk = CrosstalkChannels()
+    for exposure in kinds.get("spot", []):
+        spot_frames = read(exposure)
+        images = [flats.clean(f) for f in spot_frames]
+        crosstalk.add(images, [noise.get(f.name, 1.0) for f in spot_frames])
+        image = np.full(source.shape, np.nan)
+        for frame, cleaned, gain in zip(spot_frames, images, rough, strict=True):
+            place(image, frame, cleaned * gain)
+        reason = spots.add(exposure, image)
+        if reason:
+            notes.append(f"spots {exposure.number}: {reason}")
+    channels = [
+        *flats.channels(), *maps.channels(), *codes.channels(), *biases.channels(),
+        *darks.channels(), *spots.channels(), *crosstalk.channels(),
+    ]  # fmt: skip
+    return Measured(
+        channels=tuple(channels),
+        amplifiers=tuple(f.name for f in layout),
+        gains=rough,
+        read_noise=tuple(noise.get(f.name, np.nan) for f in layout),
+        phases=tuple(spots.phases),
+        columns=tuple(f.image.shape[1] + f.prescan.shape[1] for f in layout),
+        flips=tuple((f.flip_x, f.flip_y) for f in layout),
+        origins=tuple((int(f.origin[0]), int(f.origin[1])) for f in layout),
+        shape=source.shape,
+        notes=tuple(notes),
+        lamp_known=all(e.lamp is not None for e in kinds.get("flat", [])),
+        counts={k: len(v) for k, v in kinds.items()},
+    )
+
+
+def pair_flats(flats: Sequence[Exposure]) -> list[tuple[Exposure, Exposure]]:
+    """Pair flats of one condition and exposure time that follow one another."""
+    pairs, open_flat = [], None
+    for flat in flats:
+        if open_flat is not None and (
+            (Condition.of(open_flat).key, open_flat.exposure_time)
+            == (Condition.of(flat).key, flat.exposure_time)
+        ):
+            pairs.append((open_flat, flat))
+            open_flat = None
+        else:
+            open_flat = flat
+    return pairs
+
+
+def place(image: NDArray[np.float64], frame: Frame, values: NDArray[np.float64]) -> None:
+    """Put an amplifier's values, in readout order, where they lie on the sensor."""
+    values = values[:, ::-1] if frame.flip_x else values
+    values = values[::-1] if frame.flip_y else values
+    x, y = frame.origin
+    image[y : y + values.shape[0], x : x + values.shape[1]] = values
+
+
+def _data_section(frame: Frame, whole: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cut what belongs to the image out of a whole frame."""
+    start = frame.prescan.shape[1] if frame.prescan.ndim == 2 else 0
+    ny, nx = frame.image.shape
+    return whole[:ny, start : start + nx]
+
+
+def _by_level(
+    pairs: list[tuple[Exposure, Exposure]],
+) -> dict[tuple, list[tuple[Exposure, Exposure]]]:
+    groups: dict[tuple, list[tuple[Exposure, Exposure]]] = {}
+    for pair in pairs:
+        key = (Condition.of(pair[0]).key, pair[0].exposure_time)
+        groups.setdefault(key, []).append(pair)
+    return groups
+
+
+def _rough_gains(channel: Channel, gains: list[list[float]]) -> None:
+    """Gain from mean over variance at low levels [e-/ADU]."""
+    a = channel.axes
+    variance = (a["i"] == 0) & (a["j"] == 0)
+    for amp, found in enumerate(gains):
+        rows = variance & (a["amp"] == amp)
+        if not rows.any():
+            continue
+        level, value = a["level"][rows], channel.values[rows]
+        # The slope of the variance at low levels: read noise is in the lowest of them.
+        low = level <= max(0.5 * level.max(), np.sort(level)[:3].max())
+        if low.sum() >= 2:
+            found.append(1.0 / np.polyfit(level[low], value[low], 1)[0])
+        else:
+            found.append(float(level[low][0] / value[low][0]))

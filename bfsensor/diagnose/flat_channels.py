@@ -1,0 +1,219 @@
+"""Flats: covariances of pairs, means against the lamp, and the overscan behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.conditions import Axes, Condition, Exposure, Frame
+from bfsensor.measure.bartlett import bartlett_matrix
+from bfsensor.measure.flats import flat_covariances
+
+LAGS = 4
+TAIL = 8
+"""Last pixels of an overscan, held for free of what was deferred: the profile's zero."""
+
+LAMP_UNKNOWN = 0.02
+"""Relative error of the light of an exposure without a lamp monitor: fluxes repeat to a few
+per cent in shuttered exposures of laboratory lamps; wide enough not to speak of linearity."""
+
+
+@dataclass
+class _Group:
+    """Sums over the pairs of one condition, exposure time, amplifier and fold."""
+
+    covariances: list[NDArray[np.float64]] = field(default_factory=list)
+    counts: list[NDArray[np.int64]] = field(default_factory=list)
+    levels: list[float] = field(default_factory=list)
+    serial: list[NDArray[np.float64]] = field(default_factory=list)
+    parallel: list[NDArray[np.float64]] = field(default_factory=list)
+    clipped: int = 0
+
+
+class FlatChannels:
+    """Takes pairs of flats one by one and gives their channels.
+
+    Parameters
+    ----------
+    bias : mapping of str to ndarray
+        Mean bias of each amplifier's whole frame less its overscan [ADU]; may lack some.
+    read_noise : mapping of str to float
+        Of each amplifier [ADU].
+    lamp_error : float
+        Relative error of the lamp monitor.
+    lags : int
+        Largest lag of the covariances [pixel].
+    """
+
+    def __init__(
+        self,
+        bias: dict[str, NDArray[np.float64]],
+        read_noise: dict[str, float],
+        *,
+        lamp_error: float,
+        lags: int = LAGS,
+    ) -> None:
+        self._bias, self._noise = bias, read_noise
+        self._lamp_error, self._lags = lamp_error, lags
+        self._groups: dict[tuple, _Group] = {}
+        self._conditions: dict[tuple[str, ...], Condition] = {}
+        self._means: dict[str, list[tuple]] = {}
+
+    def add_pair(
+        self,
+        first: tuple[Exposure, Sequence[Frame]],
+        second: tuple[Exposure, Sequence[Frame]],
+        *,
+        fold: str,
+        masks: Sequence[NDArray[np.bool_]] | None = None,
+    ) -> None:
+        """Measure one pair of flats and add it to its group."""
+        condition = Condition.of(first[0])
+        self._conditions[condition.key] = condition
+        time = first[0].exposure_time or 0.0
+        means: list[list[tuple[float, float]]] = [[], []]
+        for n, frames in enumerate(zip(first[1], second[1], strict=True)):
+            name = frames[0].name
+            images = [self.clean(f) for f in frames]
+            mask = None if masks is None else masks[n]
+            found = flat_covariances(
+                *images, mask=mask, lags=self._lags, unit="adu", region=name
+            )
+            group = self._groups.setdefault((condition.key, time, n, fold), _Group())
+            group.covariances.append(found.covariances)
+            group.counts.append(found.pairs)
+            group.levels.append(found.level)
+            group.clipped += found.clipped
+            for frame in frames:
+                group.serial.append(profile(frame.serial_overscan, 1))
+                group.parallel.append(profile(frame.parallel_overscan, 0))
+            for k in (0, 1):
+                m = found.means[k]
+                # Poisson noise of so many pixels, in ADU for a gain the variance tells, and
+                # that of the overscan's level.
+                shot = max(found.covariances[0, 0], 0.0) / found.pixels
+                zero = self._noise.get(name, 0.0) ** 2 / max(
+                    frames[k].serial_overscan.size // 2, 1
+                )
+                means[k].append((m, shot + zero))
+        for (exposure, _), values in zip((first, second), means, strict=True):
+            self._means.setdefault(fold, []).append((exposure, condition, values))
+
+    def clean(self, frame: Frame) -> NDArray[np.float64]:
+        """Image less the frame's overscan level and the mean bias [ADU]."""
+        over = frame.serial_overscan
+        level = float(np.mean(over[:, over.shape[1] // 2 :])) if over.size else 0.0
+        image = frame.image.astype(np.float64) - level
+        bias = self._bias.get(frame.name)
+        return image if bias is None else image - bias
+
+    def channels(self) -> list[Channel]:
+        """All that was added, by fold."""
+        return [*self._covariances(), *self._mean_levels(), *self._overscans()]
+
+    def _covariances(self) -> list[Channel]:
+        out = []
+        j, i = (index.ravel() for index in np.indices((self._lags + 1,) * 2))
+        for fold in dict.fromkeys(key[3] for key in self._groups):
+            values, blocks, axes = [], [], Axes()
+            for (condition, time, amp, which), group in self._groups.items():
+                if which != fold:
+                    continue
+                pairs = np.sum(group.counts, axis=0)
+                mean = np.average(group.covariances, axis=0, weights=group.counts)
+                values.append(mean.ravel())
+                blocks.append(bartlett_matrix(mean, pairs))
+                level = float(np.mean(group.levels))
+                axes.add(
+                    len(j), self._conditions[condition], amp=amp, time=time, level=level,
+                    pairs=len(group.levels), i=i, j=j,
+                )  # fmt: skip
+            out.append(
+                Channel("flat_cov", np.concatenate(values), tuple(blocks), axes.columns(),
+                        "adu2", fold)
+            )  # fmt: skip
+        return out
+
+    def _mean_levels(self) -> list[Channel]:
+        out = []
+        for fold, rows in self._means.items():
+            values, blocks, axes = [], [], Axes()
+            for exposure, condition, amplifiers in rows:
+                m, variance = np.array(amplifiers).T
+                known = exposure.lamp is not None
+                error = self._lamp_error if known else LAMP_UNKNOWN
+                values.append(m)
+                blocks.append(np.diag(variance) + error**2 * np.outer(m, m))
+                axes.add(
+                    len(m), condition, amp=np.arange(len(m)), time=exposure.exposure_time,
+                    lamp=exposure.lamp if known else 1.0, exposure=exposure.number, level=m,
+                    mjd=np.nan if exposure.mjd is None else exposure.mjd,
+                )  # fmt: skip
+            out.append(
+                Channel("flat_mean", np.concatenate(values), tuple(blocks), axes.columns(),
+                        "adu", fold)
+            )  # fmt: skip
+        return out
+
+    def _overscans(self) -> list[Channel]:
+        out = []
+        for word, name in (
+            ("serial_overscan", "serial"),
+            ("parallel_overscan", "parallel"),
+        ):
+            for fold in dict.fromkeys(key[3] for key in self._groups):
+                values, blocks, axes = [], [], Axes()
+                for (condition, time, amp, which), group in self._groups.items():
+                    profiles = [p for p in getattr(group, name) if len(p)]
+                    if which != fold or not profiles:
+                        continue
+                    mean, matrix = mean_profile(np.array(profiles))
+                    values.append(mean)
+                    blocks.append(matrix)
+                    axes.add(
+                        len(mean), self._conditions[condition], amp=amp, time=time,
+                        level=float(np.mean(group.levels)), k=np.arange(1, len(mean) + 1),
+                    )  # fmt: skip
+                if values:
+                    out.append(
+                        Channel(word, np.concatenate(values), tuple(blocks), axes.columns(),
+                                "adu", fold)
+                    )  # fmt: skip
+        return out
+
+
+def profile(strip: NDArray[np.float32], axis: int) -> NDArray[np.float64]:
+    """Mean and variance of the mean of an overscan along its depth, shape (n, 2); empty if short.
+
+    ``axis`` is that along which charge would be deferred: 1 in the serial overscan.
+    """
+    depth = strip.shape[axis] if strip.ndim == 2 else 0
+    lines = strip.size // depth if depth else 0
+    if depth <= TAIL or lines < 8:
+        return np.zeros((0, 2))
+    other = 1 - axis
+    values = strip.astype(np.float64)
+    return np.stack([values.mean(other), values.var(other, ddof=1) / lines], axis=1)
+
+
+def mean_profile(
+    profiles: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Profile above its own tail, averaged over exposures, and its error matrix.
+
+    Parameters
+    ----------
+    profiles : ndarray, shape (exposures, n, 2)
+        From :func:`profile`.
+    """
+    count = len(profiles)
+    mean = profiles[..., 0].mean(0)
+    variance = profiles[..., 1].mean(0) / count
+    head = len(mean) - TAIL
+    values = mean[:head] - mean[head:].mean()
+    matrix = np.diag(variance[:head]) + variance[head:].mean() / TAIL
+    return values, matrix

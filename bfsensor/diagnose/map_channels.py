@@ -1,0 +1,266 @@
+"""Maps: what flats show against position, free of light's smooth shape in the prediction."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.conditions import Axes, Condition
+
+BLOCKS = 16
+"""Blocks of a map along its longer side."""
+
+RINGS = 24
+"""Bins of the spatial frequency, from 0 to half a cycle a pixel."""
+
+ORDER = 4
+"""Order of the smooth shape of the light in x and in y that rings are freed of."""
+
+LOW = 8
+"""Side of the boxes [pixel] that tell noise over many pixels."""
+
+
+class MapChannels:
+    """Adds up flats on the sensor, each over its amplifier's mean.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Rows and columns of the sensor.
+    """
+
+    def __init__(self, shape: tuple[int, int], fold: str = "fit") -> None:
+        self._shape, self._fold = shape, fold
+        self._groups: dict[tuple, _Group] = {}
+        self._conditions: dict[tuple[str, ...], Condition] = {}
+
+    def add_pair(
+        self,
+        condition: Condition,
+        time: float,
+        first: NDArray[np.float64],
+        second: NDArray[np.float64],
+    ) -> None:
+        """Add a pair of flats, each over its amplifiers' means.
+
+        Parameters
+        ----------
+        condition : Condition
+            Of the light.
+        time : float
+            Exposure time [s].
+        first, second : ndarray, shape of the sensor
+            nan where no amplifier reads or a pixel is bad.
+        """
+        self._conditions[condition.key] = condition
+        group = self._groups.setdefault(
+            (condition.key, time),
+            _Group(np.zeros(self._shape), np.zeros(self._shape, np.int64)),
+        )
+        for image in (first, second):
+            good = np.isfinite(image)
+            group.total[good] += image[good]
+            group.count[good] += 1
+        # Charges repel: noise is smaller over few pixels than over many.
+        noise = np.nan_to_num((first - second) / np.sqrt(2.0))
+        side = LOW
+        ny, nx = (n // side * side for n in self._shape)
+        low = (
+            noise[:ny, :nx].reshape(ny // side, side, nx // side, side).mean((1, 3)) * side
+        )
+        group.low += float(low.var())
+        group.high += float(np.diff(noise, axis=1).var()) / 2
+        group.power += _ring_power(noise)
+        group.pairs += 1
+
+    def channels(self) -> list[Channel]:
+        """Columns, rows, blocks and rings of the map of all light, and of what differs.
+
+        'all': all flats of the commonest condition together, weighted by their light; 'short':
+        its short exposures over its long ones; other conditions over the commonest.
+        """
+        if not self._groups:
+            return []
+        times: dict[tuple[str, ...], list[float]] = {}
+        for key, time in self._groups:
+            times.setdefault(key, []).append(time)
+        common = max(times, key=lambda k: sum(self._groups[k, t].pairs for t in times[k]))
+        ordered = sorted(times[common])
+        maps: dict[str, tuple[_Map, Condition]] = {}
+        condition = self._conditions[common]
+        whole = self._average(common, ordered)
+        maps["all"] = (whole, condition)
+        split = [t for t in ordered if t < 0.25 * ordered[-1]]
+        if split and len(split) < len(ordered):
+            short = self._average(common, split)
+            long = self._average(common, [t for t in ordered if t not in split])
+            maps["short"] = (short.over(long), condition)
+        for other, members in times.items():
+            if other != common:
+                image = self._average(other, members)
+                maps["/".join(other)] = (image.over(whole), self._conditions[other])
+        values, blocks, axes = [], [], Axes()
+        for name, (image, where) in maps.items():
+            for v, e, columns in self._parts(image, own=name == "all"):
+                values.append(v)
+                blocks.extend(np.square(e)[:, None, None])
+                axes.add(len(v), where, map=name, **columns)
+        return [Channel("flat_map", np.concatenate(values), tuple(blocks), axes.columns(), "",
+                        self._fold)]  # fmt: skip
+
+    def _average(self, key: tuple[str, ...], times: list[float]) -> _Map:
+        """Map of several exposure times, by inverse variance of their noise."""
+        groups = [self._groups[key, t] for t in times]
+        weights = np.array([g.pairs**2 / max(g.low, 1e-30) for g in groups])
+        weights = weights / weights.sum()
+        with np.errstate(invalid="ignore", divide="ignore"):
+            image = sum(w * g.total / g.count for w, g in zip(weights, groups, strict=True))
+        # A mean of 2 n flats, whose single noise each pair tells.
+        low = sum(
+            w**2 * g.low / (2 * g.pairs**2) for w, g in zip(weights, groups, strict=True)
+        )
+        power = sum(
+            w**2 * g.power / (2 * g.pairs**2) for w, g in zip(weights, groups, strict=True)
+        )
+        pairs = sum(g.pairs for g in groups)
+        ratio = sum(g.low / max(g.high, 1e-30) * g.pairs for g in groups) / pairs
+        return _Map(np.asarray(image), float(low), np.asarray(power), float(ratio), pairs)
+
+    def _parts(
+        self, image: _Map, *, own: bool
+    ) -> list[tuple[NDArray, NDArray, Mapping[str, object]]]:
+        """Columns, rows, blocks and rings of a map with errors.
+
+        ``own``: the map holds the pixels' own response, of which its neighbours tell.
+        """
+        ny, nx = self._shape
+        sigma = np.sqrt(image.low)
+        if own:
+            steps = np.diff(image.values, axis=1).ravel()
+            seen = (
+                1.4826
+                * float(np.nanmedian(np.abs(steps - np.nanmedian(steps))))
+                / np.sqrt(2.0)
+            )
+            sigma = max(sigma, seen * np.sqrt(image.ratio))
+        good = np.isfinite(image.values)
+        filled = np.where(good, image.values, 1.0) - 1.0
+        out: list[tuple[NDArray, NDArray, Mapping[str, object]]] = []
+        for what, axis, n in (("column", 0, nx), ("row", 1, ny)):
+            count = np.maximum(good.sum(axis), 1)
+            at = (
+                {"x": np.arange(n), "y": -1.0}
+                if what == "column"
+                else {"x": -1.0, "y": np.arange(n)}
+            )
+            out.append(
+                (
+                    filled.sum(axis) / count,
+                    sigma / np.sqrt(count),
+                    {"what": what, "k": -1.0, **at},
+                )
+            )
+        side = int(np.ceil(max(ny, nx) / BLOCKS))
+        rows, columns = ny // side, nx // side
+        count = _blocks(good.astype(float), side).sum((1, 3))
+        mean = _blocks(filled, side).sum((1, 3)) / np.maximum(count, 1)
+        y, x = ((index + 0.5) * side - 0.5 for index in np.indices((rows, columns)))
+        full = count.ravel() > side * side // 2
+        out.append(
+            (
+                mean.ravel()[full],
+                (sigma / np.sqrt(np.maximum(count, 1))).ravel()[full],
+                {"what": "block", "k": -1.0, "x": x.ravel()[full], "y": y.ravel()[full]},
+            )
+        )
+        power = _ring_power(_without_shape(filled))
+        keep = self._modes > 50
+        frequency = (np.arange(RINGS) + 0.5) / (2 * RINGS)
+        # Of n modes, each exponential; in parts per million of a pixel.
+        out.append(
+            (
+                1e6 * (power - image.power)[keep],
+                1e6
+                * np.sqrt(
+                    (power**2 + image.power**2 / image.pairs) / np.maximum(self._modes, 1)
+                )[keep],
+                {"what": "ring", "k": frequency[keep], "x": -1.0, "y": -1.0},
+            )
+        )
+        return out
+
+    @property
+    def _modes(self) -> NDArray[np.int64]:
+        """Modes of each ring."""
+        bins, use = _ring_bins(self._shape)
+        return np.bincount(bins[use], minlength=RINGS)[:RINGS]
+
+
+@dataclass
+class _Group:
+    """Sums over the pairs of one condition and exposure time."""
+
+    total: NDArray[np.float64]
+    count: NDArray[np.int64]
+    low: float = 0.0
+    high: float = 0.0
+    power: NDArray[np.float64] = field(default_factory=lambda: np.zeros(RINGS))
+    pairs: int = 0
+
+
+@dataclass
+class _Map:
+    """A map, its noise over many pixels as a pixel's variance, and by ring.
+
+    ``ratio``: of that variance to the one between neighbours; the effect evens the response of
+    single pixels out as it does their noise, to first order.
+    """
+
+    values: NDArray[np.float64]
+    low: float
+    power: NDArray[np.float64]
+    ratio: float
+    pairs: int
+
+    def over(self, other: _Map) -> _Map:
+        """Ratio of two maps."""
+        return _Map(
+            self.values / other.values, self.low + other.low, self.power + other.power,
+            self.ratio, min(self.pairs, other.pairs),
+        )  # fmt: skip
+
+
+def _blocks(image: NDArray[np.float64], side: int) -> NDArray[np.float64]:
+    ny, nx = (n // side for n in image.shape)
+    return image[: ny * side, : nx * side].reshape(ny, side, nx, side)
+
+
+def _ring_bins(shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Ring of each mode, and which are used: rows' and columns' own are not."""
+    fy, fx = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None]
+    bins = np.minimum((np.hypot(fy, fx) * 2 * RINGS).astype(int), RINGS)
+    return bins, (np.abs(fy) > 0) & (fx > 0) & (bins < RINGS)
+
+
+def _ring_power(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean power of a mode by ring; that of white noise is a pixel's variance."""
+    bins, use = _ring_bins(image.shape)
+    power = np.abs(np.fft.rfft2(image)) ** 2 / image.size
+    count = np.bincount(bins[use], minlength=RINGS)[:RINGS]
+    return np.bincount(bins[use], power[use], minlength=RINGS)[:RINGS] / np.maximum(
+        count, 1
+    )
+
+
+def _without_shape(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Take a polynomial of order :data:`ORDER` in x and y off."""
+    ny, nx = image.shape
+    v, u = np.linspace(-1, 1, ny), np.linspace(-1, 1, nx)
+    left_y = np.polynomial.legendre.legvander(v, ORDER)
+    left_x = np.polynomial.legendre.legvander(u, ORDER)
+    q_y, q_x = np.linalg.qr(left_y)[0], np.linalg.qr(left_x)[0]
+    return np.asarray(image - q_y @ (q_y.T @ image @ q_x) @ q_x.T)

@@ -1,0 +1,191 @@
+"""The baseline fitted with all that may float, and what is left of the channels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.predict import Predictor
+from bfsensor.errors import ConvergenceError
+
+ROUNDS = 6
+SMALL = 0.05
+"""Largest step of a parameter [of its error] at which the fit has arrived."""
+
+
+@dataclass(frozen=True, eq=False)
+class BaselineFit:
+    """A joint fit of all channels by the baseline.
+
+    Attributes
+    ----------
+    channels : tuple of Channel
+        What was fitted.
+    names : tuple of str
+        Non-linear parameters, then linear ones.
+    values, errors : ndarray
+        Of the parameters.
+    residuals : ndarray, shape (n,)
+        Whitened, all channels one after another.
+    basis : ndarray, shape (n + priors, p)
+        Orthonormal columns that the parameters span, priors' rows last: noise in them is
+        fitted away.
+    starts : ndarray of int, shape (channels + 1,)
+        Where each channel's residuals begin.
+    pulls : dict of str to float
+        Device parameters in units of their spread.
+    notes : tuple of str
+        What the prediction had to assume.
+    """
+
+    channels: tuple[Channel, ...]
+    names: tuple[str, ...]
+    values: NDArray[np.float64]
+    errors: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+    basis: NDArray[np.float64] = field(repr=False)
+    starts: NDArray[np.int64] = field(repr=False)
+    pulls: dict[str, float]
+    notes: tuple[str, ...] = ()
+
+    def of(self, word: str) -> NDArray[np.bool_]:
+        """Which residuals belong to a channel word."""
+        out = np.zeros(len(self.residuals), bool)
+        for channel, start in zip(self.channels, self.starts, strict=False):
+            if channel.word == word:
+                out[start : start + len(channel)] = True
+        return out
+
+    def chi2(self) -> dict[str, tuple[float, float]]:
+        """Chi-square and degrees of freedom of each channel word.
+
+        The parameters' degrees are shared out as the basis lies in the channels.
+        """
+        leverage = (self.basis[: len(self.residuals)] ** 2).sum(1)
+        out = {}
+        for word in dict.fromkeys(c.word for c in self.channels):
+            rows = self.of(word)
+            out[word] = (
+                float(self.residuals[rows] @ self.residuals[rows]),
+                float(rows.sum() - leverage[rows].sum()),
+            )
+        return out
+
+    def draw(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """Residuals that noise alone leaves, shape (count, n), the fit linear about its end."""
+        total, n = len(self.basis), len(self.residuals)
+        noise = rng.standard_normal((count, total))
+        noise -= (noise @ self.basis) @ self.basis.T
+        return np.asarray(noise[:, :n])
+
+
+def fit_baseline(predictor: Predictor, channels: Sequence[Channel]) -> BaselineFit:
+    """Fit the baseline to channels: Gauss-Newton, device parameters held by their spread.
+
+    Parameters
+    ----------
+    predictor : Predictor
+        Predicts them.
+    channels : sequence of Channel
+        What to fit.
+
+    Raises
+    ------
+    ConvergenceError
+        The parameters still move after :data:`ROUNDS` rounds.
+    """
+    starts = np.concatenate([[0], np.cumsum([len(c) for c in channels])])
+    total = int(starts[-1])
+    columns: dict[str, NDArray[np.float64]] = {}
+    for channel, start in zip(channels, starts, strict=False):
+        for name, column in predictor.linear(channel).items():
+            whole = columns.setdefault(name, np.zeros(total))
+            whole[start : start + len(channel)] += channel.whiten(column)
+    # A parameter that no value depends on is none.
+    columns = {k: v for k, v in columns.items() if np.abs(v).max() > 0}
+    linear = np.array(list(columns.values())).T.reshape(total, len(columns))
+    scales = np.sqrt((linear**2).sum(0))
+    count, priors = len(predictor.names), len(predictor.prior_rows)
+    point = predictor.start.astype(float).copy()
+    moved = np.inf
+    history: list[float] = []
+    for _ in range(ROUNDS):
+        predicted = [predictor.predict(c, point) for c in channels]
+        residuals = np.concatenate([
+            c.whiten(c.values - p) for c, p in zip(channels, predicted, strict=True)
+        ])  # fmt: skip
+        slopes = np.zeros((total, count))
+        for n in range(count):
+            for channel, start, here in zip(channels, starts, predicted, strict=False):
+                if not predictor.depends(channel)[n]:
+                    continue
+                step = point.copy()
+                step[n] += predictor.steps[n]
+                change = (predictor.predict(channel, step) - here) / predictor.steps[n]
+                slopes[start : start + len(channel), n] = channel.whiten(change)
+        design = np.zeros((total + priors, count + linear.shape[1]))
+        design[:total, :count] = slopes
+        design[:total, count:] = linear / scales
+        design[total + np.arange(priors), predictor.prior_rows] = 1.0
+        target = np.concatenate([residuals, -point[predictor.prior_rows]])
+        norms = np.sqrt((design**2).sum(0))
+        used = norms > 0
+        q, r = np.linalg.qr(design[:, used] / norms[used])
+        # Directions that the data do not hold are left where they are.
+        singular = np.abs(np.diag(r)) > 1e-10
+        q = (
+            q
+            if singular.all()
+            else np.linalg.svd(design[:, used] / norms[used], full_matrices=False)[0][
+                :, : np.linalg.matrix_rank(r)
+            ]
+        )
+        solution = np.zeros(design.shape[1])
+        if singular.all():
+            solution[used] = solve_triangular(r, q.T @ target) / norms[used]
+            inverse = solve_triangular(r, np.eye(len(r)))
+            errors = np.zeros(design.shape[1])
+            errors[used] = np.sqrt((inverse**2).sum(1)) / norms[used]
+        else:
+            pinv = np.linalg.pinv(design[:, used] / norms[used], rcond=1e-10)
+            solution[used] = (pinv @ target) / norms[used]
+            errors = np.zeros(design.shape[1])
+            errors[used] = np.sqrt((pinv**2).sum(1)) / norms[used]
+        point = point + solution[:count]
+        moved = float(
+            np.max(
+                np.abs(solution[:count]) / np.maximum(errors[:count], 1e-300),
+                where=errors[:count] > 0,
+                initial=0.0,
+            )
+        )
+        history.append(moved)
+        if moved < SMALL:
+            break
+    else:
+        raise ConvergenceError(
+            f"the baseline's parameters still move by {moved:.2g} of their errors after {ROUNDS} "
+            f"rounds (steps {', '.join(f'{h:.2g}' for h in history)})"
+        )
+    left = target - q @ (q.T @ target)
+    values = np.concatenate([point, solution[count:] / scales])
+    errors[count:] /= scales
+    return BaselineFit(
+        channels=tuple(channels),
+        names=(*predictor.names, *columns),
+        values=values,
+        errors=errors,
+        residuals=left[:total],
+        basis=q,
+        starts=starts,
+        pulls={
+            predictor.names[n].removeprefix("device "): float(point[n])
+            for n in predictor.prior_rows
+        },
+        notes=tuple(predictor.notes),
+    )

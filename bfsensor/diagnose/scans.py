@@ -1,0 +1,375 @@
+"""Template-free scans of what the baseline leaves: where, and how unlikely by chance."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.mismatch import BaselineFit
+
+POWERS = (0, 1, 2, 3)
+"""Powers of the level that covariances and means may go with."""
+
+OCTAVES = 4
+"""Sizes of strips and boxes, from the whole side on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """A shape sought in the whitened residuals.
+
+    Attributes
+    ----------
+    family : str
+        Scan it belongs to.
+    word : str
+        Channel.
+    rows : ndarray of int
+        Residuals it covers.
+    weights : ndarray
+        At those rows, whitened like them.
+    where : mapping
+        What it stands for: 'lags', 'level', 'x', 'y', 'amp', 'condition', 'exposure', 'k', ...
+    """
+
+    family: str
+    word: str
+    rows: NDArray[np.int64]
+    weights: NDArray[np.float64]
+    where: Mapping[str, object] = field(default_factory=dict)
+
+
+def make_templates(fit: BaselineFit) -> list[Template]:
+    """All templates that the channels of a fit allow.
+
+    Every template is a pattern in the units of its channel, spread over all folds that the fit
+    holds: a flux power of one lag, a step in time, a strip.
+    """
+    by_word: dict[str, list[tuple[Channel, int]]] = {}
+    for channel, start in zip(fit.channels, fit.starts, strict=False):
+        by_word.setdefault(channel.word, []).append((channel, int(start)))
+    out: list[Template] = []
+    makers = {
+        "flat_cov": _covariances, "flat_mean": _means, "flat_map": _maps,
+        "serial_overscan": _overscan, "parallel_overscan": _overscan, "bias_cov": _noise,
+        "bias_level": _levels, "dark_map": _darks, "spot": _spots, "amp_cross": _single,
+        "code_hist": _codes,
+    }  # fmt: skip
+    for word, members in by_word.items():
+        group = _Group(word, members)
+        for family, pattern, where in makers[word](group):
+            template = group.template(family, pattern, where)
+            if template is not None:
+                out.append(template)
+    return out
+
+
+class _Group:
+    """Channels of one word as one table."""
+
+    def __init__(self, word: str, members: list[tuple[Channel, int]]) -> None:
+        self.word, self.members = word, members
+        names = [n for n in members[0][0].axes if all(n in c.axes for c, _ in members)]
+        self.axes = {n: np.concatenate([c.axes[n] for c, _ in members]) for n in names}
+        self.size = sum(len(c) for c, _ in members)
+        self.rows = np.concatenate([s + np.arange(len(c)) for c, s in members])
+        columns = [self.axes[n] for n in ("wavelength", "back_bias", "temperature")]
+        self.condition = np.array([
+            "/".join(f"{float(v):g}" for v in row) for row in zip(*columns, strict=True)
+        ])  # fmt: skip
+
+    def template(
+        self, family: str, pattern: NDArray[np.float64], where: Mapping[str, object]
+    ) -> Template | None:
+        """Whiten a pattern; None if it is nothing."""
+        parts, start = [], 0
+        for channel, _ in self.members:
+            parts.append(channel.whiten(pattern[start : start + len(channel)]))
+            start += len(channel)
+        whole = np.concatenate(parts)
+        used = np.nonzero(np.abs(whole) > 1e-12 * max(np.abs(whole).max(), 1e-300))[0]
+        if len(used) == 0 or not np.isfinite(whole).all():
+            return None
+        return Template(family, self.word, self.rows[used], whole[used], dict(where))
+
+
+Pattern = tuple[str, NDArray[np.float64], dict[str, object]]
+
+
+def _covariances(g: _Group) -> Iterator[Pattern]:
+    """Lag by power of the level, by single level, by amplifier, by condition."""
+    x = g.axes
+    i, j, level = x["i"].astype(int), x["j"].astype(int), x["level"].astype(float)
+    unit = level / level.max()
+    lags = sorted(set(zip(i.tolist(), j.tolist(), strict=True)))
+    low, high = float(level.min()), float(level.max())
+    for a, b in lags:
+        here = (i == a) & (j == b)
+        base = {"lags": [(a, b)], "level": (low, high)}
+        for p in POWERS:
+            yield "lag x power", np.where(here, unit**p, 0.0), {**base, "power": p}
+        for condition in dict.fromkeys(g.condition):
+            own = here & (g.condition == condition)
+            rest = here & ~own
+            if rest.any():
+                yield (
+                    "lag x condition", np.where(own, unit**2, 0.0), {**base, "condition": condition}
+                )  # fmt: skip
+        for amp in np.unique(x["amp"]):
+            yield (
+                "lag x amplifier", np.where(here & (x["amp"] == amp), unit**2, 0.0),
+                {**base, "amp": int(amp)},
+            )  # fmt: skip
+        for time in np.unique(x["time"]):
+            own = here & (x["time"] == time)
+            span = (float(level[own].min()), float(level[own].max()))
+            yield "lag x level", np.where(own, 1.0, 0.0), {"lags": [(a, b)], "level": span}
+    # Rows, columns and rings of lags together.
+    radius = np.hypot(i, j)
+    sets = {
+        "row of lags": (j == 0) & (i > 0), "column of lags": (i == 0) & (j > 0),
+        "near lags": (radius > 0) & (radius < 1.5), "far lags": radius > 2.5,
+    }  # fmt: skip
+    for name, here in sets.items():
+        chosen = sorted(set(zip(i[here].tolist(), j[here].tolist(), strict=True)))
+        for p in POWERS:
+            yield "lags together", np.where(here, unit**p, 0.0), {
+                "lags": chosen, "level": (low, high), "power": p, "set": name,
+            }  # fmt: skip
+
+
+def _means(g: _Group) -> Iterator[Pattern]:
+    """Powers of the level, single exposures and steps and slopes in time, by amplifier."""
+    x = g.axes
+    level = x["level"].astype(float)
+    unit = level / level.max()
+    order = x["exposure"].astype(float)
+    span = (float(level.min()), float(level.max()))
+    for name, here in _amplifiers(x):
+        for p in (0, 2, 3, 4):
+            yield (
+                "mean x power",
+                np.where(here, unit**p, 0.0),
+                {"amp": name, "level": span, "power": p},
+            )
+        for time in np.unique(x["time"]):
+            own = here & (x["time"] == time)
+            if own.any():
+                yield "mean x level", np.where(own, unit, 0.0), {
+                    "amp": name, "level": (float(level[own].min()), float(level[own].max())),
+                }  # fmt: skip
+        for cut in np.unique(order)[1::2]:
+            yield "mean, step in time", np.where(here & (order >= cut), unit, 0.0), {
+                "amp": name, "exposure": (int(cut), int(order.max())),
+            }  # fmt: skip
+        yield "mean, slope in time", np.where(here, unit * (order - order.mean()), 0.0), {
+            "amp": name, "exposure": (int(order.min()), int(order.max())),
+        }  # fmt: skip
+        for one in np.unique(order):
+            yield "mean, one exposure", np.where(here & (order == one), unit, 0.0), {
+                "amp": name, "exposure": (int(one), int(one)),
+            }  # fmt: skip
+
+
+def _maps(g: _Group) -> Iterator[Pattern]:
+    """Strips, steps, edges and waves in columns and rows, boxes in blocks, rings."""
+    x = g.axes
+    for name in dict.fromkeys(x["map"]):
+        here = x["map"] == name
+        for what, axis in (("column", "x"), ("row", "y")):
+            rows = here & (x["what"] == what)
+            if not rows.any():
+                continue
+            place = x[axis].astype(float)
+            n = int(place[rows].max()) + 1
+            common = {"map": str(name), "what": what}
+            for one in range(n):
+                yield f"{what}s", np.where(rows & (place == one), 1.0, 0.0), {
+                    **common, axis: (one, one + 1),
+                }  # fmt: skip
+            for octave in range(2, OCTAVES + 2):
+                width = n / 2**octave
+                for k in range(2 ** (octave + 1) - 1):
+                    lo, hi = 0.5 * k * width, (0.5 * k + 1) * width
+                    yield f"{what} strips", np.where(rows & (place >= lo) & (place < hi), 1.0, 0.0), {
+                        **common, axis: (int(lo), int(np.ceil(hi))),
+                    }  # fmt: skip
+            for length in (2.0, 5.0, 12.0):
+                for side, distance in (("low", place), ("high", n - 1 - place)):
+                    reach = int(3 * length)
+                    yield f"{what} edges", np.where(rows, np.exp(-distance / length), 0.0), {
+                        **common, axis: (0, reach) if side == "low" else (n - reach, n),
+                    }  # fmt: skip
+            for cycles in range(3, n // 2):
+                phase = 2 * np.pi * cycles * (place + 0.5) / n
+                for wave in (np.cos, np.sin):
+                    yield f"{what} waves", np.where(rows, wave(phase), 0.0), {
+                        **common, "period": n / cycles,
+                    }  # fmt: skip
+        rows = here & (x["what"] == "block")
+        if rows.any():
+            u, v = x["x"].astype(float), x["y"].astype(float)
+            nx, ny = u[rows].max() + u[rows].min(), v[rows].max() + v[rows].min()
+            for octave in range(1, OCTAVES + 1):
+                wide, tall = nx / 2**octave, ny / 2**octave
+                for a in range(2**octave):
+                    for b in range(2**octave):
+                        lo = (a * wide, b * tall)
+                        own = (
+                            (u >= lo[0])
+                            & (u < lo[0] + wide)
+                            & (v >= lo[1])
+                            & (v < lo[1] + tall)
+                        )
+                        yield "boxes", np.where(rows & own, 1.0, 0.0), {
+                            "map": str(name), "what": "block", "x": (int(lo[0]), int(lo[0] + wide)),
+                            "y": (int(lo[1]), int(lo[1] + tall)),
+                        }  # fmt: skip
+        rows = here & (x["what"] == "ring")
+        for k in np.unique(x["k"][rows]):
+            yield "rings", np.where(rows & (x["k"] == k), 1.0, 0.0), {
+                "map": str(name), "what": "ring", "period": 1 / float(k),
+            }  # fmt: skip
+        if rows.any():
+            yield "rings", np.where(rows, 1.0, 0.0), {"map": str(name), "what": "ring"}
+
+
+def _overscan(g: _Group) -> Iterator[Pattern]:
+    """First pixels and tails by power of the level, single levels, amplifiers."""
+    x = g.axes
+    k, level = x["k"].astype(float), x["level"].astype(float)
+    unit = level / level.max()
+    span = (float(level.min()), float(level.max()))
+    for name, here in _amplifiers(x):
+        for one in np.unique(k):
+            for p in (0, 1):
+                yield "overscan pixel x power", np.where(here & (k == one), unit**p, 0.0), {
+                    "amp": name, "k": (int(one), int(one)), "level": span, "power": p,
+                }  # fmt: skip
+        for length in (1.0, 2.0, 4.0, 8.0):
+            tail = np.exp(-(k - 1) / length)
+            for p in (0, 1):
+                yield "overscan tail x power", np.where(here, tail * unit**p, 0.0), {
+                    "amp": name, "k": (1, int(k.max())), "length": length, "level": span, "power": p,
+                }  # fmt: skip
+            for time in np.unique(x["time"]):
+                own = here & (x["time"] == time)
+                yield "overscan tail x level", np.where(own, tail, 0.0), {
+                    "amp": name, "k": (1, int(k.max())), "length": length,
+                    "level": (float(level[own].min()), float(level[own].max())),
+                }  # fmt: skip
+
+
+def _noise(g: _Group) -> Iterator[Pattern]:
+    """Single lags in readout order, tails, waves."""
+    x = g.axes
+    lag = x["lag"].astype(float)
+    for name, here in _amplifiers(x):
+        for one in np.unique(lag):
+            yield (
+                "noise lag",
+                np.where(here & (lag == one), 1.0, 0.0),
+                {"amp": name, "k": (int(one), int(one))},
+            )
+        for length in (1.0, 2.0, 4.0, 8.0, 1e9):
+            yield "noise tail", np.where(here & (lag > 0), np.exp(-lag / length), 0.0), {
+                "amp": name, "k": (1, int(lag.max())), "length": length,
+            }  # fmt: skip
+        for period in np.geomspace(2.0, lag.max(), 24):
+            yield "noise wave", np.where(here & (lag > 0), np.cos(2 * np.pi * lag / period), 0.0), {
+                "amp": name, "period": float(period),
+            }  # fmt: skip
+
+
+def _levels(g: _Group) -> Iterator[Pattern]:
+    x = g.axes
+    for what in dict.fromkeys(x["what"]):
+        for name, here in _amplifiers(x):
+            rows = here & (x["what"] == what)
+            yield "bias", np.where(rows, 1.0, 0.0), {"amp": name, "what": str(what)}
+            for one in np.unique(x["exposure"][rows]):
+                yield "bias, one exposure", np.where(rows & (x["exposure"] == one), 1.0, 0.0), {
+                    "amp": name, "what": str(what), "exposure": (int(one), int(one)),
+                }  # fmt: skip
+
+
+def _darks(g: _Group) -> Iterator[Pattern]:
+    x = g.axes
+    after = x["after"].astype(float)
+    for name, here in _amplifiers(x):
+        level, struck = (here & (x["what"] == w) for w in ("level", "struck"))
+        column = here & (x["what"] == "column")
+        if after.max() > 0:
+            yield (
+                "dark after light",
+                np.where(level, after / after.max(), 0.0),
+                {"amp": name, "what": "after light"},
+            )
+        yield "struck pixels", np.where(struck, 1.0, 0.0), {"amp": name, "what": "struck"}
+        if name == "all":
+            continue
+        for one in np.unique(x["x"][column]):
+            yield "dark columns", np.where(column & (x["x"] == one), 1.0, 0.0), {
+                "amp": name, "x": (int(one), int(one) + 1), "what": "column",
+            }  # fmt: skip
+
+
+def _spots(g: _Group) -> Iterator[Pattern]:
+    """Widths, asymmetry, wings and flux by power of the light, by condition, in time."""
+    x = g.axes
+    flux = x["flux"].astype(float)
+    unit = flux / flux.max()
+    for what in dict.fromkeys(x["what"]):
+        here = x["what"] == what
+        for p in (0, 1, 2, 3):
+            yield "spots x power", np.where(here, unit**p, 0.0), {
+                "what": str(what), "level": (float(flux.min()), float(flux.max())), "power": p,
+            }  # fmt: skip
+        for condition in dict.fromkeys(g.condition):
+            own = here & (g.condition == condition)
+            for p in (0, 1):
+                yield "spots x condition", np.where(own, unit**p, 0.0), {
+                    "what": str(what), "condition": condition, "power": p,
+                }  # fmt: skip
+        for one in np.unique(x["exposure"][here]):
+            yield "spots, one exposure", np.where(here & (x["exposure"] == one), 1.0, 0.0), {
+                "what": str(what), "exposure": (int(one), int(one)),
+            }  # fmt: skip
+
+
+def _codes(g: _Group) -> Iterator[Pattern]:
+    """Bits, single codes, by amplifier."""
+    x = g.axes
+    code = x["code"].astype(int)
+    for name, here in _amplifiers(x):
+        bit = 1
+        while bit <= code.max():
+            yield "code bits", np.where(here, np.where(code & bit, 1.0, -1.0), 0.0), {
+                "amp": name, "bit": bit,
+            }  # fmt: skip
+            bit *= 2
+        for one in np.unique(code):
+            yield (
+                "codes",
+                np.where(here & (code == one), 1.0, 0.0),
+                {"amp": name, "code": int(one)},
+            )
+
+
+def _single(g: _Group) -> Iterator[Pattern]:
+    x = g.axes
+    for n in range(g.size):
+        yield "amplifiers", np.eye(g.size)[n], {
+            "amp": int(x["amp"][n]), "other": int(x["other"][n]), "what": str(x["what"][n]),
+        }  # fmt: skip
+
+
+def _amplifiers(x: Mapping[str, NDArray]) -> list[tuple[object, NDArray[np.bool_]]]:
+    """All amplifiers together, and each alone."""
+    amps = np.unique(x["amp"])
+    out: list[tuple[object, NDArray[np.bool_]]] = [("all", np.ones(len(x["amp"]), bool))]
+    return out + ([(int(a), x["amp"] == a) for a in amps] if len(amps) > 1 else [])

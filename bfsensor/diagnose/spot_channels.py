@@ -1,0 +1,148 @@
+"""Spots: widths, flux, asymmetry and wings against exposure time, condition by condition."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.conditions import Axes, Condition, Exposure
+from bfsensor.errors import MeasurementError
+from bfsensor.measure.spot_fit import fit_spots
+from bfsensor.measure.spots import SpotList, cut_stamps, find_spots
+
+STAMP = 11
+WING = 21
+"""Sides of the stamps [pixel] that are fitted, and that the wings are summed in."""
+
+FLUX_ERROR = 2e-3
+"""Relative error common to the fluxes of an exposure, beside the lamp's: illumination of a mask
+with pinholes moves with its dithers (assumed)."""
+
+WING_ERROR = 2e-4
+"""Error of the share of a spot's flux outside its stamp: backgrounds are known to about 0.1 e- a
+pixel of 320 (assumed)."""
+
+
+class SpotChannels:
+    """Takes images of spots on the sensor in electrons, one by one, and gives their channel."""
+
+    def __init__(self, *, read_noise: float, lamp_error: float, fold: str = "fit") -> None:
+        self._noise, self._lamp_error, self._fold = read_noise, lamp_error, fold
+        self._rows: list[tuple[Exposure, dict[str, tuple[float, float]], NDArray]] = []
+        self.dropped: dict[str, int] = {}
+
+    def add(self, exposure: Exposure, image: NDArray[np.float64]) -> str | None:
+        """Measure an exposure; gives why it could not be, or None."""
+        background = float(np.nanmedian(image))
+        peak = float(np.nanpercentile(image, 99.9)) - background
+        if peak < 10 * max(self._noise, 1.0):
+            return "no spots stand out"
+        filled = np.where(np.isfinite(image), image, background)
+        try:
+            spots = find_spots(
+                filled, threshold=background + 0.3 * peak, separation=WING // 2, stamp=STAMP
+            )
+            inside = _inside(spots, filled.shape, WING // 2 + 1)
+            if len(inside) < 4:
+                return f"{len(inside)} spots"
+            stamps = cut_stamps(filled, inside, size=STAMP)
+            fit = fit_spots(
+                stamps, read_noise=self._noise, weights="equal", largest_offset=1.5
+            )
+        except MeasurementError as error:
+            return str(error)
+        used = fit.used
+        if used.sum() < 4:
+            return f"{int(used.sum())} spots are left by the fit"
+        wide = cut_stamps(filled, inside, size=WING).electrons[used]
+        values = _moments(
+            stamps.electrons[used], wide, fit.centre_x[used], fit.centre_y[used]
+        )
+        n = used.sum()
+        errors = np.sqrt(np.diag(fit.scatter_covariance))
+        out = {
+            "sigma_x": (fit.sigma_x, float(errors[0])),
+            "sigma_y": (fit.sigma_y, float(errors[1])),
+        }
+        # Pinholes differ, but are the same in all exposures: the error is the electrons'.
+        total = values.pop("flux").mean()
+        out["flux"] = (
+            float(total),
+            float(np.sqrt(total / n + (WING * self._noise) ** 2 / n)),
+        )
+        for name, column in values.items():
+            out[name] = (float(column.mean()), float(column.std(ddof=1) / np.sqrt(n)))
+        phases = np.stack([fit.centre_x[used], fit.centre_y[used]], axis=1)
+        self._rows.append((exposure, out, phases))
+        return None
+
+    def channels(self) -> list[Channel]:
+        """Widths, fluxes, skewness and wings of each exposure."""
+        if not self._rows:
+            return []
+        values, blocks, axes = [], [], Axes()
+        for exposure, found, _ in self._rows:
+            lamp = exposure.lamp
+            light = (exposure.exposure_time or 0.0) * (1.0 if lamp is None else lamp)
+            for what, (value, error) in found.items():
+                variance = error**2
+                if what == "flux":
+                    variance += (value * np.hypot(FLUX_ERROR, self._lamp_error)) ** 2
+                if what == "wings":
+                    variance += WING_ERROR**2
+                values.append(np.array([value]))
+                blocks.append(np.array([[max(variance, 1e-30)]]))
+                axes.add(1, Condition.of(exposure), what=what, light=light,
+                         flux=found["flux"][0], time=exposure.exposure_time or 0.0,
+                         exposure=exposure.number)  # fmt: skip
+        return [Channel("spot", np.concatenate(values), tuple(blocks), axes.columns(), "",
+                        self._fold)]  # fmt: skip
+
+    @property
+    def phases(self) -> list[NDArray[np.float64]]:
+        """Centres of each exposure's spots within their pixels, shape (n, 2) [pixel]."""
+        return [p for *_, p in self._rows]
+
+
+def _inside(spots: SpotList, shape: tuple[int, int], border: int) -> SpotList:
+    """Spots whose wide stamps lie inside."""
+    keep = (
+        (spots.x >= border) & (spots.x < shape[1] - border)
+        & (spots.y >= border) & (spots.y < shape[0] - border)
+    )  # fmt: skip
+    return SpotList(spots.x[keep], spots.y[keep], dict(spots.rejected))
+
+
+def _moments(
+    stamps: NDArray[np.float64],
+    wide: NDArray[np.float64],
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+) -> dict[str, NDArray[np.float64]]:
+    """Flux, skewness along x and y, and the share of the flux in the wings, spot by spot.
+
+    Skewness: the third power of the distance from the fitted centre, with a Gaussian weight of
+    2 pixels, over the flux.  Wings: what lies in the wide stamp outside the fitted one.
+    """
+    size = stamps.shape[-1]
+    step = np.arange(size) - size // 2
+    rim = np.concatenate(
+        [
+            wide[:, [0, -1]].reshape(len(wide), -1),
+            wide[:, 1:-1, [0, -1]].reshape(len(wide), -1),
+        ],
+        axis=1,
+    )
+    background = np.median(rim, axis=1)[:, None, None]
+    signal = stamps - background
+    dx, dy = step[None] - x[:, None], step[None] - y[:, None]
+    weight = np.exp(-(dx[:, None] ** 2 + dy[..., None] ** 2) / 8.0)
+    flux = (signal * weight).sum((1, 2))
+    total = (wide - background).sum((1, 2))
+    return {
+        "skew_x": (signal * weight * dx[:, None] ** 3).sum((1, 2)) / flux,
+        "skew_y": (signal * weight * dy[..., None] ** 3).sum((1, 2)) / flux,
+        "flux": total,
+        "wings": 1.0 - signal.sum((1, 2)) / total,
+    }
