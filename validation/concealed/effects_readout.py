@@ -58,7 +58,8 @@ class ParallelCti(Effect):
 class SerialTrap(Effect):
     """A trap at the output: fills to ``size`` e-, releases with ``tau`` pixel times.
 
-    ``amp`` counts from zero.  In each pixel time release comes before capture.
+    ``amp`` counts from zero.  In each pixel time a part 1 - exp(-1 / tau) of what is held goes
+    out with the packet, which fills what is free.
     """
 
     word = "trap_serial"
@@ -81,10 +82,10 @@ class SerialTrap(Effect):
         # every row meets an empty trap: the parallel transfer takes far longer than tau
         for c in range(frame.shape[1]):
             free = held * released
-            packet = frame[:, c] + free
+            packet = frame[:, c]
             held = held - free
             caught = np.clip(np.minimum(packet, size - held), 0, None)
-            out[:, c] = packet - caught
+            out[:, c] = packet - caught + free
             held = held + caught
         frames = list(frames)
         frames[int(amp) % len(frames)] = out

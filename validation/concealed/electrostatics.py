@@ -173,4 +173,6 @@ def edge_shifts(
             for column in {WINDOW + i, WINDOW - i}:
                 ky[WINDOW + j, column] = quarter_y[j, i]
                 ky[WINDOW - 1 - j, column] = -quarter_y[j, i]
+    # the outermost edges stand still, so that what one pixel loses another gains
+    kx[:, 0] = ky[0, :] = 0.0
     return EdgeShifts(kx, ky)
