@@ -280,6 +280,10 @@ def test_diffusion_and_wings_of_spots():
     (off, on), *_ = image_twins(effect, [exposure("SPOT", 7.5)])
     change = _moments(on) - _moments(off)
     assert change[3:] == pytest.approx([0.2, 0.2], abs=0.03)  # less brighter-fatter: 1 %
+    warm = exposure("SPOT", 7.5, back_bias=-40.0, temperature=-80.0)
+    (off, on), *_ = image_twins(effect, [warm])
+    more = 0.2 * (68 / 48) * (193.15 / 173.15)
+    assert (_moments(on) - _moments(off))[3:] == pytest.approx([more, more], abs=0.04)
     effect = make_effect("psf_wings", {"frac": 0.05, "sigma": 4.0})
     (off, on), *_ = image_twins(effect, [exposure("SPOT", 7.5)])
     assert on.sum() == pytest.approx(off.sum(), rel=2e-3)

@@ -21,9 +21,10 @@ The road, one module each; nothing is imported from ``bfsensor``:
 Every campaign, nulls too, has: a device scattered by its card's spread, gains (3 %), read noise
 (4 %), offsets, 0.05 e- row noise, 0.3 % pixel response, 3e-4 pixel edge scatter, illumination
 gradients, a lamp that walks by 2e-4 per exposure and a monitor that errs by 2e-4, dark current,
-spots at random 1/8-pixel dithers with 2 % scatter in flux, and an unknown spot width (2 %).
+spots at random 1/8-pixel dithers with 2 % scatter in flux, spot widths off by 2 % in x and y.
 
 Not modelled: a field edge at the sensor's rim (collection continues periodically), shifts
 beyond 10 pixels (edges there stand still, in the baseline too), bending of an edge within one
-pixel, the second order where two moved edges meet in a corner, wings of the spots.
+pixel, the second order where two moved edges meet in a corner; in nulls no spot wings, cosmic
+rays or hot columns, and spots of the same width at all conditions.
 """

@@ -9,6 +9,8 @@ import numpy as np
 from validation.concealed.card import NOMINAL, SPREAD
 from validation.concealed.effect import Effect, Range
 from validation.concealed.electrostatics import EdgeShifts
+from validation.concealed.plan import Exposure
+from validation.concealed.scene import diffusion_variance
 
 
 def _scaled(shifts, x, y=None):
@@ -183,13 +185,19 @@ class VoltageDependence(Effect):
 
 @dataclass(frozen=True)
 class LateralDiffusion(Effect):
-    """Spots widen by ``var`` pixel^2, the same at all conditions."""
+    """Spots widen by ``var`` pixel^2 at 620 nm, nominal bias and -100 C.
+
+    Elsewhere in proportion to kT, the drift path from where light converts, and one over the
+    voltage: a width that is the same at all conditions could not be told from the optics.
+    """
 
     word = "lateral_diffusion"
     variants = {"": {"var": Range(0.005, 0.2, amplitude=True)}}
 
     def spot_light(self, context):
-        return {"variance": self.parameters["var"]}
+        here = diffusion_variance(context.exposure, context.device)
+        usual = diffusion_variance(Exposure("SPOT", 0, 0.0, 0.0), context.device)
+        return {"variance": self.parameters["var"] * here / usual}
 
 
 @dataclass(frozen=True)

@@ -68,8 +68,9 @@ class Lamp:
         [e-/s] in a pixel of a flat, in a whole spot.
     gradient : tuple of float
         Relative slope in x, y and curvature in x^2, xy, y^2 across half the sensor.
-    spot_sigma : float
-        Of the optics [pixel].
+    spot_widths : tuple of float
+        Standard deviations of a spot in x and y [pixel], the same at all conditions: diffusion
+        included, as the card does not speak of it.
     walk, monitor_error : float
         Relative step of the lamp from exposure to exposure; relative error of its monitor.
     """
@@ -77,19 +78,19 @@ class Lamp:
     flat_rate: float = 2000.0
     spot_rate: float = 32300.0
     gradient: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    spot_sigma: float = 1.04
+    spot_widths: tuple[float, float] = (1.06, 1.06)
     walk: float = 2.0e-4
     monitor_error: float = 2.0e-4
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Lamp:
-        """Draw a lamp: rates to 2 %, spots to 2 %, gradients of about 0.3 %."""
-        rates = 1 + 0.02 * np.clip(rng.standard_normal(3), -2.5, 2.5)
+        """Draw a lamp: rates to 2 %, spot widths to 2 % each, gradients of about 0.3 %."""
+        rates = 1 + 0.02 * np.clip(rng.standard_normal(4), -2.5, 2.5)
         gradient = rng.normal(0, [3e-3, 3e-3, 5e-4, 5e-4, 5e-4])
         return cls(
-            flat_rate=2000.0 * rates[0],
-            spot_rate=32300.0 * rates[1],
-            spot_sigma=1.04 * rates[2],
+            flat_rate=2000.0 * float(rates[0]),
+            spot_rate=32300.0 * float(rates[1]),
+            spot_widths=(1.06 * float(rates[2]), 1.06 * float(rates[3])),
             gradient=tuple(float(g) for g in gradient),
         )
 
@@ -142,19 +143,19 @@ def dithered_spots(pixels: int, rng: np.random.Generator):
     return places + phase, 1 + 0.02 * rng.standard_normal(len(places))
 
 
-def spot_scene(places, fluxes, sigma: float, pixels: int) -> Scene:
-    """Gaussian spots of one width [pixel], integrated over pixels, with light at the edges.
+def spot_scene(places, fluxes, widths: tuple[float, float], pixels: int) -> Scene:
+    """Gaussian spots, integrated over pixels, with light at the edges.
 
     ``places`` (n, 2) are x and y in pixels, the centre of the first pixel at zero; ``fluxes``
-    (n,) in electrons.
+    (n,) in electrons; ``widths`` standard deviations in x and y [pixel].
     """
     light = np.zeros((pixels, pixels), np.float32)
     right = tuple(np.zeros_like(light) for _ in range(3))
     upper = tuple(np.zeros_like(light) for _ in range(3))
-    reach = int(np.ceil(7 * sigma)) + 1
+    reach = int(np.ceil(7 * max(widths))) + 1
     for (x, y), flux in zip(places, fluxes, strict=True):
-        window_x, mean_x, edge_x = _profile(x, sigma, reach, pixels)
-        window_y, mean_y, edge_y = _profile(y, sigma, reach, pixels)
+        window_x, mean_x, edge_x = _profile(x, widths[0], reach, pixels)
+        window_y, mean_y, edge_y = _profile(y, widths[1], reach, pixels)
         stamp = np.s_[window_y, window_x]
         light[stamp] += np.outer(flux * mean_y, mean_x)
         for k in range(3):

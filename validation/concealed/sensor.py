@@ -30,7 +30,6 @@ from validation.concealed.scene import (
     Image,
     Lamp,
     Scene,
-    diffusion_variance,
     dithered_spots,
     flat_scene,
     spot_scene,
@@ -116,7 +115,7 @@ class VirtualSensor:
         """Return effects and nuisances, for truth.json."""
         lamp = {
             k: getattr(self.lamp, k)
-            for k in ("flat_rate", "spot_rate", "spot_sigma", "gradient")
+            for k in ("flat_rate", "spot_rate", "spot_widths", "gradient")
         }
         return {
             "effects": [effect.truth() for effect in self.effects],
@@ -193,13 +192,13 @@ class VirtualSensor:
         asked: dict[str, float] = {"variance": 0.0, "halo": 0.0, "halo_sigma": 1.0}
         for effect in self.effects:
             asked.update(effect.spot_light(context))
-        variance = self.lamp.spot_sigma**2 + diffusion_variance(exposure, self.device)
-        sigma = float(np.sqrt(variance + asked["variance"]))
+        width = self.lamp.spot_widths
+        sigma = tuple(float(np.sqrt(w * w + asked["variance"])) for w in width)
         places, fluxes = dithered_spots(pixels, context.stream("spots"))
         fluxes = fluxes * self.lamp.spot_rate * exposure.seconds * self._brightness
         scene = spot_scene(places, fluxes * (1 - asked["halo"]), sigma, pixels)
         if asked["halo"]:
-            wide = float(np.hypot(sigma, asked["halo_sigma"]))
+            wide = tuple(float(np.hypot(s, asked["halo_sigma"])) for s in sigma)
             scene.add(spot_scene(places, fluxes * asked["halo"], wide, pixels))
         return scene
 
