@@ -1,0 +1,121 @@
+"""``python -m validation.concealed make``: campaigns whose truth is sealed."""
+
+from __future__ import annotations
+
+import secrets
+from pathlib import Path
+
+import click
+import numpy as np
+from tqdm import tqdm
+
+from validation.concealed.campaign import write_campaign
+from validation.concealed.effect import Effect
+from validation.concealed.library import EFFECTS, draw_effect, draw_effects, make_effect
+from validation.concealed.plan import SIZES
+
+
+@click.group()
+def main() -> None:
+    """Concealed campaigns of a virtual sensor."""
+
+
+def _asked(words, variant, strength, amplitudes, rng) -> tuple[Effect, ...]:
+    """Draw the effects asked for by class, then set the parameters that were given."""
+    effects = [draw_effect(w, rng, strength=strength, variant=variant) for w in words]
+    for entry in amplitudes:
+        name, _, value = entry.partition("=")
+        at = [k for k, e in enumerate(effects) if name in e.parameters]
+        try:
+            number = float(value)
+        except ValueError:
+            at = []
+        if not at:
+            raise click.UsageError(
+                f"--amplitude {entry}: NAME=NUMBER, a parameter of --class"
+            )
+        effect = effects[at[0]]
+        effects[at[0]] = make_effect(
+            effect.word, {**effect.parameters, name: number}, effect.variant
+        )
+    return tuple(effects)
+
+
+@main.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("--size", type=click.Choice(list(SIZES)), default="S", show_default=True)
+@click.option("--count", default=1, show_default=True, help="Number of campaigns.")
+@click.option("--seed", type=int, help="Fixes everything; secret and fresh if not given.")
+@click.option(
+    "--name", default="concealed", show_default=True, help="NAME_0000, NAME_0001, ..."
+)
+@click.option("--class", "words", multiple=True, type=click.Choice(sorted(EFFECTS)))
+@click.option("--variant", help="Variant of the class, where it has some.")
+@click.option("--strength", type=float, help="0 to 1: place in the range of amplitudes.")
+@click.option(
+    "--amplitude", "amplitudes", multiple=True, help="NAME=NUMBER of a class's parameter."
+)
+@click.option("--null-fraction", default=0.25, show_default=True)
+@click.option("--outside-fraction", default=0.12, show_default=True)
+@click.option("--several-fraction", default=0.16, show_default=True)
+@click.option("--amplifiers", default=2, show_default=True)
+@click.option(
+    "--truth-folder", type=click.Path(path_type=Path), help="Away from the campaigns."
+)
+@click.option(
+    "--withheld-folder", type=click.Path(path_type=Path), help="Exposures kept back."
+)
+def make(
+    folder: Path,
+    size: str,
+    count: int,
+    seed: int | None,
+    name: str,
+    words: tuple[str, ...],
+    variant: str | None,
+    strength: float | None,
+    amplitudes: tuple[str, ...],
+    null_fraction: float,
+    outside_fraction: float,
+    several_fraction: float,
+    amplifiers: int,
+    truth_folder: Path | None,
+    withheld_folder: Path | None,
+) -> None:
+    """Make campaigns under FOLDER: of given classes, or drawn with nulls and foreign ones.
+
+    \b
+    Example:
+      python -m validation.concealed make /tmp/c --class cti_serial --amplitude cti=1e-6
+      python -m validation.concealed make /tmp/c --count 40 --truth-folder /tmp/sealed
+    """
+    seed = secrets.randbits(63) if seed is None else seed
+    try:
+        for number in range(count):
+            rng = np.random.default_rng([seed, number])
+            if words or null_fraction == 1:
+                effects = _asked(words, variant, strength, amplitudes, rng)
+            else:
+                effects = draw_effects(
+                    rng,
+                    null_fraction=null_fraction,
+                    outside_fraction=outside_fraction,
+                    several_fraction=several_fraction,
+                    strength=strength,
+                )
+            write_campaign(
+                folder / f"{name}_{number:04d}",
+                seed=int(rng.integers(2**62)),
+                size=size,
+                effects=effects,
+                amplifiers=amplifiers,
+                truth_folder=truth_folder,
+                withheld_folder=withheld_folder,
+                progress=lambda e, n=number: tqdm(e, desc=f"{name}_{n:04d}", disable=None),
+            )
+    except ValueError as error:
+        raise click.ClickException(str(error)) from None
+
+
+if __name__ == "__main__":
+    main()
