@@ -62,6 +62,7 @@ class FlatChannels:
         self._groups: dict[tuple, _Group] = {}
         self._conditions: dict[tuple[str, ...], Condition] = {}
         self._means: dict[str, list[tuple]] = {}
+        self._ratios: dict[int, list[tuple[float, float]]] = {}
 
     def add_pair(
         self,
@@ -75,7 +76,7 @@ class FlatChannels:
         condition = Condition.of(first[0])
         self._conditions[condition.key] = condition
         time = first[0].exposure_time or 0.0
-        means: list[list[tuple[float, float]]] = [[], []]
+        means: list[list[tuple[float, float, int]]] = [[], []]
         for n, frames in enumerate(zip(first[1], second[1], strict=True)):
             name = frames[0].name
             images = [self.clean(f) for f in frames]
@@ -93,13 +94,14 @@ class FlatChannels:
                 group.parallel.append(profile(frame.parallel_overscan, 0))
             for k in (0, 1):
                 m = found.means[k]
-                # Poisson noise of so many pixels, in ADU for a gain the variance tells, and
-                # that of the overscan's level.
-                shot = max(found.covariances[0, 0], 0.0) / found.pixels
-                zero = self._noise.get(name, 0.0) ** 2 / max(
-                    frames[k].serial_overscan.size // 2, 1
+                read = self._noise.get(name, 0.0) ** 2
+                zero = (
+                    read / max(frames[k].serial_overscan.size // 2, 1) + read / found.pixels
                 )
-                means[k].append((m, shot + zero))
+                means[k].append((m, zero, found.pixels))
+                self._ratios.setdefault(n, []).append(
+                    (m, (found.covariances[0, 0] - read) / m)
+                )
         for (exposure, _), values in zip((first, second), means, strict=True):
             self._means.setdefault(fold, []).append((exposure, condition, values))
 
@@ -143,7 +145,9 @@ class FlatChannels:
         for fold, rows in self._means.items():
             values, blocks, axes = [], [], Axes()
             for exposure, condition, amplifiers in rows:
-                m, variance = np.array(amplifiers).T
+                m, zero, pixels = np.array(amplifiers).T
+                # The effect moves charge between pixels: the noise of the sum of many is Poisson's.
+                variance = m * [self._poisson(n) for n in range(len(m))] / pixels + zero
                 known = exposure.lamp is not None
                 error = self._lamp_error if known else LAMP_UNKNOWN
                 values.append(m)
@@ -158,6 +162,12 @@ class FlatChannels:
                         "adu", fold)
             )  # fmt: skip
         return out
+
+    def _poisson(self, amp: int) -> float:
+        """Variance of a pixel over its mean in weak flats [ADU]."""
+        level, ratio = np.array(self._ratios[amp]).T
+        weak = level <= np.quantile(level, 0.3)
+        return float(max(np.median(ratio[weak]), 0.0))
 
     def _overscans(self) -> list[Channel]:
         out = []

@@ -114,20 +114,19 @@ def fit_baseline(predictor: Predictor, channels: Sequence[Channel]) -> BaselineF
     point = predictor.start.astype(float).copy()
     moved = np.inf
     history: list[float] = []
-    for _ in range(ROUNDS):
+    slopes = np.zeros((total, count))
+    for turn in range(ROUNDS):
         predicted = [predictor.predict(c, point) for c in channels]
         residuals = np.concatenate([
             c.whiten(c.values - p) for c, p in zip(channels, predicted, strict=True)
         ])  # fmt: skip
-        slopes = np.zeros((total, count))
-        for n in range(count):
-            for channel, start, here in zip(channels, starts, predicted, strict=False):
-                if not predictor.depends(channel)[n]:
-                    continue
-                step = point.copy()
-                step[n] += predictor.steps[n]
-                change = (predictor.predict(channel, step) - here) / predictor.steps[n]
-                slopes[start : start + len(channel), n] = channel.whiten(change)
+        # Derivatives hardly change: those of the second round serve all later ones.
+        if turn < 2:
+            for n in range(count):
+                for channel, start, here in zip(channels, starts, predicted, strict=False):
+                    if predictor.depends(channel)[n]:
+                        change = predictor.slope(channel, point, n, here)
+                        slopes[start : start + len(channel), n] = channel.whiten(change)
         design = np.zeros((total + priors, count + linear.shape[1]))
         design[:total, :count] = slopes
         design[:total, count:] = linear / scales

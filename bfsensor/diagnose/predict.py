@@ -105,7 +105,11 @@ class Predictor:
                 )
 
     def predict(
-        self, channel: Channel, parameters: NDArray[np.float64]
+        self,
+        channel: Channel,
+        parameters: NDArray[np.float64],
+        *,
+        only: tuple[str, ...] | None = None,
     ) -> NDArray[np.float64]:
         """What a channel should read, linear terms left out.
 
@@ -115,6 +119,8 @@ class Predictor:
             Its axes say where.
         parameters : ndarray
             In the order of ``names``.
+        only : tuple of str, optional
+            Predict spots of this condition alone.
         """
         a = self._amps
         gains, noise = parameters[:a], parameters[a : 2 * a]
@@ -128,7 +134,7 @@ class Predictor:
         if channel.word == "flat_cov":
             return self._flat_cov(channel, gains, noise, device)
         if channel.word == "spot":
-            return self._spots(channel, gains, device, parameters[2 * a + count :])
+            return self._spots(channel, gains, device, parameters[2 * a + count :], only)
         out = np.zeros(len(channel))
         if channel.word == "bias_cov":
             own = noise[channel.axes["amp"].astype(int)]
@@ -156,6 +162,27 @@ class Predictor:
         if channel.word == "spot":
             return gain | device | sigma
         return noise if channel.word == "bias_cov" else np.zeros(len(names), bool)
+
+    def slope(
+        self,
+        channel: Channel,
+        parameters: NDArray[np.float64],
+        n: int,
+        here: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Derivative of a channel by one parameter, given the prediction there."""
+        step = parameters.copy()
+        step[n] += self.steps[n]
+        if channel.word == "spot" and self.names[n].startswith("sigma"):
+            # Of one condition's width the others know nothing.
+            first = self.names.index(next(m for m in self.names if m.startswith("sigma")))
+            only = self._spot_conditions[(n - first) // 2]
+            moved = self.predict(channel, step, only=only)
+            rows = self._rows(channel)[only]
+            out = np.zeros(len(channel))
+            out[rows] = (moved[rows] - here[rows]) / self.steps[n]
+            return out
+        return (self.predict(channel, step) - here) / self.steps[n]
 
     def linear(self, channel: Channel) -> dict[str, NDArray[np.float64]]:
         """Columns of the linear parameters, by name; the same name is the same parameter."""
@@ -198,6 +225,7 @@ class Predictor:
         gains: NDArray[np.float64],
         device: dict[str, float],
         sigmas: NDArray[np.float64],
+        only: tuple[str, ...] | None,
     ) -> NDArray[np.float64]:
         x = channel.axes
         # Images were put on the scale of electrons with rough gains.
@@ -205,7 +233,7 @@ class Predictor:
         out = np.zeros(len(channel))
         for n, key in enumerate(self._spot_conditions):
             rows = self._rows(channel).get(key, np.zeros(0, int))
-            if not len(rows):
+            if not len(rows) or (only is not None and key != only):
                 continue
             (kx, ky), _ = self.baseline.at(self._spot_of[key], device)
             found = predict_spots(
