@@ -354,8 +354,9 @@ def show(source: str, settings: list[tuple[str, str]], output: Path | None) -> N
     """Draw a table (.fits, GalSim stem) or a DEVICE (name or .toml).
 
     A table: distorted pixel boundaries with their areas, the response against charge,
-    background and depth.  A device: potentials, carriers and electron paths of an empty and
-    a filled pixel.
+    background and depth.  A device, four figures, each with its name before the suffix:
+    potentials and carriers (profiles, sections), drift paths (paths), and electrons that
+    drift, that diffuse, and that a full pixel repels (diffusion).
 
     \b
     Examples:

@@ -5,7 +5,7 @@ the gates, electron paths, distorted pixel boundaries with their areas.  Axes ar
 x serial and y parallel, z up from the gates; light comes from the top.
 
 Matplotlib is needed only here (``pip install 'bfsensor[plots]'``).  The figures of solved
-devices are written in :mod:`bfsensor.show_device`.
+devices are written in :mod:`bfsensor.show_device` and :mod:`bfsensor.show_paths`.
 """
 
 from __future__ import annotations
@@ -17,17 +17,19 @@ from numpy.typing import NDArray
 
 from bfsensor.errors import TableError
 from bfsensor.show_device import (
+    draw_charge_cross_sections,
+    draw_potential_profiles,
+    figure_for_device,
+)
+from bfsensor.show_paths import draw_collected_paths, draw_electron_paths
+from bfsensor.show_style import (
     BLACK,
     BLUE,
     GREEN,
     GREY,
     ORANGE,
     SHOWN_CHARGE,
-    draw_charge_cross_sections,
-    draw_electron_paths,
-    draw_potential_profiles,
     electrons_text,
-    figure_for_device,
     import_matplotlib,
     new_figure,
 )
@@ -43,6 +45,7 @@ __all__ = [
     "SHOWN_CHARGE",
     "draw_area_changes",
     "draw_charge_cross_sections",
+    "draw_collected_paths",
     "draw_depth_response",
     "draw_electron_paths",
     "draw_pixel_boundaries",

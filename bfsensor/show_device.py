@@ -1,10 +1,8 @@
-"""Figures of a solved device: potentials, carriers and electron paths under the gates.
+"""Figures of a solved device: potentials and carriers under the gates; all pages of a device.
 
 They follow figures 6 and 7 of Lage, Bradshaw & Tyson (2017).  Axes are in um, x serial and
 y parallel, z up from the gates; light comes from the top.  :mod:`bfsensor.show` gives these
-functions together with the figures of tables, which share the helpers here.
-
-Colours are those of Okabe & Ito (2008), which the colour-blind can tell apart.
+functions together with the figures of tables.
 """
 
 from __future__ import annotations
@@ -15,11 +13,22 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor._kernels import drift
-from bfsensor.errors import BFSensorError
-from bfsensor.simulate.field import Field
+from bfsensor.show_paths import draw_collected_paths, draw_electron_paths
+from bfsensor.show_style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    PURPLE,
+    RED,
+    SHOWN_CHARGE,
+    central_pixel,
+    electrons_text,
+    import_matplotlib,
+    new_figure,
+)
 from bfsensor.simulate.mesh import Surfaces, make_mesh
 from bfsensor.simulate.poisson import Electrostatics, Potential, solve_unit_cell, tile
+from bfsensor.simulate.transport import Transport
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,47 +36,9 @@ if TYPE_CHECKING:
 
     from bfsensor.device import Device
 
-BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
-PURPLE, SKY, BLACK, GREY = "#CC79A7", "#56B4E9", "#222222", "#B5B5B5"
-
 ELECTRON_COLOUR, HOLE_COLOUR, DOPANT_COLOUR = BLUE, RED, GREEN
 
-SHOWN_CHARGE = 80_000.0
-"""Stored charge of the example figures [e-], as in the publication."""
-
-_PATH_STEP = 0.25  # of the local scale, as for finding boundaries
-_MOST_STEPS = 3000
 _FAINTEST = 1e2  # carriers/um^3 below which a cross section is left white
-
-
-def import_matplotlib() -> Any:
-    """Import matplotlib, or say how to get it.
-
-    Raises
-    ------
-    BFSensorError
-        Matplotlib is missing.
-    """
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise BFSensorError(
-            "figures need matplotlib, which is not installed: pip install 'bfsensor[plots]'"
-        ) from error
-    return matplotlib
-
-
-def new_figure(width: float, height: float) -> Figure:
-    """Make an empty figure of a size [inch], not attached to any window."""
-    import_matplotlib()
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
-
-
-def electrons_text(charge: float) -> str:
-    """Write a number of electrons as it is read: 80 000 e-."""
-    return f"{charge:,.0f}".replace(",", "\u2009") + " e⁻"
 
 
 def draw_potential_profiles(
@@ -108,7 +79,7 @@ def draw_potential_profiles(
         ("channel stop", half_x, 0.0, 0.0),
         (f"barrier gate, {point.gate_low:+g} V", 0.0, half_y, half_x),
     )
-    charge = float(potential.charges[_central_pixel(potential)])
+    charge = float(potential.charges[central_pixel(potential)])
     for column, (name, x, y, distance) in enumerate(places):
         above, below = axes[0][column], axes[1][column]
         gate = float(surfaces.gate(np.array([distance]))[0])
@@ -305,86 +276,6 @@ def draw_charge_cross_sections(
     fig.colorbar(maps[1], ax=axes, shrink=0.6, pad=0.01, label="electrons [µm⁻³]")
 
 
-def draw_electron_paths(
-    potential: Potential,
-    ax: Axes,
-    *,
-    plane: Literal["x", "y"] = "x",
-    paths: int = 8,
-    height: float | None = None,
-) -> None:
-    """Draw drift paths, without diffusion, from the light side to the wells.
-
-    Parameters
-    ----------
-    potential : Potential
-        Solved; paths start in the plane of pixel (0, 0), 1 um below the back surface.
-    ax : matplotlib.axes.Axes
-        Where; colours tell in which undistorted pixel a path started.
-    plane : {'x', 'y'}
-        Along x (y = 0) or along y (x = 0).
-    paths : int
-        Paths a pixel.
-    height : float, optional
-        Upper end of the view [um]; by default the back surface.
-
-    Raises
-    ------
-    BFSensorError
-        Matplotlib is missing, or ``plane`` is neither.
-    """
-    import_matplotlib()
-    from matplotlib.collections import LineCollection
-
-    if plane not in ("x", "y"):
-        raise BFSensorError(f"plane = {plane!r} must be 'x' or 'y'")
-    mesh = potential.mesh
-    axis = 0 if plane == "x" else 1
-    pitch = mesh.pitch[axis]
-    reach = max(0, min(2, int((mesh.period[axis] / pitch - 1) / 2)))
-    pixels = np.arange(0, reach + 1)
-    # Starts avoid centres and edges of pixels, where a path may end on a saddle.
-    fractions = (np.arange(paths) + 0.5) / paths - 0.5
-    starts = np.zeros((len(pixels) * paths, 3))
-    starts[:, axis] = ((pixels[:, None] + fractions) * pitch).ravel()
-    starts[:, 2] = mesh.z[-1] - 1.0
-    field = Field.of(potential)
-    out = np.zeros((len(starts), _MOST_STEPS, 3))
-    lengths = np.zeros(len(starts), np.int64)
-    drift.trace_down(
-        field.phi,
-        field.x,
-        field.y,
-        field.z,
-        starts,
-        field.zone,
-        _PATH_STEP,
-        _MOST_STEPS,
-        out,
-        lengths,
-    )
-    lines, colours = [], []
-    for start, path, length in zip(starts, out, lengths, strict=True):
-        pixel = int(np.round(start[axis] / pitch))
-        colour = (RED, BLUE, GREEN)[pixel % 3]
-        line = path[:length][:, [axis, 2]]
-        lines.append(line)
-        colours.append(colour)
-        if pixel > 0:
-            lines.append(line * np.array([-1.0, 1.0]))
-            colours.append(colour)
-    ax.add_collection(LineCollection(lines, colors=colours, linewidths=0.7, zorder=2))
-    for edge in np.arange(-reach, reach + 2) - 0.5:
-        ax.axvline(edge * pitch, color=GREY, linewidth=0.8, linestyle="--", zorder=1)
-    ax.set_xlim(-(reach + 0.55) * pitch, (reach + 0.55) * pitch)
-    ax.set_ylim(0.0, mesh.z[-1] if height is None else height)
-    ax.set_xlabel(f"{plane}, {'serial' if axis == 0 else 'parallel'} [µm]")
-    ax.set_ylabel("z above the gates [µm]")
-    charge = float(potential.charges[_central_pixel(potential)])
-    content = f"{electrons_text(charge)} in the centre" if charge > 0 else "empty"
-    ax.set_title(f"Drift paths along {plane}, {content}")
-
-
 def figure_for_device(device: Device) -> dict[str, Figure]:
     """Solve an empty and a filled pixel and draw them.
 
@@ -392,12 +283,13 @@ def figure_for_device(device: Device) -> dict[str, Figure]:
     ----------
     device : Device
         What to solve: a period of 4 pixels of 16 cells, pixel (0, 0) once empty, once with
-        :data:`SHOWN_CHARGE`.
+        :data:`~bfsensor.show_style.SHOWN_CHARGE`.
 
     Returns
     -------
     figures : dict of str to matplotlib.figure.Figure
-        ``profiles``, ``sections`` and ``paths``, each to be written with ``savefig``.
+        ``profiles``, ``sections``, ``paths`` (drift alone) and ``diffusion`` (drift, with
+        diffusion, with diffusion above a full pixel), each to be written with ``savefig``.
 
     Raises
     ------
@@ -412,7 +304,7 @@ def figure_for_device(device: Device) -> dict[str, Figure]:
     unit = solve_unit_cell(device, 0.0, cells=16)
     empty = solver.solve(0.0, start=tile(unit, mesh))
     charges = np.zeros(solver.pixel_shape)
-    charges[_central_pixel(empty)] = SHOWN_CHARGE
+    charges[central_pixel(empty)] = SHOWN_CHARGE
     filled = solver.solve(charges, start=empty.phi)
 
     draw_potential_profiles(filled, profiles.subplots(2, 3), empty=empty)
@@ -424,7 +316,26 @@ def figure_for_device(device: Device) -> dict[str, Figure]:
     for row, (solved, height) in enumerate(((filled, None), (empty, 12.0), (filled, 12.0))):
         draw_electron_paths(solved, axes[row, 0], plane="x", paths=16, height=height)
         draw_electron_paths(solved, axes[row, 1], plane="y", paths=16, height=height)
-    return {"profiles": profiles, "sections": sections, "paths": paths}
+    diffusion = _diffusion_page(empty, filled)
+    return {
+        "profiles": profiles,
+        "sections": sections,
+        "paths": paths,
+        "diffusion": diffusion,
+    }
+
+
+def _diffusion_page(empty: Potential, filled: Potential) -> Figure:
+    """Drift, diffusion and repulsion: the whole thickness, and close to the wells."""
+    figure = new_figure(14.0, 13.5)
+    axes = figure.subplots(3, 3)
+    still = Transport(diffusion=0.0)
+    planes: tuple[Literal["x", "y"], ...] = ("x", "x", "y")
+    for row, plane, height in zip(axes, planes, (None, 12.0, 12.0), strict=True):
+        draw_collected_paths(empty, row[0], plane=plane, height=height, transport=still)
+        draw_collected_paths(empty, row[1], plane=plane, height=height)
+        draw_collected_paths(filled, row[2], plane=plane, height=height, compare=empty)
+    return figure
 
 
 def _write_in_gate(ax: Axes, position: float, top: float, text: str) -> None:
@@ -432,12 +343,6 @@ def _write_in_gate(ax: Axes, position: float, top: float, text: str) -> None:
         position, 0.5 * (top - 0.25), text, ha="center", va="center", fontsize=8,
         color="white", zorder=6,
     )  # fmt: skip
-
-
-def _central_pixel(potential: Potential) -> tuple[int, int]:
-    """Place of pixel (0, 0) in ``potential.charges``."""
-    mesh = potential.mesh
-    return int(np.argmax(mesh.pixels("y") == 0)), int(np.argmax(mesh.pixels("x") == 0))
 
 
 def _node(potential: Potential, axis: int, position: float) -> int:

@@ -8,8 +8,10 @@ import pytest
 from bfsensor import show
 from bfsensor.device import Device
 from bfsensor.errors import BFSensorError
+from bfsensor.show_style import BLUE, RED
 from bfsensor.simulate.mesh import make_mesh
 from bfsensor.simulate.poisson import Electrostatics, solve_unit_cell, tile
+from bfsensor.simulate.transport import Transport
 
 matplotlib = pytest.importorskip("matplotlib")
 matplotlib.use("Agg")
@@ -134,10 +136,85 @@ def test_paths_refuse_another_plane(solved, ax):
         show.draw_electron_paths(solved[0], ax, plane="z")
 
 
-def test_figure_for_device_draws_three_pages():
+def collected(potential, **more):
+    """Axes, segments from the lowest layer up, their colours and widths."""
+    ax = new_figure().subplots()
+    show.draw_collected_paths(potential, ax, **more)
+    return ax, sorted(ax.collections, key=lambda c: c.get_zorder())
+
+
+@pytest.mark.parametrize("plane", ["x", "y"])
+def test_without_diffusion_each_pixel_collects_what_is_above_it(solved, plane):
+    ax, (drawn,) = collected(solved[0], plane=plane, transport=Transport(diffusion=0.0))
+    assert has_units(ax) and ax.get_xlabel().startswith(plane)
+    assert "24 of 24 from above the centre" in ax.get_title()
+    for path, colour in zip(drawn.get_segments(), drawn.get_colors(), strict=True):
+        pixel = round(path[0, 0] / PITCH)
+        assert round(path[-1, 0] / PITCH) == pixel
+        assert matplotlib.colors.to_hex(colour) == (RED, BLUE)[abs(pixel)].lower()
+
+
+def test_diffusion_spreads_paths_as_einstein_says(solved):
+    """Half way down, by the drift in the mean field of the bulk of the same column."""
+    empty, _ = solved
+    count = 400
+    _, (drawn,) = collected(empty, plane="x", paths=count, seed=9113)
+    phi, z = empty.phi[:, 0, 0], empty.mesh.z
+    assert len(drawn.get_segments()) == 3 * count
+    # sigma^2 = 2 kT s, s = int dz / |E|; paths are drawn in steps of at most 0.5 um.
+    heights = np.linspace(50.0, z[-1] - 1.0, 2001)
+    slope = -np.gradient(np.interp(heights, z, phi), heights)
+    kt = empty.device.material.thermal_voltage(empty.device.operating_point.temperature)
+    wanted = np.sqrt(2 * kt * np.trapezoid(1 / slope, heights))
+    off = np.array(
+        [
+            path[np.argmax(path[:, 1] < 50.0), 0] - path[0, 0]
+            for path in drawn.get_segments()
+        ]
+    )
+    # 3 sigma of 1200 widths: 6 %.
+    assert off.std() == pytest.approx(wanted, rel=0.07)
+
+
+def test_a_full_pixel_repels(solved):
+    empty, filled = solved
+    ax, (grey, drawn) = collected(filled, compare=empty, paths=100, plane="y")
+    widths = np.array(drawn.get_linewidths())
+    moved = widths > 1
+    assert moved.any() and f"black: {moved.sum()} to another pixel" in ax.get_title()
+    ends = [round(path[-1, 0] / PITCH) for path in drawn.get_segments()]
+    # All that change pixel along y leave the full one.
+    assert all(ends[n] != 0 for n in np.nonzero(moved)[0])
+    black = {matplotlib.colors.to_hex(c) for c in np.array(drawn.get_colors())[moved]}
+    assert black == {"#222222"}
+
+    def kept(axes):
+        return int(axes.get_title().split("\n")[1].split()[0])
+
+    hollow, _ = collected(empty, paths=100, plane="y")
+    assert kept(ax) < kept(hollow)
+    # The same random numbers: in the potential they are compared with, all is the same.
+    ax, (grey, drawn) = collected(empty, compare=empty)
+    assert "black: 0 " in ax.get_title()
+    for one, other in zip(grey.get_segments(), drawn.get_segments(), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_collected_paths_refuse_another_plane(solved, ax):
+    with pytest.raises(BFSensorError, match="plane = 'z' must be 'x' or 'y'"):
+        show.draw_collected_paths(solved[0], ax, plane="z")
+
+
+def test_figure_for_device_draws_four_pages():
     figures = show.figure_for_device(Device.load("itl_sta3800c"))
-    assert list(figures) == ["profiles", "sections", "paths"]
+    assert list(figures) == ["profiles", "sections", "paths", "diffusion"]
     for figure in figures.values():
         figure.canvas.draw()
     assert len(figures["profiles"].axes) == 6
     assert len(figures["paths"].axes) == 6
+    titles = [ax.get_title() for ax in figures["diffusion"].axes]
+    assert len(titles) == 9
+    for drift, diffusion, repulsion in (titles[0:3], titles[3:6], titles[6:9]):
+        assert drift.startswith("drift along") and "empty" in drift
+        assert diffusion.startswith("drift and diffusion along") and "empty" in diffusion
+        assert "000 e" in repulsion and "to another pixel" in repulsion

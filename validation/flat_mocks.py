@@ -3,7 +3,8 @@
 ``python -m validation.flat_mocks [--kind fields|pixels|both] [--mocks N]`` makes campaigns
 of flat pairs, measures and fits them with ``bfsensor.measure``, and writes a row for each
 parameter to ``validation/results/flat_mocks.ecsv``: truth, mean, scatter, stated error,
-pulls, and how often the truth lies within 1 and 1.96 stated errors.
+pulls, and how often the truth lies within 1 and 1.96 stated errors.  The pulls of every mock are
+in ``validation/results/flat_pulls.ecsv``, one row a mock, one column a parameter.
 
 Neither kind of mock shares the fit's series in the level.  ``fields``: Gaussian flats whose
 spectrum is the integral of dC/dm = 1 + 2 (a + c m) C, mode by mode, by quadrature.
@@ -30,6 +31,7 @@ from bfsensor.measure.curve import CovarianceCurve, measure_curve
 from validation.write_results import write_results
 
 RESULTS = Path(__file__).parent / "results" / "flat_mocks.ecsv"
+PULLS = "flat_pulls.ecsv"
 COMMAND = "python -m validation.flat_mocks"
 
 
@@ -219,6 +221,36 @@ def summarise(kind: str, truth: Truth, fits: list[CovarianceFit], side: int) -> 
     return Table(rows)
 
 
+def seed_of(mock: int) -> int:
+    """Seed of a mock by its number."""
+    return 61_000 + 7 * mock
+
+
+def pulls_of(kind: str, truth: Truth, fit: CovarianceFit) -> dict[str, float]:
+    """Pull of every parameter of one mock, by name."""
+    values, errors = parameters_of(fit)
+    known = truth_of(truth, kind)
+    return {name: (values[name] - known[name]) / errors[name] for name in known}
+
+
+def list_pulls(kind: str, truth: Truth, fits: list[CovarianceFit]) -> Table:
+    """Make a row for each mock."""
+    rows = []
+    for mock, fit in enumerate(fits):
+        row: dict[str, object] = {"kind": kind, "mock": mock}
+        pulls = pulls_of(kind, truth, fit)
+        rows.append(row | {name: float(f"{pull:.6g}") for name, pull in pulls.items()})
+    return Table(rows)
+
+
+def replace_kind(path: Path, table: Table, kind: str) -> Table:
+    """Rows of the file with those of one kind replaced."""
+    if not path.exists():
+        return table
+    old = Table.read(path, format="ascii.ecsv")
+    return vstack([old[old["kind"] != kind], table], metadata_conflicts="silent")
+
+
 def main() -> None:
     """Make the mocks, print and write what they give."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -232,7 +264,7 @@ def main() -> None:
     for kind in ("fields", "pixels") if options.kind == "both" else (options.kind,):
         began = time.process_time()
         fits = [
-            measure_mock(kind, truth, options.side, 61_000 + 7 * k)
+            measure_mock(kind, truth, options.side, seed_of(k))
             for k in range(options.mocks)
         ]
         table = summarise(kind, truth, fits, options.side)
@@ -240,11 +272,11 @@ def main() -> None:
         table["dropped"] = sum(len(fit.dropped) for fit in fits)
         table["turnoffs"] = sum(fit.range_reason == "found" for fit in fits)
         table["cpu_s"] = round(time.process_time() - began, 1)
-        if path.exists():
-            old = Table.read(path, format="ascii.ecsv")
-            table = vstack([old[old["kind"] != kind], table], metadata_conflicts="silent")
         command = f"{COMMAND} --mocks {options.mocks} --side {options.side}"
-        write_results(table, str(path), command)
+        write_results(replace_kind(path, table, kind), str(path), command)
+        where = path.with_name(PULLS)
+        listed = list_pulls(kind, truth, fits)
+        write_results(replace_kind(where, listed, kind), str(where), command)
     wanted = ["kind", "parameter", "truth", "mean", "scatter", "stated_error", "pull_mean"]
     Table.read(path, format="ascii.ecsv")[
         [*wanted, "pull_rms", "within_1_sigma", "within_1.96_sigma"]

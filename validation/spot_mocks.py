@@ -16,7 +16,8 @@ Methods: ``noise`` and ``equal`` are the weights of the forward model.
 
 Columns: pulls are (found - truth) / error; ``within_1`` and ``within_2`` the fraction of them
 below 1 and 2; ``found`` for moffat only; of slopes ``peak`` is the median end of the range found.
-``spots_per_s`` is by process time, one thread.
+``spots_per_s`` is by process time, one thread.  The pull of every mock of sizes and slopes is in
+``results/spot_pulls.ecsv``.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ from bfsensor.measure.spots import Stamps
 from validation.write_results import write_results
 
 RESULTS = Path(__file__).parent / "results" / "spot_mocks.ecsv"
+PULLS = "spot_pulls.ecsv"
 COMMAND = "python -m validation.spot_mocks"
 SHAPE = Shape(1.02, 1.05)
 READ_NOISE = 5.0
@@ -47,6 +49,8 @@ READ_NOISE = 5.0
 SLOPES = (0.71, 0.94)
 LADDER = np.linspace(20e3, 240e3, 12)
 BEND = 200e3
+SIZES = ((500.0, 10.0), (2e3, 100.0), (20e3, 100.0), (100e3, 100.0))  # peak, background
+SIZE_SEED, SLOPE_SEED, BEND_SEED, WINGS_SEED = 310, 320, 321, 330
 
 
 def gaussian(x: NDArray, y: NDArray, shape: Shape) -> NDArray:
@@ -105,10 +109,21 @@ def summarise(pulls: NDArray) -> dict[str, float]:
     return row
 
 
+def list_pulls(
+    case: str, method: str, peak: float, pulls: NDArray
+) -> list[dict[str, object]]:
+    """Rows of the pulls (mocks, 2) of one case, mock by mock."""
+    return [
+        {"case": case, "method": method, "asked_peak": peak, "mock": mock}
+        | {"pull_x": float(x), "pull_y": float(y)}
+        for mock, (x, y) in enumerate(pulls)
+    ]
+
+
 def recover_sizes(
     mocks: int, spots: int, peak: float, background: float, seed: int
-) -> list[dict[str, object]]:
-    """Rows of the forward model and of the moments for regions at one peak."""
+) -> tuple[list[dict[str, object]], list[dict[str, object]]]:
+    """Rows of the forward model and of the moments for regions at one peak; their pulls."""
     pulls: dict[str, list] = {"noise": [], "equal": [], "moments": []}
     errors: dict[str, list] = {method: [] for method in pulls}
     chi2: dict[str, list] = {method: [] for method in pulls}
@@ -148,7 +163,12 @@ def recover_sizes(
         row |= {"dropped": dropped[method] / (mocks * spots)}
         row |= {"spots_per_s": round(mocks * spots / seconds[method])}
         rows.append(row)
-    return rows
+    single = [
+        one
+        for method, found in pulls.items()
+        for one in list_pulls("size", method, peak, np.array(found))
+    ]
+    return rows, single
 
 
 def true_widths(peak: float, bend: bool) -> Shape:
@@ -181,8 +201,8 @@ def climb(
 
 def recover_slopes(
     mocks: int, spots: int, weights: str, bend: bool, seed: int
-) -> dict[str, object]:
-    """Row of ladders with known slopes; errors are those with the range's effect."""
+) -> tuple[dict[str, object], list[dict[str, object]]]:
+    """Row of ladders with known slopes, and pulls; errors are those with the range's effect."""
     pulls, errors, highest = [], [], []
     for mock in range(mocks):
         fits = climb(
@@ -212,7 +232,8 @@ def recover_slopes(
     row |= {"background": 100.0, "truth_x": SLOPES[0], "truth_y": SLOPES[1]}
     error = np.mean(errors, axis=0)
     row |= {"error_x": error[0], "error_y": error[1]}
-    return row | summarise(np.array(pulls))
+    single = list_pulls(str(row["case"]), weights, np.nan, np.array(pulls))
+    return row | summarise(np.array(pulls)), single
 
 
 def fit_wings(spots: int, weights: str, seed: int) -> list[dict[str, object]]:
@@ -251,22 +272,30 @@ def main() -> None:
     options = parser.parse_args()
     mocks, spots = options.mocks, options.spots
     rows: list[dict[str, object]] = []
-    for seed, (peak, background) in enumerate(
-        [(500.0, 10.0), (2e3, 100.0), (20e3, 100.0), (100e3, 100.0)], 310
-    ):
-        rows += recover_sizes(mocks, spots, peak, background, seed)
+    pulls: list[dict[str, object]] = []
+    for seed, (peak, background) in enumerate(SIZES, SIZE_SEED):
+        found, single = recover_sizes(mocks, spots, peak, background, seed)
+        rows += found
+        pulls += single
     few = max(spots // 3, 10)
     for weights in ("noise", "equal"):
-        rows.append(recover_slopes(mocks, few, weights, False, 320))
-        rows.append(recover_slopes(mocks, few, weights, True, 321))
-        rows += fit_wings(spots, weights, 330)
+        for bend, seed in ((False, SLOPE_SEED), (True, BEND_SEED)):
+            row, single = recover_slopes(mocks, few, weights, bend, seed)
+            rows.append(row)
+            pulls += single
+        rows += fit_wings(spots, weights, WINGS_SEED)
     names = list(dict.fromkeys(name for row in rows for name in row))
     table = Table({name: [row.get(name, np.nan) for row in rows] for name in names})
     for name in names:
         if table[name].dtype.kind == "f":
             table[name] = [float(f"{value:.5g}") for value in table[name]]
     print("\n".join(table.pformat(max_width=-1, max_lines=-1)))
-    write_results(table, options.output, f"{COMMAND} --mocks {mocks} --spots {spots}")
+    command = f"{COMMAND} --mocks {mocks} --spots {spots}"
+    write_results(table, options.output, command)
+    listed = Table(rows=pulls)
+    for name in ("pull_x", "pull_y"):
+        listed[name] = [float(f"{value:.6g}") for value in listed[name]]
+    write_results(listed, str(Path(options.output).with_name(PULLS)), command)
 
 
 if __name__ == "__main__":

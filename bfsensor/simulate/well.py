@@ -46,6 +46,34 @@ def barrier(potential: Potential) -> float:
     return float(highest[own].max() - highest[path].min())
 
 
+def surface_barrier(potential: Potential) -> float:
+    """Height that keeps the electrons of pixel (0, 0) off the oxide [V].
+
+    The potential of the well less the highest at the interface of silicon and oxide in the
+    same pixel.  Electrons in equilibrium are there less dense than in the middle of the cloud
+    by exp(-height / kT): at 0.1 V and 173 K by a factor 1000.
+
+    Parameters
+    ----------
+    potential : Potential
+        On a domain that holds part of pixel (0, 0).
+
+    Returns
+    -------
+    height : float
+        Barrier [V]; zero where the electrons lie at the interface.
+    """
+    mesh = potential.mesh
+    own_x = np.abs(mesh.x) <= mesh.pitch[0] / 2 + 1e-9
+    own_y = np.abs(mesh.y) <= mesh.pitch[1] / 2 + 1e-9
+    pixel = np.ix_(np.arange(potential.silicon.shape[0]), own_y, own_x)
+    silicon = potential.silicon[pixel] > 0
+    front = np.where(silicon, potential.phi[pixel], -np.inf)
+    lowest = np.argmax(silicon, axis=0)
+    interface = np.take_along_axis(front, lowest[None], axis=0)
+    return float(front.max() - interface.max())
+
+
 def full_well(device: Device, *, cells: int = 16) -> float:
     """Charge at which the barrier along the column falls to the spill barrier [e-].
 
