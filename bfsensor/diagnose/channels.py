@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -100,6 +101,10 @@ class Channel:
                 ) from None
             roots.append(solve_triangular(root, np.eye(len(root)), lower=True))
         return csr_array(block_diag(roots, format="csr"))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        given = (self.word, self.values, self.blocks, dict(self.axes), self.unit, self.fold)
+        return Channel, given
 
     def __len__(self) -> int:
         return len(self.values)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -201,37 +200,3 @@ def _step_down(
                 Finding(template.family, template.word, z, p, dict(template.where))
             )
     return findings
-
-
-def summarise(findings: Sequence[Finding]) -> dict[str, Any]:
-    """Location of the report: channels, lags, levels, columns, rows, amplifiers, exposures."""
-    out: dict[str, Any] = {
-        "channels": list(dict.fromkeys(f.word for f in findings)), "lags": [], "flux_e": [],
-        "x": [], "y": [], "amps": [], "wavelength": [], "exposures": [],
-    }  # fmt: skip
-    strongest: dict[str, Finding] = {}
-    for finding in findings:
-        for key in finding.where:
-            strongest.setdefault(key, finding)
-    for finding in findings:
-        # Only what comes near the strongest of its kind: its shadow reaches far.
-        if finding.family == "chi-square":
-            continue
-        if "lags" in finding.where and abs(finding.z) > 0.5 * abs(strongest["lags"].z):
-            for lag in finding.where["lags"]:
-                if list(lag) not in out["lags"]:
-                    out["lags"].append(list(lag))
-    for key, name in (
-        ("level", "flux_e"),
-        ("x", "x"),
-        ("y", "y"),
-        ("exposure", "exposures"),
-    ):
-        if key in strongest:
-            out[name] = [float(v) for v in strongest[key].where[key]]
-    for key, name in (("amp", "amps"),):
-        if key in strongest and strongest[key].where[key] != "all":
-            out[name] = [strongest[key].where[key]]
-    if "condition" in strongest:
-        out["wavelength"] = [float(strongest["condition"].where["condition"].split("/")[0])]
-    return out
