@@ -255,5 +255,19 @@ def named(exposures: Iterable[Exposure], most: int = 3) -> str:
     return ", ".join(names[:most]) + rest
 
 
+def count_of(number: int, word: str) -> str:
+    """Give a number with its noun.
+
+    Examples
+    --------
+    >>> count_of(1, "pair"), count_of(0, "bias"), count_of(3, "flat")
+    ('1 pair', 'no biases', '3 flats')
+    """
+    if number == 1:
+        return f"1 {word}"
+    plural = f"{word}es" if word.endswith("s") else f"{word}s"
+    return f"{number or 'no'} {plural}"
+
+
 Progress = Callable[[int, int], None]
 """Called with what is done and what there is."""
