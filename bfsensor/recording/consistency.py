@@ -123,8 +123,8 @@ def check_layout(amplifiers: Sequence[AmplifierLayout]) -> list[Caution]:
         found.append(
             Caution(
                 "axes",
-                f"{above[0].name}: BIASSEC lies above DATASEC, not beside it, and no columns "
-                "follow the image: no serial overscan was kept, or x and y are exchanged",
+                f"{above[0].name}: BIASSEC lies above DATASEC, not beside it: it is no serial "
+                "overscan, or x and y are exchanged",
                 "serial and parallel effects are exchanged if so; x must be serial",
             )
         )
@@ -336,8 +336,9 @@ def _place(one: AmplifierLayout) -> str:
 
 
 def _bias_above(one: AmplifierLayout) -> bool:
+    """Whether the overscan that the header names follows in y, not in x."""
     return bool(
         one.bias is not None
-        and one.serial_overscan == 0
         and one.bias[0].start >= one.data[0].stop
+        and one.bias[1].start < one.data[1].stop
     )

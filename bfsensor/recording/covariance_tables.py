@@ -1,4 +1,4 @@
-"""Covariances that others measured: our ECSV table, LSST's datasets, tables of a_ij."""
+"""Covariances that others measured: our ECSV table and LSST's datasets."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from astropy.io import ascii as text_tables
-from astropy.io.ascii import InconsistentTableError
 from astropy.table import Table
 from numpy.typing import ArrayLike, NDArray
 
@@ -135,9 +133,9 @@ def read_covariances(path: str | os.PathLike[str]) -> CovarianceTable:
     n = len(table)
     gain = _gain(path, table)
     if "mu_e" in table.colnames:
-        level = _floats(table, "mu_e")
+        level = floats(table, "mu_e")
     elif "mu_adu" in table.colnames:
-        level = _floats(table, "mu_adu") * gain
+        level = floats(table, "mu_adu") * gain
     else:
         raise RecordingError(f"{path}: mu_e (or mu_adu with a gain) missing")
     unit = str(table.meta.get("unit", "electron"))
@@ -147,7 +145,7 @@ def read_covariances(path: str | os.PathLike[str]) -> CovarianceTable:
     factor = factor / 2 if table.meta.get("difference", False) else factor
     warnings = []
     if "sigma" in table.colnames:
-        error = _floats(table, "sigma") * factor
+        error = floats(table, "sigma") * factor
     else:
         raise RecordingError(
             f"{path}: sigma missing: a covariance without error is refused"
@@ -169,10 +167,10 @@ def read_covariances(path: str | os.PathLike[str]) -> CovarianceTable:
     return _checked(
         CovarianceTable(
             path=path, amplifier=np.array([str(v) for v in names]), level=level,
-            lag_x=_whole(path, table, "i"), lag_y=_whole(path, table, "j"),
-            covariance=_floats(table, "cov") * factor, error=error,
-            pixels=_whole(path, table, "npix"), pairs=_whole(path, table, "npair"),
-            wavelength=_floats(table, "wavelength"), back_bias=_floats(table, "vbb"),
+            lag_x=whole_numbers(path, table, "i"), lag_y=whole_numbers(path, table, "j"),
+            covariance=floats(table, "cov") * factor, error=error,
+            pixels=whole_numbers(path, table, "npix"), pairs=whole_numbers(path, table, "npair"),
+            wavelength=floats(table, "wavelength"), back_bias=floats(table, "vbb"),
             matrix=matrix, warnings=tuple(warnings),
         )
     )  # fmt: skip
@@ -246,98 +244,6 @@ def from_photon_transfer(dataset: PhotonTransferDataset, path: Path) -> Covarian
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class AreaChangeTable:
-    """Measured a_ij: relative change of the pixel's area per electron, by lag.
-
-    Attributes
-    ----------
-    path : Path
-        Where they came from.
-    a, errors : ndarray, shape (ny, nx)
-        [j, i], from lag (0, 0) [1/e-]; nan where not given.
-    independent : ndarray of bool, shape (ny, nx)
-        False at (0, 0) where it was set so that all lags add up to nothing.
-    warnings : tuple of str
-    """
-
-    path: Path
-    a: NDArray[np.float64]
-    errors: NDArray[np.float64]
-    independent: NDArray[np.bool_]
-    warnings: tuple[str, ...] = ()
-
-    @property
-    def what(self) -> str:
-        """One line for a list."""
-        ny, nx = self.a.shape
-        return f"a_ij, lags to {nx - 1}, {ny - 1}, a_00 = {self.a[0, 0]:.3e} per electron"
-
-
-def read_area_changes(
-    path: str | os.PathLike[str],
-    *,
-    columns: tuple[str, str, str, str] = (
-        "i_serial",
-        "j_parallel",
-        "cov_per_e",
-        "err_per_e",
-    ),
-) -> AreaChangeTable:
-    """Read a table of a_ij, comma-separated or ECSV, lines with # passed over.
-
-    Parameters
-    ----------
-    path : path-like
-        The table.
-    columns : tuple of str
-        Names of the columns of the lag in x, the lag in y, the value and its error
-        [1/e-]; by default those of the published ITL and E2V tables as they are kept here.
-        A table with the axes the other way is read by exchanging the first two.
-
-    Raises
-    ------
-    RecordingError
-        A column is missing, a lag is given twice or is no whole number.
-
-    Notes
-    -----
-    Such tables are C_ij over C_00 and the level, or slopes of it: the flux range is the
-    publisher's.  Where all lags, those of both signs counted, add up to less than a
-    hundredth of the sum's error, a_00 was computed from the rest: it is no measurement.
-    """
-    path = Path(path)
-    try:
-        form = "ecsv" if path.suffix == ".ecsv" else "csv"
-        table = text_tables.read(path, format=form, comment="#")
-    except (OSError, ValueError, InconsistentTableError) as error:
-        line = " ".join(str(error).split())[:200]
-        raise RecordingError(f"{path}: cannot be read: {line}") from None
-    require(str(path), table.colnames, columns)
-    i, j = (_whole(path, table, name) for name in columns[:2])
-    if min(i.min(), j.min()) < 0:
-        raise RecordingError(f"{path}: lags below 0 are not read; average the quadrants")
-    a = np.full((j.max() + 1, i.max() + 1), np.nan)
-    errors = a.copy()
-    if len(set(zip(i.tolist(), j.tolist(), strict=True))) < len(i):
-        raise RecordingError(f"{path}: a lag is given twice")
-    a[j, i], errors[j, i] = _floats(table, columns[2]), _floats(table, columns[3])
-    times = np.where(np.arange(a.shape[1]) > 0, 2, 1) * np.where(
-        np.arange(a.shape[0]) > 0, 2, 1
-    )[:, None]  # fmt: skip
-    total = np.nansum(times * a)
-    scatter = np.sqrt(np.nansum((times * errors) ** 2))
-    independent = np.isfinite(a)
-    warnings = [_larger_axis(float(a[0, 1]), float(a[1, 0]))] if min(a.shape) > 1 else []
-    if abs(total) < 0.01 * scatter:
-        independent[0, 0] = False
-        warnings.append(
-            f"all lags add up to {total:.1e}, with an error of {scatter:.1e}: a_00 was set by "
-            "the sum and is not independent; charge conservation is not tested by this table"
-        )
-    return AreaChangeTable(path, a, errors, independent, tuple(w for w in warnings if w))
-
-
 def _checked(table: CovarianceTable) -> CovarianceTable:
     """Refuse what cannot be used; add warnings about units and axes."""
     from dataclasses import replace
@@ -369,7 +275,7 @@ def _checked(table: CovarianceTable) -> CovarianceTable:
     for lag in ((1, 0), (0, 1)):
         here = (table.lag_x == lag[0]) & (table.lag_y == lag[1])
         at[lag] = float(np.mean(table.covariance[here])) if here.any() else np.nan
-    warnings.append(_larger_axis(at[1, 0], at[0, 1]))
+    warnings.append(warn_of_axes(at[1, 0], at[0, 1]))
     return replace(table, warnings=tuple(w for w in warnings if w))
 
 
@@ -382,7 +288,7 @@ def _meaning(ratio: float) -> str:
     return "a wrong gain, or ADU taken for electrons?"
 
 
-def _larger_axis(x: float, y: float) -> str:
+def warn_of_axes(x: float, y: float) -> str:
     """Warn where the neighbour in x gains more than that in y; '' otherwise."""
     if not x > y:
         return ""
@@ -395,7 +301,7 @@ def _larger_axis(x: float, y: float) -> str:
 def _gain(path: Path, table: Table) -> NDArray[np.float64]:
     """Gain of each row [e-/ADU]; nan where not said, an error where it is needed."""
     if "gain" in table.colnames:
-        return _floats(table, "gain")
+        return floats(table, "gain")
     value = table.meta.get("gain")
     needed = "mu_e" not in table.colnames or table.meta.get("unit") == "adu"
     if value is None and needed:
@@ -403,16 +309,16 @@ def _gain(path: Path, table: Table) -> NDArray[np.float64]:
     return np.full(len(table), np.nan if value is None else float(value))
 
 
-def _floats(table: Table, name: str) -> NDArray[np.float64]:
+def floats(table: Table, name: str) -> NDArray[np.float64]:
     """Give a column as floats; nan where it is masked or not there."""
     if name not in table.colnames:
         return np.full(len(table), np.nan)
     return np.asarray(np.ma.filled(np.ma.asarray(table[name], float), np.nan), float)
 
 
-def _whole(path: Path, table: Table, name: str) -> NDArray[np.int64]:
+def whole_numbers(path: Path, table: Table, name: str) -> NDArray[np.int64]:
     """Give a column as whole numbers; 0 where it is not there."""
-    values = _floats(table, name) if name in table.colnames else np.zeros(len(table))
+    values = floats(table, name) if name in table.colnames else np.zeros(len(table))
     if not np.all(values == np.round(values)):
         raise RecordingError(f"{path}: {name} must be whole numbers")
     return values.astype(np.int64)

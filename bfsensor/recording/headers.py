@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from astropy.io import fits
 from astropy.utils.exceptions import AstropyUserWarning
+from scipy.integrate import trapezoid
 
 from bfsensor.errors import RecordingError
 from bfsensor.recording.fits_images import header_cards
@@ -22,7 +23,9 @@ from bfsensor.recording.keywords import Override, header_units, quantity
 from bfsensor.recording.sections import AmplifierLayout, layout_of
 
 SUFFIXES = (".fits", ".fit", ".fts", ".fits.fz", ".fits.gz", ".fit.gz")
-BROKEN = (OSError, EOFError, ValueError, TypeError, KeyError, zlib.error, fits.VerifyError)
+BROKEN = (
+    OSError, EOFError, ValueError, TypeError, LookupError, zlib.error, fits.VerifyError,
+)  # fmt: skip
 """What astropy may raise on a damaged file."""
 
 AMPLIFIER_ENTRIES = {
@@ -224,7 +227,7 @@ def _mean_current(hdu: fits.BinTableHDU, cards: Mapping[str, Any]) -> float | No
         return None
     current = np.abs(current)
     dark = np.median(np.sort(current)[: max(len(current) // 10, 1)])
-    return float(np.trapezoid(current - dark, t) / seconds * 1e9)
+    return float(trapezoid(current - dark, t) / seconds * 1e9)
 
 
 def whole_digest(scan: FileScan) -> str:

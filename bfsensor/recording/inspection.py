@@ -42,10 +42,10 @@ class FrameStatistics:
     exposure, amplifier : int, str
         Which.
     level : float
-        Median of the box in the middle above the pedestal [ADU].
+        Mean of the box in the middle, cut at 5 sigma, above the pedestal [ADU].
     pedestal, noise : float
-        Median of the serial overscan and the scatter in it [ADU]; of the biases where there
-        is no overscan; nan without either.
+        Mean of the serial overscan and the scatter in it [ADU]; without overscan the biases'
+        mean, and no scatter; nan without either.
     not_finite, saturated, top : float
         Shares of the image's pixels: not finite, saturated, and equal to the largest one.
     """
@@ -213,13 +213,9 @@ def _statistics(frame: AmplifierFrame) -> FrameStatistics:
     top = float(np.max(image, where=finite, initial=-np.inf))
     over = frame.serial_overscan[:, SKIP:]
     over = over[np.isfinite(over)] if over.shape[1] > 2 else over[:0]
-    pedestal = float(np.median(over)) if over.size else np.nan
-    noise = (
-        MAD_TO_SIGMA * float(np.median(np.abs(over - pedestal))) if over.size else np.nan
-    )
+    pedestal, noise = _mean_and_scatter(over)
     box = _box(frame)
-    box = box[np.isfinite(box)]
-    raw = float(np.median(box)) if box.size else np.nan
+    raw, _ = _mean_and_scatter(box[np.isfinite(box)])
     return FrameStatistics(
         exposure=frame.exposure,
         amplifier=frame.name,
@@ -230,6 +226,19 @@ def _statistics(frame: AmplifierFrame) -> FrameStatistics:
         saturated=float(np.count_nonzero(image >= frame.saturation)) / image.size,
         top=float(np.count_nonzero(image == top)) / image.size,
     )
+
+
+def _mean_and_scatter(values: NDArray[np.float32]) -> tuple[float, float]:
+    """Mean and standard deviation of what lies within 5 sigma of the median.
+
+    Medians of whole numbers would be whole numbers.
+    """
+    if not values.size:
+        return float("nan"), float("nan")
+    middle = float(np.median(values))
+    sigma = MAD_TO_SIGMA * float(np.median(np.abs(values - middle)))
+    kept = values[np.abs(values - middle) <= 5 * max(sigma, 0.5)].astype(np.float64)
+    return float(kept.mean()), float(kept.std())
 
 
 def _box(frame: AmplifierFrame) -> NDArray[np.float32]:

@@ -111,9 +111,10 @@ class Override:
     keywords : tuple of str
         Tried before the table's.
     unit : str
-        What the header's number is in; '' as the table says.
+        What the numbers of headers, and of a manifest's column without a unit, are in; '' as
+        the table says.
     scale : float
-        The header's number is multiplied by it, such as -1 for a sign.
+        These numbers are multiplied by it, such as -1 for a sign.
     value : object
         The same for every exposure, whatever headers say; None for what they say.
     """

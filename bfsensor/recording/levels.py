@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.recording.campaign import Campaign
-from bfsensor.recording.exposures import Caution, named
+from bfsensor.recording.exposures import Caution, count_of, named
 
 if TYPE_CHECKING:
     from bfsensor.recording.inspection import FrameStatistics, PairStatistics
@@ -54,7 +54,7 @@ def check_saturation(
         found.append(
             Caution(
                 "saturation",
-                f"{name}: the variance of {len(wrong)} pairs falls below that of lower levels, "
+                f"{name}: the variance of {count_of(len(wrong), 'pair')} is below that of lower levels, "
                 f"from {lowest.level:.0f} ADU on: saturated",
                 "leave them out of covariances; they give the full well",
                 tuple(n for p in wrong for n in (p.first, p.second)),
@@ -276,13 +276,15 @@ def _largest_step(values: NDArray[np.float64]) -> tuple[int, float, float]:
     """Index, size and scatter of the largest step between medians of neighbours in time."""
     if len(values) < 2 * WINDOW:
         return 0, 0.0, 0.0
-    best = (0, 0.0, 0.0)
+    best, most = (0, 0.0, 0.0), 0.0
     for k in range(WINDOW, len(values) - WINDOW + 1):
         before, after = values[k - WINDOW : k], values[k : k + WINDOW]
         step = float(np.median(after) - np.median(before))
-        if abs(step) > abs(best[1]):
-            both = np.concatenate([before - np.median(before), after - np.median(after)])
-            best = (k, step, 1.4826 * float(np.median(np.abs(both))))
+        both = np.concatenate([before - np.median(before), after - np.median(after)])
+        # A window that has a part of the other side gives the same step, with more scatter.
+        score = abs(step) - 2 * float(np.mean(np.abs(both)))
+        if score > most:
+            best, most = (k, step, 1.4826 * float(np.median(np.abs(both)))), score
     return best
 
 

@@ -15,7 +15,7 @@ from astropy.table import Table
 from bfsensor.errors import RecordingError
 from bfsensor.recording.exposures import LIT, TOLERANCES
 from bfsensor.recording.headers import FileScan, file_sha256, is_fits, scan_file
-from bfsensor.recording.keywords import MEANINGS, kind_in_name, translate
+from bfsensor.recording.keywords import MEANINGS, Override, kind_in_name, translate
 from bfsensor.recording.settings import CampaignSettings
 
 COLUMNS = {
@@ -86,8 +86,17 @@ def natural(name: str) -> list[tuple[int, float, str]]:
     return [(0, float(p), "") if p[:1].isdigit() else (1, 0.0, p) for p in parts]
 
 
-def read_manifest(path: Path) -> list[dict[str, Any]]:
+def read_manifest(
+    path: Path, overrides: Mapping[str, Override] | None = None
+) -> list[dict[str, Any]]:
     """Read manifest.ecsv: a mapping for each row, None where it says nothing.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    overrides : mapping of str to Override, optional
+        Units and scales of campaign.yaml, for columns that have no unit themselves.
 
     Raises
     ------
@@ -112,6 +121,11 @@ def read_manifest(path: Path) -> list[dict[str, Any]]:
         for name, column in there.items()
         if name in MEANINGS and table[column].unit is not None
     }
+    scales = {
+        name: Override(unit=one.unit, scale=one.scale)
+        for name, one in (overrides or {}).items()
+        if MEANINGS[name].keywords[0] not in units
+    }
     rows = []
     for k in range(len(table)):
         plain = {name: _plain(table[column][k]) for name, column in there.items()}
@@ -120,7 +134,7 @@ def read_manifest(path: Path) -> list[dict[str, Any]]:
             for name, value in plain.items()
             if name in MEANINGS and value is not None
         }
-        said, problems = translate(cards, card_units=units)
+        said, problems = translate(cards, card_units=units, overrides=scales)
         said.update({name: plain.get(name) for name in ("file", "mjd", "pair", "sha256")})
         said["problems"] = problems
         rows.append(said)
@@ -149,7 +163,7 @@ def gather(
     has_manifest : bool
     """
     files = {one.name: one for one in list_files(folder)}
-    rows = read_manifest(settings.manifest) if settings.manifest else []
+    rows = read_manifest(settings.manifest, settings.overrides) if settings.manifest else []
     entries: list[Entry] = []
     taken: set[Path] = set()
     for row in rows:

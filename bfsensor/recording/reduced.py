@@ -15,12 +15,8 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bfsensor.errors import RecordingError
-from bfsensor.recording.covariance_tables import (
-    AreaChangeTable,
-    CovarianceTable,
-    read_area_changes,
-    read_covariances,
-)
+from bfsensor.recording.area_changes import AreaChangeTable, read_area_changes
+from bfsensor.recording.covariance_tables import CovarianceTable, read_covariances
 from bfsensor.recording.headers import is_fits
 from bfsensor.recording.manifest import list_files
 
