@@ -6,7 +6,6 @@ import fnmatch
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import yaml
@@ -81,10 +80,6 @@ class CampaignSettings:
     pair_tolerance: float = 1e-3
     nuisances: Mapping[str, Any] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        for one in ("overrides", "excluded", "nuisances"):
-            object.__setattr__(self, one, MappingProxyType(dict(getattr(self, one))))
 
     def reason_to_exclude(self, name: str) -> str | None:
         """Give the reason for which campaign.yaml leaves a file out; None where it does not."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import pickle
 import shutil
 
 import numpy as np
@@ -69,6 +70,11 @@ def test_a_whole_campaign(whole):
         (96, 80), 24, 16,
     )  # fmt: skip
     assert layout.flip_x and not campaign.amplifiers[0].flip_x
+
+
+def test_pickling(whole):
+    campaign = read_campaign(whole)
+    assert pickle.loads(pickle.dumps(campaign)) == campaign
 
 
 def test_the_manifest_is_not_needed(copied):
