@@ -13,6 +13,7 @@ from typing import Any
 
 import click
 
+from bfsensor.cli_check import check
 from bfsensor.cli_common import load_device, parse_settings
 from bfsensor.cli_measure import measure
 from bfsensor.cli_spots import spots
@@ -388,6 +389,7 @@ def show(source: str, settings: list[tuple[str, str]], output: Path | None) -> N
 
 main.add_command(spots)
 main.add_command(measure)
+main.add_command(check)
 
 
 if __name__ == "__main__":

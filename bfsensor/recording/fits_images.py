@@ -149,7 +149,7 @@ def read_raw(
         )
     if skip < 0:
         raise RecordingError(f"skip = {skip} must not be negative")
-    with _opened(path) as hdus:
+    with open_fits(path) as hdus:
         images = _images(path, hdus, extensions)
         if sections is not None and len(images) > 1:
             raise RecordingError(
@@ -159,7 +159,7 @@ def read_raw(
         names = [str(hdu.header.get("EXTNAME", "")) for hdu in images]
         amplifiers: list[AmplifierImage] = []
         for number, hdu in enumerate(images):
-            cards = {**_cards(hdus[0].header), **_cards(hdu.header)}
+            cards = {**header_cards(hdus[0].header), **header_cards(hdu.header)}
             name = names[number] or "image"
             if names.count(names[number]) > 1:
                 name = f"{name} {number + 1}"
@@ -233,7 +233,7 @@ def read_bias(
 
 
 @contextmanager
-def _opened(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
+def open_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
     """Open a file and let the harmless faults of old cameras' cards pass."""
     with warnings.catch_warnings():
         # Lower-case exponents, null padding: read correctly, warned about.
@@ -268,7 +268,7 @@ def _images(
     return found
 
 
-def _cards(header: fits.Header) -> dict[str, Any]:
+def header_cards(header: fits.Header) -> dict[str, Any]:
     """Cards with a value, by keyword; comments and history are left out."""
     skipped = ("COMMENT", "HISTORY", "", "SIMPLE", "XTENSION", "BITPIX", "BSCALE", "BZERO")
     return {

@@ -1,0 +1,291 @@
+"""Where one amplifier lies in its file and on the sensor: FITS sections, reversed ones too.
+
+Everything here is in readout order: x counts serial transfers from the output, y parallel
+ones.  A reversed DATASEC means that the file stores an axis backwards, a reversed DETSEC that
+the sensor's coordinate runs against the readout.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.errors import RecordingError
+
+Box = tuple[slice, slice]
+"""Rows and columns."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A FITS section, '[x1:x2,y1:y2]', as slices from 0 and two directions."""
+
+    rows: slice
+    columns: slice
+    flip_x: bool = False
+    flip_y: bool = False
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
+
+
+def parse_section(text: Any, where: str) -> Section:
+    """Read a FITS section of either direction.
+
+    Parameters
+    ----------
+    text : str
+        Such as '[1:128,1:256]', counted from 1, ends included, x first.
+    where : str
+        Named in errors.
+
+    Raises
+    ------
+    RecordingError
+        It is not of that form, or begins below 1.
+
+    Examples
+    --------
+    >>> found = parse_section("[256:129,1:256]", "DETSEC")
+    >>> found.columns, found.flip_x, found.flip_y
+    (slice(128, 256, None), True, False)
+    """
+    match = re.fullmatch(r"\s*\[\s*(\d+):(\d+)\s*,\s*(\d+):(\d+)\s*\]\s*", str(text))
+    if match is None:
+        raise RecordingError(f"{where} = {text!r} is not like '[1:512,1:2000]'")
+    x1, x2, y1, y2 = (int(number) for number in match.groups())
+    if min(x1, x2, y1, y2) < 1:
+        raise RecordingError(f"{where} = {text!r} begins below 1")
+    return Section(
+        slice(min(y1, y2) - 1, max(y1, y2)), slice(min(x1, x2) - 1, max(x1, x2)),
+        x1 > x2, y1 > y2,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class AmplifierLayout:
+    """Where the pixels of an amplifier are, in the file and on the sensor.
+
+    Attributes
+    ----------
+    name : str
+        EXTNAME, or the name given in campaign.yaml.
+    hdu : int
+        Number of the extension.
+    stored : tuple of int
+        Shape (ny, nx) of the stored image.
+    window : (slice, slice)
+        Rows and columns of the stored image that are this amplifier's.
+    stored_flip_x, stored_flip_y : bool
+        The file holds the axis backwards.
+    data : (slice, slice)
+        Image section, in readout order within the window.
+    bias : (slice, slice) or None
+        Overscan that the header names, likewise.
+    origin : tuple of int or None
+        Sensor coordinates (x, y) of the corner of lowest x and y, from 0, in pixels as read
+        (binned); None where not known.
+    flip_x, flip_y : bool
+        The sensor's coordinate falls in readout order.
+    on_sensor : tuple of int or None
+        Rows and columns there; not those of ``data`` where the header is wrong.
+    binning : tuple of int
+        In x and y.
+    gain, noise, saturation : float or None
+        [e-/ADU], [e-], [ADU], where the header or campaign.yaml says.
+    """
+
+    name: str
+    hdu: int
+    stored: tuple[int, int]
+    window: Box
+    stored_flip_x: bool
+    stored_flip_y: bool
+    data: Box
+    bias: Box | None
+    origin: tuple[int, int] | None
+    flip_x: bool
+    flip_y: bool
+    on_sensor: tuple[int, int] | None
+    binning: tuple[int, int] = (1, 1)
+    gain: float | None = None
+    noise: float | None = None
+    saturation: float | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the image section."""
+        rows, columns = self.data
+        return rows.stop - rows.start, columns.stop - columns.start
+
+    @property
+    def raw_shape(self) -> tuple[int, int]:
+        """Rows and columns with prescan and overscan."""
+        rows, columns = self.window
+        return rows.stop - rows.start, columns.stop - columns.start
+
+    @property
+    def serial_overscan(self) -> int:
+        """Columns read after the image's last one."""
+        return self.raw_shape[1] - self.data[1].stop
+
+    @property
+    def parallel_overscan(self) -> int:
+        """Rows read after the image's last one."""
+        return self.raw_shape[0] - self.data[0].stop
+
+    @property
+    def prescan(self) -> int:
+        """Columns read before the image's first one."""
+        return int(self.data[1].start)
+
+    def geometry(self) -> tuple[Any, ...]:
+        """What must agree between exposures: everything but gain, noise and saturation."""
+        return tuple(
+            str(getattr(self, name)) for name in self.__dataclass_fields__
+        )[:-3]  # fmt: skip
+
+    def footprint(self) -> tuple[int, int, int, int] | None:
+        """First and last + 1 of x and of y on the sensor."""
+        if self.origin is None:
+            return None
+        (x, y), (ny, nx) = self.origin, self.shape
+        return x, x + nx, y, y + ny
+
+
+def layout_of(
+    where: str, name: str, hdu: int, stored: tuple[int, int], cards: Mapping[str, Any]
+) -> AmplifierLayout:
+    """Find one amplifier's place from DATASEC, BIASSEC, DETSEC and CCDSUM.
+
+    Parameters
+    ----------
+    where : str
+        Named in errors.
+    name, hdu, stored
+        See :class:`AmplifierLayout`.
+    cards : mapping
+        Also WINDOW, a section of the stored image, which campaign.yaml may give.
+
+    Raises
+    ------
+    RecordingError
+        A section that is none, or leaves the image; says so where it would fit with x and y
+        exchanged.
+    """
+    window = Section(slice(0, stored[0]), slice(0, stored[1]))
+    if cards.get("WINDOW"):
+        window = parse_section(cards["WINDOW"], f"{where}: window")
+        _inside(window, stored, f"{where}: window = {cards['WINDOW']!r}")
+    data, bias = window, None
+    if cards.get("DATASEC"):
+        data = parse_section(cards["DATASEC"], f"{where}: DATASEC")
+        _inside(data, stored, f"{where}: DATASEC = {cards['DATASEC']!r}")
+    if cards.get("BIASSEC"):
+        bias = parse_section(cards["BIASSEC"], f"{where}: BIASSEC")
+        _inside(bias, stored, f"{where}: BIASSEC = {cards['BIASSEC']!r}")
+    for section, card in ((data, "DATASEC"), (bias, "BIASSEC")):
+        if section is not None and not _within(section, window):
+            raise RecordingError(f"{where}: {card} leaves the amplifier's window")
+
+    def readout(section: Section) -> Box:
+        return (
+            _seen_from(section.rows, window.rows, data.flip_y),
+            _seen_from(section.columns, window.columns, data.flip_x),
+        )
+
+    layout = AmplifierLayout(
+        name=name, hdu=hdu, stored=stored, window=(window.rows, window.columns),
+        stored_flip_x=data.flip_x, stored_flip_y=data.flip_y, data=readout(data),
+        bias=None if bias is None else readout(bias), origin=None, flip_x=False, flip_y=False,
+        on_sensor=None,
+    )  # fmt: skip
+    if not cards.get("DETSEC"):
+        return layout
+    place = parse_section(cards["DETSEC"], f"{where}: DETSEC")
+    bx, by = _binning(cards.get("CCDSUM"), where)
+    # Some cameras count the binned pixels there, most the sensor's own.
+    if place.shape == layout.shape:
+        bx_place, by_place = 1, 1
+    else:
+        bx_place, by_place = bx, by
+    ny, nx = place.shape
+    return replace(
+        layout,
+        origin=(place.columns.start // bx_place, place.rows.start // by_place),
+        flip_x=place.flip_x, flip_y=place.flip_y,
+        on_sensor=(-(-ny // by_place), -(-nx // bx_place)), binning=(bx, by),
+    )  # fmt: skip
+
+
+def to_sensor(layout: AmplifierLayout, image: NDArray[Any]) -> NDArray[Any]:
+    """Turn an image in readout order as the sensor lies (and back), a view."""
+    return image[:: -1 if layout.flip_y else 1, :: -1 if layout.flip_x else 1]
+
+
+def overlaps(layouts: Sequence[AmplifierLayout]) -> list[tuple[str, str]]:
+    """Names of the amplifiers that claim the same pixels of the sensor.
+
+    Examples
+    --------
+    >>> card = {"DETSEC": "[1:4,1:4]"}
+    >>> overlaps([layout_of("x", n, 1, (4, 4), card) for n in ("A", "B")])
+    [('A', 'B')]
+    """
+    found = []
+    for k, one in enumerate(layouts):
+        for other in layouts[k + 1 :]:
+            a, b = one.footprint(), other.footprint()
+            if a is None or b is None:
+                continue
+            if max(a[0], b[0]) < min(a[1], b[1]) and max(a[2], b[2]) < min(a[3], b[3]):
+                found.append((one.name, other.name))
+    return found
+
+
+def _seen_from(part: slice, whole: slice, flipped: bool) -> slice:
+    """Slice within a window, from its other end where the axis is stored backwards."""
+    if flipped:
+        return slice(whole.stop - part.stop, whole.stop - part.start)
+    return slice(part.start - whole.start, part.stop - whole.start)
+
+
+def _within(part: Section, whole: Section) -> bool:
+    return bool(
+        whole.rows.start <= part.rows.start
+        and part.rows.stop <= whole.rows.stop
+        and whole.columns.start <= part.columns.start
+        and part.columns.stop <= whole.columns.stop
+    )
+
+
+def _inside(section: Section, stored: tuple[int, int], where: str) -> None:
+    """Refuse a section that leaves the stored image."""
+    ny, nx = stored
+    if section.rows.stop <= ny and section.columns.stop <= nx:
+        return
+    exchanged = section.rows.stop <= nx and section.columns.stop <= ny
+    raise RecordingError(
+        f"{where} leaves the image, {nx} x {ny} pixels"
+        + ("; with x and y exchanged it would fit" if exchanged else "")
+    )
+
+
+def _binning(text: Any, where: str) -> tuple[int, int]:
+    """Read CCDSUM, '2 2'; 1 in both where it is not there."""
+    if text is None:
+        return 1, 1
+    try:
+        bx, by = (int(float(word)) for word in np.atleast_1d(str(text).split()))
+    except ValueError:
+        raise RecordingError(f"{where}: CCDSUM = {text!r} is not like '1 1'") from None
+    if min(bx, by) < 1:
+        raise RecordingError(f"{where}: CCDSUM = {text!r} must be above 0")
+    return bx, by
