@@ -34,7 +34,13 @@ def draw_lags(axes: Table, pulls: NDArray[np.float64], ax: Axes) -> None:
         for b in range(image.shape[0]):
             here = (i == a) & (j == b)
             image[b, a] = (weight[here] @ pulls[here]) / np.sqrt((weight[here] ** 2).sum())
-    _image(image, ax, "lag x", "lag y", (-0.5, image.shape[1] - 0.5, -0.5, image.shape[0] - 0.5))
+    _image(
+        image,
+        ax,
+        "lag x",
+        "lag y",
+        (-0.5, image.shape[1] - 0.5, -0.5, image.shape[0] - 0.5),
+    )
 
 
 def draw_lag_levels(axes: Table, pulls: NDArray[np.float64], ax: Axes, *, lags: Sequence[tuple[int, int]]) -> None:  # fmt: skip
@@ -42,7 +48,12 @@ def draw_lag_levels(axes: Table, pulls: NDArray[np.float64], ax: Axes, *, lags: 
     for n, (a, b) in enumerate(lags):
         here = (axes["i"] == a) & (axes["j"] == b)
         ax.plot(
-            axes["level"][here] / 1e3, pulls[here], "o", ms=4, color=f"C{n}", label=f"({a},{b})"
+            axes["level"][here] / 1e3,
+            pulls[here],
+            "o",
+            ms=4,
+            color=f"C{n}",
+            label=f"({a},{b})",
         )
     _band(ax)
     ax.set(xlabel="level [1000 ADU]", ylabel="pull")
@@ -53,7 +64,12 @@ def draw_means(axes: Table, relative: NDArray[np.float64], ax: Axes) -> None:
     """Relative residual of the means against level."""
     for amp in np.unique(axes["amp"]):
         here = axes["amp"] == amp
-        ax.plot(axes["level"][here] / 1e3, 100 * relative[here], ".", label=f"amplifier {int(amp) + 1}")
+        ax.plot(
+            axes["level"][here] / 1e3,
+            100 * relative[here],
+            ".",
+            label=f"amplifier {int(amp) + 1}",
+        )
     ax.axhline(0, color="0.6", lw=0.8)
     ax.set(xlabel="level [1000 ADU]", ylabel="mean, residual [%]")
     ax.legend(frameon=False, fontsize=8)
@@ -66,9 +82,16 @@ def draw_overscan(axes: Table, values: NDArray[np.float64], errors: NDArray[np.f
         top = own & (axes["level"] > 0.7 * axes["level"][own].max())
         k = np.unique(axes["k"])
         weight = 1 / errors**2
-        mean = [np.average(values[top & (axes["k"] == q)], weights=weight[top & (axes["k"] == q)]) for q in k]
+        mean = [
+            np.average(
+                values[top & (axes["k"] == q)], weights=weight[top & (axes["k"] == q)]
+            )
+            for q in k
+        ]
         error = [1 / np.sqrt(weight[top & (axes["k"] == q)].sum()) for q in k]
-        ax.errorbar(k + 0.1 * n, mean, error, fmt="o", ms=3, label=f"amplifier {int(amp) + 1}")
+        ax.errorbar(
+            k + 0.1 * n, mean, error, fmt="o", ms=3, label=f"amplifier {int(amp) + 1}"
+        )
     ax.axhline(0, color="0.6", lw=0.8)
     ax.set(xlabel="overscan pixel", ylabel="above its tail [ADU]")
     ax.legend(frameon=False, fontsize=8)
@@ -118,10 +141,18 @@ def draw_noise(axes: Table, pulls: NDArray[np.float64], ax: Axes) -> None:
     ax.legend(frameon=False, fontsize=8)
 
 
-def draw_parameters(pulls: Mapping[str, float], errors: Mapping[str, float], ax: Axes) -> None:
+def draw_parameters(
+    pulls: Mapping[str, float], errors: Mapping[str, float], ax: Axes
+) -> None:
     """Device parameters in units of their spread."""
     names = list(pulls)[::-1]
-    ax.errorbar([pulls[n] for n in names], range(len(names)), xerr=[errors[n] for n in names], fmt="ko", ms=4)
+    ax.errorbar(
+        [pulls[n] for n in names],
+        range(len(names)),
+        xerr=[errors[n] for n in names],
+        fmt="ko",
+        ms=4,
+    )
     ax.set_yticks(range(len(names)), names)
     ax.axvspan(-1, 1, color="0.9", zorder=0)
     ax.set_xlabel("off the card [its spread]")
@@ -133,9 +164,15 @@ def _band(ax: Axes) -> None:
 
 
 def _image(
-    image: NDArray[np.float64], ax: Axes, x: str, y: str, extent: tuple[float, float, float, float]
+    image: NDArray[np.float64],
+    ax: Axes,
+    x: str,
+    y: str,
+    extent: tuple[float, float, float, float],
 ) -> None:
     top = max(4.0, float(np.nanmax(np.abs(image))))
-    drawn = ax.imshow(image, origin="lower", cmap="RdBu_r", vmin=-top, vmax=top, extent=extent)
+    drawn = ax.imshow(
+        image, origin="lower", cmap="RdBu_r", vmin=-top, vmax=top, extent=extent
+    )
     ax.figure.colorbar(drawn, ax=ax, label="pull", shrink=0.8)
     ax.set(xlabel=x, ylabel=y)

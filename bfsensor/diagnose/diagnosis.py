@@ -78,7 +78,9 @@ class Diagnosis:
         for finding in lags:
             # A strong one casts shadows: what is less than half of it is not listed.
             if abs(finding.z) > 0.5 * abs(lags[0].z):
-                out["lags"] += [list(p) for p in finding.where["lags"] if list(p) not in out["lags"]]
+                out["lags"] += [
+                    list(p) for p in finding.where["lags"] if list(p) not in out["lags"]
+                ]
         if "level" in best:
             finding = best["level"]
             scale = 1.0 if finding.word == "spot" else self.gain
@@ -124,7 +126,9 @@ class Diagnosis:
         """Contents of report.json."""
         fitted = {
             name: {"value": float(v), "error": float(e)}
-            for name, v, e in zip(self.fit.names, self.fit.values, self.fit.errors, strict=True)
+            for name, v, e in zip(
+                self.fit.names, self.fit.values, self.fit.errors, strict=True
+            )
             if not name.startswith(("map ", "spot ", "light ", "dark "))
         }
         return {
@@ -217,6 +221,7 @@ def _finite(value: float) -> float | None:
 
 def _plain(where: dict[str, Any]) -> dict[str, Any]:
     """Tuples as lists, numpy's numbers as Python's."""
+
     def plain(v: Any) -> Any:
         if isinstance(v, list | tuple):
             return [plain(x) for x in v]

@@ -151,7 +151,16 @@ def measure_channels(
                 if fold != "held-out":
                     codes.add(each)
             if fold != "held-out":
-                maps.add_pair(Condition.of(one), one.exposure_time or 0.0, *whole)
+                bias_noise = [
+                    noise.get(f.name, 0.0)
+                    / np.sqrt(max(len(kinds.get("bias", [])), 1))
+                    / i.mean()
+                    for f, i in zip(frames[1], images, strict=True)
+                ]
+                maps.add_pair(
+                    Condition.of(one), one.exposure_time or 0.0, whole[0], whole[1],
+                    shared=float(np.sqrt(np.mean(np.square(bias_noise)))),
+                )  # fmt: skip
     for channel in flats.channels():
         if channel.word == "flat_cov":
             _rough_gains(channel, gains)

@@ -44,6 +44,7 @@ class MapChannels:
         time: float,
         first: NDArray[np.float64],
         second: NDArray[np.float64],
+        shared: float = 0.0,
     ) -> None:
         """Add a pair of flats, each over its amplifiers' means.
 
@@ -55,6 +56,8 @@ class MapChannels:
             Exposure time [s].
         first, second : ndarray, shape of the sensor
             nan where no amplifier reads or a pixel is bad.
+        shared : float
+            Noise that all flats share, that of the mean bias, over the mean.
         """
         self._conditions[condition.key] = condition
         group = self._groups.setdefault(
@@ -76,6 +79,7 @@ class MapChannels:
         group.high += float(np.diff(noise, axis=1).var()) / 2
         group.power += _ring_power(noise)
         group.pairs += 1
+        group.shared += shared
 
     def channels(self) -> list[Channel]:
         """Columns, rows, blocks and rings of the map of all light, and of what differs.
@@ -119,6 +123,10 @@ class MapChannels:
         weights = weights / weights.sum()
         with np.errstate(invalid="ignore", divide="ignore"):
             image = sum(w * g.total / g.count for w, g in zip(weights, groups, strict=True))
+        # The mean bias is the same in all; of it differences of pairs know nothing.
+        common = (
+            sum(w * g.shared / g.pairs for w, g in zip(weights, groups, strict=True)) ** 2
+        )
         # A mean of 2 n flats, whose single noise each pair tells.
         low = sum(
             w**2 * g.low / (2 * g.pairs**2) for w, g in zip(weights, groups, strict=True)
@@ -128,7 +136,13 @@ class MapChannels:
         )
         pairs = sum(g.pairs for g in groups)
         ratio = sum(g.low / max(g.high, 1e-30) * g.pairs for g in groups) / pairs
-        return _Map(np.asarray(image), float(low), np.asarray(power), float(ratio), pairs)
+        return _Map(
+            np.asarray(image),
+            float(low) + common,
+            np.asarray(power) + common,
+            float(ratio),
+            pairs,
+        )
 
     def _parts(
         self, image: _Map, *, own: bool
@@ -210,6 +224,7 @@ class _Group:
     high: float = 0.0
     power: NDArray[np.float64] = field(default_factory=lambda: np.zeros(RINGS))
     pairs: int = 0
+    shared: float = 0.0
 
 
 @dataclass

@@ -288,11 +288,13 @@ class Predictor:
                         basis[rows] = u[rows] ** p * v[rows] ** q
                         out[f"map {name} {what} {p}{q}"] = basis
             ring = here & (x["what"] == "ring")
+            if ring.any():
+                # Sizes of pixels, and the effect, which evens the pixels' response out: more at
+                # some levels and conditions than at others, so that ratios keep of it.
+                for power in (2, 4):
+                    out[f"map {name} rings k{power}"] = np.where(ring, x["k"] ** power, 0.0)
             if name == "all" and ring.any():
                 out["map rings white"] = np.where(ring, 1.0, 0.0)
-                # Sizes of pixels, and the effect, which evens the pixels' response out.
-                for power in (2, 4):
-                    out[f"map rings k{power}"] = np.where(ring, x["k"] ** power, 0.0)
             for amp, (flip, origin) in enumerate(
                 zip(self.measured.flips, self.measured.origins, strict=True)
             ):

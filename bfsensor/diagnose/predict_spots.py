@@ -26,8 +26,8 @@ def grow_spots(
     """Mean images of Gaussian spots as they build up.
 
     The light that each boundary sweeps over by its shift, seen at the middle of each step,
-    goes from one of its pixels to the other: shifts are small against the spot, and
-    first order in them.
+    goes from one of its pixels to the other.  What two shifts share at a corner, second order
+    in them, is left out.
 
     Parameters
     ----------
@@ -53,16 +53,10 @@ def grow_spots(
     along_x = np.diff(ndtr((edge - x[:, None]) / sigma[0]), axis=1)
     along_y = np.diff(ndtr((edge - y[:, None]) / sigma[1]), axis=1)
 
-    def density(centre: NDArray[np.float64], width: float) -> NDArray[np.float64]:
-        u = (edge[1:] - centre[:, None]) / width
-        return np.asarray(np.exp(-0.5 * u * u) / (np.sqrt(2 * np.pi) * width))
-
     light = along_y[:, :, None] * along_x[:, None]
-    # Light on each right and upper edge, per pixel of shift; the outermost see none.
-    right = along_y[:, :, None] * density(x, sigma[0])[:, None]
-    upper = density(y, sigma[1])[:, :, None] * along_x[:, None]
-    right[..., -1] = 0.0
-    upper[:, -1] = 0.0
+    at_x = (edge[1:] - x[:, None])[:, None] / sigma[0]
+    at_y = (edge[1:] - y[:, None])[:, :, None] / sigma[1]
+    below_x, below_y = ndtr(at_x), ndtr(at_y)
     padded = next_fast_len(size + kx.shape[0] - 1)
     spectra = [rfft2(k, s=(padded, padded)) for k in (kx, ky)]
     half = kx.shape[0] // 2
@@ -76,10 +70,13 @@ def grow_spots(
             irfft2(seen * k, s=(padded, padded))[:, inside, inside] for k in spectra
         )
         gained = each * light
-        across = each * shift_x * right
+        # Light changes across a shift of a tenth of a pixel: its integral, not its value.
+        across = each * along_y[:, :, None] * (ndtr(at_x + shift_x / sigma[0]) - below_x)
+        across[..., -1] = 0.0
         gained += across
         gained[..., 1:] -= across[..., :-1]
-        across = each * shift_y * upper
+        across = each * along_x[:, None] * (ndtr(at_y + shift_y / sigma[1]) - below_y)
+        across[:, -1] = 0.0
         gained += across
         gained[:, 1:] -= across[:, :-1]
         charge = charge + gained

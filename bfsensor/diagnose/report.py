@@ -78,7 +78,9 @@ def draw_figures(diagnosis: Diagnosis, folder: Path) -> dict[str, Path]:
         found[word] = max(parts, key=lambda p: len(p[0]))
     out: dict[str, Path] = {}
 
-    def add(name: str, caption: str, size: tuple[float, float], *parts: Callable[[Axes], None]) -> None:
+    def add(
+        name: str, caption: str, size: tuple[float, float], *parts: Callable[[Axes], None]
+    ) -> None:
         figure = Figure(figsize=size, layout="constrained")
         for n, part in enumerate(parts):
             part(figure.add_subplot(1, len(parts), n + 1))
@@ -92,7 +94,9 @@ def draw_figures(diagnosis: Diagnosis, folder: Path) -> dict[str, Path]:
         n.removeprefix("device "): float(e)
         for n, e in zip(fit.names, fit.errors, strict=True) if n.startswith("device ")
     }  # fmt: skip
-    parts: list[Callable[[Axes], None]] = [lambda ax: show.draw_channels(diagnosis.mismatch.chi2, ax)]
+    parts: list[Callable[[Axes], None]] = [
+        lambda ax: show.draw_channels(diagnosis.mismatch.chi2, ax)
+    ]
     if fit.pulls:
         parts.append(lambda ax: show.draw_parameters(fit.pulls, errors, ax))
     add("channels", "How far each channel is from the baseline, all that may float fitted; and the "
@@ -162,17 +166,17 @@ def to_html(diagnosis: Diagnosis, figures: dict[str, Path]) -> str:
 <html lang=en><meta charset=utf-8><title>{text(diagnosis.campaign)}: diagnosis</title>
 <style>{STYLE}</style>
 <h1>{text(diagnosis.campaign)}</h1>
-<p class="said{'' if report['detected'] else ' clear'}">{text(report['said'])}</p>
+<p class="said{"" if report["detected"] else " clear"}">{text(report["said"])}</p>
 <p>Baseline: {text(diagnosis.baseline)}. Exposures: {text(exposures)}.
-{'' if heldout is None else f'Flats that were not fitted: chi-square per value {heldout:.2f}.'}
-Family-wise p: {report['p_value']:.2g} (chi-squares {report['p_chi2']:.2g}, scans {report['p_scans']:.2g});
-below {report['alarm']:g} counts as detected.</p>
+{"" if heldout is None else f"Flats that were not fitted: chi-square per value {heldout:.2f}."}
+Family-wise p: {report["p_value"]:.2g} (chi-squares {report["p_chi2"]:.2g}, scans {report["p_scans"]:.2g});
+below {report["alarm"]:g} counts as detected.</p>
 <h2>Channels</h2>
-<table><tr><th>channel<th>chi-square<th>dof<th>ratio<th>p of the channel alone</tr>{''.join(rows)}</table>
-{f'<h2>What stands out</h2><table><tr><th>channel<th>scan<th>deviates<th>family-wise p<th>where</tr>{found}</table>' if found else ''}
+<table><tr><th>channel<th>chi-square<th>dof<th>ratio<th>p of the channel alone</tr>{"".join(rows)}</table>
+{f"<h2>What stands out</h2><table><tr><th>channel<th>scan<th>deviates<th>family-wise p<th>where</tr>{found}</table>" if found else ""}
 <h2>Residuals of the baseline</h2>
-{pictures or '<p>No figures: matplotlib is not installed.</p>'}
-{f'<h2>Notes</h2><ul class=notes>{notes}</ul>' if notes else ''}
+{pictures or "<p>No figures: matplotlib is not installed.</p>"}
+{f"<h2>Notes</h2><ul class=notes>{notes}</ul>" if notes else ""}
 </html>
 """
 

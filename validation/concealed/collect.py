@@ -77,7 +77,7 @@ class Response:
 
     @classmethod
     def of(cls, shifts: EdgeShifts, pixels: int, **laws) -> Response:
-        """Put shift kernels on a sensor's grid; it continues periodically beyond its rim."""
+        """Put shift kernels on a sensor's grid, periodic in what differs from the light's shape."""
         return cls(transform(shifts.kx, pixels), transform(shifts.ky, pixels), **laws)
 
 
@@ -171,24 +171,47 @@ def _still(displaced):
     return x[:, 1:], y[1:], np.diff(x, axis=1) + np.diff(y, axis=0)
 
 
-def _acting(response: Response, middle: Image) -> NDArray[np.complex64]:
-    """Transform of the charge as the shifts feel it."""
-    if response.curvature:
-        middle = middle * (1 + np.float32(response.curvature / 2) * middle)
-    return scipy.fft.rfft2(middle)
+def _acting(
+    response: Response, middle: Image, smooth: Image | None = None
+) -> NDArray[np.complex64]:
+    """Transform of the charge as the shifts feel it, less that of the smooth part if given."""
+
+    def felt(charge: Image) -> Image:
+        return charge * (1 + np.float32(response.curvature / 2) * charge)
+
+    if smooth is not None:
+        return scipy.fft.rfft2(felt(middle) - felt(smooth))
+    return scipy.fft.rfft2(felt(middle) if response.curvature else middle)
 
 
-def _turned(response: Response, middle: Image) -> NDArray[np.complex64]:
-    return scipy.fft.rfft2(middle * (1 - middle / np.float32(response.turning)))
+def _turned(
+    response: Response, middle: Image, smooth: Image | None = None
+) -> NDArray[np.complex64]:
+    def felt(charge: Image) -> Image:
+        return charge * (1 - charge / np.float32(response.turning))
+
+    return scipy.fft.rfft2(felt(middle) if smooth is None else felt(middle) - felt(smooth))
+
+
+def _smooth(scene: Scene, middle: Image) -> Image:
+    """Charge that the scene's light alone has brought.
+
+    It repels evenly where it is smooth; across the rim, where one side of the sensor would meet
+    the other, it does not, and must not act.
+    """
+    return scene.light * np.float32(
+        middle.sum(dtype=np.float64) / scene.light.sum(dtype=np.float64)
+    )
 
 
 def _gather_flat(scene, response, middle, strength, still):
     """Light of smooth scenes: areas alone matter."""
     area = np.ones_like(scene.light) if still is None else 1 + still[2]
     if middle is not None:
-        moved = _acting(response, middle) * response.area
+        smooth = _smooth(scene, middle)
+        moved = _acting(response, middle, smooth) * response.area
         if response.extra is not None:
-            moved = moved + _turned(response, middle) * response.extra
+            moved = moved + _turned(response, middle, smooth) * response.extra
         area += strength * scipy.fft.irfft2(moved, s=area.shape)
     return scene.light * area
 
