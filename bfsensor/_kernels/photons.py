@@ -153,9 +153,9 @@ def find_origin(pattern, x, y, part):
         dx, dy = fixed_shift(pattern, px, py, part)
         new_x = px + dx - x
         new_y = py + dy - y
+        if n >= 3 and abs(new_x) + abs(new_y) < _ORIGIN_TOLERANCE:
+            return x - dx, y - dy
         if n >= 4:
-            if abs(new_x) + abs(new_y) < _ORIGIN_TOLERANCE:
-                break
             to_x = _next_place(px, before_x, new_x, excess_x)
             to_y = _next_place(py, before_y, new_y, excess_y)
         else:

@@ -92,7 +92,10 @@ class ShiftMap:
 
         Shifts of opposite edges add up, and those of x and y do not know of each other: the
         corners of a sensor are not modelled.  Around the sensor the shift of its outermost
-        boundaries is held, so that light beyond the last pixel lands where they say.
+        boundaries is held, so that light beyond the last pixel lands where they say.  The
+        shift grows with the height of conversion like that of long doping ripples ('bulk'):
+        that of a guard ring does so from about three thicknesses / pi on; nearer, light that
+        converts deep is moved too little or too much (``validation/edge_shift.ipynb``).
 
         Parameters
         ----------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from bfsensor import Device
 from bfsensor.device_parts import Edge, EdgeStrip, Implant, Ripple
-from bfsensor.errors import DeviceError
+from bfsensor.errors import ConvergenceError, DeviceError
 from bfsensor.simulate.boundaries import find_boundaries
 from bfsensor.simulate.edge_field import FrontPlane, front_plane, solve_edge
 from bfsensor.simulate.edge_shift import trace_edge
@@ -269,3 +270,21 @@ def test_refused_depths():
     ):  # fmt: skip
         with pytest.raises(DeviceError, match=message):
             trace_edge(edge, depths)
+
+
+def test_unconverged_holes_are_refused(monkeypatch):
+    monkeypatch.setattr("bfsensor.simulate.edge_system._MAX_NEWTON", 3)
+    device = with_strips(contact(20.0, 50.0), EdgeStrip(300.0))
+    with pytest.raises(ConvergenceError, match="did not settle in 3 steps") as caught:
+        solve_edge(device, front=PIXELS)
+    assert len(caught.value.history) == 3
+
+
+def test_a_device_file_describes_the_edge():
+    device = Device.load(Path(__file__).parents[2] / "validation" / "decam_like.toml")
+    assert Device.from_toml(device.to_toml()) == device
+    edge = solve_edge(device)
+    shift = trace_edge(edge, [250.0])
+    # A ring below the pixels' potential draws light in from beyond the array.
+    assert edge.front.potential > 5.0
+    assert np.all(shift.area_changes[0, :20] > 0)
