@@ -31,7 +31,7 @@ def light(x, y):
 @pytest.mark.parametrize("size", [1.7, -6.0])
 def test_areas_and_light_follow_the_boundaries(side, size):
     """Pixels that lose light and pixels that are several times too large."""
-    shifts = size * FALL if size > 0 else size * FALL
+    shifts = size * FALL
     shifts = np.maximum.accumulate(shifts + np.arange(41)) - np.arange(41)
     instrument = sensor(ShiftMap.from_edges((NY, NX), **{side: shifts}))
     axis, end = SIDES[side]
