@@ -236,7 +236,11 @@ class Well:
 
 @dataclass(frozen=True)
 class EdgeStrip:
-    """A strip beyond the last pixel: at a voltage [V], or field-free where that is None."""
+    """A strip beyond the last pixel: at a voltage [V], or field-free where that is None.
+
+    A voltage acts behind the gate or field oxide, or at the silicon itself ('none': a contact).
+    Nothing holds the surface of a field-free strip.
+    """
 
     width: float = _quantity("length", "um", 0.0, above=True)
     voltage: float | None = _quantity("potential", "V", default=None)

@@ -13,6 +13,9 @@ from bfsensor._kernels.counter_rng import deviates, words
 
 BUFFER = 1024
 LOST = np.float32(-1.0)
+_ORIGIN_STEPS = 64
+_FLATTEST, _STEEPEST = 0.02, 50.0  # relative areas of pixels
+_ORIGIN_TOLERANCE = 1e-6  # pixel
 
 
 class Light(NamedTuple):
@@ -121,6 +124,50 @@ def fixed_shift(pattern, x, y, part):
                 + d * pattern.map_y[j + 1, i + 1]
             )
     return dx, dy
+
+
+@numba.njit(cache=True, inline="always")
+def _next_place(now, before, excess, excess_before):
+    """Secant step, each axis by itself, its slope kept positive: boundaries never cross."""
+    moved = now - before
+    slope = 1.0
+    if abs(moved) > 1e-12:
+        slope = min(max((excess - excess_before) / moved, _FLATTEST), _STEEPEST)
+    return now - excess / slope
+
+
+@numba.njit(cache=True, _nrt=False)
+def find_origin(pattern, x, y, part):
+    """Point whose shift leads to (x, y) [pixel], for ``part`` of the thickness.
+
+    Four plain steps are enough for rings; where they are not, as next to a guard ring, whose
+    pixels can be several times too large or small, secants go on.
+    """
+    px = x
+    py = y
+    before_x = x
+    before_y = y
+    excess_x = 0.0
+    excess_y = 0.0
+    for n in range(_ORIGIN_STEPS):
+        dx, dy = fixed_shift(pattern, px, py, part)
+        new_x = px + dx - x
+        new_y = py + dy - y
+        if n >= 3 and abs(new_x) + abs(new_y) < _ORIGIN_TOLERANCE:
+            return x - dx, y - dy
+        if n >= 4:
+            to_x = _next_place(px, before_x, new_x, excess_x)
+            to_y = _next_place(py, before_y, new_y, excess_y)
+        else:
+            to_x = x - dx
+            to_y = y - dy
+        before_x = px
+        before_y = py
+        excess_x = new_x
+        excess_y = new_y
+        px = to_x
+        py = to_y
+    return px, py
 
 
 @numba.njit(cache=True, _nrt=False)
@@ -273,11 +320,6 @@ def land(
                 part = np.float64(out_z[m]) / medium.thickness
                 if part < 0.0:
                     continue
-                px = out_x[m]
-                py = out_y[m]
-                for _ in range(4):
-                    dx, dy = fixed_shift(pattern, px, py, part)
-                    px = out_x[m] - dx
-                    py = out_y[m] - dy
+                px, py = find_origin(pattern, out_x[m], out_y[m], part)
                 out_x[m] = px
                 out_y[m] = py

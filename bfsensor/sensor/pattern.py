@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from bfsensor._kernels.photons import Pattern
 from bfsensor.errors import SensorError
@@ -79,6 +79,71 @@ class ShiftMap:
     __hash__ = None  # type: ignore[assignment]
 
     @classmethod
+    def from_edges(
+        cls,
+        shape: tuple[int, int],
+        *,
+        x_low: ArrayLike | None = None,
+        x_high: ArrayLike | None = None,
+        y_low: ArrayLike | None = None,
+        y_high: ArrayLike | None = None,
+    ) -> ShiftMap:
+        """Make the map of a sensor whose boundaries shift near its edges.
+
+        Shifts of opposite edges add up, and those of x and y do not know of each other: the
+        corners of a sensor are not modelled.  Around the sensor the shift of its outermost
+        boundaries is held, so that light beyond the last pixel lands where they say.  The
+        shift grows with the height of conversion like that of long doping ripples ('bulk'):
+        that of a guard ring does so from about three thicknesses / pi on; nearer, light that
+        converts deep is moved too little or too much (``validation/edge_shift.ipynb``).
+
+        Parameters
+        ----------
+        shape : tuple of int
+            Rows and columns of the sensor; its first pixel is (1, 1).
+        x_low, x_high, y_low, y_high : array_like, shape (n + 1,), optional
+            Shifts [pixel] of the boundaries at 0, 1, ..., n pixels from that edge for
+            conversion at the back surface, positive away from the edge: the last row of
+            ``pixel_shifts`` of :class:`bfsensor.simulate.edge_shift.EdgeShift`.
+
+        Returns
+        -------
+        ShiftMap
+
+        Raises
+        ------
+        SensorError
+            Shifts that are not finite, not one-dimensional, that cross one another, or that
+            end before they have fallen to a hundredth.
+
+        Examples
+        --------
+        >>> falling = -0.5 * np.exp(-np.arange(30) / 3.0)
+        >>> edges = ShiftMap.from_edges((40, 60), x_low=falling, x_high=falling)
+        >>> edges.dx.shape, bool(edges.dx[0, 0] == -edges.dx[0, -1])
+        ((45, 65), True)
+        """
+        ny, nx = shape
+        if ny < 1 or nx < 1:
+            raise SensorError(f"shape = {shape} of a sensor must be at least (1, 1)")
+        given = {"x_low": x_low, "x_high": x_high, "y_low": y_low, "y_high": y_high}
+        lines = {n: _edge_line(n, s, nx if n[0] == "x" else ny) for n, s in given.items()}
+        pad = 1 + max(int(np.ceil(np.abs(s).max())) for s in lines.values())
+        along = [
+            np.pad(lines[f"{axis}_low"] - lines[f"{axis}_high"][::-1], pad, mode="edge")
+            for axis in "xy"
+        ]
+        if any(np.any(np.diff(a) < -1 - 1e-9) for a in along):
+            raise SensorError(
+                "the shifts of opposite edges make boundaries cross one another"
+            )
+        counts = (ny + 1 + 2 * pad, nx + 1 + 2 * pad)
+        return cls(
+            np.broadcast_to(along[0], counts), np.broadcast_to(along[1][:, None], counts),
+            0.5 - pad, 0.5 - pad,
+        )  # fmt: skip
+
+    @classmethod
     def read(cls, path: str | os.PathLike[str]) -> ShiftMap:
         """Read a FITS file with images DX and DY, and X0, Y0 and DEPTH in the header.
 
@@ -126,6 +191,29 @@ class ShiftMap:
             os.replace(beside, path)
         finally:
             beside.unlink(missing_ok=True)
+
+
+def _edge_line(name: str, given: ArrayLike | None, pixels: int) -> NDArray[np.float64]:
+    """Shifts [pixel] at all boundaries of a row or column, from one edge on."""
+    out = np.zeros(pixels + 1)
+    if given is None:
+        return out
+    shifts = np.array(given, float)
+    if shifts.ndim != 1 or len(shifts) < 2 or not np.all(np.isfinite(shifts)):
+        raise SensorError(
+            f"{name} must hold the finite shifts of at least two boundaries, not an array of "
+            f"shape {shifts.shape}" + ("" if np.all(np.isfinite(shifts)) else " with nan")
+        )
+    if np.any(np.diff(shifts) < -1 - 1e-9):
+        raise SensorError(f"{name}: the shifts make boundaries cross one another")
+    if len(shifts) <= pixels and abs(shifts[-1]) > 0.01 * np.abs(shifts).max():
+        raise SensorError(
+            f"{name} ends {len(shifts) - 1} pixels from the edge at {shifts[-1]:.3g} pixel; it must "
+            "fall to a hundredth of its largest value, or reach across the sensor"
+        )
+    count = min(len(shifts), pixels + 1)
+    out[:count] = shifts[:count]
+    return out
 
 
 def sample_rings(function: Any) -> tuple[NDArray[np.float64], float]:

@@ -103,7 +103,8 @@ def discretise(device: Device, mesh: Mesh) -> Coefficients:
     """
     if device.edge is not None:
         raise DeviceError(
-            f"{device.name}: edge: strips beyond the last pixel are described but not solved yet"
+            f"{device.name}: edge: a periodic array of pixels has none; strips beyond the last pixel "
+            "are solved by bfsensor.simulate.edge_field.solve_edge"
         )
     surfaces = Surfaces.of(device)
     material = device.material

@@ -328,3 +328,28 @@ def test_patterns_act_by_height_and_not_on_lost_photons(name):
         moved += abs(x[n] - ux[n]) > 1e-4
     assert moved > 10
     assert (z == kernel.LOST).any()
+
+
+@pytest.mark.kernels
+def test_origins_under_large_shifts_are_found():
+    """Next to a guard ring pixels can be several times too large, or without light."""
+    # Boundaries of a row: the first three at one place, then pixels of 3, 0.2, 1 and 1.
+    shift = np.array([2.0, 1.0, 0.0, 2.0, 1.2, 1.2, 1.2, 1.2, 1.2])
+    pattern = NO_PATTERN._replace(map_x=np.tile(shift, (3, 1)), map_y=np.zeros((3, 9)))
+    places = np.linspace(2.05, 7.15, 103)
+    moved = np.arange(9.0) + shift
+    for x in places:
+        px, py = kernel.find_origin(pattern, x, 1.3, 1.0)
+        assert px == pytest.approx(np.interp(x, moved[2:], np.arange(2.0, 9.0)), abs=3e-6)
+        assert py == 1.3
+
+
+@pytest.mark.kernels
+def test_origins_under_small_shifts_take_four_steps():
+    pattern = NO_PATTERN._replace(
+        map_x=np.array([[0.1, 0.12], [0.1, 0.12]]), map_y=np.zeros((2, 2))
+    )
+    px = 0.5
+    for _ in range(4):
+        px = 0.5 - kernel.fixed_shift(pattern, px, 0.5, 1.0)[0]
+    assert kernel.find_origin(pattern, 0.5, 0.5, 1.0)[0] == px

@@ -327,7 +327,7 @@ def test_refusals():
     with pytest.raises(DeviceError, match=r"cells = 7 must be an even number"):
         make_mesh(device, cells=7)
     edged = dataclasses.replace(device, edge=Edge("x", (EdgeStrip(20.0, voltage=5.0),)))
-    with pytest.raises(DeviceError, match="described but not solved yet"):
+    with pytest.raises(DeviceError, match=r"are solved by bfsensor\.simulate\.edge_field"):
         discretise(edged, make_mesh(edged, pixels=(2, 2), cells=8, symmetric=False))
     shallow = device.with_value("back_bias", "-1 V")
     with pytest.raises(DeviceError, match="free holes reach"):

@@ -1,0 +1,260 @@
+r"""Shifts of pixel boundaries near an edge, from the field lines of its field.
+
+Without diffusion an electron follows a field line.  The line from the boundary between two
+pixels, up through the silicon, is where electrons on either side part:
+
+.. math:: x(z) = x_n + \int_{z_g}^{z} E_x / E_z \, dz' .
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicHermiteSpline
+
+from bfsensor.errors import DeviceError
+from bfsensor.simulate.edge_field import EdgeField
+
+_STEEP = 0.05
+"""Step as a part of the height above the front plane, and no less than this [um]."""
+_LONGEST = 1.0 / 100  # of the thickness
+_FLATTEST = 10.0
+"""Lines that run further sideways than so many times up have met a strip."""
+_SEEDS, _ROUNDS = 65, 5  # 250 um / 64^5: far below a nanometre
+
+
+@dataclass(frozen=True)
+class EdgeShift:
+    """Shifts of the boundaries between pixels against their distance from the edge.
+
+    Attributes
+    ----------
+    side : str
+        'x' or 'y': the axis along which the distance counts.
+    pitch : float
+        [um].
+    depths : ndarray, shape (nd,)
+        Heights of conversion above the gates [um].
+    shifts : ndarray, shape (nd, n + 1)
+        Of the boundaries at 0, 1, ..., n pixels from the end of the array [um], positive
+        away from the edge.  The first is what divides the last pixel from the strips.
+    shadowed : int
+        Pixels at the edge that no electron reaches; their boundaries lie together.
+
+    Notes
+    -----
+    An electron found at a boundary was set free at the boundary plus the shift: in units of
+    pixels the shift is what must be added to a measured position, as in the templates of
+    DECam.  A star appears displaced by its opposite.
+    """
+
+    side: str
+    pitch: float
+    depths: NDArray[np.float64]
+    shifts: NDArray[np.float64]
+    shadowed: int
+
+    @property
+    def distances(self) -> NDArray[np.float64]:
+        """Distance of the boundaries from the end of the array [um]."""
+        return np.asarray(np.arange(self.shifts.shape[1]) * self.pitch, float)
+
+    @property
+    def pixel_shifts(self) -> NDArray[np.float64]:
+        """Shifts [pixel], shape (nd, n + 1)."""
+        return self.shifts / self.pitch
+
+    @property
+    def area_changes(self) -> NDArray[np.float64]:
+        """Relative change of the areas of the pixels, shape (nd, n): what a flat shows."""
+        return np.diff(self.shifts, axis=1) / self.pitch
+
+    def displacement(self, positions: ArrayLike, depth: float) -> NDArray[np.float64]:
+        """Give the displacement [um] of small images, positive away from the edge.
+
+        Parameters
+        ----------
+        positions : array_like
+            Where the light falls, from the end of the array [um].
+        depth : float
+            Height of conversion [um], within those traced.
+
+        Returns
+        -------
+        displacement : ndarray
+            Found less true position; linear between boundaries.
+
+        Raises
+        ------
+        DeviceError
+            A depth or a position outside what was traced.
+        """
+        places = np.asarray(positions, float)
+        if not self.depths[0] <= depth <= self.depths[-1]:
+            raise DeviceError(
+                f"depth = {depth:g} um must lie from {self.depths[0]:g} to {self.depths[-1]:g} um"
+            )
+        shifts = np.array([np.interp(depth, self.depths, s) for s in self.shifts.T])
+        moved = self.distances[self.shadowed :] + shifts[self.shadowed :]
+        if places.size and not (moved[0] <= places.min() and places.max() <= moved[-1]):
+            raise DeviceError(
+                f"positions from {places.min():g} to {places.max():g} um must lie within the "
+                f"pixels, {moved[0]:.4g} to {moved[-1]:.4g} um"
+            )
+        return np.interp(places, moved, self.distances[self.shadowed :]) - places
+
+
+def trace_edge(edge: EdgeField, depths: ArrayLike) -> EdgeShift:
+    """Trace the boundaries of the pixels near an edge.
+
+    Parameters
+    ----------
+    edge : EdgeField
+        From :func:`~bfsensor.simulate.edge_field.solve_edge`.
+    depths : array_like
+        Heights of conversion [um above the gates], ascending, above the front plane.
+
+    Returns
+    -------
+    EdgeShift
+
+    Raises
+    ------
+    DeviceError
+        A depth outside the silicon; the silicon above the pixels is not depleted; no
+        electron from the back surface reaches a pixel.
+
+    Examples
+    --------
+    >>> import dataclasses
+    >>> from bfsensor import Device
+    >>> from bfsensor.device_parts import Edge, EdgeStrip
+    >>> from bfsensor.simulate.edge_field import solve_edge
+    >>> ring = Edge("x", (EdgeStrip(50.0, 20.0, "none"), EdgeStrip(200.0)))
+    >>> device = dataclasses.replace(Device.load("itl_sta3800c"), edge=ring)
+    >>> shift = trace_edge(solve_edge(device), [50.0, 100.0])
+    >>> bool(shift.shifts[1, 2] > 1.0), bool(abs(shift.shifts[1, 40]) < 0.01)
+    (True, True)
+    """
+    levels: NDArray[np.float64] = np.array(depths, dtype=np.float64, ndmin=1)
+    low, high = edge.front.height, float(edge.z[-1])
+    if np.any(np.diff(levels) <= 0):
+        raise DeviceError(f"conversion depths {levels.tolist()} um must ascend")
+    if levels[0] <= low or levels[-1] > high + 1e-9:
+        outside = levels[0] if levels[0] <= low else levels[-1]
+        raise DeviceError(
+            f"conversion depth {outside:g} um must lie in the silicon, above the front plane at "
+            f"{low:.3g} um and up to {high:g} um (back surface)"
+        )
+    if np.any(edge.neutral[:, edge.x >= 0]):
+        raise DeviceError(
+            f"{edge.device.name}: edge: silicon above the pixels is not depleted up to "
+            f"{edge.x[np.nonzero(edge.neutral.any(axis=0))[0].max()]:.3g} um from the edge: "
+            "electrons set free there diffuse, and boundaries are not defined"
+        )
+    slopes = _Slopes(edge)
+    starts: NDArray[np.float64] = edge.pitch * np.arange(edge.pixels + 1.0)
+    first, outer = _outermost(edge, slopes, levels)
+    shadowed = int(np.searchsorted(starts, first)) - 1
+    traced = _trace_up(slopes, starts[shadowed + 1 :], levels, low, high)
+    lines = np.concatenate(
+        [np.repeat(outer[:, None], shadowed + 1, axis=1), traced], axis=1
+    )
+    return EdgeShift(
+        edge.device.edge.side if edge.device.edge else "x", edge.pitch, levels,
+        lines - starts, shadowed,
+    )  # fmt: skip
+
+
+class _Slopes:
+    """The field between the nodes above the front plane, bilinear: second order."""
+
+    def __init__(self, edge: EdgeField) -> None:
+        first = int(np.argmin(np.abs(edge.z - edge.front.height)))
+        self.x, self.z = edge.x, edge.z[first:]
+        phi = edge.phi[first:]
+        # Electrons rise up the potential gradient; down means falling phi with z.
+        self.along_x = np.gradient(phi, self.x, axis=1, edge_order=2)
+        self.along_z = np.gradient(phi, self.z, axis=0, edge_order=2)
+        # The pixels are at one potential, and the plane's end is a corner.
+        self.along_x[0, self.x >= 0] = 0.0
+
+    def __call__(
+        self, x: NDArray[np.float64], z: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Gradient of the potential [V/um] at points; beyond the mesh that of its border."""
+        i = np.clip(np.searchsorted(self.x, x) - 1, 0, len(self.x) - 2)
+        k = np.clip(np.searchsorted(self.z, z) - 1, 0, len(self.z) - 2)
+        u = np.clip((x - self.x[i]) / (self.x[i + 1] - self.x[i]), 0.0, 1.0)
+        v = np.clip((z - self.z[k]) / (self.z[k + 1] - self.z[k]), 0.0, 1.0)
+        out = []
+        for a in (self.along_x, self.along_z):
+            low = a[k, i] * (1 - u) + a[k, i + 1] * u
+            high = a[k + 1, i] * (1 - u) + a[k + 1, i + 1] * u
+            out.append(low * (1 - v) + high * v)
+        return out[0], out[1]
+
+
+def _trace_up(
+    slopes: _Slopes,
+    starts: NDArray[np.float64],
+    levels: NDArray[np.float64],
+    low: float,
+    high: float,
+) -> NDArray[np.float64]:
+    """Places of the lines from the front plane at all levels; nan where they turn back."""
+    heights = [low]
+    while heights[-1] < high:
+        step = max(_STEEP, _STEEP * (heights[-1] - low))
+        heights.append(heights[-1] + min(step, _LONGEST * (high - low)))
+    heights[-1] = high
+    x = starts.copy()
+    turned = np.zeros(len(x), bool)
+
+    def slope(x: NDArray[np.float64], z: float) -> NDArray[np.float64]:
+        gx, gz = slopes(x, np.full_like(x, z))
+        flat = gz > -np.abs(gx) / _FLATTEST
+        np.logical_or(turned, flat | (gz >= 0), out=turned)
+        return np.divide(gx, gz, out=np.zeros_like(gx), where=~turned)
+
+    path, tangents = [x], [slope(x, low)]
+    for z, after in pairwise(heights):
+        h = after - z
+        a = tangents[-1]
+        b = slope(x + 0.5 * h * a, z + 0.5 * h)
+        c = slope(x + 0.5 * h * b, z + 0.5 * h)
+        d = slope(x + h * c, after)
+        x = x + h / 6 * (a + 2 * b + 2 * c + d)
+        path.append(x)
+        tangents.append(slope(x, after))
+    out = CubicHermiteSpline(heights, np.array(path), np.array(tangents))(levels)
+    out[:, turned] = np.nan
+    return np.asarray(out)
+
+
+def _outermost(
+    edge: EdgeField, slopes: _Slopes, levels: NDArray[np.float64]
+) -> tuple[float, NDArray[np.float64]]:
+    """Where on the front plane the lines begin that reach the back, and the first of them.
+
+    Lines from further out end in the strips, or on them where the strips repel electrons.
+    """
+    low, high = edge.front.height, float(edge.z[-1])
+    left, right = 0.0, float(edge.x[-1])
+    line = np.zeros(0)
+    for _ in range(_ROUNDS):
+        seeds = np.linspace(left, right, _SEEDS)[1:]
+        lines = _trace_up(slopes, seeds, levels, low, high)
+        failed = np.flatnonzero(np.isnan(lines[0]))
+        first = int(failed[-1]) + 1 if len(failed) else 0
+        if first == len(seeds):
+            raise DeviceError(
+                f"{edge.device.name}: edge: no electron from the back surface reaches the pixels "
+                f"up to {right:.4g} um from the edge"
+            )
+        left = float(seeds[first - 1]) if first else left
+        right, line = float(seeds[first]), lines[:, first]
+    return right, line

@@ -1,0 +1,193 @@
+"""The linear system of an edge field, and the holes of the bulk in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix, csc_matrix, diags
+from scipy.sparse.linalg import splu
+
+from bfsensor.errors import ConvergenceError
+from bfsensor.units import VACUUM_PERMITTIVITY
+
+if TYPE_CHECKING:
+    from bfsensor.device import Device
+
+TOLERANCE = 1e-7
+"""Largest last step of Newton's method [V]."""
+
+FINEST_X = 0.2  # um, at the ends of strips; a jump of voltage is misplaced by half of it
+FINEST_Z = 0.1  # um, at the surface, where the implants are
+_GROWTH = 1.15
+_COARSEST = 1.0 / 50  # of the thickness
+_MAX_NEWTON = 200
+
+
+@dataclass(frozen=True)
+class FrontPlane:
+    """The conducting plane that stands for the pixels.
+
+    Attributes
+    ----------
+    height : float
+        Above the gates [um].
+    potential : float
+        [V]; the mean potential of the pixels, continued to that height.
+    """
+
+    height: float
+    potential: float
+
+
+def grade_nodes(
+    ends: list[float], thickness: float, finest: float, refine: int
+) -> NDArray[np.float64]:
+    """Nodes through all ends, fine there but for the last one, and graded."""
+    coarsest = _COARSEST * thickness
+    out = [float(ends[0])]
+    for n, (a, b) in enumerate(pairwise(ends)):
+        both = n < len(ends) - 2
+        length = b - a
+        half = length / 2 if both else length
+        steps: list[float] = []
+        step = min(finest, half)
+        while sum(steps) < half - 1e-12:
+            steps.append(step)
+            step = min(_GROWTH * step, coarsest)
+        graded = np.cumsum(steps) * (half / sum(steps))
+        if both:
+            graded = np.concatenate([graded, length - graded[-2::-1], [length]])
+        out.extend(a + graded)
+        out[-1] = float(b)
+    nodes = np.array(out)
+    for _ in range(refine):
+        nodes = np.sort(np.concatenate([nodes, 0.5 * (nodes[1:] + nodes[:-1])]))
+    return nodes
+
+
+@dataclass(frozen=True)
+class System:
+    """Matrix [e-/V per um], fixed charge [e- per um] and who is free; flat over (z, x)."""
+
+    matrix: csc_matrix
+    charge: NDArray[np.float64]
+    held: NDArray[np.float64]
+    free: NDArray[np.bool_]
+    acceptors: NDArray[np.float64]
+
+
+def assemble(
+    device: Device,
+    front: FrontPlane,
+    x: NDArray[np.float64],
+    z: NDArray[np.float64],
+    ends: NDArray[np.float64],
+    surface: float,
+) -> System:
+    """Links, charges and conductors, summed over the intervals in x."""
+    assert device.edge is not None
+    nz, nx = len(z), len(x)
+    eps_si = device.material.permittivity_silicon * VACUUM_PERMITTIVITY
+    eps_ox = device.material.permittivity_oxide * VACUUM_PERMITTIVITY
+    oxide = {"gate": device.gates.gate_oxide, "field": device.gates.field_oxide}
+    bias = device.operating_point.back_bias
+    lower = np.concatenate([[z[0]], 0.5 * (z[1:] + z[:-1])])
+    upper = np.concatenate([0.5 * (z[1:] + z[:-1]), [z[-1]]])
+    row = int(np.argmin(np.abs(z - surface)))
+    across, along = np.zeros((nz, nx - 1)), np.zeros((nz - 1, nx))
+    volume, charge, to_gate = np.zeros((3, nz, nx))
+    held = np.full((nz, nx), np.nan)
+    held[-1] = bias
+    widths = np.diff(x)
+    middle = 0.5 * (x[1:] + x[:-1])
+    strips = np.searchsorted(-ends, -middle, side="right") - 1  # -1: pixels
+    for i, (width, k) in enumerate(zip(widths, strips, strict=True)):
+        strip = device.edge.strips[k] if k >= 0 else None
+        floor = z[0] if strip is None else surface
+        height = np.maximum(upper, floor) - np.maximum(lower, floor)
+        across[:, i] = eps_si * height / width
+        solid = z[:-1] >= floor - 1e-9
+        for node in (i, i + 1):
+            along[:, node] += np.where(solid, eps_si * 0.5 * width / np.diff(z), 0.0)
+            volume[:, node] += 0.5 * width * height
+            if strip is None:
+                held[z <= front.height + 1e-9, node] = front.potential
+                continue
+            for implant in strip.implants:
+                dose = implant.cumulative(np.maximum(upper, surface) - surface)
+                dose = dose - implant.cumulative(np.maximum(lower, surface) - surface)
+                charge[:, node] += 0.5 * width * dose
+            if strip.voltage is None:
+                continue
+            if strip.oxide == "none":
+                held[row, node] = strip.voltage
+            else:
+                link = 0.5 * width * eps_ox / oxide[strip.oxide]
+                to_gate[row, node] += link
+                charge[row, node] += link * strip.voltage
+    acceptors = -device.silicon.background_doping * volume
+    # Nodes in the oxide under the strips belong to nobody.
+    held[(volume == 0) & np.isnan(held)] = bias
+    free = np.isnan(held).ravel()
+    number = np.arange(nz * nx).reshape(nz, nx)
+    one = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
+    two = np.concatenate([number[:, 1:].ravel(), number[1:].ravel()])
+    link = np.concatenate([across.ravel(), along.ravel()])
+    size = nz * nx
+    matrix = coo_matrix(
+        (
+            np.concatenate([link, link, -link, -link, to_gate.ravel()]),
+            (
+                np.concatenate([one, two, one, two, number.ravel()]),
+                np.concatenate([one, two, two, one, number.ravel()]),
+            ),
+        ),
+        shape=(size, size),
+    ).tocsc()
+    return System(
+        matrix, (charge - acceptors).ravel(), np.nan_to_num(held).ravel(), free,
+        acceptors.ravel(),
+    )  # fmt: skip
+
+
+def relax_holes(
+    device: Device, system: System
+) -> tuple[NDArray[np.float64], NDArray[np.float64], list[float]]:
+    """Potential [V] and holes [e- per um] of all nodes, and the steps on the way."""
+    kt = device.material.thermal_voltage(device.operating_point.temperature)
+    bias = device.operating_point.back_bias
+    free = system.free
+    inner = system.matrix[free][:, free].tocsc()
+    source = system.charge[free] - (system.matrix[free][:, ~free] @ system.held[~free])
+    acceptors = system.acceptors[free]
+    has_holes = bool(np.any(acceptors > 0))
+    phi = splu(inner).solve(source)
+    holes = np.zeros_like(phi)
+    steps: list[float] = []
+    if has_holes and phi.min() < bias:
+        phi = np.maximum(phi, bias)
+        while not steps or steps[-1] > TOLERANCE:
+            if len(steps) == _MAX_NEWTON:
+                raise ConvergenceError(
+                    f"{device.name}: the field of the edge did not settle in {_MAX_NEWTON} steps "
+                    f"(last {steps[-1]:.2g} V)", steps,
+                )  # fmt: skip
+            holes = acceptors * np.exp(np.minimum((bias - phi) / kt, 60.0))
+            residual = source + holes - inner @ phi
+            step = splu((inner + diags(holes / kt)).tocsc()).solve(residual)
+            # Holes grow exponentially as the potential falls: not further than linearly.
+            near = phi + step < bias + 2 * kt
+            damped = -kt * np.log1p(np.maximum(-step, 0.0) / kt)
+            step = np.where(near & (step < 0) & (phi < bias + 4 * kt), damped, step)
+            floor = np.where(phi > bias, bias - phi, -np.inf)
+            step = np.maximum(step, floor)
+            steps.append(float(np.abs(step).max()))
+            phi = phi + step
+        holes = acceptors * np.exp((bias - phi) / kt)
+    out, out_holes = system.held.copy(), np.zeros(len(system.held))
+    out[free], out_holes[free] = phi, holes
+    return out, out_holes, steps
