@@ -15,6 +15,7 @@ import click
 
 from bfsensor.cli_check import check
 from bfsensor.cli_common import load_device, parse_settings
+from bfsensor.cli_diagnose import diagnose
 from bfsensor.cli_measure import measure
 from bfsensor.cli_spots import spots
 from bfsensor.errors import BFSensorError
@@ -390,6 +391,7 @@ def show(source: str, settings: list[tuple[str, str]], output: Path | None) -> N
 main.add_command(spots)
 main.add_command(measure)
 main.add_command(check)
+main.add_command(diagnose)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import click
 from tqdm import tqdm
 
 
-class _Bar:
+class Bar:
     """A bar on stderr that the readers may call with what is done and what there is."""
 
     def __init__(self, word: str) -> None:
@@ -54,10 +54,10 @@ def check(campaign: Path, headers: bool, as_json: bool) -> None:
     if reduced and not _has_images(campaign):
         _print_reduced(reduced, as_json)
         return
-    found = read_campaign(campaign, progress=_Bar("headers"))
+    found = read_campaign(campaign, progress=Bar("headers"))
     levels: dict[int, dict[str, float]] = {}
     if not headers:
-        inspection = inspect_campaign(found, progress=_Bar("pixels"))
+        inspection = inspect_campaign(found, progress=Bar("pixels"))
         found = inspection.campaign
         levels = {one.number: inspection.levels(one.number) for one in found.exposures}
     report: dict[str, Any] = {

@@ -43,7 +43,9 @@ def draw_lags(axes: Table, pulls: NDArray[np.float64], ax: Axes) -> None:
     )
 
 
-def draw_lag_levels(axes: Table, pulls: NDArray[np.float64], ax: Axes, *, lags: Sequence[tuple[int, int]]) -> None:  # fmt: skip
+def draw_lag_levels(
+    axes: Table, pulls: NDArray[np.float64], ax: Axes, *, lags: Sequence[tuple[int, int]]
+) -> None:
     """Pull of some lags against level, amplifiers and conditions as they come."""
     for n, (a, b) in enumerate(lags):
         here = (axes["i"] == a) & (axes["j"] == b)
@@ -75,7 +77,9 @@ def draw_means(axes: Table, relative: NDArray[np.float64], ax: Axes) -> None:
     ax.legend(frameon=False, fontsize=8)
 
 
-def draw_overscan(axes: Table, values: NDArray[np.float64], errors: NDArray[np.float64], ax: Axes) -> None:  # fmt: skip
+def draw_overscan(
+    axes: Table, values: NDArray[np.float64], errors: NDArray[np.float64], ax: Axes
+) -> None:
     """Profile of an overscan for the strongest levels of each amplifier."""
     for n, amp in enumerate(np.unique(axes["amp"])):
         own = axes["amp"] == amp

@@ -38,7 +38,7 @@ class RawFrame:
     """One amplifier's frame in readout order [ADU]."""
 
     name: str
-    data: NDArray[np.float32]
+    pixels: NDArray[np.float32]
     geometry: Geometry
     number: int
 
@@ -46,24 +46,29 @@ class RawFrame:
     def image(self) -> NDArray[np.float32]:
         """Pixels of light."""
         g = self.geometry
-        return self.data[: g.pixels, g.prescan : g.prescan + g.width]
+        return self.pixels[: g.pixels, g.prescan : g.prescan + g.width]
+
+    @property
+    def mask(self) -> NDArray[np.bool_]:
+        """Codes at the converter's end."""
+        return self.image >= 65535
 
     @property
     def prescan(self) -> NDArray[np.float32]:
         """Before the first column."""
-        return self.data[: self.geometry.pixels, : self.geometry.prescan]
+        return self.pixels[: self.geometry.pixels, : self.geometry.prescan]
 
     @property
     def serial_overscan(self) -> NDArray[np.float32]:
         """After the last column."""
         g = self.geometry
-        return self.data[: g.pixels, g.prescan + g.width :]
+        return self.pixels[: g.pixels, g.prescan + g.width :]
 
     @property
     def parallel_overscan(self) -> NDArray[np.float32]:
         """After the last row."""
         g = self.geometry
-        return self.data[g.pixels :, g.prescan : g.prescan + g.width]
+        return self.pixels[g.pixels :, g.prescan : g.prescan + g.width]
 
     @property
     def flip_x(self) -> bool:

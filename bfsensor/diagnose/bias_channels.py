@@ -42,8 +42,8 @@ class BiasChannels:
         levelled, levels = [], []
         for frame in frames:
             over = frame.serial_overscan.astype(np.float64)
-            zero = float(over.mean()) if over.size else float(frame.data.mean())
-            levelled.append(frame.data.astype(np.float64) - zero)
+            zero = float(over.mean()) if over.size else float(frame.pixels.mean())
+            levelled.append(frame.pixels.astype(np.float64) - zero)
             image = frame.image.astype(np.float64)
             share = image.var() / image.size + (
                 over.var() / over.size if over.size else 0.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,6 +45,8 @@ class Diagnosis:
         What is left, and how unlikely that is.
     heldout : float
         Chi-square over degrees of freedom of the fold that was not fitted; nan without one.
+    notes : tuple of str
+        What was set aside, warned of or assumed.
     """
 
     campaign: str
@@ -53,6 +55,7 @@ class Diagnosis:
     fit: BaselineFit
     mismatch: Mismatch
     heldout: float
+    notes: tuple[str, ...] = ()
 
     @property
     def gain(self) -> float:
@@ -103,16 +106,17 @@ class Diagnosis:
         m = self.mismatch
         if not m.detected:
             parts = [
-                f"Nothing stands out: the largest of all statistics has a family-wise p of {m.p_value:.2g}.",
-                f"What these recordings cannot see is not excluded ({len(self.fit.residuals)} values in "
-                f"{len(m.chi2)} channels were held against the baseline).",
+                "Nothing stands out: the largest of all statistics has a family-wise p of "
+                f"{m.p_value:.2g}.",
+                f"{len(self.fit.residuals)} values in {len(m.chi2)} channels were held against the "
+                "baseline; what these recordings cannot see is not excluded.",
             ]  # fmt: skip
         else:
             first = m.findings[0]
             others = [NAMES[w] for w in self.location()["channels"] if w != first.word]
             parts = [
-                f"The recordings differ from the baseline (family-wise p {m.p_value:.2g}), most in the "
-                f"{NAMES[first.word]} ({first.family}, {abs(first.z):.1f} standard deviations)."
+                f"The recordings differ from the baseline (family-wise p {m.p_value:.2g}), most in "
+                f"the {NAMES[first.word]} ({first.family}, {abs(first.z):.1f} standard deviations)."
             ]  # fmt: skip
             if others:
                 parts.append(f"It is also seen in: {', '.join(others)}.")
@@ -159,7 +163,7 @@ class Diagnosis:
             ],
             "parameters": fitted,
             "exposures": dict(self.measured.counts),
-            "notes": [*self.measured.notes, *self.fit.notes],
+            "notes": list(self.notes),
             "said": self.said(),
         }  # fmt: skip
 
@@ -170,6 +174,7 @@ def diagnose(
     *,
     campaign: str = "",
     seed: int = 1,
+    notes: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> Diagnosis:
     """Hold a campaign's recordings against a baseline.
@@ -184,6 +189,8 @@ def diagnose(
         Its name.
     seed : int
         Of the draws of noise that p-values come from.
+    notes : sequence of str
+        What reading had to say, for the report.
     progress : callable, optional
         Called with (exposures done, exposures in all).
     """
@@ -197,6 +204,7 @@ def diagnose(
         fit=fit,
         mismatch=locate_mismatch(fit, seed=seed),
         heldout=held_out(predictor, fit, measured),
+        notes=(*notes, *measured.notes, *fit.notes),
     )
 
 

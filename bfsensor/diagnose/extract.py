@@ -200,7 +200,7 @@ def measure_channels(
         phases=tuple(spots.phases),
         columns=tuple(f.image.shape[1] + f.prescan.shape[1] for f in layout),
         flips=tuple((f.flip_x, f.flip_y) for f in layout),
-        origins=tuple((int(f.origin[0]), int(f.origin[1])) for f in layout),
+        origins=tuple(f.origin or (0, 0) for f in layout),
         shape=source.shape,
         notes=tuple(notes),
         lamp_known=all(e.lamp is not None for e in kinds.get("flat", [])),
@@ -227,7 +227,7 @@ def place(image: NDArray[np.float64], frame: Frame, values: NDArray[np.float64])
     """Put an amplifier's values, in readout order, where they lie on the sensor."""
     values = values[:, ::-1] if frame.flip_x else values
     values = values[::-1] if frame.flip_y else values
-    x, y = frame.origin
+    x, y = frame.origin or (0, 0)
     image[y : y + values.shape[0], x : x + values.shape[1]] = values
 
 

@@ -70,7 +70,6 @@ class FlatChannels:
         second: tuple[Exposure, Sequence[Frame]],
         *,
         fold: str,
-        masks: Sequence[NDArray[np.bool_]] | None = None,
     ) -> None:
         """Measure one pair of flats and add it to its group."""
         condition = Condition.of(first[0])
@@ -80,7 +79,7 @@ class FlatChannels:
         for n, frames in enumerate(zip(first[1], second[1], strict=True)):
             name = frames[0].name
             images = [self.clean(f) for f in frames]
-            mask = None if masks is None else masks[n]
+            mask = frames[0].mask | frames[1].mask
             found = flat_covariances(
                 *images, mask=mask, lags=self._lags, unit="adu", region=name
             )

@@ -94,13 +94,13 @@ def draw_figures(diagnosis: Diagnosis, folder: Path) -> dict[str, Path]:
         n.removeprefix("device "): float(e)
         for n, e in zip(fit.names, fit.errors, strict=True) if n.startswith("device ")
     }  # fmt: skip
-    parts: list[Callable[[Axes], None]] = [
+    first: list[Callable[[Axes], None]] = [
         lambda ax: show.draw_channels(diagnosis.mismatch.chi2, ax)
     ]
     if fit.pulls:
-        parts.append(lambda ax: show.draw_parameters(fit.pulls, errors, ax))
+        first.append(lambda ax: show.draw_parameters(fit.pulls, errors, ax))
     add("channels", "How far each channel is from the baseline, all that may float fitted; and the "
-        "device's parameters against its card.", (10, 4), *parts)  # fmt: skip
+        "device's parameters against its card.", (10, 4), *first)  # fmt: skip
     if "flat_cov" in found:
         channel, pulls = found["flat_cov"]
         lags = [(0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2)]
@@ -161,6 +161,16 @@ def to_html(diagnosis: Diagnosis, figures: dict[str, Path]) -> str:
         for caption, path in figures.items()
     )
     notes = "".join(f"<li>{text(n)}</li>" for n in report["notes"])
+    if notes:
+        notes = f"<h2>Notes</h2><ul class=notes>{notes}</ul>"
+    if found:
+        titles = "<tr><th>channel<th>scan<th>deviates<th>family-wise p<th>where</tr>"
+        found = f"<h2>What stands out</h2><table>{titles}{found}</table>"
+    head = "<tr><th>channel<th>chi-square<th>dof<th>ratio<th>p of the channel alone</tr>"
+    mood = "" if report["detected"] else " clear"
+    unseen = ""
+    if heldout is not None:
+        unseen = f"Flats that were not fitted: chi-square per value {heldout:.2f}."
     exposures = ", ".join(f"{n} {k}" for k, n in report["exposures"].items())
     return f"""<!doctype html>
 <html lang=en><meta charset=utf-8><title>{text(diagnosis.campaign)}: diagnosis</title>

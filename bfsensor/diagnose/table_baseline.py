@@ -1,0 +1,130 @@
+"""A distortion table as a baseline: mean shifts of edges per electron at each wavelength."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor import silicon
+from bfsensor.device import Device
+from bfsensor.diagnose.baseline import Baseline, Edges
+from bfsensor.errors import BFSensorError, DiagnosisError
+from bfsensor.galsim_format import read_galsim
+from bfsensor.resources import tables_dir
+from bfsensor.table import DistortionTable, vertex_fractions
+
+WAVELENGTHS = (400.0, 480.0, 550.0, 620.0, 700.0, 750.0, 870.0, 950.0)
+"""At which shifts are held [nm]."""
+
+CHARGE = 100.0
+"""Charge above the background [e-] that stands for the differential response."""
+
+
+def baseline_of_table(given: str | os.PathLike[str]) -> Baseline:
+    """Baseline of a table: a .fits file, a GalSim stem, or the name of a shipped device.
+
+    Shifts are those of the differential response at the middle of the table's backgrounds,
+    which flats see, averaged along the edge and over the depths at which the light converts.
+    Nothing of the device floats: its table holds no derivatives.
+
+    Raises
+    ------
+    DiagnosisError
+        None of these.
+    """
+    path = Path(given)
+    shipped = tables_dir() / os.fspath(given) / "table.fits"
+    try:
+        if shipped.exists():
+            table = DistortionTable.read(shipped)
+        elif path.suffix == ".fits":
+            table = DistortionTable.read(path)
+        else:
+            table = read_galsim(path)
+    except (BFSensorError, OSError) as error:
+        raise DiagnosisError(f"{given}: not a baseline: {error}") from None
+    device = Device.from_toml(table.device_text) if table.device_text else None
+    bias = device.operating_point.back_bias if device is not None else np.nan
+    temperature = device.operating_point.temperature if device is not None else 173.0
+    edges: dict[tuple[float, float], Edges] = {}
+    for wavelength in WAVELENGTHS:
+        edges[wavelength, float(bias)] = edges_at(table, wavelength, temperature)
+    return Baseline(os.fspath(given), edges, {}, {}, (620.0, float(bias)))
+
+
+def edges_at(table: DistortionTable, wavelength: float, temperature: float) -> Edges:
+    """Mean shifts of right and upper edges [pixel/e-] of light of one wavelength.
+
+    Parameters
+    ----------
+    table : DistortionTable
+        Total displacements.
+    wavelength : float
+        Of the light [nm].
+    temperature : float
+        Of the silicon [K].
+
+    Returns
+    -------
+    kx, ky : ndarray, shape (2 reach + 3, 2 reach + 3)
+        With a ring of pixels around the table's whose outer edges do not move.
+    """
+    middle = float(table.backgrounds[len(table.backgrounds) // 2])
+    if len(table.charges) == 1 or middle + CHARGE > table.charges[-1]:
+        middle = float(table.backgrounds[0])
+    weights = _conversion(table.depths, table.thickness, wavelength, temperature)
+    kx: NDArray[np.float64] | float = 0.0
+    ky: NDArray[np.float64] | float = 0.0
+    for depth, weight in zip(table.depths, weights, strict=True):
+        moved = table.displacements(
+            charge=middle + CHARGE, background=middle, depth=float(depth)
+        )
+        kx = kx + weight * _along(
+            moved.corners[..., 0], moved.vertical[..., 0], table, axis=0
+        )
+        ky = ky + weight * _along(
+            moved.corners[..., 1], moved.horizontal[..., 1], table, axis=1
+        )
+    scale = CHARGE * np.array(table.pitch)
+    n = 2 * table.reach + 3
+    out_x, out_y = np.zeros((n, n)), np.zeros((n, n))
+    # The line left of the first pixel is the right edge of a pixel outside the table.
+    out_x[1:-1, :-1] = np.asarray(kx) / scale[0]
+    out_y[:-1, 1:-1] = np.asarray(ky) / scale[1]
+    return out_x, out_y
+
+
+def _along(
+    corners: NDArray[np.float64],
+    sides: NDArray[np.float64],
+    table: DistortionTable,
+    *,
+    axis: int,
+) -> NDArray[np.float64]:
+    """Mean of a displacement along each edge: trapezoids between corners and vertices.
+
+    ``axis`` is that of the array along which the edges run.
+    """
+    ends = np.moveaxis(corners, axis, 0)
+    inner = np.moveaxis(sides, axis, 0)
+    at = np.concatenate([[0.0], vertex_fractions(table.vertices), [1.0]])
+    values = np.concatenate([ends[:-1, :, None], inner, ends[1:, :, None]], axis=-1)
+    mean = np.trapezoid(values, at, axis=-1)
+    return np.asarray(np.moveaxis(mean, 0, axis))
+
+
+def _conversion(
+    depths: NDArray[np.float64], thickness: float, wavelength: float, temperature: float
+) -> NDArray[np.float64]:
+    """Share of the light that the response at each depth stands for, linear between them."""
+    length = float(silicon.absorption_length(wavelength, temperature))
+    z = np.linspace(0.0, thickness, 4001)
+    light = np.exp(-(thickness - z) / length)
+    light /= light.sum()
+    weights = np.array([
+        np.interp(z, depths, np.eye(len(depths))[n]) @ light for n in range(len(depths))
+    ])  # fmt: skip
+    return weights / weights.sum()
