@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import resource
 import time
 import zipfile
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 
 import bfsensor
 from bfsensor.errors import TableError
+from bfsensor.files import written_whole
 from bfsensor.simulate.boundaries import SPLIT_HEIGHT, find_boundaries
 from bfsensor.simulate.far_field import FarField, image_shifts
 from bfsensor.simulate.mesh import Surfaces, make_mesh
@@ -115,11 +115,9 @@ class Level:
     image_share: float
 
     def write(self, path: Path) -> None:
-        """Write beside and rename, so that half a level never exists."""
-        beside = path.with_name(f"{path.name}.{os.getpid()}")
-        with open(beside, "wb") as stream:
+        """Write it whole or not at all: half a level never exists."""
+        with written_whole(path, TableError) as beside, open(beside, "wb") as stream:
             np.savez(stream, **self.__dict__)
-        os.replace(beside, path)
 
     @classmethod
     def read(cls, path: Path) -> Level:

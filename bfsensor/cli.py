@@ -267,6 +267,8 @@ def _start_assessment(
 ) -> Callable[[], dict[str, float]]:
     """Begin to measure the errors of a table; the answer is kept like its levels."""
     from bfsensor.assess import assess
+    from bfsensor.errors import TableError
+    from bfsensor.files import written_whole
 
     kept = checkpoint / plan.key / "errors.json"
     if kept.exists():
@@ -275,9 +277,8 @@ def _start_assessment(
 
     def finish() -> dict[str, float]:
         errors = pending.result() if pending is not None else assess(plan)
-        beside = kept.with_suffix(".part")
-        beside.write_text(json.dumps(errors))
-        beside.replace(kept)
+        with written_whole(kept, TableError) as beside:
+            beside.write_text(json.dumps(errors))
         return errors
 
     return finish

@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from bfsensor.errors import MeasurementError
+from bfsensor.files import written_whole
 
 _FILES = click.argument(
     "files", nargs=-1, required=True, type=click.Path(path_type=Path, exists=True)
@@ -220,9 +221,8 @@ def _finish(
 
         table = Table(rows=rows)
         table.meta = {"summary": summary}
-        part = output.with_name(output.name + ".part")
-        table.write(part, format="ascii.ecsv", overwrite=True)
-        part.replace(output)
+        with written_whole(output, MeasurementError) as beside:
+            table.write(beside, format="ascii.ecsv", overwrite=True)
     if as_json:
         click.echo(json.dumps({"rows": rows, "summary": summary}, indent=1))
         return

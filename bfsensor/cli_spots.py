@@ -12,6 +12,7 @@ import click
 
 from bfsensor.cli_common import load_device, parse_settings
 from bfsensor.errors import BFSensorError, SimulationError
+from bfsensor.files import written_whole
 
 
 def _spot_path(folder: Path, key: str, number: int) -> Path:
@@ -147,9 +148,8 @@ def _report(plan: Any, made: list[Any], output: Path, as_json: bool) -> None:
             for n, axis in enumerate("xy")
         }
         table.meta = {"device": plan.device.name, "key": plan.key, **summary}
-        part = output / "growth.ecsv.part"
-        table.write(part, format="ascii.ecsv", overwrite=True)
-        part.replace(output / "growth.ecsv")
+        with written_whole(output / "growth.ecsv", SimulationError) as beside:
+            table.write(beside, format="ascii.ecsv", overwrite=True)
         _draw(plan, made, growth, output / "growth.png")
     else:
         summary["slope_percent_per_50000e"] = "needs 2 spots for an error"

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from bfsensor.errors import TableError
+from bfsensor.files import refuse_existing, written_whole
 from bfsensor.interpolation import polynomial_weights, spline_weights
 
 SCHEMA = "bfsensor distortion table"
@@ -430,9 +431,7 @@ class DistortionTable:
         """
         from astropy.io import fits
 
-        path = Path(path)
-        if path.exists() and not overwrite:
-            raise TableError(f"{path} exists; say overwrite to replace it")
+        refuse_existing(path, overwrite, TableError)
         arrays = {name: getattr(self, name) for name in self._shapes()}
         quadrants = {name: _quadrant(array) for name, array in arrays.items()}
         quadrant = self.symmetric and all(
@@ -483,14 +482,8 @@ class DistortionTable:
         for name, text in (("META", meta), ("DEVICE", self.device_text)):
             data = np.frombuffer(text.encode(), np.uint8) if text else None
             hdus.append(fits.ImageHDU(data, name=name))
-        beside = path.with_name(f"{path.name}.{os.getpid()}.part")
-        try:
+        with written_whole(path, TableError) as beside:
             fits.HDUList(hdus).writeto(beside, checksum=True, overwrite=True)
-            os.replace(beside, path)
-        except OSError as error:
-            raise TableError(f"{path}: cannot be written: {error}") from None
-        finally:
-            beside.unlink(missing_ok=True)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> DistortionTable:

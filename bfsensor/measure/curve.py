@@ -13,11 +13,11 @@ from scipy.stats import chi2 as chi2_distribution
 
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.bartlett import bartlett_matrix
-from bfsensor.measure.ecsv import read_ecsv, same_fields, write_ecsv
+from bfsensor.measure.ecsv import read_ecsv, same_fields, square_lags, write_ecsv
 from bfsensor.measure.flats import UNITS, FlatCovariances, flat_covariances
 
-KIND = "bfsensor covariance curve"
-KIND_SLOPES = "bfsensor correlation slopes"
+SCHEMA = "bfsensor covariance curve"
+SCHEMA_SLOPES = "bfsensor correlation slopes"
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,13 +172,13 @@ class CovarianceCurve:
             "pairs": (self.pairs, None, f"pairs of pixels, {text}"),
         }
         meta = {"unit": self.unit, "region": self.region}
-        write_ecsv(path, KIND, columns, meta, overwrite=overwrite)
+        write_ecsv(path, SCHEMA, columns, meta, overwrite=overwrite)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> CovarianceCurve:
         """Read what :meth:`write` wrote; names the file and what is missing in it."""
         names = ("level", "covariances", "errors", "pairs")
-        columns, meta = read_ecsv(path, KIND, names, ("unit", "region"))
+        columns, meta = read_ecsv(path, SCHEMA, names, ("unit", "region"))
         return cls(levels=columns.pop("level"), **columns, **meta)
 
 
@@ -261,19 +261,20 @@ class CorrelationSlopes:
             unit = f"1 / {self.unit}" if name.startswith("slope") else None
             columns[name] = (getattr(self, name).ravel(), unit, "")
         meta = {n: getattr(self, n) for n in ("dof", "level_range", "unit", "region")}
-        write_ecsv(path, KIND_SLOPES, columns, meta, overwrite=overwrite)
+        write_ecsv(path, SCHEMA_SLOPES, columns, meta, overwrite=overwrite)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> CorrelationSlopes:
         """Read what :meth:`write` wrote; names the file and what is missing in it."""
         names = ("slopes", "slope_errors", "intercepts", "intercept_errors", "chi2")
         columns, meta = read_ecsv(
-            path, KIND_SLOPES, names, ("dof", "level_range", "unit", "region")
+            path,
+            SCHEMA_SLOPES,
+            ("i", "j", *names),
+            ("dof", "level_range", "unit", "region"),
         )
-        side = round(len(columns["chi2"]) ** 0.5)
         low, high = meta.pop("level_range")
-        arrays = {name: columns[name].reshape(side, side) for name in names}
-        return cls(**arrays, level_range=(low, high), **meta)
+        return cls(**square_lags(path, columns), level_range=(low, high), **meta)
 
 
 def fit_correlation_slopes(

@@ -14,7 +14,7 @@ from scipy.stats import norm
 
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.bartlett import bartlett_matrix
-from bfsensor.measure.ecsv import read_ecsv, same_fields, write_ecsv
+from bfsensor.measure.ecsv import read_ecsv, same_fields, square_lags, write_ecsv
 from bfsensor.measure.products import (
     box_edges,
     subtract_box_means,
@@ -24,7 +24,7 @@ from bfsensor.measure.products import (
 )
 
 UNITS = ("electron", "adu")
-KIND = "bfsensor flat covariances"
+SCHEMA = "bfsensor flat covariances"
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ class FlatCovariances:
         }
         names = ("level", "means", "pixels", "clipped", "unit", "region")
         meta = {name: getattr(self, name) for name in names}
-        write_ecsv(path, KIND, columns, meta, overwrite=overwrite)
+        write_ecsv(path, SCHEMA, columns, meta, overwrite=overwrite)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> FlatCovariances:
@@ -141,24 +141,11 @@ class FlatCovariances:
             Names the file and what is missing in it.
         """
         columns, meta = read_ecsv(
-            path, KIND, ("i", "j", "covariance", "error", "pairs"),
+            path, SCHEMA, ("i", "j", "covariance", "error", "pairs"),
             ("level", "means", "pixels", "clipped", "unit", "region"),
         )  # fmt: skip
-        side = round(len(columns["i"]) ** 0.5)
-        order = np.lexsort((columns["i"], columns["j"]))
-        j, i = np.indices((side, side))
-        if side * side != len(order) or not (
-            np.array_equal(columns["i"][order], i.ravel())
-            and np.array_equal(columns["j"][order], j.ravel())
-        ):
-            raise MeasurementError(f"{path}: its lags do not fill a square from (0, 0)")
-        arrays = {
-            attribute: columns[name][order].reshape(side, side)
-            for attribute, name in (
-                ("covariances", "covariance"), ("errors", "error"), ("pairs", "pairs")
-            )
-        }  # fmt: skip
-        return cls(**arrays, **meta)
+        lags = square_lags(path, columns)
+        return cls(lags["covariance"], lags["error"], lags["pairs"], **meta)
 
 
 def flat_covariances(

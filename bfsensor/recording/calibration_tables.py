@@ -20,6 +20,7 @@ from astropy.units import UnitsWarning
 from numpy.typing import NDArray
 
 from bfsensor.errors import RecordingError
+from bfsensor.files import refuse_existing, written_whole
 
 Columns = Mapping[str, NDArray[Any]]
 Sides = Mapping[str, int]
@@ -224,25 +225,21 @@ def write_tables(
         The file exists and ``overwrite`` is not set, or cannot hold this.
     """
     target = Path(path)
-    if target.exists() and not overwrite:
-        raise RecordingError(f"{target} exists; say overwrite to replace it")
+    refuse_existing(target, overwrite, RecordingError)
     if target.suffix == ".ecsv" and len(tables) > 1:
         raise RecordingError(f"{target}: ECSV holds one table, not {len(tables)}; use FITS")
-    part = target.with_name(f"{target.name}.{os.getpid()}.part")
-    try:
-        if target.suffix == ".ecsv":
-            tables[0].write(part, format="ascii.ecsv", overwrite=True)
-        else:
+    with written_whole(target, RecordingError) as beside:
+        try:
+            if target.suffix == ".ecsv":
+                tables[0].write(beside, format="ascii.ecsv", overwrite=True)
+                return
             with warnings.catch_warnings():
                 # Keywords above eight letters become HIERARCH cards, as LSST's do.
                 warnings.simplefilter("ignore", VerifyWarning)
                 hdus = [fits.PrimaryHDU(), *(_to_hdu(table) for table in tables)]
-                fits.HDUList(hdus).writeto(part, overwrite=True)
-        os.replace(part, target)
-    except (OSError, ValueError) as error:
-        raise RecordingError(f"{target}: cannot be written: {error}") from None
-    finally:
-        part.unlink(missing_ok=True)
+                fits.HDUList(hdus).writeto(beside, overwrite=True)
+        except ValueError as error:
+            raise RecordingError(f"{target}: cannot be written: {error}") from None
 
 
 def _to_hdu(table: Table) -> fits.BinTableHDU:

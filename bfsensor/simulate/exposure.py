@@ -18,6 +18,7 @@ from scipy.special import erf
 
 from bfsensor import silicon
 from bfsensor.errors import DeviceError, SimulationError
+from bfsensor.files import written_whole
 from bfsensor.simulate import light
 from bfsensor.simulate.build_up import build_up
 from bfsensor.simulate.transport import Transport
@@ -166,7 +167,6 @@ class Spot:
 
     def write(self, path: str | Path) -> None:
         """Write to FITS, whole or not at all."""
-        path = Path(path)
         header = fits.Header()
         header["SCHEMA"] = SCHEMA
         header["SPOT"] = (self.number, "number of the spot in its plan")
@@ -180,9 +180,8 @@ class Spot:
         ])  # fmt: skip
         for hdu in hdus[1:]:
             hdu.header["BUNIT"] = "electron"
-        part = path.with_name(path.name + ".part")
-        hdus.writeto(part, overwrite=True, checksum=True)
-        part.replace(path)
+        with written_whole(path, SimulationError) as beside:
+            hdus.writeto(beside, overwrite=True, checksum=True)
 
     @classmethod
     def read(cls, path: str | Path) -> Spot:
