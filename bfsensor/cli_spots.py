@@ -79,7 +79,6 @@ def spots(
 
     from bfsensor.simulate.exposure import Spot, SpotPlan, simulate_spot
     from bfsensor.simulate.transport import Transport
-    from bfsensor.simulate.well import full_well
     from bfsensor.sweep import open_executor, run_points
 
     plan = SpotPlan(
@@ -87,13 +86,7 @@ def spots(
         pixels=pixels, cells=cells, depth=depth, wavelength=wavelength,
         transport=Transport(diffusion=diffusion), seed=seed,
     )  # fmt: skip
-    # Wells hold in the field's solution whatever they are given: beyond the full well, wrong.
-    most = full_well(plan.device, cells=cells)
-    if plan.peak > most:
-        raise SimulationError(
-            f"spots: peak = {plan.peak:g} e- must be below the full well of "
-            f"{plan.device.name}, {most:.0f} e-: electrons that spill are not followed"
-        )
+    plan.check_full_well()  # before any worker starts
     output.mkdir(parents=True, exist_ok=True)
     bar = tqdm(total=count, unit="spot", file=sys.stderr)
 
