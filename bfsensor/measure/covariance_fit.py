@@ -231,6 +231,8 @@ def fit_covariances(
         raise MeasurementError(f"lags = {lags} must be from 0 to {curve.lags}, the curve's")
     if gain is not None and not gain > 0:
         raise MeasurementError(f"gain = {gain} e-/{curve.unit} must be above 0")
+    if not 0 < outlier_chance < 1:
+        raise MeasurementError(f"outlier_chance = {outlier_chance} must be between 0 and 1")
     fitted = curve.select(lags=lags)
     needed = 2 + (not constant_a) + (gain is None)
     reason = "given"

@@ -143,8 +143,10 @@ class CovarianceCurve:
             As the attributes.
         """
         c = np.asarray(covariances, float)
-        if c.ndim != 3:
+        if c.ndim != 3 or c.shape[1] != c.shape[2]:
             raise MeasurementError(f"covariances of shape {c.shape} are not (n, j, i)")
+        if not pixels >= 1:
+            raise MeasurementError(f"pixels = {pixels} must be at least 1")
         pairs = np.full(c.shape, int(pixels))
         variance = np.diagonal(bartlett_matrix(c, pairs), axis1=1, axis2=2)
         errors = np.sqrt(variance).reshape(c.shape)
@@ -155,6 +157,14 @@ class CovarianceCurve:
     ) -> CovarianceCurve:
         """Keep some pairs (mask or indices) and the lags up to ``lags``; all by default."""
         at = np.arange(len(self)) if keep is None else np.asarray(keep)
+        if lags is not None and not 0 <= lags <= self.lags:
+            raise MeasurementError(
+                f"lags = {lags} must be from 0 to {self.lags}, the curve's"
+            )
+        if at.dtype == bool and at.shape != (len(self),):
+            raise MeasurementError(
+                f"a choice of shape {at.shape} for {len(self)} pairs must be ({len(self)},)"
+            )
         side = (self.lags if lags is None else lags) + 1
         return CovarianceCurve(
             self.levels[at], self.covariances[at, :side, :side],
@@ -198,8 +208,21 @@ def measure_curve(
     Returns
     -------
     CovarianceCurve
+
+    Raises
+    ------
+    MeasurementError
+        No pair, or one that cannot be measured; names it by its place from 0.
     """
-    return CovarianceCurve.from_pairs(flat_covariances(a, b, **options) for a, b in pairs)
+    found = []
+    for number, pair in enumerate(pairs):
+        if len(pair) != 2:
+            raise MeasurementError(f"pair {number} holds {len(pair)} flats, not 2")
+        try:
+            found.append(flat_covariances(pair[0], pair[1], **options))
+        except MeasurementError as error:
+            raise MeasurementError(f"pair {number}: {error}") from None
+    return CovarianceCurve.from_pairs(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,7 +324,7 @@ def fit_correlation_slopes(
     Raises
     ------
     MeasurementError
-        Fewer than three pairs in the range.
+        Fewer than three pairs in the range, or one of level or variance 0 or below.
 
     Notes
     -----
@@ -333,6 +356,11 @@ def fit_correlation_slopes(
     used = curve.select(inside)
     level = used.levels[:, None, None]
     variance = used.covariances[:, :1, :1]
+    for name, least in (("level", used.levels.min()), ("variance", variance.min())):
+        if not least > 0:
+            raise MeasurementError(
+                f"a {name} of {least:g} has no correlation: give the level_range above it"
+            )
     ratio = used.covariances / variance
     # Relative errors of the variance are those of C_00; they matter where C_ij ~ C_00.
     error = np.hypot(used.errors, ratio * used.errors[:, :1, :1]) / variance

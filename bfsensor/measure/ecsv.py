@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from astropy.table import Column, Table
-from astropy.utils.exceptions import AstropyWarning
+from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 
 from bfsensor.errors import MeasurementError
@@ -99,11 +99,11 @@ def read_ecsv(
     try:
         with warnings.catch_warnings():
             # Of types that are none astropy only warns.
-            warnings.simplefilter("error", AstropyWarning)
+            warnings.simplefilter("error", AstropyUserWarning)
             table = Table.read(path, format="ascii.ecsv")
     # Damaged headers end in several kinds of exception inside astropy.
     except (
-        OSError, ValueError, TypeError, KeyError, AttributeError, AstropyWarning
+        OSError, ValueError, TypeError, KeyError, AttributeError, AstropyUserWarning
     ) as error:  # fmt: skip
         line = " ".join(str(error).split())[:200]
         raise MeasurementError(f"{path}: not readable as ECSV: {line}") from None

@@ -13,6 +13,7 @@ from scipy.ndimage import binary_dilation
 from scipy.stats import norm
 
 from bfsensor.errors import MeasurementError
+from bfsensor.measure.arrays import to_floats
 from bfsensor.measure.bartlett import bartlett_matrix
 from bfsensor.measure.ecsv import read_ecsv, same_fields, square_lags, write_ecsv
 from bfsensor.measure.products import (
@@ -177,7 +178,8 @@ def flat_covariances(
     first, second : array_like, shape (ny, nx)
         Flats with bias subtracted [unit], axis 0 along y.
     mask : array_like of bool, shape (ny, nx), optional
-        True where a pixel is bad in either.  Pixels that are not finite are left out too.
+        True where a pixel is bad in either.  Pixels that are not finite, or hidden in a masked
+        array, are left out too.
     lags : int
         Largest lag in x and y [pixel].
     clip : float
@@ -204,8 +206,9 @@ def flat_covariances(
     Raises
     ------
     MeasurementError
-        The flats differ in shape, are not above zero in the mean, or are too small for the
-        lags.
+        The flats differ in shape, are not above zero in the mean, are too small for the
+        lags, are the same image, or differ by what is no Gaussian noise: more than 5 % of
+        the pixels beyond ``clip`` sigma.
 
     Notes
     -----
@@ -247,12 +250,15 @@ def flat_covariances(
         outliers = good & (np.abs(difference) > clip * sigma)
         if not outliers.any():
             break
+        _check_outliers(int(outliers.sum()), before, clip)
         if grow:
             ring = np.ones((2 * grow + 1, 2 * grow + 1), bool)
             outliers = good & binary_dilation(outliers, ring)
         good, cut = good & ~outliers, clip
         means = (float(a[good].mean()), float(b[good].mean()))
     weights = means[0] ** -2, means[1] ** -2
+    if not np.abs(difference).max() > 1e-12:
+        raise MeasurementError("the flats do not differ: the same image twice, or no noise")
     products, pairs = sum_products(difference, good, lags)
     if pairs.min() < 100:
         raise MeasurementError(
@@ -300,6 +306,11 @@ def measure_regions(
     -------
     found : dict of str to FlatCovariances
 
+    Raises
+    ------
+    MeasurementError
+        A region that leaves the image, or that cannot be measured; names it.
+
     Examples
     --------
     >>> rng = np.random.default_rng(8232)
@@ -308,14 +319,34 @@ def measure_regions(
     >>> sorted(measure_regions(*flats, halves, lags=1))
     ['left', 'right']
     """
-    a, b = np.asarray(first), np.asarray(second)
+    a, b = to_floats(first, "first flat"), to_floats(second, "second flat")
     bad = None if mask is None else np.asarray(mask)
-    return {
-        name: flat_covariances(
-            a[at], b[at], mask=None if bad is None else bad[at], region=name, **options
+    found = {}
+    for name, at in regions.items():
+        for part, size in zip(at, a.shape, strict=True):
+            low, high, _ = part.indices(size)
+            if not (low < high and (part.stop is None or part.stop <= size)):
+                raise MeasurementError(
+                    f"{name}: [{part.start}:{part.stop}] of {size} rows or columns leaves the "
+                    "image or is empty"
+                )
+        try:
+            found[name] = flat_covariances(
+                a[at], b[at], mask=None if bad is None else bad[at], region=name, **options
+            )
+        except MeasurementError as error:
+            raise MeasurementError(f"{name}: {error}") from None
+    return found
+
+
+def _check_outliers(outliers: int, pixels: int, clip: float) -> None:
+    """Refuse to clip what cannot be the tail of noise: it would set the variance."""
+    if outliers > 0.05 * pixels:
+        raise MeasurementError(
+            f"{100 * outliers / pixels:.0f} % of the pixels differ by more than {clip:g} sigma: "
+            "signals too coarsely quantised (below one step of noise), or structure that is "
+            "to be masked; clip=inf takes them as they are"
         )
-        for name, at in regions.items()
-    }
 
 
 def _checked(
@@ -323,7 +354,7 @@ def _checked(
     lags: int, clip: float, grow: int, box: int | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:  # fmt: skip
     """Check what was given; flats as floats, and the good pixels."""
-    a, b = np.array(first, float), np.array(second, float)
+    a, b = to_floats(first, "first flat"), to_floats(second, "second flat")
     if a.ndim != 2 or a.shape != b.shape:
         raise MeasurementError(f"flats of shapes {a.shape} and {b.shape} are not a pair")
     if not (isinstance(lags, int | np.integer) and 0 <= lags < min(a.shape) / 2):
@@ -334,6 +365,8 @@ def _checked(
         raise MeasurementError(f"clip = {clip} must be at least 3 sigma, or inf for none")
     if grow < 0:
         raise MeasurementError(f"grow = {grow} must not be negative")
+    if not isinstance(grow, int | np.integer):
+        raise MeasurementError(f"grow = {grow} must be a whole number")
     if box is not None and not box > 2 * lags:
         raise MeasurementError(
             f"box = {box} pixels must be more than twice the largest lag, {lags}"

@@ -182,7 +182,7 @@ def measure_moments(
     Raises
     ------
     MeasurementError
-        A background of another length, a read noise below 0.
+        A background of another length or not finite, a read noise below 0.
 
     References
     ----------
@@ -201,6 +201,8 @@ def measure_moments(
     below = np.asarray(background, float)
     if below.shape not in ((), (n,)):
         raise MeasurementError(f"background has the shape {below.shape}, the spots ({n},)")
+    if not np.all(np.isfinite(below)):
+        raise MeasurementError(f"background = {background!r} e- must be finite")
     if not (read_noise >= 0 and np.isfinite(read_noise)):
         raise MeasurementError(f"read_noise = {read_noise} e- must be 0 e- or more")
     data = stamps.electrons.reshape(n, -1)
