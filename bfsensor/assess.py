@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.build import Plan, _workshop, solve_level
+from bfsensor.levels import _workshop, solve_level
 from bfsensor.simulate.boundaries import (
     COARSENESS,
     RATIO,
@@ -21,6 +21,7 @@ from bfsensor.simulate.boundaries import (
 from bfsensor.simulate.mesh import make_mesh
 from bfsensor.simulate.poisson import Electrostatics, Potential, solve_unit_cell, tile
 from bfsensor.table import DistortionTable, vertex_fractions
+from bfsensor.table_plan import Plan
 
 _CELLS = 16
 _PERIOD = 10

@@ -3,29 +3,12 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import click
-from tqdm import tqdm
 
-
-class Bar:
-    """A bar on stderr that the readers may call with what is done and what there is."""
-
-    def __init__(self, word: str) -> None:
-        self._word = word
-        self._bar: Any = None
-
-    def __call__(self, done: int, of: int) -> None:
-        if self._bar is None:
-            self._bar = tqdm(
-                total=of, desc=self._word, leave=False, disable=not sys.stderr.isatty()
-            )
-        self._bar.update(done - self._bar.n)
-        if done >= of:
-            self._bar.close()
+from bfsensor.cli_common import Bar
 
 
 @click.command("check")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from typing import Any
 
 import click
+from tqdm import tqdm
 
 
 def parse_settings(
@@ -31,3 +33,21 @@ def load_device(name: str, settings: Sequence[tuple[str, str]]) -> Any:
     for key, value in settings:
         device = device.with_value(key, value)
     return device
+
+
+class Bar:
+    """A bar on stderr that the readers may call with what is done and what there is."""
+
+    def __init__(self, word: str) -> None:
+        self._word = word
+        self._bar: Any = None
+
+    def __call__(self, done: int, of: int) -> None:
+        """Move to what is done."""
+        if self._bar is None:
+            self._bar = tqdm(
+                total=of, desc=self._word, leave=False, disable=not sys.stderr.isatty()
+            )
+        self._bar.update(done - self._bar.n)
+        if done >= of:
+            self._bar.close()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from bfsensor.cli_check import Bar
+from bfsensor.cli_common import Bar
 
 
 @click.command("diagnose")

@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from bfsensor.errors import MeasurementError
+from bfsensor.files import written_whole
 
 _FILES = click.argument(
     "files", nargs=-1, required=True, type=click.Path(path_type=Path, exists=True)
@@ -88,11 +89,13 @@ def spots(
                     f"{path}: {amplifier.name}: no spot above {threshold:g} "
                     f"{amplifier.unit}; rejected: {dict(found.rejected)}"
                 )
-            fit = fit_spots(
-                cut_stamps(amplifier.image, found, size=stamp, mask=amplifier.mask),
-                weights=weights,
-            )
-            errors = fit.scatter_covariance if len(found.x) > 1 else fit.covariance
+            stamps = cut_stamps(amplifier.image, found, size=stamp, mask=amplifier.mask)
+            try:
+                fit = fit_spots(stamps, weights=weights)
+            except MeasurementError as error:
+                raise MeasurementError(f"{path}: {amplifier.name}: {error}") from None
+            # One spot has no scatter.
+            errors = fit.scatter_covariance if fit.used.sum() > 1 else fit.covariance
             rows.append(
                 {
                     "file": str(path), "amplifier": amplifier.name, "unit": amplifier.unit,
@@ -176,10 +179,18 @@ def flats(
             )
         for name, one in both[0].items():
             other = both[1][name]
-            pair = flat_covariances(
-                one.image, other.image, mask=one.mask | other.mask, lags=lags, unit=one.unit,
-                region=name,
-            )  # fmt: skip
+            if one.image.shape != other.image.shape or one.unit != other.unit:
+                raise MeasurementError(
+                    f"{first} and {second}: {name}: {one.image.shape} pixels in {one.unit} and "
+                    f"{other.image.shape} in {other.unit} are no pair"
+                )
+            try:
+                pair = flat_covariances(
+                    one.image, other.image, mask=one.mask | other.mask, lags=lags,
+                    unit=one.unit, region=name,
+                )  # fmt: skip
+            except MeasurementError as error:
+                raise MeasurementError(f"{first} and {second}: {name}: {error}") from None
             pairs.setdefault(name, []).append(pair)
             for j in range(lags + 1):
                 for i in range(lags + 1):
@@ -220,9 +231,8 @@ def _finish(
 
         table = Table(rows=rows)
         table.meta = {"summary": summary}
-        part = output.with_name(output.name + ".part")
-        table.write(part, format="ascii.ecsv", overwrite=True)
-        part.replace(output)
+        with written_whole(output, MeasurementError) as beside:
+            table.write(beside, format="ascii.ecsv", overwrite=True)
     if as_json:
         click.echo(json.dumps({"rows": rows, "summary": summary}, indent=1))
         return

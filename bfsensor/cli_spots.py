@@ -12,6 +12,7 @@ import click
 
 from bfsensor.cli_common import load_device, parse_settings
 from bfsensor.errors import BFSensorError, SimulationError
+from bfsensor.files import written_whole
 
 
 def _spot_path(folder: Path, key: str, number: int) -> Path:
@@ -78,7 +79,6 @@ def spots(
 
     from bfsensor.simulate.exposure import Spot, SpotPlan, simulate_spot
     from bfsensor.simulate.transport import Transport
-    from bfsensor.simulate.well import full_well
     from bfsensor.sweep import open_executor, run_points
 
     plan = SpotPlan(
@@ -86,13 +86,7 @@ def spots(
         pixels=pixels, cells=cells, depth=depth, wavelength=wavelength,
         transport=Transport(diffusion=diffusion), seed=seed,
     )  # fmt: skip
-    # Wells hold in the field's solution whatever they are given: beyond the full well, wrong.
-    most = full_well(plan.device, cells=cells)
-    if plan.peak > most:
-        raise SimulationError(
-            f"spots: peak = {plan.peak:g} e- must be below the full well of "
-            f"{plan.device.name}, {most:.0f} e-: electrons that spill are not followed"
-        )
+    plan.check_full_well()  # before any worker starts
     output.mkdir(parents=True, exist_ok=True)
     bar = tqdm(total=count, unit="spot", file=sys.stderr)
 
@@ -147,9 +141,8 @@ def _report(plan: Any, made: list[Any], output: Path, as_json: bool) -> None:
             for n, axis in enumerate("xy")
         }
         table.meta = {"device": plan.device.name, "key": plan.key, **summary}
-        part = output / "growth.ecsv.part"
-        table.write(part, format="ascii.ecsv", overwrite=True)
-        part.replace(output / "growth.ecsv")
+        with written_whole(output / "growth.ecsv", SimulationError) as beside:
+            table.write(beside, format="ascii.ecsv", overwrite=True)
         _draw(plan, made, growth, output / "growth.png")
     else:
         summary["slope_percent_per_50000e"] = "needs 2 spots for an error"

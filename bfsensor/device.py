@@ -38,6 +38,7 @@ from bfsensor.device_parts import (
     Well,
 )
 from bfsensor.errors import DeviceError
+from bfsensor.files import written_whole
 from bfsensor.resources import tables_dir
 from bfsensor.units import from_internal, to_internal
 
@@ -176,10 +177,8 @@ class Device:
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write a device file (beside, then renamed)."""
-        path = Path(path)
-        beside = path.with_name(path.name + ".part")
-        beside.write_text(self.to_toml(), encoding="utf-8")
-        os.replace(beside, path)
+        with written_whole(path, DeviceError) as beside:
+            beside.write_text(self.to_toml(), encoding="utf-8")
 
     def with_value(self, key: str, value: str) -> Device:
         """Give a copy with one quantity changed.

@@ -7,6 +7,7 @@ the left side: pixel centre x and y, angle, vertex x and y.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import warnings
 from dataclasses import replace
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from bfsensor.device import Device
 from bfsensor.device_import import import_poisson_ccd, read_configuration
 from bfsensor.errors import DeviceError, TableError
+from bfsensor.files import refuse_existing, written_whole
 from bfsensor.table import DistortionTable, nominal_positions, vertex_fractions
 
 
@@ -66,8 +68,7 @@ def write_galsim(
     stem = Path(stem)
     paths = (stem.with_name(stem.name + ".cfg"), stem.with_name(stem.name + ".dat"))
     for path in paths:
-        if path.exists() and not overwrite:
-            raise TableError(f"{path} exists; say overwrite to replace it")
+        refuse_existing(path, overwrite, TableError)
     if device is None and not table.device_text:
         raise TableError(
             "GalSim needs the device for its diffusion, and this table has none"
@@ -138,17 +139,10 @@ def write_galsim(
 
 def _write_together(files: dict[Path, list[str]]) -> None:
     """Write all files beside before the first is renamed: no half pair after a failure."""
-    parts = {path: path.with_name(f"{path.name}.{os.getpid()}.part") for path in files}
-    try:
+    with contextlib.ExitStack() as stack:
         for path, lines in files.items():
-            parts[path].write_text("\n".join(lines) + "\n", encoding="utf-8")
-        for path, part in parts.items():
-            os.replace(part, path)
-    except OSError as error:
-        raise TableError(f"{path}: cannot be written: {error}") from None
-    finally:
-        for part in parts.values():
-            part.unlink(missing_ok=True)
+            beside = stack.enter_context(written_whole(path, TableError))
+            beside.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def read_galsim(stem: str | os.PathLike[str]) -> DistortionTable:

@@ -7,12 +7,9 @@ source pixel for levels of all three.
 
 from __future__ import annotations
 
-import json
 import os
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -24,60 +21,7 @@ from scipy.interpolate import PchipInterpolator
 
 from bfsensor.errors import TableError
 from bfsensor.interpolation import polynomial_weights, spline_weights
-
-SCHEMA = "bfsensor distortion table"
-SCHEMA_VERSION = 1
-
-_ARRAYS = ("corners", "horizontal", "vertical")
-_AXES = ("charges", "backgrounds", "depths")
-
-
-def vertex_fractions(vertices: int) -> NDArray[np.float64]:
-    """Nominal positions of the vertices along a side, 0 to 1, denser at the middle.
-
-    Equal steps of the angle seen from the pixel centre, as in GalSim's tables, so that a
-    table can be exported without resampling.
-
-    Parameters
-    ----------
-    vertices : int
-        Vertices between the corners.
-
-    Returns
-    -------
-    fractions : ndarray, shape (vertices,)
-
-    Examples
-    --------
-    >>> vertex_fractions(1)
-    array([0.5])
-    """
-    angle = -np.pi / 4 + (np.arange(vertices) + 1) * np.pi / (2 * (vertices + 1))
-    return np.asarray((np.tan(angle) + 1) / 2)
-
-
-@dataclass(frozen=True)
-class Displacements:
-    """Displacements (dx, dy) [um] of corners and side vertices at one point of a table."""
-
-    corners: NDArray[np.float64]
-    horizontal: NDArray[np.float64]
-    vertical: NDArray[np.float64]
-
-
-def nominal_positions(
-    pitch: tuple[float, float], reach: int, fractions: NDArray[np.float64]
-) -> Displacements:
-    """Positions (x, y) [um] of the vertices of undistorted pixels around (0, 0)."""
-    n = 2 * reach + 1
-    x = (np.arange(n + 1) - reach - 0.5) * pitch[0]
-    y = (np.arange(n + 1) - reach - 0.5) * pitch[1]
-    corners = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), -1)
-    along_x = (x[:-1, None] + fractions * pitch[0])[None]
-    along_y = (y[:-1, None] + fractions * pitch[1])[:, None]
-    horizontal = np.stack(np.broadcast_arrays(along_x, y[:, None, None]), -1)
-    vertical = np.stack(np.broadcast_arrays(x[None, :, None], along_y), -1)
-    return Displacements(corners, horizontal, vertical)
+from bfsensor.vertices import Displacements, nominal_positions, vertex_fractions
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +100,7 @@ class DistortionTable:
 
     def __post_init__(self) -> None:
         self._check_numbers()
-        for name in _AXES:
+        for name in ("charges", "backgrounds", "depths"):
             axis = np.array(getattr(self, name), float)
             if (
                 axis.ndim != 1
@@ -428,69 +372,10 @@ class DistortionTable:
         TableError
             The file exists and ``overwrite`` is not set, or it cannot be written.
         """
-        from astropy.io import fits
+        # Not at the top: astropy is slow to load.
+        from bfsensor.table_files import write_table
 
-        path = Path(path)
-        if path.exists() and not overwrite:
-            raise TableError(f"{path} exists; say overwrite to replace it")
-        arrays = {name: getattr(self, name) for name in self._shapes()}
-        quadrants = {name: _quadrant(array) for name, array in arrays.items()}
-        quadrant = self.symmetric and all(
-            np.array_equal(_whole(name, quadrants[name]), array)
-            for name, array in arrays.items()
-        )
-        if quadrant:
-            arrays = quadrants
-        primary = fits.PrimaryHDU()
-        header = primary.header
-        header["SCHEMA"] = (SCHEMA, "what this file is")
-        header["SCHEMAV"] = (SCHEMA_VERSION, "version of the schema")
-        header["BUNIT"] = ("um", "unit of all displacements")
-        header["VERTICES"] = (self.vertices, "vertices a side between the corners")
-        header["REACH"] = (self.reach, "largest pixel offset")
-        header["QUADRANT"] = (quadrant, "only offsets >= 0 are stored, the rest mirrored")
-        header["SYMMETRC"] = (self.symmetric, "mirror-symmetric about the source pixel")
-        header["PITCHX"] = (self.pitch[0], "[um] pixel pitch along the gates")
-        header["PITCHY"] = (self.pitch[1], "[um] pixel pitch along the channel stops")
-        header["THICKNSS"] = (self.thickness, "[um] height of the back surface")
-        if np.isfinite(self.full_well):
-            header["FULLWELL"] = (
-                self.full_well,
-                "[electron] charge at which a pixel spills",
-            )
-        header["DATE"] = (
-            datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"),
-            "[UTC] when this file was written",
-        )
-        # For people who look at the header; META is what is read back.
-        for key, text in self.provenance.items():
-            header["HISTORY"] = _printable(f"{key} = {text}")
-        for key, error in self.errors.items():
-            header["COMMENT"] = _printable(f"error: {key} = {error:.3g}")
-        hdus = [primary]
-        for name, array in arrays.items():
-            hdu = fits.ImageHDU(array.astype(np.float32), name=name.upper())
-            hdu.header["BUNIT"] = "um"
-            hdus.append(hdu)
-        for name, unit in zip(_AXES, ("electron", "electron", "um"), strict=True):
-            hdu = fits.ImageHDU(getattr(self, name), name=name.upper())
-            hdu.header["BUNIT"] = unit
-            hdus.append(hdu)
-        meta = json.dumps(
-            {"errors": dict(self.errors), "provenance": dict(self.provenance)},
-            sort_keys=True,
-        )
-        for name, text in (("META", meta), ("DEVICE", self.device_text)):
-            data = np.frombuffer(text.encode(), np.uint8) if text else None
-            hdus.append(fits.ImageHDU(data, name=name))
-        beside = path.with_name(f"{path.name}.{os.getpid()}.part")
-        try:
-            fits.HDUList(hdus).writeto(beside, checksum=True, overwrite=True)
-            os.replace(beside, path)
-        except OSError as error:
-            raise TableError(f"{path}: cannot be written: {error}") from None
-        finally:
-            beside.unlink(missing_ok=True)
+        write_table(self, path, overwrite=overwrite)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> DistortionTable:
@@ -501,63 +386,13 @@ class DistortionTable:
         TableError
             Not such a file, an unknown schema, or damaged; names the file.
         """
-        from astropy.io import fits
-        from astropy.utils.exceptions import AstropyWarning
+        from bfsensor.table_files import read_fields
 
-        path = Path(path)
-        if not path.exists():
-            raise TableError(f"{path}: no such file")
+        fields = read_fields(path)
         try:
-            with warnings.catch_warnings():
-                # astropy only warns of a wrong checksum or a short file.
-                warnings.simplefilter("error", AstropyWarning)
-                # Opened here: astropy leaves a file open in whose headers it fails.
-                with open(path, "rb") as stream, fits.open(stream, checksum=True) as hdus:
-                    header = hdus[0].header
-                    _check_schema(header, path)
-                    data = {hdu.name: hdu.data for hdu in hdus[1:]}
-                    hdus[0].verify("exception")
-        except TableError:
-            raise
-        # Damaged headers end in many kinds of exception inside astropy.
-        except Exception as error:
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise TableError(f"{path}: not a FITS file, or damaged: {reason}") from None
-        needed = [name.upper() for name in (*_ARRAYS, *_AXES, "meta", "device")]
-        missing = [name for name in needed if name not in data]
-        if missing:
-            raise TableError(f"{path}: truncated: {', '.join(missing)} is missing")
-        try:
-            return cls._from_parts(header, data)
-        except KeyError as error:
-            raise TableError(
-                f"{path}: not a FITS file, or damaged: {error.args[0]}"
-            ) from None
+            return cls(**fields)
         except (ValueError, TypeError, AttributeError, IndexError) as error:
-            raise TableError(f"{path}: {error}") from None
-
-    @classmethod
-    def _from_parts(
-        cls, header: Mapping[str, Any], data: dict[str, Any]
-    ) -> DistortionTable:
-        arrays = {}
-        for name in _ARRAYS:
-            array = np.array(data[name.upper()], float)
-            arrays[name] = _whole(name, array) if header["QUADRANT"] else array
-        meta = json.loads(_text(data["META"]))
-        return cls(
-            **{name: np.array(data[name.upper()], float) for name in _AXES},
-            pitch=(header["PITCHX"], header["PITCHY"]),
-            thickness=header["THICKNSS"],
-            vertices=header["VERTICES"],
-            reach=header["REACH"],
-            full_well=header.get("FULLWELL", float("nan")),
-            errors=meta["errors"],
-            provenance=meta["provenance"],
-            device_text=_text(data["DEVICE"]),
-            symmetric=header["SYMMETRC"],
-            **arrays,
-        )
+            raise TableError(f"{Path(path)}: {error}") from None
 
 
 def _make(values: dict[str, Any]) -> DistortionTable:
@@ -568,42 +403,3 @@ def _keep(table: DistortionTable, name: str, array: NDArray[np.float64]) -> None
     """Set a frozen attribute, read-only."""
     array.flags.writeable = False
     object.__setattr__(table, name, array)
-
-
-def _check_schema(header: Mapping[str, Any], path: Path) -> None:
-    """Refuse what is not a table of the schema that this version reads."""
-    if header.get("SCHEMA") != SCHEMA:
-        raise TableError(f"{path}: not a distortion table (no SCHEMA = '{SCHEMA}')")
-    if header.get("SCHEMAV") != SCHEMA_VERSION:
-        raise TableError(
-            f"{path}: schema version {header.get('SCHEMAV')} is not {SCHEMA_VERSION}, the "
-            "one this version of bfsensor reads"
-        )
-
-
-def _printable(text: str) -> str:
-    """Turn text into what a FITS header may hold."""
-    return text.encode("unicode_escape").decode("ascii")
-
-
-def _text(data: NDArray[np.uint8] | None) -> str:
-    """Decode the text of an extension; none where it has no data."""
-    return "" if data is None else data.astype(np.uint8).tobytes().decode()
-
-
-def _quadrant(array: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cut out the offsets from the source pixel's centre on."""
-    ny, nx = array.shape[3:5]
-    return array[:, :, :, ny // 2 :, nx // 2 :]
-
-
-def _whole(name: str, quadrant: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mirror a quadrant to the whole array; the source's own row and column stay."""
-    x, y, vertex = 4, 3, 5
-    for axis, sides, sign in ((x, "horizontal", (-1.0, 1.0)), (y, "vertical", (1.0, -1.0))):
-        mirrored = np.flip(quadrant, axis) * np.array(sign)
-        if name == sides:  # its vertices run along the axis, and it counts pixels there
-            mirrored = np.flip(mirrored, vertex)
-            mirrored = np.delete(mirrored, -1, axis)
-        quadrant = np.concatenate([mirrored, quadrant], axis) + 0.0
-    return quadrant

@@ -27,6 +27,7 @@ INTERNAL = {
     "potential": u.V,
     "temperature": u.K,
     "angle": u.rad,
+    "field": u.V / u.um,
     "density": u.um**-3,
     "dose": u.um**-2,
     "number": u.dimensionless_unscaled,

@@ -118,3 +118,25 @@ def test_spots_ask_for_the_gain(tmp_path):
 def test_help_shows_examples():
     for name in ("spots", "flats"):
         assert f"bfsensor measure {name}" in invoke(name, "--help").output
+
+
+def test_faults_name_file_and_amplifier(tmp_path):
+    rng = np.random.default_rng(8110)
+    image = rng.poisson(1000.0, (50, 50)).astype(float)
+    first = write(tmp_path / "first.fits", image)
+    small = write(tmp_path / "small.fits", image[:40])
+    result = invoke("flats", first, first)
+    assert result.output == (
+        f"bfsensor: {first} and {first}: AMP1: the flats do not differ: the same image twice, or "
+        "no noise\n"
+    )
+    result = invoke("flats", first, small)
+    assert result.output == (
+        f"bfsensor: {first} and {small}: AMP1: (50, 50) pixels in electron and (40, 50) in "
+        "electron are no pair\n"
+    )
+    # Plateaus, as saturation leaves them, are no Gaussians.
+    image[20:27, 20:27] = image[20:27, 35:42] = 5e4
+    result = invoke("spots", write(tmp_path / "flat_top.fits", image), "--threshold", 1e4)
+    assert result.exit_code == 1 and len(result.output.splitlines()) == 1
+    assert "flat_top.fits: AMP1: only" in result.output

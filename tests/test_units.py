@@ -22,6 +22,7 @@ WRITTEN = {
     "potential": "V",
     "temperature": "K",
     "angle": "deg",
+    "field": "V / cm",
     "density": "cm-3",
     "dose": "cm-2",
     "number": "",

@@ -128,6 +128,7 @@ def main() -> None:
     slopes, curve = [], []
     for setting in SETTINGS:
         plan = plan_for(setting)
+        plan.check_full_well()  # here, that workers need not
         folder = options.folder / setting
         folder.mkdir(parents=True, exist_ok=True)
         bar = tqdm(total=options.spots, desc=setting, unit="spot", file=sys.stderr)

@@ -7,6 +7,9 @@ from typing import Any
 
 from astropy.table import Table
 
+from bfsensor.errors import MeasurementError
+from bfsensor.files import written_whole
+
 
 def write_results(table: Table, path: str, command: str, **more: Any) -> None:
     """Write a table of results as ECSV, with command and commit in its header."""
@@ -14,4 +17,5 @@ def write_results(table: Table, path: str, command: str, **more: Any) -> None:
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
     )
     table.meta = {"command": command, "commit": commit.stdout.strip(), **more}
-    table.write(path, format="ascii.ecsv", overwrite=True)
+    with written_whole(path, MeasurementError) as beside:
+        table.write(beside, format="ascii.ecsv", overwrite=True)

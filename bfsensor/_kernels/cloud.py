@@ -8,7 +8,6 @@ distance that is a sum of N log N operations; ``pair_field`` sums over all pairs
 import numba
 import numpy as np
 
-from bfsensor._kernels.counter_rng import philox
 from bfsensor._kernels.transport import (
     ABSORBED,
     ARRIVED,
@@ -18,6 +17,7 @@ from bfsensor._kernels.transport import (
     _field,
     _mobility,
     _normals,
+    step_words,
 )
 
 
@@ -152,11 +152,7 @@ def drift_together(
             _field(phi, xs, ys, zs, room, q[n], cell, weights, g)
             for m in range(3):
                 p[n, m] += 0.5 * ds * (field[n, m] + g[m] + push[n, m]) + noise[m]
-            word = philox(
-                np.uint32(np.uint64(numbers[n]) & np.uint64(0xFFFFFFFF)),
-                np.uint32(np.uint64(numbers[n]) >> np.uint64(32)), np.uint32(step), np.uint32(2),
-                key0, key1,
-            )[0]  # fmt: skip
+            word = step_words(np.uint64(numbers[n]), step, 2, key0, key1)[0]
             if _confine(room, p[n], word):
                 active[n] = False
                 out_fate[n] = ABSORBED

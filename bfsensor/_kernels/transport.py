@@ -51,12 +51,18 @@ class Pace(NamedTuple):
 
 
 @numba.njit(cache=True, inline="always")
+def step_words(electron, step, stream, key0, key1):
+    """Four random words of an electron's step: 1 its noise, 2 the surface, 3 a collision."""
+    return philox(
+        np.uint32(electron & np.uint64(0xFFFFFFFF)), np.uint32(electron >> np.uint64(32)),
+        np.uint32(step), np.uint32(stream), key0, key1,
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, inline="always")
 def _normals(electron, step, key0, key1, out):
     """Three normal deviates."""
-    a, b, c, d = philox(
-        np.uint32(electron & np.uint64(0xFFFFFFFF)), np.uint32(electron >> np.uint64(32)),
-        np.uint32(step), np.uint32(1), key0, key1,
-    )  # fmt: skip
+    a, b, c, d = step_words(electron, step, 1, key0, key1)
     radius = np.sqrt(np.float32(-2) * log_uniform(b))
     sine, cosine = sine_cosine(a)
     out[0] = radius * cosine
@@ -125,7 +131,11 @@ def _confine(room, p, word):
 
 
 @numba.njit(cache=True)
-def _start_path(path, length, n, p):
+def _begin(room, starts, n, p, path, length):
+    """Put an electron where it is set free, and begin its path."""
+    for m in range(3):
+        p[m] = starts[n, m]
+    _confine(room, p, np.uint32(0xFFFFFFFF))
     if path.shape[0] > 0:
         for m in range(3):
             path[n, 0, m] = p[m]
@@ -159,12 +169,8 @@ def walk(
     q = np.zeros(3)
     noise = np.zeros(3)
     for n in range(starts.shape[0]):
-        for m in range(3):
-            p[m] = starts[n, m]
-        fate = LOST
-        if _confine(room, p, np.uint32(0xFFFFFFFF)):
-            fate = ABSORBED
-        _start_path(out_path, out_length, n, p)
+        _begin(room, starts, n, p, out_path, out_length)
+        fate, number = LOST, np.uint64(numbers[n])
         for step in range(pace.most):
             if _arrived(room.zone, p[0], p[1], p[2]):
                 fate = ARRIVED
@@ -182,17 +188,13 @@ def walk(
             if kt > 0.0:
                 ds = min(ds, 0.5 * length * length / kt)
             width = np.sqrt(2.0 * kt * ds)
-            _normals(np.uint64(numbers[n]), step, key0, key1, noise)
+            _normals(number, step, key0, key1, noise)
             for m in range(3):
                 noise[m] *= width
                 q[m] = p[m] + ds * here[m] + noise[m]
             word = np.uint32(0)
             if room.absorbed > 0.0:
-                word = philox(
-                    np.uint32(np.uint64(numbers[n]) & np.uint64(0xFFFFFFFF)),
-                    np.uint32(np.uint64(numbers[n]) >> np.uint64(32)), np.uint32(step),
-                    np.uint32(2), key0, key1,
-                )[0]  # fmt: skip
+                word = step_words(number, step, 2, key0, key1)[0]
             for m in range(3):
                 here[m] = p[m] + 0.5 * ds * here[m] + noise[m]
             # The field where the step would lead, held at the surfaces.
@@ -231,14 +233,9 @@ def scatter(
     g = np.zeros(3)
     p = np.zeros(3)
     for n in range(starts.shape[0]):
-        for m in range(3):
-            p[m] = starts[n, m]
-        fate = LOST
-        if _confine(room, p, np.uint32(0xFFFFFFFF)):
-            fate = ABSORBED
-        _start_path(out_path, out_length, n, p)
+        _begin(room, starts, n, p, out_path, out_length)
+        fate, number = LOST, np.uint64(numbers[n])
         free = -1.0
-        number = np.uint64(numbers[n])
         for step in range(most):
             if _arrived(room.zone, p[0], p[1], p[2]):
                 fate = ARRIVED
@@ -248,10 +245,7 @@ def scatter(
             mobility = _mobility(size, law)
             if free < 0.0 or not frozen:
                 free = mass * mobility
-            a, b, c, d = philox(
-                np.uint32(number & np.uint64(0xFFFFFFFF)), np.uint32(number >> np.uint64(32)),
-                np.uint32(step), np.uint32(3), key0, key1,
-            )  # fmt: skip
+            a, b, c, d = step_words(number, step, 3, key0, key1)
             time = -np.float64(log_uniform(a)) * free
             up = 2.0 * (np.float64(b) + 0.5) * 2.0**-32 - 1.0
             flat = np.sqrt(max(1.0 - up * up, 0.0))

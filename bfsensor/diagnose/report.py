@@ -176,17 +176,17 @@ def to_html(diagnosis: Diagnosis, figures: dict[str, Path]) -> str:
 <html lang=en><meta charset=utf-8><title>{text(diagnosis.campaign)}: diagnosis</title>
 <style>{STYLE}</style>
 <h1>{text(diagnosis.campaign)}</h1>
-<p class="said{"" if report["detected"] else " clear"}">{text(report["said"])}</p>
+<p class="said{mood}">{text(report["said"])}</p>
 <p>Baseline: {text(diagnosis.baseline)}. Exposures: {text(exposures)}.
-{"" if heldout is None else f"Flats that were not fitted: chi-square per value {heldout:.2f}."}
-Family-wise p: {report["p_value"]:.2g} (chi-squares {report["p_chi2"]:.2g}, scans {report["p_scans"]:.2g});
-below {report["alarm"]:g} counts as detected.</p>
+{unseen}
+Family-wise p: {report["p_value"]:.2g} (chi-squares {report["p_chi2"]:.2g}, scans
+{report["p_scans"]:.2g}); below {report["alarm"]:g} counts as detected.</p>
 <h2>Channels</h2>
-<table><tr><th>channel<th>chi-square<th>dof<th>ratio<th>p of the channel alone</tr>{"".join(rows)}</table>
-{f"<h2>What stands out</h2><table><tr><th>channel<th>scan<th>deviates<th>family-wise p<th>where</tr>{found}</table>" if found else ""}
+<table>{head}{"".join(rows)}</table>
+{found}
 <h2>Residuals of the baseline</h2>
 {pictures or "<p>No figures: matplotlib is not installed.</p>"}
-{f"<h2>Notes</h2><ul class=notes>{notes}</ul>" if notes else ""}
+{notes}
 </html>
 """
 

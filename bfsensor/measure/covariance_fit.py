@@ -15,9 +15,9 @@ from bfsensor.measure.bartlett import image_weights
 from bfsensor.measure.covariance_model import expand
 from bfsensor.measure.covariance_solver import Solution, find_turnoff, solve, start_values
 from bfsensor.measure.curve import CovarianceCurve
-from bfsensor.measure.ecsv import read_ecsv, same_fields, write_ecsv
+from bfsensor.measure.ecsv import read_ecsv, same_fields, square_lags, write_ecsv
 
-KIND = "bfsensor covariance fit"
+SCHEMA = "bfsensor covariance fit"
 _MATRICES = ("a", "c", "noise")
 _NAMES = (
     "gain", "held", "chi2", "dof", "dropped", "level_range", "range_reason", "powers",
@@ -145,24 +145,24 @@ class CovarianceFit:
         meta["gain_error"] = self.gain_error
         meta["gain_variance"] = float(self.matrix[-1, -1])
         meta["sum_of_a"], meta["sum_of_a_error"] = self.sum_rule
-        write_ecsv(path, KIND, columns, meta, overwrite=overwrite)
+        write_ecsv(path, SCHEMA, columns, meta, overwrite=overwrite)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> CovarianceFit:
         """Read what :meth:`write` wrote; names the file and what is missing in it."""
         columns, meta = read_ecsv(
-            path, KIND, (*_MATRICES, "matrix"), (*_NAMES, "gain_variance")
+            path, SCHEMA, ("i", "j", *_MATRICES, "matrix"), (*_NAMES, "gain_variance")
         )
-        n = len(columns["a"])
-        side = round(n**0.5)
+        lags = square_lags(path, columns)
+        n = lags["a"].size
+        rows = lags.pop("matrix").reshape(n, 3, -1).transpose(1, 0, 2)
         matrix = np.empty((3 * n + 1, 3 * n + 1))
-        matrix[: 3 * n] = columns["matrix"].transpose(1, 0, 2).reshape(3 * n, -1)
+        matrix[: 3 * n] = rows.reshape(3 * n, -1)
         matrix[-1, :-1] = matrix[:-1, -1]
         matrix[-1, -1] = meta.pop("gain_variance")
         for name in ("held", "dropped", "level_range"):
             meta[name] = tuple(meta[name])
-        arrays = {name: columns[name].reshape(side, side) for name in _MATRICES}
-        return cls(**arrays, matrix=matrix, **meta)
+        return cls(**lags, matrix=matrix, **meta)
 
 
 def fit_covariances(
@@ -231,6 +231,8 @@ def fit_covariances(
         raise MeasurementError(f"lags = {lags} must be from 0 to {curve.lags}, the curve's")
     if gain is not None and not gain > 0:
         raise MeasurementError(f"gain = {gain} e-/{curve.unit} must be above 0")
+    if not 0 < outlier_chance < 1:
+        raise MeasurementError(f"outlier_chance = {outlier_chance} must be between 0 and 1")
     fitted = curve.select(lags=lags)
     needed = 2 + (not constant_a) + (gain is None)
     reason = "given"

@@ -54,18 +54,32 @@ def model_covariances(
     covariances : ndarray, shape (n, lags + 1, lags + 1)
         [unit^2], indexed [pair, j, i].
 
+    Raises
+    ------
+    MeasurementError
+        Shapes that do not fit, a gain that is not above 0, or too many powers.
+
     Examples
     --------
     >>> a = np.array([[-1e-6, 2e-7], [2e-7, 5e-8]])
     >>> model_covariances([1e4], a)[0, 0].round(1)
     array([9900.8,   19.8])
     """
-    quadrant = np.asarray(a, float)
+    quadrant, mu = np.asarray(a, float), np.asarray(levels, float)
+    if mu.ndim != 1:
+        raise MeasurementError(f"levels of shape {mu.shape} must be a list, (n,)")
+    if quadrant.ndim != 2 or quadrant.shape[0] != quadrant.shape[1]:
+        raise MeasurementError(f"a of shape {quadrant.shape} is not (lags + 1, lags + 1)")
+    for name, other in (("b", b), ("noise", noise)):
+        if other is not None and np.shape(other) != quadrant.shape:
+            raise MeasurementError(
+                f"{name} has the shape {np.shape(other)}, a {quadrant.shape}"
+            )
     c = np.zeros_like(quadrant) if b is None else quadrant * np.asarray(b, float)
     n = np.zeros_like(quadrant) if noise is None else np.asarray(noise, float)
     if not gain > 0:
         raise MeasurementError(f"gain = {gain} e-/unit must be above 0")
-    m = gain * np.asarray(levels, float)
+    m = gain * mu
     return (expand(quadrant, c, powers).at(m) + n) / gain**2
 
 
@@ -100,6 +114,8 @@ def expand(
     """
     if not 1 <= powers <= 12:
         raise MeasurementError(f"powers = {powers} must be from 1 to 12")
+    if int(powers) != powers:
+        raise MeasurementError(f"powers = {powers} must be a whole number")
     lags = a.shape[0] - 1
     # Wide enough that no product wraps around into the lags that are read.
     reach = max(powers, 2) * lags

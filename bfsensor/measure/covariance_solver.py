@@ -49,7 +49,10 @@ def start_values(curve: CovarianceCurve, gain: float | None = None) -> Solution:
         line = p[0] + p[1] * (mu / top) + p[2] * (mu / top) ** 2
         return np.asarray((c[:, 0, 0] - top * line) / error[:, 0, 0])
 
-    first = float(np.median(c[:, 0, 0] / mu))
+    lit = mu > 0
+    if not lit.any():
+        raise MeasurementError(f"no pair has a level above 0, the highest is {top:g}")
+    first = float(np.median(c[lit, 0, 0] / mu[lit]))
     parabola = least_squares(residual, [0.0, first, 0.0], loss="soft_l1", x_scale=first)
     slope = parabola.x[1]
     if gain is None and not slope > 0:

@@ -13,11 +13,11 @@ from scipy.stats import chi2 as chi2_distribution
 
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.bartlett import bartlett_matrix
-from bfsensor.measure.ecsv import read_ecsv, same_fields, write_ecsv
+from bfsensor.measure.ecsv import read_ecsv, same_fields, square_lags, write_ecsv
 from bfsensor.measure.flats import UNITS, FlatCovariances, flat_covariances
 
-KIND = "bfsensor covariance curve"
-KIND_SLOPES = "bfsensor correlation slopes"
+SCHEMA = "bfsensor covariance curve"
+SCHEMA_SLOPES = "bfsensor correlation slopes"
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,8 +143,10 @@ class CovarianceCurve:
             As the attributes.
         """
         c = np.asarray(covariances, float)
-        if c.ndim != 3:
+        if c.ndim != 3 or c.shape[1] != c.shape[2]:
             raise MeasurementError(f"covariances of shape {c.shape} are not (n, j, i)")
+        if not pixels >= 1:
+            raise MeasurementError(f"pixels = {pixels} must be at least 1")
         pairs = np.full(c.shape, int(pixels))
         variance = np.diagonal(bartlett_matrix(c, pairs), axis1=1, axis2=2)
         errors = np.sqrt(variance).reshape(c.shape)
@@ -155,6 +157,14 @@ class CovarianceCurve:
     ) -> CovarianceCurve:
         """Keep some pairs (mask or indices) and the lags up to ``lags``; all by default."""
         at = np.arange(len(self)) if keep is None else np.asarray(keep)
+        if lags is not None and not 0 <= lags <= self.lags:
+            raise MeasurementError(
+                f"lags = {lags} must be from 0 to {self.lags}, the curve's"
+            )
+        if at.dtype == bool and at.shape != (len(self),):
+            raise MeasurementError(
+                f"a choice of shape {at.shape} for {len(self)} pairs must be ({len(self)},)"
+            )
         side = (self.lags if lags is None else lags) + 1
         return CovarianceCurve(
             self.levels[at], self.covariances[at, :side, :side],
@@ -172,13 +182,13 @@ class CovarianceCurve:
             "pairs": (self.pairs, None, f"pairs of pixels, {text}"),
         }
         meta = {"unit": self.unit, "region": self.region}
-        write_ecsv(path, KIND, columns, meta, overwrite=overwrite)
+        write_ecsv(path, SCHEMA, columns, meta, overwrite=overwrite)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> CovarianceCurve:
         """Read what :meth:`write` wrote; names the file and what is missing in it."""
         names = ("level", "covariances", "errors", "pairs")
-        columns, meta = read_ecsv(path, KIND, names, ("unit", "region"))
+        columns, meta = read_ecsv(path, SCHEMA, names, ("unit", "region"))
         return cls(levels=columns.pop("level"), **columns, **meta)
 
 
@@ -198,8 +208,21 @@ def measure_curve(
     Returns
     -------
     CovarianceCurve
+
+    Raises
+    ------
+    MeasurementError
+        No pair, or one that cannot be measured; names it by its place from 0.
     """
-    return CovarianceCurve.from_pairs(flat_covariances(a, b, **options) for a, b in pairs)
+    found = []
+    for number, pair in enumerate(pairs):
+        if len(pair) != 2:
+            raise MeasurementError(f"pair {number} holds {len(pair)} flats, not 2")
+        try:
+            found.append(flat_covariances(pair[0], pair[1], **options))
+        except MeasurementError as error:
+            raise MeasurementError(f"pair {number}: {error}") from None
+    return CovarianceCurve.from_pairs(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,19 +284,20 @@ class CorrelationSlopes:
             unit = f"1 / {self.unit}" if name.startswith("slope") else None
             columns[name] = (getattr(self, name).ravel(), unit, "")
         meta = {n: getattr(self, n) for n in ("dof", "level_range", "unit", "region")}
-        write_ecsv(path, KIND_SLOPES, columns, meta, overwrite=overwrite)
+        write_ecsv(path, SCHEMA_SLOPES, columns, meta, overwrite=overwrite)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> CorrelationSlopes:
         """Read what :meth:`write` wrote; names the file and what is missing in it."""
         names = ("slopes", "slope_errors", "intercepts", "intercept_errors", "chi2")
         columns, meta = read_ecsv(
-            path, KIND_SLOPES, names, ("dof", "level_range", "unit", "region")
+            path,
+            SCHEMA_SLOPES,
+            ("i", "j", *names),
+            ("dof", "level_range", "unit", "region"),
         )
-        side = round(len(columns["chi2"]) ** 0.5)
         low, high = meta.pop("level_range")
-        arrays = {name: columns[name].reshape(side, side) for name in names}
-        return cls(**arrays, level_range=(low, high), **meta)
+        return cls(**square_lags(path, columns), level_range=(low, high), **meta)
 
 
 def fit_correlation_slopes(
@@ -300,7 +324,7 @@ def fit_correlation_slopes(
     Raises
     ------
     MeasurementError
-        Fewer than three pairs in the range.
+        Fewer than three pairs in the range, or one of level or variance 0 or below.
 
     Notes
     -----
@@ -332,6 +356,11 @@ def fit_correlation_slopes(
     used = curve.select(inside)
     level = used.levels[:, None, None]
     variance = used.covariances[:, :1, :1]
+    for name, least in (("level", used.levels.min()), ("variance", variance.min())):
+        if not least > 0:
+            raise MeasurementError(
+                f"a {name} of {least:g} has no correlation: give the level_range above it"
+            )
     ratio = used.covariances / variance
     # Relative errors of the variance are those of C_00; they matter where C_ij ~ C_00.
     error = np.hypot(used.errors, ratio * used.errors[:, :1, :1]) / variance

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy.table import Column, Table
+from astropy.utils.exceptions import AstropyUserWarning
+from numpy.typing import NDArray
 
 from bfsensor.errors import MeasurementError
+from bfsensor.files import refuse_existing, written_whole
 
 
 def same_fields(one: Any, other: Any) -> bool:
@@ -28,50 +31,127 @@ def same_fields(one: Any, other: Any) -> bool:
 
 def write_ecsv(
     path: str | os.PathLike[str],
-    kind: str,
+    schema: str,
     columns: Mapping[str, tuple[Any, str | None, str]],
     meta: Mapping[str, Any],
     *,
     overwrite: bool,
 ) -> None:
-    """Write columns (values, unit, description) beside and rename them."""
-    target = Path(path)
-    if target.exists() and not overwrite:
-        raise MeasurementError(f"{target} exists; say overwrite to replace it")
+    """Write columns (values, unit, description) and single values of the header.
+
+    Parameters
+    ----------
+    path : path-like
+        The file, written whole or not at all.
+    schema : str
+        What the file is.
+    columns : mapping of str to (array_like, str or None, str)
+        Rows along the first axis.
+    meta : mapping
+        Single values and short arrays.
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    MeasurementError
+        The file exists and ``overwrite`` is not set, or it cannot be written.
+    """
+    refuse_existing(path, overwrite, MeasurementError)
     table = Table(
         [
-            Column(np.asarray(values), name=name, unit=unit, description=text)
+            Column(np.asarray(values), name=name, unit=unit, description=text or None)
             for name, (values, unit, text) in columns.items()
         ]
     )
-    table.meta = {"kind": kind}
+    table.meta = {"schema": schema}
     for name, value in meta.items():
         # YAML knows lists and plain numbers only.
         table.meta[name] = np.asarray(value).tolist()
-    part = target.with_name(f"{target.name}.{os.getpid()}.part")
-    try:
-        table.write(part, format="ascii.ecsv", overwrite=True)
-        os.replace(part, target)
-    except OSError as error:
-        raise MeasurementError(f"{target}: cannot be written: {error}") from None
-    finally:
-        part.unlink(missing_ok=True)
+    with written_whole(path, MeasurementError) as beside:
+        table.write(beside, format="ascii.ecsv", overwrite=True)
 
 
 def read_ecsv(
-    path: str | os.PathLike[str], kind: str, columns: Sequence[str], meta: Sequence[str]
+    path: str | os.PathLike[str], schema: str, columns: Sequence[str], meta: Sequence[str]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Read columns and meta by name; raises MeasurementError naming file and lack."""
+    """Read columns and single values by name.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+    schema : str
+        What it must be.
+    columns, meta : sequence of str
+        What it must hold; anything else in it is left alone.
+
+    Returns
+    -------
+    columns, meta : dict
+        Arrays, and values of the header.
+
+    Raises
+    ------
+    MeasurementError
+        The file is missing, damaged, of another schema, or lacks something; names it.
+    """
     try:
-        table = Table.read(path, format="ascii.ecsv")
-    except (OSError, ValueError) as error:
-        raise MeasurementError(f"{path}: cannot be read: {error}") from None
-    if table.meta.get("kind") != kind:
-        raise MeasurementError(f"{path}: holds {table.meta.get('kind')!r}, not {kind!r}")
-    for name, there in ((columns, table.colnames), (meta, table.meta)):
-        lacking = [one for one in name if one not in there]
+        with warnings.catch_warnings():
+            # Of types that are none astropy only warns.
+            warnings.simplefilter("error", AstropyUserWarning)
+            table = Table.read(path, format="ascii.ecsv")
+    # Damaged headers end in several kinds of exception inside astropy.
+    except (
+        OSError, ValueError, TypeError, KeyError, AttributeError, AstropyUserWarning
+    ) as error:  # fmt: skip
+        line = " ".join(str(error).split())[:200]
+        raise MeasurementError(f"{path}: not readable as ECSV: {line}") from None
+    # Curves and fits of flats said 'kind' once.
+    found = table.meta.get("schema", table.meta.get("kind"))
+    if found != schema:
+        raise MeasurementError(f"{path}: its schema is {found!r}, not {schema!r}")
+    for names, there in ((columns, table.colnames), (meta, table.meta)):
+        lacking = [name for name in names if name not in there]
         if lacking:
             raise MeasurementError(f"{path}: {', '.join(lacking)} missing")
-    return {name: np.asarray(table[name]) for name in columns}, {
-        name: table.meta[name] for name in meta
+    found_columns = {}
+    for name in columns:
+        values = np.asarray(table[name])
+        empty = getattr(table[name], "mask", np.False_)
+        if np.any(empty) and values.dtype.kind != "U":
+            raise MeasurementError(f"{path}: column {name} has empty cells")
+        found_columns[name] = np.where(empty, "", values) if np.any(empty) else values
+    return found_columns, {name: table.meta[name] for name in meta}
+
+
+def square_lags(
+    path: str | os.PathLike[str], columns: Mapping[str, NDArray[Any]]
+) -> dict[str, Any]:
+    """Bring columns with a row for each lag to the shape (lags + 1, lags + 1, ...), [j, i].
+
+    Parameters
+    ----------
+    path : path-like
+        The file, for the error.
+    columns : mapping of str to ndarray
+        With the lags as ``i`` and ``j``; rows in any order.
+
+    Raises
+    ------
+    MeasurementError
+        The lags do not fill a square from (0, 0).
+    """
+    side = round(len(columns["i"]) ** 0.5)
+    order = np.lexsort((columns["i"], columns["j"]))
+    j, i = np.indices((side, side))
+    if side * side != len(order) or not (
+        np.array_equal(columns["i"][order], i.ravel())
+        and np.array_equal(columns["j"][order], j.ravel())
+    ):
+        raise MeasurementError(f"{path}: its lags do not fill a square from (0, 0)")
+    return {
+        name: values[order].reshape(side, side, *values.shape[1:])
+        for name, values in columns.items()
+        if name not in ("i", "j")
     }

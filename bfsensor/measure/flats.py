@@ -13,8 +13,9 @@ from scipy.ndimage import binary_dilation
 from scipy.stats import norm
 
 from bfsensor.errors import MeasurementError
+from bfsensor.measure.arrays import to_floats
 from bfsensor.measure.bartlett import bartlett_matrix
-from bfsensor.measure.ecsv import read_ecsv, same_fields, write_ecsv
+from bfsensor.measure.ecsv import read_ecsv, same_fields, square_lags, write_ecsv
 from bfsensor.measure.products import (
     box_edges,
     subtract_box_means,
@@ -24,7 +25,7 @@ from bfsensor.measure.products import (
 )
 
 UNITS = ("electron", "adu")
-KIND = "bfsensor flat covariances"
+SCHEMA = "bfsensor flat covariances"
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +130,7 @@ class FlatCovariances:
         }
         names = ("level", "means", "pixels", "clipped", "unit", "region")
         meta = {name: getattr(self, name) for name in names}
-        write_ecsv(path, KIND, columns, meta, overwrite=overwrite)
+        write_ecsv(path, SCHEMA, columns, meta, overwrite=overwrite)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> FlatCovariances:
@@ -141,24 +142,11 @@ class FlatCovariances:
             Names the file and what is missing in it.
         """
         columns, meta = read_ecsv(
-            path, KIND, ("i", "j", "covariance", "error", "pairs"),
+            path, SCHEMA, ("i", "j", "covariance", "error", "pairs"),
             ("level", "means", "pixels", "clipped", "unit", "region"),
         )  # fmt: skip
-        side = round(len(columns["i"]) ** 0.5)
-        order = np.lexsort((columns["i"], columns["j"]))
-        j, i = np.indices((side, side))
-        if side * side != len(order) or not (
-            np.array_equal(columns["i"][order], i.ravel())
-            and np.array_equal(columns["j"][order], j.ravel())
-        ):
-            raise MeasurementError(f"{path}: its lags do not fill a square from (0, 0)")
-        arrays = {
-            attribute: columns[name][order].reshape(side, side)
-            for attribute, name in (
-                ("covariances", "covariance"), ("errors", "error"), ("pairs", "pairs")
-            )
-        }  # fmt: skip
-        return cls(**arrays, **meta)
+        lags = square_lags(path, columns)
+        return cls(lags["covariance"], lags["error"], lags["pairs"], **meta)
 
 
 def flat_covariances(
@@ -190,7 +178,8 @@ def flat_covariances(
     first, second : array_like, shape (ny, nx)
         Flats with bias subtracted [unit], axis 0 along y.
     mask : array_like of bool, shape (ny, nx), optional
-        True where a pixel is bad in either.  Pixels that are not finite are left out too.
+        True where a pixel is bad in either.  Pixels that are not finite, or hidden in a masked
+        array, are left out too.
     lags : int
         Largest lag in x and y [pixel].
     clip : float
@@ -217,8 +206,9 @@ def flat_covariances(
     Raises
     ------
     MeasurementError
-        The flats differ in shape, are not above zero in the mean, or are too small for the
-        lags.
+        The flats differ in shape, are not above zero in the mean, are too small for the
+        lags, are the same image, or differ by what is no Gaussian noise: more than 5 % of
+        the pixels beyond ``clip`` sigma.
 
     Notes
     -----
@@ -260,12 +250,15 @@ def flat_covariances(
         outliers = good & (np.abs(difference) > clip * sigma)
         if not outliers.any():
             break
+        _check_outliers(int(outliers.sum()), before, clip)
         if grow:
             ring = np.ones((2 * grow + 1, 2 * grow + 1), bool)
             outliers = good & binary_dilation(outliers, ring)
         good, cut = good & ~outliers, clip
         means = (float(a[good].mean()), float(b[good].mean()))
     weights = means[0] ** -2, means[1] ** -2
+    if not np.abs(difference).max() > 1e-12:
+        raise MeasurementError("the flats do not differ: the same image twice, or no noise")
     products, pairs = sum_products(difference, good, lags)
     if pairs.min() < 100:
         raise MeasurementError(
@@ -313,6 +306,11 @@ def measure_regions(
     -------
     found : dict of str to FlatCovariances
 
+    Raises
+    ------
+    MeasurementError
+        A region that leaves the image, or that cannot be measured; names it.
+
     Examples
     --------
     >>> rng = np.random.default_rng(8232)
@@ -321,14 +319,34 @@ def measure_regions(
     >>> sorted(measure_regions(*flats, halves, lags=1))
     ['left', 'right']
     """
-    a, b = np.asarray(first), np.asarray(second)
+    a, b = to_floats(first, "first flat"), to_floats(second, "second flat")
     bad = None if mask is None else np.asarray(mask)
-    return {
-        name: flat_covariances(
-            a[at], b[at], mask=None if bad is None else bad[at], region=name, **options
+    found = {}
+    for name, at in regions.items():
+        for part, size in zip(at, a.shape, strict=True):
+            low, high, _ = part.indices(size)
+            if not (low < high and (part.stop is None or part.stop <= size)):
+                raise MeasurementError(
+                    f"{name}: [{part.start}:{part.stop}] of {size} rows or columns leaves the "
+                    "image or is empty"
+                )
+        try:
+            found[name] = flat_covariances(
+                a[at], b[at], mask=None if bad is None else bad[at], region=name, **options
+            )
+        except MeasurementError as error:
+            raise MeasurementError(f"{name}: {error}") from None
+    return found
+
+
+def _check_outliers(outliers: int, pixels: int, clip: float) -> None:
+    """Refuse to clip what cannot be the tail of noise: it would set the variance."""
+    if outliers > 0.05 * pixels:
+        raise MeasurementError(
+            f"{100 * outliers / pixels:.0f} % of the pixels differ by more than {clip:g} sigma: "
+            "signals too coarsely quantised (below one step of noise), or structure that is "
+            "to be masked; clip=inf takes them as they are"
         )
-        for name, at in regions.items()
-    }
 
 
 def _checked(
@@ -336,7 +354,7 @@ def _checked(
     lags: int, clip: float, grow: int, box: int | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:  # fmt: skip
     """Check what was given; flats as floats, and the good pixels."""
-    a, b = np.array(first, float), np.array(second, float)
+    a, b = to_floats(first, "first flat"), to_floats(second, "second flat")
     if a.ndim != 2 or a.shape != b.shape:
         raise MeasurementError(f"flats of shapes {a.shape} and {b.shape} are not a pair")
     if not (isinstance(lags, int | np.integer) and 0 <= lags < min(a.shape) / 2):
@@ -347,6 +365,8 @@ def _checked(
         raise MeasurementError(f"clip = {clip} must be at least 3 sigma, or inf for none")
     if grow < 0:
         raise MeasurementError(f"grow = {grow} must not be negative")
+    if not isinstance(grow, int | np.integer):
+        raise MeasurementError(f"grow = {grow} must be a whole number")
     if box is not None and not box > 2 * lags:
         raise MeasurementError(
             f"box = {box} pixels must be more than twice the largest lag, {lags}"

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bfsensor.errors import MeasurementError
+from bfsensor.measure.arrays import to_floats
 from bfsensor.measure.spot_fit import fit_spots
 from bfsensor.measure.spots import Stamps
 
@@ -71,7 +72,8 @@ def measure_growth(
     Raises
     ------
     MeasurementError
-        Shapes that do not fit, or fewer than two spots.
+        Shapes that do not fit, images without a pixel in the middle, fewer than two spots, or
+        a level that cannot be fitted; names it, from 0.
 
     Examples
     --------
@@ -84,13 +86,15 @@ def measure_growth(
     >>> (found.growth.round(3) + 0.0).tolist()
     [[0.5, 1.0]]
     """
-    on, off = np.asarray(on, float), np.asarray(off, float)
+    on, off = to_floats(on, "images with the effect"), to_floats(off, "images without")
     if on.shape != off.shape or on.ndim != 4:
         raise MeasurementError(
             f"images with the effect {on.shape} and without {off.shape} must both be "
             "(spots, levels, rows, columns)"
         )
     spots, _, ny, nx = on.shape
+    if ny % 2 == 0 or nx % 2 == 0:
+        raise MeasurementError(f"images of {ny} x {nx} pixels have none in the middle")
     if spots < 2:
         raise MeasurementError(f"{spots} spots: errors need 2 at least")
     if stamp % 2 == 0 or not 3 <= stamp <= min(ny, nx):
@@ -125,10 +129,13 @@ def _measure(
     """Peak, width, growth by level, and slope of the growth."""
     peak, sigma, growth = [], [], []
     for level in range(on.shape[1]):
-        wide, plain = (
-            fit_spots(Stamps(images[:, level]), weights=weights, background=0.0)
-            for images in (on, off)
-        )
+        try:
+            wide, plain = (
+                fit_spots(Stamps(images[:, level]), weights=weights, background=0.0)
+                for images in (on, off)
+            )
+        except MeasurementError as error:
+            raise MeasurementError(f"level {level}: {error}") from None
         peak.append(float(np.mean(plain.peak)))
         sigma.append((plain.sigma_x, plain.sigma_y))
         growth.append(

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from astropy.table import Column, Table
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2 as chi2_distribution
 
 from bfsensor.errors import MeasurementError
-from bfsensor.measure.spot_files import read_ecsv, write_ecsv
+from bfsensor.measure.ecsv import read_ecsv, same_fields, write_ecsv
 
 UNIT_PEAK = 50_000.0
 """Slopes are per this many electrons in the peak, as published."""
@@ -76,38 +75,26 @@ class BFSlope:
         return float(np.hypot(self.slope_error, self.range_error))
 
     def __eq__(self, other: object) -> bool:
-        if not isinstance(other, BFSlope):
-            return NotImplemented
-        return all(
-            np.array_equal(
-                getattr(self, one.name), getattr(other, one.name), equal_nan=True
-            )
-            for one in fields(self)
-        )
+        return same_fields(self, other)
 
     __hash__ = None  # type: ignore[assignment]
 
-    def write(self, path: str | os.PathLike[str]) -> None:
+    def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write as ECSV, one row a point; raises MeasurementError if that cannot be."""
-        columns = [
-            Column(getattr(self, name), name=name, unit=unit)
-            for name, unit in _UNITS.items()
-        ]
+        columns = {name: (getattr(self, name), unit, "") for name, unit in _UNITS.items()}
         single = {
             one.name: getattr(self, one.name)
             for one in fields(self)
             if one.name not in _UNITS
         }
-        write_ecsv(path, Table(columns), SCHEMA, single)
+        write_ecsv(path, SCHEMA, columns, single, overwrite=overwrite)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> BFSlope:
         """Read what :meth:`write` wrote; raises MeasurementError for anything else."""
-        header = tuple(one.name for one in fields(cls) if one.name not in _UNITS)
-        table = read_ecsv(path, SCHEMA, {"columns": tuple(_UNITS), "header": header})
-        single = {name: table.meta[name] for name in header}
-        values: dict[str, Any] = {name: np.array(table[name].data) for name in _UNITS}
-        return cls(**single, **values)
+        header = [one.name for one in fields(cls) if one.name not in _UNITS]
+        columns, single = read_ecsv(path, SCHEMA, tuple(_UNITS), header)
+        return cls(**single, **columns)
 
 
 class _Line(NamedTuple):

@@ -14,15 +14,14 @@ For a Gaussian M is its covariance matrix.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from astropy.table import Column, Table
 from numpy.typing import ArrayLike, NDArray
 
 from bfsensor.errors import MeasurementError
-from bfsensor.measure.spot_files import read_ecsv, write_ecsv
+from bfsensor.measure.ecsv import read_ecsv, same_fields, write_ecsv
 from bfsensor.measure.spots import Stamps
 
 SCHEMA = "bfsensor.SpotMoments 1"
@@ -141,32 +140,19 @@ class SpotMoments:
         return MeanWidths(sx, sy, ex, ey, kx, ky)
 
     def __eq__(self, other: object) -> bool:
-        if not isinstance(other, SpotMoments):
-            return NotImplemented
-        return all(
-            np.array_equal(
-                getattr(self, one.name),
-                getattr(other, one.name),
-                equal_nan=one.name != "status",
-            )
-            for one in fields(self)
-        )
+        return same_fields(self, other)
 
     __hash__ = None  # type: ignore[assignment]
 
-    def write(self, path: str | os.PathLike[str]) -> None:
+    def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write as ECSV, one row a spot; raises MeasurementError if that cannot be."""
-        columns = [
-            Column(getattr(self, name), name=name, unit=unit)
-            for name, unit in _UNITS.items()
-        ]
-        write_ecsv(path, Table(columns), SCHEMA, {})
+        columns = {name: (getattr(self, name), unit, "") for name, unit in _UNITS.items()}
+        write_ecsv(path, SCHEMA, columns, {}, overwrite=overwrite)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> SpotMoments:
         """Read what :meth:`write` wrote; raises MeasurementError for anything else."""
-        table = read_ecsv(path, SCHEMA, {"columns": tuple(_UNITS), "header": ()})
-        return cls(**{name: np.array(table[name].data) for name in _UNITS})
+        return cls(**read_ecsv(path, SCHEMA, tuple(_UNITS), ())[0])
 
 
 def measure_moments(
@@ -196,7 +182,7 @@ def measure_moments(
     Raises
     ------
     MeasurementError
-        A background of another length, a read noise below 0.
+        A background of another length or not finite, a read noise below 0.
 
     References
     ----------
@@ -215,6 +201,8 @@ def measure_moments(
     below = np.asarray(background, float)
     if below.shape not in ((), (n,)):
         raise MeasurementError(f"background has the shape {below.shape}, the spots ({n},)")
+    if not np.all(np.isfinite(below)):
+        raise MeasurementError(f"background = {background!r} e- must be finite")
     if not (read_noise >= 0 and np.isfinite(read_noise)):
         raise MeasurementError(f"read_noise = {read_noise} e- must be 0 e- or more")
     data = stamps.electrons.reshape(n, -1)

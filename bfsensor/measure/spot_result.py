@@ -6,14 +6,12 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from astropy.table import Column, Table
 from numpy.typing import NDArray
 
 from bfsensor.errors import MeasurementError
-from bfsensor.measure.spot_files import read_ecsv, write_ecsv
+from bfsensor.measure.ecsv import read_ecsv, same_fields, write_ecsv
 from bfsensor.measure.spot_model import Shape, integrate_gaussian
 
 REASONS: Mapping[str, str] = {
@@ -173,40 +171,25 @@ class SpotFit:
         return float(np.mean(self.peaks[self.used]))
 
     def __eq__(self, other: object) -> bool:
-        if not isinstance(other, SpotFit):
-            return NotImplemented
-        for one in fields(self):
-            a, b = getattr(self, one.name), getattr(other, one.name)
-            if one.name in ("status", "weights"):
-                same = np.array_equal(a, b)
-            else:
-                same = np.array_equal(a, b, equal_nan=True)
-            if not same:
-                return False
-        return True
+        return same_fields(self, other)
 
     __hash__ = None  # type: ignore[assignment]
 
-    def write(self, path: str | os.PathLike[str]) -> None:
+    def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write as ECSV: one row a spot, what they share in the header.
 
         Raises
         ------
         MeasurementError
-            The file cannot be written.
+            The file exists and ``overwrite`` is not set, or it cannot be written.
         """
-        columns = [
-            Column(getattr(self, name), name=name, unit=unit)
-            for name, unit in _UNITS.items()
-        ]
-        shared = {}
-        for one in fields(self):
-            if one.name not in _UNITS:
-                value = getattr(self, one.name)
-                shared[one.name] = (
-                    value.tolist() if isinstance(value, np.ndarray) else value
-                )
-        write_ecsv(path, Table(columns), SCHEMA, shared)
+        columns = {name: (getattr(self, name), unit, "") for name, unit in _UNITS.items()}
+        shared = {
+            one.name: getattr(self, one.name)
+            for one in fields(self)
+            if one.name not in _UNITS
+        }
+        write_ecsv(path, SCHEMA, columns, shared, overwrite=overwrite)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> SpotFit:
@@ -217,13 +200,11 @@ class SpotFit:
         MeasurementError
             The file is missing, damaged or of another schema; names it.
         """
-        header = tuple(one.name for one in fields(cls) if one.name not in _UNITS)
-        table = read_ecsv(path, SCHEMA, {"columns": tuple(_UNITS), "header": header})
+        header = [one.name for one in fields(cls) if one.name not in _UNITS]
+        columns, shared = read_ecsv(path, SCHEMA, tuple(_UNITS), header)
         try:
-            arrays: dict[str, Any] = {name: np.array(table[name].data) for name in _UNITS}
-            shared = {name: table.meta[name] for name in header}
             for name in ("covariance", "scatter_covariance"):
                 shared[name] = np.array(shared[name], float).reshape(3, 3)
-            return cls(**shared, **arrays)
+            return cls(**shared, **columns)
         except (TypeError, ValueError) as error:
             raise MeasurementError(f"{path}: damaged: {error}") from None

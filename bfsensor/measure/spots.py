@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from bfsensor.errors import MeasurementError
+from bfsensor.measure.arrays import to_floats
 
 STAMP = 9
 """Pixels of a stamp a side, as in Lage et al. (2017), section 2.1: 4 sigma of their spots."""
@@ -83,7 +84,7 @@ class Stamps:
     y: NDArray[np.int64] | Any = None
 
     def __post_init__(self) -> None:
-        electrons = np.array(self.electrons, float)
+        electrons = to_floats(self.electrons, "stamps")
         if electrons.ndim != 3 or len(electrons) == 0:
             raise MeasurementError(
                 f"stamps of shape {electrons.shape} must be (spots, rows, columns)"
@@ -154,8 +155,9 @@ def find_spots(
     saturation : float
         A spot with a pixel of its stamp at this signal or above is rejected [e-].
     mask : array_like of bool, shape (ny, nx), optional
-        Bad pixels, True; so are values that are not finite.  A spot with a bad pixel in
-        the 3 x 3 about its centre is rejected; elsewhere the fit does without them.
+        Bad pixels, True; so are values that are not finite, or hidden in a masked array.  A
+        spot with a bad pixel in the 3 x 3 about its centre is rejected; elsewhere the fit
+        does without them.
     stamp : int
         Pixels of the stamps a side; spots whose stamp leaves the image are rejected.
 
@@ -179,7 +181,7 @@ def find_spots(
     >>> spots.x.tolist(), spots.y.tolist(), spots.rejected["border"]
     ([20], [10], 1)
     """
-    data = np.asarray(image, float)
+    data = to_floats(image, "image")
     _check_search(data, threshold, separation, saturation, stamp)
     bad = ~np.isfinite(data)
     if mask is not None:
@@ -230,6 +232,10 @@ def _check_search(
         )
     if separation < 2:
         raise MeasurementError(f"separation = {separation} pixels must be 2 or more")
+    if int(separation) != separation:
+        raise MeasurementError(
+            f"separation = {separation} must be a whole number of pixels"
+        )
     if stamp < 3 or stamp % 2 == 0:
         raise MeasurementError(f"stamp = {stamp} pixels must be odd, 3 or more")
     if min(data.shape) < stamp:
@@ -285,7 +291,7 @@ def cut_stamps(
     MeasurementError
         No spots, or a stamp that leaves the image.
     """
-    data = np.asarray(image, float)
+    data = to_floats(image, "image")
     if data.ndim != 2:
         raise MeasurementError(f"an image has rows and columns, not the shape {data.shape}")
     if len(spots) == 0:

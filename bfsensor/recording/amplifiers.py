@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from bfsensor.errors import RecordingError
 from bfsensor.recording.campaign import Campaign, Exposure
-from bfsensor.recording.fits_images import open_fits
 from bfsensor.recording.headers import BROKEN
+from bfsensor.recording.open_fits import open_fits
 from bfsensor.recording.sections import AmplifierLayout, to_sensor
 
 

@@ -17,9 +17,12 @@ from astropy.io import fits
 from astropy.io.fits.verify import VerifyWarning
 from astropy.table import Table
 from astropy.units import UnitsWarning
+from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 
 from bfsensor.errors import RecordingError
+from bfsensor.files import refuse_existing, written_whole
+from bfsensor.recording.open_fits import open_fits
 
 Columns = Mapping[str, NDArray[Any]]
 Sides = Mapping[str, int]
@@ -194,23 +197,36 @@ def read_tables(path: str | os.PathLike[str]) -> list[Table]:
     RecordingError
         The file cannot be read or holds no table.
     """
-    target = Path(path)
-    try:
-        if target.suffix == ".ecsv":
-            return [Table.read(target, format="ascii.ecsv")]
-        with warnings.catch_warnings(), fits.open(target, memmap=False) as hdus:
-            warnings.simplefilter("ignore", (VerifyWarning, UnitsWarning))
-            tables = []
-            for hdu in hdus:
-                if not isinstance(hdu, fits.BinTableHDU):
-                    continue
-                table = _from_hdu(hdu)
-                tables.append(table)
-    except (OSError, ValueError) as error:
-        raise RecordingError(f"{path}: cannot be read: {error}") from None
+    if Path(path).suffix == ".ecsv":
+        return [_from_ecsv(path)]
+    with open_fits(path) as hdus, warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnitsWarning)
+        tables = [_from_hdu(hdu) for hdu in hdus if isinstance(hdu, fits.BinTableHDU)]
     if not tables:
         raise RecordingError(f"{path}: holds no table")
     return tables
+
+
+def _from_ecsv(path: str | os.PathLike[str]) -> Table:
+    """Read a table; numbers that are left out are nan, text is empty."""
+    try:
+        with warnings.catch_warnings():
+            # Of types that are none astropy only warns.
+            warnings.simplefilter("error", AstropyUserWarning)
+            table = Table.read(path, format="ascii.ecsv")
+    # Damaged headers end in several kinds of exception inside astropy.
+    except (
+        OSError, ValueError, TypeError, KeyError, AttributeError, AstropyUserWarning
+    ) as error:  # fmt: skip
+        line = " ".join(str(error).split())[:200]
+        raise RecordingError(f"{path}: cannot be read: {line}") from None
+    for name in table.colnames:
+        if not np.any(getattr(table[name], "mask", False)):
+            continue
+        if table[name].dtype.kind not in "fU":
+            raise RecordingError(f"{path}: column {name} has empty cells")
+        table[name] = table[name].filled(np.nan if table[name].dtype.kind == "f" else "")
+    return table
 
 
 def write_tables(
@@ -224,25 +240,21 @@ def write_tables(
         The file exists and ``overwrite`` is not set, or cannot hold this.
     """
     target = Path(path)
-    if target.exists() and not overwrite:
-        raise RecordingError(f"{target} exists; say overwrite to replace it")
+    refuse_existing(target, overwrite, RecordingError)
     if target.suffix == ".ecsv" and len(tables) > 1:
         raise RecordingError(f"{target}: ECSV holds one table, not {len(tables)}; use FITS")
-    part = target.with_name(f"{target.name}.{os.getpid()}.part")
-    try:
-        if target.suffix == ".ecsv":
-            tables[0].write(part, format="ascii.ecsv", overwrite=True)
-        else:
+    with written_whole(target, RecordingError) as beside:
+        try:
+            if target.suffix == ".ecsv":
+                tables[0].write(beside, format="ascii.ecsv", overwrite=True)
+                return
             with warnings.catch_warnings():
                 # Keywords above eight letters become HIERARCH cards, as LSST's do.
                 warnings.simplefilter("ignore", VerifyWarning)
                 hdus = [fits.PrimaryHDU(), *(_to_hdu(table) for table in tables)]
-                fits.HDUList(hdus).writeto(part, overwrite=True)
-        os.replace(part, target)
-    except (OSError, ValueError) as error:
-        raise RecordingError(f"{target}: cannot be written: {error}") from None
-    finally:
-        part.unlink(missing_ok=True)
+                fits.HDUList(hdus).writeto(beside, overwrite=True)
+        except ValueError as error:
+            raise RecordingError(f"{target}: cannot be written: {error}") from None
 
 
 def _to_hdu(table: Table) -> fits.BinTableHDU:

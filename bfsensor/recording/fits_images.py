@@ -3,28 +3,28 @@
 from __future__ import annotations
 
 import os
-import re
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from astropy.io import fits
-from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import ArrayLike, NDArray
 
 from bfsensor.errors import RecordingError
-
-MAD_TO_SIGMA = 1.4826022185056018
-"""Standard deviation of a Gaussian over its median absolute deviation."""
+from bfsensor.recording.fits_sections import (
+    end_of_range,
+    find_saturated,
+    number_of,
+    parse_section,
+    subtract_overscan,
+)
+from bfsensor.recording.open_fits import open_fits
 
 OVERSCANS = ("row median", "row mean", "median")
 GAIN_KEYS = ("GAIN", "E-GAIN", "EGAIN")
 EXPOSURE_KEYS = ("EXPTIME", "EXPOSURE", "DARKTIME")
-SATURATION_KEYS = ("SATURATE", "SATLEVEL")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,8 @@ class AmplifierImage:
     image : ndarray, shape (ny, nx)
         Data section, bias subtracted, in ``unit``; axis 0 along y.
     mask : ndarray of bool, shape (ny, nx)
-        True where saturated (header, or the end of an integer's range) or not finite.
+        True where saturated (header, or the end of an integer's range) or not finite, which a
+        row without a finite overscan pixel is too.
     unit : str
         'electron', or 'adu' where no gain is known.
     gain : float
@@ -166,13 +167,16 @@ def read_raw(
             parts: Mapping[str, tuple[Any, Any]] = sections or {
                 name: (cards.get("DATASEC"), cards.get("BIASSEC"))
             }
-            mask = _saturated(hdu, cards)
+            end = end_of_range(hdu.header)  # before the data are read and scaled
+            mask = find_saturated(np.asarray(hdu.data), cards, end)
             for part, (data, over) in parts.items():
                 where = f"{path}: {part}"
                 sizes = (where, hdu.data.shape)
-                area = _parse_section("DATASEC", data, *sizes)
-                strip = None if over is None else _parse_section("BIASSEC", over, *sizes)
-                image, level, noise, count = _subtract_overscan(
+                area = parse_section("DATASEC", data, *sizes)
+                # Where no overscan is wanted the card may say anything.
+                wanted = overscan is not None and over is not None
+                strip = parse_section("BIASSEC", over, *sizes) if wanted else None
+                image, level, noise, count = subtract_overscan(
                     where, np.asarray(hdu.data, float), area, strip, overscan, skip
                 )
                 image = image - _bias_of(where, bias, part, image.shape)
@@ -186,7 +190,7 @@ def read_raw(
                         mask=mask[area] | ~np.isfinite(image),
                         unit="electron" if known else "adu",
                         gain=factor,
-                        exposure_time=_number(cards, EXPOSURE_KEYS),
+                        exposure_time=number_of(cards, EXPOSURE_KEYS),
                         overscan=overscan or "none",
                         overscan_level=level,
                         overscan_noise=noise * scale,
@@ -232,20 +236,6 @@ def read_bias(
     return {name: image / len(paths) for name, image in total.items()}
 
 
-@contextmanager
-def open_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
-    """Open a file and let the harmless faults of old cameras' cards pass."""
-    with warnings.catch_warnings():
-        # Lower-case exponents, null padding: read correctly, warned about.
-        warnings.simplefilter("ignore", AstropyUserWarning)
-        try:
-            with fits.open(path, memmap=False) as hdus:
-                hdus.verify("silentfix")
-                yield hdus
-        except OSError as error:
-            raise RecordingError(f"{path}: cannot be read: {error}") from None
-
-
 def _images(
     path: str | os.PathLike[str], hdus: fits.HDUList, names: Sequence[int | str] | None
 ) -> list[Any]:
@@ -278,78 +268,6 @@ def header_cards(header: fits.Header) -> dict[str, Any]:
     }
 
 
-def _number(cards: Mapping[str, Any], keys: Sequence[str]) -> float:
-    """Give the first of some cards that is a number; nan without one."""
-    for key in keys:
-        if isinstance(cards.get(key), int | float):
-            return float(cards[key])
-    return float("nan")
-
-
-def _saturated(hdu: Any, cards: Mapping[str, Any]) -> NDArray[np.bool_]:
-    """Find pixels at the header's saturation level, or at the end of an integer's range."""
-    data = np.asarray(hdu.data)
-    limit = _number(cards, SATURATION_KEYS)
-    if data.dtype.kind in "iu":
-        top = float(np.iinfo(data.dtype).max)
-        limit = min(limit, top) if np.isfinite(limit) else top
-    return np.asarray(data >= limit) if np.isfinite(limit) else np.zeros(data.shape, bool)
-
-
-def _parse_section(
-    card: str, text: Any, where: str, shape: tuple[int, int]
-) -> tuple[slice, slice]:
-    """Read '[x1:x2,y1:y2]' as slices of rows and columns; None is the whole image."""
-    if text is None:
-        return slice(0, shape[0]), slice(0, shape[1])
-    match = re.fullmatch(r"\s*\[\s*(\d+):(\d+)\s*,\s*(\d+):(\d+)\s*\]\s*", str(text))
-    if match is None:
-        raise RecordingError(f"{where}: {card} = {text!r} is not like '[1:512,1:2000]'")
-    x1, x2, y1, y2 = (int(number) for number in match.groups())
-    if x1 > x2 or y1 > y2:
-        raise RecordingError(
-            f"{where}: {card} = {text!r} runs backwards; flip the image and say so yourself"
-        )
-    if min(x1, y1) < 1 or x2 > shape[1] or y2 > shape[0]:
-        raise RecordingError(
-            f"{where}: {card} = {text!r} leaves the image, {shape[1]} x {shape[0]} pixels"
-        )
-    return slice(y1 - 1, y2), slice(x1 - 1, x2)
-
-
-def _subtract_overscan(
-    where: str, pixels: NDArray[np.float64], area: tuple[slice, slice],
-    strip: tuple[slice, slice] | None, method: str | None, skip: int,
-) -> tuple[NDArray[np.float64], float, float, int]:  # fmt: skip
-    """Data section less overscan; level and noise of it, pixels in a row of it."""
-    image = pixels[area]
-    if method is None:
-        return image, float("nan"), float("nan"), 0
-    if strip is None:
-        raise RecordingError(
-            f"{where}: BIASSEC is missing; give sections, or say overscan=None and a bias"
-        )
-    rows, columns = strip
-    columns = slice(columns.start + skip, columns.stop)
-    over = pixels[rows, columns]
-    if over.shape[1] < 1:
-        raise RecordingError(f"{where}: skip = {skip} leaves nothing of BIASSEC")
-    by_row = np.median(over, axis=1, keepdims=True)
-    level = float(np.median(over))
-    noise = MAD_TO_SIGMA * float(np.median(np.abs(over - by_row)))
-    if method == "median":
-        return image - level, level, noise, over.shape[1]
-    if rows.start > area[0].start or rows.stop < area[0].stop:
-        raise RecordingError(
-            f"{where}: BIASSEC has the rows {rows.start + 1} to {rows.stop}, not all of "
-            f"{area[0].start + 1} to {area[0].stop}; overscan='median' needs no rows"
-        )
-    if method == "row mean":
-        by_row = over.mean(axis=1, keepdims=True)
-    first = area[0].start - rows.start
-    return image - by_row[first : first + len(image)], level, noise, over.shape[1]
-
-
 def _bias_of(
     where: str, bias: ArrayLike | Mapping[str, ArrayLike] | None, part: str,
     shape: tuple[int, ...],
@@ -378,7 +296,8 @@ def _gain_of(
         if part not in gain:
             raise RecordingError(f"{where}: no gain for it among {', '.join(gain)}")
         gain = gain[part]
-    value = _number(cards, GAIN_KEYS) if gain is None else float(gain)
-    if not np.isnan(value) and not (0 < value < np.inf):
+    value = number_of(cards, GAIN_KEYS) if gain is None else float(gain)
+    unknown = gain is None and np.isnan(value)
+    if not unknown and not (0 < value < np.inf):
         raise RecordingError(f"{where}: gain = {value:g} e-/ADU must be above 0")
     return value

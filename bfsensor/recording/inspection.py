@@ -12,7 +12,7 @@ from bfsensor.errors import RecordingError
 from bfsensor.recording.amplifiers import AmplifierFrame, read_exposure
 from bfsensor.recording.campaign import Campaign
 from bfsensor.recording.exposures import Caution, Exposure, Progress, count_of, named
-from bfsensor.recording.fits_images import MAD_TO_SIGMA
+from bfsensor.recording.fits_sections import MAD_TO_SIGMA
 from bfsensor.recording.levels import (
     MISMATCH,
     check_gain,

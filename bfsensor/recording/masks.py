@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.errors import RecordingError
-from bfsensor.recording.fits_images import open_fits
+from bfsensor.recording.open_fits import open_fits
 from bfsensor.recording.sections import AmplifierLayout, parse_section, to_sensor
 
 

@@ -255,7 +255,7 @@ def _is_photon_transfer(path: Path) -> bool:
     """Whether a FITS file is LSST's photon transfer dataset, by its first table's header."""
     from astropy.io import fits
 
-    from bfsensor.recording.fits_images import open_fits
+    from bfsensor.recording.open_fits import open_fits
 
     if path.stat().st_size < 2880 * 2:
         return False

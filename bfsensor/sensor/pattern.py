@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bfsensor._kernels.photons import Pattern
 from bfsensor.errors import SensorError
+from bfsensor.files import refuse_existing, written_whole
 
 _FINER = 16
 _NOTHING = np.zeros(0)
@@ -174,9 +175,7 @@ class ShiftMap:
         """Write what :meth:`read` reads (beside, then renamed)."""
         from astropy.io import fits
 
-        path = Path(path)
-        if path.exists() and not overwrite:
-            raise SensorError(f"{path} exists; say overwrite to replace it")
+        refuse_existing(path, overwrite, SensorError)
         primary = fits.PrimaryHDU()
         primary.header["X0"] = (self.x0, "[pixel] image coordinate of DX[0, 0]")
         primary.header["Y0"] = self.y0
@@ -185,12 +184,8 @@ class ShiftMap:
         hdus = [primary] + [
             fits.ImageHDU(getattr(self, n), name=n.upper()) for n in ("dx", "dy")
         ]
-        beside = path.with_name(f"{path.name}.{os.getpid()}.part")
-        try:
+        with written_whole(path, SensorError) as beside:
             fits.HDUList(hdus).writeto(beside, overwrite=True)
-            os.replace(beside, path)
-        finally:
-            beside.unlink(missing_ok=True)
 
 
 def _edge_line(name: str, given: ArrayLike | None, pixels: int) -> NDArray[np.float64]:

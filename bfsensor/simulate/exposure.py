@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
-import hashlib
-import io
-import time
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from astropy.io import fits
 from numpy.typing import NDArray
 from scipy.special import erf
 
 from bfsensor import silicon
-from bfsensor.errors import DeviceError, SimulationError
+from bfsensor.errors import DeviceError
 from bfsensor.simulate import light
-from bfsensor.simulate.build_up import build_up
+from bfsensor.simulate.exposure_base import (
+    ExposurePlan,
+    expose,
+    read_exposure,
+    step_ends,
+    write_exposure,
+)
 from bfsensor.simulate.transport import Transport
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ _SPOT_STREAM = 0x5B0750
 
 
 @dataclass(frozen=True)
-class SpotPlan:
+class SpotPlan(ExposurePlan):
     """Spots to be built up, all alike but for their centres and their electrons.
 
     Parameters
@@ -39,8 +40,7 @@ class SpotPlan:
         The sensor at its operating point.
     peak : float
         Electrons that the brightest pixel of a spot centred on it would get without
-        diffusion [e-].  Below the full well, which ``bfsensor spots`` checks: the field is
-        solved for any charge, and electrons that spill are not followed.
+        diffusion [e-].  At most the full well (:meth:`check_full_well`).
     sigma : float
         Width of the spot at the back surface [um].
     steps : int
@@ -65,6 +65,13 @@ class SpotPlan:
         A value that makes no sense, by name.
     """
 
+    KIND: ClassVar[str] = "spots"
+    SCHEMA: ClassVar[str] = SCHEMA
+    KEYED: ClassVar[tuple[str, ...]] = (
+        "peak", "sigma", "steps", "pixels", "cells", "depth", "wavelength", "transport", "seed",
+    )  # fmt: skip
+    CHARGE: ClassVar[str] = "peak"
+
     device: Device
     peak: float = 80_000.0
     sigma: float = 10.0
@@ -78,25 +85,7 @@ class SpotPlan:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be."""
-        thickness = self.device.silicon.thickness
-        checks = (
-            ("peak", self.peak, 1.0, 1e7),
-            ("sigma", self.sigma, 0.1, 1000.0),
-            ("steps", self.steps, 1, 100_000),
-            ("pixels", self.pixels, 3, 63),
-            ("cells", self.cells, 8, 64),
-            ("depth", self.conversion_height, 2.0, thickness),
-            ("seed", self.seed, 0, 2**63),
-        )
-        for name, value, low, high in checks:
-            if not low <= value <= high:
-                raise DeviceError(
-                    f"spots: {name} = {value:g} must be from {low:g} to {high:g}"
-                )
-        if self.pixels % 2 == 0:
-            raise DeviceError(
-                f"spots: pixels = {self.pixels} must be odd: one is in the middle"
-            )
+        self._check(peak=(1.0, 1e7), sigma=(0.1, 1000.0))
         pitch = max(self.device.pixel.pitch_x, self.device.pixel.pitch_y)
         if self.pixels * pitch < 6.0 * self.sigma + pitch:
             raise DeviceError(
@@ -105,11 +94,6 @@ class SpotPlan:
             )
         if self.wavelength is not None and self.depth is not None:
             raise DeviceError("spots: give a depth or a wavelength, not both")
-
-    @property
-    def conversion_height(self) -> float:
-        """Height of conversion [um] where no wavelength is given."""
-        return self.device.silicon.thickness - 5.0 if self.depth is None else self.depth
 
     @property
     def electrons(self) -> int:
@@ -122,21 +106,7 @@ class SpotPlan:
     @property
     def step_ends(self) -> NDArray[np.int64]:
         """How many electrons have come after each step, from 0 before the first."""
-        return np.round(np.linspace(0, self.electrons, self.steps + 1)).astype(np.int64)
-
-    @property
-    def key(self) -> str:
-        """What tells the results of one plan from those of another."""
-        text = "\n".join([
-            SCHEMA, self.device.to_toml(), *(
-                f"{name}={getattr(self, name)!r}"
-                for name in (
-                    "peak", "sigma", "steps", "pixels", "cells", "depth", "wavelength",
-                    "transport", "seed",
-                )
-            ),
-        ])  # fmt: skip
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        return step_ends(self.electrons, self.steps)
 
 
 @dataclass(frozen=True)
@@ -166,23 +136,14 @@ class Spot:
 
     def write(self, path: str | Path) -> None:
         """Write to FITS, whole or not at all."""
-        path = Path(path)
-        header = fits.Header()
-        header["SCHEMA"] = SCHEMA
-        header["SPOT"] = (self.number, "number of the spot in its plan")
-        header["CENTRE_X"] = (self.centre[0], "[um] from the middle of the central pixel")
-        header["CENTRE_Y"] = (self.centre[1], "[um]")
-        header["PLANKEY"] = (self.key, "of the plan")
-        header["CPU_S"] = (round(self.cpu_seconds, 2), "[s]")
-        hdus = fits.HDUList([
-            fits.PrimaryHDU(header=header), fits.ImageHDU(self.on, name="ON"),
-            fits.ImageHDU(self.off, name="OFF"),
-        ])  # fmt: skip
-        for hdu in hdus[1:]:
-            hdu.header["BUNIT"] = "electron"
-        part = path.with_name(path.name + ".part")
-        hdus.writeto(part, overwrite=True, checksum=True)
-        part.replace(path)
+        cards = {
+            "SPOT": (self.number, "number of the spot in its plan"),
+            "CENTRE_X": (self.centre[0], "[um] from the middle of the central pixel"),
+            "CENTRE_Y": (self.centre[1], "[um]"),
+            "PLANKEY": (self.key, "of the plan"),
+            "CPU_S": (round(self.cpu_seconds, 2), "[s]"),
+        }
+        write_exposure(path, SCHEMA, cards, self.on, self.off)
 
     @classmethod
     def read(cls, path: str | Path) -> Spot:
@@ -193,28 +154,14 @@ class Spot:
         SimulationError
             Not such a file, or damaged.
         """
-        # From memory: a damaged file would else stay open.
-        content = io.BytesIO(Path(path).read_bytes())
-        try:
-            with warnings.catch_warnings(), fits.open(content, checksum=True) as hdus:
-                warnings.simplefilter("error")  # checksums
-                header = hdus[0].header
-                if header.get("SCHEMA") != SCHEMA:
-                    raise SimulationError(f"{path}: not a spot of the direct simulation")
-                return cls(
-                    number=int(header["SPOT"]),
-                    centre=(float(header["CENTRE_X"]), float(header["CENTRE_Y"])),
-                    on=hdus["ON"].data.astype(np.int32),
-                    off=hdus["OFF"].data.astype(np.int32),
-                    key=str(header["PLANKEY"]),
-                    cpu_seconds=float(header["CPU_S"]),
-                )
-        except (OSError, KeyError, TypeError, ValueError, UserWarning) as error:
-            if isinstance(error, SimulationError):
-                raise
-            raise SimulationError(
-                f"{path}: not a spot of the direct simulation, or damaged"
-            ) from error
+        kinds = {
+            "SPOT": int, "CENTRE_X": float, "CENTRE_Y": float, "PLANKEY": str, "CPU_S": float,
+        }  # fmt: skip
+        cards, on, off = read_exposure(
+            path, SCHEMA, kinds, "a spot of the direct simulation"
+        )
+        centre = cards["CENTRE_X"], cards["CENTRE_Y"]
+        return cls(cards["SPOT"], centre, on, off, cards["PLANKEY"], cards["CPU_S"])
 
 
 def simulate_spot(
@@ -238,20 +185,18 @@ def simulate_spot(
 
     Raises
     ------
+    SimulationError
+        The peak is above the full well, see :meth:`SpotPlan.check_full_well`.
     ConvergenceError
         From the solver or the tracer.
     """
-    begin = time.process_time()
     centre, seed = _choose(plan, number)
-    on, off = build_up(
-        plan.device, plan.step_ends,
-        lambda numbers: _starts(plan, seed, numbers, centre), pixels=plan.pixels,
-        cells=plan.cells, transport=plan.transport, seed=seed, progress=progress,
+    found = expose(
+        plan, plan.electrons, lambda numbers: _starts(plan, seed, numbers, centre),
+        seed=seed, progress=progress,
     )  # fmt: skip
-    return Spot(
-        number, (float(centre[0]), float(centre[1])), on, off, plan.key,
-        time.process_time() - begin,
-    )  # fmt: skip
+    at = float(centre[0]), float(centre[1])
+    return Spot(number, at, found.on, found.off, plan.key, found.cpu_seconds)
 
 
 def spot_electrons(

@@ -8,28 +8,32 @@ moves between both images is the effect of the pixels' differences, and
 
 from __future__ import annotations
 
-import hashlib
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.errors import DeviceError
 from bfsensor.simulate import light
-from bfsensor.simulate.build_up import build_up
+from bfsensor.simulate.exposure_base import (
+    ExposurePlan,
+    expose,
+    read_exposure,
+    write_exposure,
+)
 from bfsensor.simulate.transport import Transport
 
 if TYPE_CHECKING:
     from bfsensor.device import Device
 
+SCHEMA = "bfsensor flat 2"
 _FLAT_STREAM = 0xF1A7
 
 
 @dataclass(frozen=True)
-class FlatPlan:
+class FlatPlan(ExposurePlan):
     """Flats to be built up, all alike but for their electrons.
 
     Parameters
@@ -37,7 +41,7 @@ class FlatPlan:
     device : Device
         The sensor at its operating point.
     level : float
-        Electrons a pixel at the end [e-].
+        Electrons a pixel at the end [e-].  At most the full well (:meth:`check_full_well`).
     steps : int
         Equal steps of charge.
     pixels, cells : int
@@ -48,7 +52,19 @@ class FlatPlan:
         How electrons move.
     seed : int
         Chooses all random numbers; flats differ by their number.
+
+    Raises
+    ------
+    DeviceError
+        A value that makes no sense, by name.
     """
+
+    KIND: ClassVar[str] = "flats"
+    SCHEMA: ClassVar[str] = SCHEMA
+    KEYED: ClassVar[tuple[str, ...]] = (
+        "level", "steps", "pixels", "cells", "depth", "transport", "seed",
+    )  # fmt: skip
+    CHARGE: ClassVar[str] = "level"
 
     device: Device
     level: float = 80_000.0
@@ -61,35 +77,7 @@ class FlatPlan:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be."""
-        for name, value, low, high in (
-            ("level", self.level, 1.0, 1e6),
-            ("steps", self.steps, 1, 100_000),
-            ("pixels", self.pixels, 3, 63),
-            ("cells", self.cells, 8, 64),
-            ("depth", self.height, light.LOWEST, self.device.silicon.thickness),
-            ("seed", self.seed, 0, 2**63),
-        ):
-            if not low <= value <= high:
-                raise DeviceError(
-                    f"flats: {name} = {value:g} must be from {low:g} to {high:g}"
-                )
-        if self.pixels % 2 == 0:
-            raise DeviceError(f"flats: pixels = {self.pixels} must be odd")
-
-    @property
-    def height(self) -> float:
-        """Height of conversion [um]."""
-        return self.device.silicon.thickness - 5.0 if self.depth is None else self.depth
-
-    @property
-    def key(self) -> str:
-        """What tells the results of one plan from those of another."""
-        names = ("level", "steps", "pixels", "cells", "depth", "transport", "seed")
-        text = "\n".join(
-            ["bfsensor flat 2", self.device.to_toml()]
-            + [f"{name}={getattr(self, name)!r}" for name in names]
-        )
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        self._check(level=(1.0, 1e6))
 
 
 @dataclass(frozen=True)
@@ -105,12 +93,39 @@ class Flat:
         with evenly filled wells.
     cpu_seconds : float
         What it took.
+    key : str
+        Of the plan; empty where not known.
     """
 
     number: int
     on: NDArray[np.int32] = field(repr=False)
     off: NDArray[np.int32] = field(repr=False)
     cpu_seconds: float
+    key: str = ""
+
+    def write(self, path: str | Path) -> None:
+        """Write to FITS, whole or not at all."""
+        cards = {
+            "FLAT": (self.number, "number of the flat in its plan"),
+            "PLANKEY": (self.key, "of the plan"),
+            "CPU_S": (round(self.cpu_seconds, 2), "[s]"),
+        }
+        write_exposure(path, SCHEMA, cards, self.on, self.off)
+
+    @classmethod
+    def read(cls, path: str | Path) -> Flat:
+        """Read what :meth:`write` wrote.
+
+        Raises
+        ------
+        SimulationError
+            Not such a file, or damaged.
+        """
+        kinds = {"FLAT": int, "PLANKEY": str, "CPU_S": float}
+        cards, on, off = read_exposure(
+            path, SCHEMA, kinds, "a flat of the direct simulation"
+        )
+        return cls(cards["FLAT"], on, off, cards["CPU_S"], cards["PLANKEY"])
 
 
 def simulate_flat(
@@ -132,12 +147,17 @@ def simulate_flat(
     Flat
         The same bits for the same plan and number.  The electrons of a whole period are a
         Poisson number.
+
+    Raises
+    ------
+    SimulationError
+        The level is above the full well, see :meth:`FlatPlan.check_full_well`.
+    ConvergenceError
+        From the solver or the tracer.
     """
-    begin = time.process_time()
     rng = np.random.default_rng([plan.seed, number, _FLAT_STREAM])
     seed = int(rng.integers(2**63))
     total = int(rng.poisson(plan.level * plan.pixels**2))
-    ends = np.round(np.linspace(0, total, plan.steps + 1)).astype(np.int64)
     pixel = plan.device.pixel
     half = plan.pixels / 2
     box = (-half * pixel.pitch_x, half * pixel.pitch_x, -half * pixel.pitch_y,
@@ -145,13 +165,10 @@ def simulate_flat(
 
     def starts(numbers: NDArray[np.int64]) -> NDArray[np.float64]:
         places = light.flat(numbers, seed=seed, box=box)
-        return np.column_stack([places, np.full(len(places), plan.height)])
+        return np.column_stack([places, np.full(len(places), plan.conversion_height)])
 
-    on, off = build_up(
-        plan.device, ends, starts, pixels=plan.pixels, cells=plan.cells,
-        transport=plan.transport, seed=seed, reference="even", progress=progress,
-    )  # fmt: skip
-    return Flat(number, on, off, time.process_time() - begin)
+    found = expose(plan, total, starts, seed=seed, reference="even", progress=progress)
+    return Flat(number, found.on, found.off, found.cpu_seconds, plan.key)
 
 
 def periodic_covariances(images: NDArray[np.integer]) -> NDArray[np.float64]:

@@ -77,7 +77,8 @@ def surface_barrier(potential: Potential) -> float:
 def full_well(device: Device, *, cells: int = 16) -> float:
     """Charge at which the barrier along the column falls to the spill barrier [e-].
 
-    One pixel is filled and its neighbours are empty, as in a bright star on dark sky.
+    One pixel is filled and its neighbours are empty, as in a bright star on dark sky.  Of a
+    device without mirror planes it is the pixel in the middle of a whole period.
 
     Parameters
     ----------
@@ -96,14 +97,19 @@ def full_well(device: Device, *, cells: int = 16) -> float:
     DeviceError
         The empty well is already shallower than the spill barrier.
     """
-    solver = Electrostatics(
-        device, make_mesh(device, pixels=(_PERIOD, _PERIOD), cells=cells)
-    )
-    start = tile(solve_unit_cell(device, 0.0, cells=cells), solver.mesh)
+    mirrored = device.is_mirror_symmetric
+    period = _PERIOD if mirrored else _PERIOD + 1
+    mesh = make_mesh(device, pixels=(period, period), cells=cells, symmetric=mirrored)
+    solver = Electrostatics(device, mesh)
+    middle = 0 if mirrored else period // 2
+    if mirrored:
+        start = tile(solve_unit_cell(device, 0.0, cells=cells), mesh)
+    else:
+        start = solver.solve(0.0, tolerance=1e-3).phi
 
     def excess(charge: float) -> float:
         charges = np.zeros(solver.pixel_shape)
-        charges[0, 0] = charge
+        charges[middle, middle] = charge
         return (
             barrier(solver.solve(charges, start=start, tolerance=1e-3))
             - device.well.spill_barrier

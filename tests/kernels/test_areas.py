@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bfsensor._kernels.areas import pixel_areas
-from tests.kernels.test_edges import (
+from tests.kernels.plain_edges import (
     IMAGES,
     NO_PATTERN,
     displace,

@@ -8,7 +8,7 @@ import pytest
 
 from bfsensor._kernels import charge as kernel
 from bfsensor._kernels.charge import TILE
-from tests.kernels.test_edges import (
+from tests.kernels.plain_edges import (
     effective_charges,
     expose,
     make_image,

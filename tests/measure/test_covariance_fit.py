@@ -270,7 +270,9 @@ def test_reading_what_was_written(tmp_path):
         assert kind.read(path) == one
         with pytest.raises(MeasurementError, match="exists; say overwrite"):
             one.write(path)
-        with pytest.raises(MeasurementError, match=r"holds 'bfsensor .*', not 'bfsensor "):
+        with pytest.raises(
+            MeasurementError, match=r"schema is 'bfsensor .*', not 'bfsensor "
+        ):
             (CovarianceFit if kind is not CovarianceFit else CovarianceCurve).read(path)
     assert fit.dropped == (5,)
     assert CovarianceFit.read(tmp_path / "CovarianceFit.ecsv").sum_rule == fit.sum_rule

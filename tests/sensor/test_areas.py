@@ -10,7 +10,7 @@ from bfsensor.resources import tables_dir
 from bfsensor.sensor.base import _lowest
 from bfsensor.sensor.exposure import Exposure
 from bfsensor.sensor.flats import draw_flat
-from tests.kernels.test_edges import NO_PATTERN
+from tests.kernels.plain_edges import NO_PATTERN
 from validation.sensor_flats import predict
 
 BOTH = pytest.mark.parametrize("kind", [SiliconSensor, BrighterFatterSensor])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bfsensor import BrighterFatterSensor
-from tests.sensor.test_contract import BOTH, draw, make, photons
+from tests.sensor.contract_cases import BOTH, draw, make, photons
 
 
 @BOTH
