@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bfsensor.diagnose.baseline import Baseline, read_edges
 from validation.concealed.arrays import iterate_exposures
 from validation.concealed.card import baseline_edges, device_card
-from validation.concealed.plan import SIZES, Geometry
+from validation.concealed.plan import SIZES, Geometry, Size
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,8 @@ class VirtualSource:
         effects: Sequence[Any] = (),
         amplifiers: int = 2,
     ) -> None:
-        self._geometry = Geometry(SIZES[size].pixels, amplifiers)
+        pixels = SIZES[size].pixels if isinstance(size, str) else size.pixels
+        self._geometry = Geometry(pixels, amplifiers)
         self._frames: dict[int, list[NDArray[np.uint16]]] = {}
         self.exposures: list[Shot] = []
         self.lamp_error = 2e-4

@@ -138,6 +138,8 @@ def read_edges(
         raise DiagnosisError(
             f"{path}: not a file of edge displacements: {error!r}"
         ) from None
+    if not edges:
+        raise DiagnosisError(f"{path}: no boundary shifts")
     derivatives: dict[str, Edges] = {}
     reference = next(iter(edges))
     for name, block in text.items():

@@ -15,9 +15,8 @@ STAMP = 11
 WING = 21
 """Sides of the stamps [pixel] that are fitted, and that the wings are summed in."""
 
-FLUX_ERROR = 2e-3
-"""Relative error common to the fluxes of an exposure, beside the lamp's: illumination of a mask
-with pinholes moves with its dithers (assumed)."""
+REPEATS = 8
+"""Exposures of equal light, less one a group, from which on their fluxes' scatter is believed."""
 
 WING_ERROR = 2e-4
 """Error of the share of a spot's flux outside its stamp: backgrounds are known to about 0.1 e- a
@@ -65,12 +64,9 @@ class SpotChannels:
             "sigma_x": (fit.sigma_x, float(errors[0])),
             "sigma_y": (fit.sigma_y, float(errors[1])),
         }
-        # Pinholes differ, but are the same in all exposures: the error is the electrons'.
-        total = values.pop("flux").mean()
-        out["flux"] = (
-            float(total),
-            float(np.sqrt(total / n + (WING * self._noise) ** 2 / n)),
-        )
+        flux = values.pop("flux")
+        total = float(flux.mean())
+        out["flux"] = (total, float(flux.std(ddof=1) / np.sqrt(n)))
         for name, column in values.items():
             out[name] = (float(column.mean()), float(column.std(ddof=1) / np.sqrt(n)))
         phases = np.stack([fit.centre_x[used], fit.centre_y[used]], axis=1)
@@ -82,13 +78,17 @@ class SpotChannels:
         if not self._rows:
             return []
         values, blocks, axes = [], [], Axes()
+        repeat = self._flux_scatter()
         for exposure, found, _ in self._rows:
             lamp = exposure.lamp
             light = (exposure.exposure_time or 0.0) * (1.0 if lamp is None else lamp)
             for what, (value, error) in found.items():
                 variance = error**2
                 if what == "flux":
-                    variance += (value * np.hypot(FLUX_ERROR, self._lamp_error)) ** 2
+                    # Pinholes differ: how much of that is the same in all exposures, exposures of
+                    # equal light tell; without such the error is that of as many strangers.
+                    scatter = error / value if repeat is None else repeat
+                    variance = (value * np.hypot(scatter, self._lamp_error)) ** 2
                 if what == "wings":
                     variance += WING_ERROR**2
                 values.append(np.array([value]))
@@ -98,6 +98,19 @@ class SpotChannels:
                          exposure=exposure.number)  # fmt: skip
         return [Channel("spot", np.concatenate(values), tuple(blocks), axes.columns(), "",
                         self._fold)]  # fmt: skip
+
+    def _flux_scatter(self) -> float | None:
+        """Relative scatter of the fluxes of exposures of equal light; None of too few."""
+        groups: dict[tuple, list[float]] = {}
+        for exposure, found, _ in self._rows:
+            key = (Condition.of(exposure).key, exposure.exposure_time)
+            groups.setdefault(key, []).append(found["flux"][0] / (exposure.lamp or 1.0))
+        square, number = 0.0, 0
+        for fluxes in groups.values():
+            ratio = np.array(fluxes) / np.mean(fluxes)
+            square += float(((ratio - 1) ** 2).sum())
+            number += len(fluxes) - 1
+        return float(np.sqrt(square / number)) if number >= REPEATS else None
 
     @property
     def phases(self) -> list[NDArray[np.float64]]:

@@ -1,0 +1,124 @@
+"""Small campaigns of the virtual sensor, diagnosed: a null, and effects in four channels."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from bfsensor.cli import main
+from bfsensor.diagnose.diagnosis import SCHEMA, diagnose
+from bfsensor.diagnose.locate import Scanner, locate_mismatch, tail_probability
+from bfsensor.diagnose.report import write_report
+from validation.concealed.campaign import write_campaign
+from validation.concealed.library import make_effect
+from validation.concealed.plan import Size
+from validation.virtual_source import VirtualSource, virtual_baseline
+
+SMALL = Size(128, 4, 1, dithers=1)
+
+
+def run(seed, *effects):
+    source = VirtualSource(seed=seed, size=SMALL, effects=effects)
+    return diagnose(source, virtual_baseline(), campaign=f"small {seed}")
+
+
+@pytest.fixture(scope="module")
+def null():
+    return run(7001)
+
+
+def test_a_null_is_a_null(null):
+    assert not null.mismatch.detected
+    assert null.mismatch.p_value > 0.01
+    assert all(not v for v in null.location().values())
+    assert 0.9 < null.heldout < 1.1
+    for word, (square, dof) in null.mismatch.chi2.items():
+        assert square < dof + 5 * np.sqrt(2 * dof) + 5, word
+    assert "Nothing stands out" in null.said()
+
+
+def test_gains_and_device_come_back(null):
+    assert (np.abs(list(null.fit.pulls.values())) < 4).all()
+    names = list(null.fit.names)
+    gains = [null.fit.values[names.index(f"gain {n}")] for n in (0, 1)]
+    assert 1.8 < min(gains) and max(gains) < 2.7
+
+
+def test_draws_give_unit_deviates(null):
+    scanner = Scanner(null.fit)
+    z = scanner.templates_z(null.fit.draw(np.random.default_rng(5), 400))
+    width = z.std(0)
+    assert abs(width.mean() - 1) < 0.01 and abs(z.mean()) < 0.01
+    c = scanner.chi2_z(null.fit.draw(np.random.default_rng(6), 400))
+    assert (np.abs(c.mean(0)) < 0.35).all() and (np.abs(c.std(0) - 1) < 0.35).all()
+
+
+def test_family_wise_p_is_what_it_claims(null):
+    """Noise drawn through the fit, diagnosed as if it were recorded."""
+    scanner = Scanner(null.fit)
+    draw = null.fit.draw(np.random.default_rng(8), 900)
+    largest = np.maximum(
+        np.abs(scanner.templates_z(draw)).max(1), scanner.chi2_z(draw).max(1)
+    )
+    p = np.array([tail_probability(v, largest[:500]) for v in largest[500:]])
+    assert abs((p < 0.05).mean() - 0.05) < 0.04
+    assert (p < 0.01).mean() < 0.035
+
+
+@pytest.mark.parametrize(
+    ("word", "parameters", "channel"),
+    [
+        ("cti_serial", {"cti": 2e-6}, "serial_overscan"),
+        ("gain_nonlinearity", {"c2": -0.01, "c3": 0.0}, "flat_mean"),
+        ("electronic_memory", {"alpha": 1e-3}, "serial_overscan"),
+        ("mask_stitch", {"amp": 0.02, "period": 32.0}, "flat_map"),
+    ],
+)
+def test_effects_are_seen_where_they_are(word, parameters, channel):
+    found = run(7002, make_effect(word, parameters))
+    assert found.mismatch.detected
+    assert found.mismatch.p_value < 1e-4
+    assert channel in found.location()["channels"]
+    assert found.mismatch.findings[0].word == channel
+
+
+def test_the_report_has_what_programs_rely_on(null, tmp_path):
+    written = write_report(null, tmp_path / "out")
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["schema"] == SCHEMA == "bfsensor-diagnosis-1"
+    for key in ("campaign", "version", "detected", "p_value", "effects", "class_probability",
+                "equivalence_class", "open_world", "location", "recommended_recordings",
+                "heldout", "said"):  # fmt: skip
+        assert key in report
+    assert set(report["location"]) == {
+        "channels", "lags", "flux_e", "x", "y", "amps", "wavelength", "exposures",
+    }  # fmt: skip
+    text = (tmp_path / "out" / "report.html").read_text()
+    assert text.count("<img") >= 6 and "Nothing stands out" in text
+    assert all(p.exists() for p in written)
+    assert not list((tmp_path / "out").glob("*.tmp*"))
+
+
+def test_the_same_seed_gives_the_same_p(null):
+    assert (
+        locate_mismatch(null.fit, seed=4).p_value
+        == locate_mismatch(null.fit, seed=4).p_value
+    )
+
+
+def test_the_command_diagnoses_a_folder(tmp_path):
+    folder = tmp_path / "campaign"
+    write_campaign(
+        folder, seed=7003, size="S", effects=[make_effect("cti_serial", {"cti": 2e-6})]
+    )
+    out = tmp_path / "out"
+    result = CliRunner().invoke(main, ["diagnose", str(folder), "-o", str(out)])
+    assert result.exit_code == 0, result.output
+    assert "serial overscan" in result.stdout
+    report = json.loads((out / "report.json").read_text())
+    assert report["detected"] and "serial_overscan" in report["location"]["channels"]
+    again = CliRunner().invoke(main, ["diagnose", str(tmp_path / "nowhere")])
+    assert again.exit_code == 1 and "nowhere" in again.stderr
+    none = CliRunner().invoke(main, ["diagnose", str(folder), "--baseline", "nothing"])
+    assert none.exit_code == 1 and "nothing: not a baseline" in none.stderr
