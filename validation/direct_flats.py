@@ -5,19 +5,23 @@
 electron by electron with diffusion, the charge fed back, beside the same electrons in evenly
 filled wells.  Each flat is a row of ``validation/results/direct_flats.ecsv``: the fitted a-matrix
 and the covariances of both images by lag.  Flats that are there already are not made again.
+Beside them the a-matrix of tables on 8 cells, as the flats have, and on 16 and 32 goes to
+``direct_flats_tables.ecsv``: the differential response at two thirds of the level, about which the
+covariance of a flat averages it.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from astropy.table import Table, vstack
 
-from bfsensor import Device
+from bfsensor import Device, build_table, plan_table
 from bfsensor.measure.response import measure_response
 from bfsensor.simulate.flat_exposure import (
     Flat,
@@ -57,6 +61,26 @@ def reduce_flat(plan: FlatPlan, flat: Flat) -> Table:
     )  # fmt: skip
 
 
+def predict_responses(plan: FlatPlan) -> Table:
+    """a-matrix [1/e-] of tables on several meshes, by lag."""
+    background = plan.level * 2 / 3
+    charges, depth = [background, background + 5000.0], plan.conversion_height
+    rows = []
+    for cells in (8, 16, 32):
+        request = plan_table(
+            plan.device, charges=charges, backgrounds=[background], depths=[50.0, depth]
+        )
+        table = build_table(replace(request, cells=cells))
+        change = table.area_changes(charge=charges[1], background=background, depth=depth)
+        a = change / 5000.0 / np.prod(table.pitch)
+        r = table.reach
+        rows += [
+            (plan.device.name, cells, i, j, a[r + j, r + i])
+            for j in range(r + 1) for i in range(r + 1)
+        ]  # fmt: skip
+    return Table(rows=rows, names=("device", "cells", "i", "j", "a"))
+
+
 def main() -> None:
     """Simulate what is missing, one row each, and print what is there."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -87,6 +111,9 @@ def main() -> None:
             write_results(row, str(path), COMMAND)
             print(f"flat {flat.number}: {flat.cpu_seconds:.0f} CPU s, "
                   f"{time.monotonic() - begin:.0f} s in all", flush=True)  # fmt: skip
+    tables = path.with_name(f"{path.stem}_tables.ecsv")
+    if not tables.exists():
+        write_results(predict_responses(plan), str(tables), COMMAND)
     table = Table.read(path, format="ascii.ecsv")
     table = table[table["device"] == plan.device.name]
     half = PIXELS // 2 + 1
