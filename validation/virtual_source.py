@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bfsensor.diagnose.baseline import Baseline, read_edges
 from validation.concealed.arrays import iterate_exposures
 from validation.concealed.card import baseline_edges, device_card
-from validation.concealed.plan import SIZES, Geometry, Size
+from validation.concealed.plan import SIZES, Geometry
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from bfsensor.device import Device
 from bfsensor.diagnose.baseline import Baseline, read_edges
+from bfsensor.diagnose.device_baseline import baseline_of_device, write_edges
 from bfsensor.diagnose.table_baseline import baseline_of_table
-from bfsensor.errors import DiagnosisError
+from bfsensor.errors import DeviceError, DiagnosisError
 from bfsensor.recording.amplifiers import AmplifierFrame, read_exposure
 from bfsensor.recording.campaign import Campaign
 from bfsensor.recording.exposures import Exposure
@@ -81,3 +84,50 @@ def find_baseline(
     if path.suffix == ".json":
         return read_edges(path, card=card)
     return baseline_of_table(given)
+
+
+def simulate_baseline(
+    given: str | os.PathLike[str] | None,
+    parameters: Sequence[str],
+    back_biases: Sequence[float],
+    *,
+    keep: Path,
+    progress: Callable[[int, int], None] | None = None,
+) -> Baseline:
+    """Simulate a device with floating parameters, or read what an earlier run kept.
+
+    Parameters
+    ----------
+    given : str or path-like
+        Name of a built-in device, or a device file.
+    parameters : sequence of str
+        Which float; ('all',) for all with an uncertainty.
+    back_biases : sequence of float
+        Of the recordings [V].
+    keep : Path
+        Folder where the shifts are kept as ``baseline_KEY.json``.
+    progress : callable, optional
+        Called with (tables made, tables in all).
+
+    Raises
+    ------
+    DiagnosisError
+        The baseline is no device: only a device can be simulated anew.
+    """
+    if given is None or Path(given).suffix in (".json", ".fits"):
+        raise DiagnosisError(
+            f"parameters float for a device, by name or .toml, not for {given or 'no baseline'}"
+        )
+    try:
+        device = Device.load(given)
+    except DeviceError as error:
+        raise DiagnosisError(f"parameters float for a device: {error}") from None
+    text = "\n".join([device.to_toml(), *parameters, *(f"{b:g}" for b in back_biases)])
+    path = keep / f"baseline_{hashlib.sha256(text.encode()).hexdigest()[:12]}.json"
+    if not path.exists():
+        baseline = baseline_of_device(
+            device, parameters=parameters, back_biases=back_biases, progress=progress
+        )
+        keep.mkdir(parents=True, exist_ok=True)
+        write_edges(baseline, path)
+    return read_edges(path, card=path)

@@ -15,8 +15,8 @@ from bfsensor.measure.covariance_model import model_covariances
 from bfsensor.measure.growth import measure_growth
 from bfsensor.resources import tables_dir
 from bfsensor.table import DistortionTable
-from validation.concealed.card import baseline_edges, shifts_at
 from validation.concealed.card import NOMINAL as CARD
+from validation.concealed.card import baseline_edges, shifts_at
 from validation.concealed.collect import Response, collect
 from validation.concealed.scene import spot_scene
 
@@ -74,7 +74,7 @@ def test_growth_agrees_with_the_concealed_engine():
             off.append(plain[stamp])
     phases = places - np.round(places)
     kx, ky = np.asarray(found.kx), np.asarray(found.ky)
-    grow = dict(sigma=sigma, phases=phases, flux=flux)
+    grow = {"sigma": sigma, "phases": phases, "flux": flux}
     ours, plain = (grow_spots(f * kx, f * ky, **grow)[-1][:, 4:-4, 4:-4] for f in (1, 0))
     theirs = measure_growth(np.array(on)[:, None], np.array(off)[:, None], stamp=11)
     predicted = measure_growth(ours[:, None], plain[:, None], stamp=11).growth[0]
