@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor.show_style import BLUE, RED
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
@@ -18,7 +20,7 @@ def draw_channels(chi2: Mapping[str, tuple[float, float]], ax: Axes) -> None:
     """Deviate of each channel's chi-square, on a scale that shows both 1 and 1000."""
     words = list(chi2)[::-1]
     z = [(s - d) / np.sqrt(2 * max(d, 1e-9)) for s, d in (chi2[w] for w in words)]
-    colours = ["C3" if value > 4 else "C0" for value in z]
+    colours = [RED if value > 4 else BLUE for value in z]
     ax.barh(words, z, color=colours)
     ax.axvspan(-3, 3, color="0.9", zorder=0)
     ax.set_xscale("symlog", linthresh=5)

@@ -126,6 +126,16 @@ class Channel:
         """
         return np.asarray(self._whitener @ np.asarray(residuals, float))
 
+    def unwhiten(self, white: ArrayLike) -> NDArray[np.float64]:
+        """Undo :meth:`whiten`: residuals in ``unit``, shape (n,)."""
+        given = np.asarray(white, float)
+        out, start = np.empty_like(given), 0
+        for block in self.blocks:
+            part = slice(start, start + len(block))
+            out[part] = np.linalg.cholesky(block) @ given[part]
+            start += len(block)
+        return out
+
 
 def join_channels(channels: Sequence[Channel]) -> Channel:
     """Join channels of one word and unit; axes that not all have are left out."""

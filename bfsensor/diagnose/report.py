@@ -110,7 +110,7 @@ def draw_figures(diagnosis: Diagnosis, folder: Path) -> dict[str, Path]:
             lambda ax: show.draw_lag_levels(channel.axes, pulls, ax, lags=lags))  # fmt: skip
     if "flat_mean" in found:
         channel_m, pulls_m = found["flat_mean"]
-        left = pulls_m * channel_m.errors / np.maximum(channel_m.values, 1e-9)
+        left = channel_m.unwhiten(pulls_m) / np.maximum(channel_m.values, 1e-9)
         add("flat_mean", "Means of flats against exposure time and lamp.", (6, 3.6),
             lambda ax: show.draw_means(channel_m.axes, left, ax))  # fmt: skip
     for word in ("serial_overscan", "parallel_overscan"):

@@ -29,6 +29,7 @@ def test_whitened_noise_is_white():
     noise = np.linalg.cholesky(dense) @ rng.normal(size=(4, 40_000))
     white = channel.whiten(noise)
     np.testing.assert_allclose(white @ white.T / 40_000, np.eye(4), atol=0.03)
+    np.testing.assert_allclose(channel.unwhiten(white[:, 0]), noise[:, 0], rtol=1e-9)
     square = (channel.whiten(channel.values) ** 2).sum()
     assert square == pytest.approx(channel.values @ np.linalg.solve(dense, channel.values))
 
