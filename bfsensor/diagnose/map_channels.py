@@ -62,7 +62,7 @@ class MapChannels:
         self._conditions[condition.key] = condition
         group = self._groups.setdefault(
             (condition.key, time),
-            _Group(np.zeros(self._shape), np.zeros(self._shape, np.int64)),
+            _Group(np.zeros(self._shape, np.float32), np.zeros(self._shape, np.uint16)),
         )
         for image in (first, second):
             good = np.isfinite(image)
@@ -216,10 +216,10 @@ class MapChannels:
 
 @dataclass
 class _Group:
-    """Sums over the pairs of one condition and exposure time."""
+    """Sums over the pairs of one condition and exposure time: 6 bytes a pixel, of large sensors too."""
 
-    total: NDArray[np.float64]
-    count: NDArray[np.int64]
+    total: NDArray[np.float32]
+    count: NDArray[np.uint16]
     low: float = 0.0
     high: float = 0.0
     power: NDArray[np.float64] = field(default_factory=lambda: np.zeros(RINGS))
