@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.diagnose.baseline import Baseline, area_matrix
-from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
 from bfsensor.diagnose.predict_flats import flat_covariances_of
@@ -158,7 +158,7 @@ class Predictor:
         noise = np.char.startswith(names, "noise")
         del a
         if channel.word == "flat_cov":
-            return gain | noise | device
+            return device if channel.unit == PER_ELECTRON else gain | noise | device
         if channel.word == "spot":
             return gain | device | sigma
         return noise if channel.word == "bias_cov" else np.zeros(len(names), bool)
@@ -208,6 +208,12 @@ class Predictor:
             del key
             edges, _ = self.baseline.at(_condition(channel, rows[0]), device)
             a = area_matrix(*edges)
+            if channel.unit == PER_ELECTRON:
+                y, x0 = (n // 2 for n in a.shape)
+                out[rows] = 0.5 * (
+                    a[y + j[rows], x0 + i[rows]] + a[y - j[rows], x0 + i[rows]]
+                )
+                continue
             pairs = np.stack([amp[rows], x["level"][rows]], axis=1)
             groups, index = np.unique(pairs, axis=0, return_inverse=True)
             own = gains[groups[:, 0].astype(int)]
