@@ -11,6 +11,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 import bfsensor
 from bfsensor.diagnose.baseline import Baseline
+from bfsensor.diagnose.channels import PER_ELECTRON
 from bfsensor.diagnose.extract import Measured, Source, measure_channels
 from bfsensor.diagnose.locate import ALARM, Finding, Mismatch, locate_mismatch
 from bfsensor.diagnose.mismatch import BaselineFit, fit_baseline
@@ -85,8 +86,10 @@ class Diagnosis:
                 best.setdefault(key, finding)
         lags = [f for f in findings if "lags" in f.where]
         for finding in lags:
-            # A strong one casts shadows: what is less than half of it is not listed.
-            if abs(finding.z) > 0.5 * abs(lags[0].z):
+            # A strong one casts shadows: what is less than half of it is not listed, nor lags
+            # together that say less than one alone.
+            together = len(finding.where["lags"]) > 1 and finding is not lags[0]
+            if abs(finding.z) > 0.5 * abs(lags[0].z) and not together:
                 out["lags"] += [
                     list(p) for p in finding.where["lags"] if list(p) not in out["lags"]
                 ]
@@ -270,11 +273,9 @@ def _of_free(measured: Measured, baseline: Baseline, fit: BaselineFit) -> list[s
         for n in baseline.not_below
     )  # fmt: skip
     out = [f"a_ij that float, per electron: {text}"]
-    levels = {
-        round(float(v)) for c in measured.channels if c.word == "flat_cov"
-        for v in c.axes["level"]
-    }  # fmt: skip
-    if len(levels) < 2:
+    flats = [c for c in measured.channels if c.word == "flat_cov"]
+    levels = {float(v) for c in flats for v in c.axes["time"]}
+    if len(levels) < 2 and not any(c.unit == PER_ELECTRON for c in flats):
         out.append(
             "flats at fewer than two levels: a positive covariance of near neighbours cannot be told "
             "from the brighter-fatter effect, nor the gain from its a_00"

@@ -166,11 +166,11 @@ def measure_channels(
                 continue
             whole = []
             for exposure, each in pair:
-                images = [flats.clean(f) for f in each]
-                levels[exposure.number] = float(np.mean([i.mean() for i in images]))
+                images = [_good(flats, f) for f in each]
+                levels[exposure.number] = float(np.mean([np.nanmean(i) for i in images]))
                 image = np.full(source.shape, np.nan)
                 for frame, values in zip(each, images, strict=True):
-                    place(image, frame, values / values.mean())
+                    place(image, frame, values / np.nanmean(values))
                 whole.append(image)
                 if fold != "held-out":
                     codes.add(each)
@@ -178,7 +178,7 @@ def measure_channels(
                 bias_noise = [
                     noise.get(f.name, 0.0)
                     / np.sqrt(max(len(kinds.get("bias", [])), 1))
-                    / i.mean()
+                    / np.nanmean(i)
                     for f, i in zip(second_frames, images, strict=True)
                 ]
                 maps.add_pair(
@@ -187,7 +187,7 @@ def measure_channels(
                 )  # fmt: skip
     unlike = scan_unlike(
         sorted([*finder.single, *(g[0] for g in groups if len(g) == 1)], key=lambda f: f.number),
-        lambda flat: [flats.clean(f) for f in read(flat)], lags=lags,
+        lambda flat: [_good(flats, f) for f in read(flat)], lags=lags,
     )  # fmt: skip
     notes += [*finder.notes, *describe_unlike(unlike)]
     for channel in flats.channels():
@@ -265,7 +265,12 @@ def _data_section(frame: Frame, whole: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def _mean_level(flats: FlatChannels, frames: Sequence[Frame]) -> float:
-    return float(np.mean([flats.clean(f).mean() for f in frames]))
+    return float(np.mean([np.nanmean(_good(flats, f)) for f in frames]))
+
+
+def _good(flats: FlatChannels, frame: Frame) -> NDArray[np.float64]:
+    """Clean image, nan where a pixel is masked."""
+    return np.where(frame.mask, np.nan, flats.clean(frame))
 
 
 def _rough_gains(channel: Channel, gains: list[list[float]]) -> None:

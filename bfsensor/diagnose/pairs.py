@@ -171,7 +171,9 @@ def compare_unlike(
     UnlikePair or None
         Mean of the amplifiers; None where levels are too far apart or nothing can be measured.
     """
-    means = [float(np.mean([i.mean() for i in images])) for _, images in (first, second)]
+    means = [
+        float(np.mean([np.nanmean(i) for i in images])) for _, images in (first, second)
+    ]
     if min(means) <= 0 or not RATIO[0] <= means[1] / means[0] <= RATIO[1]:
         return None
     j, i = np.indices((lags + 1, lags + 1))

@@ -43,7 +43,7 @@ def measure_reduced(
 
 
 def _of_areas(table: AreaChangeTable, reach: int) -> Measured:
-    j, i = np.indices(table.a.shape)
+    j, i = (np.asarray(index) for index in np.indices(table.a.shape))
     inside = (i <= reach) & (j <= reach)
     used = inside & table.independent & (table.errors > 0)
     if not used.any():
