@@ -93,6 +93,17 @@ class Predictor:
         n, p = 2 * self._amps, len(baseline.parameters)
         self.prior_rows = np.arange(n, n + p)
         """Parameters with a prior of mean 0 and width 1."""
+        self._noise_told = _noise_told(measured)
+        if not self._noise_told.all():
+            names = [
+                a
+                for a, told in zip(measured.amplifiers, self._noise_told, strict=True)
+                if not told
+            ]
+            self.notes.append(
+                f"read noise of {', '.join(names)} taken as {np.sqrt(noise[0]):.3g} ADU: no biases, "
+                "and flats of one level cannot tell it from the gain"
+            )
         exact = {
             key: baseline.at(_condition(c, rows[0]))[1]
             for c in measured.channels if c.word in ("flat_cov", "spot")
@@ -156,7 +167,7 @@ class Predictor:
         sigma = np.char.startswith(names, "sigma")
         gain = np.char.startswith(names, "gain")
         noise = np.char.startswith(names, "noise")
-        del a
+        noise[a : 2 * a] &= self._noise_told
         if channel.word == "flat_cov":
             return device if channel.unit == PER_ELECTRON else gain | noise | device
         if channel.word == "spot":
@@ -329,6 +340,23 @@ class Predictor:
                 column[here] = x["light"][here] if what == "flux" else 1.0
                 out[f"spot {what} {'/'.join(key)}"] = column
         return out
+
+
+def _noise_told(measured: Measured) -> NDArray[np.bool_]:
+    """Of which amplifiers biases, or flats of several levels, tell the read noise."""
+    count = len(measured.amplifiers)
+    told = np.zeros(count, bool)
+    levels: list[set[float]] = [set() for _ in range(count)]
+    for channel in measured.channels:
+        if channel.word not in ("bias_cov", "flat_cov") or channel.unit == PER_ELECTRON:
+            continue
+        for n in np.unique(channel.axes["amp"]).astype(int):
+            own = channel.axes["amp"] == n
+            told[n] |= channel.word == "bias_cov"
+            if channel.word == "flat_cov":
+                levels[n] |= set(channel.axes["time"][own].tolist())
+    flats = any(levels)
+    return told | np.array([len(v) > 1 or not flats for v in levels], bool)
 
 
 def _by_condition(channel: Channel) -> dict[tuple[str, ...], NDArray[np.int64]]:
