@@ -79,6 +79,20 @@ def test_biases_alone(tmp_path):
     assert not found.mismatch.detected and found.location()["lags"] == []
 
 
+def test_masked_pixels_of_one_amplifier_without_detsec_are_left_out(tmp_path):
+    """A dark rim, masked: neither the covariances nor the map see it."""
+    write(tmp_path, [("BIAS", 0.0, 0, -5.0)] * 2 + [("FLAT", 5.0, 2e4, -5.0)] * 2, seed=71)
+    for path in tmp_path.glob("*.fits"):
+        with fits.open(path, mode="update") as hdus:
+            hdus[0].data[:, :4] = 210
+    assert run(tmp_path).mismatch.detected
+    (tmp_path / "campaign.yaml").write_text(f"masks: ['[1:4,1:{SIDE}]']\n")
+    found = run(tmp_path)
+    assert "flat_map" not in found.location()["channels"]
+    (cov,) = (c for c in found.measured.channels if c.word == "flat_cov")
+    np.testing.assert_allclose(cov.values[0], 2e4 / GAIN**2 + NOISE**2, rtol=0.05)
+
+
 @pytest.mark.parametrize(
     ("kinds", "message"),
     [
