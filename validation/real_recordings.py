@@ -224,6 +224,7 @@ def main() -> None:
         (table, "real_recordings"),
         (ladder, "real_unlike"),
         (areas, "real_lags"),
+        (nulls, "real_nulls"),
     ):
         write_results(made, str(RESULTS / f"{name}.ecsv"), COMMAND, cpu_s=cpu)
     table.pprint_all()
