@@ -20,6 +20,7 @@ from bfsensor.measure.bartlett import bartlett_matrix
 from bfsensor.measure.covariance_model import model_covariances
 from bfsensor.recording.area_changes import AreaChangeTable, read_area_changes
 from bfsensor.recording.covariance_tables import CovarianceTable
+from tests.recording.test_reduced import photon_transfer
 
 AREAS = {"a10": 1.0e-7, "a01": 2.4e-7, "a20": 2.0e-8, "a02": 3.0e-8, "a11": 5.0e-8}
 
@@ -234,3 +235,17 @@ def test_a_correlation_that_changes_its_sign_is_named():
     assert "lag (1, 0) changes its sign" in said
     assert all(abs(p.serial) > RISE * p.near_error for p in pairs)
     assert describe_unlike(pairs[:1]) == []
+
+
+def test_covariances_and_lssts_datasets_from_files(tmp_path):
+    """Our ECSV keeps the error matrix; LSST's dataset is read in electrons with its own gain."""
+    covariances(47).write(tmp_path / "c.ecsv")
+    table = find_reduced_recording(tmp_path / "c.ecsv")
+    found = diagnose_measured(measure_reduced(table, reach=4), baseline_of(AREAS))
+    assert not found.mismatch.detected and len(found.fit.channels[0].blocks) == 8
+    photon_transfer(side=3).write(tmp_path / "ptc.fits")
+    measured = measure_reduced(find_reduced_recording(tmp_path / "ptc.fits"), reach=4)
+    (channel,) = measured.channels
+    assert channel.unit == "electron2" and channel.axes["i"].max() == 2
+    assert channel.axes["j"].max() == 2 and len(measured.amplifiers) >= 1
+    diagnose_measured(measured, free_baseline())
