@@ -13,8 +13,9 @@ from bfsensor.cli_common import Bar
 @click.command("diagnose")
 @click.argument("campaign", type=click.Path(path_type=Path))
 @click.option("--baseline", metavar="FILE|STEM|DEVICE",
-              help="What predicts: edge displacements (.json), a table (.fits), a GalSim stem or a "
-              "built-in device; by default the one campaign.yaml names.")  # fmt: skip
+              help="What predicts: edge displacements (.json), a table (.fits), a GalSim stem, a "
+              "built-in device, or 'none' for a sensor of which nothing is known (white noise and "
+              "near a_ij that float); by default the one campaign.yaml names.")  # fmt: skip
 @click.option(
     "--float",
     "floating",
@@ -41,6 +42,9 @@ def diagnose(
 ) -> None:
     """Hold the recordings of CAMPAIGN against a baseline; say what is left, and where.
 
+    CAMPAIGN is a folder of raw exposures, or a reduced recording: a table of measured a_ij or
+    of covariances (ECSV, LSST's photon transfer dataset), diagnosed as one channel.
+
     Everything that may honestly float is fitted: gains, noise, lamp, pixel response, the
     device's parameters within their card's spread.  What remains is sought in all channels
     at one false-alarm rate.  The status is 0 when the diagnosis was made, whatever it says.
@@ -49,27 +53,47 @@ def diagnose(
     Examples:
       bfsensor diagnose recordings/run_12 -o run_12_diagnosis
       bfsensor diagnose recordings/run_12 --baseline itl_sta3800c --float all
+      bfsensor diagnose other_camera --baseline none
+      bfsensor diagnose itl_covariances.csv --baseline itl_sta3800c_60
     """
     from bfsensor.diagnose import diagnosis
+    from bfsensor.diagnose.reduced_channels import measure_reduced
     from bfsensor.diagnose.report import write_report
-    from bfsensor.diagnose.sources import CampaignSource, find_baseline, simulate_baseline
+    from bfsensor.diagnose.sources import (
+        CampaignSource,
+        find_baseline,
+        find_reduced_recording,
+        simulate_baseline,
+    )
     from bfsensor.recording.campaign import read_campaign
 
-    found = read_campaign(campaign, progress=Bar("headers"))
-    folder = output or campaign.with_name(campaign.resolve().name + "_diagnosis")
-    named = baseline or found.baseline
+    folder = output or campaign.with_name(campaign.resolve().stem + "_diagnosis")
+    reduced = find_reduced_recording(campaign)
+    found = (
+        None if reduced is not None else read_campaign(campaign, progress=Bar("headers"))
+    )
+    named = baseline or (None if found is None else found.baseline)
     if floating:
-        biases = sorted({e.back_bias for e in found.exposures if e.back_bias is not None})
+        exposures = () if found is None else found.exposures
+        biases = sorted({e.back_bias for e in exposures if e.back_bias is not None})
         predicted = simulate_baseline(
             named, floating, biases, keep=folder, progress=Bar("simulations")
         )
     else:
-        predicted = find_baseline(named, card=found.card)
-    result = diagnosis.diagnose(
-        CampaignSource(found), predicted, campaign=found.name, seed=seed, progress=Bar("pixels"),
-        notes=[f"{c.topic}: {c.message}" for c in found.warnings]
-        + [f"set aside: {s.path.name}: {s.reason}" for s in found.set_aside],
-    )  # fmt: skip
+        predicted = find_baseline(named, card=None if found is None else found.card)
+    if found is None:
+        assert reduced is not None
+        measured = measure_reduced(reduced, reach=predicted.reach)
+        result = diagnosis.diagnose_measured(
+            measured, predicted, campaign=reduced.path.stem, seed=seed
+        )
+    else:
+        result = diagnosis.diagnose(
+            CampaignSource(found), predicted, campaign=found.name, seed=seed,
+            progress=Bar("pixels"),
+            notes=[f"{c.topic}: {c.message}" for c in found.warnings]
+            + [f"set aside: {s.path.name}: {s.reason}" for s in found.set_aside],
+        )  # fmt: skip
     written = write_report(result, folder)
     if as_json:
         click.echo(json.dumps(result.to_report(), indent=1))
@@ -78,4 +102,6 @@ def diagnose(
     click.echo(f"{'channel':22s}{'chi2':>10s}{'dof':>8s}{'ratio':>8s}")
     for word, (square, dof) in result.mismatch.chi2.items():
         click.echo(f"{word:22s}{square:10.1f}{dof:8.1f}{square / max(dof, 1e-9):8.2f}")
+    for note in result.notes[result.read :]:
+        click.echo(f"note: {note}")
     click.echo(f"{folder}: {', '.join(p.name for p in written if p.suffix != '.png')}")

@@ -31,11 +31,14 @@ def draw_lags(axes: Table, pulls: NDArray[np.float64], ax: Axes) -> None:
     """Pull of each lag, all levels together by their square, as covariances of flats see it."""
     i, j, level = axes["i"].astype(int), axes["j"].astype(int), axes["level"].astype(float)
     weight = (level / level.max()) ** 2
-    image = np.zeros((j.max() + 1, i.max() + 1))
+    image = np.full((j.max() + 1, i.max() + 1), np.nan)
     for a in range(image.shape[1]):
         for b in range(image.shape[0]):
             here = (i == a) & (j == b)
-            image[b, a] = (weight[here] @ pulls[here]) / np.sqrt((weight[here] ** 2).sum())
+            if here.any():
+                image[b, a] = (weight[here] @ pulls[here]) / np.sqrt(
+                    (weight[here] ** 2).sum()
+                )
     _image(
         image,
         ax,

@@ -1,7 +1,7 @@
 """Practice campaigns diagnosed: what is found, chi-square by channel, time and memory.
 
-``python -m validation.practice_campaigns FOLDER`` runs ``bfsensor diagnose`` on each campaign of FOLDER in
-a process of its own, and writes a row for each channel to
+``python -m validation.practice_campaigns FOLDER`` runs ``bfsensor diagnose`` on each campaign of
+FOLDER in a process of its own, and writes a row for each channel to
 ``validation/results/practice_campaigns.ecsv``.  The truths are not read.
 """
 
@@ -26,7 +26,8 @@ COMMAND = "python -m validation.practice_campaigns FOLDER"
 def diagnose(folder: Path, out: Path) -> tuple[dict, float, float]:
     """Report, CPU seconds and peak memory [GB] of the command on one campaign."""
     begin = time.monotonic()
-    line = [sys.executable, "-c", "from bfsensor.cli import main; main()", "diagnose", str(folder), "-o", str(out)]  # fmt: skip
+    code = "from bfsensor.cli import main; main()"
+    line = [sys.executable, "-c", code, "diagnose", str(folder), "-o", str(out)]
     process = subprocess.Popen(line, stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
@@ -50,14 +51,27 @@ def main() -> None:
         with TemporaryDirectory() as out:
             report, cpu, memory = diagnose(campaign, Path(out))
         where = json.dumps(report["location"], separators=(",", ":"))
-        print(f"  p = {report['p_value']:.2g}, {cpu:.1f} CPU s, {memory:.2f} GB; {report['said']}")
+        print(
+            f"  p = {report['p_value']:.2g}, {cpu:.1f} CPU s, {memory:.2f} GB; {report['said']}"
+        )
         print(f"  {where}")
         for word, found in report["channels"].items():
-            print(f"  {word:18s} {found['chi2']:10.1f} / {found['dof']:7.1f} = {found['chi2'] / found['dof']:.2f}")
+            square, dof = found["chi2"], found["dof"]
+            print(f"  {word:18s} {square:10.1f} / {dof:7.1f} = {square / dof:.2f}")
             rows.append((campaign.name, report["p_value"], word, round(found["chi2"], 2),
                          round(found["dof"], 2), report["heldout"]["chi2dof_before"], where,
                          round(cpu, 1), round(memory, 3)))  # fmt: skip
-    names = ("campaign", "p", "channel", "chi2", "dof", "heldout", "location", "cpu_s", "memory_gb")
+    names = (
+        "campaign",
+        "p",
+        "channel",
+        "chi2",
+        "dof",
+        "heldout",
+        "location",
+        "cpu_s",
+        "memory_gb",
+    )
     write_results(Table(rows=rows, names=names), options.output, COMMAND)
 
 

@@ -31,6 +31,7 @@ class Shot:
     temperature: float
     lamp: float | None
     mjd: float
+    pair: int | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +33,9 @@ class Baseline:
     spread : mapping of str to float
         Standard deviation of each parameter about its nominal value.
     reference : tuple of float
-        Wavelength [nm] and back bias [V] of the derivatives.
+        Wavelength [nm] and back bias [V] of the derivatives; nan where any is meant.
+    not_below : tuple of str
+        Parameters that cannot be below 0, such as areas that neighbours gain.
     """
 
     name: str
@@ -41,6 +43,7 @@ class Baseline:
     derivatives: Mapping[str, Edges]
     spread: Mapping[str, float]
     reference: tuple[float, float]
+    not_below: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.edges:
@@ -61,6 +64,18 @@ class Baseline:
         """Device parameters that may float."""
         return tuple(self.derivatives)
 
+    @property
+    def reach(self) -> int:
+        """Largest lag at which the areas are complete [pixel]."""
+        return next(iter(self.edges.values()))[0].shape[0] // 2 - 1
+
+    def without(self, names: Iterable[str]) -> Baseline:
+        """Give the baseline with some parameters held at their nominal values."""
+        gone = set(names)
+        kept = {k: v for k, v in self.derivatives.items() if k not in gone}
+        floors = tuple(n for n in self.not_below if n in kept)
+        return replace(self, derivatives=kept, not_below=floors)
+
     def nearest(self, condition: Condition) -> tuple[float, float]:
         """Wavelength and back bias held that come nearest to a condition.
 
@@ -70,9 +85,7 @@ class Baseline:
             given if np.isfinite(given) else own
             for given, own in zip(condition[:2], self.reference, strict=True)
         )
-        return min(
-            self.edges, key=lambda k: (abs(k[1] - bias) / 10, abs(k[0] - wavelength) / 100)
-        )
+        return min(self.edges, key=lambda k: (_off(k[1], bias), _off(k[0], wavelength)))
 
     def at(
         self, condition: Condition, change: Mapping[str, float] | None = None
@@ -85,18 +98,24 @@ class Baseline:
         key = self.nearest(condition)
         kx, ky = self.edges[key]
         exact = all(
-            not np.isfinite(given) or abs(given - own) < 0.5
+            not _off(given, own) >= 0.5
             for given, own in zip(condition[:2], key, strict=True)
         )
         if not change:
             return (kx, ky), exact
         reference = self.edges.get(self.reference, (kx, ky))
-        factor = centre(kx, ky) / centre(*reference)
+        nominal = centre(*reference)
+        factor = centre(kx, ky) / nominal if nominal else 1.0
         for name, value in change.items():
             dkx, dky = self.derivatives[name]
             kx = kx + factor * value * dkx
             ky = ky + factor * value * dky
         return (kx, ky), exact
+
+
+def _off(one: float, other: float) -> float:
+    """Difference; 0 where either is not known, for it then counts as met."""
+    return abs(one - other) if np.isfinite(one) and np.isfinite(other) else 0.0
 
 
 def area_matrix(kx: NDArray[np.float64], ky: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -42,14 +42,15 @@ class BiasChannels:
         levelled, levels = [], []
         for frame in frames:
             over = frame.serial_overscan.astype(np.float64)
-            zero = float(over.mean()) if over.size else float(frame.pixels.mean())
+            # Without an overscan the mean bias is the zero of flats: its level stays in it.
+            zero = float(over.mean()) if over.size else 0.0
             levelled.append(frame.pixels.astype(np.float64) - zero)
             image = frame.image.astype(np.float64)
-            share = image.var() / image.size + (
-                over.var() / over.size if over.size else 0.0
-            )
-            levels.append((float(image.mean()) - zero, share + LEVEL_ERROR**2))
-        self._levels.append((exposure, levels))
+            if over.size:
+                share = image.var() / image.size + over.var() / over.size
+                levels.append((float(image.mean()) - zero, share + LEVEL_ERROR**2))
+        if len(levels) == len(frames):
+            self._levels.append((exposure, levels))
         if not self._sum:
             self._sum = [np.zeros_like(x) for x in levelled]
             self._names = [f.name for f in frames]
@@ -73,7 +74,7 @@ class BiasChannels:
 
     @property
     def mean(self) -> dict[str, NDArray[np.float64]]:
-        """Mean bias of each amplifier's whole frame, its overscan's level taken off [ADU]."""
+        """Mean bias of each amplifier's whole frame, any overscan's level taken off [ADU]."""
         return {
             name: total / self._frames
             for name, total in zip(self._names, self._sum, strict=True)

@@ -20,6 +20,9 @@ WORDS = (
 )  # fmt: skip
 """The channels there are."""
 
+PER_ELECTRON = "1/e-"
+"""Unit of covariances that are a_ij: areas themselves, of no level, without gain or noise."""
+
 FOLDS = ("fit", "select", "held-out")
 
 

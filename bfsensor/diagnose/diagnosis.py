@@ -11,13 +11,17 @@ from scipy.stats import chi2 as chi2_distribution
 
 import bfsensor
 from bfsensor.diagnose.baseline import Baseline
+from bfsensor.diagnose.channels import PER_ELECTRON
 from bfsensor.diagnose.extract import Measured, Source, measure_channels
-from bfsensor.diagnose.locate import ALARM, Mismatch, locate_mismatch
+from bfsensor.diagnose.locate import ALARM, Finding, Mismatch, locate_mismatch
 from bfsensor.diagnose.mismatch import BaselineFit, fit_baseline
 from bfsensor.diagnose.predict import Predictor, used_channels
 
 SCHEMA = "bfsensor-diagnosis-1"
 FITTED = ("fit", "select")
+FARTHEST, OF_EACH = 50, 10
+"""Findings that report.json holds: of all, and of each channel at least."""
+
 NAMES = {
     "flat_cov": "covariances of flats", "flat_mean": "mean of flats against the lamp",
     "flat_map": "flats against position", "serial_overscan": "serial overscan",
@@ -47,6 +51,8 @@ class Diagnosis:
         Chi-square over degrees of freedom of the fold that was not fitted; nan without one.
     notes : tuple of str
         What was set aside, warned of or assumed.
+    read : int
+        How many of them, the first, are of the reading.
     """
 
     campaign: str
@@ -56,12 +62,13 @@ class Diagnosis:
     mismatch: Mismatch
     heldout: float
     notes: tuple[str, ...] = ()
+    read: int = 0
 
     @property
     def gain(self) -> float:
-        """Mean gain of the amplifiers [e-/ADU]."""
+        """Mean gain of the amplifiers [e-/ADU]; nan where there is none."""
         count = len(self.measured.amplifiers)
-        return float(np.mean(self.fit.values[:count]))
+        return float(np.mean(self.fit.values[:count])) if count else np.nan
 
     def location(self) -> dict[str, Any]:
         """Where the mismatch is, as report.json has it; empty lists where nothing was found."""
@@ -79,8 +86,10 @@ class Diagnosis:
                 best.setdefault(key, finding)
         lags = [f for f in findings if "lags" in f.where]
         for finding in lags:
-            # A strong one casts shadows: what is less than half of it is not listed.
-            if abs(finding.z) > 0.5 * abs(lags[0].z):
+            # A strong one casts shadows: what is less than half of it is not listed, nor lags
+            # together that say less than one alone.
+            together = len(finding.where["lags"]) > 1 and finding is not lags[0]
+            if abs(finding.z) > 0.5 * abs(lags[0].z) and not together:
                 out["lags"] += [
                     list(p) for p in finding.where["lags"] if list(p) not in out["lags"]
                 ]
@@ -90,7 +99,10 @@ class Diagnosis:
             out["flux_e"] = [float(v) * scale for v in finding.where["level"]]
         ny, nx = self.measured.shape
         for key, size in (("x", nx), ("y", ny)):
-            out[key] = [int(v) for v in best[key].where[key]] if key in best else [0, size]
+            if key in best:
+                out[key] = [int(v) for v in best[key].where[key]]
+            elif size:
+                out[key] = [0, size]
         if "amp" in best and best["amp"].where["amp"] != "all":
             out["amps"] = [int(best["amp"].where["amp"]) + 1]
         else:
@@ -113,7 +125,7 @@ class Diagnosis:
             ]  # fmt: skip
         else:
             first = m.findings[0]
-            others = [NAMES[w] for w in self.location()["channels"] if w != first.word]
+            others = self._elsewhere(first)
             parts = [
                 f"The recordings differ from the baseline (family-wise p {m.p_value:.2g}), most in "
                 f"the {NAMES[first.word]} ({first.family}, {abs(first.z):.1f} standard deviations)."
@@ -125,6 +137,16 @@ class Diagnosis:
             text = ", ".join(f"{k} {v:+.1f}" for k, v in far.items())
             parts.append(f"Device parameters off the card, in units of its spread: {text}.")
         return " ".join(parts)
+
+    def _elsewhere(self, first: Finding) -> list[str]:
+        """Channels with findings beside the first's, each with its farthest lags, if it has any."""
+        out = []
+        for word in self.location()["channels"]:
+            own = [f for f in self.mismatch.findings if f.word == word]
+            lags = next((f for f in own if "lags" in f.where), None)
+            if word != first.word:
+                out.append(NAMES[word] + (f" ({_said_lags(lags)})" if lags else ""))
+        return out
 
     def to_report(self) -> dict[str, Any]:
         """Contents of report.json."""
@@ -159,10 +181,14 @@ class Diagnosis:
             "findings": [
                 {"family": f.family, "channel": f.word, "z": f.z, "p_value": f.p_value,
                  "where": _plain(f.where)}
-                for f in self.mismatch.findings[:50]
+                for f in _shown(self.mismatch.findings)
             ],
             "parameters": fitted,
             "exposures": dict(self.measured.counts),
+            "unlike_flats": [
+                {k: float(v) for k, v in vars(p).items()} | {"rises": bool(p.rises)}
+                for p in self.measured.unlike
+            ],
             "notes": list(self.notes),
             "said": self.said(),
         }  # fmt: skip
@@ -195,8 +221,20 @@ def diagnose(
         Called with (exposures done, exposures in all).
     """
     measured = measure_channels(source, progress=progress)
-    predictor = Predictor(measured, baseline)
-    fit = fit_baseline(predictor, used_channels(measured.channels, FITTED))
+    return diagnose_measured(measured, baseline, campaign=campaign, seed=seed, notes=notes)
+
+
+def diagnose_measured(
+    measured: Measured,
+    baseline: Baseline,
+    *,
+    campaign: str = "",
+    seed: int = 1,
+    notes: Sequence[str] = (),
+) -> Diagnosis:
+    """Hold channels that are measured already against a baseline; see :func:`diagnose`."""
+    predictor, fit = fit_bounded(measured, baseline)
+    more = _of_free(measured, baseline, fit)
     return Diagnosis(
         campaign=campaign,
         baseline=baseline.name,
@@ -204,8 +242,45 @@ def diagnose(
         fit=fit,
         mismatch=locate_mismatch(fit, seed=seed),
         heldout=held_out(predictor, fit, measured),
-        notes=(*notes, *measured.notes, *fit.notes),
+        notes=(*notes, *measured.notes, *fit.notes, *more),
+        read=len(notes),
     )
+
+
+def fit_bounded(measured: Measured, baseline: Baseline) -> tuple[Predictor, BaselineFit]:
+    """Fit the baseline; parameters that come out below their bound are held at it, worst first.
+
+    What is held is no parameter any more: of the noise in its direction the residuals keep the
+    forbidden half, which the scans, two-sided, judge rightly.
+    """
+    while True:
+        predictor = Predictor(measured, baseline)
+        fit = fit_baseline(predictor, used_channels(measured.channels, FITTED))
+        below = {n: fit.pulls[n] for n in baseline.not_below if fit.pulls[n] < 0}
+        if not below:
+            return predictor, fit
+        baseline = baseline.without([min(below, key=lambda n: below[n])])
+
+
+def _of_free(measured: Measured, baseline: Baseline, fit: BaselineFit) -> list[str]:
+    """What floats without a device behind it, and what few levels leave open of that."""
+    if not baseline.not_below:
+        return []
+    errors = dict(zip(fit.names, fit.errors, strict=True))
+    text = ", ".join(
+        f"{n} {fit.pulls[n] * baseline.spread[n]:.2g} +- "
+        f"{errors[f'device {n}'] * baseline.spread[n]:.1g}" if n in fit.pulls else f"{n} held at 0"
+        for n in baseline.not_below
+    )  # fmt: skip
+    out = [f"a_ij that float, per electron: {text}"]
+    flats = [c for c in measured.channels if c.word == "flat_cov"]
+    levels = {float(v) for c in flats for v in c.axes["time"]}
+    if len(levels) < 2 and not any(c.unit == PER_ELECTRON for c in flats):
+        out.append(
+            "flats at fewer than two levels: a positive covariance of near neighbours cannot be told "
+            "from the brighter-fatter effect, nor the gain from its a_00"
+        )
+    return out
 
 
 def held_out(predictor: Predictor, fit: BaselineFit, measured: Measured) -> float:
@@ -221,6 +296,21 @@ def held_out(predictor: Predictor, fit: BaselineFit, measured: Measured) -> floa
         square += float(left @ left)
         number += len(channel)
     return square / number if number else np.nan
+
+
+def _shown(findings: Sequence[Finding]) -> list[Finding]:
+    """The farthest of all, and of each channel: one must not crowd out the others."""
+    kept = list(findings[:FARTHEST])
+    for word in dict.fromkeys(f.word for f in findings):
+        kept += [f for f in findings if f.word == word][:OF_EACH]
+    chosen = {id(f) for f in kept}
+    return [f for f in findings if id(f) in chosen]
+
+
+def _said_lags(finding: Finding) -> str:
+    lags = finding.where["lags"]
+    text = f"lag ({lags[0][0]}, {lags[0][1]})" if len(lags) == 1 else f"{len(lags)} lags"
+    return f"{text}, {finding.z:+.1f}"
 
 
 def _finite(value: float) -> float | None:

@@ -16,6 +16,14 @@ from bfsensor.diagnose.code_channels import CodeChannels, CrosstalkChannels
 from bfsensor.diagnose.conditions import Condition, Exposure, Frame, assign_folds
 from bfsensor.diagnose.flat_channels import FlatChannels
 from bfsensor.diagnose.map_channels import MapChannels
+from bfsensor.diagnose.pairs import (
+    PairFinder,
+    UnlikePair,
+    by_level,
+    describe_unlike,
+    group_flats,
+    scan_unlike,
+)
 from bfsensor.diagnose.spot_channels import SpotChannels
 from bfsensor.errors import MeasurementError
 
@@ -56,6 +64,12 @@ class Measured:
         Lower left corner (x, y) of each amplifier on the sensor.
     notes : tuple of str
         What could not be measured, and why.
+    lamp_known : bool
+        Whether every flat has a reading of the lamp.
+    counts : mapping of str to int
+        Exposures of each kind.
+    unlike : tuple of UnlikePair
+        Flats of unlike exposure beside one another; in no channel.
     """
 
     channels: tuple[Channel, ...]
@@ -70,6 +84,7 @@ class Measured:
     notes: tuple[str, ...] = ()
     lamp_known: bool = True
     counts: Mapping[str, int] = field(default_factory=dict)
+    unlike: tuple[UnlikePair, ...] = ()
 
 
 def measure_channels(
@@ -94,7 +109,7 @@ def measure_channels(
     Raises
     ------
     MeasurementError
-        No exposure can be used.
+        No exposure can be used, or nothing can be measured with those there are.
     """
     exposures = list(source.exposures)
     kinds: dict[str, list[Exposure]] = {}
@@ -116,10 +131,15 @@ def measure_channels(
         biases.add(exposure, read(exposure))
     bias_images: dict[str, NDArray[np.float64]] = {}
     layout: Sequence[Frame] | None = None
-    pairs = pair_flats(kinds.get("flat", []))
-    if not pairs and not kinds.get("spot") and not kinds.get("bias"):
-        raise MeasurementError("no bias, no pair of flats and no spots: nothing to measure")
-    first = (kinds.get("flat") or kinds.get("spot") or kinds.get("bias") or [])[0]
+    groups = group_flats(kinds.get("flat", []))
+    if not any(kinds.get(kind) for kind in ("flat", "spot", "bias", "dark")):
+        raise MeasurementError(
+            "no bias, flat, dark or spots among "
+            f"{', '.join(f'{len(v)} {k}' for k, v in kinds.items()) or 'no exposures'}"
+        )
+    first = next(
+        kinds[kind] for kind in ("flat", "spot", "bias", "dark") if kinds.get(kind)
+    )[0]
     layout = source.read(first)
     means = biases.mean if kinds.get("bias") else {}
     for frame in layout:
@@ -131,22 +151,26 @@ def measure_channels(
     codes = CodeChannels()
     gains: list[list[float]] = [[] for _ in layout]
     levels: dict[int, float] = {}
-    for members in _by_level(pairs).values():
-        folds = assign_folds(range(len(members)), shift=len(levels))
-        for (one, two), fold in zip(members, folds, strict=True):
-            frames = read(one), read(two)
+    finder = PairFinder(read, lambda frames: _mean_level(flats, frames))
+    for members in by_level(groups):
+        folds = iter(
+            assign_folds(range(sum(len(g) // 2 for g in members)), shift=len(levels))
+        )
+        for pair in finder.pairs(members):
+            (one, _), (two, second_frames) = pair
+            fold = next(folds)
             try:
-                flats.add_pair((one, frames[0]), (two, frames[1]), fold=fold)
+                flats.add_pair(*pair, fold=fold)
             except MeasurementError as error:
                 notes.append(f"flats {one.number}, {two.number}: {error}")
                 continue
             whole = []
-            for exposure, each in ((one, frames[0]), (two, frames[1])):
-                images = [flats.clean(f) for f in each]
-                levels[exposure.number] = float(np.mean([i.mean() for i in images]))
+            for exposure, each in pair:
+                images = [_good(flats, f) for f in each]
+                levels[exposure.number] = float(np.mean([np.nanmean(i) for i in images]))
                 image = np.full(source.shape, np.nan)
                 for frame, values in zip(each, images, strict=True):
-                    place(image, frame, values / values.mean())
+                    place(image, frame, values / np.nanmean(values))
                 whole.append(image)
                 if fold != "held-out":
                     codes.add(each)
@@ -154,13 +178,18 @@ def measure_channels(
                 bias_noise = [
                     noise.get(f.name, 0.0)
                     / np.sqrt(max(len(kinds.get("bias", [])), 1))
-                    / i.mean()
-                    for f, i in zip(frames[1], images, strict=True)
+                    / np.nanmean(i)
+                    for f, i in zip(second_frames, images, strict=True)
                 ]
                 maps.add_pair(
                     Condition.of(one), one.exposure_time or 0.0, whole[0], whole[1],
                     shared=float(np.sqrt(np.mean(np.square(bias_noise)))),
                 )  # fmt: skip
+    unlike = scan_unlike(
+        sorted([*finder.single, *(g[0] for g in groups if len(g) == 1)], key=lambda f: f.number),
+        lambda flat: [_good(flats, f) for f in read(flat)], lags=lags,
+    )  # fmt: skip
+    notes += [*finder.notes, *describe_unlike(unlike)]
     for channel in flats.channels():
         if channel.word == "flat_cov":
             _rough_gains(channel, gains)
@@ -192,6 +221,17 @@ def measure_channels(
         *flats.channels(), *maps.channels(), *codes.channels(), *biases.channels(),
         *darks.channels(), *spots.channels(), *crosstalk.channels(),
     ]  # fmt: skip
+    if not channels:
+        raise MeasurementError(
+            f"nothing can be measured: {len(kinds.get('flat', []))} flats make no pair of equal "
+            f"exposure and level, biases {len(kinds.get('bias', []))} (2 are needed), no dark, no "
+            f"spots that could be fitted{'; ' + '; '.join(notes) if notes else ''}"
+        )
+    if "bias" not in kinds and any(f.serial_overscan.size == 0 for f in layout):
+        notes.append(
+            "no bias and no overscan: the zero level is not known and stays in the levels, "
+            "read noise is not known"
+        )
     return Measured(
         channels=tuple(channels),
         amplifiers=tuple(f.name for f in layout),
@@ -205,22 +245,8 @@ def measure_channels(
         notes=tuple(notes),
         lamp_known=all(e.lamp is not None for e in kinds.get("flat", [])),
         counts={k: len(v) for k, v in kinds.items()},
+        unlike=tuple(unlike),
     )
-
-
-def pair_flats(flats: Sequence[Exposure]) -> list[tuple[Exposure, Exposure]]:
-    """Pair flats of one condition and exposure time that follow one another."""
-    pairs, open_flat = [], None
-    for flat in flats:
-        if open_flat is not None and (
-            (Condition.of(open_flat).key, open_flat.exposure_time)
-            == (Condition.of(flat).key, flat.exposure_time)
-        ):
-            pairs.append((open_flat, flat))
-            open_flat = None
-        else:
-            open_flat = flat
-    return pairs
 
 
 def place(image: NDArray[np.float64], frame: Frame, values: NDArray[np.float64]) -> None:
@@ -238,14 +264,13 @@ def _data_section(frame: Frame, whole: NDArray[np.float64]) -> NDArray[np.float6
     return whole[:ny, start : start + nx]
 
 
-def _by_level(
-    pairs: list[tuple[Exposure, Exposure]],
-) -> dict[tuple, list[tuple[Exposure, Exposure]]]:
-    groups: dict[tuple, list[tuple[Exposure, Exposure]]] = {}
-    for pair in pairs:
-        key = (Condition.of(pair[0]).key, pair[0].exposure_time)
-        groups.setdefault(key, []).append(pair)
-    return groups
+def _mean_level(flats: FlatChannels, frames: Sequence[Frame]) -> float:
+    return float(np.mean([np.nanmean(_good(flats, f)) for f in frames]))
+
+
+def _good(flats: FlatChannels, frame: Frame) -> NDArray[np.float64]:
+    """Clean image, nan where a pixel is masked."""
+    return np.where(frame.mask, np.nan, flats.clean(frame))
 
 
 def _rough_gains(channel: Channel, gains: list[list[float]]) -> None:
@@ -259,7 +284,7 @@ def _rough_gains(channel: Channel, gains: list[list[float]]) -> None:
         level, value = a["level"][rows], channel.values[rows]
         # The slope of the variance at low levels: read noise is in the lowest of them.
         low = level <= max(0.5 * level.max(), np.sort(level)[:3].max())
-        if low.sum() >= 2:
-            found.append(1.0 / np.polyfit(level[low], value[low], 1)[0])
-        else:
-            found.append(float(level[low][0] / value[low][0]))
+        slope = (
+            np.polyfit(level[low], value[low], 1)[0] if len(set(level[low])) > 1 else 0.0
+        )
+        found.append(1.0 / slope if slope > 0 else float(level[low][0] / value[low][0]))

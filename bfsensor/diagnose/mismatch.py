@@ -13,7 +13,7 @@ from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.predict import Predictor
 from bfsensor.errors import ConvergenceError
 
-ROUNDS = 6
+ROUNDS = 12
 SMALL = 0.05
 """Largest step of a parameter [of its error] at which the fit has arrived."""
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.diagnose.baseline import Baseline, area_matrix
-from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
 from bfsensor.diagnose.predict_flats import flat_covariances_of
@@ -93,6 +93,17 @@ class Predictor:
         n, p = 2 * self._amps, len(baseline.parameters)
         self.prior_rows = np.arange(n, n + p)
         """Parameters with a prior of mean 0 and width 1."""
+        self._noise_told = _noise_told(measured)
+        if not self._noise_told.all():
+            names = [
+                a
+                for a, told in zip(measured.amplifiers, self._noise_told, strict=True)
+                if not told
+            ]
+            self.notes.append(
+                f"read noise of {', '.join(names)} taken as {np.sqrt(noise[0]):.3g} ADU: no biases, "
+                "and flats of one level cannot tell it from the gain"
+            )
         exact = {
             key: baseline.at(_condition(c, rows[0]))[1]
             for c in measured.channels if c.word in ("flat_cov", "spot")
@@ -156,9 +167,9 @@ class Predictor:
         sigma = np.char.startswith(names, "sigma")
         gain = np.char.startswith(names, "gain")
         noise = np.char.startswith(names, "noise")
-        del a
+        noise[a : 2 * a] &= self._noise_told
         if channel.word == "flat_cov":
-            return gain | noise | device
+            return device if channel.unit == PER_ELECTRON else gain | noise | device
         if channel.word == "spot":
             return gain | device | sigma
         return noise if channel.word == "bias_cov" else np.zeros(len(names), bool)
@@ -208,6 +219,12 @@ class Predictor:
             del key
             edges, _ = self.baseline.at(_condition(channel, rows[0]), device)
             a = area_matrix(*edges)
+            if channel.unit == PER_ELECTRON:
+                y, x0 = (n // 2 for n in a.shape)
+                out[rows] = 0.5 * (
+                    a[y + j[rows], x0 + i[rows]] + a[y - j[rows], x0 + i[rows]]
+                )
+                continue
             pairs = np.stack([amp[rows], x["level"][rows]], axis=1)
             groups, index = np.unique(pairs, axis=0, return_inverse=True)
             own = gains[groups[:, 0].astype(int)]
@@ -323,6 +340,23 @@ class Predictor:
                 column[here] = x["light"][here] if what == "flux" else 1.0
                 out[f"spot {what} {'/'.join(key)}"] = column
         return out
+
+
+def _noise_told(measured: Measured) -> NDArray[np.bool_]:
+    """Of which amplifiers biases, or flats of several levels, tell the read noise."""
+    count = len(measured.amplifiers)
+    told = np.zeros(count, bool)
+    levels: list[set[float]] = [set() for _ in range(count)]
+    for channel in measured.channels:
+        if channel.word not in ("bias_cov", "flat_cov") or channel.unit == PER_ELECTRON:
+            continue
+        for n in np.unique(channel.axes["amp"]).astype(int):
+            own = channel.axes["amp"] == n
+            told[n] |= channel.word == "bias_cov"
+            if channel.word == "flat_cov":
+                levels[n] |= set(channel.axes["time"][own].tolist())
+    flats = any(levels)
+    return told | np.array([len(v) > 1 or not flats for v in levels], bool)
 
 
 def _by_condition(channel: Channel) -> dict[tuple[str, ...], NDArray[np.int64]]:

@@ -39,7 +39,7 @@ def flat_covariances_of(
     >>> a = np.zeros((3, 3))
     >>> a[1] = [1e-7, -2e-7, 1e-7]
     >>> flat_covariances_of(a, [1e5], lags=1)[0].round(0)
-    array([[98049.,   970.],
+    array([[98039.,   974.],
            [    0.,     0.]])
     """
     ny, nx = a.shape

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor import show_mismatch as show
-from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.diagnosis import NAMES, Diagnosis
 
 if TYPE_CHECKING:
@@ -104,10 +104,16 @@ def draw_figures(diagnosis: Diagnosis, folder: Path) -> dict[str, Path]:
     if "flat_cov" in found:
         channel, pulls = found["flat_cov"]
         lags = [(0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2)]
-        add("flat_cov", "Covariances of flats: pulls by lag, weighted by the square of the level, "
-            "and of the nearest lags against level.", (10, 4),
-            lambda ax: show.draw_lags(channel.axes, pulls, ax),
-            lambda ax: show.draw_lag_levels(channel.axes, pulls, ax, lags=lags))  # fmt: skip
+        caption = "Covariances of flats: pulls by lag"
+        panels: list[Callable[[Axes], None]] = [
+            lambda ax: show.draw_lags(channel.axes, pulls, ax)
+        ]
+        if channel.unit != PER_ELECTRON:
+            caption += ", weighted by the square of the level, and of the nearest lags against level"
+            panels.append(
+                lambda ax: show.draw_lag_levels(channel.axes, pulls, ax, lags=lags)
+            )
+        add("flat_cov", f"{caption}.", (5 * len(panels), 4), *panels)
     if "flat_mean" in found:
         channel_m, pulls_m = found["flat_mean"]
         left = channel_m.unwhiten(pulls_m) / np.maximum(channel_m.values, 1e-9)
@@ -171,13 +177,14 @@ def to_html(diagnosis: Diagnosis, figures: dict[str, Path]) -> str:
     unseen = ""
     if heldout is not None:
         unseen = f"Flats that were not fitted: chi-square per value {heldout:.2f}."
-    exposures = ", ".join(f"{n} {k}" for k, n in report["exposures"].items())
+    taken = ", ".join(f"{n} {k}" for k, n in report["exposures"].items())
+    exposures = f"Exposures: {taken}." if taken else "A reduced recording."
     return f"""<!doctype html>
 <html lang=en><meta charset=utf-8><title>{text(diagnosis.campaign)}: diagnosis</title>
 <style>{STYLE}</style>
 <h1>{text(diagnosis.campaign)}</h1>
 <p class="said{mood}">{text(report["said"])}</p>
-<p>Baseline: {text(diagnosis.baseline)}. Exposures: {text(exposures)}.
+<p>Baseline: {text(diagnosis.baseline)}. {text(exposures)}
 {unseen}
 Family-wise p: {report["p_value"]:.2g} (chi-squares {report["p_chi2"]:.2g}, scans
 {report["p_scans"]:.2g}); below {report["alarm"]:g} counts as detected.</p>

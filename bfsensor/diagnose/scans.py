@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.mismatch import BaselineFit
 
 POWERS = (0, 1, 2, 3)
@@ -100,8 +100,32 @@ class _Group:
 Pattern = tuple[str, NDArray[np.float64], dict[str, object]]
 
 
+def _areas(g: _Group) -> Iterator[Pattern]:
+    """Of a_ij, which know no level: single lags, and lags together."""
+    i, j = g.axes["i"].astype(int), g.axes["j"].astype(int)
+    for a, b in zip(i.tolist(), j.tolist(), strict=True):
+        yield "lags", np.where((i == a) & (j == b), 1.0, 0.0), {"lags": [(a, b)]}
+    for name, here in _lags_together(i, j).items():
+        chosen = sorted(zip(i[here].tolist(), j[here].tolist(), strict=True))
+        yield "lags together", np.where(here, 1.0, 0.0), {"lags": chosen, "set": name}
+
+
+def _lags_together(
+    i: NDArray[np.int64], j: NDArray[np.int64]
+) -> dict[str, NDArray[np.bool_]]:
+    """Rows, columns and rings of lags."""
+    radius = np.hypot(i, j)
+    return {
+        "row of lags": (j == 0) & (i > 0), "column of lags": (i == 0) & (j > 0),
+        "near lags": (radius > 0) & (radius < 1.5), "far lags": radius > 2.5,
+    }  # fmt: skip
+
+
 def _covariances(g: _Group) -> Iterator[Pattern]:
     """Lag by power of the level, by single level, by amplifier, by condition."""
+    if g.members[0][0].unit == PER_ELECTRON:
+        yield from _areas(g)
+        return
     x = g.axes
     i, j, level = x["i"].astype(int), x["j"].astype(int), x["level"].astype(float)
     unit = level / level.max()
@@ -128,13 +152,7 @@ def _covariances(g: _Group) -> Iterator[Pattern]:
             own = here & (x["time"] == time)
             span = (float(level[own].min()), float(level[own].max()))
             yield "lag x level", np.where(own, 1.0, 0.0), {"lags": [(a, b)], "level": span}
-    # Rows, columns and rings of lags together.
-    radius = np.hypot(i, j)
-    sets = {
-        "row of lags": (j == 0) & (i > 0), "column of lags": (i == 0) & (j > 0),
-        "near lags": (radius > 0) & (radius < 1.5), "far lags": radius > 2.5,
-    }  # fmt: skip
-    for name, here in sets.items():
+    for name, here in _lags_together(i, j).items():
         chosen = sorted(set(zip(i[here].tolist(), j[here].tolist(), strict=True)))
         for p in POWERS:
             yield "lags together", np.where(here, unit**p, 0.0), {

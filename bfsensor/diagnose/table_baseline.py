@@ -19,6 +19,10 @@ from bfsensor.table import DistortionTable, vertex_fractions
 WAVELENGTHS = (400.0, 480.0, 550.0, 620.0, 700.0, 750.0, 870.0, 950.0)
 """At which shifts are held [nm]."""
 
+MIDDLE = 40_000.0
+"""Background [e-] at which the response is taken: what a flat of twice as much sees while it
+grows, halfway.  Published covariances are quoted at 80,000 e-, ladders end at 100,000 to 150,000."""
+
 CHARGE = 100.0
 """Charge above the background [e-] that stands for the differential response."""
 
@@ -26,9 +30,15 @@ CHARGE = 100.0
 def baseline_of_table(given: str | os.PathLike[str]) -> Baseline:
     """Baseline of a table: a .fits file, a GalSim stem, or the name of a shipped device.
 
-    Shifts are those of the differential response at the middle of the table's backgrounds,
-    which flats see, averaged along the edge and over the depths at which the light converts.
-    Nothing of the device floats: its table holds no derivatives.
+    Shifts are those of the differential response on a background of :data:`MIDDLE`, which
+    flats see, averaged along the edge and over the depths at which the light converts; of a
+    table of one charge, such as GalSim's, that charge's over it.  Nothing of the device floats:
+    its table holds no derivatives.
+
+    Parameters
+    ----------
+    given : str or path-like
+        File, stem (a path, or the name of one of GalSim's own), or device.
 
     Raises
     ------
@@ -43,7 +53,7 @@ def baseline_of_table(given: str | os.PathLike[str]) -> Baseline:
         elif path.suffix == ".fits":
             table = DistortionTable.read(path)
         else:
-            table = read_galsim(path)
+            table = read_galsim(_stem(path))
     except (BFSensorError, OSError) as error:
         raise DiagnosisError(f"{given}: not a baseline: {error}") from None
     device = Device.from_toml(table.device_text) if table.device_text else None
@@ -53,6 +63,17 @@ def baseline_of_table(given: str | os.PathLike[str]) -> Baseline:
     for wavelength in WAVELENGTHS:
         edges[wavelength, float(bias)] = edges_at(table, wavelength, temperature)
     return Baseline(os.fspath(given), edges, {}, {}, (620.0, float(bias)))
+
+
+def _stem(path: Path) -> Path:
+    """The path, or GalSim's own file of that name where nothing lies at it."""
+    import galsim
+
+    own = Path(galsim.meta_data.share_dir) / "sensors" / path.name
+    there = Path(f"{path}.cfg").exists()
+    return (
+        own if not there and path.parent == Path() and Path(f"{own}.cfg").exists() else path
+    )
 
 
 def edges_at(table: DistortionTable, wavelength: float, temperature: float) -> Edges:
@@ -72,7 +93,7 @@ def edges_at(table: DistortionTable, wavelength: float, temperature: float) -> E
     kx, ky : ndarray, shape (2 reach + 3, 2 reach + 3)
         With a ring of pixels around the table's whose outer edges do not move.
     """
-    middle = float(table.backgrounds[len(table.backgrounds) // 2])
+    middle = min(MIDDLE, float(table.backgrounds[-1]))
     if len(table.charges) == 1 or middle + CHARGE > table.charges[-1]:
         middle = float(table.backgrounds[0])
     weights = _conversion(table.depths, table.thickness, wavelength, temperature)

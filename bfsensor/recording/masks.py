@@ -40,6 +40,10 @@ def read_masks(
     if not masks:
         return {}
     boxes = {one.name: one.footprint() for one in layouts}
+    if len(layouts) == 1 and layouts[0].origin is None:
+        # One amplifier alone is the sensor.
+        rows, columns = layouts[0].shape
+        boxes = {layouts[0].name: (0, columns, 0, rows)}
     lost = [name for name, box in boxes.items() if box is None]
     if lost:
         raise RecordingError(

@@ -8,8 +8,8 @@ import pytest
 
 from bfsensor.diagnose.channels import Channel, join_channels
 from bfsensor.diagnose.conditions import Condition, assign_folds
-from bfsensor.diagnose.extract import pair_flats
 from bfsensor.diagnose.flat_channels import TAIL, mean_profile, profile
+from bfsensor.diagnose.pairs import PairFinder, by_level, group_flats
 from bfsensor.errors import DiagnosisError
 
 
@@ -81,15 +81,41 @@ class Shot:
     wavelength: float = 620.0
     back_bias: float = -60.0
     temperature: float | None = None
+    pair: int | None = None
+    level: float = 1000.0
+
+
+def pairs_of(shots):
+    """Frames are stood for by the level itself."""
+    finder = PairFinder(lambda shot: shot.level, lambda level: level)
+    found = [
+        (a[0].number, b[0].number)
+        for groups in by_level(group_flats(shots))
+        for a, b in finder.pairs(groups)
+    ]
+    return found, [s.number for s in finder.single], finder.notes
 
 
 def test_pairs_are_neighbours_of_one_condition_and_time():
     times = [1, 1, 5, 5, 5, 1, 1]
     shots = [Shot(n, t) for n, t in enumerate(times)]
-    assert [(a.number, b.number) for a, b in pair_flats(shots)] == [(0, 1), (2, 3), (5, 6)]
+    assert pairs_of(shots) == ([(0, 1), (5, 6), (2, 3)], [4], [])
     shots[1].back_bias = -40.0
-    assert [(a.number, b.number) for a, b in pair_flats(shots)] == [(2, 3), (5, 6)]
+    assert pairs_of(shots) == ([(2, 3), (5, 6)], [4], [])
     assert Condition.of(shots[0]).key == ("620", "-60", "nan")
+
+
+def test_unequal_levels_make_no_pair():
+    """The lamp of the first was 13 % weaker: the other two are the pair."""
+    shots = [Shot(n, 30, level=v) for n, v in enumerate((5843.0, 6624.0, 6349.0))]
+    found, single, (note,) = pairs_of(shots)
+    assert found == [(1, 2)] and single == [0]
+    assert "flats 0, 1: levels of 5843 and 6624 ADU make no pair" in note
+
+
+def test_numbers_of_pairs_count_where_there_are_any():
+    shots = [Shot(n, 30, pair=p) for n, p in enumerate((0, 1, 0, 1, None))]
+    assert pairs_of(shots)[0] == [(0, 2), (1, 3)]
 
 
 def test_overscan_profile_finds_what_is_deferred():
