@@ -18,6 +18,9 @@ DRAWS = 500
 ALARM = 0.01
 """Family-wise probability below which a mismatch is called detected."""
 
+HOPELESS = 2.5
+"""Deviate below which a lone statistic is not below :data:`ALARM`: two-sided p = 0.012."""
+
 SMALLEST = 1e-30
 """Least probability that is told apart from zero: no tail is known farther out."""
 
@@ -116,8 +119,8 @@ class Scanner:
         return np.asarray((np.cbrt(squares / d) - (1 - 2 / (9 * d))) / np.sqrt(2 / (9 * d)))
 
 
-def locate_mismatch(fit: BaselineFit, *, seed: int = 1, draws: int = DRAWS) -> Mismatch:
-    """Find what of the residuals noise does not explain.
+class Locator:
+    """Judges residuals against noise that is drawn once.
 
     The noise is drawn through the fit's own linear model; the largest of all statistics,
     chi-squares (one-sided) and templates (two-sided) on one scale of deviates, gives
@@ -132,36 +135,84 @@ def locate_mismatch(fit: BaselineFit, *, seed: int = 1, draws: int = DRAWS) -> M
         Of the draws.
     draws : int
         How many.
-
-    Returns
-    -------
-    Mismatch
     """
-    scanner = Scanner(fit)
-    rng = np.random.default_rng(seed)
-    seen_t = np.abs(scanner.templates_z(fit.residuals))
-    seen_c = scanner.chi2_z(fit.residuals)
-    null_t, null_c = [], []
-    for start in range(0, draws, 50):
-        noise = fit.draw(rng, min(50, draws - start))
-        null_t.append(np.abs(scanner.templates_z(noise)))
-        null_c.append(scanner.chi2_z(noise))
-    drawn_t, drawn_c = np.concatenate(null_t), np.concatenate(null_c)
-    observed = np.concatenate([seen_c, seen_t])
-    drawn = np.concatenate([drawn_c, drawn_t], axis=1)
-    chi = len(seen_c)
-    findings = _step_down(scanner, observed, drawn, chi)
-    return Mismatch(
-        p_value=_family(observed, drawn),
-        p_chi2=_family(observed[:chi], drawn[:, :chi]),
-        p_scans=_family(observed[chi:], drawn[:, chi:]),
-        findings=tuple(findings),
-        chi2=fit.chi2(),
-    )
+
+    def __init__(self, fit: BaselineFit, *, seed: int = 1, draws: int = DRAWS) -> None:
+        self.scanner = Scanner(fit)
+        self._chi = len(self.scanner.words)
+        rng = np.random.default_rng(seed)
+        # One row a statistic, chi-squares first.
+        self._drawn = np.empty((self._chi + len(self.scanner.templates), draws), np.float32)
+        for start in range(0, draws, 50):
+            noise = fit.draw(rng, min(50, draws - start))
+            columns = slice(start, start + len(noise))
+            self._drawn[: self._chi, columns] = self.scanner.chi2_z(noise).T
+            self._drawn[self._chi :, columns] = np.abs(self.scanner.templates_z(noise)).T
+        parts = self._drawn[: self._chi], self._drawn[self._chi :]
+        self._maxima = [p.max(0).astype(float) for p in parts]
+
+    def locate(self, residuals: NDArray[np.float64] | None = None) -> Mismatch:
+        """Find what of residuals noise does not explain.
+
+        Parameters
+        ----------
+        residuals : ndarray, shape (n,), optional
+            Whitened, what was fitted taken off; by default the fit's.
+        """
+        fit = self.scanner.fit
+        residuals = fit.residuals if residuals is None else residuals
+        signed = self.scanner.templates_z(residuals)
+        chi2, scans = self.scanner.chi2_z(residuals), np.abs(signed)
+        maxima = np.maximum(*self._maxima)
+        largest = max(float(chi2.max()), float(scans.max()))
+        squares = [
+            float(residuals[fit.of(w)] @ residuals[fit.of(w)]) for w in self.scanner.words
+        ]
+        dofs = [d for _, d in fit.chi2().values()]
+        return Mismatch(
+            p_value=tail_probability(largest, maxima),
+            p_chi2=tail_probability(float(chi2.max()), self._maxima[0]),
+            p_scans=tail_probability(float(scans.max()), self._maxima[1]),
+            findings=tuple(self._step_down(np.concatenate([chi2, scans]), signed)),
+            chi2=dict(
+                zip(self.scanner.words, zip(squares, dofs, strict=True), strict=True)
+            ),
+        )
+
+    def _step_down(
+        self, observed: NDArray[np.float64], signed: NDArray[np.float64]
+    ) -> list[Finding]:
+        """Farthest first, each held against those that are left."""
+        # Below HOPELESS a single statistic would not be found, whatever the family's size.
+        count = int((observed > HOPELESS).sum())
+        order = np.argsort(-observed, kind="stable")
+        rest = self._drawn[np.sort(order[count:])].max(0, initial=-np.inf)
+        # Of what is left after each: maxima from the least to the farthest.
+        left = np.maximum.accumulate(
+            np.concatenate([rest[None], self._drawn[order[:count]][::-1]])
+        )[:0:-1]
+        findings: list[Finding] = []
+        largest = 0.0
+        for n, maxima in zip(order[:count], left, strict=True):
+            p = max(largest, tail_probability(float(observed[n]), maxima.astype(float)))
+            if p >= ALARM:
+                break
+            largest = p
+            if n < self._chi:
+                word = self.scanner.words[n]
+                findings.append(Finding("chi-square", word, float(observed[n]), p))
+            else:
+                template = self.scanner.templates[n - self._chi]
+                z = float(signed[n - self._chi])
+                findings.append(
+                    Finding(template.family, template.word, z, p, dict(template.where))
+                )
+        return findings
 
 
-def _family(observed: NDArray[np.float64], drawn: NDArray[np.float64]) -> float:
-    return tail_probability(float(observed.max()), drawn.max(1))
+def locate_mismatch(fit: BaselineFit, *, seed: int = 1, draws: int = DRAWS) -> Mismatch:
+    """Find what of a fit's residuals noise does not explain: :class:`Locator`, once."""
+    return Locator(fit, seed=seed, draws=draws).locate()
 
 
 def tail_probability(value: float, maxima: NDArray[np.float64]) -> float:
@@ -173,30 +224,3 @@ def tail_probability(value: float, maxima: NDArray[np.float64]) -> float:
     threshold = float(np.quantile(maxima, 0.8))
     excess = maxima[maxima > threshold] - threshold
     return max(0.2 * float(np.exp(-(value - threshold) / excess.mean())), SMALLEST)
-
-
-def _step_down(
-    scanner: Scanner, observed: NDArray[np.float64], drawn: NDArray[np.float64], chi: int
-) -> list[Finding]:
-    """Farthest first, each held against those that are left."""
-    order = np.argsort(-observed)
-    # Of what is left after each: maxima from the least to the farthest.
-    sorted_draws = drawn[:, order]
-    left = np.maximum.accumulate(sorted_draws[:, ::-1], axis=1)[:, ::-1]
-    signed = scanner.templates_z(scanner.fit.residuals)
-    findings: list[Finding] = []
-    largest = 0.0
-    for count, n in enumerate(order):
-        p = max(largest, tail_probability(float(observed[n]), left[:, count]))
-        if p >= ALARM:
-            break
-        largest = p
-        if n < chi:
-            findings.append(Finding("chi-square", scanner.words[n], float(observed[n]), p))
-        else:
-            template = scanner.templates[n - chi]
-            z = float(signed[n - chi])
-            findings.append(
-                Finding(template.family, template.word, z, p, dict(template.where))
-            )
-    return findings
