@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 from scipy.sparse import block_diag, csr_array, diags_array
+from scipy.sparse.linalg import spsolve_triangular
 
 from bfsensor.errors import DiagnosisError
 
@@ -125,6 +126,10 @@ class Channel:
             Differences, or derivatives, in ``unit``.
         """
         return np.asarray(self._whitener @ np.asarray(residuals, float))
+
+    def unwhiten(self, whitened: ArrayLike) -> NDArray[np.float64]:
+        """Undo :meth:`whiten` of values, shape (n,)."""
+        return np.asarray(spsolve_triangular(self._whitener, np.asarray(whitened, float)))
 
 
 def join_channels(channels: Sequence[Channel]) -> Channel:
