@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.baseline import Baseline, area_matrix
+from bfsensor.diagnose.baseline import Baseline
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
@@ -207,15 +207,12 @@ class Predictor:
         out = np.empty(len(channel))
         for key, rows in self._rows(channel).items():
             del key
-            edges, _ = self.baseline.at(_condition(channel, rows[0]), device)
-            a = area_matrix(*edges)
             pairs = np.stack([amp[rows], x["level"][rows]], axis=1)
             groups, index = np.unique(pairs, axis=0, return_inverse=True)
             own = gains[groups[:, 0].astype(int)]
-            c = (
-                flat_covariances_of(a, own * groups[:, 1], lags=lags)
-                / own[:, None, None] ** 2
-            )
+            levels = own * groups[:, 1]
+            a = self.baseline.flat_areas(_condition(channel, rows[0]), device, levels)
+            c = flat_covariances_of(a, levels, lags=lags) / own[:, None, None] ** 2
             c[:, 0, 0] += noise[groups[:, 0].astype(int)]
             out[rows] = c[index.ravel(), j[rows], i[rows]]
         return out
