@@ -232,11 +232,10 @@ def score(case: Case, signature: Signature, measured: Measured, fit: BaselineFit
     if case.x is not None:
         out["x"] = overlap(tuple(where["x"]), case.x) if where["x"] else 0.0
     fluxes = flux_of(fit, told.gain, signature.direction)
-    if fluxes:
-        given = where["flux_e"]
-        out["flux"] = (
-            max(overlap((given[0], given[1]), f) for f in fluxes) if given else 0.0
-        )
+    given = where["flux_e"]
+    # A place on the sensor has no flux: none told is none wrong.
+    if fluxes and given:
+        out["flux"] = max(overlap((given[0], given[1]), f) for f in fluxes)
     flats = [c.axes["exposure"] for c in fit.channels if c.word == "flat_mean"]
     span = float(min(f.min() for f in flats)), float(max(f.max() for f in flats))
     if case.all_exposures:
@@ -297,7 +296,7 @@ def summary(case: Case, kind: str, snr: float, rows: list[dict]) -> Table:
         "flux",
         "exposures",
     ):
-        values = [r[name] for r in rows if name in r]
+        values = [r[name] for r in rows if np.isfinite(r.get(name, np.nan))]
         out[name] = round(float(np.mean(values)), 3) if values else np.nan
     return Table({k: [v] for k, v in out.items()})
 
@@ -312,7 +311,7 @@ def pixel_campaign(case: Case, signature: Signature, seed: int) -> Table:
     found = Locator(fit, seed=seed).locate()
     row: dict[str, Any] = {"effect": case.word, "seed": seed, "factor": round(factor, 4)}
     n = len(fit.residuals)
-    if n == len(signature.direction) - 7 or n <= len(signature.direction):
+    if n + len(predictor.prior_rows) == len(signature.direction):
         # The fitted amplitude of the signature: about 8 with an error of 1.
         row["seen"] = round(float(fit.residuals @ signature.direction[:n]), 2)
     row |= {"p": found.p_value, "p_chi2": found.p_chi2, "p_scans": found.p_scans}

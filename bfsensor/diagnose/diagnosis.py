@@ -108,14 +108,13 @@ class Diagnosis:
     def _all_flux(self, words: list[str]) -> list[float]:
         """Lowest and highest flux [e-] of the first of channels that has any."""
         for word in words:
-            levels = [
-                c.axes["level"].astype(float)
-                for c in self.fit.channels
-                if c.word == word and "level" in c.axes
+            name, scale = ("flux", 1.0) if word == "spot" else ("level", self.gain)
+            held = [
+                c.axes[name] for c in self.fit.channels if c.word == word and name in c.axes
             ]
-            if levels:
-                both = np.concatenate(levels)
-                return [float(both.min()) * self.gain, float(both.max()) * self.gain]
+            if held:
+                both = scale * np.concatenate(held).astype(float)
+                return [float(both.min()), float(both.max())]
         return []
 
     def said(self) -> str:
