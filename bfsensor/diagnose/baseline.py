@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +36,10 @@ class Baseline:
         Wavelength [nm] and back bias [V] of the derivatives; nan where any is meant.
     not_below : tuple of str
         Parameters that cannot be below 0, such as areas that neighbours gain.
+    slopes : mapping of (wavelength, back_bias) to (dkx, dky), optional
+        Change of the shifts per electron with the level of a flat [pixel/e-^2].
+    level : float
+        Level [e-] at which the shifts are those of ``edges``, where there are slopes.
     """
 
     name: str
@@ -44,6 +48,8 @@ class Baseline:
     spread: Mapping[str, float]
     reference: tuple[float, float]
     not_below: tuple[str, ...] = ()
+    slopes: Mapping[tuple[float, float], Edges] = field(default_factory=dict)
+    level: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.edges:
@@ -111,6 +117,35 @@ class Baseline:
             kx = kx + factor * value * dkx
             ky = ky + factor * value * dky
         return (kx, ky), exact
+
+    def flat_areas(
+        self,
+        condition: Condition,
+        change: Mapping[str, float] | None,
+        levels: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        r"""Change of the areas per electron [1/e-] that flats of given levels have felt.
+
+        Covariances grow as :math:`2\int a(\mu)\,\mu\,d\mu`, to first order in a: of a response
+        that goes straight with the level, that of 2/3 of the level reached counts.
+
+        Parameters
+        ----------
+        condition, change
+            As for :meth:`at`.
+        levels : ndarray, shape (n,)
+            Of the flats [e-].
+
+        Returns
+        -------
+        a : ndarray, shape (n, ny, nx), or (ny, nx) where the response does not change
+        """
+        a = area_matrix(*self.at(condition, change)[0])
+        slopes = self.slopes.get(self.nearest(condition))
+        if slopes is None:
+            return a
+        away = 2 / 3 * levels - self.level
+        return a + away[:, None, None] * area_matrix(*slopes)
 
 
 def _off(one: float, other: float) -> float:

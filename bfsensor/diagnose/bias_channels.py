@@ -16,6 +16,10 @@ READOUT_LAGS = 32
 OUTLIER = 6.0
 """Deviation [sigma] from which a pixel of a dark or bias counts as struck: one in 5e8 by noise."""
 
+UNEVEN = 1.25
+"""Scatter of a dark's columns over that of noise from which columns count as uneven by nature:
+four standard deviations of the scatter of 128."""
+
 LEVEL_ERROR = 0.05
 """How well the overscan's level stands for the image's in a quiet system [ADU] (assumed)."""
 
@@ -153,10 +157,14 @@ class DarkChannels:
         bias: dict[str, NDArray[np.float64]],
         read_noise: dict[str, float],
         fold: str = "fit",
+        *,
+        biases: int = 0,
     ) -> None:
         self._bias, self._noise, self._fold = bias, read_noise, fold
+        self._biases = biases
         self._rows: list[tuple[Exposure, float, list[tuple[float, float, int, int]]]] = []
-        self._columns: list[tuple[float, list[NDArray[np.float64]]]] = []
+        self._columns: list[tuple[float, list[NDArray[np.float64]], list[float]]] = []
+        self._names: list[str] = []
         self._condition = Condition(np.nan, np.nan, np.nan)
 
     def add(
@@ -164,7 +172,8 @@ class DarkChannels:
     ) -> None:
         """Add a dark; ``after`` is the mean level [ADU] of the exposure before it."""
         self._condition = Condition.of(exposure)
-        found, columns = [], []
+        found, columns, noises = [], [], []
+        self._names = [f.name for f in frames]
         for frame in frames:
             over = frame.serial_overscan
             zero = float(over[:, over.shape[1] // 2 :].mean()) if over.size else 0.0
@@ -185,8 +194,9 @@ class DarkChannels:
             columns.append(
                 np.nanmean(kept, 0) if np.isfinite(kept).any(0).all() else image.mean(0)
             )
+            noises.append(float(good.var()) / image.shape[0])
         self._rows.append((exposure, after, found))
-        self._columns.append((exposure.exposure_time or 0.0, columns))
+        self._columns.append((exposure.exposure_time or 0.0, columns, noises))
 
     def channels(self) -> list[Channel]:
         """Levels and struck pixels by dark; columns of the longest darks."""
@@ -207,11 +217,12 @@ class DarkChannels:
             values.append(struck)
             blocks.append(np.diag(struck + 1.0))
             axes.add(len(level), self._condition, what="struck", x=-1, **common)
-        longest = max(t for t, _ in self._columns)
-        chosen = [c for t, c in self._columns if t == longest]
+        longest = max(t for t, *_ in self._columns)
+        chosen = [c for t, c, _ in self._columns if t == longest]
+        noises = np.mean([n for t, _, n in self._columns if t == longest], axis=0)
         for amp, lines in enumerate(zip(*chosen, strict=True)):
             mean = np.mean(lines, axis=0)
-            noise = self._robust_error(mean)
+            noise = self._column_error(mean, amp, float(noises[amp]), len(chosen))
             values.append(mean - np.median(mean))
             blocks.extend([np.array([[noise**2]])] * len(mean))
             axes.add(len(mean), self._condition, what="column", x=np.arange(len(mean)), amp=amp,
@@ -219,9 +230,35 @@ class DarkChannels:
         return [Channel("dark_map", np.concatenate(values), tuple(blocks), axes.columns(), "adu",
                         self._fold)]  # fmt: skip
 
-    @staticmethod
-    def _robust_error(mean: NDArray[np.float64]) -> float:
-        return max(1.4826 * float(np.median(np.abs(mean - np.median(mean)))), 1e-6)
+    def _column_error(
+        self, mean: NDArray[np.float64], amp: int, noise: float, darks: int
+    ) -> float:
+        """Error of a column's mean: of the pixels' noise, or of what most columns do.
+
+        The scatter of a hundred columns is itself known to 10 % only, which would make farther
+        outliers of the farthest; it counts where columns are uneven beyond noise.
+
+        Parameters
+        ----------
+        mean : ndarray
+            Of the columns [ADU].
+        amp : int
+            Amplifier.
+        noise : float
+            Variance of a column's mean in one dark, the mean bias's share in it [ADU^2].
+        darks : int
+            Whose mean it is.
+        """
+        scatter = max(1.4826 * float(np.median(np.abs(mean - np.median(mean)))), 1e-6)
+        read = self._noise.get(self._names[amp], 0.0)
+        pixels = self._pixels(amp) / len(mean)
+        # The mean bias is the same in all darks.
+        shared = read**2 / self._biases / pixels if self._biases else 0.0
+        expected = float(np.sqrt(max(noise - shared, 0.0) / darks + shared))
+        return expected if scatter < UNEVEN * expected else scatter
+
+    def _pixels(self, amp: int) -> int:
+        return self._rows[0][2][amp][3]
 
 
 def _without_outliers(noise: NDArray[np.float64]) -> NDArray[np.float64]:

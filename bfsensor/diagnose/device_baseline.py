@@ -140,13 +140,18 @@ def baseline_of_device(
     for bias in biases:
         table = table_of(change_parameter(device, "operating_point.back_bias", bias - own))
         for wavelength in WAVELENGTHS:
-            edges[wavelength, bias] = edges_at(table, wavelength, temperature)
+            edges[wavelength, bias] = edges_at(
+                table, wavelength, temperature, background=LEVEL
+            )
     derivatives: dict[str, Edges] = {}
     for name in chosen:
         step = STEP * known[name]
         sides = [
             edges_at(
-                table_of(change_parameter(device, name, sign * step)), 620.0, temperature
+                table_of(change_parameter(device, name, sign * step)),
+                620.0,
+                temperature,
+                background=LEVEL,
             )
             for sign in (1.0, -1.0)
         ]

@@ -76,42 +76,56 @@ class Diagnosis:
             "channels": [], "lags": [], "flux_e": [], "x": [], "y": [], "amps": [],
             "wavelength": [], "exposures": [],
         }  # fmt: skip
-        findings = [f for f in self.mismatch.findings if f.family != "chi-square"]
         if not self.mismatch.detected:
             return out
-        out["channels"] = list(dict.fromkeys(f.word for f in self.mismatch.findings))
+        # Of all that stands out most is shadow of the same: the parts are what makes it up.
+        parts = self.mismatch.parts
+        out["channels"] = list(
+            dict.fromkeys(f.word for f in parts or self.mismatch.findings)
+        )
         best: dict[str, Any] = {}
-        for finding in findings:
-            for key in finding.where:
-                best.setdefault(key, finding)
-        lags = [f for f in findings if "lags" in f.where]
-        for finding in lags:
-            # A strong one casts shadows: what is less than half of it is not listed, nor lags
-            # together that say less than one alone.
-            together = len(finding.where["lags"]) > 1 and finding is not lags[0]
-            if abs(finding.z) > 0.5 * abs(lags[0].z) and not together:
-                out["lags"] += [
-                    list(p) for p in finding.where["lags"] if list(p) not in out["lags"]
-                ]
+        for part in parts:
+            for key in part.where:
+                best.setdefault(key, part)
+        lags = [p for part in parts for p in part.where.get("lags", ())]
+        out["lags"] = [list(p) for p in dict.fromkeys(lags)]
         if "level" in best:
-            finding = best["level"]
-            scale = 1.0 if finding.word == "spot" else self.gain
-            out["flux_e"] = [float(v) * scale for v in finding.where["level"]]
+            part = best["level"]
+            scale = 1.0 if part.word == "spot" else self.gain
+            out["flux_e"] = [float(v) * scale for v in part.where["level"]]
+        else:
+            out["flux_e"] = self._all_flux(out["channels"])
         ny, nx = self.measured.shape
         for key, size in (("x", nx), ("y", ny)):
             if key in best:
                 out[key] = [int(v) for v in best[key].where[key]]
             elif size:
                 out[key] = [0, size]
-        if "amp" in best and best["amp"].where["amp"] != "all":
-            out["amps"] = [int(best["amp"].where["amp"]) + 1]
-        else:
-            out["amps"] = list(range(1, len(self.measured.amplifiers) + 1))
+        count = len(self.measured.amplifiers)
+        amps: set[int] = set()
+        for part in parts:
+            amp = part.where.get("amp", "all")
+            amps |= set(range(1, count + 1)) if amp == "all" else {int(amp) + 1}
+            if "other" in part.where:
+                amps.add(int(part.where["other"]) + 1)
+        out["amps"] = sorted(amps) or list(range(1, count + 1))
         if "condition" in best:
             out["wavelength"] = [float(best["condition"].where["condition"].split("/")[0])]
         if "exposure" in best:
             out["exposures"] = [int(v) for v in best["exposure"].where["exposure"]]
         return out
+
+    def _all_flux(self, words: list[str]) -> list[float]:
+        """Lowest and highest flux [e-] of the first of channels that has any."""
+        for word in words:
+            name, scale = ("flux", 1.0) if word == "spot" else ("level", self.gain)
+            held = [
+                c.axes[name] for c in self.fit.channels if c.word == word and name in c.axes
+            ]
+            if held:
+                both = scale * np.concatenate(held).astype(float)
+                return [float(both.min()), float(both.max())]
+        return []
 
     def said(self) -> str:
         """Give the diagnosis in two or three plain sentences."""
@@ -178,6 +192,11 @@ class Diagnosis:
                 word: {"chi2": s, "dof": d, "p_value": float(chi2_distribution.sf(s, d))}
                 for word, (s, d) in self.mismatch.chi2.items()
             },
+            "parts": [
+                {"family": f.family, "channel": f.word, "z": f.z, "p_value": f.p_value,
+                 "where": _plain(f.where)}
+                for f in self.mismatch.parts
+            ],
             "findings": [
                 {"family": f.family, "channel": f.word, "z": f.z, "p_value": f.p_value,
                  "where": _plain(f.where)}

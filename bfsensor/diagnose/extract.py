@@ -194,7 +194,7 @@ def measure_channels(
         if channel.word == "flat_cov":
             _rough_gains(channel, gains)
     rough = tuple(float(np.median(g)) if g else 1.0 for g in gains)
-    darks = DarkChannels(bias_images, noise)
+    darks = DarkChannels(bias_images, noise, biases=len(kinds.get("bias", [])))
     before: dict[int, float] = {}
     last = 0.0
     for exposure in exposures:

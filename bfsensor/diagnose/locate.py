@@ -18,6 +18,16 @@ DRAWS = 500
 ALARM = 0.01
 """Family-wise probability below which a mismatch is called detected."""
 
+HOPELESS = 2.3
+"""Deviate below which a lone statistic is not below :data:`ALARM`: one-sided p = 0.0107."""
+
+PARTS = 12
+"""Most templates that a mismatch is taken apart into."""
+
+FAINT = 0.2
+"""Deviate, relative to the farthest, below which a part counts as what a template's shape,
+chosen of a few, has left over."""
+
 SMALLEST = 1e-30
 """Least probability that is told apart from zero: no tail is known farther out."""
 
@@ -59,6 +69,9 @@ class Mismatch:
         Statistics below :data:`ALARM`, step-down, farthest first.
     chi2 : dict of str to (float, float)
         Chi-square and degrees of freedom by channel.
+    parts : tuple of Finding
+        The few templates that together make up what the scans find: each the farthest of what
+        those before it leave.  The findings also hold their shadows.
     """
 
     p_value: float
@@ -66,6 +79,7 @@ class Mismatch:
     p_scans: float
     findings: tuple[Finding, ...]
     chi2: dict[str, tuple[float, float]]
+    parts: tuple[Finding, ...] = ()
 
     @property
     def detected(self) -> bool:
@@ -100,6 +114,7 @@ class Scanner:
         ]
         self._matrix = matrix[keep]
         self._norm = np.sqrt(left[keep])
+        self._inside = inside[keep]
         self.words = list(dict.fromkeys(c.word for c in fit.channels))
         self._masks = [fit.of(w) for w in self.words]
         counts = fit.chi2()
@@ -109,6 +124,12 @@ class Scanner:
         """Of residuals (..., n): the templates' amplitudes over their errors."""
         return np.asarray((self._matrix @ residuals.T).T / self._norm)
 
+    def correlations(self, n: int) -> NDArray[np.float64]:
+        """Of the amplitude of template ``n`` with those of all."""
+        shape = self._matrix[[n]].toarray()[0]
+        product = self._matrix @ shape - self._inside @ self._inside[n]
+        return np.asarray(product / (self._norm * self._norm[n]))
+
     def chi2_z(self, residuals: NDArray[np.float64]) -> NDArray[np.float64]:
         """Of residuals (..., n): Gaussian deviates of each word's chi-square (Wilson & Hilferty)."""
         squares = np.stack([(residuals[..., m] ** 2).sum(-1) for m in self._masks], axis=-1)
@@ -116,13 +137,16 @@ class Scanner:
         return np.asarray((np.cbrt(squares / d) - (1 - 2 / (9 * d))) / np.sqrt(2 / (9 * d)))
 
 
-def locate_mismatch(fit: BaselineFit, *, seed: int = 1, draws: int = DRAWS) -> Mismatch:
-    """Find what of the residuals noise does not explain.
+class Locator:
+    """Judges residuals against noise that is drawn once.
 
-    The noise is drawn through the fit's own linear model; the largest of all statistics,
-    chi-squares (one-sided) and templates (two-sided) on one scale of deviates, gives
-    family-wise p-values, step-down (Westfall & Young 1993): what has been found no longer
-    hides what is next.  Beyond the draws an exponential tail of the largest deviates is taken.
+    The noise is drawn through the fit's own linear model.  Statistics are the chi-squares
+    (one-sided) and the templates (two-sided).  So that thousands of templates of one channel do
+    not hide another's few, deviates are put on the scale of the largest that noise gives in
+    the same family, the chi-squares or one channel's templates: the logarithm of its tail's
+    probability.  The largest of all then gives family-wise p-values, step-down (Westfall & Young
+    1993): what has been found no longer hides what is next.  Beyond the draws an exponential
+    tail of the largest deviates is taken.
 
     Parameters
     ----------
@@ -132,36 +156,138 @@ def locate_mismatch(fit: BaselineFit, *, seed: int = 1, draws: int = DRAWS) -> M
         Of the draws.
     draws : int
         How many.
-
-    Returns
-    -------
-    Mismatch
     """
-    scanner = Scanner(fit)
-    rng = np.random.default_rng(seed)
-    seen_t = np.abs(scanner.templates_z(fit.residuals))
-    seen_c = scanner.chi2_z(fit.residuals)
-    null_t, null_c = [], []
-    for start in range(0, draws, 50):
-        noise = fit.draw(rng, min(50, draws - start))
-        null_t.append(np.abs(scanner.templates_z(noise)))
-        null_c.append(scanner.chi2_z(noise))
-    drawn_t, drawn_c = np.concatenate(null_t), np.concatenate(null_c)
-    observed = np.concatenate([seen_c, seen_t])
-    drawn = np.concatenate([drawn_c, drawn_t], axis=1)
-    chi = len(seen_c)
-    findings = _step_down(scanner, observed, drawn, chi)
-    return Mismatch(
-        p_value=_family(observed, drawn),
-        p_chi2=_family(observed[:chi], drawn[:, :chi]),
-        p_scans=_family(observed[chi:], drawn[:, chi:]),
-        findings=tuple(findings),
-        chi2=fit.chi2(),
-    )
+
+    def __init__(self, fit: BaselineFit, *, seed: int = 1, draws: int = DRAWS) -> None:
+        self.scanner = Scanner(fit)
+        self._chi = len(self.scanner.words)
+        rng = np.random.default_rng(seed)
+        # One row a statistic, chi-squares first.
+        self._drawn = np.empty((self._chi + len(self.scanner.templates), draws), np.float32)
+        for start in range(0, draws, 50):
+            noise = fit.draw(rng, min(50, draws - start))
+            columns = slice(start, start + len(noise))
+            self._drawn[: self._chi, columns] = self.scanner.chi2_z(noise).T
+            self._drawn[self._chi :, columns] = np.abs(self.scanner.templates_z(noise)).T
+        words = np.array([t.word for t in self.scanner.templates])
+        families = [np.arange(self._chi)] + [
+            self._chi + np.nonzero(words == w)[0] for w in dict.fromkeys(words)
+        ]
+        self._zero, self._scale = np.zeros(len(self._drawn)), np.ones(len(self._drawn))
+        for rows in families:
+            largest = self._drawn[rows].max(0)
+            self._zero[rows] = threshold = np.quantile(largest, 0.8)
+            self._scale[rows] = (largest[largest > threshold] - threshold).mean()
+        self._drawn -= self._zero[:, None].astype(np.float32)
+        self._drawn /= self._scale[:, None].astype(np.float32)
+        parts = self._drawn[: self._chi], self._drawn[self._chi :]
+        self._maxima = [p.max(0).astype(float) for p in parts]
+
+    def locate(self, residuals: NDArray[np.float64] | None = None) -> Mismatch:
+        """Find what of residuals noise does not explain.
+
+        Parameters
+        ----------
+        residuals : ndarray, shape (n,), optional
+            Whitened, what was fitted taken off; by default the fit's.
+        """
+        fit = self.scanner.fit
+        residuals = fit.residuals if residuals is None else residuals
+        signed = self.scanner.templates_z(residuals)
+        chi2, scans = self.scanner.chi2_z(residuals), np.abs(signed)
+        maxima = np.maximum(*self._maxima)
+        observed = np.concatenate([chi2, scans])
+        ranks = (observed - self._zero) / self._scale
+        best = float(ranks[: self._chi].max()), float(ranks[self._chi :].max())
+        squares = [
+            float(residuals[fit.of(w)] @ residuals[fit.of(w)]) for w in self.scanner.words
+        ]
+        dofs = [d for _, d in fit.chi2().values()]
+        return Mismatch(
+            p_value=tail_probability(max(best), maxima),
+            p_chi2=tail_probability(best[0], self._maxima[0]),
+            p_scans=tail_probability(best[1], self._maxima[1]),
+            findings=tuple(self._step_down(observed, ranks, signed)),
+            chi2=dict(
+                zip(self.scanner.words, zip(squares, dofs, strict=True), strict=True)
+            ),
+            parts=tuple(self._pursue(signed)),
+        )
+
+    def _pursue(self, signed: NDArray[np.float64]) -> list[Finding]:
+        """Take the farthest template, take off what it explains, and so on (matching pursuit)."""
+        z = signed.copy()
+        critical = float(np.quantile(self._maxima[1], 1 - 2 * ALARM))
+        # What is left of each template's variance, and directions taken so far.
+        free = np.ones(len(z))
+        taken: list[NDArray[np.float64]] = []
+        parts: list[Finding] = []
+        while len(parts) < PARTS:
+            open_ = free > 0.02
+            normed = np.where(open_, z / np.sqrt(np.maximum(free, 0.02)), 0.0)
+            ranks = (np.abs(normed) - self._zero[self._chi :]) / self._scale[self._chi :]
+            n = int(np.argmax(np.where(ranks > critical, np.abs(normed), 0.0)))
+            p = tail_probability(float(ranks[n]), self._maxima[1])
+            if p >= ALARM or (parts and abs(normed[n]) < FAINT * abs(parts[0].z)):
+                break
+            template = self.scanner.templates[n]
+            parts.append(
+                Finding(
+                    template.family,
+                    template.word,
+                    float(normed[n]),
+                    p,
+                    dict(template.where),
+                )
+            )
+            # Gram-Schmidt among templates: covariance of each with what is new in this one.
+            new = self.scanner.correlations(n)
+            for old in taken:
+                new = new - old * old[n]
+            new = new / np.sqrt(free[n])
+            taken.append(new)
+            z = z - new * normed[n]
+            free = free - new**2
+        return parts
+
+    def _step_down(
+        self,
+        observed: NDArray[np.float64],
+        ranks: NDArray[np.float64],
+        signed: NDArray[np.float64],
+    ) -> list[Finding]:
+        """Farthest first, each held against those that are left."""
+        # Below HOPELESS a single statistic would not be found, whatever the family's size.
+        ranks = np.where(observed > HOPELESS, ranks, -np.inf)
+        count = int((observed > HOPELESS).sum())
+        order = np.argsort(-ranks, kind="stable")
+        rest = self._drawn[np.sort(order[count:])].max(0, initial=-np.inf)
+        # Of what is left after each: maxima from the least to the farthest.
+        left = np.maximum.accumulate(
+            np.concatenate([rest[None], self._drawn[order[:count]][::-1]])
+        )[:0:-1]
+        findings: list[Finding] = []
+        largest = 0.0
+        for n, maxima in zip(order[:count], left, strict=True):
+            p = max(largest, tail_probability(float(ranks[n]), maxima.astype(float)))
+            if p >= ALARM:
+                break
+            largest = p
+            if n < self._chi:
+                word = self.scanner.words[n]
+                findings.append(Finding("chi-square", word, float(observed[n]), p))
+            else:
+                template = self.scanner.templates[n - self._chi]
+                z = float(signed[n - self._chi])
+                findings.append(
+                    Finding(template.family, template.word, z, p, dict(template.where))
+                )
+        return findings
 
 
-def _family(observed: NDArray[np.float64], drawn: NDArray[np.float64]) -> float:
-    return tail_probability(float(observed.max()), drawn.max(1))
+def locate_mismatch(fit: BaselineFit, *, seed: int = 1, draws: int = DRAWS) -> Mismatch:
+    """Find what of a fit's residuals noise does not explain: :class:`Locator`, once."""
+    return Locator(fit, seed=seed, draws=draws).locate()
 
 
 def tail_probability(value: float, maxima: NDArray[np.float64]) -> float:
@@ -173,30 +299,3 @@ def tail_probability(value: float, maxima: NDArray[np.float64]) -> float:
     threshold = float(np.quantile(maxima, 0.8))
     excess = maxima[maxima > threshold] - threshold
     return max(0.2 * float(np.exp(-(value - threshold) / excess.mean())), SMALLEST)
-
-
-def _step_down(
-    scanner: Scanner, observed: NDArray[np.float64], drawn: NDArray[np.float64], chi: int
-) -> list[Finding]:
-    """Farthest first, each held against those that are left."""
-    order = np.argsort(-observed)
-    # Of what is left after each: maxima from the least to the farthest.
-    sorted_draws = drawn[:, order]
-    left = np.maximum.accumulate(sorted_draws[:, ::-1], axis=1)[:, ::-1]
-    signed = scanner.templates_z(scanner.fit.residuals)
-    findings: list[Finding] = []
-    largest = 0.0
-    for count, n in enumerate(order):
-        p = max(largest, tail_probability(float(observed[n]), left[:, count]))
-        if p >= ALARM:
-            break
-        largest = p
-        if n < chi:
-            findings.append(Finding("chi-square", scanner.words[n], float(observed[n]), p))
-        else:
-            template = scanner.templates[n - chi]
-            z = float(signed[n - chi])
-            findings.append(
-                Finding(template.family, template.word, z, p, dict(template.where))
-            )
-    return findings

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.baseline import Baseline, area_matrix
+from bfsensor.diagnose.baseline import Baseline
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
@@ -16,6 +16,9 @@ from bfsensor.diagnose.predict_spots import predict_spots
 
 MAP_ORDER = 4
 """Order of the polynomial in x and y that the light on the sensor may have."""
+
+REDUCED_LEVEL = 60_000.0
+"""Level [e-] of the flats that a_ij without a level are from: the response at 40,000 e- counts."""
 
 PHASES = 12
 """Spots whose positions stand for those of an exposure."""
@@ -26,7 +29,7 @@ class Predictor:
 
     Non-linear parameters: gain of each amplifier [e-/ADU], variance of its read noise [ADU^2],
     the device's parameters in units of their spread, widths of the spots without charge for
-    each condition.  Linear ones, as columns of :meth:`linear`: light by amplifier and
+    each wavelength.  Linear ones, as columns of :meth:`linear`: light by amplifier and
     condition, dark current, shape of the light, levels of bias and noise, flux of the spots.
 
     Parameters
@@ -43,6 +46,8 @@ class Predictor:
         self._kept: dict[int, tuple[Channel, dict[tuple[str, ...], NDArray[np.int64]]]] = {}
         self._spot_conditions: list[tuple[str, ...]] = []
         self._spot_of: dict[tuple[str, ...], Condition] = {}
+        # Optics know of the wavelength, not of voltages or the silicon's temperature.
+        self._widths: list[str] = []
         self._phases: dict[tuple[str, ...], NDArray[np.float64]] = {}
         self.notes: list[str] = []
         start_sigma: list[float] = []
@@ -58,8 +63,10 @@ class Predictor:
                 if condition.key not in self._spot_of:
                     self._spot_conditions.append(condition.key)
                     self._spot_of[condition.key] = condition
-                    both = channel.values[row], channel.values[row + 1]
-                    start_sigma += [float(v) for v in both]
+                    if condition.key[0] not in self._widths:
+                        self._widths.append(condition.key[0])
+                        both = channel.values[row], channel.values[row + 1]
+                        start_sigma += [float(v) for v in both]
                     self._phases[condition.key] = phases
                 else:
                     self._phases[condition.key] = np.concatenate(
@@ -77,11 +84,7 @@ class Predictor:
             *(f"gain {a}" for a in range(self._amps)),
             *(f"noise {a}" for a in range(self._amps)),
             *(f"device {p}" for p in baseline.parameters),
-            *(
-                f"sigma_{axis} {'/'.join(key)}"
-                for key in self._spot_conditions
-                for axis in "xy"
-            ),
+            *(f"sigma_{axis} {wavelength}" for wavelength in self._widths for axis in "xy"),
         )
         self.start = np.array([
             *measured.gains, *noise, *(0.0 for _ in baseline.parameters), *start_sigma,
@@ -120,7 +123,7 @@ class Predictor:
         channel: Channel,
         parameters: NDArray[np.float64],
         *,
-        only: tuple[str, ...] | None = None,
+        only: str | None = None,
     ) -> NDArray[np.float64]:
         """What a channel should read, linear terms left out.
 
@@ -130,8 +133,8 @@ class Predictor:
             Its axes say where.
         parameters : ndarray
             In the order of ``names``.
-        only : tuple of str, optional
-            Predict spots of this condition alone.
+        only : str, optional
+            Predict spots of this wavelength alone.
         """
         a = self._amps
         gains, noise = parameters[:a], parameters[a : 2 * a]
@@ -185,13 +188,14 @@ class Predictor:
         step = parameters.copy()
         step[n] += self.steps[n]
         if channel.word == "spot" and self.names[n].startswith("sigma"):
-            # Of one condition's width the others know nothing.
+            # Of one wavelength's width the others know nothing.
             first = self.names.index(next(m for m in self.names if m.startswith("sigma")))
-            only = self._spot_conditions[(n - first) // 2]
+            only = self._widths[(n - first) // 2]
             moved = self.predict(channel, step, only=only)
-            rows = self._rows(channel)[only]
             out = np.zeros(len(channel))
-            out[rows] = (moved[rows] - here[rows]) / self.steps[n]
+            for key, rows in self._rows(channel).items():
+                if key[0] == only:
+                    out[rows] = (moved[rows] - here[rows]) / self.steps[n]
             return out
         return (self.predict(channel, step) - here) / self.steps[n]
 
@@ -217,9 +221,10 @@ class Predictor:
         out = np.empty(len(channel))
         for key, rows in self._rows(channel).items():
             del key
-            edges, _ = self.baseline.at(_condition(channel, rows[0]), device)
-            a = area_matrix(*edges)
             if channel.unit == PER_ELECTRON:
+                where = _condition(channel, rows[0])
+                a = self.baseline.flat_areas(where, device, np.array([REDUCED_LEVEL]))
+                a = a[0] if a.ndim == 3 else a
                 y, x0 = (n // 2 for n in a.shape)
                 out[rows] = 0.5 * (
                     a[y + j[rows], x0 + i[rows]] + a[y - j[rows], x0 + i[rows]]
@@ -228,10 +233,9 @@ class Predictor:
             pairs = np.stack([amp[rows], x["level"][rows]], axis=1)
             groups, index = np.unique(pairs, axis=0, return_inverse=True)
             own = gains[groups[:, 0].astype(int)]
-            c = (
-                flat_covariances_of(a, own * groups[:, 1], lags=lags)
-                / own[:, None, None] ** 2
-            )
+            levels = own * groups[:, 1]
+            a = self.baseline.flat_areas(_condition(channel, rows[0]), device, levels)
+            c = flat_covariances_of(a, levels, lags=lags) / own[:, None, None] ** 2
             c[:, 0, 0] += noise[groups[:, 0].astype(int)]
             out[rows] = c[index.ravel(), j[rows], i[rows]]
         return out
@@ -242,16 +246,17 @@ class Predictor:
         gains: NDArray[np.float64],
         device: dict[str, float],
         sigmas: NDArray[np.float64],
-        only: tuple[str, ...] | None,
+        only: str | None,
     ) -> NDArray[np.float64]:
         x = channel.axes
         # Images were put on the scale of electrons with rough gains.
         scale = float(np.mean(gains / np.array(self.measured.gains)))
         out = np.zeros(len(channel))
-        for n, key in enumerate(self._spot_conditions):
+        for key in self._spot_conditions:
             rows = self._rows(channel).get(key, np.zeros(0, int))
-            if not len(rows) or (only is not None and key != only):
+            if not len(rows) or (only is not None and key[0] != only):
                 continue
+            n = self._widths.index(key[0])
             (kx, ky), _ = self.baseline.at(self._spot_of[key], device)
             found = predict_spots(
                 kx, ky, sigma=(float(sigmas[2 * n]), float(sigmas[2 * n + 1])),

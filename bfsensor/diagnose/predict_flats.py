@@ -23,7 +23,8 @@ def flat_covariances_of(
     Parameters
     ----------
     a : ndarray, odd sides
-        Area change per electron [1/e-], lag (0, 0) in the middle.
+        Area change per electron [1/e-], lag (0, 0) in the middle; shape (ny, nx), or (n, ny, nx)
+        where each level has its own.
     levels : array_like, shape (n,)
         Mean electrons m [e-].
     lags : int
@@ -42,10 +43,10 @@ def flat_covariances_of(
     array([[98039.,   974.],
            [    0.,     0.]])
     """
-    ny, nx = a.shape
-    wide = np.zeros((GRID, GRID))
-    wide[:ny, :nx] = a
-    wide = np.roll(wide, (-(ny // 2), -(nx // 2)), (0, 1))
+    ny, nx = a.shape[-2:]
+    wide = np.zeros((*a.shape[:-2], GRID, GRID))
+    wide[..., :ny, :nx] = a
+    wide = np.roll(wide, (-(ny // 2), -(nx // 2)), (-2, -1))
     a_k = np.fft.fft2(wide).real
     m = np.asarray(levels, float)[:, None, None]
     x = 2 * a_k * m

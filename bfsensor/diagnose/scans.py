@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.mismatch import BaselineFit
+from bfsensor.diagnose.scan_shapes import boundaries, middle, own_shapes
 
 POWERS = (0, 1, 2, 3)
 """Powers of the level that covariances and means may go with."""
@@ -60,7 +61,7 @@ def make_templates(fit: BaselineFit) -> list[Template]:
         "code_hist": _codes,
     }  # fmt: skip
     for word, members in by_word.items():
-        group = _Group(word, members)
+        group = Group(word, members, fit.residuals)
         for family, pattern, where in makers[word](group):
             template = group.template(family, pattern, where)
             if template is not None:
@@ -68,11 +69,13 @@ def make_templates(fit: BaselineFit) -> list[Template]:
     return out
 
 
-class _Group:
+class Group:
     """Channels of one word as one table."""
 
-    def __init__(self, word: str, members: list[tuple[Channel, int]]) -> None:
-        self.word, self.members = word, members
+    def __init__(
+        self, word: str, members: list[tuple[Channel, int]], residuals: NDArray[np.float64]
+    ) -> None:
+        self.word, self.members, self._residuals = word, members, residuals
         names = [n for n in members[0][0].axes if all(n in c.axes for c, _ in members)]
         self.axes = {n: np.concatenate([c.axes[n] for c, _ in members]) for n in names}
         self.size = sum(len(c) for c, _ in members)
@@ -80,6 +83,13 @@ class _Group:
         columns = [self.axes[n] for n in ("wavelength", "back_bias", "temperature")]
         self.condition = np.array([
             "/".join(f"{float(v):g}" for v in row) for row in zip(*columns, strict=True)
+        ])  # fmt: skip
+
+    def predicted(self) -> NDArray[np.float64]:
+        """What the fit predicts, in the units of the channel."""
+        return np.concatenate([
+            c.values - c.unwhiten(self._residuals[start : start + len(c)])
+            for c, start in self.members
         ])  # fmt: skip
 
     def template(
@@ -94,13 +104,18 @@ class _Group:
         used = np.nonzero(np.abs(whole) > 1e-12 * max(np.abs(whole).max(), 1e-300))[0]
         if len(used) == 0 or not np.isfinite(whole).all():
             return None
-        return Template(family, self.word, self.rows[used], whole[used], dict(where))
+        told = dict(where)
+        weights = whole[used] ** 2
+        flux = "flux" if self.word == "spot" else "level"
+        if "level" in told and flux in self.axes:
+            told["level"] = middle(self.axes[flux][used].astype(float), weights)
+        return Template(family, self.word, self.rows[used], whole[used], told)
 
 
 Pattern = tuple[str, NDArray[np.float64], dict[str, object]]
 
 
-def _areas(g: _Group) -> Iterator[Pattern]:
+def _areas(g: Group) -> Iterator[Pattern]:
     """Of a_ij, which know no level: single lags, and lags together."""
     i, j = g.axes["i"].astype(int), g.axes["j"].astype(int)
     for a, b in zip(i.tolist(), j.tolist(), strict=True):
@@ -117,11 +132,12 @@ def _lags_together(
     radius = np.hypot(i, j)
     return {
         "row of lags": (j == 0) & (i > 0), "column of lags": (i == 0) & (j > 0),
+        "first neighbours": radius == 1,
         "near lags": (radius > 0) & (radius < 1.5), "far lags": radius > 2.5,
     }  # fmt: skip
 
 
-def _covariances(g: _Group) -> Iterator[Pattern]:
+def _covariances(g: Group) -> Iterator[Pattern]:
     """Lag by power of the level, by single level, by amplifier, by condition."""
     if g.members[0][0].unit == PER_ELECTRON:
         yield from _areas(g)
@@ -158,9 +174,10 @@ def _covariances(g: _Group) -> Iterator[Pattern]:
             yield "lags together", np.where(here, unit**p, 0.0), {
                 "lags": chosen, "level": (low, high), "power": p, "set": name,
             }  # fmt: skip
+    yield from own_shapes(g)
 
 
-def _means(g: _Group) -> Iterator[Pattern]:
+def _means(g: Group) -> Iterator[Pattern]:
     """Powers of the level, single exposures and steps and slopes in time, by amplifier."""
     x = g.axes
     level = x["level"].astype(float)
@@ -193,7 +210,7 @@ def _means(g: _Group) -> Iterator[Pattern]:
             }  # fmt: skip
 
 
-def _maps(g: _Group) -> Iterator[Pattern]:
+def _maps(g: Group) -> Iterator[Pattern]:
     """Strips, steps, edges and waves in columns and rows, boxes in blocks, rings."""
     x = g.axes
     for name in dict.fromkeys(x["map"]):
@@ -222,6 +239,8 @@ def _maps(g: _Group) -> Iterator[Pattern]:
                     yield f"{what} edges", np.where(rows, np.exp(-distance / length), 0.0), {
                         **common, axis: (0, reach) if side == "low" else (n - reach, n),
                     }  # fmt: skip
+            if name == "all":
+                yield from boundaries(rows, place, common, axis)
             for cycles in range(3, n // 2):
                 phase = 2 * np.pi * cycles * (place + 0.5) / n
                 for wave in (np.cos, np.sin):
@@ -256,7 +275,7 @@ def _maps(g: _Group) -> Iterator[Pattern]:
             yield "rings", np.where(rows, 1.0, 0.0), {"map": str(name), "what": "ring"}
 
 
-def _overscan(g: _Group) -> Iterator[Pattern]:
+def _overscan(g: Group) -> Iterator[Pattern]:
     """First pixels and tails by power of the level, single levels, amplifiers."""
     x = g.axes
     k, level = x["k"].astype(float), x["level"].astype(float)
@@ -282,7 +301,7 @@ def _overscan(g: _Group) -> Iterator[Pattern]:
                 }  # fmt: skip
 
 
-def _noise(g: _Group) -> Iterator[Pattern]:
+def _noise(g: Group) -> Iterator[Pattern]:
     """Single lags in readout order, tails, waves."""
     x = g.axes
     lag = x["lag"].astype(float)
@@ -303,7 +322,7 @@ def _noise(g: _Group) -> Iterator[Pattern]:
             }  # fmt: skip
 
 
-def _levels(g: _Group) -> Iterator[Pattern]:
+def _levels(g: Group) -> Iterator[Pattern]:
     x = g.axes
     for what in dict.fromkeys(x["what"]):
         for name, here in _amplifiers(x):
@@ -315,7 +334,7 @@ def _levels(g: _Group) -> Iterator[Pattern]:
                 }  # fmt: skip
 
 
-def _darks(g: _Group) -> Iterator[Pattern]:
+def _darks(g: Group) -> Iterator[Pattern]:
     x = g.axes
     after = x["after"].astype(float)
     for name, here in _amplifiers(x):
@@ -336,30 +355,33 @@ def _darks(g: _Group) -> Iterator[Pattern]:
             }  # fmt: skip
 
 
-def _spots(g: _Group) -> Iterator[Pattern]:
+def _spots(g: Group) -> Iterator[Pattern]:
     """Widths, asymmetry, wings and flux by power of the light, by condition, in time."""
     x = g.axes
     flux = x["flux"].astype(float)
     unit = flux / flux.max()
-    for what in dict.fromkeys(x["what"]):
-        here = x["what"] == what
+    sizes = np.isin(x["what"], ("sigma_x", "sigma_y"))
+    named = {str(w): x["what"] == w for w in dict.fromkeys(x["what"])}
+    for what, here in {**named, "sizes": sizes}.items():
+        if not here.any():
+            continue
         for p in (0, 1, 2, 3):
             yield "spots x power", np.where(here, unit**p, 0.0), {
-                "what": str(what), "level": (float(flux.min()), float(flux.max())), "power": p,
+                "what": what, "level": (float(flux.min()), float(flux.max())), "power": p,
             }  # fmt: skip
         for condition in dict.fromkeys(g.condition):
             own = here & (g.condition == condition)
             for p in (0, 1):
                 yield "spots x condition", np.where(own, unit**p, 0.0), {
-                    "what": str(what), "condition": condition, "power": p,
+                    "what": what, "condition": condition, "power": p,
                 }  # fmt: skip
         for one in np.unique(x["exposure"][here]):
             yield "spots, one exposure", np.where(here & (x["exposure"] == one), 1.0, 0.0), {
-                "what": str(what), "exposure": (int(one), int(one)),
+                "what": what, "exposure": (int(one), int(one)),
             }  # fmt: skip
 
 
-def _codes(g: _Group) -> Iterator[Pattern]:
+def _codes(g: Group) -> Iterator[Pattern]:
     """Bits, single codes, by amplifier."""
     x = g.axes
     code = x["code"].astype(int)
@@ -378,7 +400,7 @@ def _codes(g: _Group) -> Iterator[Pattern]:
             )
 
 
-def _single(g: _Group) -> Iterator[Pattern]:
+def _single(g: Group) -> Iterator[Pattern]:
     x = g.axes
     for n in range(g.size):
         yield "amplifiers", np.eye(g.size)[n], {

@@ -19,9 +19,8 @@ from bfsensor.table import DistortionTable, vertex_fractions
 WAVELENGTHS = (400.0, 480.0, 550.0, 620.0, 700.0, 750.0, 870.0, 950.0)
 """At which shifts are held [nm]."""
 
-MIDDLE = 40_000.0
-"""Background [e-] at which the response is taken: what a flat of twice as much sees while it
-grows, halfway.  Published covariances are quoted at 80,000 e-, ladders end at 100,000 to 150,000."""
+SPAN = 0.15, 0.6
+"""Parts of the largest background of a table between which the response is taken as straight."""
 
 CHARGE = 100.0
 """Charge above the background [e-] that stands for the differential response."""
@@ -30,10 +29,11 @@ CHARGE = 100.0
 def baseline_of_table(given: str | os.PathLike[str]) -> Baseline:
     """Baseline of a table: a .fits file, a GalSim stem, or the name of a shipped device.
 
-    Shifts are those of the differential response on a background of :data:`MIDDLE`, which
-    flats see, averaged along the edge and over the depths at which the light converts; of a
-    table of one charge, such as GalSim's, that charge's over it.  Nothing of the device floats:
-    its table holds no derivatives.
+    Shifts are those of the differential response, which flats see, averaged along the edge and
+    over the depths at which the light converts.  It changes with the level: its mean and its
+    slope between two backgrounds are held (:data:`SPAN`); a table of one charge, such as
+    GalSim's, gives that charge's over it and has no slope.  Nothing of the device floats: its
+    table holds no derivatives.
 
     Parameters
     ----------
@@ -60,9 +60,27 @@ def baseline_of_table(given: str | os.PathLike[str]) -> Baseline:
     bias = device.operating_point.back_bias if device is not None else np.nan
     temperature = device.operating_point.temperature if device is not None else 173.0
     edges: dict[tuple[float, float], Edges] = {}
+    slopes: dict[tuple[float, float], Edges] = {}
+    low, high = (part * float(table.backgrounds[-1]) for part in SPAN)
     for wavelength in WAVELENGTHS:
-        edges[wavelength, float(bias)] = edges_at(table, wavelength, temperature)
-    return Baseline(os.fspath(given), edges, {}, {}, (620.0, float(bias)))
+        key = wavelength, float(bias)
+        if len(table.charges) == 1 or high + CHARGE > table.charges[-1] or not high > low:
+            lowest = float(table.backgrounds[0])
+            edges[key] = edges_at(table, wavelength, temperature, background=lowest)
+            continue
+        one = edges_at(table, wavelength, temperature, background=low)
+        two = edges_at(table, wavelength, temperature, background=high)
+        edges[key] = 0.5 * (one[0] + two[0]), 0.5 * (one[1] + two[1])
+        slopes[key] = (two[0] - one[0]) / (high - low), (two[1] - one[1]) / (high - low)
+    return Baseline(
+        os.fspath(given),
+        edges,
+        {},
+        {},
+        (620.0, float(bias)),
+        slopes=slopes,
+        level=0.5 * (low + high),
+    )
 
 
 def _stem(path: Path) -> Path:
@@ -76,7 +94,13 @@ def _stem(path: Path) -> Path:
     )
 
 
-def edges_at(table: DistortionTable, wavelength: float, temperature: float) -> Edges:
+def edges_at(
+    table: DistortionTable,
+    wavelength: float,
+    temperature: float,
+    *,
+    background: float = 0.0,
+) -> Edges:
     """Mean shifts of right and upper edges [pixel/e-] of light of one wavelength.
 
     Parameters
@@ -87,21 +111,20 @@ def edges_at(table: DistortionTable, wavelength: float, temperature: float) -> E
         Of the light [nm].
     temperature : float
         Of the silicon [K].
+    background : float
+        Charge in all pixels [e-], about which the response is taken.
 
     Returns
     -------
     kx, ky : ndarray, shape (2 reach + 3, 2 reach + 3)
         With a ring of pixels around the table's whose outer edges do not move.
     """
-    middle = min(MIDDLE, float(table.backgrounds[-1]))
-    if len(table.charges) == 1 or middle + CHARGE > table.charges[-1]:
-        middle = float(table.backgrounds[0])
     weights = _conversion(table.depths, table.thickness, wavelength, temperature)
     kx: NDArray[np.float64] | float = 0.0
     ky: NDArray[np.float64] | float = 0.0
     for depth, weight in zip(table.depths, weights, strict=True):
         moved = table.displacements(
-            charge=middle + CHARGE, background=middle, depth=float(depth)
+            charge=background + CHARGE, background=background, depth=float(depth)
         )
         kx = kx + weight * _along(
             moved.corners[..., 0], moved.vertical[..., 0], table, axis=0

@@ -1,0 +1,103 @@
+"""Shapes that scans seek as a whole: the effect itself, and boundaries between columns or rows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from bfsensor.diagnose.scans import Group, Pattern
+
+LENGTHS = 1.5, 4.0
+"""Reaches of a distortion by a boundary [pixel]."""
+
+REACH = 1.5
+"""Of these lengths, to either side: 95 % of the distortion's square."""
+
+
+def middle(
+    values: NDArray[np.float64], weights: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Interval of the values that holds the middle 90 % of the weights."""
+    order = np.argsort(values)
+    share = np.cumsum(weights[order]) / weights.sum()
+    low, high = np.searchsorted(share, (0.05, 0.95))
+    return float(values[order][low]), float(values[order][min(high, len(values) - 1)])
+
+
+def own_shapes(g: Group) -> Iterator[Pattern]:
+    """Covariances as the effect gives them, stronger or weaker: by flux, condition and level.
+
+    One template for what single lags hold in small parts each.
+    """
+    x = g.axes
+    shape = _own_shape(g)
+    level = x["level"].astype(float)
+    where = {
+        "lags": [(0, 0), (1, 0), (0, 1), (1, 1)],
+        "level": (float(level.min()), float(level.max())),
+        "set": "own shape",
+    }
+    for p in (0, 1, 2):
+        # The covariances themselves go with the square of the level.
+        unit = (level / level.max()) ** p
+        yield "own shape x power", shape * unit, {**where, "power": p + 2}
+    for condition in dict.fromkeys(g.condition):
+        own = g.condition == condition
+        if not own.all():
+            told = {**where, "condition": condition}
+            yield "own shape x condition", np.where(own, shape, 0.0), told
+
+
+def _own_shape(g: Group) -> NDArray[np.float64]:
+    """Covariances due to the effect, as predicted; what neighbours gain the variance lacks."""
+    x = g.axes
+    i, j = x["i"].astype(int), x["j"].astype(int)
+    weight = np.where(i > 0, 2.0, 1.0) * np.where(j > 0, 2.0, 1.0)
+    zero = (i == 0) & (j == 0)
+    shape = np.where(zero, 0.0, g.predicted())
+    folds = np.repeat(np.arange(len(g.members)), [len(c) for c, _ in g.members])
+    keys = np.array([
+        "/".join(map(str, row)) for row in zip(folds, x["amp"], x["time"], g.condition, strict=True)
+    ])  # fmt: skip
+    for key in dict.fromkeys(keys):
+        own = keys == key
+        shape[own & zero] = -(weight[own] * shape[own]).sum()
+    return shape
+
+
+def boundaries(
+    rows: NDArray[np.bool_],
+    place: NDArray[np.float64],
+    where: Mapping[str, object],
+    axis: str,
+) -> Iterator[Pattern]:
+    """Edges displaced by a boundary, exponentially less with distance: wide here, narrow there.
+
+    Parameters
+    ----------
+    rows : ndarray of bool
+        Values that are columns (or rows) of one map.
+    place : ndarray
+        Which column (or row) each is.
+    where : mapping
+        What the map is.
+    axis : str
+        'x' of columns, 'y' of rows.
+    """
+    count = int(place[rows].max()) + 1
+    for length in LENGTHS:
+        for boundary in range(2, count - 1):
+            away = place + 0.5 - boundary
+            shape = np.sign(away) * np.exp(-np.abs(away) / length)
+            reach = REACH * length
+            lo, hi = (
+                max(int(boundary - reach), 0),
+                min(int(np.ceil(boundary + reach)), count),
+            )
+            yield f"{where['what']} boundaries", np.where(rows, shape, 0.0), {
+                **where, axis: (lo, hi),
+            }  # fmt: skip

@@ -1,0 +1,63 @@
+"""Widths of spots: what floats, and what a change between conditions leaves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.conditions import Axes, Condition
+from bfsensor.diagnose.extract import Measured
+from bfsensor.diagnose.predict import Predictor
+from validation.virtual_source import virtual_baseline
+
+CONDITIONS = (
+    Condition(620.0, -60.0, -100.0), Condition(620.0, -40.0, -100.0),
+    Condition(620.0, -60.0, -80.0), Condition(950.0, -60.0, -100.0),
+)  # fmt: skip
+ERROR = 1e-3
+PHASES = np.random.default_rng(56).uniform(-0.5, 0.5, (12, 2))
+
+
+def a_campaign(*widths: float) -> Measured:
+    """Spots of one flux at each condition, of given widths [pixel]."""
+    axes, values = Axes(), []
+    for n, (condition, width) in enumerate(zip(CONDITIONS, widths, strict=True)):
+        for what in ("sigma_x", "sigma_y"):
+            axes.add(1, condition, what=what, light=1.0, flux=3e4, time=1.0, exposure=n)
+            values.append(np.array([width]))
+    blocks = tuple(np.array([[ERROR**2]]) for _ in values)
+    channel = Channel("spot", np.concatenate(values), blocks, axes.columns(), "")
+    return Measured(
+        channels=(channel,), amplifiers=("one",), gains=(1.0,), read_noise=(3.0,),
+        phases=(PHASES,) * len(CONDITIONS), columns=(64,), flips=((False, False),),
+        origins=((0, 0),), shape=(64, 64),
+    )  # fmt: skip
+
+
+def test_widths_float_by_wavelength_alone() -> None:
+    predictor = Predictor(a_campaign(1.1, 1.1, 1.1, 1.2), virtual_baseline())
+    assert [n for n in predictor.names if n.startswith("sigma")] == [
+        "sigma_x 620", "sigma_y 620", "sigma_x 950", "sigma_y 950",
+    ]  # fmt: skip
+
+
+def test_one_width_moves_all_voltages_and_temperatures() -> None:
+    measured = a_campaign(1.1, 1.1, 1.1, 1.2)
+    predictor = Predictor(measured, virtual_baseline())
+    channel = measured.channels[0]
+    here = predictor.predict(channel, predictor.start)
+    n = predictor.names.index("sigma_x 620")
+    slope = predictor.slope(channel, predictor.start, n, here)
+    x = channel.axes
+    own = (x["what"] == "sigma_x") & (x["wavelength"] == 620.0)
+    # The effect's own widening falls a little with the width.
+    assert slope[own] == pytest.approx(np.ones(3), abs=0.1)
+    assert np.all(slope[x["wavelength"] == 950.0] == 0.0)
+    # Diffusion at a lower voltage is thus left over: no width of its own follows it.
+    moved = [k for k, name in enumerate(predictor.names) if name.startswith("sigma")]
+    wanted = np.where(own & (x["back_bias"] == -40.0), 20 * ERROR, 0.0)
+    slopes = np.array([predictor.slope(channel, predictor.start, k, here) for k in moved]).T
+    best = np.linalg.lstsq(slopes, wanted, rcond=None)[0]
+    left = np.square(wanted - slopes @ best).sum() / ERROR**2
+    assert left == pytest.approx(400 * 2 / 3, rel=0.1)
