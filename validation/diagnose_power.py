@@ -149,8 +149,10 @@ class Signature(NamedTuple):
         return float(np.log(self.snr[1] / self.snr[0]) / np.log(b / a))
 
     def factor_of(self, snr: float) -> float:
-        """Amplitude in units of the case's."""
-        return float(self.factors[0] * (snr / self.snr[0]) ** (1 / self.power))
+        """Amplitude in units of the case's, from the smaller one: larger ones bend the power law."""
+        return float(
+            self.factors[0] * (snr / self.snr[0]) ** (1 / max(round(self.power), 1))
+        )
 
 
 def take_signature(case: Case) -> Signature:
