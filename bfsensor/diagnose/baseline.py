@@ -38,6 +38,8 @@ class Baseline:
         Parameters that cannot be below 0, such as areas that neighbours gain.
     slopes : mapping of (wavelength, back_bias) to (dkx, dky), optional
         Change of the shifts per electron with the level of a flat [pixel/e-^2].
+    bends : mapping of (wavelength, back_bias) to (dkx, dky), optional
+        Half of the second derivative by the level [pixel/e-^3], where there are slopes.
     level : float
         Level [e-] at which the shifts are those of ``edges``, where there are slopes.
     """
@@ -49,6 +51,7 @@ class Baseline:
     reference: tuple[float, float]
     not_below: tuple[str, ...] = ()
     slopes: Mapping[tuple[float, float], Edges] = field(default_factory=dict)
+    bends: Mapping[tuple[float, float], Edges] = field(default_factory=dict)
     level: float = 0.0
 
     def __post_init__(self) -> None:
@@ -127,7 +130,8 @@ class Baseline:
         r"""Change of the areas per electron [1/e-] that flats of given levels have felt.
 
         Covariances grow as :math:`2\int a(\mu)\,\mu\,d\mu`, to first order in a: of a response
-        that goes straight with the level, that of 2/3 of the level reached counts.
+        that goes straight with the level, that of 2/3 of the level reached counts; a bend adds
+        1/18 of the level squared.
 
         Parameters
         ----------
@@ -144,8 +148,15 @@ class Baseline:
         slopes = self.slopes.get(self.nearest(condition))
         if slopes is None:
             return a
-        away = 2 / 3 * levels - self.level
-        return a + away[:, None, None] * area_matrix(*slopes)
+        away = (2 / 3 * levels - self.level)[:, None, None]
+        a = a + away * area_matrix(*slopes)
+        bends = self.bends.get(self.nearest(condition))
+        if bends is not None:
+            # The mean of the square over a flat's growth, weighted by the level, is 1/2 of its
+            # level's, against 4/9 of the square of the mean.
+            spread = (levels**2 / 18)[:, None, None]
+            a = a + (away**2 + spread) * area_matrix(*bends)
+        return np.asarray(a)
 
 
 def _off(one: float, other: float) -> float:

@@ -79,9 +79,13 @@ class Diagnosis:
         if not self.mismatch.detected:
             return out
         # Of all that stands out most is shadow of the same: the parts are what makes it up.
-        parts = self.mismatch.parts
+        # Channels cast none on one another: those that no part is in follow by their farthest.
+        found = [f for f in self.mismatch.findings if f.family != "chi-square"]
+        seen = {p.word for p in self.mismatch.parts}
+        others = {f.word: f for f in reversed(found) if f.word not in seen}
+        parts = [*self.mismatch.parts, *list(others.values())[::-1]]
         out["channels"] = list(
-            dict.fromkeys(f.word for f in parts or self.mismatch.findings)
+            dict.fromkeys(f.word for f in (*parts, *self.mismatch.findings))
         )
         best: dict[str, Any] = {}
         for part in parts:

@@ -20,7 +20,7 @@ WAVELENGTHS = (400.0, 480.0, 550.0, 620.0, 700.0, 750.0, 870.0, 950.0)
 """At which shifts are held [nm]."""
 
 SPAN = 0.15, 0.6
-"""Parts of the largest background of a table between which the response is taken as straight."""
+"""Parts of the largest background of a table between which the response is taken as a parabola."""
 
 CHARGE = 100.0
 """Charge above the background [e-] that stands for the differential response."""
@@ -30,8 +30,8 @@ def baseline_of_table(given: str | os.PathLike[str]) -> Baseline:
     """Baseline of a table: a .fits file, a GalSim stem, or the name of a shipped device.
 
     Shifts are those of the differential response, which flats see, averaged along the edge and
-    over the depths at which the light converts.  It changes with the level: its mean and its
-    slope between two backgrounds are held (:data:`SPAN`); a table of one charge, such as
+    over the depths at which the light converts.  It changes with the level: a parabola through
+    three backgrounds is held (:data:`SPAN`); a table of one charge, such as
     GalSim's, gives that charge's over it and has no slope.  Nothing of the device floats: its
     table holds no derivatives.
 
@@ -61,6 +61,7 @@ def baseline_of_table(given: str | os.PathLike[str]) -> Baseline:
     temperature = device.operating_point.temperature if device is not None else 173.0
     edges: dict[tuple[float, float], Edges] = {}
     slopes: dict[tuple[float, float], Edges] = {}
+    bends: dict[tuple[float, float], Edges] = {}
     low, high = (part * float(table.backgrounds[-1]) for part in SPAN)
     for wavelength in WAVELENGTHS:
         key = wavelength, float(bias)
@@ -68,10 +69,17 @@ def baseline_of_table(given: str | os.PathLike[str]) -> Baseline:
             lowest = float(table.backgrounds[0])
             edges[key] = edges_at(table, wavelength, temperature, background=lowest)
             continue
-        one = edges_at(table, wavelength, temperature, background=low)
-        two = edges_at(table, wavelength, temperature, background=high)
-        edges[key] = 0.5 * (one[0] + two[0]), 0.5 * (one[1] + two[1])
-        slopes[key] = (two[0] - one[0]) / (high - low), (two[1] - one[1]) / (high - low)
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        one, mean, two = (
+            edges_at(table, wavelength, temperature, background=b)
+            for b in (low, middle, high)
+        )
+        edges[key] = mean
+        slopes[key] = (two[0] - one[0]) / (2 * half), (two[1] - one[1]) / (2 * half)
+        bends[key] = (
+            (two[0] + one[0] - 2 * mean[0]) / (2 * half**2),
+            (two[1] + one[1] - 2 * mean[1]) / (2 * half**2),
+        )
     return Baseline(
         os.fspath(given),
         edges,
@@ -79,6 +87,7 @@ def baseline_of_table(given: str | os.PathLike[str]) -> Baseline:
         {},
         (620.0, float(bias)),
         slopes=slopes,
+        bends=bends,
         level=0.5 * (low + high),
     )
 

@@ -9,7 +9,7 @@ from bfsensor.diagnose.baseline import area_matrix, read_edges
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.predict_flats import flat_covariances_of
 from bfsensor.diagnose.predict_spots import grow_spots, predict_spots
-from bfsensor.diagnose.table_baseline import MIDDLE, baseline_of_table
+from bfsensor.diagnose.table_baseline import baseline_of_table
 from bfsensor.errors import DiagnosisError
 from bfsensor.measure.covariance_model import model_covariances
 from bfsensor.measure.growth import measure_growth
@@ -87,11 +87,11 @@ def test_growth_agrees_with_the_concealed_engine():
 
 def test_table_as_baseline_keeps_its_areas():
     table = DistortionTable.read(tables_dir() / "itl_sta3800c" / "table.fits")
-    middle = MIDDLE
+    baseline = baseline_of_table("itl_sta3800c")
+    middle = baseline.level
     change = table.area_changes(
         charge=middle + 100, background=middle, depth=float(table.depths[-1])
     ) / (100 * np.prod(table.pitch))
-    baseline = baseline_of_table("itl_sta3800c")
     edges, held = baseline.at(Condition(480.0, np.nan, np.nan))
     a = area_matrix(*edges)
     assert held and abs(a.sum()) < 1e-18
