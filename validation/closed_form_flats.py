@@ -7,7 +7,7 @@ drawn again.  The sensor knows nothing of the closed form: areas follow the char
 step by step, background and all, Poisson number by Poisson number.
 
 ``predict`` gives the closed form as the diagnosis uses it: the response that counts for each
-level, straight between two backgrounds of the table.  ``predict_constant`` keeps one response for
+level, of a parabola through three backgrounds of the table.  ``predict_constant`` keeps one response for
 all levels.  ``predict_ladder`` integrates the equation with the table's own response at each level.
 """
 
