@@ -15,9 +15,9 @@ STAMP = 11
 WING = 21
 """Sides of the stamps [pixel] that are fitted, and that the wings are summed in."""
 
-FLUX_ERROR = 2e-3
-"""Relative error common to the fluxes of an exposure, beside the lamp's: illumination of a mask
-with pinholes moves with its dithers (assumed)."""
+FLUX_ERROR = 1e-3
+"""Relative error common to the fluxes of an exposure, beside the lamp's and the spots' own
+differences: light on a mask of pinholes, and shutters (assumed)."""
 
 WING_ERROR = 2e-4
 """Error of the share of a spot's flux outside its stamp: backgrounds are known to about 0.1 e- a
@@ -65,12 +65,9 @@ class SpotChannels:
             "sigma_x": (fit.sigma_x, float(errors[0])),
             "sigma_y": (fit.sigma_y, float(errors[1])),
         }
-        # Pinholes differ, but are the same in all exposures: the error is the electrons'.
-        total = values.pop("flux").mean()
-        out["flux"] = (
-            float(total),
-            float(np.sqrt(total / n + (WING * self._noise) ** 2 / n)),
-        )
+        # Pinholes differ, and other ones may be lit or kept: the mean is as sure as they are alike.
+        total = values.pop("flux")
+        out["flux"] = (float(total.mean()), float(total.std(ddof=1) / np.sqrt(n)))
         for name, column in values.items():
             out[name] = (float(column.mean()), float(column.std(ddof=1) / np.sqrt(n)))
         phases = np.stack([fit.centre_x[used], fit.centre_y[used]], axis=1)
