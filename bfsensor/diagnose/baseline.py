@@ -121,6 +121,18 @@ class Baseline:
             ky = ky + factor * value * dky
         return (kx, ky), exact
 
+    def areas_on(
+        self, condition: Condition, change: Mapping[str, float] | None, background: float
+    ) -> NDArray[np.float64]:
+        """Change of the areas per electron [1/e-] where all pixels hold a background [e-]."""
+        a = area_matrix(*self.at(condition, change)[0])
+        away, key = background - self.level, self.nearest(condition)
+        if key in self.slopes:
+            a = a + away * area_matrix(*self.slopes[key])
+        if key in self.bends:
+            a = a + away**2 * area_matrix(*self.bends[key])
+        return np.asarray(a)
+
     def flat_areas(
         self,
         condition: Condition,

@@ -17,8 +17,9 @@ from bfsensor.diagnose.predict_spots import predict_spots
 MAP_ORDER = 4
 """Order of the polynomial in x and y that the light on the sensor may have."""
 
-REDUCED_LEVEL = 60_000.0
-"""Level [e-] of the flats that a_ij without a level are from: the response at 40,000 e- counts."""
+REDUCED_LEVEL = 40_000.0
+"""Background [e-] at which a_ij without a level are predicted: halfway to a flat of 80,000 e-, at
+which published covariances are quoted."""
 
 PHASES = 12
 """Spots whose positions stand for those of an exposure."""
@@ -223,8 +224,7 @@ class Predictor:
             del key
             if channel.unit == PER_ELECTRON:
                 where = _condition(channel, rows[0])
-                a = self.baseline.flat_areas(where, device, np.array([REDUCED_LEVEL]))
-                a = a[0] if a.ndim == 3 else a
+                a = self.baseline.areas_on(where, device, REDUCED_LEVEL)
                 y, x0 = (n // 2 for n in a.shape)
                 out[rows] = 0.5 * (
                     a[y + j[rows], x0 + i[rows]] + a[y - j[rows], x0 + i[rows]]
