@@ -20,7 +20,8 @@ from validation.concealed import (
 from validation.concealed.card import NOMINAL, SPREAD, baseline_edges, shifts_at
 from validation.concealed.electrostatics import ELECTRON, SILICON, edge_shifts
 
-PRACTICE = Path("/work/shared/practice/practice_a/baseline_edges.json")
+SHARED = Path(__file__).parents[2].parent / "shared"
+PRACTICE = SHARED / "practice" / "practice_a" / "baseline_edges.json"
 
 
 @pytest.mark.parametrize(

@@ -86,8 +86,8 @@ def make(
 
     \b
     Example:
-      python -m validation.concealed make /tmp/c --class cti_serial --amplitude cti=1e-6
-      python -m validation.concealed make /tmp/c --count 40 --truth-folder /tmp/sealed
+      python -m validation.concealed make campaign --class cti_serial --amplitude cti=1e-6
+      python -m validation.concealed make campaigns --count 40 --truth-folder sealed
     """
     seed = secrets.randbits(63) if seed is None else seed
     try:
