@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.special import ndtr
 
-from bfsensor.diagnose.spot_channels import STAMP, WING, _moments
+from bfsensor.diagnose.spot_channels import STAMP, WING, stamp_moments
 from bfsensor.measure.spot_fit import fit_spots
 from bfsensor.measure.spots import Stamps
 
@@ -122,7 +122,7 @@ def predict_spots(
             limit=1e6,
             correct_bias=False,
         )
-        moments = _moments(stamps, wide, fit.centre_x, fit.centre_y)
+        moments = stamp_moments(stamps, wide, fit.centre_x, fit.centre_y)
         rows.append(
             [fit.sigma_x, fit.sigma_y, *(float(moments[n].mean()) for n in names[2:])]
         )

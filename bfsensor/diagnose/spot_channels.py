@@ -55,7 +55,7 @@ class SpotChannels:
         if used.sum() < 4:
             return f"{int(used.sum())} spots are left by the fit"
         wide = cut_stamps(filled, inside, size=WING).electrons[used]
-        values = _moments(
+        values = stamp_moments(
             stamps.electrons[used], wide, fit.centre_x[used], fit.centre_y[used]
         )
         n = used.sum()
@@ -127,7 +127,7 @@ def _inside(spots: SpotList, shape: tuple[int, int], border: int) -> SpotList:
     return SpotList(spots.x[keep], spots.y[keep], dict(spots.rejected))
 
 
-def _moments(
+def stamp_moments(
     stamps: NDArray[np.float64],
     wide: NDArray[np.float64],
     x: NDArray[np.float64],
