@@ -37,6 +37,10 @@ class DiagnosisError(BFSensorError, ValueError):
     """Recordings and prediction cannot be held against one another as asked."""
 
 
+class EffectError(BFSensorError, ValueError):
+    """An effect was given parameters or data that it has no meaning for."""
+
+
 class SweepError(BFSensorError, ValueError):
     """Work cannot be spread as asked."""
 

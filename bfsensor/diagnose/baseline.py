@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,11 @@ class Baseline:
         Half of the second derivative by the level [pixel/e-^3], where there are slopes.
     level : float
         Level [e-] at which the shifts are those of ``edges``, where there are slopes.
+    nominal : mapping of str to float
+        Values of the parameters that the shifts are given for.
+    card : mapping of str to object
+        What else is known of the device: 'pixel', 'thickness' [um], 'front' [V], 'absorption'
+        [um by nm].
     """
 
     name: str
@@ -53,6 +59,8 @@ class Baseline:
     slopes: Mapping[tuple[float, float], Edges] = field(default_factory=dict)
     bends: Mapping[tuple[float, float], Edges] = field(default_factory=dict)
     level: float = 0.0
+    nominal: Mapping[str, float] = field(default_factory=dict)
+    card: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.edges:
@@ -228,16 +236,32 @@ def read_edges(
                 for k, v in block.items()
             }
     spread: dict[str, float] = {}
+    nominal: dict[str, float] = {}
+    known: dict[str, Any] = {}
     if card is not None:
         try:
-            spread = {
-                k: float(v)
-                for k, v in json.loads(Path(card).read_text())["spread_1sigma"].items()
+            told = json.loads(Path(card).read_text())
+            spread = {k: float(v) for k, v in told["spread_1sigma"].items()}
+            nominal = {k: float(v) for k, v in told.get("nominal", {}).items()}
+            known = {
+                name: nominal[key]
+                for name, key in (
+                    ("pixel", "pixel"),
+                    ("thickness", "thickness"),
+                    ("front", "vfront"),
+                )
+                if key in nominal
             }
+            if "absorption_um" in told:
+                known["absorption"] = {
+                    float(k): float(v) for k, v in told["absorption_um"].items()
+                }
         except (OSError, KeyError, ValueError, TypeError) as error:
             raise DiagnosisError(f"{card}: not a device card: {error!r}") from None
     derivatives = {k: v for k, v in derivatives.items() if k in spread}
-    return Baseline(str(path), edges, derivatives, spread, reference)
+    return Baseline(
+        str(path), edges, derivatives, spread, reference, nominal=nominal, card=known
+    )
 
 
 def _key(text: str, path: str | os.PathLike[str]) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.code_channels import CodeChannels, CrosstalkChannels
 from bfsensor.diagnose.conditions import Condition, Exposure, Frame, assign_folds
 from bfsensor.diagnose.flat_channels import FlatChannels
-from bfsensor.diagnose.map_channels import MapChannels
+from bfsensor.diagnose.map_channels import MapChannels, MapShare
 from bfsensor.diagnose.pairs import (
     PairFinder,
     UnlikePair,
@@ -25,6 +25,7 @@ from bfsensor.diagnose.pairs import (
     scan_unlike,
 )
 from bfsensor.diagnose.spot_channels import SpotChannels
+from bfsensor.effects.effect import Segment, Shot
 from bfsensor.errors import MeasurementError
 
 
@@ -70,6 +71,12 @@ class Measured:
         Exposures of each kind.
     unlike : tuple of UnlikePair
         Flats of unlike exposure beside one another; in no channel.
+    segments : tuple of Segment
+        Where each amplifier lies, and what is read before and after it.
+    shots : tuple of Shot
+        All exposures in the order of time; levels by the rough gains.
+    maps : mapping of str to tuple of MapShare
+        Of which flats each map is made.
     """
 
     channels: tuple[Channel, ...]
@@ -85,6 +92,9 @@ class Measured:
     lamp_known: bool = True
     counts: Mapping[str, int] = field(default_factory=dict)
     unlike: tuple[UnlikePair, ...] = ()
+    segments: tuple[Segment, ...] = ()
+    shots: tuple[Shot, ...] = ()
+    maps: Mapping[str, tuple[MapShare, ...]] = field(default_factory=dict)
 
 
 def measure_channels(
@@ -183,6 +193,7 @@ def measure_channels(
                 ]
                 maps.add_pair(
                     Condition.of(one), one.exposure_time or 0.0, whole[0], whole[1],
+                    level=levels[one.number],
                     shared=float(np.sqrt(np.mean(np.square(bias_noise)))),
                 )  # fmt: skip
     unlike = scan_unlike(
@@ -246,7 +257,33 @@ def measure_channels(
         lamp_known=all(e.lamp is not None for e in kinds.get("flat", [])),
         counts={k: len(v) for k, v in kinds.items()},
         unlike=tuple(unlike),
+        segments=tuple(_segment(f) for f in layout),
+        shots=_shots(exposures, levels, float(np.mean(rough))),
+        maps=maps.shares(),
     )
+
+
+def _segment(frame: Frame) -> Segment:
+    rows, columns = frame.image.shape
+    x, y = frame.origin or (0, 0)
+    depth = [strip.shape[axis] if strip.size else 0 for strip, axis in (
+        (frame.prescan, 1), (frame.serial_overscan, 1), (frame.parallel_overscan, 0))]  # fmt: skip
+    return Segment(x, y, columns, rows, frame.flip_x, frame.flip_y, *depth)
+
+
+def _shots(
+    exposures: Sequence[Exposure], levels: Mapping[int, float], gain: float
+) -> tuple[Shot, ...]:
+    """All exposures as effects see them; without a level unless they are flats."""
+    times = [e.mjd for e in exposures if e.mjd is not None]
+    out = []
+    for e in exposures:
+        hours = 0.0 if e.mjd is None else 24.0 * (e.mjd - min(times))
+        level = gain * levels.get(e.number, 0.0)
+        out.append(
+            Shot(e.kind, e.number, e.exposure_time or 0.0, *Condition.of(e), hours, level)
+        )
+    return tuple(out)
 
 
 def place(image: NDArray[np.float64], frame: Frame, values: NDArray[np.float64]) -> None:

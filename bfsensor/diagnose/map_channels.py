@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,25 @@ ORDER = 4
 
 LOW = 8
 """Side of the boxes [pixel] that tell noise over many pixels."""
+
+
+class MapShare(NamedTuple):
+    """Part of a map that flats of one condition and exposure time make up.
+
+    Attributes
+    ----------
+    weight : float
+        Of the flats in the map; below 0 where the map is divided by them.
+    condition : Condition
+        Of the light.
+    seconds, level : float
+        Exposure time [s] and mean level [ADU].
+    """
+
+    weight: float
+    condition: Condition
+    seconds: float
+    level: float
 
 
 class MapChannels:
@@ -45,6 +65,7 @@ class MapChannels:
         first: NDArray[np.float64],
         second: NDArray[np.float64],
         shared: float = 0.0,
+        level: float = 0.0,
     ) -> None:
         """Add a pair of flats, each over its amplifiers' means.
 
@@ -58,6 +79,8 @@ class MapChannels:
             nan where no amplifier reads or a pixel is bad.
         shared : float
             Noise that all flats share, that of the mean bias, over the mean.
+        level : float
+            Mean level [ADU].
         """
         self._conditions[condition.key] = condition
         group = self._groups.setdefault(
@@ -77,9 +100,10 @@ class MapChannels:
         )
         group.low += float(low.var())
         group.high += float(np.diff(noise, axis=1).var()) / 2
-        group.power += _ring_power(noise)
+        group.power += ring_power(noise)
         group.pairs += 1
         group.shared += shared
+        group.level += level
 
     def channels(self) -> list[Channel]:
         """Columns, rows, blocks and rings of the map of all light, and of what differs.
@@ -89,24 +113,16 @@ class MapChannels:
         """
         if not self._groups:
             return []
-        times: dict[tuple[str, ...], list[float]] = {}
-        for key, time in self._groups:
-            times.setdefault(key, []).append(time)
-        common = max(times, key=lambda k: sum(self._groups[k, t].pairs for t in times[k]))
-        ordered = sorted(times[common])
         maps: dict[str, tuple[_Map, Condition]] = {}
-        condition = self._conditions[common]
-        whole = self._average(common, ordered)
-        maps["all"] = (whole, condition)
-        split = [t for t in ordered if t < 0.25 * ordered[-1]]
-        if split and len(split) < len(ordered):
-            short = self._average(common, split)
-            long = self._average(common, [t for t in ordered if t not in split])
-            maps["short"] = (short.over(long), condition)
-        for other, members in times.items():
-            if other != common:
-                image = self._average(other, members)
-                maps["/".join(other)] = (image.over(whole), self._conditions[other])
+        made: dict[tuple, _Map] = {}
+        for name, (key, times, below) in self._plan().items():
+            for which in filter(None, ((key, times), below)):
+                if which not in made:
+                    made[which] = self._average(which[0], list(which[1]))
+            image = made[key, times]
+            maps[name] = (
+                image if below is None else image.over(made[below]), self._conditions[key]
+            )  # fmt: skip
         values, blocks, axes = [], [], Axes()
         for name, (image, where) in maps.items():
             for v, e, columns in self._parts(image, own=name == "all"):
@@ -116,11 +132,54 @@ class MapChannels:
         return [Channel("flat_map", np.concatenate(values), tuple(blocks), axes.columns(), "",
                         self._fold)]  # fmt: skip
 
+    def _plan(self) -> dict[str, tuple[tuple[str, ...], tuple[float, ...], tuple | None]]:
+        """Of each map: condition, exposure times, and the two of what it is divided by."""
+        times: dict[tuple[str, ...], list[float]] = {}
+        for key, time in self._groups:
+            times.setdefault(key, []).append(time)
+        common = max(times, key=lambda k: sum(self._groups[k, t].pairs for t in times[k]))
+        ordered = tuple(sorted(times[common]))
+        out: dict[str, tuple[tuple[str, ...], tuple[float, ...], tuple | None]] = {
+            "all": (common, ordered, None)
+        }
+        split = tuple(t for t in ordered if t < 0.25 * ordered[-1])
+        if split and len(split) < len(ordered):
+            long = tuple(t for t in ordered if t not in split)
+            out["short"] = (common, split, (common, long))
+        for other, members in times.items():
+            if other != common:
+                out["/".join(other)] = (other, tuple(members), (common, ordered))
+        return out
+
+    def shares(self) -> dict[str, tuple[MapShare, ...]]:
+        """Of which flats each map is made."""
+        out = {}
+        for name, (key, times, below) in (self._plan() if self._groups else {}).items():
+            parts = []
+            for (k, members), sign in (((key, times), 1.0), (below or ((), ()), -1.0)):
+                for t, w in zip(members, self._weights(k, members), strict=True):
+                    group = self._groups[k, t]
+                    parts.append(
+                        MapShare(
+                            sign * float(w),
+                            self._conditions[k],
+                            t,
+                            group.level / group.pairs,
+                        )
+                    )
+            out[name] = tuple(parts)
+        return out
+
+    def _weights(self, key: tuple[str, ...], times: Sequence[float]) -> NDArray[np.float64]:
+        """Of groups in their mean, by inverse variance of their noise."""
+        groups = [self._groups[key, t] for t in times]
+        weights = np.array([g.pairs**2 / max(g.low, 1e-30) for g in groups])
+        return np.asarray(weights / weights.sum())
+
     def _average(self, key: tuple[str, ...], times: list[float]) -> _Map:
         """Map of several exposure times, by inverse variance of their noise."""
         groups = [self._groups[key, t] for t in times]
-        weights = np.array([g.pairs**2 / max(g.low, 1e-30) for g in groups])
-        weights = weights / weights.sum()
+        weights = self._weights(key, times)
         with np.errstate(invalid="ignore", divide="ignore"):
             image = sum(w * g.total / g.count for w, g in zip(weights, groups, strict=True))
         # The mean bias is the same in all; of it differences of pairs know nothing.
@@ -191,7 +250,7 @@ class MapChannels:
                 {"what": "block", "k": -1.0, "x": x.ravel()[full], "y": y.ravel()[full]},
             )
         )
-        power = _ring_power(_without_shape(filled))
+        power = ring_power(_without_shape(filled))
         keep = self._modes > 50
         frequency = (np.arange(RINGS) + 0.5) / (2 * RINGS)
         # Of n modes, each exponential; in parts per million of a pixel.
@@ -225,6 +284,7 @@ class _Group:
     power: NDArray[np.float64] = field(default_factory=lambda: np.zeros(RINGS))
     pairs: int = 0
     shared: float = 0.0
+    level: float = 0.0
 
 
 @dataclass
@@ -261,7 +321,7 @@ def _ring_bins(shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.bo
     return bins, (np.abs(fy) > 0) & (fx > 0) & (bins < RINGS)
 
 
-def _ring_power(image: NDArray[np.float64]) -> NDArray[np.float64]:
+def ring_power(image: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean power of a mode by ring; that of white noise is a pixel's variance."""
     bins, use = _ring_bins(image.shape)
     power = np.abs(np.fft.rfft2(image)) ** 2 / image.size

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +12,14 @@ from bfsensor.diagnose.baseline import Baseline
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
-from bfsensor.diagnose.predict_flats import flat_covariances_of
+from bfsensor.diagnose.predict_effects import ADDED, EffectChain, layout_of, pad_areas
+from bfsensor.diagnose.predict_flats import (
+    flat_covariances_of,
+    periodic_covariances,
+    quadrant,
+)
 from bfsensor.diagnose.predict_spots import predict_spots
+from bfsensor.effects.effect import Effect, Parameter
 
 MAP_ORDER = 4
 """Order of the polynomial in x and y that the light on the sensor may have."""
@@ -39,10 +46,17 @@ class Predictor:
         The campaign, for its amplifiers, conditions and positions of spots.
     baseline : Baseline
         Boundary shifts.
+    effects : sequence of Effect
+        What is added to it; their parameters are non-linear ones.
     """
 
-    def __init__(self, measured: Measured, baseline: Baseline) -> None:
-        self.measured, self.baseline = measured, baseline
+    def __init__(
+        self, measured: Measured, baseline: Baseline, effects: Sequence[Effect] = ()
+    ) -> None:
+        self.measured, self.baseline, self.effects = measured, baseline, tuple(effects)
+        self.layout = layout_of(measured, baseline)
+        self._evened: dict[tuple, NDArray[np.float64]] = {}
+        self._lit: dict[int, tuple[Channel, NDArray[np.float64]]] = {}
         self._amps = len(measured.amplifiers)
         self._kept: dict[int, tuple[Channel, dict[tuple[str, ...], NDArray[np.int64]]]] = {}
         self._spot_conditions: list[tuple[str, ...]] = []
@@ -86,13 +100,18 @@ class Predictor:
             *(f"noise {a}" for a in range(self._amps)),
             *(f"device {p}" for p in baseline.parameters),
             *(f"sigma_{axis} {wavelength}" for wavelength in self._widths for axis in "xy"),
+            *(f"effect {e.name} {p.name}" for e in self.effects for p in fitted(e)),
         )
+        effect_values = [e[p.name] for e in self.effects for p in fitted(e)]
+        effect_steps = [_effect_step(e, p) for e in self.effects for p in fitted(e)]
         self.start = np.array([
             *measured.gains, *noise, *(0.0 for _ in baseline.parameters), *start_sigma,
+            *effect_values,
         ])  # fmt: skip
         self.steps = np.array([
             *(1e-3 * g for g in measured.gains), *(0.01 * max(n, 0.1) for n in noise),
             *(0.1 for _ in baseline.parameters), *(2e-3 for _ in start_sigma),
+            *effect_steps,
         ])  # fmt: skip
         n, p = 2 * self._amps, len(baseline.parameters)
         self.prior_rows = np.arange(n, n + p)
@@ -138,6 +157,7 @@ class Predictor:
             Predict spots of this wavelength alone.
         """
         a = self._amps
+        chain = self.chain(parameters)
         gains, noise = parameters[:a], parameters[a : 2 * a]
         count = len(self.baseline.parameters)
         device = {
@@ -147,14 +167,76 @@ class Predictor:
             )
         }
         if channel.word == "flat_cov":
-            return self._flat_cov(channel, gains, noise, device)
+            return self._flat_cov(channel, gains, noise, device, chain)
         if channel.word == "spot":
-            return self._spots(channel, gains, device, parameters[2 * a + count :], only)
+            return self._spots(
+                channel, gains, device, parameters[2 * a + count :], only, chain
+            )
         out = np.zeros(len(channel))
         if channel.word == "bias_cov":
             own = noise[channel.axes["amp"].astype(int)]
             out = np.where(channel.axes["lag"] == 0, own, 0.0)
+        if chain is not None:
+            if channel.word in ADDED:
+                out = out + chain.added(channel, gains, self._with_light(channel, gains))
+            elif channel.word == "flat_map":
+                out = out + chain.map_change(channel)
         return out
+
+    def chain(self, parameters: NDArray[np.float64]) -> EffectChain | None:
+        """Effects with their parameters as given; None of none."""
+        if not self.effects:
+            return None
+        return EffectChain(
+            self.effects_at(parameters),
+            self.layout,
+            self.measured,
+            self.baseline,
+            self._evened,
+        )
+
+    def effects_at(self, parameters: NDArray[np.float64]) -> tuple[Effect, ...]:
+        """Effects with their parameters as given."""
+        values = iter(parameters[len(parameters) - self._effect_count :])
+        return tuple(
+            e.with_values(**{p.name: float(next(values)) for p in fitted(e)})
+            for e in self.effects
+        )
+
+    @property
+    def _effect_count(self) -> int:
+        return sum(len(fitted(e)) for e in self.effects)
+
+    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Lowest and highest values of the parameters: effects' ranges, widened."""
+        low, high = (np.full(len(self.names), v) for v in (-np.inf, np.inf))
+        n = len(self.names) - self._effect_count
+        for effect in self.effects:
+            for p in fitted(effect):
+                low[n], high[n] = widened(p)
+                n += 1
+        return low, high
+
+    def _with_light(
+        self, channel: Channel, gains: NDArray[np.float64]
+    ) -> dict[str, NDArray]:
+        """Axes, of flats with 'light': electrons that light in proportion would bring."""
+        if channel.word not in ("flat_mean", "flat_cov") or channel.unit == PER_ELECTRON:
+            return dict(channel.axes)
+        kept = self._lit.get(id(channel))
+        if kept is None or kept[0] is not channel:
+            x = channel.axes
+            light = x["time"] * x.get("lamp", np.array(1.0))
+            out = np.zeros(len(channel))
+            for rows in self._rows(channel).values():
+                for amp in np.unique(x["amp"][rows]):
+                    here = rows[x["amp"][rows] == amp]
+                    ratio = x["level"][here] / np.maximum(light[here], 1e-300)
+                    weak = light[here] <= np.quantile(light[here], 0.4)
+                    out[here] = np.median(ratio[weak]) * light[here]
+            kept = self._lit[id(channel)] = channel, out
+        amps = channel.axes["amp"].astype(int)
+        return dict(channel.axes) | {"light": gains[amps] * kept[1]}
 
     def _rows(self, channel: Channel) -> dict[tuple[str, ...], NDArray[np.int64]]:
         """Rows of each condition, found once: channels do not change."""
@@ -165,10 +247,21 @@ class Predictor:
 
     def depends(self, channel: Channel) -> NDArray[np.bool_]:
         """Which parameters a channel can depend on: the others need no derivative."""
-        a = self._amps
         names = np.array(self.names)
         device = np.char.startswith(names, "device")
         sigma = np.char.startswith(names, "sigma")
+        effect = np.zeros(len(names), bool)
+        n = len(names) - self._effect_count
+        for e in self.effects:
+            for _ in fitted(e):
+                effect[n] = channel.word in e.touches
+                n += 1
+        return effect | self._baseline_depends(channel, device, sigma)
+
+    def _baseline_depends(
+        self, channel: Channel, device: NDArray[np.bool_], sigma: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        a, names = self._amps, np.array(self.names)
         gain = np.char.startswith(names, "gain")
         noise = np.char.startswith(names, "noise")
         noise[a : 2 * a] &= self._noise_told
@@ -214,6 +307,7 @@ class Predictor:
         gains: NDArray[np.float64],
         noise: NDArray[np.float64],
         device: dict[str, float],
+        chain: EffectChain | None,
     ) -> NDArray[np.float64]:
         x = channel.axes
         i, j = x["i"].astype(int), x["j"].astype(int)
@@ -225,17 +319,36 @@ class Predictor:
             if channel.unit == PER_ELECTRON:
                 where = _condition(channel, rows[0])
                 a = self.baseline.areas_on(where, device, REDUCED_LEVEL)
+                if chain is not None:
+                    more = chain.area_change(self.baseline.at(where, device)[0], where)
+                    a = a * (1 + chain.law.bend * REDUCED_LEVEL)
+                    reach = max(more.shape[-1], a.shape[-1]) // 2
+                    a = pad_areas(a, reach) + pad_areas(more, reach)
                 y, x0 = (n // 2 for n in a.shape)
                 out[rows] = 0.5 * (
                     a[y + j[rows], x0 + i[rows]] + a[y - j[rows], x0 + i[rows]]
                 )
                 continue
             pairs = np.stack([amp[rows], x["level"][rows]], axis=1)
-            groups, index = np.unique(pairs, axis=0, return_inverse=True)
+            groups, first, index = np.unique(
+                pairs, axis=0, return_index=True, return_inverse=True
+            )
             own = gains[groups[:, 0].astype(int)]
             levels = own * groups[:, 1]
-            a = self.baseline.flat_areas(_condition(channel, rows[0]), device, levels)
-            c = flat_covariances_of(a, levels, lags=lags) / own[:, None, None] ** 2
+            where = _condition(channel, rows[0])
+            if chain is None:
+                a = self.baseline.flat_areas(where, device, levels)
+                c = flat_covariances_of(a, levels, lags=lags) / own[:, None, None] ** 2
+            else:
+                lit = self._with_light(channel, gains)
+                axes = {k: v[rows[first]] for k, v in lit.items()} | {"level": levels}
+                axes["level"] = levels = chain.collected(levels, axes)
+                more = chain.area_change(self.baseline.at(where, device)[0], where)
+                a = self.baseline.flat_areas(where, device, levels)
+                reach = max(more.shape[-1], a.shape[-1]) // 2
+                a = pad_areas(a, reach) + pad_areas(more, reach)
+                whole = periodic_covariances(a, levels, law=chain.law)
+                c = quadrant(chain.covariances(whole, axes), lags) / own[:, None, None] ** 2
             c[:, 0, 0] += noise[groups[:, 0].astype(int)]
             out[rows] = c[index.ravel(), j[rows], i[rows]]
         return out
@@ -247,6 +360,7 @@ class Predictor:
         device: dict[str, float],
         sigmas: NDArray[np.float64],
         only: str | None,
+        chain: EffectChain | None,
     ) -> NDArray[np.float64]:
         x = channel.axes
         # Images were put on the scale of electrons with rough gains.
@@ -257,11 +371,23 @@ class Predictor:
             if not len(rows) or (only is not None and key[0] != only):
                 continue
             n = self._widths.index(key[0])
-            (kx, ky), _ = self.baseline.at(self._spot_of[key], device)
-            found = predict_spots(
-                kx, ky, sigma=(float(sigmas[2 * n]), float(sigmas[2 * n + 1])),
-                phases=self._phases[key], fluxes=scale * x["flux"][rows],
-            )  # fmt: skip
+            edges, _ = self.baseline.at(self._spot_of[key], device)
+            sigma = float(sigmas[2 * n]), float(sigmas[2 * n + 1])
+            fluxes = scale * x["flux"][rows]
+            if chain is None:
+                found = predict_spots(
+                    *edges, sigma=sigma, phases=self._phases[key], fluxes=fluxes
+                )
+                found.pop("flux")
+            else:
+                variance, halo, axes = chain.spot_change(self._spot_of[key])
+                wide = [float(np.sqrt(max(s * s + variance, 0.01 * s * s))) for s in sigma]
+                found = predict_spots(
+                    *chain.edges(edges, self._spot_of[key]), sigma=(wide[0], wide[1]),
+                    phases=self._phases[key], fluxes=fluxes, halo=halo, law=chain.law,
+                    change=partial(chain.spot_image, axes=axes),
+                )  # fmt: skip
+                found["flux"] = found["flux"] / scale
             for what, values in found.items():
                 here = x["what"][rows] == what
                 out[rows[here]] = values[here]
@@ -345,6 +471,26 @@ class Predictor:
                 column[here] = x["light"][here] if what == "flux" else 1.0
                 out[f"spot {what} {'/'.join(key)}"] = column
         return out
+
+
+def fitted(effect: Effect) -> list[Parameter]:
+    """Parameters that a fit may move: whole numbers stay where the search put them."""
+    return [p for p in effect.parameters if p.law != "whole"]
+
+
+def widened(p: Parameter) -> tuple[float, float]:
+    """Range of a parameter in fits: ten times beyond the plausible one, or half of its width."""
+    if p.law == "log":
+        low = -10 * p.high if p.signed else (0.0 if p.amplitude else 0.3 * p.low)
+        return p.neutral + low, p.neutral + (10 * p.high if p.amplitude else 3 * p.high)
+    reach = 0.5 * (p.high - p.low)
+    return p.low - reach, p.high + reach
+
+
+def _effect_step(effect: Effect, p: Parameter) -> float:
+    """Of derivatives: small against the value, or the least plausible one."""
+    scale = abs(effect[p.name] - p.neutral)
+    return 0.02 * max(scale, p.low) if p.law == "log" else 0.01 * (p.high - p.low)
 
 
 def _noise_told(measured: Measured) -> NDArray[np.bool_]:

@@ -5,12 +5,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bfsensor.effects.effect import Law
+
 GRID = 48
 """Side of the periodic array of the closed form: shifts of 21 x 21 pixels fold thrice over."""
 
+NODES = 12
+"""Of the quadrature where boundaries do not shift in proportion to charge: exact to 1e-12."""
+
+LINEAR = Law()
+
 
 def flat_covariances_of(
-    a: NDArray[np.float64], levels: ArrayLike, *, lags: int
+    a: NDArray[np.float64], levels: ArrayLike, *, lags: int, law: Law = LINEAR
 ) -> NDArray[np.float64]:
     r"""Covariances of flats of given levels.
 
@@ -29,6 +36,8 @@ def flat_covariances_of(
         Mean electrons m [e-].
     lags : int
         Largest lag.
+    law : Law
+        How collection departs from linear shifts.
 
     Returns
     -------
@@ -43,15 +52,51 @@ def flat_covariances_of(
     array([[98039.,   974.],
            [    0.,     0.]])
     """
+    c = periodic_covariances(a, levels, law=law)
+    return quadrant(c, lags)
+
+
+def periodic_covariances(
+    a: NDArray[np.float64], levels: ArrayLike, *, law: Law = LINEAR
+) -> NDArray[np.float64]:
+    r"""Covariances of flats at all lags of a periodic array, lag (0, 0) in the corner [e-^2].
+
+    With a bend b and a loss q of the law the power follows
+    :math:`d\tilde C / dm = 1 + 2 (\hat a (1 + b m) - q) \tilde C`: the response to a small
+    change of Q (1 + b Q / 2) about the level m, and light that is lost where there is more
+    charge; m is what is collected.
+
+    Parameters
+    ----------
+    a, levels, law
+        As for :func:`flat_covariances_of`.
+
+    Returns
+    -------
+    covariances : ndarray, shape (n, :data:`GRID`, :data:`GRID`)
+    """
     ny, nx = a.shape[-2:]
     wide = np.zeros((*a.shape[:-2], GRID, GRID))
     wide[..., :ny, :nx] = a
     wide = np.roll(wide, (-(ny // 2), -(nx // 2)), (-2, -1))
-    a_k = np.fft.fft2(wide).real
+    a_k = np.fft.fft2(wide).real - law.loss
     m = np.asarray(levels, float)[:, None, None]
-    x = 2 * a_k * m
-    small = np.abs(x) < 1e-9
-    power = m * np.where(small, 1 + x / 2, np.expm1(x) / np.where(small, 1.0, x))
-    c = np.fft.ifft2(power).real
+    if law.bend:
+        # The integrating factor, over the charge s that a fluctuation came at; smooth.
+        nodes, weights = np.polynomial.legendre.leggauss(NODES)
+        power = np.zeros(np.broadcast_shapes(a_k.shape, m.shape))
+        a_bent = law.bend * (a_k + law.loss)
+        for node, weight in zip(0.5 * (nodes + 1), 0.5 * weights, strict=True):
+            s = node * m
+            power += weight * m * np.exp(2 * a_k * (m - s) + a_bent * (m**2 - s**2))
+    else:
+        x = 2 * a_k * m
+        small = np.abs(x) < 1e-9
+        power = m * np.where(small, 1 + x / 2, np.expm1(x) / np.where(small, 1.0, x))
+    return np.asarray(np.fft.ifft2(power).real)
+
+
+def quadrant(c: NDArray[np.float64], lags: int) -> NDArray[np.float64]:
+    """Lags from 0, the mean of (i, j) and (i, -j), of periodic covariances."""
     side = np.arange(lags + 1)
     return np.asarray(0.5 * (c[:, side[:, None], side] + c[:, -side[:, None], side]))

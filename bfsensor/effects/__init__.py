@@ -1,0 +1,1 @@
+"""Effects that a baseline may leave out: one file each, on plain arrays."""

@@ -1,0 +1,430 @@
+"""What an effect is: parameters, what it does to pixels, and what it does to each channel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, ClassVar, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.errors import EffectError
+
+STAGES = ("light", "collect", "store", "shift", "amplifier", "converter")
+"""In the order in which light becomes codes."""
+
+Image = NDArray[Any]
+Values = NDArray[np.float64]
+Edges = tuple[Values, Values]
+Axes = Mapping[str, NDArray]
+Seen = Mapping[str, Any]
+
+
+class Parameter(NamedTuple):
+    """One number of an effect.
+
+    Attributes
+    ----------
+    name, unit : str
+        As the report has them.
+    low, high : float
+        Ends of the range that is plausible, of the magnitude where ``signed``; fits may leave
+        it by a factor of ten, evidence is counted inside it.
+    neutral : float
+        Of an amplitude: the value at which nothing changes.
+    law : str
+        "log" or "flat": how plausible values are spread; "whole": whole numbers.
+    signed : bool
+        Either sign.
+    amplitude : bool
+        Whether the effect is off at ``neutral``; other parameters are of its shape.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    neutral: float = 0.0
+    law: str = "log"
+    signed: bool = False
+    amplitude: bool = False
+
+
+class Segment(NamedTuple):
+    """One amplifier's part of the sensor [pixel]; its overscans are read after it."""
+
+    x: int
+    y: int
+    columns: int
+    rows: int
+    flip_x: bool = False
+    flip_y: bool = False
+    prescan: int = 0
+    serial_overscan: int = 0
+    parallel_overscan: int = 0
+
+
+class Shot(NamedTuple):
+    """What an effect may know of one exposure; nan where not known.
+
+    Attributes
+    ----------
+    kind : str
+        'bias', 'dark', 'flat' or 'spot'.
+    number : int
+        Place in the order of time.
+    seconds : float
+        Commanded exposure time [s].
+    wavelength, back_bias, temperature : float
+        [nm], [V], [C].
+    hours : float
+        Since the first exposure [h].
+    level : float
+        Mean charge of a pixel [e-].
+    """
+
+    kind: str
+    number: int
+    seconds: float
+    wavelength: float = np.nan
+    back_bias: float = np.nan
+    temperature: float = np.nan
+    hours: float = 0.0
+    level: float = 0.0
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Sensor and campaign that predictions are made for.
+
+    Attributes
+    ----------
+    shape : tuple of int
+        Rows and columns of the sensor.
+    segments : tuple of Segment
+        Amplifiers, in the order of the axis 'amp'.
+    shots : tuple of Shot
+        Exposures in the order of time.
+    gains : tuple of float
+        Of the amplifiers [e-/ADU].
+    reference : tuple of float
+        Wavelength [nm], back bias [V] and temperature [C] that a baseline is given for.
+    pixel, thickness : float
+        Pitch and thickness [um].
+    front : float
+        Mean voltage of the front side [V].
+    absorption : mapping of float to float
+        Absorption length [um] by wavelength [nm].
+    """
+
+    shape: tuple[int, int]
+    segments: tuple[Segment, ...]
+    shots: tuple[Shot, ...] = ()
+    gains: tuple[float, ...] = ()
+    reference: tuple[float, float, float] = (620.0, -60.0, -100.0)
+    pixel: float = 10.0
+    thickness: float = 100.0
+    front: float = 8.0
+    absorption: Mapping[float, float] = field(default_factory=dict)
+
+
+class Law(NamedTuple):
+    """How collection departs from shifts that are proportional to the stored charge.
+
+    Attributes
+    ----------
+    bend : float
+        b: boundaries move by k Q (1 + b Q / 2) [1/e-].
+    loss : float
+        q: light is collected with exp(-q Q) [1/e-].
+    full_well : float
+        Charge beyond which it spills along the column [e-].
+    """
+
+    bend: float = 0.0
+    loss: float = 0.0
+    full_well: float = np.inf
+
+    def with_law(self, other: Law) -> Law:
+        """Both together."""
+        return Law(
+            self.bend + other.bend,
+            self.loss + other.loss,
+            min(self.full_well, other.full_well),
+        )
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One piece of physics with its parameters; subclasses say what it does.
+
+    Two faces.  *On pixels*, stage by stage, in electrons: :meth:`edges`, :meth:`law`,
+    :meth:`light_map`, :meth:`displacements`, :meth:`spot_light` (they serve predictions too),
+    :meth:`turbulence`, :meth:`store`, :meth:`shift`, :meth:`amplify`, :meth:`noise`,
+    :meth:`convert`.  *On channels*, in closed form: :meth:`signal`, :meth:`covariances`,
+    :meth:`spot_image`, :meth:`pattern` and the methods named after channel words, which give the
+    change that is to be added, in electrons (or e-^2), and are given the axes of the channel
+    with 'level' in electrons.  A subclass overrides what it touches and nothing else.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        All parameters.
+
+    Raises
+    ------
+    EffectError
+        A parameter is missing, unknown, or not finite.
+
+    Attributes
+    ----------
+    word, variant : str
+        Class in the taxonomy, and which kind of it where there are several.
+    stage : str
+        Of :data:`STAGES`.
+    parameters : tuple of Parameter
+    touches : tuple of str
+        Channel words that can change.
+    source : str
+        Where the law and the range come from.
+    by_time : bool
+        Whether :meth:`light_map`, :meth:`displacements` or :meth:`pattern` change with the
+        exposure time or the level.
+    """
+
+    values: Mapping[str, float]
+
+    word: ClassVar[str] = ""
+    variant: ClassVar[str] = ""
+    stage: ClassVar[str] = "amplifier"
+    parameters: ClassVar[tuple[Parameter, ...]] = ()
+    touches: ClassVar[tuple[str, ...]] = ()
+    source: ClassVar[str] = ""
+    by_time: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        needed = {p.name for p in self.parameters}
+        if set(self.values) != needed:
+            raise EffectError(
+                f"{self.name}: parameters {', '.join(sorted(self.values)) or 'none'} given, "
+                f"{', '.join(sorted(needed))} needed"
+            )
+        for name, value in self.values.items():
+            if not np.isfinite(value):
+                raise EffectError(f"{self.name}: {name} = {value!r} is not finite")
+        object.__setattr__(self, "values", MappingProxyType(dict(self.values)))
+
+    def __reduce__(self) -> tuple[type[Effect], tuple[dict[str, float]]]:
+        return type(self), (dict(self.values),)
+
+    def __getitem__(self, name: str) -> float:
+        return self.values[name]
+
+    @property
+    def name(self) -> str:
+        """Class, and variant where there are several."""
+        return f"{self.word}:{self.variant}" if self.variant else self.word
+
+    @classmethod
+    def amplitudes(cls) -> tuple[str, ...]:
+        """Names of the parameters that switch the effect off."""
+        return tuple(p.name for p in cls.parameters if p.amplitude)
+
+    def is_neutral(self) -> bool:
+        """Whether every amplitude has its neutral value: nothing changes by a bit."""
+        return all(self[p.name] == p.neutral for p in self.parameters if p.amplitude)
+
+    def with_values(self, **values: float) -> Self:
+        """Copy with some parameters changed."""
+        return type(self)({**self.values, **values})
+
+    def scaled(self, factor: float) -> Self:
+        """Copy with every amplitude's distance from neutral multiplied."""
+        return self.with_values(**{
+            p.name: p.neutral + factor * (self[p.name] - p.neutral)
+            for p in self.parameters if p.amplitude
+        })  # fmt: skip
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        """Give places where a fit may begin, one of which leads to the best fit.
+
+        By default amplitudes at the middle of their range and three places of each shape
+        parameter's range, crossed.
+
+        Parameters
+        ----------
+        layout : Layout
+            Sensor and campaign.
+        seen : sequence of mapping
+            Where the baseline fails, farthest first: 'word' of the channel, 'z', and what the
+            scan found: 'x', 'y', 'amp', 'lag', 'period' ... as far as it says.
+        """
+        del layout, seen
+        grids: list[dict[str, float]] = [{}]
+        for p in cls.parameters:
+            middle = (
+                float(np.sqrt(p.low * p.high)) if p.law == "log" else (p.low + p.high) / 2
+            )
+            places = [p.neutral + middle]
+            if not p.amplitude and p.law == "log":
+                places = [float(v) for v in np.geomspace(p.low, p.high, 5)[1:4]]
+            elif not p.amplitude and p.law == "flat":
+                places = [float(p.low + f * (p.high - p.low)) for f in (0.2, 0.5, 0.8)]
+            elif not p.amplitude:
+                places = [float(v) for v in range(int(p.low), int(p.high) + 1)]
+            grids = [{**g, p.name: v} for g in grids for v in places]
+        return grids
+
+    # -- light and collection: on pixels and in predictions alike
+
+    def edges(self, kx: Values, ky: Values, shot: Shot, layout: Layout) -> Edges:
+        """Shifts of right and upper edges per electron [pixel/e-], [row dy, column dx]."""
+        del shot, layout
+        return kx, ky
+
+    def law(self) -> Law:
+        """How collection departs from linear shifts."""
+        return Law()
+
+    def light_map(self, shot: Shot, layout: Layout) -> Values | None:
+        """Factor on the light of an exposure, shape of the sensor; None: one."""
+        del shot, layout
+        return None
+
+    def displacements(self, shot: Shot, layout: Layout) -> Edges | None:
+        """Standing displacements [pixel] of the edges between columns and between rows.
+
+        Shapes (ny, nx + 1) and (ny + 1, nx), the rim's edges too; None: they stand.
+        """
+        del shot, layout
+        return None
+
+    def spot_light(self, shot: Shot, layout: Layout) -> tuple[float, float, float]:
+        """Of spots: added variance [pixel^2], share of light in a halo, its sigma [pixel]."""
+        del shot, layout
+        return 0.0, 0.0, 1.0
+
+    # -- on pixels alone
+
+    def turbulence(
+        self, shot: Shot, layout: Layout, rng: np.random.Generator
+    ) -> Values | None:
+        """Factor on the light that differs from frame to frame; None: one."""
+        del shot, layout, rng
+        return None
+
+    def store(
+        self,
+        charge: Image,
+        shot: Shot,
+        layout: Layout,
+        rng: np.random.Generator,
+        memory: dict[str, NDArray],
+    ) -> Image:
+        """Charge as it is stored [e-], shape of the sensor.
+
+        ``memory`` is kept from exposure to exposure.
+        """
+        del shot, layout, rng, memory
+        return charge
+
+    def shift(self, frame: Image, amp: int, layout: Layout) -> Image:
+        """Frame of an amplifier after transfer [e-], readout order, overscans included."""
+        del amp, layout
+        return frame
+
+    def amplify(self, frames: list[Image], shot: Shot, layout: Layout) -> list[Image]:
+        """Frames of all amplifiers after the amplifier [e-]."""
+        del shot, layout
+        return frames
+
+    def noise(
+        self, frames: list[Image], layout: Layout, rng: np.random.Generator
+    ) -> list[Image]:
+        """Frames with noise and offsets added [e-]."""
+        del layout, rng
+        return frames
+
+    def convert(self, levels: Image) -> Image:
+        """Levels as the converter's wrong steps show them [ADU], before rounding."""
+        return levels
+
+    # -- on channels: what is to be added to the prediction
+
+    def pattern(self, shot: Shot, layout: Layout) -> Values | None:
+        """Relative change of a flat's map that comes after collection; None: none.
+
+        Shape of the sensor, on its axes (not in readout order); ``shot.level`` [e-] is the
+        flat's.  What :meth:`light_map` and :meth:`displacements` change is not to be given again.
+        """
+        del shot, layout
+        return None
+
+    def signal(self, level: Values, axes: Axes, layout: Layout) -> Values:
+        """Signal of smooth light after the amplifier [e-] against the collected charge [e-].
+
+        One to one and smooth; also of pixels of spots' mean images.
+        """
+        del axes, layout
+        return level
+
+    def covariances(self, c: Values, axes: Axes, layout: Layout) -> Values:
+        """Covariances of flats after this effect [e-^2].
+
+        Parameters
+        ----------
+        c : ndarray, shape (n, ny, nx)
+            Periodic, lag (0, 0) in the corner, by flat.
+        axes : mapping
+            Of the flats, shape (n,): 'amp', 'level' [e-], 'time' [s], conditions.
+        layout : Layout
+            Of the sensor.
+        """
+        del axes, layout
+        return c
+
+    def spot_image(
+        self, images: Values, axes: Mapping[str, float], layout: Layout
+    ) -> Values:
+        """Mean images of spots [e-] on the sensor's axes after this effect, shape (..., ny, nx)."""
+        del axes, layout
+        return images
+
+    def flat_mean(self, axes: Axes, layout: Layout) -> Values:
+        """Added to means of flats [e-], besides :meth:`signal`."""
+        return _nothing(axes)
+
+    def serial_overscan(self, axes: Axes, layout: Layout) -> Values:
+        """Added to the k-th pixel of the serial overscan behind flats [e-]."""
+        return _nothing(axes)
+
+    def parallel_overscan(self, axes: Axes, layout: Layout) -> Values:
+        """Added to the k-th row of the parallel overscan behind flats [e-]."""
+        return _nothing(axes)
+
+    def bias_cov(self, axes: Axes, layout: Layout) -> Values:
+        """Added to the noise's covariance at a lag in readout order [e-^2]."""
+        return _nothing(axes)
+
+    def bias_level(self, axes: Axes, layout: Layout) -> Values:
+        """Added to bias levels [e-]; where 'what' is 'rows' to their variance [e-^2]."""
+        return _nothing(axes)
+
+    def dark_map(self, axes: Axes, layout: Layout) -> Values:
+        """Added to levels and columns of darks [e-]; where 'what' is 'struck', to numbers."""
+        return _nothing(axes)
+
+    def amp_cross(self, axes: Axes, layout: Layout) -> Values:
+        """Added to shared noise [e-^2]; where 'what' is 'crosstalk', to fractions."""
+        return _nothing(axes)
+
+    def code_hist(self, axes: Axes, layout: Layout) -> Values:
+        """Added to the relative frequencies of codes by remainder."""
+        return _nothing(axes)
+
+
+def _nothing(axes: Axes) -> Values:
+    return np.zeros(len(next(iter(axes.values()))))

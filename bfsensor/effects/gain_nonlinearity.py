@@ -1,0 +1,35 @@
+"""Gain non-linearity: the response against signal is curved."""
+
+from __future__ import annotations
+
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Shot, Values
+
+SCALE = 1e5
+"""Signal [e-] that the coefficients are given at."""
+
+
+class GainNonlinearity(Effect):
+    """Signal S becomes S (1 + c2 S/1e5 + c3 (S/1e5)^2), S in electrons."""
+
+    word = "gain_nonlinearity"
+    stage = "amplifier"
+    parameters = (
+        Parameter("c2", "", 1e-3, 2e-2, signed=True, amplitude=True),
+        Parameter("c3", "", 3e-4, 5e-3, signed=True, amplitude=True),
+    )
+    touches = ("flat_mean", "flat_cov", "spot")
+    source = (
+        "Polynomial response of video chains: Astier et al. 2019, A&A 629, A36, section 5 (0.6 % "
+        "of an LSST test chain); range assumed"
+    )
+
+    def amplify(self, frames: list[Image], shot: Shot, layout: Layout) -> list[Image]:
+        del shot
+        return [self._bent(f) for f in frames]
+
+    def signal(self, level: Values, axes: Axes, layout: Layout) -> Values:
+        return self._bent(level)
+
+    def _bent(self, signal: Image) -> Image:
+        x = signal / SCALE
+        return signal * (1 + self["c2"] * x + self["c3"] * x * x)

@@ -1,0 +1,205 @@
+"""Our effects on the pixels of the virtual sensor, and what they change in its channels.
+
+Predictions of effects are held against what the same effects do to pixels: two campaigns of the
+virtual sensor share all noise and differ in the effect alone.  The sensor's own effects have the
+same conventions and none of this code: the same comparison with them checks the laws as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.extract import Measured, measure_channels
+from bfsensor.diagnose.mismatch import BaselineFit, fit_baseline
+from bfsensor.diagnose.predict import Predictor, used_channels
+from bfsensor.effects.effect import Effect, Layout, Segment, Shot
+from validation.concealed.electrostatics import EdgeShifts
+from validation.virtual_source import VirtualSource, virtual_baseline
+
+FOLDS = ("fit", "select")
+
+
+class OnPixels:
+    """One of our effects in the shape in which the virtual sensor takes effects."""
+
+    def __init__(self, effect: Effect) -> None:
+        self.effect = effect
+        self.word = effect.name
+        self._layout: Layout | None = None
+        self._count = 0
+
+    def _of(self, context: Any) -> tuple[Shot, Layout]:
+        if self._layout is None:
+            g = context.geometry
+            segments = tuple(
+                Segment(n * g.width, 0, g.width, g.pixels, n % 2 == 1, False, g.prescan,
+                        g.serial_overscan, g.parallel_overscan)
+                for n in range(g.amplifiers)
+            )  # fmt: skip
+            card = virtual_baseline().card
+            self._layout = Layout(
+                (g.pixels, g.pixels),
+                segments,
+                gains=tuple(context.electronics.gain),
+                **card,
+            )
+        e = context.exposure
+        shot = Shot(e.kind.lower(), e.sequence, e.seconds, e.wavelength, e.back_bias,
+                    e.temperature, e.hours)  # fmt: skip
+        return shot, self._layout
+
+    def device(self, device):
+        return device
+
+    def shifts(self, shifts: Any, context: Any) -> Any:
+        shot, layout = self._of(context)
+        return EdgeShifts(*self.effect.edges(shifts.kx, shifts.ky, shot, layout))
+
+    def laws(self, context: Any) -> dict[str, Any]:
+        law = self.effect.law()
+        out: dict[str, Any] = {"curvature": law.bend, "loss": law.loss}
+        if np.isfinite(law.full_well):
+            out["full_well"] = law.full_well
+        return {k: v for k, v in out.items() if v}
+
+    def spot_light(self, context: Any) -> dict[str, float]:
+        variance, halo, wide = self.effect.spot_light(*self._of(context))
+        out = {"variance": variance} if variance else {}
+        return out | ({"halo": halo, "halo_sigma": wide} if halo else {})
+
+    def light(self, scene: Any, context: Any) -> None:
+        shot, layout = self._of(context)
+        for factor in (
+            self.effect.light_map(shot, layout),
+            self.effect.turbulence(shot, layout, context.stream(self.word)),
+        ):
+            if factor is not None:
+                scene.scale(factor.astype(np.float32))
+
+    def displaced(self, context: Any) -> Any:
+        moved = self.effect.displacements(*self._of(context))
+        return None if moved is None else tuple(m.astype(np.float32) for m in moved)
+
+    def store(self, charge: Any, context: Any) -> Any:
+        shot, layout = self._of(context)
+        stream = context.stream(self.word)
+        return self.effect.store(charge, shot, layout, stream, context.memory)
+
+    def shift(self, frames: Any, context: Any) -> Any:
+        layout = self._of(context)[1]
+        return [self.effect.shift(f, n, layout) for n, f in enumerate(frames)]
+
+    def amplifier(self, frames: Any, context: Any) -> Any:
+        return self.effect.amplify(frames, *self._of(context))
+
+    def noise(self, frames: Any, context: Any) -> Any:
+        return self.effect.noise(frames, self._of(context)[1], context.stream(self.word))
+
+    def gain(self, context: Any) -> float:
+        return 1.0
+
+    def converter(self, levels: Any, context: Any) -> Any:
+        return [self.effect.convert(level) for level in levels]
+
+    def truth(self) -> dict[str, Any]:
+        return {"class": self.effect.word, "parameters": dict(self.effect.values)}
+
+
+def residuals(
+    fit: BaselineFit, measured: Measured, effects: Sequence[Effect]
+) -> dict[str, NDArray[np.float64]]:
+    """Channels less what is predicted with effects, all else as in a null's fit, by its errors.
+
+    Linear parameters are left out: they are the same with and without effects.
+    """
+    baseline = virtual_baseline()
+    count = len(Predictor(measured, baseline).names)
+    predictor = Predictor(measured, baseline, effects)
+    point = np.concatenate([fit.values[:count], predictor.start[count:]])
+    out: dict[str, list[NDArray]] = {}
+    channels = used_channels(measured.channels, FOLDS)
+    for like, channel in zip(fit.channels, channels, strict=True):
+        if len(like) != len(channel):
+            raise ValueError(f"{like.word}: {len(channel)} values, the null {len(like)}")
+        left = channel.values - predictor.predict(channel, point)
+        out.setdefault(channel.word, []).append(like.whiten(left))
+    return {w: np.concatenate(v) for w, v in out.items()}
+
+
+def compare(
+    effect: Effect, seed: int = 31_000, size: Any = "S", own: Any = None
+) -> dict[str, tuple[float, float, float]]:
+    """Hold an effect's prediction against pixels.
+
+    Parameters
+    ----------
+    effect : Effect
+        Ours.
+    seed, size
+        Of the campaigns.
+    own : optional
+        Effect of the virtual sensor to be on its pixels instead of ours.
+
+    Returns
+    -------
+    dict of str to (float, float, float)
+        By channel, the baseline's parameters taken off: length of the prediction [standard
+        deviations], factor on it that fits the pixels best, and its error from what noise the
+        two campaigns do not share.  Where nothing is predicted: 0, 0 and the length seen.
+    """
+    null, fit = null_campaign(seed, size)
+    source = VirtualSource(seed=seed, size=size, effects=[own or OnPixels(effect)])
+    other = measure_channels(source)
+    before, bare, after = (
+        residuals(fit, m, e) for m, e in ((null, ()), (other, ()), (other, (effect,)))
+    )
+    seen = _without_parameters(fit, {w: bare[w] - before[w] for w in bare})
+    said = _without_parameters(fit, {w: bare[w] - after[w] for w in bare})
+    out = {}
+    for word in seen:
+        p, s = said[word], seen[word]
+        norm = float(np.sqrt(p @ p))
+        factor = float(p @ s) / max(norm, 1e-9) ** 2 if norm > SHADOW else 0.0
+        left = s - factor * p
+        spread = float(np.sqrt(left @ left / max(len(left), 1)))
+        out[word] = (
+            norm,
+            factor,
+            spread / norm if norm > SHADOW else spread * len(left) ** 0.5,
+        )
+    return out
+
+
+SHADOW = 0.1
+"""Length [standard deviations] below which a channel has no part in an effect."""
+
+
+def _without_parameters(
+    fit: BaselineFit, changes: dict[str, NDArray[np.float64]]
+) -> dict[str, NDArray[np.float64]]:
+    """Changes less what the baseline's parameters would take of them, by channel word."""
+    whole = np.zeros(len(fit.basis))
+    for word, change in changes.items():
+        whole[: len(fit.residuals)][fit.of(word)] = change
+    left = whole - fit.basis @ (fit.basis.T @ whole)
+    return {w: left[: len(fit.residuals)][fit.of(w)] for w in changes}
+
+
+_NULLS: dict[Any, tuple[Measured, BaselineFit]] = {}
+
+
+def null_campaign(seed: int, size: Any) -> tuple[Measured, BaselineFit]:
+    """A campaign without effects, and its fit; kept."""
+    key = seed, repr(size)
+    if key not in _NULLS:
+        measured = measure_channels(VirtualSource(seed=seed, size=size))
+        predictor = Predictor(measured, virtual_baseline())
+        _NULLS[key] = (
+            measured,
+            fit_baseline(predictor, used_channels(measured.channels, FOLDS)),
+        )
+    return _NULLS[key]
