@@ -32,7 +32,7 @@ class BiasChannels:
         self._last: Sequence[NDArray[np.float64]] | None = None
         self._sum: list[NDArray[np.float64]] = []
         self._names: list[str] = []
-        self._frames = 0
+        self.frames = 0
         self._spectra: list[list[NDArray[np.float64]]] = []
         self._cross: list[NDArray[np.float64]] = []
         self._rows: list[list[tuple[float, float]]] = []
@@ -60,7 +60,7 @@ class BiasChannels:
             self._names = [f.name for f in frames]
         for total, one in zip(self._sum, levelled, strict=True):
             total += one
-        self._frames += 1
+        self.frames += 1
         if self._last is None:
             self._last = levelled
             return
@@ -80,7 +80,7 @@ class BiasChannels:
     def mean(self) -> dict[str, NDArray[np.float64]]:
         """Mean bias of each amplifier's whole frame, any overscan's level taken off [ADU]."""
         return {
-            name: total / self._frames
+            name: total / self.frames
             for name, total in zip(self._names, self._sum, strict=True)
         }
 

@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from bfsensor.diagnose.bias_channels import BiasChannels, DarkChannels
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.code_channels import CodeChannels, CrosstalkChannels
-from bfsensor.diagnose.conditions import Condition, Exposure, Frame, assign_folds
+from bfsensor.diagnose.conditions import (
+    Condition,
+    Exposure,
+    Frame,
+    assign_folds,
+    is_held_out,
+)
 from bfsensor.diagnose.flat_channels import FlatChannels
 from bfsensor.diagnose.map_channels import MapChannels, MapShare
 from bfsensor.diagnose.pairs import (
@@ -75,7 +81,7 @@ class Measured:
         Where each amplifier lies, and what is read before and after it.
     shots : tuple of Shot
         All exposures in the order of time; levels by the rough gains.
-    maps : mapping of str to tuple of MapShare
+    maps : mapping of (fold, map) to tuple of MapShare
         Of which flats each map is made.
     """
 
@@ -94,7 +100,7 @@ class Measured:
     unlike: tuple[UnlikePair, ...] = ()
     segments: tuple[Segment, ...] = ()
     shots: tuple[Shot, ...] = ()
-    maps: Mapping[str, tuple[MapShare, ...]] = field(default_factory=dict)
+    maps: Mapping[tuple[str, str], tuple[MapShare, ...]] = field(default_factory=dict)
 
 
 def measure_channels(
@@ -114,7 +120,8 @@ def measure_channels(
     Returns
     -------
     Measured
-        Pairs of flats are spread over the folds; everything else is in the fold 'fit'.
+        Pairs of flats are spread over the folds; of other exposures, where there are many, one
+        in five is held out, the others are in the fold 'fit'.
 
     Raises
     ------
@@ -136,9 +143,11 @@ def measure_channels(
             progress(done, len(exposures))
         return frames
 
-    biases = BiasChannels()
-    for exposure in kinds.get("bias", []):
-        biases.add(exposure, read(exposure))
+    biases, late_biases = BiasChannels(), BiasChannels("held-out")
+    for n, exposure in enumerate(kinds.get("bias", [])):
+        # Noise is measured in differences of two frames: they go together.
+        held = is_held_out(n // 2, len(kinds["bias"]) // 2)
+        (late_biases if held else biases).add(exposure, read(exposure))
     bias_images: dict[str, NDArray[np.float64]] = {}
     layout: Sequence[Frame] | None = None
     groups = group_flats(kinds.get("flat", []))
@@ -157,8 +166,8 @@ def measure_channels(
             bias_images[frame.name] = _data_section(frame, means[frame.name])
     noise = biases.read_noise
     flats = FlatChannels(bias_images, noise, lamp_error=source.lamp_error, lags=lags)
-    maps = MapChannels(source.shape)
-    codes = CodeChannels()
+    maps, late_maps = MapChannels(source.shape), MapChannels(source.shape, "held-out")
+    codes, late_codes = CodeChannels(), CodeChannels("held-out")
     gains: list[list[float]] = [[] for _ in layout]
     levels: dict[int, float] = {}
     finder = PairFinder(read, lambda frames: _mean_level(flats, frames))
@@ -182,20 +191,16 @@ def measure_channels(
                 for frame, values in zip(each, images, strict=True):
                     place(image, frame, values / np.nanmean(values))
                 whole.append(image)
-                if fold != "held-out":
-                    codes.add(each)
-            if fold != "held-out":
-                bias_noise = [
-                    noise.get(f.name, 0.0)
-                    / np.sqrt(max(len(kinds.get("bias", [])), 1))
-                    / np.nanmean(i)
-                    for f, i in zip(second_frames, images, strict=True)
-                ]
-                maps.add_pair(
-                    Condition.of(one), one.exposure_time or 0.0, whole[0], whole[1],
-                    level=levels[one.number],
-                    shared=float(np.sqrt(np.mean(np.square(bias_noise)))),
-                )  # fmt: skip
+                (late_codes if fold == "held-out" else codes).add(each)
+            bias_noise = [
+                noise.get(f.name, 0.0) / np.sqrt(max(biases.frames, 1)) / np.nanmean(i)
+                for f, i in zip(second_frames, images, strict=True)
+            ]
+            (late_maps if fold == "held-out" else maps).add_pair(
+                Condition.of(one), one.exposure_time or 0.0, whole[0], whole[1],
+                level=levels[one.number],
+                shared=float(np.sqrt(np.mean(np.square(bias_noise)))),
+            )  # fmt: skip
     unlike = scan_unlike(
         sorted([*finder.single, *(g[0] for g in groups if len(g) == 1)], key=lambda f: f.number),
         lambda flat: [_good(flats, f) for f in read(flat)], lags=lags,
@@ -205,32 +210,48 @@ def measure_channels(
         if channel.word == "flat_cov":
             _rough_gains(channel, gains)
     rough = tuple(float(np.median(g)) if g else 1.0 for g in gains)
-    darks = DarkChannels(bias_images, noise, biases=len(kinds.get("bias", [])))
+    darks, late_darks = (
+        DarkChannels(bias_images, noise, fold, biases=biases.frames)
+        for fold in ("fit", "held-out")
+    )
     before: dict[int, float] = {}
     last = 0.0
     for exposure in exposures:
         before[exposure.number] = last
         last = levels.get(exposure.number, 0.0)
+    seen: dict[float | None, int] = {}
+    times = [e.exposure_time for e in kinds.get("dark", [])]
     for exposure in kinds.get("dark", []):
-        darks.add(exposure, read(exposure), after=before[exposure.number])
+        turn = seen.get(exposure.exposure_time, 0)
+        seen[exposure.exposure_time] = turn + 1
+        # The third of at least four of an exposure time.
+        held = turn == 2 and times.count(exposure.exposure_time) >= 4
+        (late_darks if held else darks).add(
+            exposure, read(exposure), after=before[exposure.number]
+        )
     mean_noise = float(
         np.mean([noise.get(f.name, 0.0) * g for f, g in zip(layout, rough, strict=True)])
     )
     spots = SpotChannels(read_noise=mean_noise, lamp_error=source.lamp_error)
-    crosstalk = CrosstalkChannels()
-    for exposure in kinds.get("spot", []):
+    crosstalk, late_crosstalk = CrosstalkChannels(), CrosstalkChannels("held-out")
+    for n, exposure in enumerate(kinds.get("spot", [])):
+        held = is_held_out(n, len(kinds["spot"]))
         spot_frames = read(exposure)
         images = [flats.clean(f) for f in spot_frames]
-        crosstalk.add(images, [noise.get(f.name, 1.0) for f in spot_frames])
+        (late_crosstalk if held else crosstalk).add(
+            images, [noise.get(f.name, 1.0) for f in spot_frames]
+        )
         image = np.full(source.shape, np.nan)
         for frame, cleaned, gain in zip(spot_frames, images, rough, strict=True):
             place(image, frame, cleaned * gain)
-        reason = spots.add(exposure, image)
+        reason = spots.add(exposure, image, fold="held-out" if held else "fit")
         if reason:
             notes.append(f"spots {exposure.number}: {reason}")
     channels = [
         *flats.channels(), *maps.channels(), *codes.channels(), *biases.channels(),
         *darks.channels(), *spots.channels(), *crosstalk.channels(),
+        *late_maps.channels(), *late_codes.channels(), *late_biases.channels(),
+        *late_darks.channels(), *late_crosstalk.channels(),
     ]  # fmt: skip
     if not channels:
         raise MeasurementError(
@@ -259,7 +280,11 @@ def measure_channels(
         unlike=tuple(unlike),
         segments=tuple(_segment(f) for f in layout),
         shots=_shots(exposures, levels, float(np.mean(rough))),
-        maps=maps.shares(),
+        maps={
+            (each.fold, name): shares
+            for each in (maps, late_maps)
+            for name, shares in each.shares().items()
+        },
     )
 
 

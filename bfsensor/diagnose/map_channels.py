@@ -54,7 +54,7 @@ class MapChannels:
     """
 
     def __init__(self, shape: tuple[int, int], fold: str = "fit") -> None:
-        self._shape, self._fold = shape, fold
+        self._shape, self.fold = shape, fold
         self._groups: dict[tuple, _Group] = {}
         self._conditions: dict[tuple[str, ...], Condition] = {}
 
@@ -130,7 +130,7 @@ class MapChannels:
                 blocks.extend(np.square(e)[:, None, None])
                 axes.add(len(v), where, map=name, **columns)
         return [Channel("flat_map", np.concatenate(values), tuple(blocks), axes.columns(), "",
-                        self._fold)]  # fmt: skip
+                        self.fold)]  # fmt: skip
 
     def _plan(self) -> dict[str, tuple[tuple[str, ...], tuple[float, ...], tuple | None]]:
         """Of each map: condition, exposure times, and the two of what it is divided by."""

@@ -197,7 +197,9 @@ class EffectChain:
         gain = float(np.mean(self.measured.gains or (1.0,)))
         by_time = any(e.by_time for e in self.effects)
         kept: dict[tuple, NDArray[np.complex128] | None] = {}
-        for name, shares in self.measured.maps.items():
+        for (fold, name), shares in self.measured.maps.items():
+            if fold != channel.fold:
+                continue
             delta: NDArray[np.complex128] | None = None
             for share in shares:
                 key = (share.condition.key, share.seconds if by_time else 0.0)

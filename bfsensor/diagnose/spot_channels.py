@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.channels import FOLDS, Channel
 from bfsensor.diagnose.conditions import Axes, Condition, Exposure
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.spot_fit import fit_spots
@@ -26,12 +26,14 @@ pixel of 320 (assumed)."""
 class SpotChannels:
     """Takes images of spots on the sensor in electrons, one by one, and gives their channel."""
 
-    def __init__(self, *, read_noise: float, lamp_error: float, fold: str = "fit") -> None:
-        self._noise, self._lamp_error, self._fold = read_noise, lamp_error, fold
-        self._rows: list[tuple[Exposure, dict[str, tuple[float, float]], NDArray]] = []
+    def __init__(self, *, read_noise: float, lamp_error: float) -> None:
+        self._noise, self._lamp_error = read_noise, lamp_error
+        self._rows: list[tuple[Exposure, dict[str, tuple[float, float]], NDArray, str]] = []
         self.dropped: dict[str, int] = {}
 
-    def add(self, exposure: Exposure, image: NDArray[np.float64]) -> str | None:
+    def add(
+        self, exposure: Exposure, image: NDArray[np.float64], *, fold: str = "fit"
+    ) -> str | None:
         """Measure an exposure; gives why it could not be, or None."""
         background = float(np.nanmedian(image))
         peak = float(np.nanpercentile(image, 99.9)) - background
@@ -70,16 +72,24 @@ class SpotChannels:
         for name, column in values.items():
             out[name] = (float(column.mean()), float(column.std(ddof=1) / np.sqrt(n)))
         phases = np.stack([fit.centre_x[used], fit.centre_y[used]], axis=1)
-        self._rows.append((exposure, out, phases))
+        self._rows.append((exposure, out, phases, fold))
         return None
 
     def channels(self) -> list[Channel]:
         """Widths, fluxes, skewness and wings of each exposure."""
-        if not self._rows:
-            return []
+        return [self._channel(fold) for fold in self._folds]
+
+    @property
+    def _folds(self) -> list[str]:
+        """Folds that there are, what is fitted first."""
+        return [f for f in FOLDS if any(row[3] == f for row in self._rows)]
+
+    def _channel(self, fold: str) -> Channel:
         values, blocks, axes = [], [], Axes()
         repeat = self._flux_scatter()
-        for exposure, found, _ in self._rows:
+        for exposure, found, _, own in self._rows:
+            if own != fold:
+                continue
             lamp = exposure.lamp
             light = (exposure.exposure_time or 0.0) * (1.0 if lamp is None else lamp)
             for what, (value, error) in found.items():
@@ -96,13 +106,13 @@ class SpotChannels:
                 axes.add(1, Condition.of(exposure), what=what, light=light,
                          flux=found["flux"][0], time=exposure.exposure_time or 0.0,
                          exposure=exposure.number)  # fmt: skip
-        return [Channel("spot", np.concatenate(values), tuple(blocks), axes.columns(), "",
-                        self._fold)]  # fmt: skip
+        return Channel("spot", np.concatenate(values), tuple(blocks), axes.columns(), "",
+                       fold)  # fmt: skip
 
     def _flux_scatter(self) -> float | None:
         """Relative scatter of the fluxes of exposures of equal light; None of too few."""
         groups: dict[tuple, list[float]] = {}
-        for exposure, found, _ in self._rows:
+        for exposure, found, *_ in self._rows:
             key = (Condition.of(exposure).key, exposure.exposure_time)
             groups.setdefault(key, []).append(found["flux"][0] / (exposure.lamp or 1.0))
         square, number = 0.0, 0
@@ -114,8 +124,11 @@ class SpotChannels:
 
     @property
     def phases(self) -> list[NDArray[np.float64]]:
-        """Centres of each exposure's spots within their pixels, shape (n, 2) [pixel]."""
-        return [p for *_, p in self._rows]
+        """Centres of each exposure's spots within their pixels, shape (n, 2) [pixel].
+
+        In the order of the channels' exposures.
+        """
+        return [row[2] for fold in self._folds for row in self._rows if row[3] == fold]
 
 
 def _inside(spots: SpotList, shape: tuple[int, int], border: int) -> SpotList:
