@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from functools import partial
 
 import numpy as np
@@ -53,7 +54,7 @@ class Predictor:
     def __init__(
         self, measured: Measured, baseline: Baseline, effects: Sequence[Effect] = ()
     ) -> None:
-        self.measured, self.baseline, self.effects = measured, baseline, tuple(effects)
+        self.measured, self.baseline = measured, baseline
         self.layout = layout_of(measured, baseline)
         self._evened: dict[tuple, NDArray[np.float64]] = {}
         self._lit: dict[int, tuple[Channel, NDArray[np.float64]]] = {}
@@ -100,18 +101,13 @@ class Predictor:
             *(f"noise {a}" for a in range(self._amps)),
             *(f"device {p}" for p in baseline.parameters),
             *(f"sigma_{axis} {wavelength}" for wavelength in self._widths for axis in "xy"),
-            *(f"effect {e.name} {p.name}" for e in self.effects for p in fitted(e)),
         )
-        effect_values = [e[p.name] for e in self.effects for p in fitted(e)]
-        effect_steps = [_effect_step(e, p) for e in self.effects for p in fitted(e)]
         self.start = np.array([
             *measured.gains, *noise, *(0.0 for _ in baseline.parameters), *start_sigma,
-            *effect_values,
         ])  # fmt: skip
         self.steps = np.array([
             *(1e-3 * g for g in measured.gains), *(0.01 * max(n, 0.1) for n in noise),
             *(0.1 for _ in baseline.parameters), *(2e-3 for _ in start_sigma),
-            *effect_steps,
         ])  # fmt: skip
         n, p = 2 * self._amps, len(baseline.parameters)
         self.prior_rows = np.arange(n, n + p)
@@ -137,6 +133,36 @@ class Predictor:
                 self.notes.append(
                     f"baseline has no shifts at {'/'.join(key)}: the nearest condition's are taken"
                 )
+
+        self.effects: tuple[Effect, ...] = ()
+        self._add(effects)
+
+    def with_effects(
+        self, effects: Sequence[Effect], point: NDArray[np.float64] | None = None
+    ) -> Predictor:
+        """Copy with other effects, which shares what does not depend on them.
+
+        Parameters
+        ----------
+        effects : sequence of Effect
+            Instead of those there are.
+        point : ndarray, optional
+            Where fits begin: parameters other than effects'.
+        """
+        other = copy(self)
+        plain = len(self.names) - self._effect_count
+        other.names, other.steps = self.names[:plain], self.steps[:plain]
+        other.start = (self.start if point is None else point)[:plain].copy()
+        other._add(effects)
+        return other
+
+    def _add(self, effects: Sequence[Effect]) -> None:
+        """Append the parameters of effects."""
+        self.effects = tuple(effects)
+        each = [(n, e, p) for n, e in enumerate(self.effects) for p in fitted(e)]
+        self.names = (*self.names, *(f"effect {n} {e.name} {p.name}" for n, e, p in each))
+        self.start = np.append(self.start, [e[p.name] for _, e, p in each])
+        self.steps = np.append(self.steps, [_effect_step(e, p) for _, e, p in each])
 
     def predict(
         self,
