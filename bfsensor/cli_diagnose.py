@@ -30,6 +30,10 @@ from bfsensor.cli_common import Bar
     "--seed", default=1, show_default=True, help="Of the draws that p-values come from."
 )
 @click.option(
+    "--explain/--locate-only", default=True,
+    help="Look for the effects that explain a mismatch, or only for where it is.",
+)  # fmt: skip
+@click.option(
     "--json", "as_json", is_flag=True, help="Print report.json instead of a summary."
 )
 def diagnose(
@@ -38,6 +42,7 @@ def diagnose(
     floating: tuple[str, ...],
     output: Path | None,
     seed: int,
+    explain: bool,
     as_json: bool,
 ) -> None:
     """Hold the recordings of CAMPAIGN against a baseline; say what is left, and where.
@@ -85,11 +90,11 @@ def diagnose(
         assert reduced is not None
         measured = measure_reduced(reduced, reach=predicted.reach)
         result = diagnosis.diagnose_measured(
-            measured, predicted, campaign=reduced.path.stem, seed=seed
+            measured, predicted, campaign=reduced.path.stem, seed=seed, explain=explain
         )
     else:
         result = diagnosis.diagnose(
-            CampaignSource(found), predicted, campaign=found.name, seed=seed,
+            CampaignSource(found), predicted, campaign=found.name, seed=seed, explain=explain,
             progress=Bar("pixels"),
             notes=[f"{c.topic}: {c.message}" for c in found.warnings]
             + [f"set aside: {s.path.name}: {s.reason}" for s in found.set_aside],

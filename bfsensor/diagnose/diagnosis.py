@@ -10,6 +10,8 @@ import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
 import bfsensor
+from bfsensor.diagnose.attribute import Attribution, attribute
+from bfsensor.diagnose.attribution_words import reported, said_of
 from bfsensor.diagnose.baseline import Baseline
 from bfsensor.diagnose.channels import PER_ELECTRON
 from bfsensor.diagnose.extract import Measured, Source, measure_channels
@@ -53,6 +55,8 @@ class Diagnosis:
         What was set aside, warned of or assumed.
     read : int
         How many of them, the first, are of the reading.
+    attribution : Attribution, optional
+        What explains it; None where nothing stands out.
     """
 
     campaign: str
@@ -63,6 +67,7 @@ class Diagnosis:
     heldout: float
     notes: tuple[str, ...] = ()
     read: int = 0
+    attribution: Attribution | None = None
 
     @property
     def gain(self) -> float:
@@ -119,6 +124,20 @@ class Diagnosis:
             out["exposures"] = [int(v) for v in best["exposure"].where["exposure"]]
         return out
 
+    def _heldout(self) -> dict[str, Any]:
+        """Chi-square over number of what was not fitted, before and after, by channel too."""
+        out: dict[str, Any] = {
+            "chi2dof_before": _finite(self.heldout), "chi2dof_after": None, "channels": {},
+        }  # fmt: skip
+        if self.attribution is not None and self.attribution.found:
+            out["chi2dof_after"] = _finite(self.attribution.chi2dof()[1])
+        if self.attribution is not None:
+            out["channels"] = {
+                word: {"before": b / n, "after": a / n, "values": n}
+                for word, (b, a, n) in self.attribution.heldout.items()
+            }
+        return out
+
     def _all_flux(self, words: list[str]) -> list[float]:
         """Lowest and highest flux [e-] of the first of channels that has any."""
         for word in words:
@@ -150,6 +169,8 @@ class Diagnosis:
             ]  # fmt: skip
             if others:
                 parts.append(f"It is also seen in: {', '.join(others)}.")
+            if self.attribution is not None:
+                parts += said_of(self.attribution)
         far = {k: v for k, v in self.fit.pulls.items() if abs(v) > 3}
         if far:
             text = ", ".join(f"{k} {v:+.1f}" for k, v in far.items())
@@ -185,13 +206,10 @@ class Diagnosis:
             "p_chi2": self.mismatch.p_chi2,
             "p_scans": self.mismatch.p_scans,
             "alarm": ALARM,
-            "effects": [],
-            "class_probability": {},
-            "equivalence_class": [],
-            "open_world": False,
+            **reported(self.attribution),
             "location": self.location(),
             "recommended_recordings": [],
-            "heldout": {"chi2dof_before": _finite(self.heldout), "chi2dof_after": None},
+            "heldout": self._heldout(),
             "channels": {
                 word: {"chi2": s, "dof": d, "p_value": float(chi2_distribution.sf(s, d))}
                 for word, (s, d) in self.mismatch.chi2.items()
@@ -225,6 +243,7 @@ def diagnose(
     seed: int = 1,
     notes: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
+    explain: bool = True,
 ) -> Diagnosis:
     """Hold a campaign's recordings against a baseline.
 
@@ -242,9 +261,13 @@ def diagnose(
         What reading had to say, for the report.
     progress : callable, optional
         Called with (exposures done, exposures in all).
+    explain : bool
+        Look for what explains a mismatch, beyond where it is.
     """
     measured = measure_channels(source, progress=progress)
-    return diagnose_measured(measured, baseline, campaign=campaign, seed=seed, notes=notes)
+    return diagnose_measured(
+        measured, baseline, campaign=campaign, seed=seed, notes=notes, explain=explain
+    )
 
 
 def diagnose_measured(
@@ -254,19 +277,26 @@ def diagnose_measured(
     campaign: str = "",
     seed: int = 1,
     notes: Sequence[str] = (),
+    explain: bool = True,
 ) -> Diagnosis:
     """Hold channels that are measured already against a baseline; see :func:`diagnose`."""
     predictor, fit = fit_bounded(measured, baseline)
     more = _of_free(measured, baseline, fit)
+    mismatch = locate_mismatch(fit, seed=seed)
+    attribution = None
+    if mismatch.detected and explain:
+        attribution = attribute(predictor, fit, mismatch, seed=seed)
+        more += attribution.notes
     return Diagnosis(
         campaign=campaign,
         baseline=baseline.name,
         measured=measured,
         fit=fit,
-        mismatch=locate_mismatch(fit, seed=seed),
+        mismatch=mismatch,
         heldout=held_out(predictor, fit, measured),
         notes=(*notes, *measured.notes, *fit.notes, *more),
         read=len(notes),
+        attribution=attribution,
     )
 
 
