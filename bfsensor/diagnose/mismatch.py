@@ -136,6 +136,8 @@ def fit_baseline(
     columns = {k: v for k, v in columns.items() if np.abs(v).max() > 0}
     linear = np.array(list(columns.values())).T.reshape(total, len(columns))
     scales = np.sqrt((linear**2).sum(0))
+    span = np.linalg.svd(linear / scales, full_matrices=False)
+    span_linear = span[0][:, span[1] > 1e-10 * span[1].max(initial=0.0)]
     count, priors = len(predictor.names), len(predictor.prior_rows)
     point = predictor.start.astype(float).copy()
     low, high = predictor.bounds()
@@ -153,9 +155,10 @@ def fit_baseline(
             c.whiten(c.values - p) for c, p in zip(channels, predicted, strict=True)
         ])  # fmt: skip
         if effect.any():
-            square = float(residuals @ residuals) + float(
-                point[predictor.prior_rows] @ point[predictor.prior_rows]
-            )
+            # Of what is left with the linear parameters at their best.
+            given = span_linear.T @ residuals
+            square = float(residuals @ residuals) - float(given @ given)
+            square += float(point[predictor.prior_rows] @ point[predictor.prior_rows])
             # Effects bend: a step that does harm is taken back by half, at last altogether.
             if square > least + 0.01 and halved < HALVINGS:
                 halved += 1
