@@ -211,7 +211,8 @@ def attribute(
     rankings: dict[int, list[Rival]] = {}
     while mismatch.detected and len(model.effects) < MOST:
         screen = Screen(model.predictor, model.fit, _seen(mismatch))
-        ranking = rank(screen, kinds)
+        there = {e.name for e in model.effects}
+        ranking = rank(screen, [k for k in kinds if name_of(k) not in there])
         critical = threshold(screen, ranking, seed=seed)
         good = [r for r in ranking if r.gain > critical and not r.select < 0]
         if not good:
@@ -239,6 +240,11 @@ def attribute(
         heldout=compare_held_out(Model(predictor, fit), model),
         notes=tuple(notes),
     )
+
+
+def name_of(kind: type[Effect]) -> str:
+    """Class, and variant where there are several."""
+    return f"{kind.word}:{kind.variant}" if kind.variant else kind.word
 
 
 def rank(screen: Screen, kinds: Sequence[type[Effect]]) -> list[Rival]:
@@ -311,7 +317,10 @@ def _judge(
                 model, places, swapped = without, {}, True
                 break
             screen = Screen(without.predictor, without.fit, _seen(mismatch))
-            ranking = refine(without, rank(screen, kinds))
+            there = {e.name for e in others}
+            ranking = refine(
+                without, rank(screen, [k for k in kinds if name_of(k) not in there])
+            )
             places[n] = ranking
             here = next(
                 (r for r in ranking if r.effect.name == model.effects[n].name), None
@@ -372,6 +381,8 @@ def compare_held_out(before: Model, after: Model) -> dict[str, tuple[float, floa
     out: dict[str, tuple[float, float, int]] = {}
     channels = used_channels(before.predictor.measured.channels, ("held-out",))
     for channel in channels:
+        if not len(channel):
+            continue
         squares = []
         for model in (before, after):
             left = _left(model, channel)
