@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -13,6 +14,7 @@ from bfsensor.diagnose.baseline import Baseline
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
+from bfsensor.diagnose.map_channels import MapShare
 from bfsensor.diagnose.predict_effects import ADDED, EffectChain, layout_of, pad_areas
 from bfsensor.diagnose.predict_flats import (
     flat_covariances_of,
@@ -21,6 +23,7 @@ from bfsensor.diagnose.predict_flats import (
 )
 from bfsensor.diagnose.predict_spots import predict_spots
 from bfsensor.effects.effect import Effect, Parameter
+from bfsensor.errors import DiagnosisError
 
 MAP_ORDER = 4
 """Order of the polynomial in x and y that the light on the sensor may have."""
@@ -154,6 +157,46 @@ class Predictor:
         other.names, other.steps = self.names[:plain], self.steps[:plain]
         other.start = (self.start if point is None else point)[:plain].copy()
         other._add(effects)
+        return other
+
+    def with_exposures(
+        self,
+        spots: Iterable[Condition] = (),
+        maps: Mapping[tuple[str, str], tuple[MapShare, ...]] | None = None,
+    ) -> Predictor:
+        """Copy that predicts spots at further conditions, and further maps, as well.
+
+        Spots fall on their pixels as those of the same wavelength do.
+
+        Parameters
+        ----------
+        spots : iterable of Condition
+            Conditions that the campaign may lack.
+        maps : mapping of (fold, map) to tuple of MapShare, optional
+            Of which flats each is made.
+
+        Raises
+        ------
+        DiagnosisError
+            The campaign has no spots of that wavelength: nothing tells their width.
+        """
+        other = copy(self)
+        other._spot_of, other._phases = dict(self._spot_of), dict(self._phases)
+        other._spot_conditions = list(self._spot_conditions)
+        for condition in spots:
+            key = condition.key
+            if key in other._spot_of:
+                continue
+            like = next((k for k in self._spot_conditions if k[0] == key[0]), None)
+            if like is None:
+                raise DiagnosisError(
+                    f"spots at wavelength={key[0]}: their width without charge is known at "
+                    f"{', '.join(self._widths) or 'no wavelength'} only"
+                )
+            other._spot_of[key], other._phases[key] = condition, self._phases[like]
+            other._spot_conditions.append(key)
+        if maps:
+            other.measured = replace(self.measured, maps={**self.measured.maps, **maps})
         return other
 
     def _add(self, effects: Sequence[Effect]) -> None:
