@@ -77,6 +77,8 @@ class Measured:
         All exposures in the order of time; levels by the rough gains.
     maps : mapping of str to tuple of MapShare
         Of which flats each map is made.
+    neighbours : (float, float)
+        Distance of the next spots in x and y [pixel], and how many of those places hold one.
     """
 
     channels: tuple[Channel, ...]
@@ -95,6 +97,7 @@ class Measured:
     segments: tuple[Segment, ...] = ()
     shots: tuple[Shot, ...] = ()
     maps: Mapping[str, tuple[MapShare, ...]] = field(default_factory=dict)
+    neighbours: tuple[float, float] = (np.inf, 0.0)
 
 
 def measure_channels(
@@ -260,6 +263,7 @@ def measure_channels(
         segments=tuple(_segment(f) for f in layout),
         shots=_shots(exposures, levels, float(np.mean(rough))),
         maps=maps.shares(),
+        neighbours=spots.neighbours,
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Axes, Condition, Exposure
@@ -30,6 +31,7 @@ class SpotChannels:
         self._noise, self._lamp_error, self._fold = read_noise, lamp_error, fold
         self._rows: list[tuple[Exposure, dict[str, tuple[float, float]], NDArray]] = []
         self.dropped: dict[str, int] = {}
+        self._grids: list[tuple[float, float]] = []
 
     def add(self, exposure: Exposure, image: NDArray[np.float64]) -> str | None:
         """Measure an exposure; gives why it could not be, or None."""
@@ -71,6 +73,7 @@ class SpotChannels:
             out[name] = (float(column.mean()), float(column.std(ddof=1) / np.sqrt(n)))
         phases = np.stack([fit.centre_x[used], fit.centre_y[used]], axis=1)
         self._rows.append((exposure, out, phases))
+        self._grids.append(_grid(inside))
         return None
 
     def channels(self) -> list[Channel]:
@@ -117,6 +120,24 @@ class SpotChannels:
         """Centres of each exposure's spots within their pixels, shape (n, 2) [pixel]."""
         return [p for *_, p in self._rows]
 
+    @property
+    def neighbours(self) -> tuple[float, float]:
+        """Distance of the next spots [pixel], and how many of the four places hold one."""
+        if not self._grids:
+            return np.inf, 0.0
+        pitch, share = np.median(self._grids, axis=0)
+        return float(pitch), float(share)
+
+
+def _grid(spots: SpotList) -> tuple[float, float]:
+    """Pitch of a square grid of spots [pixel], and share of a spot's four neighbours there are."""
+    dx, dy = (np.abs(v[:, None] - v) for v in (spots.x, spots.y))
+    away = np.hypot(dx, dy)
+    np.fill_diagonal(away, np.inf)
+    pitch = float(np.median(away.min(0)))
+    beside = (np.abs(away - pitch) < 0.1 * pitch) & (np.minimum(dx, dy) < 0.1 * pitch)
+    return pitch, float(beside.sum(0).mean() / 4)
+
 
 def _inside(spots: SpotList, shape: tuple[int, int], border: int) -> SpotList:
     """Spots whose wide stamps lie inside."""
@@ -132,11 +153,15 @@ def stamp_moments(
     wide: NDArray[np.float64],
     x: NDArray[np.float64],
     y: NDArray[np.float64],
+    *,
+    noise: float | None = None,
 ) -> dict[str, NDArray[np.float64]]:
     """Flux, skewness along x and y, and the share of the flux in the wings, spot by spot.
 
     Skewness: the third power of the distance from the fitted centre, with a Gaussian weight of
-    2 pixels, over the flux.  Wings: what lies in the wide stamp outside the fitted one.
+    2 pixels, over the flux.  Wings: what lies in the wide stamp outside the fitted one.  The
+    background is the median of the wide stamp's rim; of images that are means, that which the
+    rim would have with Poisson's noise and a read ``noise`` [e-].
     """
     size = stamps.shape[-1]
     step = np.arange(size) - size // 2
@@ -148,6 +173,8 @@ def stamp_moments(
         axis=1,
     )
     background = np.median(rim, axis=1)[:, None, None]
+    if noise is not None:
+        background = _median_with_noise(rim, background[..., 0], noise)[..., None]
     signal = stamps - background
     dx, dy = step[None] - x[:, None], step[None] - y[:, None]
     weight = np.exp(-(dx[:, None] ** 2 + dy[..., None] ** 2) / 8.0)
@@ -159,3 +186,17 @@ def stamp_moments(
         "flux": total,
         "wings": 1.0 - signal.sum((1, 2)) / total,
     }
+
+
+def _median_with_noise(
+    rim: NDArray[np.float64], start: NDArray[np.float64], noise: float
+) -> NDArray[np.float64]:
+    """Median that uneven pixels have once noise has blurred their distribution, shape (n, 1)."""
+    width = np.sqrt(np.maximum(rim, 0.0) + max(noise, 1.0) ** 2)
+    middle = start
+    for _ in range(4):
+        t = (middle - rim) / width
+        slope = (np.exp(-0.5 * t * t) / (np.sqrt(2 * np.pi) * width)).mean(1, keepdims=True)
+        step = (0.5 - ndtr(t).mean(1, keepdims=True)) / np.maximum(slope, 1e-300)
+        middle = middle + np.clip(step, -width.min(), width.min())
+    return np.asarray(middle)
