@@ -57,21 +57,43 @@ def change_parameter(device: Device, key: str, by: float) -> Device:
     DiagnosisError
         No such quantity.
     """
-    found = re.fullmatch(r"(\w+)(?:\.implant\[(\d+)\])?\.(\w+)", key)
-    section = getattr(device, found[1], None) if found else None
-    if found is None or section is None:
-        raise DiagnosisError(f"no quantity {key!r} in the device {device.name}")
-    name = found[3]
-    if found[2] is None:
+    part, index, name = _place(device, key)
+    section = getattr(device, part)
+    if index is None:
         changed = dataclasses.replace(section, **{name: getattr(section, name) + by})
     else:
         implants = list(section.implants)
-        n = int(found[2])
-        implants[n] = dataclasses.replace(
-            implants[n], **{name: getattr(implants[n], name) + by}
+        implants[index] = dataclasses.replace(
+            implants[index], **{name: getattr(implants[index], name) + by}
         )
         changed = dataclasses.replace(section, implants=tuple(implants))
-    return dataclasses.replace(device, **{found[1]: changed})
+    return dataclasses.replace(device, **{part: changed})
+
+
+def parameter_value(device: Device, key: str) -> float:
+    """Give one quantity, also of an implant [internal units].
+
+    Raises
+    ------
+    DiagnosisError
+        No such quantity.
+
+    Examples
+    --------
+    >>> parameter_value(Device.load("itl_sta3800c"), "silicon.thickness")
+    100.0
+    """
+    part, index, name = _place(device, key)
+    section = getattr(device, part)
+    return float(getattr(section if index is None else section.implants[index], name))
+
+
+def _place(device: Device, key: str) -> tuple[str, int | None, str]:
+    """Section, number of the implant if it is of one, and name of a quantity."""
+    found = re.fullmatch(r"(\w+)(?:\.implant\[(\d+)\])?\.(\w+)", key)
+    if found is None or getattr(device, found[1], None) is None:
+        raise DiagnosisError(f"no quantity {key!r} in the device {device.name}")
+    return found[1], None if found[2] is None else int(found[2]), found[3]
 
 
 def baseline_of_device(
@@ -161,8 +183,9 @@ def baseline_of_device(
             (up[1] - down[1]) / (2 * step),
         )
     return Baseline(
-        device.name, edges, derivatives, {n: known[n] for n in chosen}, (620.0, own)
-    )
+        device.name, edges, derivatives, {n: known[n] for n in chosen}, (620.0, own),
+        nominal={n: parameter_value(device, n) for n in chosen},
+    )  # fmt: skip
 
 
 def write_edges(baseline: Baseline, path: str | os.PathLike[str]) -> None:

@@ -83,6 +83,8 @@ class Measured:
         All exposures in the order of time; levels by the rough gains.
     maps : mapping of (fold, map) to tuple of MapShare
         Of which flats each map is made.
+    neighbours : (float, float)
+        Distance of the next spots in x and y [pixel], and how many of those places hold one.
     """
 
     channels: tuple[Channel, ...]
@@ -101,6 +103,7 @@ class Measured:
     segments: tuple[Segment, ...] = ()
     shots: tuple[Shot, ...] = ()
     maps: Mapping[tuple[str, str], tuple[MapShare, ...]] = field(default_factory=dict)
+    neighbours: tuple[float, float] = (np.inf, 0.0)
 
 
 def measure_channels(
@@ -285,6 +288,7 @@ def measure_channels(
             for each in (maps, late_maps)
             for name, shares in each.shares().items()
         },
+        neighbours=spots.neighbours,
     )
 
 

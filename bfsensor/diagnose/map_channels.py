@@ -21,6 +21,9 @@ RINGS = 24
 ORDER = 4
 """Order of the smooth shape of the light in x and in y that rings are freed of."""
 
+FULL = 0.5
+"""Part of the light's noise below which a flat's wells are full."""
+
 LOW = 8
 """Side of the boxes [pixel] that tell noise over many pixels."""
 
@@ -135,8 +138,10 @@ class MapChannels:
     def _plan(self) -> dict[str, tuple[tuple[str, ...], tuple[float, ...], tuple | None]]:
         """Of each map: condition, exposure times, and the two of what it is divided by."""
         times: dict[tuple[str, ...], list[float]] = {}
+        full = self._full()
         for key, time in self._groups:
-            times.setdefault(key, []).append(time)
+            if (key, time) not in full:
+                times.setdefault(key, []).append(time)
         common = max(times, key=lambda k: sum(self._groups[k, t].pairs for t in times[k]))
         ordered = tuple(sorted(times[common]))
         out: dict[str, tuple[tuple[str, ...], tuple[float, ...], tuple | None]] = {
@@ -150,6 +155,17 @@ class MapChannels:
             if other != common:
                 out["/".join(other)] = (other, tuple(members), (common, ordered))
         return out
+
+    def _full(self) -> set[tuple]:
+        """Groups of flats at the full well: without their light's noise, without its pattern.
+
+        Noise over many pixels is Poisson's whatever charges do to one another: relative
+        variance times level is one number, larger only where read noise adds to it.
+        """
+        white = {k: g.low * g.level / g.pairs**2 for k, g in self._groups.items()}
+        usual = float(np.median(list(white.values())))
+        found = {k for k, value in white.items() if value < FULL * usual}
+        return found if len(found) < len(white) else set()
 
     def shares(self) -> dict[str, tuple[MapShare, ...]]:
         """Of which flats each map is made."""

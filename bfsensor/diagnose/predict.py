@@ -19,7 +19,7 @@ from bfsensor.diagnose.predict_flats import (
     periodic_covariances,
     quadrant,
 )
-from bfsensor.diagnose.predict_spots import predict_spots
+from bfsensor.diagnose.predict_spots import predict_spots, representative_phases
 from bfsensor.effects.effect import Effect, Parameter
 
 MAP_ORDER = 4
@@ -28,9 +28,6 @@ MAP_ORDER = 4
 REDUCED_LEVEL = 40_000.0
 """Background [e-] at which a_ij without a level are predicted: halfway to a flat of 80,000 e-, at
 which published covariances are quoted."""
-
-PHASES = 12
-"""Spots whose positions stand for those of an exposure."""
 
 
 class Predictor:
@@ -88,13 +85,7 @@ class Predictor:
                     self._phases[condition.key] = np.concatenate(
                         [self._phases[condition.key], phases]
                     )
-        for key, phases in self._phases.items():
-            order = (
-                np.linspace(0, len(phases) - 1, min(PHASES, len(phases)))
-                .round()
-                .astype(int)
-            )
-            self._phases[key] = phases[order]
+        self._phases = {k: representative_phases(p) for k, p in self._phases.items()}
         noise = [0.0 if not np.isfinite(n) else n**2 for n in measured.read_noise]
         self.names = (
             *(f"gain {a}" for a in range(self._amps)),
@@ -391,6 +382,7 @@ class Predictor:
         x = channel.axes
         # Images were put on the scale of electrons with rough gains.
         scale = float(np.mean(gains / np.array(self.measured.gains)))
+        noise = float(np.nan_to_num(np.mean(gains * np.array(self.measured.read_noise))))
         out = np.zeros(len(channel))
         for key in self._spot_conditions:
             rows = self._rows(channel).get(key, np.zeros(0, int))
@@ -411,6 +403,7 @@ class Predictor:
                 found = predict_spots(
                     *chain.edges(edges, self._spot_of[key]), sigma=(wide[0], wide[1]),
                     phases=self._phases[key], fluxes=fluxes, halo=halo, law=chain.law,
+                    neighbours=self.measured.neighbours, read_noise=noise,
                     change=partial(chain.spot_image, axes=axes),
                 )  # fmt: skip
                 found["flux"] = found["flux"] / scale
@@ -491,7 +484,7 @@ class Predictor:
         x = channel.axes
         out = {}
         for key, rows in self._rows(channel).items():
-            for what in ("flux", "skew_x", "skew_y", "wings"):
+            for what in ("flux", "skew_x", "skew_y"):
                 here = rows[x["what"][rows] == what]
                 column = np.zeros(len(channel))
                 column[here] = x["light"][here] if what == "flux" else 1.0
