@@ -263,7 +263,7 @@ class MapChannels:
                     {"what": what, "k": -1.0, **at},
                 )
             )
-        side = int(np.ceil(max(ny, nx) / BLOCKS))
+        side = block_side(self._shape)
         rows, columns = ny // side, nx // side
         count = _blocks(good, side).sum((1, 3))
         mean = _blocks(filled, side).sum((1, 3), dtype=np.float64) / np.maximum(count, 1)
@@ -345,6 +345,11 @@ class _Map:
             (self.values - other.values) / (1 + other.values), self.low + other.low,
             self.power + other.power, self.ratio, min(self.pairs, other.pairs),
         )  # fmt: skip
+
+
+def block_side(shape: tuple[int, int]) -> int:
+    """Side of the blocks of a map [pixel]."""
+    return int(np.ceil(max(shape) / BLOCKS))
 
 
 def _weights(groups: list[_Group]) -> NDArray[np.float64]:

@@ -13,6 +13,7 @@ from bfsensor.diagnose.baseline import Baseline
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
+from bfsensor.diagnose.map_channels import block_side
 from bfsensor.diagnose.predict_effects import ADDED, EffectChain, layout_of, pad_areas
 from bfsensor.diagnose.predict_flats import (
     flat_covariances_of,
@@ -469,22 +470,33 @@ class Predictor:
                     out[f"map {name} rings k{power}"] = np.where(ring, x["k"] ** power, 0.0)
             if name == "all" and ring.any():
                 out["map rings white"] = np.where(ring, 1.0, 0.0)
-            for amp, (flip, origin) in enumerate(
-                zip(self.measured.flips, self.measured.origins, strict=True)
-            ):
-                del flip
-                if amp == 0:
-                    continue
-                # Amplifiers were divided by their means: steps between them are free.
-                side = here & (x["what"] != "ring") & (x["what"] != "row")
-                beyond = (
-                    side & (x["x"] >= origin[0]) if origin[0] > 0 else np.zeros_like(side)
-                )
-                if beyond.any():
-                    for what in ("column", "block"):
-                        out[f"map {name} {what} amp {amp}"] = np.where(
-                            beyond & (x["what"] == what), 1.0, 0.0
-                        )
+            for step, column in self._amplifier_steps(channel, here).items():
+                out[f"map {name} {step}"] = column
+        return out
+
+    def _amplifier_steps(
+        self, channel: Channel, here: NDArray[np.bool_]
+    ) -> dict[str, NDArray[np.float64]]:
+        """Steps between amplifiers, which were divided by their means: free, along x and y."""
+        x, out = channel.axes, {}
+        for what, axis, n in (("column", "x", 0), ("row", "y", 1)):
+            rows = here & (x["what"] == what)
+            for start in sorted({o[n] for o in self.measured.origins} - {0}):
+                beyond = rows & (x[axis] >= start)
+                if beyond.any() and not beyond[rows].all():
+                    out[f"{what} from {start}"] = np.where(beyond, 1.0, 0.0)
+        rows = here & (x["what"] == "block")
+        # Blocks may lie on several amplifiers.
+        half = 0.5 * block_side(self.measured.shape)
+        shares = [
+            np.where(rows, _overlap(x["x"], half, s.x, s.columns), 0.0)
+            * _overlap(x["y"], half, s.y, s.rows)
+            for s in self.measured.segments
+        ]
+        covered = np.maximum(np.sum(shares, axis=0), 1e-9)
+        for amp, share in enumerate(shares[1:], 1):
+            if share.any():
+                out[f"block amp {amp}"] = share / covered
         return out
 
     def _spot_columns(self, channel: Channel) -> dict[str, NDArray[np.float64]]:
@@ -497,6 +509,14 @@ class Predictor:
                 column[here] = x["light"][here] if what == "flux" else 1.0
                 out[f"spot {what} {'/'.join(key)}"] = column
         return out
+
+
+def _overlap(
+    centre: NDArray[np.float64], half: float, start: int, count: int
+) -> NDArray[np.float64]:
+    """Pixels of intervals about centres that lie in another interval."""
+    low, high = centre + 0.5 - half, centre + 0.5 + half
+    return np.maximum(np.minimum(high, start + count) - np.maximum(low, start), 0.0)
 
 
 def fitted(effect: Effect) -> list[Parameter]:
