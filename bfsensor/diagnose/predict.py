@@ -39,7 +39,7 @@ class Predictor:
 
     Non-linear parameters: gain of each amplifier [e-/ADU], variance of its read noise [ADU^2],
     the device's parameters in units of their spread, widths of the spots without charge for
-    each wavelength.  Linear ones, as columns of :meth:`linear`: light by amplifier and
+    each wavelength and temperature.  Linear ones, as columns of :meth:`linear`: light by amplifier and
     condition, dark current, shape of the light, levels of bias and noise, flux of the spots.
 
     Parameters
@@ -63,7 +63,8 @@ class Predictor:
         self._kept: dict[int, tuple[Channel, dict[tuple[str, ...], NDArray[np.int64]]]] = {}
         self._spot_conditions: list[tuple[str, ...]] = []
         self._spot_of: dict[tuple[str, ...], Condition] = {}
-        # Optics know of the wavelength, not of voltages or the silicon's temperature.
+        # Optics know of the wavelength, diffusion of the silicon's temperature, of which cards do
+        # not speak; what goes with voltages at one temperature is left to be found.
         self._widths: list[str] = []
         self._phases: dict[tuple[str, ...], NDArray[np.float64]] = {}
         self.notes: list[str] = []
@@ -80,8 +81,8 @@ class Predictor:
                 if condition.key not in self._spot_of:
                     self._spot_conditions.append(condition.key)
                     self._spot_of[condition.key] = condition
-                    if condition.key[0] not in self._widths:
-                        self._widths.append(condition.key[0])
+                    if _width_of(condition.key) not in self._widths:
+                        self._widths.append(_width_of(condition.key))
                         both = channel.values[row], channel.values[row + 1]
                         start_sigma += [float(v) for v in both]
                     self._phases[condition.key] = phases
@@ -101,7 +102,7 @@ class Predictor:
             *(f"gain {a}" for a in range(self._amps)),
             *(f"noise {a}" for a in range(self._amps)),
             *(f"device {p}" for p in baseline.parameters),
-            *(f"sigma_{axis} {wavelength}" for wavelength in self._widths for axis in "xy"),
+            *(f"sigma_{axis} {width}" for width in self._widths for axis in "xy"),
         )
         self.start = np.array([
             *measured.gains, *noise, *(0.0 for _ in baseline.parameters), *start_sigma,
@@ -181,7 +182,7 @@ class Predictor:
         parameters : ndarray
             In the order of ``names``.
         only : str, optional
-            Predict spots of this wavelength alone.
+            Predict spots of this wavelength and temperature alone, such as '620/173.15'.
         """
         a = self._amps
         chain = self.chain(parameters)
@@ -309,13 +310,13 @@ class Predictor:
         step = parameters.copy()
         step[n] += self.steps[n]
         if channel.word == "spot" and self.names[n].startswith("sigma"):
-            # Of one wavelength's width the others know nothing.
+            # Of one width the spots of others know nothing.
             first = self.names.index(next(m for m in self.names if m.startswith("sigma")))
             only = self._widths[(n - first) // 2]
             moved = self.predict(channel, step, only=only)
             out = np.zeros(len(channel))
             for key, rows in self._rows(channel).items():
-                if key[0] == only:
+                if _width_of(key) == only:
                     out[rows] = (moved[rows] - here[rows]) / self.steps[n]
             return out
         return (self.predict(channel, step) - here) / self.steps[n]
@@ -395,9 +396,9 @@ class Predictor:
         out = np.zeros(len(channel))
         for key in self._spot_conditions:
             rows = self._rows(channel).get(key, np.zeros(0, int))
-            if not len(rows) or (only is not None and key[0] != only):
+            if not len(rows) or (only is not None and _width_of(key) != only):
                 continue
-            n = self._widths.index(key[0])
+            n = self._widths.index(_width_of(key))
             edges, _ = self.baseline.at(self._spot_of[key], device)
             sigma = float(sigmas[2 * n]), float(sigmas[2 * n + 1])
             fluxes = scale * x["flux"][rows]
@@ -509,6 +510,11 @@ class Predictor:
                 column[here] = x["light"][here] if what == "flux" else 1.0
                 out[f"spot {what} {'/'.join(key)}"] = column
         return out
+
+
+def _width_of(key: tuple[str, ...]) -> str:
+    """Wavelength and temperature of a condition: what spots have one width at."""
+    return f"{key[0]}/{key[2]}"
 
 
 def _overlap(
