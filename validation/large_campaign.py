@@ -7,6 +7,7 @@ effect.  Exposures are the same bit for bit whenever they are made.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -63,6 +64,12 @@ class LargeCampaign:
         self._response *= 1 + 0.01 * x[None] - 0.005 * y[:, None] + 0.004 * (x**2)[None]
         self.layouts = [_layout(n) for n in range(2 * COLUMNS)]
         self.exposures = _plan(exposures)
+
+    def write_baseline(self, path: Path) -> None:
+        """Write edge displacements as they are here: none."""
+        nothing = np.zeros((11, 11)).tolist()
+        edges = {f"{w:g}_{b:g}": {"kx": nothing, "ky": nothing} for w, b in CONDITIONS}
+        path.write_text(json.dumps({"conditions": edges}))
 
     def read(self, exposure: Exposure) -> Sequence[AmplifierFrame]:
         """Make the frames of an exposure."""
