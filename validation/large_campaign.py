@@ -28,8 +28,8 @@ GAIN, READ_NOISE, BIAS = 1.5, 6.0, 1000.0
 """[e-/ADU], [e-], [ADU]."""
 
 SECONDS = (1.0, 2.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0)
-RATE, SPOT_RATE, DARK = 1500.0, 15_000.0, 0.02
-"""Electrons a second in a pixel of a flat, in a spot, and in the dark."""
+RATE, SPOT_RATE, DARK = 1500.0, 11_000.0, 0.02
+"""Electrons a second in a pixel of a flat, in a spot, and in the dark: nothing saturates."""
 
 CONDITIONS = ((620.0, -60.0), (870.0, -60.0), (620.0, -50.0))
 """Wavelength [nm] and back bias [V]; the first is that of most exposures."""
