@@ -29,8 +29,8 @@ class BiasChannels:
 
     def __init__(self, fold: str = "fit") -> None:
         self._fold = fold
-        self._last: Sequence[NDArray[np.float64]] | None = None
-        self._sum: list[NDArray[np.float64]] = []
+        self._last: list[tuple[NDArray[np.float32], float]] = []
+        self._sum: dict[str, NDArray[np.float64]] = {}
         self._names: list[str] = []
         self.frames = 0
         self._spectra: list[list[NDArray[np.float64]]] = []
@@ -43,46 +43,50 @@ class BiasChannels:
     def add(self, exposure: Exposure, frames: Sequence[Frame]) -> None:
         """Add a bias frame."""
         self._condition = Condition.of(exposure)
-        levelled, levels = [], []
+        self._names = [f.name for f in frames]
+        zeros, levels = [], []
         for frame in frames:
             over = frame.serial_overscan.astype(np.float64)
             # Without an overscan the mean bias is the zero of flats: its level stays in it.
-            zero = float(over.mean()) if over.size else 0.0
-            levelled.append(frame.pixels.astype(np.float64) - zero)
+            zeros.append(float(over.mean()) if over.size else 0.0)
+            if frame.name not in self._sum:
+                self._sum[frame.name] = np.zeros(frame.pixels.shape)
+            self._sum[frame.name] += frame.pixels.astype(np.float64) - zeros[-1]
             image = frame.image.astype(np.float64)
             if over.size:
                 share = image.var() / image.size + over.var() / over.size
-                levels.append((float(image.mean()) - zero, share + LEVEL_ERROR**2))
+                levels.append((float(image.mean()) - zeros[-1], share + LEVEL_ERROR**2))
         if len(levels) == len(frames):
             self._levels.append((exposure, levels))
-        if not self._sum:
-            self._sum = [np.zeros_like(x) for x in levelled]
-            self._names = [f.name for f in frames]
-        for total, one in zip(self._sum, levelled, strict=True):
-            total += one
         self.frames += 1
-        if self._last is None:
-            self._last = levelled
+        here = [(f.pixels, zero) for f, zero in zip(frames, zeros, strict=True)]
+        if not self._last:
+            self._last = here
             return
         # Each frame is used once: differences of frames that follow one another.
-        noise = [
-            _without_outliers((a - b) / np.sqrt(2.0))
-            for a, b in zip(self._last, levelled, strict=True)
-        ]
-        self._last = None
-        self._size = noise[0].size
-        self._spectra.append([_autocovariance(n) for n in noise])
-        self._rows.append([_row_excess(n) for n in noise])
-        flat = np.array([n.ravel() for n in noise])
-        self._cross.append(np.cov(flat) if len(flat) > 1 else np.array([[flat.var()]]))
+        self._size = here[0][0].size
+        flat = np.empty((len(here), self._size))
+        spectra, rows = [], []
+        for own, (a, zero_a), (b, zero_b) in zip(flat, self._last, here, strict=True):
+            first, second = a.astype(np.float64) - zero_a, b.astype(np.float64) - zero_b
+            noise = _without_outliers((first - second) / np.sqrt(2.0))
+            own[:] = noise.ravel()
+            spectra.append(_autocovariance(noise))
+            rows.append(_row_excess(noise))
+        self._last = []
+        self._spectra.append(spectra)
+        self._rows.append(rows)
+        flat -= flat.mean(1, keepdims=True)
+        self._cross.append(flat @ flat.T / (self._size - (len(flat) > 1)))
 
-    @property
-    def mean(self) -> dict[str, NDArray[np.float64]]:
-        """Mean bias of each amplifier's whole frame, any overscan's level taken off [ADU]."""
-        return {
-            name: total / self.frames
-            for name, total in zip(self._names, self._sum, strict=True)
-        }
+    def mean(self, name: str) -> NDArray[np.float64] | None:
+        """Mean bias of an amplifier's whole frame, any overscan's level taken off [ADU]."""
+        total = self._sum.get(name)
+        return None if total is None else total / self.frames
+
+    def forget_mean(self) -> None:
+        """Give up what :meth:`mean` is made of, which is large, once it is known."""
+        self._sum.clear()
 
     @property
     def read_noise(self) -> dict[str, float]:

@@ -16,7 +16,8 @@ PERIOD = 64
 """Codes that a wide distribution visits alike [ADU]."""
 
 CLEAR = 7.0
-"""Distance from an amplifier's own spots [pixel] from which on others' traces are sought."""
+"""Distance from an amplifier's own spots, and from its edges, over which spots of the next one
+reach that it knows nothing of [pixel], from which on others' traces are sought."""
 
 HALO_ERROR = 5e-6
 """Crosstalk for which unlike sides of spots' halos may be taken (assumed): 0.2 ADU of 40,000."""
@@ -99,8 +100,11 @@ class CrosstalkChannels:
                     np.column_stack([rows, columns])
                 )
                 y, x = (2 * centres[b][which] - np.column_stack([rows, columns])).T
-                ny, nx = victim.shape
-                use = (distance > CLEAR) & (y >= 0) & (y < ny) & (x >= 0) & (x < nx)
+                use = (
+                    (distance > CLEAR)
+                    & _is_inside(rows, columns, victim.shape)
+                    & _is_inside(y, x, victim.shape)
+                )
                 r, c, y, x = rows[use], columns[use], y[use], x[use]
                 dark = aggressor[y, x] < 0.01 * aggressor[r, c]
                 r, c, y, x = r[dark], c[dark], y[dark], x[dark]
@@ -126,6 +130,14 @@ class CrosstalkChannels:
                  what="crosstalk")  # fmt: skip
         blocks = tuple(np.array([[1.0 / self._sums[p][1] + HALO_ERROR**2]]) for p in pairs)
         return [Channel("amp_cross", values, blocks, axes.columns(), "", self._fold)]
+
+
+def _is_inside(
+    y: NDArray[np.int64], x: NDArray[np.int64], shape: tuple[int, ...]
+) -> NDArray[np.bool_]:
+    """Whether pixels lie clear of an image's edges."""
+    ny, nx = shape
+    return (y >= CLEAR) & (y < ny - CLEAR) & (x >= CLEAR) & (x < nx - CLEAR)
 
 
 def _spots(signal: NDArray[np.float64], threshold: float) -> NDArray[np.int64]:

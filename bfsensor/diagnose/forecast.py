@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.conditions import Axes, Condition
 from bfsensor.diagnose.flat_channels import TAIL
-from bfsensor.diagnose.map_channels import BLOCKS, MapShare
+from bfsensor.diagnose.map_channels import MapShare, block_side
 from bfsensor.diagnose.mismatch import BaselineFit
 from bfsensor.diagnose.planned import Forecast, Planned
 from bfsensor.diagnose.predict import Predictor
@@ -290,7 +290,7 @@ class Forecaster:
             for sign, where in ((1.0, condition), (-1.0, self.usual))
         )
         ny, nx = self.measured.shape
-        side = int(np.ceil(max(ny, nx) / BLOCKS))
+        side = block_side((ny, nx))
         pixels = {"column": ny, "row": nx, "block": side**2}
         # Photon noise of both: the usual condition's flats are at least as many.
         noise = 2 / (float((levels * self.gains).mean()) * planned.count)

@@ -136,12 +136,11 @@ def fit_baseline(
     columns = {k: v for k, v in columns.items() if np.abs(v).max() > 0}
     linear = np.array(list(columns.values())).T.reshape(total, len(columns))
     scales = np.sqrt((linear**2).sum(0))
-    span = np.linalg.svd(linear / scales, full_matrices=False)
-    span_linear = span[0][:, span[1] > 1e-10 * span[1].max(initial=0.0)]
     count, priors = len(predictor.names), len(predictor.prior_rows)
     point = predictor.start.astype(float).copy()
     low, high = predictor.bounds()
     effect = np.char.startswith(np.array(predictor.names, str), "effect ")
+    span = np.linalg.qr(linear / scales)[0] if effect.any() else linear[:, :0]
     before, least, halved, arrived = point.copy(), np.inf, 0, False
     moved = np.inf
     history: list[float] = []
@@ -156,7 +155,7 @@ def fit_baseline(
         ])  # fmt: skip
         if effect.any():
             # Of what is left with the linear parameters at their best.
-            given = span_linear.T @ residuals
+            given = span.T @ residuals
             square = float(residuals @ residuals) - float(given @ given)
             square += float(point[predictor.prior_rows] @ point[predictor.prior_rows])
             # Effects bend: a step that does harm is taken back by half, at last altogether.

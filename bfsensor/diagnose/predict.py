@@ -14,14 +14,14 @@ from bfsensor.diagnose.baseline import Baseline
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
-from bfsensor.diagnose.map_channels import MapShare
+from bfsensor.diagnose.map_channels import MapShare, block_side
 from bfsensor.diagnose.predict_effects import ADDED, EffectChain, layout_of, pad_areas
 from bfsensor.diagnose.predict_flats import (
     flat_covariances_of,
     periodic_covariances,
     quadrant,
 )
-from bfsensor.diagnose.predict_spots import predict_spots
+from bfsensor.diagnose.predict_spots import predict_spots, representative_phases
 from bfsensor.effects.effect import Effect, Parameter
 from bfsensor.errors import DiagnosisError
 
@@ -32,16 +32,13 @@ REDUCED_LEVEL = 40_000.0
 """Background [e-] at which a_ij without a level are predicted: halfway to a flat of 80,000 e-, at
 which published covariances are quoted."""
 
-PHASES = 12
-"""Spots whose positions stand for those of an exposure."""
-
 
 class Predictor:
     """Predicts the channels of a campaign; what may float honestly is a parameter.
 
     Non-linear parameters: gain of each amplifier [e-/ADU], variance of its read noise [ADU^2],
     the device's parameters in units of their spread, widths of the spots without charge for
-    each wavelength.  Linear ones, as columns of :meth:`linear`: light by amplifier and
+    each wavelength and temperature.  Linear ones, as columns of :meth:`linear`: light by amplifier and
     condition, dark current, shape of the light, levels of bias and noise, flux of the spots.
 
     Parameters
@@ -65,7 +62,8 @@ class Predictor:
         self._kept: dict[int, tuple[Channel, dict[tuple[str, ...], NDArray[np.int64]]]] = {}
         self._spot_conditions: list[tuple[str, ...]] = []
         self._spot_of: dict[tuple[str, ...], Condition] = {}
-        # Optics know of the wavelength, not of voltages or the silicon's temperature.
+        # Optics know of the wavelength, diffusion of the silicon's temperature, of which cards do
+        # not speak; what goes with voltages at one temperature is left to be found.
         self._widths: list[str] = []
         self._phases: dict[tuple[str, ...], NDArray[np.float64]] = {}
         self.notes: list[str] = []
@@ -82,8 +80,8 @@ class Predictor:
                 if condition.key not in self._spot_of:
                     self._spot_conditions.append(condition.key)
                     self._spot_of[condition.key] = condition
-                    if condition.key[0] not in self._widths:
-                        self._widths.append(condition.key[0])
+                    if _width_of(condition.key) not in self._widths:
+                        self._widths.append(_width_of(condition.key))
                         both = channel.values[row], channel.values[row + 1]
                         start_sigma += [float(v) for v in both]
                     self._phases[condition.key] = phases
@@ -91,19 +89,13 @@ class Predictor:
                     self._phases[condition.key] = np.concatenate(
                         [self._phases[condition.key], phases]
                     )
-        for key, phases in self._phases.items():
-            order = (
-                np.linspace(0, len(phases) - 1, min(PHASES, len(phases)))
-                .round()
-                .astype(int)
-            )
-            self._phases[key] = phases[order]
+        self._phases = {k: representative_phases(p) for k, p in self._phases.items()}
         noise = [0.0 if not np.isfinite(n) else n**2 for n in measured.read_noise]
         self.names = (
             *(f"gain {a}" for a in range(self._amps)),
             *(f"noise {a}" for a in range(self._amps)),
             *(f"device {p}" for p in baseline.parameters),
-            *(f"sigma_{axis} {wavelength}" for wavelength in self._widths for axis in "xy"),
+            *(f"sigma_{axis} {width}" for width in self._widths for axis in "xy"),
         )
         self.start = np.array([
             *measured.gains, *noise, *(0.0 for _ in baseline.parameters), *start_sigma,
@@ -166,7 +158,7 @@ class Predictor:
     ) -> Predictor:
         """Copy that predicts spots at further conditions, and further maps, as well.
 
-        Spots fall on their pixels as those of the same wavelength do.
+        Spots fall on their pixels as others of the same light and temperature do.
 
         Parameters
         ----------
@@ -178,7 +170,7 @@ class Predictor:
         Raises
         ------
         DiagnosisError
-            The campaign has no spots of that wavelength: nothing tells their width.
+            The campaign has no spots of that wavelength and temperature: nothing tells their width.
         """
         other = copy(self)
         other._spot_of, other._phases = dict(self._spot_of), dict(self._phases)
@@ -187,11 +179,12 @@ class Predictor:
             key = condition.key
             if key in other._spot_of:
                 continue
-            like = next((k for k in self._spot_conditions if k[0] == key[0]), None)
+            width = _width_of(key)
+            like = next((k for k in self._spot_conditions if _width_of(k) == width), None)
             if like is None:
                 raise DiagnosisError(
-                    f"spots at wavelength={key[0]}: their width without charge is known at "
-                    f"{', '.join(self._widths) or 'no wavelength'} only"
+                    f"spots at wavelength/temperature {width}: their width without charge is known "
+                    f"at {', '.join(self._widths) or 'none'} only"
                 )
             other._spot_of[key], other._phases[key] = condition, self._phases[like]
             other._spot_conditions.append(key)
@@ -223,7 +216,7 @@ class Predictor:
         parameters : ndarray
             In the order of ``names``.
         only : str, optional
-            Predict spots of this wavelength alone.
+            Predict spots of this wavelength and temperature alone, such as '620/173.15'.
         """
         a = self._amps
         chain = self.chain(parameters)
@@ -351,13 +344,13 @@ class Predictor:
         step = parameters.copy()
         step[n] += self.steps[n]
         if channel.word == "spot" and self.names[n].startswith("sigma"):
-            # Of one wavelength's width the others know nothing.
+            # Of one width the spots of others know nothing.
             first = self.names.index(next(m for m in self.names if m.startswith("sigma")))
             only = self._widths[(n - first) // 2]
             moved = self.predict(channel, step, only=only)
             out = np.zeros(len(channel))
             for key, rows in self._rows(channel).items():
-                if key[0] == only:
+                if _width_of(key) == only:
                     out[rows] = (moved[rows] - here[rows]) / self.steps[n]
             return out
         return (self.predict(channel, step) - here) / self.steps[n]
@@ -434,12 +427,13 @@ class Predictor:
         x = channel.axes
         # Images were put on the scale of electrons with rough gains.
         scale = float(np.mean(gains / np.array(self.measured.gains)))
+        noise = float(np.nan_to_num(np.mean(gains * np.array(self.measured.read_noise))))
         out = np.zeros(len(channel))
         for key in self._spot_conditions:
             rows = self._rows(channel).get(key, np.zeros(0, int))
-            if not len(rows) or (only is not None and key[0] != only):
+            if not len(rows) or (only is not None and _width_of(key) != only):
                 continue
-            n = self._widths.index(key[0])
+            n = self._widths.index(_width_of(key))
             edges, _ = self.baseline.at(self._spot_of[key], device)
             sigma = float(sigmas[2 * n]), float(sigmas[2 * n + 1])
             fluxes = scale * x["flux"][rows]
@@ -454,6 +448,7 @@ class Predictor:
                 found = predict_spots(
                     *chain.edges(edges, self._spot_of[key]), sigma=(wide[0], wide[1]),
                     phases=self._phases[key], fluxes=fluxes, halo=halo, law=chain.law,
+                    neighbours=self.measured.neighbours, read_noise=noise,
                     change=partial(chain.spot_image, axes=axes),
                 )  # fmt: skip
                 found["flux"] = found["flux"] / scale
@@ -512,34 +507,58 @@ class Predictor:
                     out[f"map {name} rings k{power}"] = np.where(ring, x["k"] ** power, 0.0)
             if name == "all" and ring.any():
                 out["map rings white"] = np.where(ring, 1.0, 0.0)
-            for amp, (flip, origin) in enumerate(
-                zip(self.measured.flips, self.measured.origins, strict=True)
-            ):
-                del flip
-                if amp == 0:
-                    continue
-                # Amplifiers were divided by their means: steps between them are free.
-                side = here & (x["what"] != "ring") & (x["what"] != "row")
-                beyond = (
-                    side & (x["x"] >= origin[0]) if origin[0] > 0 else np.zeros_like(side)
-                )
-                if beyond.any():
-                    for what in ("column", "block"):
-                        out[f"map {name} {what} amp {amp}"] = np.where(
-                            beyond & (x["what"] == what), 1.0, 0.0
-                        )
+            for step, column in self._amplifier_steps(channel, here).items():
+                out[f"map {name} {step}"] = column
+        return out
+
+    def _amplifier_steps(
+        self, channel: Channel, here: NDArray[np.bool_]
+    ) -> dict[str, NDArray[np.float64]]:
+        """Steps between amplifiers, which were divided by their means: free, along x and y."""
+        x, out = channel.axes, {}
+        for what, axis, n in (("column", "x", 0), ("row", "y", 1)):
+            rows = here & (x["what"] == what)
+            for start in sorted({o[n] for o in self.measured.origins} - {0}):
+                beyond = rows & (x[axis] >= start)
+                if beyond.any() and not beyond[rows].all():
+                    out[f"{what} from {start}"] = np.where(beyond, 1.0, 0.0)
+        rows = here & (x["what"] == "block")
+        # Blocks may lie on several amplifiers.
+        half = 0.5 * block_side(self.measured.shape)
+        shares = [
+            np.where(rows, _overlap(x["x"], half, s.x, s.columns), 0.0)
+            * _overlap(x["y"], half, s.y, s.rows)
+            for s in self.measured.segments
+        ]
+        covered = np.maximum(np.sum(shares, axis=0), 1e-9)
+        for amp, share in enumerate(shares[1:], 1):
+            if share.any():
+                out[f"block amp {amp}"] = share / covered
         return out
 
     def _spot_columns(self, channel: Channel) -> dict[str, NDArray[np.float64]]:
         x = channel.axes
         out = {}
         for key, rows in self._rows(channel).items():
-            for what in ("flux", "skew_x", "skew_y", "wings"):
+            for what in ("flux", "skew_x", "skew_y"):
                 here = rows[x["what"][rows] == what]
                 column = np.zeros(len(channel))
                 column[here] = x["light"][here] if what == "flux" else 1.0
                 out[f"spot {what} {'/'.join(key)}"] = column
         return out
+
+
+def _width_of(key: tuple[str, ...]) -> str:
+    """Wavelength and temperature of a condition: what spots have one width at."""
+    return f"{key[0]}/{key[2]}"
+
+
+def _overlap(
+    centre: NDArray[np.float64], half: float, start: int, count: int
+) -> NDArray[np.float64]:
+    """Pixels of intervals about centres that lie in another interval."""
+    low, high = centre + 0.5 - half, centre + 0.5 + half
+    return np.maximum(np.minimum(high, start + count) - np.maximum(low, start), 0.0)
 
 
 def fitted(effect: Effect) -> list[Parameter]:

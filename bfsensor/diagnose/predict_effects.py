@@ -12,7 +12,6 @@ from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
 from bfsensor.diagnose.map_channels import BLOCKS, RINGS, ring_power
-from bfsensor.diagnose.predict_flats import GRID
 from bfsensor.effects.effect import STAGES, Axes, Effect, Law, Layout, Shot
 
 ADDED = (
@@ -292,8 +291,8 @@ def reduce_map(change: NDArray[np.float64], axes: Axes) -> NDArray[np.float64]:
 
 
 def pad_areas(a: NDArray[np.float64], reach: int) -> NDArray[np.float64]:
-    """Area changes on a wider window, at most that of the closed form."""
-    more = min(reach, GRID // 2 - 1) - a.shape[-1] // 2
+    """Area changes on a wider window."""
+    more = reach - a.shape[-1] // 2
     if more <= 0:
         return a
     return np.pad(a, [(0, 0)] * (a.ndim - 2) + [(more, more)] * 2)

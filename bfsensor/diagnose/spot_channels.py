@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.special import ndtr
 
 from bfsensor.diagnose.channels import FOLDS, Channel
 from bfsensor.diagnose.conditions import Axes, Condition, Exposure
@@ -30,6 +32,7 @@ class SpotChannels:
         self._noise, self._lamp_error = read_noise, lamp_error
         self._rows: list[tuple[Exposure, dict[str, tuple[float, float]], NDArray, str]] = []
         self.dropped: dict[str, int] = {}
+        self._grids: list[tuple[float, float]] = []
 
     def add(
         self, exposure: Exposure, image: NDArray[np.float64], *, fold: str = "fit"
@@ -73,6 +76,7 @@ class SpotChannels:
             out[name] = (float(column.mean()), float(column.std(ddof=1) / np.sqrt(n)))
         phases = np.stack([fit.centre_x[used], fit.centre_y[used]], axis=1)
         self._rows.append((exposure, out, phases, fold))
+        self._grids.append(_grid(inside))
         return None
 
     def channels(self) -> list[Channel]:
@@ -130,6 +134,26 @@ class SpotChannels:
         """
         return [row[2] for fold in self._folds for row in self._rows if row[3] == fold]
 
+    @property
+    def neighbours(self) -> tuple[float, float]:
+        """Distance of the next spots [pixel], and how many of the four places hold one."""
+        if not self._grids:
+            return np.inf, 0.0
+        pitch, share = np.median(self._grids, axis=0)
+        return float(pitch), float(share)
+
+
+def _grid(spots: SpotList) -> tuple[float, float]:
+    """Pitch of a square grid of spots [pixel], and share of a spot's four neighbours there are."""
+    places = np.column_stack([spots.x, spots.y])
+    tree = cKDTree(places)
+    # The nearest but itself, and of a square grid four and their diagonals.
+    away, which = tree.query(places, k=min(9, len(places)))
+    pitch = float(np.median(away[:, 1]))
+    step = np.abs(places[which[:, 1:]] - places[:, None])
+    beside = (np.abs(away[:, 1:] - pitch) < 0.1 * pitch) & (step.min(-1) < 0.1 * pitch)
+    return pitch, float(beside.sum(1).mean() / 4)
+
 
 def _inside(spots: SpotList, shape: tuple[int, int], border: int) -> SpotList:
     """Spots whose wide stamps lie inside."""
@@ -145,11 +169,15 @@ def stamp_moments(
     wide: NDArray[np.float64],
     x: NDArray[np.float64],
     y: NDArray[np.float64],
+    *,
+    noise: float | None = None,
 ) -> dict[str, NDArray[np.float64]]:
     """Flux, skewness along x and y, and the share of the flux in the wings, spot by spot.
 
     Skewness: the third power of the distance from the fitted centre, with a Gaussian weight of
-    2 pixels, over the flux.  Wings: what lies in the wide stamp outside the fitted one.
+    2 pixels, over the flux.  Wings: what lies in the wide stamp outside the fitted one.  The
+    background is the median of the wide stamp's rim; of images that are means, that which the
+    rim would have with Poisson's noise and a read ``noise`` [e-].
     """
     size = stamps.shape[-1]
     step = np.arange(size) - size // 2
@@ -161,6 +189,8 @@ def stamp_moments(
         axis=1,
     )
     background = np.median(rim, axis=1)[:, None, None]
+    if noise is not None:
+        background = _median_with_noise(rim, background[..., 0], noise)[..., None]
     signal = stamps - background
     dx, dy = step[None] - x[:, None], step[None] - y[:, None]
     weight = np.exp(-(dx[:, None] ** 2 + dy[..., None] ** 2) / 8.0)
@@ -172,3 +202,17 @@ def stamp_moments(
         "flux": total,
         "wings": 1.0 - signal.sum((1, 2)) / total,
     }
+
+
+def _median_with_noise(
+    rim: NDArray[np.float64], start: NDArray[np.float64], noise: float
+) -> NDArray[np.float64]:
+    """Median that uneven pixels have once noise has blurred their distribution, shape (n, 1)."""
+    width = np.sqrt(np.maximum(rim, 0.0) + max(noise, 1.0) ** 2)
+    middle = start
+    for _ in range(4):
+        t = (middle - rim) / width
+        slope = (np.exp(-0.5 * t * t) / (np.sqrt(2 * np.pi) * width)).mean(1, keepdims=True)
+        step = (0.5 - ndtr(t).mean(1, keepdims=True)) / np.maximum(slope, 1e-300)
+        middle = middle + np.clip(step, -width.min(), width.min())
+    return np.asarray(middle)

@@ -4,22 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from bfsensor.effects.bf_anisotropy import BrighterFatterAnisotropy
+from bfsensor.effects.bf_chromatic import BrighterFatterChromatic
+from bfsensor.effects.bf_long_range import BrighterFatterLongRange
+from bfsensor.effects.bf_nonlinear import BrighterFatterNonlinear
 from bfsensor.effects.charge_loss import ChargeLoss
 from bfsensor.effects.effect import Effect
 from bfsensor.effects.gain_nonlinearity import GainNonlinearity
 from bfsensor.effects.interpixel_coupling import InterpixelCoupling
+from bfsensor.effects.lateral_diffusion import LateralDiffusion
+from bfsensor.effects.psf_wings import PsfWings
+from bfsensor.effects.saturation import Saturation
 from bfsensor.effects.tearing import Tearing
 from bfsensor.effects.trap_serial import TrapSerial
+from bfsensor.effects.voltage_dependence import VoltageDependence
 from bfsensor.errors import EffectError
 
 LIBRARY: tuple[type[Effect], ...] = (
+    BrighterFatterAnisotropy,
+    BrighterFatterChromatic,
+    BrighterFatterLongRange,
+    BrighterFatterNonlinear,
     ChargeLoss,
     GainNonlinearity,
     InterpixelCoupling,
+    LateralDiffusion,
+    PsfWings,
+    Saturation,
     Tearing,
     TrapSerial,
+    VoltageDependence,
 )
-"""Every candidate, one for each variant of a class."""
+"""Every candidate, one for each variant of a class; those of a device's parameters are made for a
+baseline, by :func:`bfsensor.effects.device_parameter.device_parameters`."""
 
 
 def make_effect(word: str, values: Mapping[str, float], variant: str = "") -> Effect:

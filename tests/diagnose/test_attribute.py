@@ -39,11 +39,13 @@ def explained(seed, *effects):
 
 @pytest.fixture(scope="module")
 def torn():
-    return explained(7101, make_effect("tearing", {"amp": 0.03, "length": 2.0, "column": 0.3}))
+    return explained(
+        7101, make_effect("tearing", {"amp": 0.03, "length": 2.0, "column": 0.3})
+    )
 
 
 def test_an_effect_is_named_with_its_parameters(torn):
-    (found,) = torn.found
+    found = torn.found[0]
     assert found.effect.word == "tearing" and torn.probability["tearing"] > 0.9
     told = found.intervals()
     # 3 sigma; the tear is open in 0.7 of the rows on average, in a few tens of exposures.
@@ -97,7 +99,10 @@ def test_probabilities_and_ties_follow_evidence_and_gain():
     torn = rival(Tearing, {"amp": 0.1, "length": 2.0, "column": 0.5}, 9.0, 0.0, [0, 0, 1])
     out = class_probabilities([loss, bent, torn])
     assert out["charge_loss"] == pytest.approx(1 / (1 + np.exp(-2.0)), rel=1e-5)
-    assert tied_classes(loss.effect, [loss, bent, torn]) == ("charge_loss", "gain_nonlinearity")
+    assert tied_classes(loss.effect, [loss, bent, torn]) == (
+        "charge_loss",
+        "gain_nonlinearity",
+    )
 
 
 def test_evidence_falls_with_the_room_a_parameter_has():
@@ -105,5 +110,12 @@ def test_evidence_falls_with_the_room_a_parameter_has():
     effect = ChargeLoss({"q": 5e-8})
     (p,) = ChargeLoss.parameters
     sigma = 5e-9
-    expected = 50.0 - np.log(5e-8 * np.log(p.high / p.low)) + 0.5 * np.log(2 * np.pi) + np.log(sigma)
-    assert evidence(effect, [p], 100.0, np.array([[1 / sigma]])) == pytest.approx(expected, abs=0.1)
+    expected = (
+        50.0
+        - np.log(5e-8 * np.log(p.high / p.low))
+        + 0.5 * np.log(2 * np.pi)
+        + np.log(sigma)
+    )
+    assert evidence(effect, [p], 100.0, np.array([[1 / sigma]])) == pytest.approx(
+        expected, abs=0.1
+    )
