@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.show_style import BLUE, RED
+from bfsensor.show_style import BLUE, GREY, ORANGE, RED
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,7 +24,66 @@ def draw_channels(chi2: Mapping[str, tuple[float, float]], ax: Axes) -> None:
     ax.barh(words, z, color=colours)
     ax.axvspan(-3, 3, color="0.9", zorder=0)
     ax.set_xscale("symlog", linthresh=5)
+    ticks = [t for t in (0, 10, 100, 1000, 10_000, 100_000) if t <= max([10, *z])]
+    ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    ax.minorticks_off()
     ax.set_xlabel("(chi-square - dof) / sqrt(2 dof)")
+
+
+def draw_classes(
+    probability: Mapping[str, float], ax: Axes, *, tied: Sequence[str] = ()
+) -> None:
+    """Probability of each class, those that cannot be told apart in a colour of their own."""
+    words = list(probability)[::-1]
+    values = [probability[w] for w in words]
+    ax.barh(
+        range(len(words)),
+        values,
+        color=[ORANGE if w in tied else BLUE for w in words],
+        height=0.65,
+    )
+    ax.set_yticks(range(len(words)), [w.replace("_", " ") for w in words])
+    for n, value in enumerate(values):
+        text = f"{100 * value:.0f} %" if value >= 0.01 else f"{100 * value:.1f} %"
+        ax.text(value + 0.015, n, text, va="center", fontsize=9)
+    ax.set(xlim=(0, 1.14), xlabel="probability")
+    ax.set_xticks(np.linspace(0, 1, 6))
+    _plain(ax)
+
+
+def draw_held_out(held: Mapping[str, tuple[float, float, int]], ax: Axes) -> None:
+    """Chi-square per value before and after, by channel: name to (before, after, values)."""
+    names = list(held)[::-1]
+    for n, name in enumerate(names):
+        before, after, count = held[name]
+        width = 1.96 * np.sqrt(2 / count)
+        ax.barh(n, 2 * width, left=1 - width, color="0.88", height=0.7, zorder=0)
+        ax.plot([before, after], [n, n], color=GREY, lw=1.5, zorder=1)
+        ax.plot(
+            before,
+            n,
+            "o",
+            mfc="white",
+            mec=RED,
+            mew=1.6,
+            ms=8,
+            label="baseline" if n == 0 else None,
+        )
+        ax.plot(
+            after, n, "o", color=BLUE, ms=6, label="with the effects" if n == 0 else None
+        )
+    ax.set_yticks(range(len(names)), names)
+    values = [v for b, a, _ in held.values() for v in (b, a)]
+    ax.set_xscale("log")
+    ax.set_xlim(min(0.5, 0.8 * min(values)), max(2.0, 1.4 * max(values)))
+    ticks = [t for t in (0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 5000)
+             if ax.get_xlim()[0] <= t <= ax.get_xlim()[1]]  # fmt: skip
+    ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    ax.minorticks_off()
+    ax.axvline(1, color="0.5", lw=0.8, zorder=0)
+    ax.set_xlabel("chi-square per value, not fitted")
+    _legend(ax, 2)
+    _plain(ax)
 
 
 def draw_lags(axes: Table, pulls: NDArray[np.float64], ax: Axes) -> None:
@@ -64,7 +123,7 @@ def draw_lag_levels(
         )
     _band(ax)
     ax.set(xlabel="level [1000 ADU]", ylabel="pull")
-    ax.legend(frameon=False, ncol=3, fontsize=8)
+    _legend(ax, 6)
 
 
 def draw_means(axes: Table, relative: NDArray[np.float64], ax: Axes) -> None:
@@ -79,13 +138,13 @@ def draw_means(axes: Table, relative: NDArray[np.float64], ax: Axes) -> None:
         )
     ax.axhline(0, color="0.6", lw=0.8)
     ax.set(xlabel="level [1000 ADU]", ylabel="mean, residual [%]")
-    ax.legend(frameon=False, fontsize=8)
+    _legend(ax, 4)
 
 
 def draw_overscan(
     axes: Table, values: NDArray[np.float64], errors: NDArray[np.float64], ax: Axes
 ) -> None:
-    """Profile of an overscan for the strongest levels of each amplifier."""
+    """Residual profile of an overscan for the strongest levels of each amplifier."""
     for n, amp in enumerate(np.unique(axes["amp"])):
         own = axes["amp"] == amp
         top = own & (axes["level"] > 0.7 * axes["level"][own].max())
@@ -102,8 +161,8 @@ def draw_overscan(
             k + 0.1 * n, mean, error, fmt="o", ms=3, label=f"amplifier {int(amp) + 1}"
         )
     ax.axhline(0, color="0.6", lw=0.8)
-    ax.set(xlabel="overscan pixel", ylabel="above its tail [ADU]")
-    ax.legend(frameon=False, fontsize=8)
+    ax.set(xlabel="overscan pixel", ylabel="above its tail, residual [ADU]")
+    _legend(ax, 4)
 
 
 def draw_map(axes: Table, pulls: NDArray[np.float64], ax: Axes, *, name: str) -> None:
@@ -127,17 +186,18 @@ def draw_profile(axes: Table, pulls: NDArray[np.float64], ax: Axes, *, name: str
         ax.plot(axes[axis][here], pulls[here], ".", ms=3, label=f"{what}s")
     _band(ax)
     ax.set(xlabel="column or row [pixel]", ylabel="pull")
-    ax.legend(frameon=False, fontsize=8)
+    _legend(ax, 2)
 
 
 def draw_spots(axes: Table, pulls: NDArray[np.float64], ax: Axes) -> None:
     """Pulls of the spots' numbers against flux."""
     for what in dict.fromkeys(axes["what"]):
         here = axes["what"] == what
-        ax.plot(axes["flux"][here] / 1e6, pulls[here], "o", ms=3, label=str(what))
+        name = str(what).replace("sigma", "width").replace("_", " ")
+        ax.plot(axes["flux"][here] / 1e6, pulls[here], "o", ms=3, label=name)
     _band(ax)
     ax.set(xlabel="flux [million e-]", ylabel="pull")
-    ax.legend(frameon=False, ncol=3, fontsize=8)
+    _legend(ax, 6)
 
 
 def draw_noise(axes: Table, pulls: NDArray[np.float64], ax: Axes) -> None:
@@ -147,7 +207,7 @@ def draw_noise(axes: Table, pulls: NDArray[np.float64], ax: Axes) -> None:
         ax.plot(axes["lag"][here], pulls[here], ".", label=f"amplifier {int(amp) + 1}")
     _band(ax)
     ax.set(xlabel="lag in readout order [pixel]", ylabel="pull")
-    ax.legend(frameon=False, fontsize=8)
+    _legend(ax, 4)
 
 
 def draw_parameters(
@@ -165,6 +225,21 @@ def draw_parameters(
     ax.set_yticks(range(len(names)), names)
     ax.axvspan(-1, 1, color="0.9", zorder=0)
     ax.set_xlabel("off the card [its spread]")
+
+
+def _legend(ax: Axes, columns: int) -> None:
+    """Above the figure, where nothing lies behind it."""
+    ax.legend(
+        frameon=False, fontsize=8, ncol=columns, loc="lower center", bbox_to_anchor=(0.5, 1),
+        handletextpad=0.2, columnspacing=1.0, borderaxespad=0.2,
+    )  # fmt: skip
+
+
+def _plain(ax: Axes) -> None:
+    """No frame where none is needed."""
+    for side in ("top", "right", "left"):
+        ax.spines[side].set_visible(False)
+    ax.tick_params(axis="y", length=0)
 
 
 def _band(ax: Axes) -> None:

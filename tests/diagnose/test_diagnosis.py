@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from astropy.table import Table
 from click.testing import CliRunner
 
 from bfsensor.cli import main
@@ -113,11 +114,18 @@ def test_the_command_diagnoses_a_folder(tmp_path):
         folder, seed=7003, size="S", effects=[make_effect("cti_serial", {"cti": 2e-6})]
     )
     out = tmp_path / "out"
-    result = CliRunner().invoke(main, ["diagnose", str(folder), "-o", str(out)])
+    asked = ["--predict", "seconds=40,back_bias=-40", "--predict", "flux=5e5"]
+    result = CliRunner().invoke(main, ["diagnose", str(folder), "-o", str(out), *asked])
     assert result.exit_code == 0, result.output
     assert "serial overscan" in result.stdout
     report = json.loads((out / "report.json").read_text())
     assert report["detected"] and "serial_overscan" in report["location"]["channels"]
+    told = Table.read(out / "predicted.ecsv", format="ascii.ecsv")
+    assert set(told["what"]) == {"mean", "covariance", "sigma_x", "sigma_y", "flux"}
+    assert (told["error"] >= 0).all() and (told["noise"] > 0).all()
+    unheld = ["diagnose", str(folder), "--predict", "level=4e4,wavelength=750"]
+    refused = CliRunner().invoke(main, unheld)
+    assert refused.exit_code == 1 and "wavelength=750: the baseline" in refused.stderr
     again = CliRunner().invoke(main, ["diagnose", str(tmp_path / "nowhere")])
     assert again.exit_code == 1 and "nowhere" in again.stderr
     none = CliRunner().invoke(main, ["diagnose", str(folder), "--baseline", "nothing"])
