@@ -77,6 +77,8 @@ class Measured:
         All exposures in the order of time; levels by the rough gains.
     maps : mapping of str to tuple of MapShare
         Of which flats each map is made.
+    offsets : tuple of float
+        Mean code of each amplifier without light, of one exposure; nan without overscan.
     """
 
     channels: tuple[Channel, ...]
@@ -95,6 +97,7 @@ class Measured:
     segments: tuple[Segment, ...] = ()
     shots: tuple[Shot, ...] = ()
     maps: Mapping[str, tuple[MapShare, ...]] = field(default_factory=dict)
+    offsets: tuple[float, ...] = ()
 
 
 def measure_channels(
@@ -156,7 +159,10 @@ def measure_channels(
         if frame.name in means:
             bias_images[frame.name] = _data_section(frame, means[frame.name])
     noise = biases.read_noise
-    flats = FlatChannels(bias_images, noise, lamp_error=source.lamp_error, lags=lags)
+    start = min((e.mjd for e in exposures if e.mjd is not None), default=np.nan)
+    flats = FlatChannels(
+        bias_images, noise, lamp_error=source.lamp_error, lags=lags, start=start
+    )
     maps = MapChannels(source.shape)
     codes = CodeChannels()
     gains: list[list[float]] = [[] for _ in layout]
@@ -216,7 +222,7 @@ def measure_channels(
     mean_noise = float(
         np.mean([noise.get(f.name, 0.0) * g for f, g in zip(layout, rough, strict=True)])
     )
-    spots = SpotChannels(read_noise=mean_noise, lamp_error=source.lamp_error)
+    spots = SpotChannels(read_noise=mean_noise, lamp_error=source.lamp_error, start=start)
     crosstalk = CrosstalkChannels()
     for exposure in kinds.get("spot", []):
         spot_frames = read(exposure)
@@ -260,6 +266,10 @@ def measure_channels(
         segments=tuple(_segment(f) for f in layout),
         shots=_shots(exposures, levels, float(np.mean(rough))),
         maps=maps.shares(),
+        offsets=tuple(
+            float(f.serial_overscan.mean()) if f.serial_overscan.size else np.nan
+            for f in layout
+        ),
     )
 
 
