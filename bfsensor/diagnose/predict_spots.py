@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
+from scipy.interpolate import PchipInterpolator
 from scipy.special import ndtr
 
 from bfsensor.diagnose.spot_channels import STAMP, WING, stamp_moments
@@ -16,6 +17,10 @@ from bfsensor.measure.spot_fit import fit_spots
 from bfsensor.measure.spots import Stamps
 
 STEPS = 16
+KNOTS = 7
+"""Fluxes, equal steps in their logarithm, at which changes after collection are found."""
+
+MEASURED = ("sigma_x", "sigma_y", "skew_x", "skew_y", "wings", "flux")
 LINEAR = Law()
 
 
@@ -169,7 +174,7 @@ def predict_spots(
     kx, ky, sigma, phases
         As for :func:`grow_spots`.
     fluxes : array_like, shape (n,)
-        Electrons of a spot [e-].
+        Electrons of a spot [e-], as they are read after ``change``.
     halo, law
         As for :func:`grow_spots`.
     change : callable, optional
@@ -184,29 +189,48 @@ def predict_spots(
     wanted = np.asarray(fluxes, float)
     top = float(wanted.max())
     images = grow_spots(kx, ky, sigma=sigma, phases=phases, flux=top, halo=halo, law=law)
-    names = ["sigma_x", "sigma_y", "skew_x", "skew_y", "wings", "flux"]
-    knots, rows = [], []
-    margin = (WING - STAMP) // 2
-    for step in range(STEPS // 4 - 1, STEPS, STEPS // 4):
-        wide = images[step] if change is None else change(images[step])
-        stamps = wide[:, margin:-margin, margin:-margin]
-        fit = fit_spots(
-            Stamps(stamps),
-            weights="equal",
-            largest_offset=2.0,
-            limit=1e6,
-            correct_bias=False,
-        )
-        moments = stamp_moments(stamps, wide, fit.centre_x, fit.centre_y)
-        rows.append(
-            [fit.sigma_x, fit.sigma_y, *(float(moments[n].mean()) for n in names[2:])]
-        )
-        knots.append(top * (step + 1) / STEPS)
-        rows[-1][-1] -= knots[-1]
-    table = np.array(rows)
+    steps = np.arange(STEPS // 4, STEPS + 1, STEPS // 4)
+    rows = [_measure(images[step - 1], top * step / STEPS) for step in steps]
     # Nearly straight in the flux: the cubic through four points.
-    out = {}
-    for n, name in enumerate(names):
-        line = np.polynomial.Polynomial.fit(np.array(knots), table[:, n], 3)
-        out[name] = line(wanted)
-    return out
+    lines = [
+        np.polynomial.Polynomial.fit(top * steps / STEPS, column, 3)
+        for column in np.array(rows).T
+    ]
+    if change is None or np.array_equal(change(images[-1]), images[-1]):
+        return {n: line(wanted) for n, line in zip(MEASURED, lines, strict=True)}
+    # What comes after collection need not be: between fluxes as they are.
+    knots = np.geomspace(min(wanted.min(), 0.999 * top), top, KNOTS)
+    more = []
+    for flux in knots:
+        image = _image_at(images, flux / top)
+        more.append(_measure(change(image), flux) - _measure(image, flux))
+    changes = PchipInterpolator(np.log(knots), np.array(more))
+    # Fluxes are given as they are read.
+    true = wanted
+    for _ in range(2):
+        true = wanted - changes(np.log(true))[:, -1]
+    return {
+        name: line(true) + column
+        for name, line, column in zip(MEASURED, lines, changes(np.log(true)).T, strict=True)
+    }
+
+
+def _image_at(images: NDArray[np.float64], part: float) -> NDArray[np.float64]:
+    """Images at a part of their last flux, their shapes being straight in it between steps."""
+    at = part * STEPS
+    low = int(np.clip(np.floor(at), 1, STEPS - 1))
+    one, two = images[low - 1] / low, images[low] / (low + 1)
+    return np.asarray(at * (one + (at - low) * (two - one)))
+
+
+def _measure(wide: NDArray[np.float64], flux: float) -> NDArray[np.float64]:
+    """What the channels' fit measures of images of a flux, in the order of :data:`MEASURED`."""
+    margin = (WING - STAMP) // 2
+    stamps = wide[:, margin:-margin, margin:-margin]
+    fit = fit_spots(
+        Stamps(stamps), weights="equal", largest_offset=2.0, limit=1e6, correct_bias=False
+    )
+    moments = stamp_moments(stamps, wide, fit.centre_x, fit.centre_y)
+    found = [fit.sigma_x, fit.sigma_y, *(float(moments[n].mean()) for n in MEASURED[2:])]
+    found[-1] -= flux
+    return np.array(found)

@@ -4,8 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from bfsensor.effects.adc_bits import AdcBits
+from bfsensor.effects.amp_crosstalk import AmpCrosstalk
+from bfsensor.effects.bias_instability import BiasByFrame, BiasByRow, BiasRamp
 from bfsensor.effects.charge_loss import ChargeLoss
+from bfsensor.effects.correlated_noise import CommonNoise, NoiseInTime, Pickup
+from bfsensor.effects.cti_parallel import CtiParallel
+from bfsensor.effects.cti_serial import CtiSerial
 from bfsensor.effects.effect import Effect
+from bfsensor.effects.electronic_memory import ElectronicMemory
+from bfsensor.effects.gain_drift import GainDrift
 from bfsensor.effects.gain_nonlinearity import GainNonlinearity
 from bfsensor.effects.interpixel_coupling import InterpixelCoupling
 from bfsensor.effects.tearing import Tearing
@@ -13,9 +21,21 @@ from bfsensor.effects.trap_serial import TrapSerial
 from bfsensor.errors import EffectError
 
 LIBRARY: tuple[type[Effect], ...] = (
+    AdcBits,
+    AmpCrosstalk,
+    BiasByFrame,
+    BiasByRow,
+    BiasRamp,
     ChargeLoss,
+    CommonNoise,
+    CtiParallel,
+    CtiSerial,
+    ElectronicMemory,
+    GainDrift,
     GainNonlinearity,
     InterpixelCoupling,
+    NoiseInTime,
+    Pickup,
     Tearing,
     TrapSerial,
 )
