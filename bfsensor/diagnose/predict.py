@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -21,7 +22,7 @@ from bfsensor.diagnose.predict_flats import (
     quadrant,
 )
 from bfsensor.diagnose.predict_spots import predict_spots, representative_phases
-from bfsensor.effects.effect import Effect, Parameter
+from bfsensor.effects.effect import Effect, Layout, Parameter
 
 MAP_ORDER = 4
 """Order of the polynomial in x and y that the light on the sensor may have."""
@@ -208,10 +209,19 @@ class Predictor:
             return None
         return EffectChain(
             self.effects_at(parameters),
-            self.layout,
+            self._layout_at(parameters),
             self.measured,
             self.baseline,
             self._evened,
+        )
+
+    def _layout_at(self, parameters: NDArray[np.float64]) -> Layout:
+        """Layout with the gains and the read noise that parameters say."""
+        gains, noise = parameters[: self._amps], parameters[self._amps : 2 * self._amps]
+        return replace(
+            self.layout,
+            gains=tuple(gains.tolist()),
+            read_noise=tuple(np.sqrt(np.maximum(noise, 0.0)).tolist()),
         )
 
     def effects_at(self, parameters: NDArray[np.float64]) -> tuple[Effect, ...]:
@@ -401,6 +411,8 @@ class Predictor:
                 found.pop("flux")
             else:
                 variance, halo, axes = chain.spot_change(self._spot_of[key])
+                if "hours" in x:
+                    axes = {**axes, "hours": float(np.mean(x["hours"][rows]))}
                 wide = [float(np.sqrt(max(s * s + variance, 0.01 * s * s))) for s in sigma]
                 found = predict_spots(
                     *chain.edges(edges, self._spot_of[key]), sigma=(wide[0], wide[1]),

@@ -25,6 +25,9 @@ SPILLING = 24
 KNOTS = 4
 """Fluxes at which spots are measured where nothing spills: nearly straight between them."""
 
+LATE = 7
+"""Fluxes at which changes after collection are found."""
+
 FEW = 4
 """Places of spots that are crossed with one another where charge spills."""
 
@@ -273,8 +276,52 @@ def predict_spots(
             centres = np.array(np.meshgrid(*centres.T)).reshape(2, -1).T
         every = 1
         images = grow(phases=centres, steps=SPILLING)
+    measure = partial(_measure, sigma=sigma, centres=centres, read_noise=read_noise)
     wide = images[every - 1 :: every]
-    wide = wide if change is None else change(wide)
+    given = top * np.arange(1, len(wide) + 1) / len(wide)
+    late = change is not None and not np.array_equal(change(wide[-1]), wide[-1])
+    if spilling and change is not None and late:
+        wide, late = change(wide), False
+    table = measure(wide, given)
+    knots = table["flux"] + given
+    if change is not None and late:
+        # What comes after collection need not go straight with the flux: at fluxes from the
+        # least on, equal steps in the logarithm, as they are read.
+        places = np.geomspace(min(float(wanted.min()), 0.999 * top), top, LATE)
+        plain = np.array([_image_at(images, flux / top) for flux in places])
+        before, after = measure(plain, places), measure(change(plain), places)
+        true = np.log(np.maximum(places + before["flux"], 1.0))
+        more = PchipInterpolator(
+            true, np.array([after[k] - before[k] for k in table]).T, extrapolate=True
+        )
+        least, most = true[0], true[-1]
+        which = list(table).index("flux")
+        read = wanted
+        for _ in range(2):
+            wanted = read - more(np.clip(np.log(wanted), least, most))[:, which]
+        changes = more(np.clip(np.log(wanted), least, most)).T
+    else:
+        changes = np.zeros((len(table), len(wanted)))
+    if spilling:
+        # Below the first knot all goes straight.
+        held = np.maximum(wanted, knots[0])
+        return {k: np.asarray(PchipInterpolator(knots, v)(held)) for k, v in table.items()}
+    # The cubic through the knots.
+    powers = np.vander(knots / top, increasing=True)
+    line = np.linalg.solve(powers, np.array(list(table.values())).T)
+    values = np.vander(wanted / top, KNOTS, increasing=True) @ line
+    return dict(zip(table, values.T + changes, strict=True))
+
+
+def _measure(
+    wide: NDArray[np.float64],
+    given: NDArray[np.float64],
+    *,
+    sigma: tuple[float, float],
+    centres: NDArray[np.float64],
+    read_noise: float,
+) -> dict[str, NDArray[np.float64]]:
+    """What the channels' fit measures of images, shape (fluxes, n, 21, 21), at given fluxes."""
     margin = (WING - STAMP) // 2
     stamps = wide[..., margin:-margin, margin:-margin]
     fit = fit_widths(stamps, sigma, centres)
@@ -285,14 +332,14 @@ def predict_spots(
     )  # fmt: skip
     table = {"sigma_x": fit.sigma_x, "sigma_y": fit.sigma_y}
     table |= {name: v.reshape(count, n).mean(1) for name, v in moments.items()}
-    knots = table["flux"].copy()
-    table["flux"] = knots - top * np.arange(1, count + 1) / count
-    if spilling:
-        # Below the first knot all goes straight.
-        held = np.maximum(wanted, knots[0])
-        return {k: np.asarray(PchipInterpolator(knots, v)(held)) for k, v in table.items()}
-    # The cubic through the knots.
-    powers = np.vander(knots / top, increasing=True)
-    line = np.linalg.solve(powers, np.array(list(table.values())).T)
-    values = np.vander(wanted / top, KNOTS, increasing=True) @ line
-    return dict(zip(table, values.T, strict=True))
+    table["flux"] = table["flux"] - given
+    return table
+
+
+def _image_at(images: NDArray[np.float64], part: float) -> NDArray[np.float64]:
+    """Images at a part of their last flux, their shapes being straight in it between steps."""
+    steps = len(images)
+    at = part * steps
+    low = int(np.clip(np.floor(at), 1, steps - 1))
+    one, two = images[low - 1] / low, images[low] / (low + 1)
+    return np.asarray(at * (one + (at - low) * (two - one)))
