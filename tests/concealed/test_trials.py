@@ -28,11 +28,11 @@ def calibration(monkeypatch):
         key: Amplitudes(0.1, 40.0, 0.025, 10.0, ("flat_cov",), 1.0, flux) for key in EVERY
     }
 
-    def take_like(effect, shown, noise, seed=0):
+    def take_signal(effect, size="S"):
         factor = 1 / headroom(effect)
-        return amplitudes.Signal(200.0 * factor, shown, noise, np.zeros(1), flux)
+        return amplitudes.Signal(200.0 * factor, ("flat_cov",), 1.0, np.zeros(1), flux)
 
-    monkeypatch.setattr(trials, "take_like", take_like)
+    monkeypatch.setattr(trials, "take_signal", take_signal)
     return told
 
 
