@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -14,7 +14,7 @@ from bfsensor.diagnose.baseline import Baseline
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
-from bfsensor.diagnose.map_channels import block_side
+from bfsensor.diagnose.map_channels import MapShare, block_side
 from bfsensor.diagnose.predict_effects import ADDED, EffectChain, layout_of, pad_areas
 from bfsensor.diagnose.predict_flats import (
     flat_covariances_of,
@@ -23,6 +23,7 @@ from bfsensor.diagnose.predict_flats import (
 )
 from bfsensor.diagnose.predict_spots import predict_spots, representative_phases
 from bfsensor.effects.effect import Effect, Layout, Parameter
+from bfsensor.errors import DiagnosisError
 
 MAP_ORDER = 4
 """Order of the polynomial in x and y that the light on the sensor may have."""
@@ -148,6 +149,47 @@ class Predictor:
         other.names, other.steps = self.names[:plain], self.steps[:plain]
         other.start = (self.start if point is None else point)[:plain].copy()
         other._add(effects)
+        return other
+
+    def with_exposures(
+        self,
+        spots: Iterable[Condition] = (),
+        maps: Mapping[tuple[str, str], tuple[MapShare, ...]] | None = None,
+    ) -> Predictor:
+        """Copy that predicts spots at further conditions, and further maps, as well.
+
+        Spots fall on their pixels as others of the same light and temperature do.
+
+        Parameters
+        ----------
+        spots : iterable of Condition
+            Conditions that the campaign may lack.
+        maps : mapping of (fold, map) to tuple of MapShare, optional
+            Of which flats each is made.
+
+        Raises
+        ------
+        DiagnosisError
+            The campaign has no spots of that wavelength and temperature: nothing tells their width.
+        """
+        other = copy(self)
+        other._spot_of, other._phases = dict(self._spot_of), dict(self._phases)
+        other._spot_conditions = list(self._spot_conditions)
+        for condition in spots:
+            key = condition.key
+            if key in other._spot_of:
+                continue
+            width = _width_of(key)
+            like = next((k for k in self._spot_conditions if _width_of(k) == width), None)
+            if like is None:
+                raise DiagnosisError(
+                    f"spots at wavelength/temperature {width}: their width without charge is known "
+                    f"at {', '.join(self._widths) or 'none'} only"
+                )
+            other._spot_of[key], other._phases[key] = condition, self._phases[like]
+            other._spot_conditions.append(key)
+        if maps:
+            other.measured = replace(self.measured, maps={**self.measured.maps, **maps})
         return other
 
     def _add(self, effects: Sequence[Effect]) -> None:
