@@ -173,11 +173,12 @@ def compare(
         norm = float(np.sqrt(p @ p))
         factor = float(p @ s) / max(norm, 1e-9) ** 2 if norm > SHADOW else 0.0
         left = s - factor * p
-        spread = float(np.sqrt(left @ left / max(len(left), 1)))
+        # Noise that is not shared is where the effect is, and large where it is strong.
+        error = float(np.sqrt((p * left) @ (p * left)))
         out[word] = (
             norm,
             factor,
-            spread / norm if norm > SHADOW else spread * len(left) ** 0.5,
+            error / norm**2 if norm > SHADOW else float(np.sqrt(left @ left)),
         )
     return out
 

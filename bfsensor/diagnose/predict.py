@@ -436,7 +436,6 @@ class Predictor:
         x = channel.axes
         # Images were put on the scale of electrons with rough gains.
         scale = float(np.mean(gains / np.array(self.measured.gains)))
-        noise = float(np.nan_to_num(np.mean(gains * np.array(self.measured.read_noise))))
         out = np.zeros(len(channel))
         for key in self._spot_conditions:
             rows = self._rows(channel).get(key, np.zeros(0, int))
@@ -455,11 +454,14 @@ class Predictor:
                 variance, halo, axes = chain.spot_change(self._spot_of[key])
                 if "hours" in x:
                     axes = {**axes, "hours": float(np.mean(x["hours"][rows]))}
-                wide = [float(np.sqrt(max(s * s + variance, 0.01 * s * s))) for s in sigma]
+                wide = sigma
+                if variance:
+                    squares = [max(s * s + variance, 0.01 * s * s) for s in sigma]
+                    wide = float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))
                 found = predict_spots(
-                    *chain.edges(edges, self._spot_of[key]), sigma=(wide[0], wide[1]),
+                    *chain.edges(edges, self._spot_of[key]), sigma=wide,
                     phases=self._phases[key], fluxes=fluxes, halo=halo, law=chain.law,
-                    neighbours=self.measured.neighbours, read_noise=noise,
+                    neighbours=self.measured.neighbours,
                     change=partial(chain.spot_image, axes=axes),
                 )  # fmt: skip
                 found["flux"] = found["flux"] / scale

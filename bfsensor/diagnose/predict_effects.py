@@ -114,13 +114,10 @@ class EffectChain:
         level = np.asarray(axes["level"], float)
         for effect in self.effects:
             step = 1e-3 * np.maximum(level, 1.0)
-            up, down = (
-                effect.signal(level + s, {**axes, "level": level + s}, self.layout)
-                for s in (step, -step)
-            )
-            slope = (up - down) / (2 * step)
-            if np.any(slope != 1.0):
-                c = c * (slope**2)[:, None, None]
+            ends = level + step, level - step
+            up, down = (effect.signal(x, {**axes, "level": x}, self.layout) for x in ends)
+            if not (np.array_equal(up, ends[0]) and np.array_equal(down, ends[1])):
+                c = c * (((up - down) / (2 * step)) ** 2)[:, None, None]
             c = effect.covariances(c, axes, self.layout)
         return c
 

@@ -169,21 +169,14 @@ def _inside(spots: SpotList, shape: tuple[int, int], border: int) -> SpotList:
     return SpotList(spots.x[keep], spots.y[keep], dict(spots.rejected))
 
 
-def _clipped_mean(
-    values: NDArray[np.float64], noise: float | None = None
-) -> NDArray[np.float64]:
+def _clipped_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean along the last axis without what is struck or a neighbour's light.
 
-    Not the median: of codes, some of which are too wide, it lies a tenth of one off.  ``noise``:
-    of images without any, of so much more than light's own, whose noise decides what is left out.
+    Not the median: of codes, some of which are too wide, it lies a tenth of one off.
     """
     middle = np.median(values, axis=-1, keepdims=True)
     away = np.abs(values - middle)
-    usual = np.median(away, axis=-1, keepdims=True)
-    if noise is not None:
-        # A median deviation is 0.674 standard deviations.
-        usual = np.hypot(usual, 0.674 * np.sqrt(np.maximum(middle, 0.0) + noise**2))
-    near = away <= CLIP * usual
+    near = away <= CLIP * np.median(away, axis=-1, keepdims=True)
     return np.asarray((values * near).sum(-1) / near.sum(-1))
 
 
@@ -192,15 +185,11 @@ def stamp_moments(
     wide: NDArray[np.float64],
     x: NDArray[np.float64],
     y: NDArray[np.float64],
-    *,
-    noise: float | None = None,
 ) -> dict[str, NDArray[np.float64]]:
     """Flux, skewness along x and y, and the share of the flux in the wings, spot by spot.
 
     Skewness: the third power of the distance from the fitted centre, with a Gaussian weight of
-    2 pixels, over the flux.  Wings: what lies in the wide stamp outside the fitted one.  The
-    background is the median of the wide stamp's rim; of images that are means, that which the
-    rim would have with Poisson's noise and a read ``noise`` [e-].
+    2 pixels, over the flux.  Wings: what lies in the wide stamp outside the fitted one.
     """
     size = stamps.shape[-1]
     step = np.arange(size) - size // 2
@@ -211,7 +200,7 @@ def stamp_moments(
         ],
         axis=1,
     )
-    background = _clipped_mean(rim, noise)[:, None, None]
+    background = _clipped_mean(rim)[:, None, None]
     signal = stamps - background
     dx, dy = step[None] - x[:, None], step[None] - y[:, None]
     weight = np.exp(-(dx[:, None] ** 2 + dy[..., None] ** 2) / 8.0)
