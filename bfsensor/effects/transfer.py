@@ -32,7 +32,7 @@ def late_shares(transfers: ArrayLike, cti: float) -> NDArray[np.float64]:
     Examples
     --------
     >>> late_shares(2, 0.1)[:3].round(4)
-    array([0.81 , 0.162, 0.0243])
+    array([0.81  , 0.162 , 0.0243])
     """
     n = np.asarray(transfers, float)
     shares = [(1.0 - cti) ** n]
