@@ -33,6 +33,10 @@ ALIKE = 0.95
 CLOSE = 40.0
 """Difference in gain from the best up to which rivals are fitted again with all parameters."""
 
+HOPELESS, FAR = 3.0, 0.05
+"""Gain of a candidate's best start below which it is not fitted on, and as a part of the best of
+all starts: a fit of its shape makes it a few times as much, not twenty times."""
+
 REFITTED = 5
 """Most rivals that are."""
 
@@ -249,7 +253,10 @@ def name_of(kind: type[Effect]) -> str:
 
 def rank(screen: Screen, kinds: Sequence[type[Effect]]) -> list[Rival]:
     """Best of each kind, greatest evidence first."""
-    found = [screen.best(kind) for kind in kinds]
+    starts = [screen.tried(kind) for kind in kinds]
+    best = max((t[0][0] for t in starts if t), default=0.0)
+    least = max(HOPELESS, FAR * best)
+    found = [screen.best(t, least=least) for t in starts]
     return sorted((r for r in found if r is not None), key=lambda r: -r.evidence)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,13 +145,7 @@ class AdcBits(Effect):
         zero = np.array(layout.offsets)
         noise = np.array(layout.read_noise or np.full(len(zero), READ_NOISE))
         noise = np.where(np.isfinite(noise) & (noise > 0), noise, READ_NOISE)
-        # The overscan's codes are wrong as well: the level that they are read from.
-        low, high = zero - abs(self["delta"]), zero + abs(self["delta"])
-        for _ in range(40):
-            middle = 0.5 * (low + high)
-            more = middle + self._error(middle, noise) < zero
-            low, high = np.where(more, middle, low), np.where(more, high, middle)
-        return 0.5 * (low + high), noise
+        return _levels(self, tuple(zero.tolist()), tuple(noise.tolist())), noise
 
     def _error(self, level: Values, sigma: Values) -> Values:
         """Mean error of the codes [ADU] of levels with noise."""
@@ -183,3 +178,16 @@ class AdcBits(Effect):
 def _known(layout: Layout) -> bool:
     """Whether codes without light are known."""
     return bool(layout.offsets) and bool(np.isfinite(layout.offsets).all())
+
+
+@lru_cache(maxsize=64)
+def _levels(effect: AdcBits, zero: tuple[float, ...], noise: tuple[float, ...]) -> Values:
+    """True levels [ADU] whose mean codes, wrong as they are, are given."""
+    given, spread = np.array(zero), np.array(noise)
+    reach = abs(effect["delta"])
+    low, high = given - reach, given + reach
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        more = middle + effect._error(middle, spread) < given
+        low, high = np.where(more, middle, low), np.where(more, high, middle)
+    return np.asarray(0.5 * (low + high))

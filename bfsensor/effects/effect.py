@@ -243,6 +243,9 @@ class Effect:
     def __reduce__(self) -> tuple[type[Effect], tuple[dict[str, float]]]:
         return type(self), (dict(self.values),)
 
+    def __hash__(self) -> int:
+        return hash((type(self), tuple(sorted(self.values.items()))))
+
     def __getitem__(self, name: str) -> float:
         return self.values[name]
 

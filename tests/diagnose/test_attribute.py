@@ -82,7 +82,8 @@ def test_a_screen_finds_the_amplitude_to_its_error():
     truth = 12.0
     effect = make_effect("trap_serial", {"size": truth, "tau": 1.5, "amp": 1})
     predictor, fit, _ = fitted(7104, effect)
-    best = Screen(predictor, fit).best(TrapSerial)
+    screen = Screen(predictor, fit)
+    best = screen.best(screen.tried(TrapSerial))
     assert best.effect["amp"] == 1.0
     error = truth / np.sqrt(best.gain)
     # 4 sigma; tau is fitted too, which doubles the error.
