@@ -449,7 +449,6 @@ class Predictor:
                 found = predict_spots(
                     *edges, sigma=sigma, phases=self._phases[key], fluxes=fluxes
                 )
-                found.pop("flux")
             else:
                 variance, halo, axes = chain.spot_change(self._spot_of[key])
                 if "hours" in x:
@@ -464,7 +463,7 @@ class Predictor:
                     neighbours=self.measured.neighbours,
                     change=partial(chain.spot_image, axes=axes),
                 )  # fmt: skip
-                found["flux"] = found["flux"] / scale
+            found["flux"] = found["flux"] / scale
             for what, values in found.items():
                 here = x["what"][rows] == what
                 out[rows[here]] = values[here]
