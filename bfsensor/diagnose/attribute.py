@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor.diagnose.baseline import Baseline
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.locate import ALARM, Mismatch, locate_mismatch
 from bfsensor.diagnose.mismatch import BaselineFit, fit_baseline
 from bfsensor.diagnose.predict import Predictor, fitted, used_channels
 from bfsensor.diagnose.screen import Rival, Screen
+from bfsensor.effects.device_parameter import device_parameters
 from bfsensor.effects.effect import Effect, Parameter
 from bfsensor.effects.library import LIBRARY
 from bfsensor.errors import ConvergenceError
@@ -189,7 +191,7 @@ def attribute(
     fit: BaselineFit,
     mismatch: Mismatch,
     *,
-    kinds: Sequence[type[Effect]] = LIBRARY,
+    kinds: Sequence[type[Effect]] | None = None,
     seed: int = 1,
 ) -> Attribution:
     """Say which effects explain what a baseline leaves.
@@ -204,11 +206,12 @@ def attribute(
     ----------
     predictor, fit, mismatch
         The baseline, fitted, and what it leaves.
-    kinds : sequence of type
-        Candidates.
+    kinds : sequence of type, optional
+        Candidates; by default :func:`candidates_of` the baseline.
     seed : int
         Of the noise that thresholds come from.
     """
+    kinds = candidates_of(predictor.baseline) if kinds is None else kinds
     model = Model(predictor, fit)
     notes: list[str] = []
     open_world = False
@@ -244,6 +247,15 @@ def attribute(
         heldout=compare_held_out(Model(predictor, fit), model),
         notes=tuple(notes),
     )
+
+
+def candidates_of(baseline: Baseline) -> tuple[type[Effect], ...]:
+    """Candidates for what a baseline leaves out: the library, and its card's parameters."""
+    own = device_parameters(
+        baseline.edges, baseline.derivatives, baseline.spread, baseline.nominal,
+        baseline.reference,
+    )  # fmt: skip
+    return (*LIBRARY, *own)
 
 
 def name_of(kind: type[Effect]) -> str:
