@@ -37,8 +37,8 @@ class Saturation(Effect):
     )
     touches = ("flat_mean", "flat_cov", "spot")
     source = (
-        "Barrier between the phases of a column: Janesick 2001, Scientific Charge-Coupled "
-        "Devices, SPIE Press, section 4.2; range assumed"
+        "Blooming along the column past the barrier phases: Janesick 2001, Scientific "
+        "Charge-Coupled Devices, SPIE Press PM83; even sharing and range assumed"
     )
 
     @classmethod

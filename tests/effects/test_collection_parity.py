@@ -145,7 +145,8 @@ def check_full_well(seed: int, size: Size | str, full_well: float) -> None:
         chi2, dof = found[word]
         # Five standard deviations, and a tenth for errors that are themselves estimates.
         assert chi2 < 1.1 * dof + 5 * np.sqrt(2 * dof), f"{word}: {chi2:.0f} of {dof}"
-    for word in ("flat_cov", "flat_mean", "spot"):
+    # The brightest spots peak at 1.1e5 e-.
+    for word in ("flat_cov", "flat_mean", "spot")[: 3 if full_well < 1e5 else 2]:
         assert without[word][0] > 3 * found[word][0], word
 
 
