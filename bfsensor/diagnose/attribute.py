@@ -35,6 +35,10 @@ ALIKE = 0.95
 CLOSE = 40.0
 """Difference in gain from the best up to which rivals are fitted again with all parameters."""
 
+REMAINDER = 0.02
+"""Part of the chi-square that effects explain up to which the farthest of what is left is laid to
+their closed forms: seven standard deviations of fifty."""
+
 HOPELESS, FAR = 3.0, 0.05
 """Gain of a candidate's best start below which it is not fitted on, and as a part of the best of
 all starts: a fit of its shape makes it a few times as much, not twenty times."""
@@ -238,6 +242,16 @@ def attribute(
     else:
         open_world = mismatch.detected
     found, model, mismatch = _judge(model, rankings, mismatch, kinds, seed)
+    if open_world and mismatch.detected and found:
+        rest = max((p.z**2 for p in mismatch.parts), default=np.inf)
+        if rest < REMAINDER * (fit.total - model.fit.total):
+            # Closed forms of effects are good to a per cent: what is seen at a hundred standard
+            # deviations leaves some.
+            open_world = False
+            notes.append(
+                f"{np.sqrt(rest):.1f} standard deviations are left in the "
+                f"{mismatch.parts[0].word}: what the effects' closed forms lack"
+            )
     return Attribution(
         found=tuple(sorted(found, key=lambda f: -f.gain)),
         fit=model.fit,

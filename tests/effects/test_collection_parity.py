@@ -180,7 +180,8 @@ def check_device_parameter(
     null, fit = null_campaign(SEED, size)
     other = measure_channels(VirtualSource(seed=SEED, size=size, effects=[own]))
     before, bare, after = (
-        residuals(fit, m, e) for m, e in ((null, ()), (other, ()), (other, (effect,)))
+        residuals(fit, m, e, used_channels(other.channels, FOLDS))
+        for m, e in ((null, ()), (other, ()), (other, (effect,)))
     )
     said, seen = bare["flat_cov"] - after["flat_cov"], bare["flat_cov"] - before["flat_cov"]
     length = np.linalg.norm(said)
