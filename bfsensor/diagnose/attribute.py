@@ -36,8 +36,8 @@ CLOSE = 40.0
 """Difference in gain from the best up to which rivals are fitted again with all parameters."""
 
 REMAINDER = 0.02
-"""Part of the chi-square that effects explain up to which the farthest of what is left is laid to
-their closed forms: seven standard deviations of fifty."""
+"""Part of the chi-square that effects explain up to which what is left is laid to their closed
+forms: seven standard deviations of fifty."""
 
 HOPELESS, FAR = 3.0, 0.05
 """Gain of a candidate's best start below which it is not fitted on, and as a part of the best of
@@ -243,14 +243,15 @@ def attribute(
         open_world = mismatch.detected
     found, model, mismatch = _judge(model, rankings, mismatch, kinds, seed)
     if open_world and mismatch.detected and found:
-        rest = max((p.z**2 for p in mismatch.parts), default=np.inf)
+        rest = remainder(mismatch)
         if rest < REMAINDER * (fit.total - model.fit.total):
             # Closed forms of effects are good to a per cent: what is seen at a hundred standard
             # deviations leaves some.
             open_world = False
             notes.append(
-                f"{np.sqrt(rest):.1f} standard deviations are left in the "
-                f"{mismatch.parts[0].word}: what the effects' closed forms lack"
+                f"{np.sqrt(rest):.1f} standard deviations are left in "
+                f"{', '.join(dict.fromkeys(p.word for p in mismatch.parts))}: laid to the effects' "
+                "closed forms"
             )
     return Attribution(
         found=tuple(sorted(found, key=lambda f: -f.gain)),
@@ -261,6 +262,16 @@ def attribute(
         heldout=compare_held_out(Model(predictor, fit), model),
         notes=tuple(notes),
     )
+
+
+def remainder(mismatch: Mismatch) -> float:
+    """Chi-square beyond noise of all channels that something is left in; infinite of none."""
+    out = 0.0
+    for word in dict.fromkeys(p.word for p in mismatch.parts):
+        square, dof = mismatch.chi2[word]
+        parts = sum(p.z**2 for p in mismatch.parts if p.word == word)
+        out += max(square - dof, parts)
+    return out or np.inf
 
 
 def candidates_of(baseline: Baseline) -> tuple[type[Effect], ...]:
