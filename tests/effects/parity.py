@@ -15,6 +15,10 @@ RANDOM = (
 )  # fmt: skip
 """Effects that are told by their scatter: predicted is what is expected of many."""
 
+SCATTER = {"correlated_noise:pickup": 3 / 14**0.5}
+"""Relative scatter of a prediction, three of its standard deviations: a wave's power in the
+differences of 2 x 7 biases, whose phases are free, is between 0 and 2 of its mean in each."""
+
 FEW = 0.05
 """Relative error of a prediction: closed forms are of first order in amplitudes of per cents."""
 
@@ -44,6 +48,7 @@ def disagreements(effect, engine, size="S", few=FEW):
         gap = abs(r.factor - 1) * r.said
         # Of random effects the sums over two campaigns differ by as many of their errors.
         allowed = max(few * r.said, 4 * 2**0.5 if effect.word in RANDOM else UNSEEN)
+        allowed = max(allowed, SCATTER.get(effect.name, 0.0) * r.said)
         if gap > max(allowed, 3 * r.error * r.said):
             out.append(
                 f"{r.channel}: factor {r.factor:.3f} +- {r.error:.3f} on {r.said:.1f} sigma"
