@@ -94,7 +94,8 @@ def diagnose_drawn(
 ) -> Diagnosis:
     """Draw and diagnose once."""
     table = draw_table(areas, errors, np.random.default_rng(seed))
-    return diagnose_measured(measure_reduced(table, reach=LAGS - 1), baseline, seed=seed)
+    measured = measure_reduced(table, reach=LAGS - 1)
+    return diagnose_measured(measured, baseline, seed=seed, explain=False)
 
 
 def row_of(found: Diagnosis, name: str, truth: float) -> dict[str, float]:
