@@ -6,7 +6,8 @@ fewer exposures from tile-compressed files written to PLACE and taken away after
 a process of its own, against a baseline without the effect, as the frames are, and against
 one with it.  A row of ``validation/results/diagnose_memory.ecsv`` is a part of one of
 them: its CPU seconds, those for each exposure, and the peak of the process's memory when the
-part was over.  What explains a mismatch is not sought.  'frames made' is what the campaign itself cost, no part of a diagnosis.
+part was over.  What explains a mismatch is not sought.  'frames made' is what the campaign
+itself cost, no part of a diagnosis.
 """
 
 from __future__ import annotations
