@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor.diagnose.baseline import Baseline
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.locate import ALARM, Mismatch, locate_mismatch
 from bfsensor.diagnose.mismatch import BaselineFit, fit_baseline
 from bfsensor.diagnose.predict import Predictor, fitted, used_channels
 from bfsensor.diagnose.screen import Rival, Screen
+from bfsensor.effects.device_parameter import device_parameters
 from bfsensor.effects.effect import Effect, Parameter
 from bfsensor.effects.library import LIBRARY
 from bfsensor.errors import ConvergenceError
@@ -32,6 +34,14 @@ ALIKE = 0.95
 
 CLOSE = 40.0
 """Difference in gain from the best up to which rivals are fitted again with all parameters."""
+
+REMAINDER = 0.02
+"""Part of the chi-square that effects explain up to which what is left is laid to their closed
+forms: seven standard deviations of fifty."""
+
+HOPELESS, FAR = 3.0, 0.05
+"""Gain of a candidate's best start below which it is not fitted on, and as a part of the best of
+all starts: a fit of its shape makes it a few times as much, not twenty times."""
 
 REFITTED = 5
 """Most rivals that are."""
@@ -185,7 +195,7 @@ def attribute(
     fit: BaselineFit,
     mismatch: Mismatch,
     *,
-    kinds: Sequence[type[Effect]] = LIBRARY,
+    kinds: Sequence[type[Effect]] | None = None,
     seed: int = 1,
 ) -> Attribution:
     """Say which effects explain what a baseline leaves.
@@ -200,11 +210,12 @@ def attribute(
     ----------
     predictor, fit, mismatch
         The baseline, fitted, and what it leaves.
-    kinds : sequence of type
-        Candidates.
+    kinds : sequence of type, optional
+        Candidates; by default :func:`candidates_of` the baseline.
     seed : int
         Of the noise that thresholds come from.
     """
+    kinds = candidates_of(predictor.baseline) if kinds is None else kinds
     model = Model(predictor, fit)
     notes: list[str] = []
     open_world = False
@@ -231,6 +242,17 @@ def attribute(
     else:
         open_world = mismatch.detected
     found, model, mismatch = _judge(model, rankings, mismatch, kinds, seed)
+    if open_world and mismatch.detected and found:
+        rest = remainder(mismatch)
+        if rest < REMAINDER * (fit.total - model.fit.total):
+            # Closed forms of effects are good to a per cent: what is seen at a hundred standard
+            # deviations leaves some.
+            open_world = False
+            notes.append(
+                f"{np.sqrt(rest):.1f} standard deviations are left in "
+                f"{', '.join(dict.fromkeys(p.word for p in mismatch.parts))}: laid to the effects' "
+                "closed forms"
+            )
     return Attribution(
         found=tuple(sorted(found, key=lambda f: -f.gain)),
         fit=model.fit,
@@ -242,6 +264,25 @@ def attribute(
     )
 
 
+def remainder(mismatch: Mismatch) -> float:
+    """Chi-square beyond noise of all channels that something is left in; infinite of none."""
+    out = 0.0
+    for word in dict.fromkeys(p.word for p in mismatch.parts):
+        square, dof = mismatch.chi2[word]
+        parts = sum(p.z**2 for p in mismatch.parts if p.word == word)
+        out += max(square - dof, parts)
+    return out or np.inf
+
+
+def candidates_of(baseline: Baseline) -> tuple[type[Effect], ...]:
+    """Candidates for what a baseline leaves out: the library, and its card's parameters."""
+    own = device_parameters(
+        baseline.edges, baseline.derivatives, baseline.spread, baseline.nominal,
+        baseline.reference,
+    )  # fmt: skip
+    return (*LIBRARY, *own)
+
+
 def name_of(kind: type[Effect]) -> str:
     """Class, and variant where there are several."""
     return f"{kind.word}:{kind.variant}" if kind.variant else kind.word
@@ -249,7 +290,10 @@ def name_of(kind: type[Effect]) -> str:
 
 def rank(screen: Screen, kinds: Sequence[type[Effect]]) -> list[Rival]:
     """Best of each kind, greatest evidence first."""
-    found = [screen.best(kind) for kind in kinds]
+    starts = [screen.tried(kind) for kind in kinds]
+    best = max((t[0][0] for t in starts if t), default=0.0)
+    least = max(HOPELESS, FAR * best)
+    found = [screen.best(t, least=least) for t in starts]
     return sorted((r for r in found if r is not None), key=lambda r: -r.evidence)
 
 

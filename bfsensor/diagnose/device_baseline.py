@@ -22,8 +22,11 @@ from bfsensor.table import DistortionTable
 from bfsensor.table_plan import plan_table
 
 CELLS = 16
-"""Cells a pixel of the tables whose differences are taken: a difference needs not the table's own
-accuracy."""
+"""Cells a pixel of the tables whose differences are taken: a difference needs not the accuracy of
+the device's own table, which has those of shipped ones."""
+
+TABLES = "nominal as shipped, differences at 16 cells"
+"""How shifts are made: what was kept of others is not read again."""
 
 STEP = 0.5
 """Shift of a parameter to either side [its uncertainty]."""
@@ -161,7 +164,7 @@ def baseline_of_device(
     ]
     total, done = len(biases) + 2 * len(chosen), 0
 
-    def table_of(changed: Device) -> DistortionTable:
+    def table_of(changed: Device, cells: int | None = None) -> DistortionTable:
         nonlocal done
         thickness = changed.silicon.thickness
         depths = [5.0, 20.0, 0.5 * thickness, thickness]
@@ -171,7 +174,9 @@ def baseline_of_device(
             backgrounds=[LEVEL],
             depths=depths,
         )
-        table = build_table(dataclasses.replace(plan, cells=CELLS))
+        table = build_table(
+            plan if cells is None else dataclasses.replace(plan, cells=cells)
+        )
         done += 1
         if progress is not None:
             progress(done, total)
@@ -191,7 +196,7 @@ def baseline_of_device(
         refused = ""
         for by in (STEP * known[name], -STEP * known[name]):
             try:
-                table = table_of(change_parameter(device, name, by))
+                table = table_of(change_parameter(device, name, by), CELLS)
             except DeviceError as error:
                 # At the end of what can be, such as oxides of equal thickness: from one side.
                 refused = str(error)
@@ -200,7 +205,8 @@ def baseline_of_device(
         if not sides:
             raise DiagnosisError(f"{device.name}: {name!r} cannot float: {refused}")
         if len(sides) == 1:
-            sides[0.0] = edges[620.0, own]
+            table = table_of(device, CELLS)
+            sides[0.0] = edges_at(table, 620.0, temperature, background=LEVEL)
         (high, up), (low, down) = sorted(sides.items(), key=lambda s: -s[0])
         derivatives[name] = (
             (up[0] - down[0]) / (high - low),

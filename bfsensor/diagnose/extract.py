@@ -86,6 +86,8 @@ class Measured:
         Of which flats each map is made.
     neighbours : (float, float)
         Distance of the next spots in x and y [pixel], and how many of those places hold one.
+    offsets : tuple of float
+        Mean code of each amplifier without light, of one exposure; nan without overscan.
     """
 
     channels: tuple[Channel, ...]
@@ -105,6 +107,7 @@ class Measured:
     shots: tuple[Shot, ...] = ()
     maps: Mapping[tuple[str, str], tuple[MapShare, ...]] = field(default_factory=dict)
     neighbours: tuple[float, float] = (np.inf, 0.0)
+    offsets: tuple[float, ...] = ()
 
 
 def measure_channels(
@@ -170,7 +173,10 @@ def measure_channels(
     for each in (biases, late_biases):
         each.forget_mean()
     noise = biases.read_noise
-    flats = FlatChannels(bias_images, noise, lamp_error=source.lamp_error, lags=lags)
+    start = min((e.mjd for e in exposures if e.mjd is not None), default=np.nan)
+    flats = FlatChannels(
+        bias_images, noise, lamp_error=source.lamp_error, lags=lags, start=start
+    )
     longest: dict[tuple[str, ...], float] = {}
     for flat in kinds.get("flat", []):
         key = Condition.of(flat).key
@@ -222,7 +228,7 @@ def measure_channels(
     mean_noise = float(
         np.mean([noise.get(f.name, 0.0) * g for f, g in zip(layout, rough, strict=True)])
     )
-    spots = SpotChannels(read_noise=mean_noise, lamp_error=source.lamp_error)
+    spots = SpotChannels(read_noise=mean_noise, lamp_error=source.lamp_error, start=start)
     crosstalk, late_crosstalk = CrosstalkChannels(), CrosstalkChannels("held-out")
     for n, exposure in enumerate(kinds.get("spot", [])):
         held = is_held_out(n, len(kinds["spot"]))
@@ -272,6 +278,10 @@ def measure_channels(
         shots=_shots(exposures, levels, float(np.mean(rough))),
         maps=shares,
         neighbours=spots.neighbours,
+        offsets=tuple(
+            float(f.serial_overscan.mean()) if f.serial_overscan.size else np.nan
+            for f in layout
+        ),
     )
 
 

@@ -22,7 +22,7 @@ from bfsensor.diagnose.predict_flats import (
     quadrant,
 )
 from bfsensor.diagnose.predict_spots import predict_spots, representative_phases
-from bfsensor.effects.effect import Effect, Parameter
+from bfsensor.effects.effect import Effect, Layout, Parameter
 from bfsensor.errors import DiagnosisError
 
 MAP_ORDER = 4
@@ -251,10 +251,19 @@ class Predictor:
             return None
         return EffectChain(
             self.effects_at(parameters),
-            self.layout,
+            self._layout_at(parameters),
             self.measured,
             self.baseline,
             self._evened,
+        )
+
+    def _layout_at(self, parameters: NDArray[np.float64]) -> Layout:
+        """Layout with the gains and the read noise that parameters say."""
+        gains, noise = parameters[: self._amps], parameters[self._amps : 2 * self._amps]
+        return replace(
+            self.layout,
+            gains=tuple(gains.tolist()),
+            read_noise=tuple(np.sqrt(np.maximum(noise, 0.0)).tolist()),
         )
 
     def effects_at(self, parameters: NDArray[np.float64]) -> tuple[Effect, ...]:
@@ -427,7 +436,6 @@ class Predictor:
         x = channel.axes
         # Images were put on the scale of electrons with rough gains.
         scale = float(np.mean(gains / np.array(self.measured.gains)))
-        noise = float(np.nan_to_num(np.mean(gains * np.array(self.measured.read_noise))))
         out = np.zeros(len(channel))
         for key in self._spot_conditions:
             rows = self._rows(channel).get(key, np.zeros(0, int))
@@ -441,17 +449,21 @@ class Predictor:
                 found = predict_spots(
                     *edges, sigma=sigma, phases=self._phases[key], fluxes=fluxes
                 )
-                found.pop("flux")
             else:
                 variance, halo, axes = chain.spot_change(self._spot_of[key])
-                wide = [float(np.sqrt(max(s * s + variance, 0.01 * s * s))) for s in sigma]
+                if "hours" in x:
+                    axes = {**axes, "hours": float(np.mean(x["hours"][rows]))}
+                wide = sigma
+                if variance:
+                    squares = [max(s * s + variance, 0.01 * s * s) for s in sigma]
+                    wide = float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))
                 found = predict_spots(
-                    *chain.edges(edges, self._spot_of[key]), sigma=(wide[0], wide[1]),
+                    *chain.edges(edges, self._spot_of[key]), sigma=wide,
                     phases=self._phases[key], fluxes=fluxes, halo=halo, law=chain.law,
-                    neighbours=self.measured.neighbours, read_noise=noise,
+                    neighbours=self.measured.neighbours,
                     change=partial(chain.spot_image, axes=axes),
                 )  # fmt: skip
-                found["flux"] = found["flux"] / scale
+            found["flux"] = found["flux"] / scale
             for what, values in found.items():
                 here = x["what"][rows] == what
                 out[rows[here]] = values[here]

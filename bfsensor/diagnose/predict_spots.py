@@ -25,6 +25,14 @@ SPILLING = 24
 KNOTS = 4
 """Fluxes at which spots are measured where nothing spills: nearly straight between them."""
 
+CHANGES = 7
+"""Fluxes, equal steps in their logarithm, at which changes after collection are found."""
+
+MEASURED = ("sigma_x", "sigma_y", "skew_x", "skew_y", "wings", "flux")
+
+LITTLE = 1e-5
+"""Excess charge that is no longer shared out [full wells]."""
+
 FEW = 4
 """Places of spots that are crossed with one another where charge spills."""
 
@@ -108,8 +116,8 @@ def spill(
     charge = charge.copy()
     for _ in range(rounds):
         excess = np.maximum(charge - full_well, 0.0)
-        if not excess.any():
-            return charge
+        if excess.max() < LITTLE * full_well:
+            break
         charge -= excess
         charge[:, 1:] += 0.5 * excess[:, :-1]
         charge[:, :-1] += 0.5 * excess[:, 1:]
@@ -235,7 +243,6 @@ def predict_spots(
     neighbours: tuple[float, float] = ALONE,
     law: Law = LINEAR,
     change: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
-    read_noise: float = 5.0,
 ) -> dict[str, NDArray[np.float64]]:
     """What the fit of the channels measures of such spots, at given fluxes.
 
@@ -244,13 +251,12 @@ def predict_spots(
     kx, ky, sigma, phases
         As for :func:`grow_spots`.
     fluxes : array_like, shape (n,)
-        Electrons of a spot as they are measured, with what is lost or lies beside [e-].
+        Electrons of a spot as they are read, with what is lost or lies beside, after ``change``
+        [e-].
     halo, neighbours, law
         As for :func:`grow_spots`.
     change : callable, optional
         What happens to the images [e-] after collection.
-    read_noise : float
-        Of a pixel [e-]: it blurs the level that is taken for the background.
 
     Returns
     -------
@@ -273,26 +279,55 @@ def predict_spots(
             centres = np.array(np.meshgrid(*centres.T)).reshape(2, -1).T
         every = 1
         images = grow(phases=centres, steps=SPILLING)
-    wide = images[every - 1 :: every]
-    wide = wide if change is None else change(wide)
+    measure = partial(_measure, sigma=sigma, centres=centres)
+    light = top * np.arange(every, len(images) + 1, every) / len(images)
+    plain = measure(images[every - 1 :: every])
+    lines = _interpolate(plain[:, -1], np.column_stack([plain[:, :-1], plain[:, -1] - light]),
+                         turning=spilling)  # fmt: skip
+    if change is None or np.array_equal(change(images[-1]), images[-1]):
+        return dict(zip(MEASURED, lines(wanted).T, strict=True))
+    # What comes after collection need not be smooth: between fluxes as they are.
+    knots = np.geomspace(min(wanted.min(), 0.999 * top), top, CHANGES)
+    those = np.array([_image_at(images, flux / top) for flux in knots])
+    both = measure(np.concatenate([those, change(those)]))
+    changes = PchipInterpolator(np.log(knots), both[CHANGES:] - both[:CHANGES])
+    before = wanted
+    for _ in range(2):
+        before = wanted - changes(np.log(before))[:, -1]
+    return dict(zip(MEASURED, (lines(before) + changes(np.log(before))).T, strict=True))
+
+
+def _interpolate(
+    knots: NDArray[np.float64], values: NDArray[np.float64], *, turning: bool
+) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Lines through values at knots of the flux: cubics, or pieces where they turn sharply."""
+    if turning:
+        pieces = PchipInterpolator(knots, values)
+        return lambda flux: np.asarray(pieces(np.maximum(flux, knots[0])))
+    scale = knots[-1]
+    line = np.linalg.solve(np.vander(knots / scale, increasing=True), values)
+    return lambda flux: np.vander(flux / scale, len(knots), increasing=True) @ line
+
+
+def _image_at(images: NDArray[np.float64], part: float) -> NDArray[np.float64]:
+    """Images at a part of their last flux, their shapes being straight in it between steps."""
+    at = part * len(images)
+    low = int(np.clip(np.floor(at), 1, len(images) - 1))
+    one, two = images[low - 1] / low, images[low] / (low + 1)
+    return np.asarray(at * (one + (at - low) * (two - one)))
+
+
+def _measure(
+    wide: NDArray[np.float64], sigma: tuple[float, float], centres: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """What the channels measure of k images, shape (k, 6), in the order of :data:`MEASURED`."""
+    count, n = wide.shape[:2]
     margin = (WING - STAMP) // 2
     stamps = wide[..., margin:-margin, margin:-margin]
     fit = fit_widths(stamps, sigma, centres)
-    count, n = wide.shape[:2]
     moments = stamp_moments(
         stamps.reshape(count * n, STAMP, STAMP), wide.reshape(count * n, WING, WING),
-        fit.centre_x.ravel(), fit.centre_y.ravel(), noise=read_noise,
+        fit.centre_x.ravel(), fit.centre_y.ravel(),
     )  # fmt: skip
-    table = {"sigma_x": fit.sigma_x, "sigma_y": fit.sigma_y}
-    table |= {name: v.reshape(count, n).mean(1) for name, v in moments.items()}
-    knots = table["flux"].copy()
-    table["flux"] = knots - top * np.arange(1, count + 1) / count
-    if spilling:
-        # Below the first knot all goes straight.
-        held = np.maximum(wanted, knots[0])
-        return {k: np.asarray(PchipInterpolator(knots, v)(held)) for k, v in table.items()}
-    # The cubic through the knots.
-    powers = np.vander(knots / top, increasing=True)
-    line = np.linalg.solve(powers, np.array(list(table.values())).T)
-    values = np.vander(wanted / top, KNOTS, increasing=True) @ line
-    return dict(zip(table, values.T, strict=True))
+    means = [moments[name].reshape(count, n).mean(1) for name in MEASURED[2:]]
+    return np.array([fit.sigma_x, fit.sigma_y, *means]).T

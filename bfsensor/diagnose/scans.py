@@ -382,20 +382,27 @@ def _spots(g: Group) -> Iterator[Pattern]:
 def _codes(g: Group) -> Iterator[Pattern]:
     """Bits, single codes, by amplifier."""
     x = g.axes
-    code = x["code"].astype(int)
-    for name, here in _amplifiers(x):
+    code, multiple = x["code"].astype(int), x["bit"].astype(int)
+    for name, amp in _amplifiers(x):
+        here = amp & (code >= 0)
         bit = 1
         while bit <= code.max():
             yield "code bits", np.where(here, np.where(code & bit, 1.0, -1.0), 0.0), {
                 "amp": name, "bit": bit,
             }  # fmt: skip
             bit *= 2
-        for one in np.unique(code):
+        for one in np.unique(code[here]):
             yield (
                 "codes",
                 np.where(here & (code == one), 1.0, 0.0),
                 {"amp": name, "code": int(one)},
             )
+        for power, below in sorted(
+            set(zip(multiple[code < 0], code[code < 0], strict=True))
+        ):
+            yield "codes below high bits", np.where(
+                amp & (multiple == power) & (code == below), 1.0, 0.0
+            ), {"amp": name, "bit": 2 ** int(power), "code": int(below)}  # fmt: skip
 
 
 def _single(g: Group) -> Iterator[Pattern]:

@@ -13,8 +13,8 @@ class BrighterFatterAnisotropy(Effect):
     parameters = (Parameter("eps", "", 0.02, 0.3, signed=True, amplitude=True),)
     touches = ("flat_cov", "spot")
     source = (
-        "Boundaries between rows and columns are sealed at other heights: Astier & Regnault "
-        "2023, A&A 670, A118; range assumed"
+        "Boundaries between rows and columns are made by other barriers (electrostatic fits of "
+        "Astier & Regnault 2023, A&A 670, A118); law and range assumed"
     )
 
     def edges(self, kx: Values, ky: Values, shot: Shot, layout: Layout) -> Edges:

@@ -16,8 +16,8 @@ class BrighterFatterChromatic(Effect):
     parameters = (Parameter("kappa", "", 0.01, 0.2, signed=True, amplitude=True),)
     touches = ("flat_cov", "spot")
     source = (
-        "Light that converts deeper is pushed over a shorter path: Astier & Regnault 2023, A&A "
-        "670, A118; range assumed"
+        "Light that converts deeper is pushed over a shorter path (Astier & Regnault 2023, A&A "
+        "670, A118, model the bands of one camera); law and range assumed"
     )
 
     def edges(self, kx: Values, ky: Values, shot: Shot, layout: Layout) -> Edges:

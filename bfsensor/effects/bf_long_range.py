@@ -27,9 +27,8 @@ class BrighterFatterLongRange(Effect):
     )
     touches = ("flat_cov", "spot")
     source = (
-        "Beyond the back plane's image the field of a charge falls off; a tail is what is left "
-        "where image or thickness are wrong: Astier & Regnault 2023, A&A 670, A118, fit areas "
-        "to lags of 10; law and range assumed"
+        "Assumed: what is left far out where the back plane's image or the thickness are wrong; "
+        "field of a charge between planes: Astier & Regnault 2023, A&A 670, A118"
     )
 
     def edges(self, kx: Values, ky: Values, shot: Shot, layout: Layout) -> Edges:

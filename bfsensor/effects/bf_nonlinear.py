@@ -17,8 +17,8 @@ class BrighterFatterNonlinear(Effect):
     parameters = (Parameter("b", "1/e-", 3e-7, 3e-6, signed=True, amplitude=True),)
     touches = ("flat_cov", "spot")
     source = (
-        "Area changes a (1 + b mu) with b of some -1e-6 /e-: Astier et al. 2019, A&A 629, A36, "
-        "equations 15 and 20; range assumed"
+        "Astier et al. 2019, A&A 629, A36, question shifts proportional to charge and fit a term "
+        "a b; law of one b and range assumed"
     )
 
     def law(self) -> Law:

@@ -48,9 +48,9 @@ class DeviceParameter(Effect):
     Notes
     -----
     Of the image-charge device of ``validation.concealed``, straight lines miss the change of the
-    areas, for shifts of 5 and 10 spreads, by 2 and 4 % of itself (thickness), 0.2 and 0.4 % (h),
-    1 and 4 % (zx, zy), 5 and 9 % (doping): that much of the shift found may be wrong.
-    Widths of the charge (wx, wy) change areas by a per cent at most, and crookedly: a
+    areas, for shifts of 5 and 10 spreads, by 2 and 3 % of itself (thickness), 0.2 and 0.6 % (h),
+    1 and 3 % (zx), 2 and 5 % (zy), 5 and 9 % (doping): that much of the shift found may be
+    wrong.  Widths of the charge (wx, wy) change areas by a per cent at most, and crookedly: a
     shift of theirs is off by half of itself.
     """
 

@@ -25,8 +25,8 @@ class LateralDiffusion(Effect):
     parameters = (Parameter("var", "pixel^2", 0.005, 0.2, amplitude=True),)
     touches = ("spot",)
     source = (
-        "Variance 2 (kT / q) d L / V of a drift path d in a slab of thickness L: Groom et al. "
-        "1999, Proc. SPIE 3649, 80; Fairfield et al. 2006, IEEE TNS 53, 3877; range assumed"
+        "Einstein's relation over the drift path d in a slab of thickness L under V: variance "
+        "2 (kT / q) d L / V; range assumed"
     )
 
     def spot_light(self, shot: Shot, layout: Layout) -> tuple[float, float, float]:

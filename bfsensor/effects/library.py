@@ -4,12 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from bfsensor.effects.adc_bits import AdcBits
+from bfsensor.effects.amp_crosstalk import AmpCrosstalk
 from bfsensor.effects.bf_anisotropy import BrighterFatterAnisotropy
 from bfsensor.effects.bf_chromatic import BrighterFatterChromatic
 from bfsensor.effects.bf_long_range import BrighterFatterLongRange
 from bfsensor.effects.bf_nonlinear import BrighterFatterNonlinear
+from bfsensor.effects.bias_instability import BiasByFrame, BiasByRow, BiasRamp
 from bfsensor.effects.charge_loss import ChargeLoss
+from bfsensor.effects.correlated_noise import CommonNoise, NoiseInTime, Pickup
+from bfsensor.effects.cti_parallel import CtiParallel
+from bfsensor.effects.cti_serial import CtiSerial
 from bfsensor.effects.effect import Effect
+from bfsensor.effects.electronic_memory import ElectronicMemory
+from bfsensor.effects.gain_drift import GainDrift
 from bfsensor.effects.gain_nonlinearity import GainNonlinearity
 from bfsensor.effects.interpixel_coupling import InterpixelCoupling
 from bfsensor.effects.lateral_diffusion import LateralDiffusion
@@ -25,12 +33,24 @@ LIBRARY: tuple[type[Effect], ...] = (
     BrighterFatterChromatic,
     BrighterFatterLongRange,
     BrighterFatterNonlinear,
+    AdcBits,
+    AmpCrosstalk,
+    BiasByFrame,
+    BiasByRow,
+    BiasRamp,
     ChargeLoss,
+    CommonNoise,
+    CtiParallel,
+    CtiSerial,
+    ElectronicMemory,
+    GainDrift,
     GainNonlinearity,
     InterpixelCoupling,
     LateralDiffusion,
     PsfWings,
     Saturation,
+    NoiseInTime,
+    Pickup,
     Tearing,
     TrapSerial,
     VoltageDependence,

@@ -15,10 +15,7 @@ class PsfWings(Effect):
         Parameter("sigma", "pixel", 3.0, 8.0),
     )
     touches = ("spot",)
-    source = (
-        "Scattered light of projectors and of the sensor's own surfaces: King 1971, PASP 83, "
-        "199, of wings in general; law and range assumed"
-    )
+    source = "Assumed: scattered light of a projector, one Gaussian for what is rather a power law"
 
     def spot_light(self, shot: Shot, layout: Layout) -> tuple[float, float, float]:
         del shot, layout

@@ -37,8 +37,8 @@ class Saturation(Effect):
     )
     touches = ("flat_mean", "flat_cov", "spot")
     source = (
-        "Barrier between the phases of a column: Janesick 2001, Scientific Charge-Coupled "
-        "Devices, SPIE Press, section 4.2; range assumed"
+        "Blooming along the column past the barrier phases: Janesick 2001, Scientific "
+        "Charge-Coupled Devices, SPIE Press PM83; even sharing and range assumed"
     )
 
     @classmethod
@@ -60,16 +60,14 @@ class Saturation(Effect):
 
     def flat_mean(self, axes: Axes, layout: Layout) -> Values:
         light = axes.get("light", axes["level"])
-        out = np.zeros(len(light))
         if self.is_neutral():
-            return out
+            return np.zeros(len(light))
+        out = np.minimum(light, self["full_well"]) - light
         sigma = np.sqrt(np.maximum(light, 1.0))
         distance = (self["full_well"] - light) / sigma
-        full = distance < -FAR
-        out[full] = self["full_well"] - light[full]
         for n in np.nonzero(np.abs(distance) <= FAR)[0]:
-            change, _ = _near(round(float(distance[n]), 1), _unevenness(light[n], sigma[n]))
-            out[n] = change * sigma[n]
+            short, _ = _near(round(float(distance[n]), 1), _unevenness(light[n], sigma[n]))
+            out[n] -= short * sigma[n]
         return out
 
     def covariances(self, c: Values, axes: Axes, layout: Layout) -> Values:
@@ -98,7 +96,7 @@ def _unevenness(light: float, sigma: float) -> float:
 
 @lru_cache(maxsize=64)
 def _near(distance: float, uneven: float) -> tuple[float, Values]:
-    """Flats near the full well: change of the mean, and covariances along the column.
+    """Flats near the full well: what their mean lacks, and covariances along the column.
 
     A small simulation of pairs with fixed random numbers, good to 1 % of the variance.
 
@@ -111,8 +109,8 @@ def _near(distance: float, uneven: float) -> tuple[float, Values]:
 
     Returns
     -------
-    change : float
-        Of the mean, in standard deviations.
+    short : float
+        Of the mean below that of the light or the full well, in standard deviations.
     left : ndarray, shape (LAGS + 1,)
         Covariances over the variance that the noise had.
     """
@@ -129,8 +127,8 @@ def _near(distance: float, uneven: float) -> tuple[float, Values]:
     found = np.array(left) / whole
     # What the fixed numbers correlate by chance.
     found[1:] -= found[0] * np.array(own) / whole
-    change = float(pairs.mean() - (noise + pattern).mean())
-    return change, found
+    short = min(float((noise + pattern).mean()), distance) - float(pairs.mean())
+    return short, found
 
 
 def spilled(charge: Values, full_well: float) -> Values:

@@ -40,7 +40,7 @@ def explained(seed, *effects):
 @pytest.fixture(scope="module")
 def torn():
     return explained(
-        7101, make_effect("tearing", {"amp": 0.03, "length": 2.0, "column": 0.3})
+        7101, make_effect("tearing", {"amp": 0.008, "length": 2.0, "column": 0.3})
     )
 
 
@@ -49,7 +49,7 @@ def test_an_effect_is_named_with_its_parameters(torn):
     assert found.effect.word == "tearing" and torn.probability["tearing"] > 0.9
     told = found.intervals()
     # 3 sigma; the tear is open in 0.7 of the rows on average, in a few tens of exposures.
-    for name, truth, more in (("amp", 0.03, 0.003), ("length", 2.0, 0.2)):
+    for name, truth, more in (("amp", 0.008, 0.0015), ("length", 2.0, 0.2)):
         width = 1.5 * (told[name]["hi68"] - told[name]["lo68"]) + more
         assert abs(told[name]["value"] - truth) < width, name
     assert abs(told["column"]["value"] * 128 - 0.3 * 128) < 1.0
@@ -58,7 +58,7 @@ def test_an_effect_is_named_with_its_parameters(torn):
 def test_recordings_that_were_not_fitted_agree_better(torn):
     before, after = torn.chi2dof()
     square_before, square_after, values = torn.heldout["flat_map"]
-    assert square_before - square_after > 50
+    assert square_before - square_after > 15
     # Scatter of a chi-square of so many values, 4 sigma.
     assert abs(square_after / values - 1) < 4 * np.sqrt(2 / values) + 0.05
     assert after < before
@@ -82,7 +82,8 @@ def test_a_screen_finds_the_amplitude_to_its_error():
     truth = 12.0
     effect = make_effect("trap_serial", {"size": truth, "tau": 1.5, "amp": 1})
     predictor, fit, _ = fitted(7104, effect)
-    best = Screen(predictor, fit).best(TrapSerial)
+    screen = Screen(predictor, fit)
+    best = screen.best(screen.tried(TrapSerial))
     assert best.effect["amp"] == 1.0
     error = truth / np.sqrt(best.gain)
     # 4 sigma; tau is fitted too, which doubles the error.
