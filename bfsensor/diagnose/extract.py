@@ -10,7 +10,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.bias_channels import BiasChannels, DarkChannels
+from bfsensor.diagnose.bias_channels import (
+    BiasChannels,
+    DarkChannels,
+    without_hot_columns,
+)
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.code_channels import CodeChannels, CrosstalkChannels
 from bfsensor.diagnose.conditions import Condition, Exposure, Frame, assign_folds
@@ -77,6 +81,8 @@ class Measured:
         All exposures in the order of time; levels by the rough gains.
     maps : mapping of str to tuple of MapShare
         Of which flats each map is made.
+    sightings : tuple of mapping
+        Waves in the maps: where fits of such patterns may begin.
     """
 
     channels: tuple[Channel, ...]
@@ -95,6 +101,7 @@ class Measured:
     segments: tuple[Segment, ...] = ()
     shots: tuple[Shot, ...] = ()
     maps: Mapping[str, tuple[MapShare, ...]] = field(default_factory=dict)
+    sightings: tuple[Mapping[str, Any], ...] = ()
 
 
 def measure_channels(
@@ -157,7 +164,12 @@ def measure_channels(
             bias_images[frame.name] = _data_section(frame, means[frame.name])
     noise = biases.read_noise
     flats = FlatChannels(bias_images, noise, lamp_error=source.lamp_error, lags=lags)
-    maps = MapChannels(source.shape)
+    maps = MapChannels(
+        source.shape,
+        amplifiers=[
+            np.s_[s.y : s.y + s.rows, s.x : s.x + s.columns] for s in map(_segment, layout)
+        ],
+    )
     codes = CodeChannels()
     gains: list[list[float]] = [[] for _ in layout]
     levels: dict[int, float] = {}
@@ -220,11 +232,14 @@ def measure_channels(
     crosstalk = CrosstalkChannels()
     for exposure in kinds.get("spot", []):
         spot_frames = read(exposure)
-        images = [flats.clean(f) for f in spot_frames]
+        images = [
+            without_hot_columns(flats.clean(f), noise.get(f.name, 0.0)) for f in spot_frames
+        ]
         crosstalk.add(images, [noise.get(f.name, 1.0) for f in spot_frames])
         image = np.full(source.shape, np.nan)
         for frame, cleaned, gain in zip(spot_frames, images, rough, strict=True):
             place(image, frame, cleaned * gain)
+        levels[exposure.number] = float(np.mean([np.nanmean(i) for i in images]))
         reason = spots.add(exposure, image)
         if reason:
             notes.append(f"spots {exposure.number}: {reason}")
@@ -260,6 +275,7 @@ def measure_channels(
         segments=tuple(_segment(f) for f in layout),
         shots=_shots(exposures, levels, float(np.mean(rough))),
         maps=maps.shares(),
+        sightings=maps.sightings,
     )
 
 
@@ -274,7 +290,7 @@ def _segment(frame: Frame) -> Segment:
 def _shots(
     exposures: Sequence[Exposure], levels: Mapping[int, float], gain: float
 ) -> tuple[Shot, ...]:
-    """All exposures as effects see them; without a level unless they are flats."""
+    """All exposures as effects see them; without a level unless they are flats or spots."""
     times = [e.mjd for e in exposures if e.mjd is not None]
     out = []
     for e in exposures:

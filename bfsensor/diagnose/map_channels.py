@@ -4,22 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Axes, Condition
+from bfsensor.diagnose.map_waves import find_patterns, without_shape
 
 BLOCKS = 16
 """Blocks of a map along its longer side."""
 
 RINGS = 24
 """Bins of the spatial frequency, from 0 to half a cycle a pixel."""
-
-ORDER = 4
-"""Order of the smooth shape of the light in x and in y that rings are freed of."""
 
 LOW = 8
 """Side of the boxes [pixel] that tell noise over many pixels."""
@@ -36,12 +35,15 @@ class MapShare(NamedTuple):
         Of the light.
     seconds, level : float
         Exposure time [s] and mean level [ADU].
+    flats : int
+        How many they are.
     """
 
     weight: float
     condition: Condition
     seconds: float
     level: float
+    flats: int = 1
 
 
 class MapChannels:
@@ -51,12 +53,22 @@ class MapChannels:
     ----------
     shape : tuple of int
         Rows and columns of the sensor.
+    fold : str
+        Of the channel.
+    amplifiers : sequence of (slice, slice)
+        Rows and columns of each on the sensor.
     """
 
-    def __init__(self, shape: tuple[int, int], fold: str = "fit") -> None:
-        self._shape, self._fold = shape, fold
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        fold: str = "fit",
+        amplifiers: Sequence[tuple[slice, slice]] = (),
+    ) -> None:
+        self._shape, self._fold, self._amplifiers = shape, fold, tuple(amplifiers)
         self._groups: dict[tuple, _Group] = {}
         self._conditions: dict[tuple[str, ...], Condition] = {}
+        self.sightings: tuple[Mapping[str, Any], ...] = ()
 
     def add_pair(
         self,
@@ -123,6 +135,11 @@ class MapChannels:
             maps[name] = (
                 image if below is None else image.over(made[below]), self._conditions[key]
             )  # fmt: skip
+        self.sightings = tuple(
+            sighting
+            for name, (image, _) in maps.items() if name != "short"
+            for sighting in find_patterns(image.values, name, self._amplifiers)
+        )  # fmt: skip
         values, blocks, axes = [], [], Axes()
         for name, (image, where) in maps.items():
             for v, e, columns in self._parts(image, own=name == "all"):
@@ -165,6 +182,7 @@ class MapChannels:
                             self._conditions[k],
                             t,
                             group.level / group.pairs,
+                            2 * group.pairs,
                         )
                     )
             out[name] = tuple(parts)
@@ -250,7 +268,7 @@ class MapChannels:
                 {"what": "block", "k": -1.0, "x": x.ravel()[full], "y": y.ravel()[full]},
             )
         )
-        power = ring_power(_without_shape(filled))
+        power = ring_power(without_shape(filled))
         keep = self._modes > 50
         frequency = (np.arange(RINGS) + 0.5) / (2 * RINGS)
         # Of n modes, each exponential; in parts per million of a pixel.
@@ -314,6 +332,7 @@ def _blocks(image: NDArray[np.float64], side: int) -> NDArray[np.float64]:
     return image[: ny * side, : nx * side].reshape(ny, side, nx, side)
 
 
+@lru_cache(maxsize=4)
 def _ring_bins(shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Ring of each mode, and which are used: rows' and columns' own are not."""
     fy, fx = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None]
@@ -323,19 +342,17 @@ def _ring_bins(shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.bo
 
 def ring_power(image: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean power of a mode by ring; that of white noise is a pixel's variance."""
-    bins, use = _ring_bins(image.shape)
-    power = np.abs(np.fft.rfft2(image)) ** 2 / image.size
+    ny, nx = image.shape
+    return spectrum_rings(np.fft.rfft2(image), (ny, nx))
+
+
+def spectrum_rings(
+    spectrum: NDArray[np.complex128], shape: tuple[int, int]
+) -> NDArray[np.float64]:
+    """Mean power of a mode by ring, of a map's transform."""
+    bins, use = _ring_bins(shape)
+    power = (spectrum.real**2 + spectrum.imag**2) / (shape[0] * shape[1])
     count = np.bincount(bins[use], minlength=RINGS)[:RINGS]
     return np.bincount(bins[use], power[use], minlength=RINGS)[:RINGS] / np.maximum(
         count, 1
     )
-
-
-def _without_shape(image: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Take a polynomial of order :data:`ORDER` in x and y off."""
-    ny, nx = image.shape
-    v, u = np.linspace(-1, 1, ny), np.linspace(-1, 1, nx)
-    left_y = np.polynomial.legendre.legvander(v, ORDER)
-    left_x = np.polynomial.legendre.legvander(u, ORDER)
-    q_y, q_x = np.linalg.qr(left_y)[0], np.linalg.qr(left_x)[0]
-    return np.asarray(image - q_y @ (q_y.T @ image @ q_x) @ q_x.T)

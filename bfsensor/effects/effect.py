@@ -40,6 +40,8 @@ class Parameter(NamedTuple):
         Either sign.
     amplitude : bool
         Whether the effect is off at ``neutral``; other parameters are of its shape.
+    step : float
+        Of derivatives; 0: after the range.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Parameter(NamedTuple):
     law: str = "log"
     signed: bool = False
     amplitude: bool = False
+    step: float = 0.0
 
 
 class Segment(NamedTuple):
@@ -64,6 +67,10 @@ class Segment(NamedTuple):
     prescan: int = 0
     serial_overscan: int = 0
     parallel_overscan: int = 0
+
+    def sensor_column(self, read: NDArray[Any]) -> NDArray[Any]:
+        """Columns of the sensor that are read as such of the amplifier, from 0."""
+        return self.x + (self.columns - 1 - read if self.flip_x else read)
 
 
 class Shot(NamedTuple):
@@ -117,6 +124,15 @@ class Layout:
         Mean voltage of the front side [V].
     absorption : mapping of float to float
         Absorption length [um] by wavelength [nm].
+    read_noise : tuple of float
+        Of the amplifiers [e-].
+    map_noise : mapping of str to float
+        Variance of each map over that of a single flat, were all flats of it alike.
+    sightings : tuple of mapping
+        What the maps were searched for as a whole, for starts: 'map', 'shape' and its numbers.
+    box, lags, clip : int, int, float
+        Of the flats' covariances: side of the boxes whose means are taken off and largest lag
+        [pixel], and the deviation [sigma] from which a pixel is left out, its neighbours too.
     """
 
     shape: tuple[int, int]
@@ -128,6 +144,12 @@ class Layout:
     thickness: float = 100.0
     front: float = 8.0
     absorption: Mapping[float, float] = field(default_factory=dict)
+    read_noise: tuple[float, ...] = ()
+    map_noise: Mapping[str, float] = field(default_factory=dict)
+    sightings: tuple[Seen, ...] = ()
+    box: int = 64
+    lags: int = 4
+    clip: float = 5.0
 
 
 class Law(NamedTuple):
@@ -164,9 +186,10 @@ class Effect:
     :meth:`light_map`, :meth:`displacements`, :meth:`spot_light` (they serve predictions too),
     :meth:`turbulence`, :meth:`store`, :meth:`shift`, :meth:`amplify`, :meth:`noise`,
     :meth:`convert`.  *On channels*, in closed form: :meth:`signal`, :meth:`covariances`,
-    :meth:`spot_image`, :meth:`pattern` and the methods named after channel words, which give the
-    change that is to be added, in electrons (or e-^2), and are given the axes of the channel
-    with 'level' in electrons.  A subclass overrides what it touches and nothing else.
+    :meth:`spot_image`, :meth:`spot_flux`, :meth:`pattern` and the methods named after channel
+    words, which give the change that is to be added, in electrons (or e-^2), and are given the
+    axes of the channel with 'level' in electrons; :meth:`modes` says what is left to chance.  A
+    subclass overrides what it touches and nothing else.
 
     Parameters
     ----------
@@ -192,6 +215,9 @@ class Effect:
     by_time : bool
         Whether :meth:`light_map`, :meth:`displacements` or :meth:`pattern` change with the
         exposure time or the level.
+    standing : bool
+        Whether :meth:`light_map`, :meth:`displacements` and :meth:`pattern` are the same in all
+        flats.
     """
 
     values: Mapping[str, float]
@@ -203,6 +229,7 @@ class Effect:
     touches: ClassVar[tuple[str, ...]] = ()
     source: ClassVar[str] = ""
     by_time: ClassVar[bool] = False
+    standing: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         needed = {p.name for p in self.parameters}
@@ -392,6 +419,33 @@ class Effect:
         """Mean images of spots [e-] on the sensor's axes after this effect, shape (..., ny, nx)."""
         del axes, layout
         return images
+
+    def spot_flux(self, axes: Axes, layout: Layout) -> Values:
+        """Added to electrons of whole spots [e-], besides :meth:`spot_image`; by exposure."""
+        return _nothing(axes)
+
+    def modes(self, word: str, axes: Axes, layout: Layout) -> Values | None:
+        """What chance adds to a channel: shapes whose strengths are independent, of variance 1.
+
+        A random effect changes values in expectation, by the other methods, and by its own
+        scatter, which is no error of measurement and ties values together.
+
+        Parameters
+        ----------
+        word : str
+            Channel.
+        axes : mapping
+            Of its n values.
+        layout : Layout
+            Sensor and campaign.
+
+        Returns
+        -------
+        modes : ndarray, shape (n, m), or None
+            In the unit of the change [e-, or e-^2, or relative in maps]; None: no chance.
+        """
+        del word, axes, layout
+        return None
 
     def flat_mean(self, axes: Axes, layout: Layout) -> Values:
         """Added to means of flats [e-], besides :meth:`signal`."""
