@@ -30,6 +30,16 @@ from bfsensor.cli_common import Bar
     "--seed", default=1, show_default=True, help="Of the draws that p-values come from."
 )
 @click.option(
+    "--explain/--locate-only", default=True,
+    help="Look for the effects that explain a mismatch, or only for where it is.",
+)  # fmt: skip
+@click.option(
+    "--predict", "asked", metavar="CONDITIONS", multiple=True,
+    help="Write predicted.ecsv: what the accepted model expects of exposures that were not taken. "
+    "Flats by level [e-] or seconds, spots by flux [e-]; wavelength, back_bias, temperature and lamp "
+    "where they differ from the campaign's; several times, or an ECSV file with these columns.",
+)  # fmt: skip
+@click.option(
     "--json", "as_json", is_flag=True, help="Print report.json instead of a summary."
 )
 def diagnose(
@@ -38,6 +48,8 @@ def diagnose(
     floating: tuple[str, ...],
     output: Path | None,
     seed: int,
+    explain: bool,
+    asked: tuple[str, ...],
     as_json: bool,
 ) -> None:
     """Hold the recordings of CAMPAIGN against a baseline; say what is left, and where.
@@ -55,8 +67,14 @@ def diagnose(
       bfsensor diagnose recordings/run_12 --baseline itl_sta3800c --float all
       bfsensor diagnose other_camera --baseline none
       bfsensor diagnose itl_covariances.csv --baseline itl_sta3800c_60
+      bfsensor diagnose recordings/run_12 --predict level=40000,back_bias=-40 --predict flux=5e5
     """
     from bfsensor.diagnose import diagnosis
+    from bfsensor.diagnose.predicted import (
+        predict_conditions,
+        read_conditions,
+        refuse_unheld,
+    )
     from bfsensor.diagnose.reduced_channels import measure_reduced
     from bfsensor.diagnose.report import write_report
     from bfsensor.diagnose.sources import (
@@ -67,6 +85,7 @@ def diagnose(
     )
     from bfsensor.recording.campaign import read_campaign
 
+    conditions = read_conditions(asked)
     folder = output or campaign.with_name(campaign.resolve().stem + "_diagnosis")
     reduced = find_reduced_recording(campaign)
     found = (
@@ -81,20 +100,27 @@ def diagnose(
         )
     else:
         predicted = find_baseline(named, card=None if found is None else found.card)
+    refuse_unheld(conditions, predicted)
     if found is None:
         assert reduced is not None
         measured = measure_reduced(reduced, reach=predicted.reach)
         result = diagnosis.diagnose_measured(
-            measured, predicted, campaign=reduced.path.stem, seed=seed
+            measured, predicted, campaign=reduced.path.stem, seed=seed, explain=explain
         )
     else:
         result = diagnosis.diagnose(
-            CampaignSource(found), predicted, campaign=found.name, seed=seed,
+            CampaignSource(found), predicted, campaign=found.name, seed=seed, explain=explain,
             progress=Bar("pixels"),
             notes=[f"{c.topic}: {c.message}" for c in found.warnings]
             + [f"set aside: {s.path.name}: {s.reason}" for s in found.set_aside],
         )  # fmt: skip
     written = write_report(result, folder)
+    notes: tuple[str, ...] = ()
+    predictor, fit = result.accepted
+    if conditions and predictor is not None:
+        prediction = predict_conditions(predictor, fit, conditions)
+        notes = prediction.notes
+        written.append(prediction.write(folder / "predicted.ecsv"))
     if as_json:
         click.echo(json.dumps(result.to_report(), indent=1))
         return
@@ -102,6 +128,8 @@ def diagnose(
     click.echo(f"{'channel':22s}{'chi2':>10s}{'dof':>8s}{'ratio':>8s}")
     for word, (square, dof) in result.mismatch.chi2.items():
         click.echo(f"{word:22s}{square:10.1f}{dof:8.1f}{square / max(dof, 1e-9):8.2f}")
-    for note in result.notes[result.read :]:
+    for advice in result.plan.said():
+        click.echo(f"advised: {advice}")
+    for note in (*result.notes[result.read :], *notes):
         click.echo(f"note: {note}")
     click.echo(f"{folder}: {', '.join(p.name for p in written if p.suffix != '.png')}")

@@ -62,13 +62,15 @@ def diagnose_sbig(folders: Sequence[Path], baseline: Baseline, *, rim: bool) -> 
         (folder / "campaign.yaml").write_text(
             "schema: bfsensor-campaign-1\n" + (f"masks:\n{masks}" if rim else "")
         )
-        return diagnose(CampaignSource(read_campaign(folder)), baseline)
+        return diagnose(CampaignSource(read_campaign(folder)), baseline, explain=False)
 
 
 def diagnose_areas(table: AreaChangeTable, name: str) -> Diagnosis:
     """Hold measured a_ij against a baseline."""
     predicted = find_baseline(name)
-    return diagnose_measured(measure_reduced(table, reach=predicted.reach), predicted)
+    return diagnose_measured(
+        measure_reduced(table, reach=predicted.reach), predicted, explain=False
+    )
 
 
 def exchanged(table: AreaChangeTable) -> AreaChangeTable:
@@ -110,7 +112,7 @@ def diagnose_nulls(count: int) -> list[dict]:
     for areas, values in (("thick CCD", thick), ("none", dict.fromkeys(thick, 0.0))):
         for seed in range(9000, 9000 + count):
             measured = measure_reduced(draw_covariances(seed, values), reach=4)
-            found = diagnose_measured(measured, free_baseline(), seed=seed)
+            found = diagnose_measured(measured, free_baseline(), seed=seed, explain=False)
             out.append(
                 {"areas": areas, "seed": seed, "p": found.mismatch.p_value,
                  "held": len(thick) - len(found.fit.pulls)}

@@ -95,6 +95,26 @@ class Frame(Protocol):
     def origin(self) -> tuple[int, int] | None: ...
 
 
+HELD = 5
+"""One in so many exposures of a kind is held out, the fourth first, of twice as many or more."""
+
+
+def is_held_out(place: int, count: int) -> bool:
+    """Whether an exposure, or pair of them, other than flats is held out of all fits.
+
+    Parameters
+    ----------
+    place, count : int
+        Its place among those of its kind, in order of time, and how many there are.
+
+    Examples
+    --------
+    >>> [n for n in range(12) if is_held_out(n, 12)], is_held_out(3, 8)
+    ([3, 8], False)
+    """
+    return count >= 2 * HELD and place % HELD == HELD - 2
+
+
 def assign_folds(pairs: Iterable[int], shift: int = 0) -> list[str]:
     """Give each pair of one level its fold: three of five fit, one selects, one is held out.
 

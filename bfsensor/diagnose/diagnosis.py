@@ -10,17 +10,23 @@ import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
 import bfsensor
+from bfsensor.diagnose.attribute import Attribution, attribute
+from bfsensor.diagnose.attribution_words import reported, said_of
 from bfsensor.diagnose.baseline import Baseline
 from bfsensor.diagnose.channels import PER_ELECTRON
 from bfsensor.diagnose.extract import Measured, Source, measure_channels
 from bfsensor.diagnose.locate import ALARM, Finding, Mismatch, locate_mismatch
 from bfsensor.diagnose.mismatch import BaselineFit, fit_baseline
+from bfsensor.diagnose.plan import Plan, plan
 from bfsensor.diagnose.predict import Predictor, used_channels
+from bfsensor.diagnose.untested import find_untested
 
 SCHEMA = "bfsensor-diagnosis-1"
 FITTED = ("fit", "select")
 FARTHEST, OF_EACH = 50, 10
 """Findings that report.json holds: of all, and of each channel at least."""
+
+NO_PLAN = Plan()
 
 NAMES = {
     "flat_cov": "covariances of flats", "flat_mean": "mean of flats against the lamp",
@@ -53,6 +59,12 @@ class Diagnosis:
         What was set aside, warned of or assumed.
     read : int
         How many of them, the first, are of the reading.
+    attribution : Attribution, optional
+        What explains it; None where nothing stands out.
+    plan : Plan
+        Recordings that tell apart what is tied.
+    predictor : Predictor, optional
+        Of the baseline's fit.
     """
 
     campaign: str
@@ -63,6 +75,15 @@ class Diagnosis:
     heldout: float
     notes: tuple[str, ...] = ()
     read: int = 0
+    attribution: Attribution | None = None
+    plan: Plan = NO_PLAN
+    predictor: Predictor | None = None
+
+    @property
+    def accepted(self) -> tuple[Predictor | None, BaselineFit]:
+        """Predictor and fit of what is believed: with the effects found, or the baseline's."""
+        of = self.attribution or self
+        return of.predictor, of.fit
 
     @property
     def gain(self) -> float:
@@ -119,6 +140,21 @@ class Diagnosis:
             out["exposures"] = [int(v) for v in best["exposure"].where["exposure"]]
         return out
 
+    def _heldout(self) -> dict[str, Any]:
+        """Chi-square over number of what was not fitted, before and after, by channel too."""
+        out: dict[str, Any] = {
+            "chi2dof_before": _finite(self.heldout), "chi2dof_after": None, "channels": {},
+        }  # fmt: skip
+        if self.attribution is not None and self.attribution.found:
+            out["chi2dof_after"] = _finite(self.attribution.chi2dof()[1])
+        if self.attribution is not None:
+            out["channels"] = {
+                word: {"before": b / n, "after": a / n, "values": n}
+                for word, (b, a, n) in self.attribution.heldout.items()
+                if n
+            }
+        return out
+
     def _all_flux(self, words: list[str]) -> list[float]:
         """Lowest and highest flux [e-] of the first of channels that has any."""
         for word in words:
@@ -150,6 +186,8 @@ class Diagnosis:
             ]  # fmt: skip
             if others:
                 parts.append(f"It is also seen in: {', '.join(others)}.")
+            if self.attribution is not None:
+                parts += said_of(self.attribution)
         far = {k: v for k, v in self.fit.pulls.items() if abs(v) > 3}
         if far:
             text = ", ".join(f"{k} {v:+.1f}" for k, v in far.items())
@@ -185,13 +223,12 @@ class Diagnosis:
             "p_chi2": self.mismatch.p_chi2,
             "p_scans": self.mismatch.p_scans,
             "alarm": ALARM,
-            "effects": [],
-            "class_probability": {},
-            "equivalence_class": [],
-            "open_world": False,
+            **reported(self.attribution),
             "location": self.location(),
-            "recommended_recordings": [],
-            "heldout": {"chi2dof_before": _finite(self.heldout), "chi2dof_after": None},
+            "recommended_recordings": self.plan.said(),
+            "plan": self.plan.to_report(),
+            "not_tested": [u.to_report() for u in find_untested(self.measured)],
+            "heldout": self._heldout(),
             "channels": {
                 word: {"chi2": s, "dof": d, "p_value": float(chi2_distribution.sf(s, d))}
                 for word, (s, d) in self.mismatch.chi2.items()
@@ -225,6 +262,7 @@ def diagnose(
     seed: int = 1,
     notes: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
+    explain: bool = True,
 ) -> Diagnosis:
     """Hold a campaign's recordings against a baseline.
 
@@ -242,9 +280,13 @@ def diagnose(
         What reading had to say, for the report.
     progress : callable, optional
         Called with (exposures done, exposures in all).
+    explain : bool
+        Look for what explains a mismatch, beyond where it is.
     """
     measured = measure_channels(source, progress=progress)
-    return diagnose_measured(measured, baseline, campaign=campaign, seed=seed, notes=notes)
+    return diagnose_measured(
+        measured, baseline, campaign=campaign, seed=seed, notes=notes, explain=explain
+    )
 
 
 def diagnose_measured(
@@ -254,19 +296,30 @@ def diagnose_measured(
     campaign: str = "",
     seed: int = 1,
     notes: Sequence[str] = (),
+    explain: bool = True,
 ) -> Diagnosis:
     """Hold channels that are measured already against a baseline; see :func:`diagnose`."""
     predictor, fit = fit_bounded(measured, baseline)
     more = _of_free(measured, baseline, fit)
+    mismatch = locate_mismatch(fit, seed=seed)
+    attribution, advised = None, Plan()
+    if mismatch.detected and explain:
+        attribution = attribute(predictor, fit, mismatch, seed=seed)
+        more += attribution.notes
+        advised = plan(attribution)
+        more += advised.notes
     return Diagnosis(
         campaign=campaign,
         baseline=baseline.name,
         measured=measured,
         fit=fit,
-        mismatch=locate_mismatch(fit, seed=seed),
+        mismatch=mismatch,
         heldout=held_out(predictor, fit, measured),
         notes=(*notes, *measured.notes, *fit.notes, *more),
         read=len(notes),
+        attribution=attribution,
+        plan=advised,
+        predictor=predictor,
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import rfft2
 
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Axes, Condition
@@ -20,8 +21,14 @@ BLOCKS = 16
 RINGS = 24
 """Bins of the spatial frequency, from 0 to half a cycle a pixel."""
 
+FULL = 0.5
+"""Part of the light's noise below which a flat's wells are full."""
+
 LOW = 8
 """Side of the boxes [pixel] that tell noise over many pixels."""
+
+SHORT = 0.25
+"""Part of the longest exposure time below which flats count as short."""
 
 
 class MapShare(NamedTuple):
@@ -49,12 +56,17 @@ class MapShare(NamedTuple):
 class MapChannels:
     """Adds up flats on the sensor, each over its amplifier's mean.
 
+    Of large sensors few maps can be held: exposure times are weighted and added up into two
+    sums of a condition, short ones and long ones, as soon as the next begins.
+
     Parameters
     ----------
     shape : tuple of int
         Rows and columns of the sensor.
+    longest : mapping of tuple to float
+        Longest exposure time [s] of the flats of each condition, by its key.
     fold : str
-        Of the channel.
+        Which exposures are added.
     amplifiers : sequence of (slice, slice)
         Rows and columns of each on the sensor.
     """
@@ -62,60 +74,92 @@ class MapChannels:
     def __init__(
         self,
         shape: tuple[int, int],
+        longest: Mapping[tuple[str, ...], float],
         fold: str = "fit",
         amplifiers: Sequence[tuple[slice, slice]] = (),
     ) -> None:
-        self._shape, self._fold, self._amplifiers = shape, fold, tuple(amplifiers)
-        self._groups: dict[tuple, _Group] = {}
-        self._conditions: dict[tuple[str, ...], Condition] = {}
+        self._shape, self._longest, self.fold = shape, longest, fold
+        self._amplifiers = tuple(amplifiers)
         self.sightings: tuple[Mapping[str, Any], ...] = ()
+        self._groups: list[_Group] = []
+        self._sums: dict[tuple[tuple[str, ...], bool], _Sum] = {}
+        self._closed = True
+        self._total = np.zeros((0, 0), np.float32)
+        self._count = np.zeros((0, 0), np.uint16)
 
     def add_pair(
         self,
         condition: Condition,
         time: float,
-        first: NDArray[np.float64],
-        second: NDArray[np.float64],
+        first: NDArray[np.float32],
+        second: NDArray[np.float32],
         shared: float = 0.0,
         level: float = 0.0,
     ) -> None:
-        """Add a pair of flats, each over its amplifiers' means.
+        """Add a pair of flats, each over its amplifiers' means less one.
 
         Parameters
         ----------
         condition : Condition
             Of the light.
         time : float
-            Exposure time [s].
-        first, second : ndarray, shape of the sensor
+            Exposure time [s]; pairs of one should follow one another.
+        first, second : ndarray of float32, shape of the sensor
             nan where no amplifier reads or a pixel is bad.
         shared : float
             Noise that all flats share, that of the mean bias, over the mean.
         level : float
             Mean level [ADU].
         """
-        self._conditions[condition.key] = condition
-        group = self._groups.setdefault(
-            (condition.key, time),
-            _Group(np.zeros(self._shape, np.float32), np.zeros(self._shape, np.uint16)),
-        )
+        last = self._groups[-1] if self._groups else None
+        if last is None or (last.condition.key, last.time) != (condition.key, time):
+            self._close()
+            self._groups.append(_Group(condition, time))
+            self._total = np.zeros(self._shape, np.float32)
+            self._count = np.zeros(self._shape, np.uint16)
+            self._closed = False
+        group = self._groups[-1]
         for image in (first, second):
             good = np.isfinite(image)
-            group.total[good] += image[good]
-            group.count[good] += 1
+            np.add(self._total, image, out=self._total, where=good)
+            self._count += good
         # Charges repel: noise is smaller over few pixels than over many.
-        noise = np.nan_to_num((first - second) / np.sqrt(2.0))
+        noise = first - second
+        noise *= np.float32(np.sqrt(0.5))
+        np.nan_to_num(noise, copy=False)
         side = LOW
         ny, nx = (n // side * side for n in self._shape)
-        low = (
-            noise[:ny, :nx].reshape(ny // side, side, nx // side, side).mean((1, 3)) * side
-        )
-        group.low += float(low.var())
-        group.high += float(np.diff(noise, axis=1).var()) / 2
+        boxes = noise[:ny, :nx].reshape(ny // side, side, nx // side, side)
+        group.low += float((boxes.mean((1, 3), dtype=np.float64) * side).var())
+        group.high += float(np.diff(noise, axis=1).var(dtype=np.float64)) / 2
         group.power += ring_power(noise)
         group.pairs += 1
         group.shared += shared
         group.level += level
+
+    def _close(self) -> None:
+        """Add what is open to the sum of its condition, by inverse variance of its noise."""
+        if self._closed:
+            return
+        self._closed = True
+        group = self._groups[-1]
+        if self._is_full(group):
+            self._groups.pop()
+            return
+        weight = group.weight
+        with np.errstate(invalid="ignore", divide="ignore"):
+            self._total /= self._count
+        self._total *= np.float32(weight)
+        name = group.condition.key, self._is_short(group)
+        if name in self._sums:
+            self._sums[name].image += self._total
+            self._sums[name].weight += weight
+        else:
+            self._sums[name] = _Sum(self._total, weight)
+        self._total = np.zeros((0, 0), np.float32)
+
+    def _is_short(self, group: _Group) -> bool:
+        return group.time < SHORT * self._longest[group.condition.key]
 
     def channels(self) -> list[Channel]:
         """Columns, rows, blocks and rings of the map of all light, and of what differs.
@@ -123,83 +167,78 @@ class MapChannels:
         'all': all flats of the commonest condition together, weighted by their light; 'short':
         its short exposures over its long ones; other conditions over the commonest.
         """
+        self._close()
         if not self._groups:
             return []
-        maps: dict[str, tuple[_Map, Condition]] = {}
-        made: dict[tuple, _Map] = {}
-        for name, (key, times, below) in self._plan().items():
-            for which in filter(None, ((key, times), below)):
-                if which not in made:
-                    made[which] = self._average(which[0], list(which[1]))
-            image = made[key, times]
-            maps[name] = (
-                image if below is None else image.over(made[below]), self._conditions[key]
-            )  # fmt: skip
-        self.sightings = tuple(
-            sighting
-            for name, (image, _) in maps.items() if name != "short"
-            for sighting in find_patterns(image.values, name, self._amplifiers)
-        )  # fmt: skip
         values, blocks, axes = [], [], Axes()
-        for name, (image, where) in maps.items():
+        # One map is held, and one that others are divided by: that of the commonest condition.
+        kept: tuple[list[_Group], _Map] | None = None
+        for name, (groups, below) in self._plan().items():
+            image = self._average(groups)
+            if name == "all":
+                kept = groups, image
+            if below:
+                if kept is None or kept[0] is not below:
+                    kept = None
+                    kept = below, self._average(below)
+                image = image.over(kept[1])
+            if self.fold == "fit" and name != "short":
+                self.sightings += tuple(find_patterns(image.values, name, self._amplifiers))
             for v, e, columns in self._parts(image, own=name == "all"):
                 values.append(v)
                 blocks.extend(np.square(e)[:, None, None])
-                axes.add(len(v), where, map=name, **columns)
+                axes.add(len(v), groups[0].condition, map=name, **columns)
         return [Channel("flat_map", np.concatenate(values), tuple(blocks), axes.columns(), "",
-                        self._fold)]  # fmt: skip
+                        self.fold)]  # fmt: skip
 
-    def _plan(self) -> dict[str, tuple[tuple[str, ...], tuple[float, ...], tuple | None]]:
-        """Of each map: condition, exposure times, and the two of what it is divided by."""
-        times: dict[tuple[str, ...], list[float]] = {}
-        for key, time in self._groups:
-            times.setdefault(key, []).append(time)
-        common = max(times, key=lambda k: sum(self._groups[k, t].pairs for t in times[k]))
-        ordered = tuple(sorted(times[common]))
-        out: dict[str, tuple[tuple[str, ...], tuple[float, ...], tuple | None]] = {
-            "all": (common, ordered, None)
-        }
-        split = tuple(t for t in ordered if t < 0.25 * ordered[-1])
-        if split and len(split) < len(ordered):
-            long = tuple(t for t in ordered if t not in split)
-            out["short"] = (common, split, (common, long))
-        for other, members in times.items():
+    def _plan(self) -> dict[str, tuple[list[_Group], list[_Group]]]:
+        """Flats of each map, and of what it is divided by."""
+        members: dict[tuple[str, ...], list[_Group]] = {}
+        for group in self._groups:
+            members.setdefault(group.condition.key, []).append(group)
+        common = max(members, key=lambda k: sum(g.pairs for g in members[k]))
+        ordered = sorted(members[common], key=lambda g: g.time)
+        out: dict[str, tuple[list[_Group], list[_Group]]] = {"all": (ordered, [])}
+        short = [g for g in ordered if self._is_short(g)]
+        if short and len(short) < len(ordered):
+            out["short"] = short, [g for g in ordered if not self._is_short(g)]
+        for other, own in members.items():
             if other != common:
-                out["/".join(other)] = (other, tuple(members), (common, ordered))
+                out["/".join(other)] = own, ordered
         return out
+
+    def _is_full(self, group: _Group) -> bool:
+        """Whether flats are at the full well: without their light's noise, without its pattern.
+
+        Noise over many pixels is Poisson's whatever charges do to one another: relative
+        variance times level is one number, larger only where read noise adds to it.  Flats come
+        by rising level: those before tell the usual one.
+        """
+        white = [g.low * g.level / g.pairs**2 for g in (*self._groups[:-1], group)]
+        return len(white) > 2 and white[-1] < FULL * float(np.median(white[:-1]))
 
     def shares(self) -> dict[str, tuple[MapShare, ...]]:
         """Of which flats each map is made."""
         out = {}
-        for name, (key, times, below) in (self._plan() if self._groups else {}).items():
-            parts = []
-            for (k, members), sign in (((key, times), 1.0), (below or ((), ()), -1.0)):
-                for t, w in zip(members, self._weights(k, members), strict=True):
-                    group = self._groups[k, t]
-                    parts.append(
-                        MapShare(
-                            sign * float(w),
-                            self._conditions[k],
-                            t,
-                            group.level / group.pairs,
-                            2 * group.pairs,
-                        )
-                    )
-            out[name] = tuple(parts)
+        for name, both in (self._plan() if self._groups else {}).items():
+            out[name] = tuple(
+                MapShare(
+                    sign * float(w), g.condition, g.time, g.level / g.pairs, 2 * g.pairs
+                )
+                for groups, sign in zip(both, (1.0, -1.0), strict=True)
+                for g, w in zip(groups, _weights(groups), strict=True)
+            )
         return out
 
-    def _weights(self, key: tuple[str, ...], times: Sequence[float]) -> NDArray[np.float64]:
-        """Of groups in their mean, by inverse variance of their noise."""
-        groups = [self._groups[key, t] for t in times]
-        weights = np.array([g.pairs**2 / max(g.low, 1e-30) for g in groups])
-        return np.asarray(weights / weights.sum())
-
-    def _average(self, key: tuple[str, ...], times: list[float]) -> _Map:
-        """Map of several exposure times, by inverse variance of their noise."""
-        groups = [self._groups[key, t] for t in times]
-        weights = self._weights(key, times)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            image = sum(w * g.total / g.count for w, g in zip(weights, groups, strict=True))
+    def _average(self, groups: list[_Group]) -> _Map:
+        """Map of all short exposures of a condition, or all long ones, or both."""
+        weights = _weights(groups)
+        which = dict.fromkeys((g.condition.key, self._is_short(g)) for g in groups)
+        sums = [self._sums[name] for name in which]
+        whole = np.float32(sum(s.weight for s in sums))
+        image = sums[0].image / whole
+        for other in sums[1:]:
+            image += other.image / whole
         # The mean bias is the same in all; of it differences of pairs know nothing.
         common = (
             sum(w * g.shared / g.pairs for w, g in zip(weights, groups, strict=True)) ** 2
@@ -214,11 +253,7 @@ class MapChannels:
         pairs = sum(g.pairs for g in groups)
         ratio = sum(g.low / max(g.high, 1e-30) * g.pairs for g in groups) / pairs
         return _Map(
-            np.asarray(image),
-            float(low) + common,
-            np.asarray(power) + common,
-            float(ratio),
-            pairs,
+            image, float(low) + common, np.asarray(power) + common, float(ratio), pairs
         )
 
     def _parts(
@@ -232,14 +267,13 @@ class MapChannels:
         sigma = np.sqrt(image.low)
         if own:
             steps = np.diff(image.values, axis=1).ravel()
-            seen = (
-                1.4826
-                * float(np.nanmedian(np.abs(steps - np.nanmedian(steps))))
-                / np.sqrt(2.0)
-            )
+            steps = steps[np.isfinite(steps)]
+            steps -= np.median(steps)
+            seen = 1.4826 * float(np.median(np.abs(steps, out=steps))) / np.sqrt(2.0)
+            del steps
             sigma = max(sigma, seen * np.sqrt(image.ratio))
         good = np.isfinite(image.values)
-        filled = np.where(good, image.values, 1.0) - 1.0
+        filled = np.where(good, image.values, np.float32(0.0))
         out: list[tuple[NDArray, NDArray, Mapping[str, object]]] = []
         for what, axis, n in (("column", 0, nx), ("row", 1, ny)):
             count = np.maximum(good.sum(axis), 1)
@@ -250,15 +284,15 @@ class MapChannels:
             )
             out.append(
                 (
-                    filled.sum(axis) / count,
+                    filled.sum(axis, dtype=np.float64) / count,
                     sigma / np.sqrt(count),
                     {"what": what, "k": -1.0, **at},
                 )
             )
-        side = int(np.ceil(max(ny, nx) / BLOCKS))
+        side = block_side(self._shape)
         rows, columns = ny // side, nx // side
-        count = _blocks(good.astype(float), side).sum((1, 3))
-        mean = _blocks(filled, side).sum((1, 3)) / np.maximum(count, 1)
+        count = _blocks(good, side).sum((1, 3))
+        mean = _blocks(filled, side).sum((1, 3), dtype=np.float64) / np.maximum(count, 1)
         y, x = ((index + 0.5) * side - 0.5 for index in np.indices((rows, columns)))
         full = count.ravel() > side * side // 2
         out.append(
@@ -287,16 +321,15 @@ class MapChannels:
     @property
     def _modes(self) -> NDArray[np.int64]:
         """Modes of each ring."""
-        bins, use = _ring_bins(self._shape)
-        return np.bincount(bins[use], minlength=RINGS)[:RINGS]
+        return np.bincount(_ring_bins(self._shape).ravel(), minlength=RINGS)[:RINGS]
 
 
 @dataclass
 class _Group:
-    """Sums over the pairs of one condition and exposure time: 6 bytes a pixel, of large sensors too."""
+    """What the pairs of one condition and exposure time have in common."""
 
-    total: NDArray[np.float32]
-    count: NDArray[np.uint16]
+    condition: Condition
+    time: float
     low: float = 0.0
     high: float = 0.0
     power: NDArray[np.float64] = field(default_factory=lambda: np.zeros(RINGS))
@@ -304,55 +337,79 @@ class _Group:
     shared: float = 0.0
     level: float = 0.0
 
+    @property
+    def weight(self) -> float:
+        """Inverse variance of the noise of their mean."""
+        return float(self.pairs**2 / max(self.low, 1e-30))
+
+
+@dataclass
+class _Sum:
+    """Weighted sum of the maps of several exposure times: 4 bytes a pixel, of large sensors too."""
+
+    image: NDArray[np.float32]
+    weight: float
+
 
 @dataclass
 class _Map:
-    """A map, its noise over many pixels as a pixel's variance, and by ring.
+    """A map less one, its noise over many pixels as a pixel's variance, and by ring.
 
     ``ratio``: of that variance to the one between neighbours; the effect evens the response of
     single pixels out as it does their noise, to first order.
     """
 
-    values: NDArray[np.float64]
+    values: NDArray[np.float32]
     low: float
     power: NDArray[np.float64]
     ratio: float
     pairs: int
 
     def over(self, other: _Map) -> _Map:
-        """Ratio of two maps."""
+        """Ratio of two maps, less one."""
         return _Map(
-            self.values / other.values, self.low + other.low, self.power + other.power,
-            self.ratio, min(self.pairs, other.pairs),
+            (self.values - other.values) / (1 + other.values), self.low + other.low,
+            self.power + other.power, self.ratio, min(self.pairs, other.pairs),
         )  # fmt: skip
 
 
-def _blocks(image: NDArray[np.float64], side: int) -> NDArray[np.float64]:
+def block_side(shape: tuple[int, int]) -> int:
+    """Side of the blocks of a map [pixel]."""
+    return int(np.ceil(max(shape) / BLOCKS))
+
+
+def _weights(groups: list[_Group]) -> NDArray[np.float64]:
+    """Of groups in their mean, by inverse variance of their noise."""
+    weights = np.array([g.weight for g in groups])
+    return np.asarray(weights / weights.sum())
+
+
+def _blocks(image: NDArray, side: int) -> NDArray:
     ny, nx = (n // side for n in image.shape)
     return image[: ny * side, : nx * side].reshape(ny, side, nx, side)
 
 
-@lru_cache(maxsize=4)
-def _ring_bins(shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Ring of each mode, and which are used: rows' and columns' own are not."""
+@lru_cache(maxsize=1)
+def _ring_bins(shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """Ring of each mode, :data:`RINGS` where it is not used: rows' and columns' own are not."""
     fy, fx = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None]
-    bins = np.minimum((np.hypot(fy, fx) * 2 * RINGS).astype(int), RINGS)
-    return bins, (np.abs(fy) > 0) & (fx > 0) & (bins < RINGS)
+    bins = np.minimum((np.hypot(fy, fx) * 2 * RINGS).astype(np.uint8), RINGS)
+    bins[0], bins[:, 0] = RINGS, RINGS
+    bins.setflags(write=False)
+    return bins
 
 
-def ring_power(image: NDArray[np.float64]) -> NDArray[np.float64]:
+def ring_power(image: NDArray) -> NDArray[np.float64]:
     """Mean power of a mode by ring; that of white noise is a pixel's variance."""
     ny, nx = image.shape
-    return spectrum_rings(np.fft.rfft2(image), (ny, nx))
+    return spectrum_rings(rfft2(image), (ny, nx))
 
 
-def spectrum_rings(
-    spectrum: NDArray[np.complex128], shape: tuple[int, int]
-) -> NDArray[np.float64]:
+def spectrum_rings(modes: NDArray, shape: tuple[int, int]) -> NDArray[np.float64]:
     """Mean power of a mode by ring, of a map's transform."""
-    bins, use = _ring_bins(shape)
-    power = (spectrum.real**2 + spectrum.imag**2) / (shape[0] * shape[1])
-    count = np.bincount(bins[use], minlength=RINGS)[:RINGS]
-    return np.bincount(bins[use], power[use], minlength=RINGS)[:RINGS] / np.maximum(
-        count, 1
-    )
+    bins = _ring_bins(shape).ravel()
+    power = modes.real**2
+    power += modes.imag**2
+    count = np.bincount(bins, minlength=RINGS + 1)[:RINGS]
+    total = np.bincount(bins, power.ravel(), minlength=RINGS + 1)[:RINGS]
+    return np.asarray(total / (shape[0] * shape[1]) / np.maximum(count, 1))

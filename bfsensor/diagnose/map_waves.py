@@ -39,10 +39,10 @@ def smooth_shapes(n: int) -> Values:
     return np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, n), ORDER))[0]
 
 
-def without_shape(image: Values) -> Values:
+def without_shape(image: NDArray[Any]) -> NDArray[Any]:
     """Take a polynomial of order :data:`ORDER` in x and y off."""
     q_y, q_x = (smooth_shapes(n) for n in image.shape)
-    return np.asarray(image - q_y @ (q_y.T @ image @ q_x) @ q_x.T)
+    return np.asarray(image - q_y @ (q_y.T @ image @ q_x) @ q_x.T, image.dtype)
 
 
 class Wave(NamedTuple):
@@ -79,7 +79,7 @@ class Wave(NamedTuple):
 
 
 def find_patterns(
-    image: Values, name: str, amplifiers: Sequence[Part] = ()
+    image: NDArray[Any], name: str, amplifiers: Sequence[Part] = ()
 ) -> list[Mapping[str, Any]]:
     """Find waves in a map, and the rings that those of the map of all light may be.
 
@@ -89,7 +89,7 @@ def find_patterns(
     Parameters
     ----------
     image : ndarray, shape (ny, nx)
-        Map about 1, nan where there is none.
+        Map less one, nan where there is none.
     name : str
         Of the map.
     amplifiers : sequence of (slice, slice)
@@ -106,7 +106,7 @@ def find_patterns(
     --------
     >>> y, x = np.mgrid[:128, :128]
     >>> rng = np.random.default_rng(8231)
-    >>> flat = 1 + 0.01 * np.sin(0.4 * x + 0.2 * y) + 0.01 * rng.standard_normal(x.shape)
+    >>> flat = 0.01 * np.sin(0.4 * x + 0.2 * y) + 0.01 * rng.standard_normal(x.shape)
     >>> found = find_patterns(flat, "950")[0]
     >>> round(2 * np.pi * found["fx"], 2), round(found["amp"], 3)
     (0.4, 0.01)
@@ -159,7 +159,9 @@ def find_patterns(
     return told
 
 
-def _middle(image: Values, amplifiers: Sequence[Part]) -> tuple[tuple[int, int], Values]:
+def _middle(
+    image: NDArray[Any], amplifiers: Sequence[Part]
+) -> tuple[tuple[int, int], Values]:
     """Where the middle begins, and its deviations from a smooth shape with steps."""
     y, x = (max((n - LARGEST) // 2, 0) for n in image.shape)
     part = np.s_[y : y + LARGEST, x : x + LARGEST]

@@ -7,13 +7,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg import block_diag, solve_triangular
 
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.predict import Predictor
 from bfsensor.errors import ConvergenceError
 
-ROUNDS = 12
+ROUNDS = 20
+HALVINGS = 4
+"""Of a step that does harm, before it is given up and the fit taken for arrived."""
+
+REFRESHED = 2, 4
+"""Rounds in which what is left to chance is taken as strong as the effects then are."""
+
 SMALL = 0.05
 """Largest step of a parameter [of its error] at which the fit has arrived."""
 
@@ -27,7 +33,7 @@ class BaselineFit:
     channels : tuple of Channel
         What was fitted.
     names : tuple of str
-        Non-linear parameters, then linear ones.
+        Non-linear parameters, then linear ones, then strengths of what effects leave to chance.
     values, errors : ndarray
         Of the parameters.
     residuals : ndarray, shape (n,)
@@ -39,6 +45,15 @@ class BaselineFit:
         Where each channel's residuals begin.
     pulls : dict of str to float
         Device parameters in units of their spread.
+    covariance : ndarray, shape (p, p)
+        Of the parameters, in the order of ``names``.
+    slopes : ndarray, shape (n, non-linear parameters)
+        Whitened derivatives.
+    left : ndarray, shape (n + priors,)
+        Residuals with those of the priors after them, what the basis spans taken off.
+    chance : float
+        Logarithm by which what effects leave to chance widens the errors of all values together
+        (of the determinant of their covariance).
     notes : tuple of str
         What the prediction had to assume.
     """
@@ -51,6 +66,14 @@ class BaselineFit:
     basis: NDArray[np.float64] = field(repr=False)
     starts: NDArray[np.int64] = field(repr=False)
     pulls: dict[str, float]
+    covariance: NDArray[np.float64] = field(
+        repr=False, default_factory=lambda: np.zeros((0, 0))
+    )
+    left: NDArray[np.float64] = field(repr=False, default_factory=lambda: np.zeros(0))
+    slopes: NDArray[np.float64] = field(
+        repr=False, default_factory=lambda: np.zeros((0, 0))
+    )
+    chance: float = 0.0
     notes: tuple[str, ...] = ()
 
     def of(self, word: str) -> NDArray[np.bool_]:
@@ -76,6 +99,11 @@ class BaselineFit:
             )
         return out
 
+    @property
+    def total(self) -> float:
+        """Chi-square of the residuals and of the priors; wider errors cost their logarithm."""
+        return float(self.left @ self.left) + self.chance
+
     def draw(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Residuals that noise alone leaves, shape (count, n), the fit linear about its end."""
         total, n = len(self.basis), len(self.residuals)
@@ -84,7 +112,9 @@ class BaselineFit:
         return np.asarray(noise[:, :n])
 
 
-def fit_baseline(predictor: Predictor, channels: Sequence[Channel]) -> BaselineFit:
+def fit_baseline(
+    predictor: Predictor, channels: Sequence[Channel], *, like: BaselineFit | None = None
+) -> BaselineFit:
     """Fit the baseline to channels: Gauss-Newton, device parameters held by their spread.
 
     Parameters
@@ -93,6 +123,9 @@ def fit_baseline(predictor: Predictor, channels: Sequence[Channel]) -> BaselineF
         Predicts them.
     channels : sequence of Channel
         What to fit.
+    like : BaselineFit, optional
+        A fit of the same channels by the same baseline, with other effects: its derivatives,
+        which hardly change, are taken over.
 
     Raises
     ------
@@ -112,26 +145,55 @@ def fit_baseline(predictor: Predictor, channels: Sequence[Channel]) -> BaselineF
     scales = np.sqrt((linear**2).sum(0))
     count, priors = len(predictor.names), len(predictor.prior_rows)
     point = predictor.start.astype(float).copy()
+    low, high = predictor.bounds()
+    effect = np.char.startswith(np.array(predictor.names, str), "effect ")
+    modes = _modes(predictor, channels, point)
+    span = _span(linear / scales, modes) if effect.any() else linear[:, :0]
+    before, least, halved, arrived = point.copy(), np.inf, 0, False
     moved = np.inf
     history: list[float] = []
     slopes = np.zeros((total, count))
+    plain = int((~effect).sum())
+    if like is not None:
+        slopes[:, :plain] = like.slopes[:, :plain]
     for turn in range(ROUNDS):
         predicted = [predictor.predict(c, point) for c in channels]
         residuals = np.concatenate([
             c.whiten(c.values - p) for c, p in zip(channels, predicted, strict=True)
         ])  # fmt: skip
-        # Derivatives hardly change: those of the second round serve all later ones.
-        if turn < 2:
-            for n in range(count):
+        if turn in REFRESHED and modes.shape[1] and not halved:
+            modes, least = _modes(predictor, channels, point), np.inf
+            span = _span(linear / scales, modes)
+        if effect.any():
+            # Of what is left with the linear parameters at their best.
+            given = span[:total].T @ residuals
+            square = float(residuals @ residuals) - float(given @ given)
+            square += float(point[predictor.prior_rows] @ point[predictor.prior_rows])
+            # Effects bend: a step that does harm is taken back by half, at last altogether.
+            if square > least + 0.01 and halved < HALVINGS:
+                halved += 1
+                point = 0.5 * (point + before) if halved < HALVINGS else before
+                history.append(np.nan)
+                continue
+            arrived = halved == HALVINGS
+            least, halved = square, 0
+        # Derivatives hardly change: those of the second round serve all later ones; effects
+        # with a shape are not as straight.
+        fresh = turn < 2 and like is None
+        if fresh or effect.any():
+            for n in map(int, np.flatnonzero(fresh | effect)):
                 for channel, start, here in zip(channels, starts, predicted, strict=False):
                     if predictor.depends(channel)[n]:
                         change = predictor.slope(channel, point, n, here)
                         slopes[start : start + len(channel), n] = channel.whiten(change)
-        design = np.zeros((total + priors, count + linear.shape[1]))
+        plainly, chance = count + linear.shape[1], modes.shape[1]
+        design = np.zeros((total + priors + chance, plainly + chance))
         design[:total, :count] = slopes
-        design[:total, count:] = linear / scales
+        design[:total, count:plainly] = linear / scales
+        design[:total, plainly:] = modes
         design[total + np.arange(priors), predictor.prior_rows] = 1.0
-        target = np.concatenate([residuals, -point[predictor.prior_rows]])
+        design[total + priors + np.arange(chance), plainly + np.arange(chance)] = 1.0
+        target = np.concatenate([residuals, -point[predictor.prior_rows], np.zeros(chance)])
         norms = np.sqrt((design**2).sum(0))
         used = norms > 0
         q, r = np.linalg.qr(design[:, used] / norms[used])
@@ -148,23 +210,23 @@ def fit_baseline(predictor: Predictor, channels: Sequence[Channel]) -> BaselineF
         if singular.all():
             solution[used] = solve_triangular(r, q.T @ target) / norms[used]
             inverse = solve_triangular(r, np.eye(len(r)))
-            errors = np.zeros(design.shape[1])
-            errors[used] = np.sqrt((inverse**2).sum(1)) / norms[used]
         else:
-            pinv = np.linalg.pinv(design[:, used] / norms[used], rcond=1e-10)
-            solution[used] = (pinv @ target) / norms[used]
-            errors = np.zeros(design.shape[1])
-            errors[used] = np.sqrt((pinv**2).sum(1)) / norms[used]
-        point = point + solution[:count]
+            inverse = np.linalg.pinv(design[:, used] / norms[used], rcond=1e-10)
+            solution[used] = (inverse @ target) / norms[used]
+        errors = np.zeros(design.shape[1])
+        errors[used] = np.sqrt((inverse**2).sum(1)) / norms[used]
+        before = point
+        point = np.clip(point + solution[:count], low, high)
         moved = float(
             np.max(
-                np.abs(solution[:count]) / np.maximum(errors[:count], 1e-300),
+                np.abs(point - before) / np.maximum(errors[:count], 1e-300),
                 where=errors[:count] > 0,
                 initial=0.0,
             )
         )
         history.append(moved)
-        if moved < SMALL:
+        if moved < SMALL or arrived:
+            point = before if arrived else point
             break
     else:
         raise ConvergenceError(
@@ -172,11 +234,16 @@ def fit_baseline(predictor: Predictor, channels: Sequence[Channel]) -> BaselineF
             f"rounds (steps {', '.join(f'{h:.2g}' for h in history)})"
         )
     left = target - q @ (q.T @ target)
-    values = np.concatenate([point, solution[count:] / scales])
-    errors[count:] /= scales
+    unit = np.concatenate([np.ones(count), scales, np.ones(chance)])
+    values = np.concatenate([point, solution[count:] / unit[count:]])
+    errors[count:] /= unit[count:]
+    covariance = np.zeros((len(unit), len(unit)))
+    covariance[np.ix_(used, used)] = (inverse @ inverse.T) / np.outer(
+        norms[used] * unit[used], norms[used] * unit[used]
+    )
     return BaselineFit(
         channels=tuple(channels),
-        names=(*predictor.names, *columns),
+        names=(*predictor.names, *columns, *(f"chance {n}" for n in range(chance))),
         values=values,
         errors=errors,
         residuals=left[:total],
@@ -186,5 +253,31 @@ def fit_baseline(predictor: Predictor, channels: Sequence[Channel]) -> BaselineF
             predictor.names[n].removeprefix("device "): float(point[n])
             for n in predictor.prior_rows
         },
+        covariance=covariance,
+        left=left,
+        slopes=slopes,
+        chance=float(np.linalg.slogdet(np.eye(chance) + modes.T @ modes)[1]),
         notes=tuple(predictor.notes),
     )
+
+
+def _modes(
+    predictor: Predictor, channels: Sequence[Channel], point: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """What effects leave to chance, whitened, shape (values, modes)."""
+    found = [predictor.modes(c, point) for c in channels]
+    found = [c.whiten(m) if m.shape[1] else m for c, m in zip(channels, found, strict=True)]
+    return (
+        block_diag(*found)
+        if any(m.shape[1] for m in found)
+        else np.zeros((sum(map(len, found)), 0))
+    )
+
+
+def _span(linear: NDArray[np.float64], modes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Orthonormal columns of linear parameters and of chance, whose priors' rows are the last."""
+    chance = modes.shape[1]
+    both = np.zeros((len(linear) + chance, linear.shape[1] + chance))
+    both[: len(linear)] = np.concatenate([linear, modes], axis=1)
+    both[len(linear) :, linear.shape[1] :] = np.eye(chance)
+    return np.linalg.qr(both)[0]

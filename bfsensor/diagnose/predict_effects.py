@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from bfsensor.diagnose.baseline import Baseline, Edges, area_matrix
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
-from bfsensor.diagnose.predict_flats import GRID
+from bfsensor.diagnose.flat_channels import TAIL
 from bfsensor.diagnose.predict_maps import MapChange, shot_at
 from bfsensor.effects.effect import STAGES, Axes, Effect, Law, Layout, Shot
 
@@ -36,33 +35,13 @@ def layout_of(measured: Measured, baseline: Baseline) -> Layout:
         measured.shape, measured.segments, measured.shots, measured.gains,
         (wavelength if np.isfinite(wavelength) else 620.0, bias if np.isfinite(bias) else -60.0,
          float(np.median(reference)) if reference else -100.0),
-        read_noise=tuple(
-            float(n * g) if np.isfinite(n) else 0.0
-            for n, g in zip(measured.read_noise, measured.gains, strict=False)
-        ),
+        offsets=measured.offsets, read_noise=measured.read_noise, biases=measured.biases,
         map_noise={
             name: float(sum(s.weight**2 / s.flats for s in shares))
             for name, shares in measured.maps.items()
         },
-        sightings=measured.sightings,
-        **card,
+        sightings=measured.sightings, **card,
     )  # fmt: skip
-
-
-def layout_at(layout: Layout, gains: NDArray[np.float64]) -> Layout:
-    """The same sensor and campaign, electrons by other gains."""
-    if not len(gains) or len(gains) != len(layout.gains):
-        return layout
-    scale = np.asarray(gains) / np.array(layout.gains)
-    level = float(np.mean(gains)) / float(np.mean(layout.gains))
-    return replace(
-        layout,
-        gains=tuple(float(g) for g in gains),
-        read_noise=tuple(
-            float(n * s) for n, s in zip(layout.read_noise, scale, strict=False)
-        ),
-        shots=tuple(s._replace(level=s.level * level) for s in layout.shots),
-    )
 
 
 class EffectChain:
@@ -80,10 +59,9 @@ class EffectChain:
         Its shifts even patterns out.
     kept : dict
         Filled with what does not depend on effects.
-    gains : ndarray
-        Of the amplifiers as they are now [e-/ADU]; the rough ones may be a quarter off.
-    device : mapping of str to float
-        Departures of the device's parameters from nominal.
+    evening : (float, mapping of str to float)
+        Gain [e-/ADU] and departures of the device's parameters from nominal by which patterns
+        are evened out.
     """
 
     def __init__(
@@ -93,13 +71,11 @@ class EffectChain:
         measured: Measured,
         baseline: Baseline,
         kept: dict[tuple, Any],
-        gains: NDArray[np.float64],
-        device: Mapping[str, float],
+        evening: tuple[float, Mapping[str, float]],
     ) -> None:
         self.effects = tuple(sorted(effects, key=lambda e: STAGES.index(e.stage)))
-        self.measured, self.baseline = measured, baseline
-        self.layout = layout_at(layout, gains)
-        self._kept, self._device = kept, device
+        self.layout, self.measured, self.baseline = layout, measured, baseline
+        self._kept, self._evening = kept, evening
         self._maps: MapChange | None = None
         self.law = Law()
         for effect in self.effects:
@@ -155,13 +131,10 @@ class EffectChain:
         level = np.asarray(axes["level"], float)
         for effect in self.effects:
             step = 1e-3 * np.maximum(level, 1.0)
-            up, down = (
-                effect.signal(level + s, {**axes, "level": level + s}, self.layout)
-                for s in (step, -step)
-            )
-            slope = (up - down) / (2 * step)
-            if np.any(slope != 1.0):
-                c = c * (slope**2)[:, None, None]
+            ends = level + step, level - step
+            up, down = (effect.signal(x, {**axes, "level": x}, self.layout) for x in ends)
+            if not (np.array_equal(up, ends[0]) and np.array_equal(down, ends[1])):
+                c = c * (((up - down) / (2 * step)) ** 2)[:, None, None]
             c = effect.covariances(c, axes, self.layout)
         return c
 
@@ -169,23 +142,28 @@ class EffectChain:
         self, channel: Channel, gains: NDArray[np.float64], axes: dict[str, NDArray]
     ) -> NDArray[np.float64]:
         """Change of a channel, of :data:`ADDED`, in its unit; axes as measured, levels in ADU."""
-        amp = axes.get("amp", np.zeros(len(channel))).astype(int)
         own, axes = self._in_electrons(channel, gains, axes)
         out = np.zeros(len(channel))
         for effect in self.effects:
             if channel.word in effect.touches:
                 out += getattr(effect, channel.word)(axes, self.layout)
+            if channel.word in ("serial_overscan", "parallel_overscan"):
+                out -= self._in_overscan(effect, channel.word, axes, TAIL)
+            if channel.word == "flat_mean":
+                out -= self._in_overscan(effect, "serial_overscan", axes, None)
         if channel.word == "flat_mean":
             level = axes["level"]
             out += self.signal(level, axes) - level
             if self.law.loss:
                 # Light that brings the level m with a loss q: (exp(q m) - 1) / q.
                 out += level - np.expm1(self.law.loss * level) / self.law.loss
+        out = out / _unit(channel, own, gains)
         if channel.word == "bias_level":
-            # Rows' variance is given over that which white noise makes.
-            rows_ = axes["what"] == "rows"
-            out[rows_] /= self._white_rows(gains)[amp[rows_]] / own[rows_]
-        return out / _unit(channel, own, gains)
+            # Variances over those that white noise makes.
+            what, ratio = axes["what"], out / own / axes["white"]
+            out = np.where(what == "rows", ratio, out)
+            out = np.where(what == "frames", np.log1p(np.maximum(ratio, 0.0)), out)
+        return np.asarray(out)
 
     def _in_electrons(
         self, channel: Channel, gains: NDArray[np.float64], axes: dict[str, NDArray]
@@ -201,11 +179,27 @@ class EffectChain:
             axes["after"] = own * axes["after"]
         return own, axes
 
-    def _white_rows(self, gains: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Variance of the mean of a frame's row by read noise, by amplifier [e-^2]."""
-        noise = np.array(self.measured.read_noise) * gains
-        columns = [s.prescan + s.columns + s.serial_overscan for s in self.layout.segments]
-        return np.asarray(noise**2 / np.array(columns))
+    def _in_overscan(
+        self, effect: Effect, word: str, axes: dict[str, NDArray], last: int | None
+    ) -> NDArray[np.float64]:
+        """Mean of what an effect adds to an overscan's last pixels, or to its second half [e-]."""
+        out = np.zeros(len(axes["amp"]))
+        if word not in effect.touches:
+            return out
+        depth = self.layout.of_amp(word, axes["amp"]).astype(int)
+        for deep in np.unique(depth[depth > 0]):
+            rows = depth == deep
+            here = {k: v[rows] for k, v in axes.items()}
+            first = deep // 2 if last is None else deep - last
+            pixels = range(first + 1, deep + 1)
+            change = [
+                getattr(effect, word)(
+                    {**here, "k": np.full(rows.sum(), float(k))}, self.layout
+                )
+                for k in pixels
+            ]
+            out[rows] = np.mean(change, axis=0)
+        return out
 
     def spot_change(
         self, condition: Condition
@@ -243,7 +237,7 @@ class EffectChain:
                 self.measured,
                 self.baseline,
                 self._kept,
-                self._device,
+                self._evening,
             )
         return self._maps.of(channel)
 
@@ -260,6 +254,7 @@ class EffectChain:
     ) -> NDArray[np.float64]:
         """Shapes of what chance adds to a channel, in its unit, shape (n, modes)."""
         own, axes = self._in_electrons(channel, gains, axes)
+        axes["fold"] = np.full(len(channel), channel.fold)
         found = [
             e.modes(channel.word, axes, self.layout)
             for e in self.effects if channel.word in e.touches
@@ -269,8 +264,8 @@ class EffectChain:
 
 
 def pad_areas(a: NDArray[np.float64], reach: int) -> NDArray[np.float64]:
-    """Area changes on a wider window, at most that of the closed form."""
-    more = min(reach, GRID // 2 - 1) - a.shape[-1] // 2
+    """Area changes on a wider window."""
+    more = reach - a.shape[-1] // 2
     if more <= 0:
         return a
     return np.pad(a, [(0, 0)] * (a.ndim - 2) + [(more, more)] * 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.fft import irfft2, next_fast_len, rfft2
 
 from bfsensor.effects.effect import Law
 
@@ -73,13 +74,16 @@ def periodic_covariances(
 
     Returns
     -------
-    covariances : ndarray, shape (n, :data:`GRID`, :data:`GRID`)
+    covariances : ndarray, shape (n, side, side)
+        The side is :data:`GRID`, or that of wider area changes.
     """
     ny, nx = a.shape[-2:]
-    wide = np.zeros((*a.shape[:-2], GRID, GRID))
+    side = max(GRID, next_fast_len(max(ny, nx), real=True))
+    wide = np.zeros((*a.shape[:-2], side, side))
     wide[..., :ny, :nx] = a
     wide = np.roll(wide, (-(ny // 2), -(nx // 2)), (-2, -1))
-    a_k = np.fft.fft2(wide).real - law.loss
+    # Of a covariance the even part of the areas counts; it has a real transform.
+    a_k = rfft2(wide).real - law.loss
     m = np.asarray(levels, float)[:, None, None]
     if law.bend:
         # The integrating factor, over the charge s that a fluctuation came at; smooth.
@@ -93,7 +97,7 @@ def periodic_covariances(
         x = 2 * a_k * m
         small = np.abs(x) < 1e-9
         power = m * np.where(small, 1 + x / 2, np.expm1(x) / np.where(small, 1.0, x))
-    return np.asarray(np.fft.ifft2(power).real)
+    return np.asarray(irfft2(power, s=(side, side)))
 
 
 def quadrant(c: NDArray[np.float64], lags: int) -> NDArray[np.float64]:

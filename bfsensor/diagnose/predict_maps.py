@@ -14,9 +14,9 @@ from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
 from bfsensor.diagnose.map_channels import (
-    BLOCKS,
     RINGS,
     MapShare,
+    block_side,
     spectrum_rings,
 )
 from bfsensor.diagnose.map_waves import smooth_shapes
@@ -57,8 +57,9 @@ class MapChange:
         Its shifts even patterns out.
     kept : dict
         Filled with what does not depend on effects.
-    device : mapping of str to float
-        Departures of the device's parameters from nominal.
+    evening : (float, mapping of str to float)
+        Gain [e-/ADU] and departures of the device's parameters from nominal by which patterns
+        are evened out.
     """
 
     def __init__(
@@ -68,17 +69,13 @@ class MapChange:
         measured: Measured,
         baseline: Baseline,
         kept: dict[tuple, Any],
-        device: Mapping[str, float],
+        evening: tuple[float, Mapping[str, float]],
     ) -> None:
         self.effects = [e for e in effects if "flat_map" in e.touches]
         self.layout, self.measured, self.baseline = layout, measured, baseline
-        self._kept, self._device = kept, dict(device)
-        self._gain = float(np.mean(layout.gains or (1.0,)))
-        # Patterns hardly depend on either: a step is 0.1 spreads, and 0.5 %.
-        state = (
-            *(round(10 * v / (baseline.spread.get(n) or 1.0)) for n, v in device.items()),
-            round(200 * np.log(self._gain)),
-        )
+        self._kept, self._device = kept, dict(evening[1])
+        self._gain = evening[0]
+        state = self._gain, *self._device.values()
         if kept.get(("state",)) != state:
             for key in [k for k in kept if k[0] == "left"]:
                 del kept[key]
@@ -92,8 +89,10 @@ class MapChange:
         out = np.zeros(len(channel))
         if not self.effects:
             return out
-        for name, shares in self.measured.maps.items():
-            delta = self._spectrum(name, shares)
+        for (fold, name), shares in self.measured.maps.items():
+            if fold != channel.fold:
+                continue
+            delta = self._spectrum((fold, name), shares)
             if delta is None or not np.abs(delta).max() > 0:
                 continue
             rows, axes = self._rows(channel, name)
@@ -101,7 +100,9 @@ class MapChange:
                 out[rows] = reduce_spectrum(delta, self.layout.shape, axes)
         return out
 
-    def _spectrum(self, name: str, shares: Sequence[MapShare]) -> Spectrum | None:
+    def _spectrum(
+        self, name: tuple[str, str], shares: Sequence[MapShare]
+    ) -> Spectrum | None:
         """Transform of a map's change."""
         total: Spectrum | None = None
         for key, group in self._groups(shares).items():
@@ -112,7 +113,7 @@ class MapChange:
             ):  # fmt: skip
                 one = part(key, first)
                 if one is not None:
-                    one = one * factor((name, *key), group)
+                    one = one * factor((*name, *key), group)
                     total = one if total is None else total + one
         return total
 
@@ -244,7 +245,7 @@ def reduce_spectrum(
         return out
     change = np.fft.irfft2(delta, s=shape)
     if len(block):
-        side = int(np.ceil(max(ny, nx) / BLOCKS))
+        side = block_side(shape)
         mean = change[: ny // side * side, : nx // side * side]
         mean = mean.reshape(ny // side, side, nx // side, side).mean((1, 3))
         y, x = (((axes[n][block] + 0.5) / side).astype(int) for n in "yx")

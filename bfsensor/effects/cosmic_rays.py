@@ -153,10 +153,10 @@ class CosmicRays(Effect):
         """By amplifier: rows of struck pixels; their mean number and its scatter, by dark, and
         the same of those that the mean bias was struck in."""  # noqa: D205, D209
         found = _tracks(layout.thickness, layout.pixel, layout.shape)
-        biases = sum(s.kind == "bias" for s in layout.shots)
+        biases = len(layout.biases)
         out = []
         for amp, (segment, noise) in enumerate(
-            zip(layout.segments, layout.read_noise, strict=True)
+            zip(layout.segments, layout.noise, strict=True)
         ):
             rows = np.nonzero(
                 (axes["what"] == "struck") & (np.asarray(axes["amp"]).astype(int) == amp)

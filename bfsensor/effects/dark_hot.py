@@ -63,7 +63,7 @@ class _Dark(Effect):
         return charge + rng.poisson(mean, charge.shape).astype(charge.dtype)
 
     def dark_map(self, axes: Axes, layout: Layout) -> Values:
-        noise, more = layout.read_noise, mean_bias(layout)
+        noise, more = layout.noise, mean_bias(layout)
         hot = self.hot(layout)
         out = np.zeros(len(axes["time"]))
         born = self._born(axes["time"], axes["temperature"])

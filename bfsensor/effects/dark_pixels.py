@@ -66,5 +66,4 @@ def struck_pixels(
 
 def mean_bias(layout: Layout) -> float:
     """Variance that the mean bias adds to a dark's pixels, over that of the read noise."""
-    biases = sum(s.kind == "bias" for s in layout.shots)
-    return 1 / biases if biases else 0.0
+    return 1 / len(layout.biases) if layout.biases else 0.0

@@ -67,7 +67,7 @@ class Persistence(Effect):
         )
 
     def dark_map(self, axes: Axes, layout: Layout) -> Values:
-        noise, more = layout.read_noise, mean_bias(layout)
+        noise, more = layout.noise, mean_bias(layout)
         left = self._left_at(axes["exposure"], layout)
         out = np.zeros(len(left))
         for row in np.nonzero(axes["what"] != "column")[0]:
@@ -82,7 +82,7 @@ class Persistence(Effect):
         # Dithers are within a pixel: the ghost of the last spot is in the stamp of the next.
         later = np.subtract.outer(axes["exposure"], axes["exposure"]).astype(float)
         ghosts = self._after(later) @ axes["flux"]
-        biases = np.array([s.number for s in layout.shots if s.kind == "bias"], float)
+        biases = np.array(layout.biases, float)
         if not len(biases):
             return np.asarray(ghosts)
         # Biases hold ghosts too, and their mean is taken off all exposures.

@@ -39,7 +39,7 @@ def write(folder, kinds, *, seed, coupling=0.0):
 
 def run(folder):
     source = CampaignSource(read_campaign(folder))
-    return diagnose(source, free_baseline())
+    return diagnose(source, free_baseline(), explain=False)
 
 
 def test_one_pair_of_flats_alone(tmp_path):
@@ -167,7 +167,9 @@ def test_measured_areas_beside_tables(kind, baseline, detected):
         pytest.skip(f"no {path}")
     predicted = find_baseline(baseline)
     recording = find_reduced_recording(path)
-    found = diagnose_measured(measure_reduced(recording, reach=predicted.reach), predicted)
+    found = diagnose_measured(
+        measure_reduced(recording, reach=predicted.reach), predicted, explain=False
+    )
     assert found.mismatch.detected == detected
     (channel,) = found.fit.channels
     assert len(channel) == 24

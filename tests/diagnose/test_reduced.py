@@ -77,7 +77,7 @@ def test_areas_as_a_campaign(tmp_path):
     assert len(channel) == 24 and channel.unit == "1/e-"
     assert (0, 0) not in set(zip(channel.axes["i"], channel.axes["j"], strict=True))
     assert any("24 values beyond lags of 4" in n for n in measured.notes)
-    found = diagnose_measured(measured, baseline_of(AREAS))
+    found = diagnose_measured(measured, baseline_of(AREAS), explain=False)
     ((square, dof),) = found.mismatch.chi2.values()
     assert dof == 24 and abs(square - 24) < 4 * np.sqrt(48)
     assert not found.mismatch.detected
@@ -85,7 +85,9 @@ def test_areas_as_a_campaign(tmp_path):
 
 def test_the_lag_that_misses_is_found(tmp_path):
     table = read_area_changes(area_table(tmp_path, seed=31, moved=9.0))
-    found = diagnose_measured(measure_reduced(table, reach=4), baseline_of(AREAS))
+    found = diagnose_measured(
+        measure_reduced(table, reach=4), baseline_of(AREAS), explain=False
+    )
     assert found.mismatch.detected
     assert found.location()["lags"] == [[1, 0]]
     assert found.location()["x"] == [] and found.location()["amps"] == []
@@ -93,7 +95,9 @@ def test_the_lag_that_misses_is_found(tmp_path):
 
 def test_free_areas_are_fitted_and_stay_above_0(tmp_path):
     table = read_area_changes(area_table(tmp_path, seed=35))
-    found = diagnose_measured(measure_reduced(table, reach=4), free_baseline())
+    found = diagnose_measured(
+        measure_reduced(table, reach=4), free_baseline(), explain=False
+    )
     errors = dict(zip(found.fit.names, found.fit.errors, strict=True))
     for name, truth in AREAS.items():
         z = (found.fit.pulls[name] * SPREAD - truth) / (errors[f"device {name}"] * SPREAD)
@@ -102,7 +106,9 @@ def test_free_areas_are_fitted_and_stay_above_0(tmp_path):
     a = table.a.copy()
     a[0, 1] = -1e-7
     turned = AreaChangeTable(table.path, a, table.errors, table.independent)
-    found = diagnose_measured(measure_reduced(turned, reach=4), free_baseline())
+    found = diagnose_measured(
+        measure_reduced(turned, reach=4), free_baseline(), explain=False
+    )
     assert "a10" not in found.fit.pulls and "a01" in found.fit.pulls
     assert found.mismatch.detected and [1, 0] in found.location()["lags"]
     assert any("a10 held at 0" in n for n in found.notes)
@@ -157,7 +163,9 @@ def test_a_covariance_that_goes_with_the_level_is_no_area():
         measure_reduced(covariances(43, extra=6e-3), reach=4), free_baseline()
     )
     assert found.mismatch.detected and [1, 0] in found.location()["lags"]
-    found = diagnose_measured(measure_reduced(covariances(43), reach=4), free_baseline())
+    found = diagnose_measured(
+        measure_reduced(covariances(43), reach=4), free_baseline(), explain=False
+    )
     assert not found.mismatch.detected
 
 
@@ -241,11 +249,13 @@ def test_covariances_and_lssts_datasets_from_files(tmp_path):
     """Our ECSV keeps the error matrix; LSST's dataset is read in electrons with its own gain."""
     covariances(47).write(tmp_path / "c.ecsv")
     table = find_reduced_recording(tmp_path / "c.ecsv")
-    found = diagnose_measured(measure_reduced(table, reach=4), baseline_of(AREAS))
+    found = diagnose_measured(
+        measure_reduced(table, reach=4), baseline_of(AREAS), explain=False
+    )
     assert not found.mismatch.detected and len(found.fit.channels[0].blocks) == 8
     photon_transfer(side=3).write(tmp_path / "ptc.fits")
     measured = measure_reduced(find_reduced_recording(tmp_path / "ptc.fits"), reach=4)
     (channel,) = measured.channels
     assert channel.unit == "electron2" and channel.axes["i"].max() == 2
     assert channel.axes["j"].max() == 2 and len(measured.amplifiers) >= 1
-    diagnose_measured(measured, free_baseline())
+    diagnose_measured(measured, free_baseline(), explain=False)

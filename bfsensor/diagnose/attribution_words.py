@@ -1,0 +1,70 @@
+"""An attribution as report.json has it, and in plain words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from bfsensor.diagnose.attribute import Attribution, Found
+
+OUTSIDE = "outside_library"
+
+
+def reported(attribution: Attribution | None) -> dict[str, Any]:
+    """Keys of report.json that say what explains a mismatch."""
+    if attribution is None:
+        return {
+            "effects": [],
+            "class_probability": {},
+            "equivalence_class": [],
+            "open_world": False,
+        }
+    effects: list[dict[str, Any]] = [_effect(f) for f in attribution.found]
+    if attribution.open_world:
+        effects.append({"class": OUTSIDE, "parameters": {}})
+    return {
+        "effects": effects,
+        "class_probability": attribution.probability,
+        "equivalence_class": attribution.tied,
+        "open_world": attribution.open_world,
+        "p_value_after": attribution.mismatch.p_value,
+    }
+
+
+def _effect(found: Found) -> dict[str, Any]:
+    told: dict[str, Any] = {"class": found.effect.word, "parameters": found.intervals()}
+    if found.effect.variant:
+        told["variant"] = found.effect.variant
+    told["gain_chi2"] = found.gain
+    told["tied"] = list(found.tied)
+    told["source"] = found.effect.source
+    return told
+
+
+def said_of(attribution: Attribution) -> list[str]:
+    """Sentences: what explains it, what would as well, what is left, what it does to new data."""
+    out = []
+    for found in attribution.found:
+        values = ", ".join(
+            f"{name} = {_value(told)}" for name, told in found.intervals().items()
+        )
+        text = f"{found.effect.word} explains it: {values}"
+        others = [w for w in found.tied if w != found.effect.word]
+        if others:
+            text += f"; these recordings cannot tell it from {' or '.join(others)}"
+        out.append(text + ".")
+    if attribution.open_world:
+        what = "what is left" if attribution.found else "it"
+        out.append(f"No effect of the library explains {what}.")
+    before, after = attribution.chi2dof()
+    if attribution.found and before == before:
+        out.append(
+            f"On recordings that were not fitted chi-square per value goes from {before:.2f} to "
+            f"{after:.2f}."
+        )
+    return out
+
+
+def _value(told: dict[str, float]) -> str:
+    if "lo68" not in told:
+        return f"{told['value']:g}"
+    return f"{told['value']:.3g} ({told['lo68']:.3g} to {told['hi68']:.3g})"

@@ -1,0 +1,268 @@
+"""How well each candidate explains what a fit leaves, all of the fit's parameters free."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from bfsensor.diagnose.mismatch import BaselineFit
+from bfsensor.diagnose.predict import Predictor, fitted, widened
+from bfsensor.effects.effect import Effect, Parameter
+
+REFINED = 2
+"""Best starts of a candidate that are refined."""
+
+OCCAM = 5.0
+"""Logarithm of the evidence that a parameter costs a candidate that is not fitted on, for it is
+far from the best (a third of a per cent of its range is about what data allow)."""
+
+STEP = 0.02
+"""Of derivatives, as a part of a parameter."""
+
+MOST_CALLS = 15
+"""Evaluations of a refinement for each of its parameters."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rival:
+    """A candidate with its best parameters.
+
+    Attributes
+    ----------
+    effect : Effect
+        The candidate.
+    gain : float
+        Decrease of the chi-square, all other parameters refitted to first order.
+    evidence : float
+        Logarithm of its evidence over that of no effect (Laplace), parameters spread over
+        their plausible range.
+    template : ndarray
+        What it changes, whitened, the fit's parameters projected out.
+    select : float
+        Decrease of the chi-square of the fold that selects, amplitude fitted without it; nan
+        where the effect is not in that fold.
+    """
+
+    effect: Effect
+    gain: float
+    evidence: float
+    template: NDArray[np.float64]
+    select: float = np.nan
+
+    @property
+    def word(self) -> str:
+        """Class."""
+        return self.effect.word
+
+
+class Screen:
+    """Judges candidates against the residuals of one fit.
+
+    To first order in what the other parameters have to give way: whatever lies in their span is
+    projected out of residuals and templates; effects themselves are not linearised.
+
+    Parameters
+    ----------
+    predictor : Predictor
+        Of the fit, effects that are in it already included.
+    fit : BaselineFit
+        Whose residuals.
+    seen : sequence of mapping
+        What the scans found, for those candidates whose place must be looked for.
+    """
+
+    def __init__(
+        self, predictor: Predictor, fit: BaselineFit, seen: Sequence[Mapping[str, Any]] = ()
+    ) -> None:
+        self.fit, self.seen = fit, tuple(seen)
+        self.point = fit.values[: len(predictor.names)]
+        self.predictor = predictor.with_effects(
+            predictor.effects_at(self.point), self.point
+        )
+        self._here: list[NDArray[np.float64] | None] = [None] * len(fit.channels)
+        select = [np.full(len(c), c.fold == "select") for c in fit.channels]
+        priors = np.zeros(len(fit.left) - len(fit.residuals), bool)
+        self._select = np.concatenate([*select, priors])
+
+    def change(self, effect: Effect) -> NDArray[np.float64]:
+        """What an effect changes: whitened, priors' rows after it, parameters projected out."""
+        both = self.predictor.with_effects((*self.predictor.effects, effect), self.point)
+        more = both.start[len(both.names) - len(fitted(effect)) :]
+        # Parameters of effects that are there already stay where the fit put them.
+        point = np.concatenate([self.point, more])
+        out = np.zeros(len(self.fit.left))
+        for n, (channel, start) in enumerate(
+            zip(self.fit.channels, self.fit.starts, strict=False)
+        ):
+            if channel.word not in effect.touches:
+                continue
+            here = self._here[n]
+            if here is None:
+                here = self._here[n] = self.predictor.predict(channel, self.point)
+            moved = both.predict(channel, point) - here
+            out[start : start + len(channel)] = channel.whiten(moved)
+        return np.asarray(out - self.fit.basis @ (self.fit.basis.T @ out))
+
+    def tried(self, kind: type[Effect]) -> list[tuple[float, Effect]]:
+        """Places where a fit of a kind of effect may begin, with their gains, greatest first.
+
+        Amplitudes are those that fit best, to first order; empty where nothing of it could be
+        seen.
+        """
+        starts = kind.starts(self.predictor.layout, self.seen)
+        tried: list[tuple[float, Effect]] = []
+        for values in starts:
+            effect = kind(values)
+            template = self.change(effect)
+            length = float(template @ template)
+            if length <= 0:
+                continue
+            factor = float(template @ self.fit.left) / length
+            signed = any(p.signed for p in kind.parameters if p.amplitude)
+            if factor <= 0 and not signed:
+                tried.append((0.0, effect))
+                continue
+            tried.append((factor**2 * length, _inside(effect.scaled(factor))))
+        return sorted(tried, key=lambda t: -t[0])
+
+    def best(
+        self, tried: Sequence[tuple[float, Effect]], *, least: float = 0.0
+    ) -> Rival | None:
+        """Best parameters of a kind of effect; None where nothing of it could be seen.
+
+        Parameters
+        ----------
+        tried : sequence of (float, Effect)
+            From :meth:`tried`.
+        least : float
+            Gain of a start below which it is not worth while to fit on from there.
+        """
+        if not tried:
+            return None
+        if tried[0][0] < least:
+            gain, effect = tried[0]
+            return Rival(effect, gain, 0.5 * gain - OCCAM, self.change(effect))
+        rivals = [self._refine(effect) for gain, effect in tried[:REFINED] if gain >= least]
+        return max(rivals, key=lambda r: r.gain)
+
+    def _refine(self, effect: Effect) -> Rival:
+        """Fit all parameters of a candidate from where it is."""
+        names = fitted(effect)
+        scales = np.array([_scale(effect, p) for p in names])
+        low, high = np.array([widened(p) for p in names]).T
+        start = np.array([effect[p.name] for p in names])
+        start = np.clip(start, low + 1e-9 * scales, high - 1e-9 * scales)
+        # Derivatives take 2 % of a value; of those with a step of their own, counted from where
+        # they start, that is it.
+        origin = np.array([
+            x - s if p.step else 0.0 for p, x, s in zip(names, start, scales, strict=True)
+        ])  # fmt: skip
+
+        def at(x: NDArray[np.float64]) -> Effect:
+            values = origin + x * scales
+            return effect.with_values(**{
+                p.name: float(v) for p, v in zip(names, values, strict=True)
+            })  # fmt: skip
+
+        def left(x: NDArray[np.float64]) -> NDArray[np.float64]:
+            return self.fit.left - self.change(at(x))
+
+        first, lowest, highest = ((v - origin) / scales for v in (start, low, high))
+        found = least_squares(
+            left, first, bounds=(lowest, highest), diff_step=STEP,
+            xtol=1e-3, ftol=1e-4, max_nfev=MOST_CALLS,
+        )  # fmt: skip
+        best = at(found.x)
+        gain = float(self.fit.left @ self.fit.left) - 2 * float(found.cost)
+        template = self.fit.left - found.fun
+        return Rival(
+            best, gain, evidence(best, names, gain, found.jac / scales), template,
+            self._select_gain(template),
+        )  # fmt: skip
+
+    def _select_gain(self, template: NDArray[np.float64]) -> float:
+        """Gain on the fold that selects, the amplitude from the others."""
+        own = self._select
+        inside = float(template[own] @ template[own])
+        outside = float(template[~own] @ template[~own])
+        # Of an effect that this fold hardly sees it cannot judge.
+        if inside < 0.05 * (inside + outside) or outside == 0:
+            return float("nan")
+        factor = float(template[~own] @ self.fit.left[~own]) / outside
+        residuals = self.fit.left[own]
+        after = residuals - factor * template[own]
+        return float(residuals @ residuals - after @ after)
+
+
+def evidence(
+    effect: Effect, names: Sequence[Parameter], gain: float, slopes: NDArray[np.float64]
+) -> float:
+    r"""Logarithm of the evidence of an effect over that of none, after Laplace.
+
+    .. math::
+        \tfrac12 \Delta\chi^2 + \sum_p \ln \pi(p) + \tfrac{k}{2} \ln 2\pi - \tfrac12 \ln |J^T J|
+
+    with priors flat in the parameter or in its logarithm over the plausible range; beyond it they
+    fall off as a Gaussian of the logarithm of a width of a factor of two.
+
+    Parameters
+    ----------
+    effect : Effect
+        With its best parameters.
+    names : sequence of Parameter
+        Those that were fitted.
+    gain : float
+        Decrease of the chi-square.
+    slopes : ndarray, shape (n, k)
+        Derivatives of the whitened prediction.
+    """
+    out = 0.5 * gain
+    for p in effect.parameters:
+        if p.law == "whole":
+            out -= np.log(max(p.high - p.low + 1, 1))
+    if not names:
+        return out
+    matrix = slopes.T @ slopes
+    prior = 0.0
+    widths = np.empty(len(names))
+    for n, p in enumerate(names):
+        value = effect[p.name] - p.neutral if p.law == "log" else effect[p.name]
+        if p.law == "log":
+            size = float(np.clip(abs(value), p.low, p.high))
+            prior -= np.log(size * np.log(p.high / p.low) * (2 if p.signed else 1))
+            beyond = np.log(max(abs(value), 1e-3 * p.low) / size) / np.log(2.0)
+            widths[n] = 0.3 * size * np.log(p.high / p.low)
+        else:
+            prior -= np.log(p.high - p.low)
+            out_by = max(p.low - value, value - p.high, 0.0)
+            beyond = 4 * out_by / (p.high - p.low)
+            widths[n] = 0.3 * (p.high - p.low)
+        prior -= 0.5 * beyond**2
+    # No wider than the prior: of what the data leave open the prior is all there is.
+    matrix = matrix + np.diag(1.0 / widths**2)
+    sign, logarithm = np.linalg.slogdet(matrix)
+    del sign
+    return float(out + prior + 0.5 * len(names) * np.log(2 * np.pi) - 0.5 * logarithm)
+
+
+def _scale(effect: Effect, p: Parameter) -> float:
+    """Size of a parameter for the minimiser."""
+    if p.step:
+        return p.step / STEP
+    if p.law != "log":
+        return p.high - p.low
+    return max(abs(effect[p.name] - p.neutral), p.low)
+
+
+def _inside(effect: Effect) -> Effect:
+    """Copy with all parameters inside the range of fits."""
+    values = {}
+    for p in fitted(effect):
+        low, high = widened(p)
+        values[p.name] = float(np.clip(effect[p.name], low, high))
+    return effect.with_values(**values)
