@@ -123,7 +123,7 @@ def residuals(
     """
     baseline = virtual_baseline()
     count = len(Predictor(measured, baseline).names)
-    predictor = Predictor(measured, baseline, effects)
+    predictor = Predictor(measured, baseline).with_effects(effects, fit.values)
     point = np.concatenate([fit.values[:count], predictor.start[count:]])
     out: dict[str, list[NDArray]] = {}
     channels = used_channels(measured.channels, FOLDS)

@@ -439,14 +439,19 @@ def compare_held_out(before: Model, after: Model) -> dict[str, tuple[float, floa
 
 
 def _left(model: Model, channel: Channel) -> NDArray[np.float64]:
-    """Whitened residuals of a channel, all parameters as fitted."""
+    """Residuals of a channel over errors and chance, all parameters as fitted."""
     values = dict(zip(model.fit.names, model.fit.values, strict=True))
-    predicted = model.predictor.predict(
-        channel, model.fit.values[: len(model.predictor.names)]
-    )
+    point = model.fit.values[: len(model.predictor.names)]
+    predicted = model.predictor.predict(channel, point)
     for name, column in model.predictor.linear(channel).items():
         predicted = predicted + values.get(name, 0.0) * column
-    return channel.whiten(channel.values - predicted)
+    left = channel.whiten(channel.values - predicted)
+    modes = model.predictor.modes(channel, point)
+    if not modes.shape[1]:
+        return left
+    shapes, sizes, _ = np.linalg.svd(channel.whiten(modes), full_matrices=False)
+    wider = 1 - 1 / np.sqrt(1 + sizes**2)
+    return np.asarray(left - shapes @ (wider * (shapes.T @ left)))
 
 
 def _seen(mismatch: Mismatch) -> list[dict[str, Any]]:

@@ -21,6 +21,9 @@ UNEVEN = 1.25
 """Scatter of a dark's columns over that of noise from which columns count as uneven by nature:
 four standard deviations of the scatter of 128."""
 
+HOT = 10.0
+"""Deviation of the mean of a column of spots [its sigma] from which it is hot."""
+
 STANDS_OUT = 5.0
 """Deviation [sigma] from which a covariance of the noise counts in the errors of all of them."""
 
@@ -224,10 +227,10 @@ class DarkChannels:
             if over.size:
                 error += float(over.var()) / (over.size // 2)
             found.append((float(good.mean()), float(error), int(struck.sum()), image.size))
-            kept = np.where(struck, np.nan, image)
-            columns.append(
-                np.nanmean(kept, 0) if np.isfinite(kept).any(0).all() else image.mean(0)
-            )
+            # What strikes most of a column is no particle: a hot column is told as it is.
+            hot = struck.mean(0) > 0.5
+            kept = np.where(struck & ~hot, np.nan, image)
+            columns.append(np.nanmean(kept, 0))
             noises.append(float(good.var()) / image.shape[0])
         self._rows.append((exposure, after, found))
         self._columns.append((exposure.exposure_time or 0.0, columns, noises))
@@ -293,6 +296,18 @@ class DarkChannels:
 
     def _pixels(self, amp: int) -> int:
         return self._rows[0][2][amp][3]
+
+
+def without_hot_columns(image: NDArray[np.float64], noise: float) -> NDArray[np.float64]:
+    """Image of spots with columns that stand out as a whole put on the others' level [ADU].
+
+    Spots are told from a column by its median: of columns through a row of them it is half a
+    standard deviation of the noise up.
+    """
+    columns = np.nanmedian(image, axis=0)
+    excess = columns - np.nanmedian(columns)
+    hot = excess > noise * (1.0 + HOT / np.sqrt(image.shape[0]))
+    return image - np.where(hot, excess, 0.0) if hot.any() else image
 
 
 def _without_outliers(noise: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,7 +10,11 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.bias_channels import BiasChannels, DarkChannels
+from bfsensor.diagnose.bias_channels import (
+    BiasChannels,
+    DarkChannels,
+    without_hot_columns,
+)
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.code_channels import CodeChannels, CrosstalkChannels
 from bfsensor.diagnose.conditions import (
@@ -88,6 +92,10 @@ class Measured:
         Distance of the next spots in x and y [pixel], and how many of those places hold one.
     offsets : tuple of float
         Mean code of each amplifier without light, of one exposure; nan without overscan.
+    biases : tuple of int
+        Numbers of the frames that the mean bias is made of.
+    sightings : tuple of mapping
+        Waves in the maps: where fits of such patterns may begin.
     """
 
     channels: tuple[Channel, ...]
@@ -108,6 +116,8 @@ class Measured:
     maps: Mapping[tuple[str, str], tuple[MapShare, ...]] = field(default_factory=dict)
     neighbours: tuple[float, float] = (np.inf, 0.0)
     offsets: tuple[float, ...] = ()
+    biases: tuple[int, ...] = ()
+    sightings: tuple[Mapping[str, Any], ...] = ()
 
 
 def measure_channels(
@@ -151,10 +161,13 @@ def measure_channels(
         return frames
 
     biases, late_biases = BiasChannels(), BiasChannels("held-out")
+    in_mean: list[int] = []
     for n, exposure in enumerate(kinds.get("bias", [])):
         # Noise is measured in differences of two frames: they go together.
         held = is_held_out(n // 2, len(kinds["bias"]) // 2)
         (late_biases if held else biases).add(exposure, read(exposure))
+        if not held:
+            in_mean.append(exposure.number)
     bias_images: dict[str, NDArray[np.float64]] = {}
     layout: Sequence[Frame] | None = None
     groups = group_flats(kinds.get("flat", []))
@@ -181,8 +194,11 @@ def measure_channels(
     for flat in kinds.get("flat", []):
         key = Condition.of(flat).key
         longest[key] = max(longest.get(key, 0.0), flat.exposure_time or 0.0)
+    amplifiers = [
+        np.s_[s.y : s.y + s.rows, s.x : s.x + s.columns] for s in map(_segment, layout)
+    ]
     maps, late_maps = (
-        MapChannels(source.shape, longest, fold) for fold in ("fit", "held-out")
+        MapChannels(source.shape, longest, fold, amplifiers) for fold in ("fit", "held-out")
     )
     codes, late_codes = CodeChannels(), CodeChannels("held-out")
     gains: list[list[float]] = [[] for _ in layout]
@@ -201,6 +217,7 @@ def measure_channels(
     # Sums of maps are the largest that is held: they go before the spots come.
     found_maps, late_found_maps = maps.channels(), late_maps.channels()
     shares = {(e.fold, k): v for e in (maps, late_maps) for k, v in e.shares().items()}
+    sightings = maps.sightings
     del maps, late_maps, by_fold
     for channel in flats.channels():
         if channel.word == "flat_cov":
@@ -233,13 +250,16 @@ def measure_channels(
     for n, exposure in enumerate(kinds.get("spot", [])):
         held = is_held_out(n, len(kinds["spot"]))
         spot_frames = read(exposure)
-        images = [flats.clean(f) for f in spot_frames]
+        images = [
+            without_hot_columns(flats.clean(f), noise.get(f.name, 0.0)) for f in spot_frames
+        ]
         (late_crosstalk if held else crosstalk).add(
             images, [noise.get(f.name, 1.0) for f in spot_frames]
         )
         image = np.full(source.shape, np.nan)
         for frame, cleaned, gain in zip(spot_frames, images, rough, strict=True):
             place(image, frame, cleaned * gain)
+        levels[exposure.number] = float(np.mean([np.nanmean(i) for i in images]))
         reason = spots.add(exposure, image, fold="held-out" if held else "fit")
         if reason:
             notes.append(f"spots {exposure.number}: {reason}")
@@ -282,6 +302,8 @@ def measure_channels(
             float(f.serial_overscan.mean()) if f.serial_overscan.size else np.nan
             for f in layout
         ),
+        biases=tuple(in_mean),
+        sightings=sightings,
     )
 
 
@@ -354,7 +376,7 @@ def _segment(frame: Frame) -> Segment:
 def _shots(
     exposures: Sequence[Exposure], levels: Mapping[int, float], gain: float
 ) -> tuple[Shot, ...]:
-    """All exposures as effects see them; without a level unless they are flats."""
+    """All exposures as effects see them; without a level unless they are flats or spots."""
     times = [e.mjd for e in exposures if e.mjd is not None]
     out = []
     for e in exposures:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,15 +13,13 @@ from scipy.fft import rfft2
 
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Axes, Condition
+from bfsensor.diagnose.map_waves import find_patterns, without_shape
 
 BLOCKS = 16
 """Blocks of a map along its longer side."""
 
 RINGS = 24
 """Bins of the spatial frequency, from 0 to half a cycle a pixel."""
-
-ORDER = 4
-"""Order of the smooth shape of the light in x and in y that rings are freed of."""
 
 FULL = 0.5
 """Part of the light's noise below which a flat's wells are full."""
@@ -44,12 +42,15 @@ class MapShare(NamedTuple):
         Of the light.
     seconds, level : float
         Exposure time [s] and mean level [ADU].
+    flats : int
+        How many they are.
     """
 
     weight: float
     condition: Condition
     seconds: float
     level: float
+    flats: int = 1
 
 
 class MapChannels:
@@ -66,6 +67,8 @@ class MapChannels:
         Longest exposure time [s] of the flats of each condition, by its key.
     fold : str
         Which exposures are added.
+    amplifiers : sequence of (slice, slice)
+        Rows and columns of each on the sensor.
     """
 
     def __init__(
@@ -73,8 +76,11 @@ class MapChannels:
         shape: tuple[int, int],
         longest: Mapping[tuple[str, ...], float],
         fold: str = "fit",
+        amplifiers: Sequence[tuple[slice, slice]] = (),
     ) -> None:
         self._shape, self._longest, self.fold = shape, longest, fold
+        self._amplifiers = tuple(amplifiers)
+        self.sightings: tuple[Mapping[str, Any], ...] = ()
         self._groups: list[_Group] = []
         self._sums: dict[tuple[tuple[str, ...], bool], _Sum] = {}
         self._closed = True
@@ -176,6 +182,8 @@ class MapChannels:
                     kept = None
                     kept = below, self._average(below)
                 image = image.over(kept[1])
+            if self.fold == "fit" and name != "short":
+                self.sightings += tuple(find_patterns(image.values, name, self._amplifiers))
             for v, e, columns in self._parts(image, own=name == "all"):
                 values.append(v)
                 blocks.extend(np.square(e)[:, None, None])
@@ -214,7 +222,9 @@ class MapChannels:
         out = {}
         for name, both in (self._plan() if self._groups else {}).items():
             out[name] = tuple(
-                MapShare(sign * float(w), g.condition, g.time, g.level / g.pairs)
+                MapShare(
+                    sign * float(w), g.condition, g.time, g.level / g.pairs, 2 * g.pairs
+                )
                 for groups, sign in zip(both, (1.0, -1.0), strict=True)
                 for g, w in zip(groups, _weights(groups), strict=True)
             )
@@ -292,7 +302,7 @@ class MapChannels:
                 {"what": "block", "k": -1.0, "x": x.ravel()[full], "y": y.ravel()[full]},
             )
         )
-        power = ring_power(_without_shape(filled))
+        power = ring_power(without_shape(filled))
         keep = self._modes > 50
         frequency = (np.arange(RINGS) + 0.5) / (2 * RINGS)
         # Of n modes, each exponential; in parts per million of a pixel.
@@ -391,21 +401,15 @@ def _ring_bins(shape: tuple[int, int]) -> NDArray[np.uint8]:
 
 def ring_power(image: NDArray) -> NDArray[np.float64]:
     """Mean power of a mode by ring; that of white noise is a pixel's variance."""
-    bins = _ring_bins(image.shape).ravel()
-    modes = rfft2(image)
+    ny, nx = image.shape
+    return spectrum_rings(rfft2(image), (ny, nx))
+
+
+def spectrum_rings(modes: NDArray, shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Mean power of a mode by ring, of a map's transform."""
+    bins = _ring_bins(shape).ravel()
     power = modes.real**2
     power += modes.imag**2
     count = np.bincount(bins, minlength=RINGS + 1)[:RINGS]
     total = np.bincount(bins, power.ravel(), minlength=RINGS + 1)[:RINGS]
-    return np.asarray(total / image.size / np.maximum(count, 1))
-
-
-def _without_shape(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Take a polynomial of order :data:`ORDER` in x and y off."""
-    ny, nx = image.shape
-    v, u = np.linspace(-1, 1, ny), np.linspace(-1, 1, nx)
-    left_y = np.polynomial.legendre.legvander(v, ORDER)
-    left_x = np.polynomial.legendre.legvander(u, ORDER)
-    q_y, q_x = np.linalg.qr(left_y)[0], np.linalg.qr(left_x)[0]
-    shape = q_y @ (q_y.T @ image @ q_x) @ q_x.T
-    return np.asarray(image - shape, np.float32)
+    return np.asarray(total / (shape[0] * shape[1]) / np.maximum(count, 1))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg import block_diag, solve_triangular
 
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.predict import Predictor
@@ -16,6 +16,9 @@ from bfsensor.errors import ConvergenceError
 ROUNDS = 20
 HALVINGS = 4
 """Of a step that does harm, before it is given up and the fit taken for arrived."""
+
+REFRESHED = 2, 4
+"""Rounds in which what is left to chance is taken as strong as the effects then are."""
 
 SMALL = 0.05
 """Largest step of a parameter [of its error] at which the fit has arrived."""
@@ -30,7 +33,7 @@ class BaselineFit:
     channels : tuple of Channel
         What was fitted.
     names : tuple of str
-        Non-linear parameters, then linear ones.
+        Non-linear parameters, then linear ones, then strengths of what effects leave to chance.
     values, errors : ndarray
         Of the parameters.
     residuals : ndarray, shape (n,)
@@ -48,6 +51,9 @@ class BaselineFit:
         Whitened derivatives.
     left : ndarray, shape (n + priors,)
         Residuals with those of the priors after them, what the basis spans taken off.
+    chance : float
+        Logarithm by which what effects leave to chance widens the errors of all values together
+        (of the determinant of their covariance).
     notes : tuple of str
         What the prediction had to assume.
     """
@@ -67,6 +73,7 @@ class BaselineFit:
     slopes: NDArray[np.float64] = field(
         repr=False, default_factory=lambda: np.zeros((0, 0))
     )
+    chance: float = 0.0
     notes: tuple[str, ...] = ()
 
     def of(self, word: str) -> NDArray[np.bool_]:
@@ -94,8 +101,8 @@ class BaselineFit:
 
     @property
     def total(self) -> float:
-        """Chi-square of the residuals and of the priors."""
-        return float(self.left @ self.left)
+        """Chi-square of the residuals and of the priors; wider errors cost their logarithm."""
+        return float(self.left @ self.left) + self.chance
 
     def draw(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Residuals that noise alone leaves, shape (count, n), the fit linear about its end."""
@@ -140,7 +147,8 @@ def fit_baseline(
     point = predictor.start.astype(float).copy()
     low, high = predictor.bounds()
     effect = np.char.startswith(np.array(predictor.names, str), "effect ")
-    span = np.linalg.qr(linear / scales)[0] if effect.any() else linear[:, :0]
+    modes = _modes(predictor, channels, point)
+    span = _span(linear / scales, modes) if effect.any() else linear[:, :0]
     before, least, halved, arrived = point.copy(), np.inf, 0, False
     moved = np.inf
     history: list[float] = []
@@ -153,9 +161,12 @@ def fit_baseline(
         residuals = np.concatenate([
             c.whiten(c.values - p) for c, p in zip(channels, predicted, strict=True)
         ])  # fmt: skip
+        if turn in REFRESHED and modes.shape[1] and not halved:
+            modes, least = _modes(predictor, channels, point), np.inf
+            span = _span(linear / scales, modes)
         if effect.any():
             # Of what is left with the linear parameters at their best.
-            given = span.T @ residuals
+            given = span[:total].T @ residuals
             square = float(residuals @ residuals) - float(given @ given)
             square += float(point[predictor.prior_rows] @ point[predictor.prior_rows])
             # Effects bend: a step that does harm is taken back by half, at last altogether.
@@ -175,11 +186,14 @@ def fit_baseline(
                     if predictor.depends(channel)[n]:
                         change = predictor.slope(channel, point, n, here)
                         slopes[start : start + len(channel), n] = channel.whiten(change)
-        design = np.zeros((total + priors, count + linear.shape[1]))
+        plainly, chance = count + linear.shape[1], modes.shape[1]
+        design = np.zeros((total + priors + chance, plainly + chance))
         design[:total, :count] = slopes
-        design[:total, count:] = linear / scales
+        design[:total, count:plainly] = linear / scales
+        design[:total, plainly:] = modes
         design[total + np.arange(priors), predictor.prior_rows] = 1.0
-        target = np.concatenate([residuals, -point[predictor.prior_rows]])
+        design[total + priors + np.arange(chance), plainly + np.arange(chance)] = 1.0
+        target = np.concatenate([residuals, -point[predictor.prior_rows], np.zeros(chance)])
         norms = np.sqrt((design**2).sum(0))
         used = norms > 0
         q, r = np.linalg.qr(design[:, used] / norms[used])
@@ -220,16 +234,16 @@ def fit_baseline(
             f"rounds (steps {', '.join(f'{h:.2g}' for h in history)})"
         )
     left = target - q @ (q.T @ target)
-    values = np.concatenate([point, solution[count:] / scales])
-    errors[count:] /= scales
-    unit = np.concatenate([np.ones(count), scales])
+    unit = np.concatenate([np.ones(count), scales, np.ones(chance)])
+    values = np.concatenate([point, solution[count:] / unit[count:]])
+    errors[count:] /= unit[count:]
     covariance = np.zeros((len(unit), len(unit)))
     covariance[np.ix_(used, used)] = (inverse @ inverse.T) / np.outer(
         norms[used] * unit[used], norms[used] * unit[used]
     )
     return BaselineFit(
         channels=tuple(channels),
-        names=(*predictor.names, *columns),
+        names=(*predictor.names, *columns, *(f"chance {n}" for n in range(chance))),
         values=values,
         errors=errors,
         residuals=left[:total],
@@ -242,5 +256,28 @@ def fit_baseline(
         covariance=covariance,
         left=left,
         slopes=slopes,
+        chance=float(np.linalg.slogdet(np.eye(chance) + modes.T @ modes)[1]),
         notes=tuple(predictor.notes),
     )
+
+
+def _modes(
+    predictor: Predictor, channels: Sequence[Channel], point: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """What effects leave to chance, whitened, shape (values, modes)."""
+    found = [predictor.modes(c, point) for c in channels]
+    found = [c.whiten(m) if m.shape[1] else m for c, m in zip(channels, found, strict=True)]
+    return (
+        block_diag(*found)
+        if any(m.shape[1] for m in found)
+        else np.zeros((sum(map(len, found)), 0))
+    )
+
+
+def _span(linear: NDArray[np.float64], modes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Orthonormal columns of linear parameters and of chance, whose priors' rows are the last."""
+    chance = modes.shape[1]
+    both = np.zeros((len(linear) + chance, linear.shape[1] + chance))
+    both[: len(linear)] = np.concatenate([linear, modes], axis=1)
+    both[len(linear) :, linear.shape[1] :] = np.eye(chance)
+    return np.linalg.qr(both)[0]

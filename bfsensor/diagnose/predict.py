@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +57,10 @@ class Predictor:
     ) -> None:
         self.measured, self.baseline = measured, baseline
         self.layout = layout_of(measured, baseline)
-        self._evened: dict[tuple, NDArray[np.float64]] = {}
+        self._evened: dict[tuple, Any] = {}
+        self._grown: dict[
+            tuple[str, ...], tuple[tuple[NDArray, ...], dict[str, NDArray]]
+        ] = {}
         self._lit: dict[int, tuple[Channel, NDArray[np.float64]]] = {}
         self._amps = len(measured.amplifiers)
         self._kept: dict[int, tuple[Channel, dict[tuple[str, ...], NDArray[np.int64]]]] = {}
@@ -222,12 +226,7 @@ class Predictor:
         chain = self.chain(parameters)
         gains, noise = parameters[:a], parameters[a : 2 * a]
         count = len(self.baseline.parameters)
-        device = {
-            name: float(value) * self.baseline.spread[name]
-            for name, value in zip(
-                self.baseline.parameters, parameters[2 * a : 2 * a + count], strict=True
-            )
-        }
+        device = self._device(parameters)
         if channel.word == "flat_cov":
             return self._flat_cov(channel, gains, noise, device, chain)
         if channel.word == "spot":
@@ -255,15 +254,42 @@ class Predictor:
             self.measured,
             self.baseline,
             self._evened,
+            # Patterns are evened out as where the fit began: they hardly depend on it.
+            (float(np.mean(self.start[: self._amps])), self._device(self.start)),
         )
+
+    def modes(
+        self, channel: Channel, parameters: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """What chance adds to a channel by its effects, in its unit, shape (n, modes).
+
+        Shapes whose strengths are independent and of variance 1: the values' covariance grows
+        by ``modes @ modes.T``.
+        """
+        chain = self.chain(parameters)
+        if chain is None:
+            return np.zeros((len(channel), 0))
+        gains = parameters[: self._amps]
+        return chain.modes(channel, gains, self._with_light(channel, gains))
+
+    def _device(self, parameters: NDArray[np.float64]) -> dict[str, float]:
+        """Departures of the device's parameters from nominal."""
+        own = parameters[2 * self._amps : 2 * self._amps + len(self.baseline.parameters)]
+        return {
+            name: float(value) * self.baseline.spread[name]
+            for name, value in zip(self.baseline.parameters, own, strict=True)
+        }
 
     def _layout_at(self, parameters: NDArray[np.float64]) -> Layout:
         """Layout with the gains and the read noise that parameters say."""
         gains, noise = parameters[: self._amps], parameters[self._amps : 2 * self._amps]
+        # Levels of exposures are by the rough gains, which may be a quarter off.
+        scale = float(np.mean(gains)) / float(np.mean(self.layout.gains or (1.0,)))
         return replace(
             self.layout,
             gains=tuple(gains.tolist()),
             read_noise=tuple(np.sqrt(np.maximum(noise, 0.0)).tolist()),
+            shots=tuple(s._replace(level=scale * s.level) for s in self.layout.shots),
         )
 
     def effects_at(self, parameters: NDArray[np.float64]) -> tuple[Effect, ...]:
@@ -445,10 +471,8 @@ class Predictor:
             edges, _ = self.baseline.at(self._spot_of[key], device)
             sigma = float(sigmas[2 * n]), float(sigmas[2 * n + 1])
             fluxes = scale * x["flux"][rows]
-            if chain is None:
-                found = predict_spots(
-                    *edges, sigma=sigma, phases=self._phases[key], fluxes=fluxes
-                )
+            if chain is None or chain.leaves_spots:
+                found = dict(self._unchanged(key, (*edges, np.array(sigma), fluxes)))
             else:
                 variance, halo, axes = chain.spot_change(self._spot_of[key])
                 if "hours" in x:
@@ -467,7 +491,25 @@ class Predictor:
             for what, values in found.items():
                 here = x["what"][rows] == what
                 out[rows[here]] = values[here]
+        if chain is not None:
+            here = x["what"] == "flux"
+            axes = {k: v[here] for k, v in x.items()} | {"flux": scale * x["flux"][here]}
+            out[here] += chain.spot_flux(axes) / scale
         return out
+
+    def _unchanged(
+        self, key: tuple[str, ...], state: tuple[NDArray[np.float64], ...]
+    ) -> dict[str, NDArray[np.float64]]:
+        """Spots that no effect changes, at a condition; kept while effects' parameters alone move."""
+        kept = self._grown.get(key)
+        if kept is None or not all(map(np.array_equal, kept[0], state)):
+            kx, ky, sigma, fluxes = state
+            found = predict_spots(
+                kx, ky, sigma=(float(sigma[0]), float(sigma[1])), phases=self._phases[key],
+                fluxes=fluxes,
+            )  # fmt: skip
+            kept = self._grown[key] = state, found
+        return kept[1]
 
     def _mean_columns(self, channel: Channel) -> dict[str, NDArray[np.float64]]:
         x = channel.axes
@@ -589,6 +631,8 @@ def widened(p: Parameter) -> tuple[float, float]:
 
 def _effect_step(effect: Effect, p: Parameter) -> float:
     """Of derivatives: small against the value, or the least plausible one."""
+    if p.step:
+        return p.step
     scale = abs(effect[p.name] - p.neutral)
     return 0.02 * max(scale, p.low) if p.law == "log" else 0.01 * (p.high - p.low)
 

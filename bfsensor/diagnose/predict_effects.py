@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
 from bfsensor.diagnose.flat_channels import TAIL
-from bfsensor.diagnose.map_channels import BLOCKS, RINGS, ring_power
+from bfsensor.diagnose.predict_maps import MapChange, shot_at
 from bfsensor.effects.effect import STAGES, Axes, Effect, Law, Layout, Shot
 
 ADDED = (
@@ -34,7 +35,12 @@ def layout_of(measured: Measured, baseline: Baseline) -> Layout:
         measured.shape, measured.segments, measured.shots, measured.gains,
         (wavelength if np.isfinite(wavelength) else 620.0, bias if np.isfinite(bias) else -60.0,
          float(np.median(reference)) if reference else -100.0),
-        offsets=measured.offsets, read_noise=measured.read_noise, **card,
+        offsets=measured.offsets, read_noise=measured.read_noise, biases=measured.biases,
+        map_noise={
+            name: float(sum(s.weight**2 / s.flats for s in shares))
+            for name, shares in measured.maps.items()
+        },
+        sightings=measured.sightings, **card,
     )  # fmt: skip
 
 
@@ -53,6 +59,9 @@ class EffectChain:
         Its shifts even patterns out.
     kept : dict
         Filled with what does not depend on effects.
+    evening : (float, mapping of str to float)
+        Gain [e-/ADU] and departures of the device's parameters from nominal by which patterns
+        are evened out.
     """
 
     def __init__(
@@ -61,28 +70,36 @@ class EffectChain:
         layout: Layout,
         measured: Measured,
         baseline: Baseline,
-        kept: dict[tuple, NDArray[np.float64]],
+        kept: dict[tuple, Any],
+        evening: tuple[float, Mapping[str, float]],
     ) -> None:
         self.effects = tuple(sorted(effects, key=lambda e: STAGES.index(e.stage)))
         self.layout, self.measured, self.baseline = layout, measured, baseline
-        self._kept_evened = kept
+        self._kept, self._evening = kept, evening
+        self._maps: MapChange | None = None
         self.law = Law()
         for effect in self.effects:
             self.law = self.law.with_law(effect.law())
 
     def shot(self, condition: Condition, kind: str = "flat", seconds: float = 0.0) -> Shot:
         """Exposure at a condition; what is not known is the reference's."""
-        values = (
-            float(own) if np.isfinite(own) else usual
-            for own, usual in zip(condition, self.layout.reference, strict=True)
-        )
-        return Shot(kind, -1, seconds, *values)
+        return shot_at(self.layout, condition, kind, seconds)
 
     def edges(self, edges: Edges, condition: Condition) -> Edges:
         """Shifts with all effects."""
         for effect in self.effects:
             edges = effect.edges(*edges, self.shot(condition), self.layout)
         return edges
+
+    @property
+    def leaves_spots(self) -> bool:
+        """Whether spots grow and are read as without effects, their light apart."""
+        own = ("edges", "law", "spot_light", "spot_image", "signal")
+        return all(
+            getattr(type(e), name) is getattr(Effect, name)
+            for e in self.effects
+            for name in own
+        )
 
     def area_change(self, edges: Edges, condition: Condition) -> NDArray[np.float64]:
         """What effects add to the area changes of given shifts [1/e-]."""
@@ -125,15 +142,8 @@ class EffectChain:
         self, channel: Channel, gains: NDArray[np.float64], axes: dict[str, NDArray]
     ) -> NDArray[np.float64]:
         """Change of a channel, of :data:`ADDED`, in its unit; axes as measured, levels in ADU."""
-        rows = len(channel)
-        amp = axes.get("amp", np.zeros(rows)).astype(int)
-        own = gains[amp] if len(gains) else np.ones(rows)
-        axes = dict(axes)
-        if "level" in axes:
-            axes["level"] = self.collected(own * axes["level"], axes)
-        if channel.word == "dark_map":
-            axes["after"] = own * axes["after"]
-        out = np.zeros(rows)
+        own, axes = self._in_electrons(channel, gains, axes)
+        out = np.zeros(len(channel))
         for effect in self.effects:
             if channel.word in effect.touches:
                 out += getattr(effect, channel.word)(axes, self.layout)
@@ -154,6 +164,20 @@ class EffectChain:
             out = np.where(what == "rows", ratio, out)
             out = np.where(what == "frames", np.log1p(np.maximum(ratio, 0.0)), out)
         return np.asarray(out)
+
+    def _in_electrons(
+        self, channel: Channel, gains: NDArray[np.float64], axes: dict[str, NDArray]
+    ) -> tuple[NDArray[np.float64], dict[str, NDArray]]:
+        """Gain of each value, and axes with levels in electrons."""
+        rows = len(channel)
+        amp = axes.get("amp", np.zeros(rows)).astype(int)
+        own = gains[amp] if len(gains) else np.ones(rows)
+        axes = dict(axes)
+        if "level" in axes:
+            axes["level"] = self.collected(own * axes["level"], axes)
+        if channel.word == "dark_map":
+            axes["after"] = own * axes["after"]
+        return own, axes
 
     def _in_overscan(
         self, effect: Effect, word: str, axes: dict[str, NDArray], last: int | None
@@ -205,113 +229,38 @@ class EffectChain:
         return images
 
     def map_change(self, channel: Channel) -> NDArray[np.float64]:
-        """Change of the flats' maps.
+        """Change of the flats' maps."""
+        if self._maps is None:
+            self._maps = MapChange(
+                self.effects,
+                self.layout,
+                self.measured,
+                self.baseline,
+                self._kept,
+                self._evening,
+            )
+        return self._maps.of(channel)
 
-        A pattern of pixel areas fills up unevenly and is evened out by the shifts that its own
-        charge makes, mode by mode as the fluctuations of the light are:
-        (exp(a m) - 1) / (a m) of it is left at the level m.
-        """
-        out = np.zeros(len(channel))
-        names = channel.axes["map"]
-        gain = float(np.mean(self.layout.gains or (1.0,)))
-        by_time = any(e.by_time for e in self.effects)
-        kept: dict[tuple, NDArray[np.complex128] | None] = {}
-        for (fold, name), shares in self.measured.maps.items():
-            if fold != channel.fold:
-                continue
-            delta: NDArray[np.complex128] | None = None
-            for share in shares:
-                key = (share.condition.key, share.seconds if by_time else 0.0)
-                if key not in kept:
-                    kept[key] = self._map(share.condition, share.seconds)
-                one = kept[key]
-                after = self._pattern(share.condition, share.seconds, gain * share.level)
-                if after is not None:
-                    after = share.weight * after
-                    delta = after if delta is None else delta + after
-                if one is not None:
-                    one = (
-                        share.weight
-                        * one
-                        * self._evened(share.condition, gain * share.level)
-                    )
-                    delta = one if delta is None else delta + one
-            rows = np.nonzero(names == name)[0]
-            if delta is not None and len(rows) and np.abs(delta).max() > 0:
-                change = np.fft.irfft2(delta, s=self.layout.shape)
-                out[rows] = reduce_map(
-                    change, {k: v[rows] for k, v in channel.axes.items()}
-                )
+    def spot_flux(self, axes: Axes) -> NDArray[np.float64]:
+        """Added to electrons of spots, exposure by exposure [e-]."""
+        out = np.zeros(len(axes["flux"]))
+        for effect in self.effects:
+            if "spot" in effect.touches:
+                out += effect.spot_flux(axes, self.layout)
         return out
 
-    def _evened(self, condition: Condition, level: float) -> NDArray[np.float64]:
-        """What is left of a pattern's modes at a level [e-], on the sensor's grid."""
-        key = (condition.key, round(level, -2), self.layout.shape)
-        kept = self._kept_evened
-        if key not in kept:
-            a = area_matrix(*self.baseline.at(condition)[0])
-            wide = np.zeros(self.layout.shape)
-            half = a.shape[0] // 2
-            rows, columns = (np.arange(-half, half + 1) % n for n in self.layout.shape)
-            np.add.at(wide, (rows[:, None], columns[None]), a)
-            x = np.fft.rfft2(wide).real * level
-            small = np.abs(x) < 1e-9
-            kept[key] = np.where(small, 1 + x / 2, np.expm1(x) / np.where(small, 1.0, x))
-        return kept[key]
-
-    def _map(self, condition: Condition, seconds: float) -> NDArray[np.complex128] | None:
-        """Transform of the relative change of a weak flat, each amplifier over its mean."""
-        shot = self.shot(condition, "flat", seconds)
-        total: NDArray[np.float64] | None = None
-        for effect in self.effects:
-            moved = effect.displacements(shot, self.layout)
-            if moved is not None:
-                change = np.diff(moved[0], axis=1) + np.diff(moved[1], axis=0)
-                total = change if total is None else total + change
-            factor = effect.light_map(shot, self.layout)
-            if factor is not None:
-                total = factor - 1.0 if total is None else total + factor - 1.0
-        return None if total is None else self._transform(total)
-
-    def _pattern(
-        self, condition: Condition, seconds: float, level: float
-    ) -> NDArray[np.complex128] | None:
-        """Transform of what is not evened out, for it comes after collection."""
-        shot = self.shot(condition, "flat", seconds)._replace(level=level)
-        parts = [e.pattern(shot, self.layout) for e in self.effects]
-        found = [p for p in parts if p is not None]
-        return self._transform(np.sum(found, axis=0)) if found else None
-
-    def _transform(self, total: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Spatial frequencies of a map, each amplifier less its mean."""
-        total = total.copy()
-        for segment in self.layout.segments:
-            part = np.s_[segment.y : segment.y + segment.rows,
-                         segment.x : segment.x + segment.columns]  # fmt: skip
-            total[part] -= total[part].mean()
-        return np.asarray(np.fft.rfft2(total))
-
-
-def reduce_map(change: NDArray[np.float64], axes: Axes) -> NDArray[np.float64]:
-    """What a change of a map does to its columns, rows, blocks and rings."""
-    ny, nx = change.shape
-    what = axes["what"]
-    out = np.zeros(len(what))
-    column, row, block, ring = (what == w for w in ("column", "row", "block", "ring"))
-    if column.any():
-        out[column] = change.mean(0)[axes["x"][column].astype(int)]
-    if row.any():
-        out[row] = change.mean(1)[axes["y"][row].astype(int)]
-    if block.any():
-        side = int(np.ceil(max(ny, nx) / BLOCKS))
-        mean = change[: ny // side * side, : nx // side * side]
-        mean = mean.reshape(ny // side, side, nx // side, side).mean((1, 3))
-        y, x = (((axes[n][block] + 0.5) / side).astype(int) for n in "yx")
-        out[block] = mean[y, x]
-    if ring.any():
-        power = ring_power(change)
-        out[ring] = 1e6 * power[(axes["k"][ring] * 2 * RINGS).astype(int)]
-    return out
+    def modes(
+        self, channel: Channel, gains: NDArray[np.float64], axes: dict[str, NDArray]
+    ) -> NDArray[np.float64]:
+        """Shapes of what chance adds to a channel, in its unit, shape (n, modes)."""
+        own, axes = self._in_electrons(channel, gains, axes)
+        axes["fold"] = np.full(len(channel), channel.fold)
+        found = [
+            e.modes(channel.word, axes, self.layout)
+            for e in self.effects if channel.word in e.touches
+        ]  # fmt: skip
+        parts = [m / _unit(channel, own, gains)[:, None] for m in found if m is not None]
+        return np.concatenate([np.zeros((len(channel), 0)), *parts], axis=1)
 
 
 def pad_areas(a: NDArray[np.float64], reach: int) -> NDArray[np.float64]:

@@ -21,6 +21,9 @@ OCCAM = 5.0
 """Logarithm of the evidence that a parameter costs a candidate that is not fitted on, for it is
 far from the best (a third of a per cent of its range is about what data allow)."""
 
+STEP = 0.02
+"""Of derivatives, as a part of a parameter."""
+
 MOST_CALLS = 15
 """Evaluations of a refinement for each of its parameters."""
 
@@ -76,8 +79,11 @@ class Screen:
     def __init__(
         self, predictor: Predictor, fit: BaselineFit, seen: Sequence[Mapping[str, Any]] = ()
     ) -> None:
-        self.predictor, self.fit, self.seen = predictor, fit, tuple(seen)
+        self.fit, self.seen = fit, tuple(seen)
         self.point = fit.values[: len(predictor.names)]
+        self.predictor = predictor.with_effects(
+            predictor.effects_at(self.point), self.point
+        )
         self._here: list[NDArray[np.float64] | None] = [None] * len(fit.channels)
         select = [np.full(len(c), c.fold == "select") for c in fit.channels]
         priors = np.zeros(len(fit.left) - len(fit.residuals), bool)
@@ -151,20 +157,28 @@ class Screen:
         low, high = np.array([widened(p) for p in names]).T
         start = np.array([effect[p.name] for p in names])
         start = np.clip(start, low + 1e-9 * scales, high - 1e-9 * scales)
+        # Derivatives take 2 % of a value; of those with a step of their own, counted from where
+        # they start, that is it.
+        origin = np.array([
+            x - s if p.step else 0.0 for p, x, s in zip(names, start, scales, strict=True)
+        ])  # fmt: skip
 
         def at(x: NDArray[np.float64]) -> Effect:
-            values = {p.name: float(v) for p, v in zip(names, x * scales, strict=True)}
-            return effect.with_values(**values)
+            values = origin + x * scales
+            return effect.with_values(**{
+                p.name: float(v) for p, v in zip(names, values, strict=True)
+            })  # fmt: skip
 
         def left(x: NDArray[np.float64]) -> NDArray[np.float64]:
             return self.fit.left - self.change(at(x))
 
+        first, lowest, highest = ((v - origin) / scales for v in (start, low, high))
         found = least_squares(
-            left, start / scales, bounds=(low / scales, high / scales), diff_step=0.02,
+            left, first, bounds=(lowest, highest), diff_step=STEP,
             xtol=1e-3, ftol=1e-4, max_nfev=MOST_CALLS,
         )  # fmt: skip
         best = at(found.x)
-        gain = self.fit.total - 2 * float(found.cost)
+        gain = float(self.fit.left @ self.fit.left) - 2 * float(found.cost)
         template = self.fit.left - found.fun
         return Rival(
             best, gain, evidence(best, names, gain, found.jac / scales), template,
@@ -238,6 +252,8 @@ def evidence(
 
 def _scale(effect: Effect, p: Parameter) -> float:
     """Size of a parameter for the minimiser."""
+    if p.step:
+        return p.step / STEP
     if p.law != "log":
         return p.high - p.low
     return max(abs(effect[p.name] - p.neutral), p.low)

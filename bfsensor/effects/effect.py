@@ -40,6 +40,8 @@ class Parameter(NamedTuple):
         Either sign.
     amplitude : bool
         Whether the effect is off at ``neutral``; other parameters are of its shape.
+    step : float
+        Of derivatives; 0: after the range.
     """
 
     name: str
@@ -50,6 +52,7 @@ class Parameter(NamedTuple):
     law: str = "log"
     signed: bool = False
     amplitude: bool = False
+    step: float = 0.0
 
 
 class Segment(NamedTuple):
@@ -64,6 +67,10 @@ class Segment(NamedTuple):
     prescan: int = 0
     serial_overscan: int = 0
     parallel_overscan: int = 0
+
+    def sensor_column(self, read: NDArray[Any]) -> NDArray[Any]:
+        """Columns of the sensor that are read as such of the amplifier, from 0."""
+        return self.x + (self.columns - 1 - read if self.flip_x else read)
 
 
 class Shot(NamedTuple):
@@ -112,6 +119,16 @@ class Layout:
     offsets, read_noise : tuple of float
         Mean code without light and read noise of the amplifiers [ADU]; empty, or nan, where not
         known.
+    biases : tuple of int
+        Numbers of the exposures that the mean bias is made of.
+    map_noise : mapping of (str, str) to float
+        By fold and name of a map: its variance over that of a single flat, were all flats of it
+        alike.
+    sightings : tuple of mapping
+        What the maps were searched for as a whole, for starts: 'map', 'shape' and its numbers.
+    box, lags, clip : int, int, float
+        Of the flats' covariances: side of the boxes whose means are taken off and largest lag
+        [pixel], and the deviation [sigma] from which a pixel is left out, its neighbours too.
     reference : tuple of float
         Wavelength [nm], back bias [V] and temperature [C] that a baseline is given for.
     pixel, thickness : float
@@ -133,6 +150,19 @@ class Layout:
     absorption: Mapping[float, float] = field(default_factory=dict)
     offsets: tuple[float, ...] = ()
     read_noise: tuple[float, ...] = ()
+    biases: tuple[int, ...] = ()
+    map_noise: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    sightings: tuple[Seen, ...] = ()
+    box: int = 64
+    lags: int = 4
+    clip: float = 5.0
+
+    @property
+    def noise(self) -> Values:
+        """Read noise of the amplifiers [e-], 0 where not known."""
+        if len(self.read_noise) != len(self.segments) or not self.gains:
+            return np.zeros(len(self.segments))
+        return np.nan_to_num(np.array(self.read_noise) * np.array(self.gains))
 
     def of_amp(self, name: str, amp: NDArray) -> Values:
         """Give an attribute of the segments, by name, of given amplifiers."""
@@ -188,9 +218,10 @@ class Effect:
     :meth:`light_map`, :meth:`displacements`, :meth:`spot_light` (they serve predictions too),
     :meth:`turbulence`, :meth:`store`, :meth:`shift`, :meth:`amplify`, :meth:`noise`,
     :meth:`convert`.  *On channels*, in closed form: :meth:`signal`, :meth:`covariances`,
-    :meth:`spot_image`, :meth:`pattern` and the methods named after channel words, which give the
-    change that is to be added, in electrons (or e-^2), and are given the axes of the channel
-    with 'level' in electrons.  A subclass overrides what it touches and nothing else.
+    :meth:`spot_image`, :meth:`spot_flux`, :meth:`pattern` and the methods named after channel
+    words, which give the change that is to be added, in electrons (or e-^2), and are given the
+    axes of the channel with 'level' in electrons; :meth:`modes` says what is left to chance.  A
+    subclass overrides what it touches and nothing else.
 
     Parameters
     ----------
@@ -216,6 +247,9 @@ class Effect:
     by_time : bool
         Whether :meth:`light_map`, :meth:`displacements` or :meth:`pattern` change with the
         exposure time or the level.
+    standing : bool
+        Whether :meth:`light_map`, :meth:`displacements` and :meth:`pattern` are the same in all
+        flats.
     """
 
     values: Mapping[str, float]
@@ -227,6 +261,7 @@ class Effect:
     touches: ClassVar[tuple[str, ...]] = ()
     source: ClassVar[str] = ""
     by_time: ClassVar[bool] = False
+    standing: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         needed = {p.name for p in self.parameters}
@@ -420,6 +455,33 @@ class Effect:
         """Mean images of spots [e-] on the sensor's axes after this effect, shape (..., ny, nx)."""
         del axes, layout
         return images
+
+    def spot_flux(self, axes: Axes, layout: Layout) -> Values:
+        """Added to electrons of whole spots [e-], besides :meth:`spot_image`; by exposure."""
+        return _nothing(axes)
+
+    def modes(self, word: str, axes: Axes, layout: Layout) -> Values | None:
+        """What chance adds to a channel: shapes whose strengths are independent, of variance 1.
+
+        A random effect changes values in expectation, by the other methods, and by its own
+        scatter, which is no error of measurement and ties values together.
+
+        Parameters
+        ----------
+        word : str
+            Channel.
+        axes : mapping
+            Of its n values, and 'fold'.
+        layout : Layout
+            Sensor and campaign.
+
+        Returns
+        -------
+        modes : ndarray, shape (n, m), or None
+            In the unit of the change [e-, or e-^2, or relative in maps]; None: no chance.
+        """
+        del word, axes, layout
+        return None
 
     def flat_mean(self, axes: Axes, layout: Layout) -> Values:
         """Added to means of flats [e-], besides :meth:`signal`."""

@@ -13,46 +13,65 @@ from bfsensor.effects.bf_nonlinear import BrighterFatterNonlinear
 from bfsensor.effects.bias_instability import BiasByFrame, BiasByRow, BiasRamp
 from bfsensor.effects.charge_loss import ChargeLoss
 from bfsensor.effects.correlated_noise import CommonNoise, NoiseInTime, Pickup
+from bfsensor.effects.cosmic_rays import CosmicRays
 from bfsensor.effects.cti_parallel import CtiParallel
 from bfsensor.effects.cti_serial import CtiSerial
+from bfsensor.effects.dark_hot import DarkCurrent, HotColumns
+from bfsensor.effects.edge_rolloff import EdgeRolloff
 from bfsensor.effects.effect import Effect
 from bfsensor.effects.electronic_memory import ElectronicMemory
+from bfsensor.effects.fringing import Fringing
 from bfsensor.effects.gain_drift import GainDrift
 from bfsensor.effects.gain_nonlinearity import GainNonlinearity
+from bfsensor.effects.illumination_turbulence import IlluminationTurbulence
 from bfsensor.effects.interpixel_coupling import InterpixelCoupling
 from bfsensor.effects.lateral_diffusion import LateralDiffusion
+from bfsensor.effects.mask_stitch import MaskStitch
+from bfsensor.effects.persistence import Persistence
 from bfsensor.effects.psf_wings import PsfWings
 from bfsensor.effects.saturation import Saturation
+from bfsensor.effects.shutter_timing import ShutterTiming
 from bfsensor.effects.tearing import Tearing
 from bfsensor.effects.trap_serial import TrapSerial
+from bfsensor.effects.tree_rings import TreeRings
 from bfsensor.effects.voltage_dependence import VoltageDependence
 from bfsensor.errors import EffectError
 
 LIBRARY: tuple[type[Effect], ...] = (
-    BrighterFatterAnisotropy,
-    BrighterFatterChromatic,
-    BrighterFatterLongRange,
-    BrighterFatterNonlinear,
     AdcBits,
     AmpCrosstalk,
     BiasByFrame,
     BiasByRow,
     BiasRamp,
+    BrighterFatterAnisotropy,
+    BrighterFatterChromatic,
+    BrighterFatterLongRange,
+    BrighterFatterNonlinear,
     ChargeLoss,
     CommonNoise,
+    CosmicRays,
     CtiParallel,
     CtiSerial,
+    DarkCurrent,
+    EdgeRolloff,
     ElectronicMemory,
+    Fringing,
     GainDrift,
     GainNonlinearity,
+    HotColumns,
+    IlluminationTurbulence,
     InterpixelCoupling,
     LateralDiffusion,
+    MaskStitch,
+    NoiseInTime,
+    Persistence,
+    Pickup,
     PsfWings,
     Saturation,
-    NoiseInTime,
-    Pickup,
+    ShutterTiming,
     Tearing,
     TrapSerial,
+    TreeRings,
     VoltageDependence,
 )
 """Every candidate, one for each variant of a class; those of a device's parameters are made for a

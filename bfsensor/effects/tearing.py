@@ -5,17 +5,31 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.special import ndtr
 
-from bfsensor.effects.effect import Edges, Effect, Layout, Parameter, Seen, Shot
+from bfsensor.effects.chance import scatter_of_pairs
+from bfsensor.effects.effect import (
+    Axes,
+    Edges,
+    Effect,
+    Layout,
+    Parameter,
+    Seen,
+    Shot,
+    Values,
+)
 
-CLOSED = 0.7
-"""Mean part of the rows that the tear is open in: it closes at a row that moves (assumed)."""
+BRIDGE = 12
+"""Modes of what chance leaves of the rows that are open: 95 % of the variance."""
 
 
 class Tearing(Effect):
     """Edges beside one column boundary stand off by ``amp`` exp(-d / length) pixels.
 
-    ``column``: place of the boundary as a part of the sensor's width.
+    ``column``: place of the boundary as a part of the sensor's width.  The tear closes at a row
+    that moves with every exposure: below the part ``open`` of the rows it never does, from there
+    to the top it is anywhere alike.  :meth:`displacements` of no exposure in particular are the
+    mean ones.
     """
 
     word = "tearing"
@@ -23,29 +37,128 @@ class Tearing(Effect):
     parameters = (
         Parameter("amp", "pixel", 3e-3, 0.2, signed=True, amplitude=True),
         Parameter("length", "pixel", 1.0, 5.0),
-        Parameter("column", "", 0.0, 1.0, law="flat"),
+        Parameter("column", "", 0.0, 1.0, law="flat", step=2e-4),
+        Parameter("open", "", 0.0, 1.0, law="flat"),
     )
-    touches = ("flat_map",)
-    source = "Juramy et al. 2020, Proc. SPIE 11454, 1145412 (e2v sensors, divisadero); range assumed"
+    touches = ("flat_map", "flat_cov")
+    source = (
+        "Juramy et al. 2020, Proc. SPIE 11454, 1145412 (arXiv 2002.09439: holes in channel stops "
+        "moved by clocks, worst beside segments' edges); exponential, rows and range are assumed"
+    )
+    standing = True
 
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        """Boundaries in strips that were seen; without such, every second one."""
         width = layout.shape[1]
-        found = [s["x"] for s in seen if s["word"] == "flat_map" and "x" in s][:3]
+        found = [
+            s["x"] for s in seen if s["word"] == "flat_map" and "x" in s
+            and s.get("what", "column") == "column"
+        ][:3]  # fmt: skip
         near = {
             b for low, high in found for b in range(int(low) - 4, int(high) + 5)
             if high - low < width / 8
         }  # fmt: skip
         return [
-            {"amp": 0.02, "length": length, "column": boundary / width}
-            for boundary in sorted(near or range(4, width, 8))
+            {"amp": 0.02, "length": length, "column": boundary / width, "open": 0.4}
+            for boundary in sorted(near or range(2, width, max(width // 64, 2)))
             for length in (1.5, 3.5)
             if 0 < boundary < width
         ]
 
     def displacements(self, shot: Shot, layout: Layout) -> Edges | None:
         ny, nx = layout.shape
-        edge = np.arange(nx + 1.0)
-        fall = np.exp(-np.abs(edge - self["column"] * nx) / self["length"])
-        torn = CLOSED * self["amp"] * fall
-        return np.broadcast_to(torn, (ny, nx + 1)).copy(), np.zeros((ny + 1, nx))
+        part = self._open(ny)
+        if shot.number >= 0:
+            # One exposure's: open up to a row that its number draws.
+            part = (part > np.random.default_rng(shot.number).random()).astype(float)
+        return part[:, None] * self._torn(nx), np.zeros((ny + 1, nx))
+
+    def covariances(self, c: Values, axes: Axes, layout: Layout) -> Values:
+        # Flats of a pair are torn in other rows: the difference holds the tear in rows between.
+        side = c.shape[-1]
+        level = np.asarray(axes["level"], float)
+        added = np.zeros_like(c)
+        for amp in np.unique(axes["amp"]).astype(int):
+            own = np.asarray(axes["amp"]).astype(int) == amp
+            segment = layout.segments[amp]
+            columns = np.s_[segment.x : segment.x + segment.columns]
+            rows = np.s_[segment.y : segment.y + segment.rows]
+            area = np.diff(self._torn(layout.shape[1]))[columns] * level[own, None]
+            # Where it stands out of the noise of a difference it is left out, neighbours too.
+            limit = layout.clip * np.sqrt(2 * level[own, None])
+            clear = ndtr((limit - np.abs(area)) / np.sqrt(2 * level[own, None]))
+            seen = np.stack([np.roll(clear, s, axis=1) for s in (-1, 0, 1)]).min(0) * area
+            chance = self._chance(layout.shape[0])[rows, rows]
+            for j in range(layout.lags + 1):
+                across = np.diagonal(chance, j).mean()
+                for i in range(layout.lags + 1):
+                    n = segment.columns - i
+                    one = across * (seen[:, :n] * seen[:, i:]).mean(1)
+                    for a, b in {(j, i), (j, -i), (-j, i), (-j, -i)}:
+                        added[own, a % side, b % side] = one
+        return np.asarray(c + added)
+
+    def modes(self, word: str, axes: Axes, layout: Layout) -> Values | None:
+        if word == "flat_cov":
+            # The distance of two rows anywhere alike scatters by 0.71 of its mean.
+            return scatter_of_pairs(self, axes, layout, lambda *_: np.sqrt(0.5))
+        ny, nx = layout.shape
+        area = np.diff(self._torn(nx))
+        t = (np.arange(ny) + 0.5 - self["open"] * ny) / max((1 - self["open"]) * ny, 1.0)
+        out, fold = [], str(axes["fold"][0])
+        for name in dict.fromkeys(axes["map"]):
+            spread = np.sqrt(layout.map_noise.get((fold, str(name)), 0.0)) * (
+                axes["map"] == name
+            )
+            for k in range(1, BRIDGE + 1):
+                rows = np.where(
+                    t > 0, np.sqrt(2) / (k * np.pi) * np.sin(k * np.pi * t), 0.0
+                )
+                out.append(spread * _reduced(rows, area, axes))
+        return np.stack(out, axis=1)
+
+    def _torn(self, nx: int) -> Values:
+        """Displacements of the edges between columns where it is open [pixel]."""
+        away = np.abs(np.arange(nx + 1.0) - self["column"] * nx)
+        return np.asarray(self["amp"] * np.exp(-away / self["length"]))
+
+    def _open(self, ny: int) -> Values:
+        """Part of the exposures in which rows are open."""
+        row, never = np.arange(ny) + 0.5, self["open"] * ny
+        return np.asarray(np.clip((ny - row) / max(ny - never, 1.0), 0.0, 1.0))
+
+    def _chance(self, ny: int) -> Values:
+        """Covariance of two rows' being open."""
+        part = self._open(ny)
+        both = np.minimum(part[:, None], part)
+        return np.asarray(both - part[:, None] * part)
+
+
+def _reduced(rows: Values, columns: Values, axes: Axes) -> Values:
+    """Columns, rows and blocks of a map that is a product; rings hold no more than its square."""
+    what = axes["what"]
+    out = np.zeros(len(what))
+    column, row, block = (what == w for w in ("column", "row", "block"))
+    out[column] = rows.mean() * columns[axes["x"][column].astype(int)]
+    out[row] = columns.mean() * rows[axes["y"][row].astype(int)]
+    if block.any():
+        x, y = axes["x"][block], axes["y"][block]
+        half = 0.5 * _spacing(x)
+        mean_x, mean_y = _running(columns), _running(rows)
+        low_x, low_y = (np.rint(v + 0.5 - half).astype(int) for v in (x, y))
+        high_x, high_y = (np.rint(v + 0.5 + half).astype(int) for v in (x, y))
+        out[block] = (
+            (mean_x[high_x] - mean_x[low_x]) * (mean_y[high_y] - mean_y[low_y])
+            / (4 * half * half)
+        )  # fmt: skip
+    return out
+
+
+def _running(values: Values) -> Values:
+    return np.concatenate([[0.0], np.cumsum(values)])
+
+
+def _spacing(places: Values) -> float:
+    steps = np.diff(np.unique(places))
+    return float(steps.min()) if len(steps) else 1.0

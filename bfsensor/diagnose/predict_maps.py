@@ -1,0 +1,267 @@
+"""What effects change in the maps of flats, in the spatial frequencies that even them out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.baseline import Baseline, area_matrix
+from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.conditions import Condition
+from bfsensor.diagnose.extract import Measured
+from bfsensor.diagnose.map_channels import (
+    RINGS,
+    MapShare,
+    block_side,
+    spectrum_rings,
+)
+from bfsensor.diagnose.map_waves import smooth_shapes
+from bfsensor.effects.effect import Axes, Effect, Layout, Shot
+
+Spectrum = NDArray[np.complex128]
+
+
+def shot_at(
+    layout: Layout, condition: Condition, kind: str = "flat", seconds: float = 0.0
+) -> Shot:
+    """Exposure at a condition; what is not known is the reference's."""
+    values = (
+        float(own) if np.isfinite(own) else usual
+        for own, usual in zip(condition, layout.reference, strict=True)
+    )
+    return Shot(kind, -1, seconds, *values)
+
+
+class MapChange:
+    """Change of the flats' maps by effects.
+
+    A pattern of pixel areas fills up unevenly and is evened out by the shifts that its own
+    charge makes, mode by mode as the fluctuations of the light are: (exp(a m) - 1) / (a m) of it
+    is left at the level m.  Light's patterns are taken as wide against the reach of the shifts,
+    which are even there: of waves of 40 pixels that keeps 1 % too much.  What comes after
+    collection is not evened out.
+
+    Parameters
+    ----------
+    effects : sequence of Effect
+        In the order of their stages.
+    layout : Layout
+        Sensor and campaign.
+    measured : Measured
+        Of which flats the maps are made.
+    baseline : Baseline
+        Its shifts even patterns out.
+    kept : dict
+        Filled with what does not depend on effects.
+    evening : (float, mapping of str to float)
+        Gain [e-/ADU] and departures of the device's parameters from nominal by which patterns
+        are evened out.
+    """
+
+    def __init__(
+        self,
+        effects: Sequence[Effect],
+        layout: Layout,
+        measured: Measured,
+        baseline: Baseline,
+        kept: dict[tuple, Any],
+        evening: tuple[float, Mapping[str, float]],
+    ) -> None:
+        self.effects = [e for e in effects if "flat_map" in e.touches]
+        self.layout, self.measured, self.baseline = layout, measured, baseline
+        self._kept, self._device = kept, dict(evening[1])
+        self._gain = evening[0]
+        state = self._gain, *self._device.values()
+        if kept.get(("state",)) != state:
+            for key in [k for k in kept if k[0] == "left"]:
+                del kept[key]
+            kept["state",] = state
+        self._by_time = any(e.by_time for e in self.effects)
+        self._standing = all(e.standing for e in self.effects)
+        self._made: dict[tuple, Spectrum | None] = {}
+
+    def of(self, channel: Channel) -> NDArray[np.float64]:
+        """Change of all values of the channel."""
+        out = np.zeros(len(channel))
+        if not self.effects:
+            return out
+        for (fold, name), shares in self.measured.maps.items():
+            if fold != channel.fold:
+                continue
+            delta = self._spectrum((fold, name), shares)
+            if delta is None or not np.abs(delta).max() > 0:
+                continue
+            rows, axes = self._rows(channel, name)
+            if len(rows):
+                out[rows] = reduce_spectrum(delta, self.layout.shape, axes)
+        return out
+
+    def _spectrum(
+        self, name: tuple[str, str], shares: Sequence[MapShare]
+    ) -> Spectrum | None:
+        """Transform of a map's change."""
+        total: Spectrum | None = None
+        for key, group in self._groups(shares).items():
+            first = group[0]
+            for part, factor in (
+                (self._areas, self._left), (self._light, self._weights),
+                (self._pattern, self._weights),
+            ):  # fmt: skip
+                one = part(key, first)
+                if one is not None:
+                    one = one * factor((*name, *key), group)
+                    total = one if total is None else total + one
+        return total
+
+    def _groups(self, shares: Sequence[MapShare]) -> dict[tuple, list[MapShare]]:
+        """Flats that effects treat alike."""
+        out: dict[tuple, list[MapShare]] = {}
+        for share in shares:
+            where = () if self._standing else share.condition.key
+            out.setdefault((where, share.seconds if self._by_time else 0.0), []).append(
+                share
+            )
+        return out
+
+    def _weights(self, key: tuple, group: Sequence[MapShare]) -> float:
+        del key
+        return float(sum(s.weight for s in group))
+
+    def _left(self, key: tuple, group: Sequence[MapShare]) -> NDArray[np.float64]:
+        """Weights of the flats by mode: what is left of a pattern in each."""
+        found = self._kept.get(("left", *key))
+        if found is None:
+            found = np.sum(
+                [s.weight * self._evened(s.condition, self._gain * s.level) for s in group],
+                axis=0,
+            )
+            self._kept["left", *key] = found
+        return np.asarray(found)
+
+    def _evened(self, condition: Condition, level: float) -> NDArray[np.float64]:
+        """What is left of a pattern's modes at a level [e-], on the sensor's grid."""
+        a = area_matrix(*self.baseline.at(condition, self._device)[0])
+        wide = np.zeros(self.layout.shape)
+        half = a.shape[0] // 2
+        rows, columns = (np.arange(-half, half + 1) % n for n in self.layout.shape)
+        np.add.at(wide, (rows[:, None], columns[None]), a)
+        x = np.fft.rfft2(wide).real * level
+        small = np.abs(x) < 1e-9
+        return np.where(small, 1 + x / 2, np.expm1(x) / np.where(small, 1.0, x))
+
+    def _areas(self, key: tuple, share: MapShare) -> Spectrum | None:
+        """Of the pixels' areas in a weak flat."""
+
+        def change(effect: Effect, shot: Shot) -> NDArray[np.float64] | None:
+            moved = effect.displacements(shot, self.layout)
+            if moved is None:
+                return None
+            return np.asarray(np.diff(moved[0], axis=1) + np.diff(moved[1], axis=0))
+
+        return self._sum("areas", key, share, change)
+
+    def _light(self, key: tuple, share: MapShare) -> Spectrum | None:
+        """Of the light."""
+
+        def change(effect: Effect, shot: Shot) -> NDArray[np.float64] | None:
+            factor = effect.light_map(shot, self.layout)
+            return None if factor is None else factor - 1.0
+
+        return self._sum("light", key, share, change)
+
+    def _pattern(self, key: tuple, share: MapShare) -> Spectrum | None:
+        """Of what comes after collection."""
+        return self._sum(
+            "pattern", key, share, lambda effect, shot: effect.pattern(shot, self.layout)
+        )
+
+    def _sum(
+        self,
+        word: str,
+        key: tuple,
+        share: MapShare,
+        change: Callable[[Effect, Shot], NDArray[np.float64] | None],
+    ) -> Spectrum | None:
+        """Transform of what all effects change, made once."""
+        if (word, *key) not in self._made:
+            shot = shot_at(self.layout, share.condition, "flat", share.seconds)
+            shot = shot._replace(level=self._gain * share.level)
+            parts = [p for e in self.effects if (p := change(e, shot)) is not None]
+            self._made[word, *key] = (
+                self._transform(np.sum(parts, axis=0)) if parts else None
+            )
+        return self._made[word, *key]
+
+    def _transform(self, change: NDArray[np.float64]) -> Spectrum:
+        """Spatial frequencies of a relative change, each amplifier over its mean."""
+        total = 1.0 + np.broadcast_to(change, self.layout.shape)
+        for segment in self.layout.segments:
+            part = np.s_[segment.y : segment.y + segment.rows,
+                         segment.x : segment.x + segment.columns]  # fmt: skip
+            total[part] /= total[part].mean()
+        return np.asarray(np.fft.rfft2(total - 1.0))
+
+    def _rows(self, channel: Channel, name: str) -> tuple[NDArray[np.int64], Axes]:
+        """Values of a map, found once: channels do not change."""
+        key = ("rows", id(channel), name)
+        kept = self._kept.get(key)
+        if kept is None or kept[0] is not channel:
+            rows = np.nonzero(channel.axes["map"] == name)[0]
+            axes = {k: channel.axes[k][rows] for k in ("what", "x", "y", "k")}
+            axes = {w: np.nonzero(axes["what"] == w)[0] for w in PARTS} | {
+                k: axes[k] for k in ("x", "y", "k")
+            }
+            kept = self._kept[key] = channel, rows, axes
+        return kept[1], kept[2]
+
+
+PARTS = ("column", "row", "block", "ring")
+
+
+def reduce_spectrum(
+    delta: Spectrum, shape: tuple[int, int], axes: Axes
+) -> NDArray[np.float64]:
+    """What a change of a map does to its columns, rows, blocks and rings.
+
+    Parameters
+    ----------
+    delta : ndarray, shape (ny, nx // 2 + 1)
+        Transform of the change.
+    shape : tuple of int
+        Rows and columns.
+    axes : mapping
+        'x', 'y', 'k' of the values, and which of them are each of :data:`PARTS`.
+    """
+    ny, nx = shape
+    column, row, block, ring = (axes[w] for w in PARTS)
+    out = np.zeros(len(axes["x"]))
+    out[column] = (np.fft.irfft(delta[0], n=nx) / ny)[axes["x"][column].astype(int)]
+    out[row] = (np.fft.ifft(delta[:, 0]).real / nx)[axes["y"][row].astype(int)]
+    if not len(block) and not len(ring):
+        return out
+    change = np.fft.irfft2(delta, s=shape)
+    if len(block):
+        side = block_side(shape)
+        mean = change[: ny // side * side, : nx // side * side]
+        mean = mean.reshape(ny // side, side, nx // side, side).mean((1, 3))
+        y, x = (((axes[n][block] + 0.5) / side).astype(int) for n in "yx")
+        out[block] = mean[y, x]
+    if len(ring):
+        # Rings are those of a map without its smooth shape.
+        q_y, q_x = (smooth_shapes(n) for n in shape)
+        (f_y, _), (_, f_x) = (_smooth_spectra(n) for n in shape)
+        rough = delta - f_y @ (q_y.T @ change @ q_x) @ f_x.T
+        power = spectrum_rings(rough, shape)
+        out[ring] = 1e6 * power[(axes["k"][ring] * 2 * RINGS).astype(int)]
+    return out
+
+
+@lru_cache(maxsize=8)
+def _smooth_spectra(n: int) -> tuple[Spectrum, Spectrum]:
+    """Transforms of the smooth shapes along a side, all frequencies and those from 0 on."""
+    shapes = smooth_shapes(n)
+    return np.fft.fft(shapes, axis=0), np.fft.rfft(shapes, axis=0)

@@ -1,0 +1,326 @@
+"""Cosmic rays: muons leave straight tracks, in all frames alike."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache, partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from bfsensor.effects.chance import scatter_of_pairs
+from bfsensor.effects.dark_pixels import OUTLIER
+from bfsensor.effects.effect import (
+    Axes,
+    Effect,
+    Image,
+    Layout,
+    Parameter,
+    Seen,
+    Shot,
+    Values,
+)
+
+AREA = 256 * 256
+"""Pixels that the rate is for."""
+
+READOUT = 5.0
+"""Time [s] that a frame waits to be read beside the exposure (assumed)."""
+
+IONISATION = 80.0
+"""Electrons of a muon's track in silicon [1/um], about; its tail is an exponential of a fifth."""
+
+SPREAD = 0.3
+"""Of the charge about the track [pixel] (assumed)."""
+
+TRACKS = 3000
+"""Of which means are taken: the mean square of 3000 is good to 3 %."""
+
+LEVELS = np.geomspace(30.0, 1e6, 40)
+"""Levels of flats [e-] that means are kept for."""
+
+
+class CosmicRays(Effect):
+    """``rate`` tracks a minute on 256 x 256 pixels, 5 s of readout included.
+
+    Directions go with the square of the cosine of the zenith angle, the sensor lying flat.  In
+    darks pixels are struck; of flats, what is too weak to be left out as an outlier adds to
+    the variance and, along the track, to covariances.
+    """
+
+    word = "cosmic_rays"
+    stage = "store"
+    parameters = (Parameter("rate", "1/min", 0.3, 30.0, amplitude=True),)
+    touches = ("dark_map", "flat_cov", "bias_level")
+    source = (
+        "Groom 2002, Exp. Astron. 14, 45 (straight muon tracks in thick CCDs; the muon rate is "
+        "irreducible); about one a minute and cm^2 at sea level, 80 e-/um: Particle Data Group, from "
+        "memory; charge in lumps of a quarter of a pixel assumed"
+    )
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        return [{"rate": 3.0}]
+
+    def store(
+        self,
+        charge: Image,
+        shot: Shot,
+        layout: Layout,
+        rng: np.random.Generator,
+        memory: dict[str, NDArray],
+    ) -> Image:
+        ny, nx = charge.shape
+        number = rng.poisson(self._each(shot.seconds) * nx * ny)
+        if not number:
+            return charge
+        found = make_tracks(number, layout.thickness, layout.pixel, rng)
+        y = found.y + rng.integers(0, ny, number)[found.owner]
+        x = found.x + rng.integers(0, nx, number)[found.owner]
+        inside = (x >= 0) & (x < nx) & (y >= 0) & (y < ny)
+        struck = charge.copy()
+        np.add.at(struck, (y[inside], x[inside]), found.charge[inside].astype(charge.dtype))
+        return struck
+
+    def covariances(self, c: Values, axes: Axes, layout: Layout) -> Values:
+        side = c.shape[-1]
+        table, _ = _excess(
+            layout.thickness, layout.pixel, layout.shape, layout.clip, layout.lags
+        )
+        place = np.interp(
+            np.log(np.maximum(axes["level"], LEVELS[0])),
+            np.log(LEVELS),
+            np.arange(len(LEVELS)),
+        )
+        low = np.minimum(place.astype(int), len(LEVELS) - 2)
+        part = (place - low)[:, None, None]
+        own = (1 - part) * table[low] + part * table[low + 1]
+        lags = np.arange(-layout.lags, layout.lags + 1)
+        added = np.zeros_like(c)
+        each = self._each(np.asarray(axes["time"], float))[:, None, None]
+        added[:, (lags % side)[:, None], lags % side] = each * own
+        return np.asarray(c + added)
+
+    def dark_map(self, axes: Axes, layout: Layout) -> Values:
+        out = np.zeros(len(axes["time"]))
+        for rows, (mean, _), (always, _) in self._struck(axes, layout):
+            out[rows] = mean + always
+        return out
+
+    def bias_level(self, axes: Axes, layout: Layout) -> Values:
+        total = _tracks(layout.thickness, layout.pixel, layout.shape).total()
+        mean = float(self._each(0.0)) * float(total.mean())
+        return np.where(axes["what"] == "level", mean, 0.0)
+
+    def modes(self, word: str, axes: Axes, layout: Layout) -> Values | None:
+        if word == "bias_level":
+            total = _tracks(layout.thickness, layout.pixel, layout.shape).total()
+            square = float(self._each(0.0)) * float((total**2).mean())
+            pixels = np.array([s.rows * s.columns for s in layout.segments])
+            own = np.sqrt(square / pixels)[np.asarray(axes["amp"]).astype(int)]
+            return np.diag(np.where(axes["what"] == "level", own, 0.0))
+        if word == "flat_cov":
+            return scatter_of_pairs(self, axes, layout, partial(self._few, layout=layout))
+        if word != "dark_map":
+            return None
+        rows = np.nonzero(axes["what"] == "struck")[0]
+        out = np.zeros((len(axes["what"]), len(rows) + len(layout.segments)))
+        for amp, (here, (_, spread), (_, common)) in enumerate(self._struck(axes, layout)):
+            out[here, np.searchsorted(rows, here)] = spread
+            # Tracks in the biases are in all darks, the other way round.
+            out[here, len(rows) + amp] = common
+        return out
+
+    def _few(self, amp: int, level: float, time: float, layout: Layout) -> float:
+        """Scatter of what the tracks of one pair add, over its mean."""
+        _, single = _excess(
+            layout.thickness, layout.pixel, layout.shape, layout.clip, layout.lags
+        )
+        segment = layout.segments[amp]
+        tracks = 2 * float(self._each(time)) * segment.rows * segment.columns
+        own = float(np.interp(np.log(max(level, LEVELS[0])), np.log(LEVELS), single))
+        return own / np.sqrt(tracks) if tracks > 0 else 0.0
+
+    def _each(self, seconds: Values | float) -> Values:
+        """Tracks that begin in a pixel of an exposure."""
+        return np.asarray(self["rate"] * (np.asarray(seconds) + READOUT) / 60.0 / AREA)
+
+    def _struck(
+        self, axes: Axes, layout: Layout
+    ) -> list[tuple[NDArray[np.int64], tuple[Values, Values], tuple[float, float]]]:
+        """By amplifier: rows of struck pixels; their mean number and its scatter, by dark, and
+        the same of those that the mean bias was struck in."""  # noqa: D205, D209
+        found = _tracks(layout.thickness, layout.pixel, layout.shape)
+        biases = len(layout.biases)
+        out = []
+        for amp, (segment, noise) in enumerate(
+            zip(layout.segments, layout.noise, strict=True)
+        ):
+            rows = np.nonzero(
+                (axes["what"] == "struck") & (np.asarray(axes["amp"]).astype(int) == amp)
+            )[0]
+            pixels = segment.rows * segment.columns
+            number = found.above(OUTLIER * noise)
+            tracks = self._each(np.asarray(axes["time"], float)[rows]) * pixels
+            often = number.mean(), float(np.sqrt((number**2).mean()))
+            before = found.above(OUTLIER * noise * biases)
+            in_biases = float(self._each(0.0)) * pixels * biases
+            out.append((
+                rows, (tracks * often[0], np.sqrt(tracks) * often[1]),
+                (in_biases * float(before.mean()), float(np.sqrt(in_biases * (before**2).mean()))),
+            ))  # fmt: skip
+        return out
+
+
+class Tracks(NamedTuple):
+    """Pixels of many tracks that begin in the pixel (0, 0).
+
+    ``number``: of the tracks; ``owner``: which track a pixel belongs to; ``share``: part of such
+    pixels that are on the sensor if the track begins anywhere on it.
+    """
+
+    number: int
+    owner: NDArray[np.int64]
+    y: NDArray[np.int64]
+    x: NDArray[np.int64]
+    charge: Values
+    share: Values
+
+    def above(self, limit: float) -> Values:
+        """Pixels of each track with more charge."""
+        weight = np.where(self.charge > limit, self.share, 0.0)
+        return np.asarray(np.bincount(self.owner, weight, self.number), float)
+
+    def total(self) -> Values:
+        """Charge of each track on the sensor [e-]."""
+        return np.asarray(
+            np.bincount(self.owner, self.share * self.charge, self.number), float
+        )
+
+
+def make_tracks(
+    count: int,
+    thickness: float,
+    pixel: float,
+    rng: np.random.Generator,
+    shape: tuple[int, int] = (10**9, 10**9),
+) -> Tracks:
+    """Draw tracks.
+
+    Parameters
+    ----------
+    count : int
+        How many.
+    thickness, pixel : float
+        Of the sensor [um].
+    rng : numpy.random.Generator
+        All randomness.
+    shape : tuple of int
+        Rows and columns that tracks begin on.
+    """
+    # A flux that goes with cos^2 crosses a plate with cos^3: evenly over the fourth power.
+    strata = (rng.permutation(count) + rng.random(count)) / count
+    cosine = np.maximum(strata, 1e-3) ** 0.25
+    run = thickness / pixel * np.sqrt(1 / cosine**2 - 1)
+    charge = IONISATION * thickness / cosine * (1 + 0.2 * rng.exponential(size=count))
+    lumps = np.maximum((4 * run).astype(int), 8)
+    owner = np.repeat(np.arange(count), lumps)
+    along = np.arange(lumps.sum()) - np.repeat(np.cumsum(lumps) - lumps, lumps)
+    along = (along + 0.5) / lumps[owner] * run[owner]
+    turn = 2 * np.pi * rng.random(count)
+    first = rng.random((2, count))
+    x, y = (
+        np.floor(first[k][owner] + along * part(turn)[owner] + SPREAD * rng.standard_normal(len(owner)))
+        for k, part in enumerate((np.cos, np.sin))
+    )  # fmt: skip
+    lump = rng.poisson((charge / lumps)[owner]).astype(float)
+    wide = int(max(np.abs(x).max(initial=0), np.abs(y).max(initial=0))) + 1
+    key = (owner * (2 * wide + 1) + (y + wide).astype(np.int64)) * (2 * wide + 1)
+    pixels, which = np.unique(key + (x + wide).astype(np.int64), return_inverse=True)
+    rest, x0 = np.divmod(pixels, 2 * wide + 1)
+    track, y0 = np.divmod(rest, 2 * wide + 1)
+    y0, x0 = y0 - wide, x0 - wide
+    inside = [
+        np.maximum(1 - np.abs(v) / n, 0.0) for v, n in zip((y0, x0), shape, strict=True)
+    ]
+    total = np.asarray(np.bincount(which.ravel(), lump), float)
+    return Tracks(count, track, y0, x0, total, inside[0] * inside[1])
+
+
+@lru_cache(maxsize=4)
+def _tracks(thickness: float, pixel: float, shape: tuple[int, int]) -> Tracks:
+    """Tracks that means are taken of."""
+    return make_tracks(TRACKS, thickness, pixel, np.random.default_rng(80_256), shape)
+
+
+@lru_cache(maxsize=4)
+def _excess(
+    thickness: float, pixel: float, shape: tuple[int, int], clip: float, lags: int
+) -> tuple[Values, Values]:
+    """What one track a pixel would add to covariances by level [e-^2], lag 0 in the middle.
+
+    And the root of the mean square of what single tracks add to the variance, over its mean.  A
+    pixel of the difference of two flats is left out beyond ``clip`` of its noise, and so are
+    its neighbours; of the others a track's charge adds to squares and products.
+    """
+    found = _tracks(thickness, pixel, shape)
+    near = found.share > 0
+    owner, y, x = found.owner[near], found.y[near], found.x[near]
+    charge, share = found.charge[near], found.share[near]
+    plane = [(j, i) for j in range(-lags, lags + 1) for i in range(-lags, lags + 1)]
+    other = dict(zip(plane, _neighbours(owner, y, x, plane), strict=True))
+    ring = [(j, i) for j in (-1, 0, 1) for i in (-1, 0, 1)]
+    out = np.zeros((len(LEVELS), 2 * lags + 1, 2 * lags + 1))
+    single = np.zeros(len(LEVELS))
+    for n, level in enumerate(LEVELS):
+        noise = np.sqrt(2 * level)
+        low, high = -clip - charge / noise, clip - charge / noise
+        kept = np.maximum(ndtr(high) - ndtr(low), 1e-300)
+        bell_low, bell_high = (
+            np.exp(-0.5 * v**2) / np.sqrt(2 * np.pi) for v in (low, high)
+        )
+        first = charge - noise * (bell_high - bell_low) / kept
+        square = (
+            charge**2 - 2 * charge * noise * (bell_high - bell_low) / kept
+            - noise**2 * (high * bell_high - low * bell_low) / kept
+        )  # fmt: skip
+        # Logarithms of the chances that a pixel, and each of those around it, are no outliers.
+        stays = np.append(np.log(kept), 0.0)
+        around = {o: stays[other[o]] for o in ring}
+        alone = np.sum(list(around.values()), axis=0)
+        each = np.bincount(owner, share * np.exp(alone) * square, found.number)
+        single[n] = np.sqrt((each**2).mean()) / max(float(each.mean()), 1e-300)
+        for j, i in plane:
+            if (j, i) < (0, 0):
+                continue
+            a = np.nonzero(other[j, i] >= 0)[0]
+            b = other[j, i][a]
+            both = [o for o in ring if (o[0] - j, o[1] - i) in around]
+            union = alone[a] + alone[b] - np.sum([around[o][a] for o in both], axis=0)
+            products = square[a] if j == i == 0 else first[a] * first[b]
+            total = float((share[a] * np.exp(union) * products).sum())
+            out[n, lags + j, lags + i] = out[n, lags - j, lags - i] = total
+    # Beginning anywhere in a pixel and in any direction, no side is preferred.
+    out = (out + out[:, ::-1] + out[:, :, ::-1] + out[:, ::-1, ::-1]) / 4
+    return np.asarray((out + out.transpose(0, 2, 1)) / 2 / found.number), single
+
+
+def _neighbours(
+    owner: NDArray[np.int64],
+    y: NDArray[np.int64],
+    x: NDArray[np.int64],
+    offsets: Sequence[tuple[int, int]],
+) -> list[NDArray[np.int64]]:
+    """Number of the pixel of the same track at each offset (y, x); -1 where there is none."""
+    reach = max(max(map(abs, o)) for o in offsets)
+    side = 2 * (int(max(np.abs(x).max(), np.abs(y).max())) + reach) + 1
+    key = (owner * side + y + side // 2) * side + x + side // 2
+    order = np.argsort(key)
+    out = []
+    for j, i in offsets:
+        wanted = key + j * side + i
+        at = order[np.minimum(np.searchsorted(key, wanted, sorter=order), len(key) - 1)]
+        out.append(np.where(key[at] == wanted, at, -1))
+    return out

@@ -1,0 +1,45 @@
+"""Edge roll-off: at the rim of the sensor the field leans, and pixels reach farther out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bfsensor.effects.effect import Edges, Effect, Layout, Parameter, Seen, Shot
+
+
+class EdgeRolloff(Effect):
+    """Edges at the distance d from the rim stand outwards by ``amp`` exp(-d / length) pixels."""
+
+    word = "edge_rolloff"
+    stage = "collect"
+    parameters = (
+        Parameter("amp", "pixel", 0.01, 0.5, amplitude=True),
+        Parameter("length", "pixel", 1.5, 8.0),
+    )
+    touches = ("flat_map",)
+    source = (
+        "Bradshaw et al. 2015, JINST 10, C04034 (arXiv 1507.02683): spots displaced near the edge of "
+        "an LSST prototype; an exponential and its range are assumed"
+    )
+    standing = True
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        return [{"amp": 0.05, "length": length} for length in (1.7, 2.6, 4.0, 6.3)]
+
+    def displacements(self, shot: Shot, layout: Layout) -> Edges | None:
+        ny, nx = layout.shape
+        x, y = (self._outwards(n) for n in (nx, ny))
+        return (
+            np.broadcast_to(x, (ny, nx + 1)),
+            np.broadcast_to(y[:, None], (ny + 1, nx)),
+        )
+
+    def _outwards(self, n: int) -> np.ndarray:
+        """Displacements of the edges between n pixels, towards larger numbers."""
+        edge, length = np.arange(n + 1.0), self["length"]
+        return np.asarray(
+            self["amp"] * (np.exp((edge - n) / length) - np.exp(-edge / length))
+        )

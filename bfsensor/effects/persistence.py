@@ -1,0 +1,122 @@
+"""Persistence: charge that an exposure leaves behind shows in those that follow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.effects.dark_pixels import mean_bias, struck_pixels
+from bfsensor.effects.effect import (
+    Axes,
+    Effect,
+    Image,
+    Layout,
+    Parameter,
+    Seen,
+    Shot,
+    Values,
+)
+
+
+class Persistence(Effect):
+    """``frac`` exp(-k / tau) of a charge shows again in the k-th exposure after it.
+
+    Exposures are counted by their numbers: those that are missing count, but what they left is
+    not known.
+    """
+
+    word = "persistence"
+    stage = "store"
+    parameters = (
+        Parameter("frac", "", 1e-5, 1e-3, amplitude=True),
+        Parameter("tau", "exposure", 0.7, 5.0),
+    )
+    touches = ("dark_map", "flat_mean", "bias_level", "spot")
+    source = (
+        "Polin, Snyder, Lage & Tyson 2025, JINST 20, P07031 (arXiv 2502.05418: residual charge in "
+        "LSST's e2v sensors); an exponential in exposures and its range are assumed"
+    )
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        return [{"frac": 1e-4, "tau": tau} for tau in (0.8, 1.3, 2.1, 3.5)]
+
+    def store(
+        self,
+        charge: Image,
+        shot: Shot,
+        layout: Layout,
+        rng: np.random.Generator,
+        memory: dict[str, NDArray],
+    ) -> Image:
+        trapped = memory.get(self.word, np.zeros_like(charge))
+        # Released once and trapped anew: what shows again leaves nothing behind.
+        memory[self.word] = (trapped + self["frac"] * charge) * np.float32(
+            np.exp(-1 / self["tau"])
+        )
+        return charge + rng.poisson(trapped).astype(charge.dtype)
+
+    def flat_mean(self, axes: Axes, layout: Layout) -> Values:
+        return self._left_at(axes["exposure"], layout)
+
+    def bias_level(self, axes: Axes, layout: Layout) -> Values:
+        return np.where(
+            axes["what"] == "level", self._left_at(axes["exposure"], layout), 0.0
+        )
+
+    def dark_map(self, axes: Axes, layout: Layout) -> Values:
+        noise, more = layout.noise, mean_bias(layout)
+        left = self._left_at(axes["exposure"], layout)
+        out = np.zeros(len(left))
+        for row in np.nonzero(axes["what"] != "column")[0]:
+            amp = int(axes["amp"][row])
+            part, others = struck_pixels(left[row], left[row], noise[amp], more)
+            segment = layout.segments[amp]
+            struck = axes["what"][row] == "struck"
+            out[row] = part * segment.rows * segment.columns if struck else others
+        return out
+
+    def spot_flux(self, axes: Axes, layout: Layout) -> Values:
+        # Dithers are within a pixel: the ghost of the last spot is in the stamp of the next.
+        later = np.subtract.outer(axes["exposure"], axes["exposure"]).astype(float)
+        ghosts = self._after(later) @ axes["flux"]
+        biases = np.array(layout.biases, float)
+        if not len(biases):
+            return np.asarray(ghosts)
+        # Biases hold ghosts too, and their mean is taken off all exposures.
+        later = np.subtract.outer(biases, np.asarray(axes["exposure"], float))
+        return np.asarray(ghosts - (self._after(later) @ axes["flux"]).sum() / len(biases))
+
+    def modes(self, word: str, axes: Axes, layout: Layout) -> Values | None:
+        if word not in ("flat_mean", "dark_map") or not layout.shots:
+            return None
+        # Of exposures that are missing the light is not known: as much as that of the others.
+        numbers = np.array([s.number for s in layout.shots])
+        lit = np.array([s.level for s in layout.shots if s.level > 0])
+        gaps = [g for g in zip(numbers[:-1] + 1, numbers[1:], strict=True) if g[0] < g[1]]
+        if not gaps or not len(lit):
+            return None
+        usual = float(np.sqrt((lit**2).mean()))
+        rows = np.ones(len(axes["exposure"]), bool)
+        if word == "dark_map":
+            rows = axes["what"] == "level"
+        return np.stack([
+            rows * usual
+            * self._after(np.subtract.outer(axes["exposure"], np.arange(*gap)).astype(float)).sum(1)
+            for gap in gaps
+        ], axis=1)  # fmt: skip
+
+    def _after(self, later: Values) -> Values:
+        """Part of a charge that shows so many exposures later."""
+        shown = self["frac"] * np.exp(-np.maximum(later, 0.0) / self["tau"])
+        return np.where(later > 0, shown, 0.0)
+
+    def _left_at(self, number: Values, layout: Layout) -> Values:
+        """Charge that earlier exposures left in these [e-]."""
+        lit = [s for s in layout.shots if s.level > 0]
+        later = np.subtract.outer(
+            np.asarray(number, float), np.array([s.number for s in lit], float)
+        )
+        return np.asarray(self._after(later) @ np.array([s.level for s in lit]))

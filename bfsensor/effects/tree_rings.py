@@ -1,0 +1,82 @@
+"""Tree rings: circles of doping about the axis of the crystal that the wafer was cut from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bfsensor.effects.effect import Edges, Effect, Layout, Parameter, Seen, Shot, Values
+
+
+class TreeRings(Effect):
+    r"""Edges stand off along the radius by a sine of the radius.
+
+    .. math::
+        u(r) = A \sin 2 \pi \left[ \frac{r}{P} \left( 1 + c\, \frac{r - r_0}{200} \right)
+        + \varphi \right],
+
+    r from (``xc``, ``yc``), :math:`r_0` that of the pixel (0, 0).  ``chirp`` c: relative change of
+    the rings' frequency per 100 pixels; ``phase`` in cycles.
+    """
+
+    word = "tree_rings"
+    stage = "collect"
+    parameters = (
+        Parameter("amp", "pixel", 1e-3, 0.05, amplitude=True),
+        Parameter("period", "pixel", 10.0, 100.0, step=0.01),
+        Parameter("xc", "pixel", -3000.0, 3000.0, law="flat", step=0.3),
+        Parameter("yc", "pixel", -3000.0, 3000.0, law="flat", step=0.3),
+        Parameter("chirp", "1/(100 pixel)", -0.05, 0.05, law="flat", step=5e-4),
+        Parameter("phase", "cycle", -0.5, 0.5, law="flat"),
+    )
+    touches = ("flat_map",)
+    source = (
+        "Plazas, Bernstein & Sheldon 2014, PASP 126, 750 (DECam: rings in flats and in positions "
+        "of stars, from memory); Baumer, Davis & Roodman 2017, PASP 129, 084502; range assumed"
+    )
+    standing = True
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        """Rings that were followed across the map of all light; without such, coarse ones."""
+        names = [p.name for p in cls.parameters]
+        found = [
+            {n: float(s[n]) for n in names}
+            for s in layout.sightings
+            if s["shape"] == "rings"
+        ]
+        if found:
+            return found
+        # Half a turn of phase shows only as a sign.
+        ny, nx = layout.shape
+        periods = [s["period"] for s in seen if s.get("what") == "ring" and "period" in s]
+        usual = {p.name: 0.0 for p in cls.parameters} | {"amp": 5e-3}
+        return [
+            usual | {"period": float(period), "xc": xc, "yc": yc, "phase": phase}
+            for period in periods[:2] or [16.0, 24.0, 36.0, 54.0]
+            for xc in (-0.4 * nx, 1.4 * nx) for yc in (-0.4 * ny, 1.4 * ny)
+            for phase in (0.0, 0.25)
+        ]  # fmt: skip
+
+    def displacements(self, shot: Shot, layout: Layout) -> Edges | None:
+        ny, nx = layout.shape
+        if not self["amp"]:
+            return None
+        x, y = np.arange(float(nx)) - self["xc"], np.arange(float(ny))[:, None] - self["yc"]
+        edge_x, edge_y = (
+            np.arange(nx + 1.0) - 0.5 - self["xc"],
+            np.arange(ny + 1.0)[:, None] - 0.5 - self["yc"],
+        )
+        return self._along(edge_x, y, edge_x), self._along(x, edge_y, edge_y)
+
+    def _along(self, x: Values, y: Values, axis: Values) -> Values:
+        """Displacement at places about the centre, its part along an axis."""
+        r = np.sqrt(x * x + y * y)
+        r0 = np.hypot(self["xc"], self["yc"])
+        turns = (
+            r * ((1 + self["chirp"] / 200.0 * (r - r0)) / self["period"]) + self["phase"]
+        )
+        return np.asarray(
+            self["amp"] * np.sin(2 * np.pi * turns) * (axis / np.maximum(r, 0.5))
+        )
