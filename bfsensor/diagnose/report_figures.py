@@ -160,13 +160,13 @@ def _pictures(
     if "flat_cov" in found:
         channel, pulls = found["flat_cov"]
         caption = "Covariances of flats: pulls by lag"
-        parts: list[Draw] = [lambda ax: show.draw_lags(channel.axes, pulls, ax)]
+        panels: list[Draw] = [lambda ax: show.draw_lags(channel.axes, pulls, ax)]
         if channel.unit != PER_ELECTRON:
             caption += ", weighted by the square of the level, and of the nearest lags against level"
-            parts.append(
+            panels.append(
                 lambda ax: show.draw_lag_levels(channel.axes, pulls, ax, lags=LAGS)
             )
-        out["flat_cov"] = Picture(f"{caption}.", (5.2, 3.5 * len(parts)), tuple(parts))
+        out["flat_cov"] = Picture(f"{caption}.", (5.2, 3.5 * len(panels)), tuple(panels))
     if "flat_mean" in found:
         channel_m, pulls_m = found["flat_mean"]
         left = channel_m.unwhiten(pulls_m) / np.maximum(channel_m.values, 1e-9)
