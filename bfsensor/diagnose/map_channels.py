@@ -21,6 +21,9 @@ RINGS = 24
 ORDER = 4
 """Order of the smooth shape of the light in x and in y that rings are freed of."""
 
+NEAREST, FARTHEST = 4, 40
+"""Distances in x [pixel] at which a map is held against itself: nearer ones share boundaries."""
+
 LOW = 8
 """Side of the boxes [pixel] that tell noise over many pixels."""
 
@@ -264,13 +267,28 @@ class MapChannels:
                 {"what": "ring", "k": frequency[keep], "x": -1.0, "y": -1.0},
             )
         )
+        texture, dx, dy = map_texture(_without_shape(filled))
+        spread = 1e6 * float(filled.var()) / np.sqrt(max(good.sum(), 1))
+        out.append(
+            (texture, np.full(len(texture), spread), {"what": "texture", "k": -1.0, "x": dx, "y": dy})
+        )  # fmt: skip
+        # Single pixels' noise is not evened out as that over many is.
+        single = np.sqrt(sigma**2 / image.ratio)
+        chess, centres = map_chess(filled)
+        count = np.maximum(map_chess(good.astype(float), signed=False)[0] * good.size, 1)
+        out.append(
+            (
+                chess,
+                single / np.sqrt(count / len(chess)),
+                {"what": "chess", "k": -1.0, "x": centres, "y": -1.0},
+            )
+        )
         return out
 
     @property
     def _modes(self) -> NDArray[np.int64]:
         """Modes of each ring."""
-        bins, use = _ring_bins(self._shape)
-        return np.bincount(bins[use], minlength=RINGS)[:RINGS]
+        return ring_modes(self._shape)
 
 
 @dataclass
@@ -321,6 +339,12 @@ def _ring_bins(shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.bo
     return bins, (np.abs(fy) > 0) & (fx > 0) & (bins < RINGS)
 
 
+def ring_modes(shape: tuple[int, int]) -> NDArray[np.int64]:
+    """Modes of each ring of a map of that shape."""
+    bins, use = _ring_bins(shape)
+    return np.bincount(bins[use], minlength=RINGS)[:RINGS]
+
+
 def ring_power(image: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean power of a mode by ring; that of white noise is a pixel's variance."""
     bins, use = _ring_bins(image.shape)
@@ -329,6 +353,53 @@ def ring_power(image: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.bincount(bins[use], power[use], minlength=RINGS)[:RINGS] / np.maximum(
         count, 1
     )
+
+
+def map_texture(
+    image: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Hold a map against itself: mean products [1e-6] of pixels (dx, dy) apart, with dx and dy.
+
+    In the same row and from one row to the next: patterns that go with the time of readout
+    keep step along a row and start the next one with another phase.  Means of columns and of
+    rows are taken off: they are told by themselves.
+
+    Examples
+    --------
+    >>> wave = np.sin(2 * np.pi * np.arange(64 * 100) / 8.1).reshape(64, 100)
+    >>> values, dx, dy = map_texture(wave)
+    >>> [float(values[(dx == n) & (dy == 0)][0].round(-5)) for n in (4, 8)]
+    [-500000.0, 500000.0]
+    """
+    ny, nx = image.shape
+    image = image - image.mean(0) - image.mean(1)[:, None] + image.mean()
+    reach = min(FARTHEST, nx // 2)
+    spectrum = np.fft.rfft(image, 2 * nx, axis=1)
+    same = np.fft.irfft((spectrum.real**2 + spectrum.imag**2).sum(0), 2 * nx)
+    following = np.fft.irfft((spectrum[:-1].conj() * spectrum[1:]).sum(0), 2 * nx)
+    near, both = np.arange(NEAREST, reach + 1), np.arange(-reach, reach + 1)
+    both = both[np.abs(both) >= NEAREST]
+    values = [
+        same[near] / (ny * (nx - near)),
+        following[both] / ((ny - 1) * (nx - np.abs(both))),
+    ]
+    dy = np.repeat([0.0, 1.0], [len(near), len(both)])
+    return 1e6 * np.concatenate(values), np.concatenate([near, both]).astype(float), dy
+
+
+def map_chess(
+    image: NDArray[np.float64], *, signed: bool = True
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Half of the difference of even and odd pixels (row plus column), in strips, and their x.
+
+    Columns and rows do not show it, nor do rings, which end at half a cycle a pixel.
+    """
+    ny, nx = image.shape
+    side = int(np.ceil(max(ny, nx) / BLOCKS))
+    sign = 1.0 - 2.0 * (np.indices(image.shape).sum(0) % 2)
+    columns = ((sign if signed else 1.0) * image).mean(0)[: nx // side * side]
+    centres = (np.arange(nx // side) + 0.5) * side - 0.5
+    return columns.reshape(-1, side).mean(1), centres
 
 
 def _without_shape(image: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -28,6 +29,9 @@ MAP_ORDER = 4
 REDUCED_LEVEL = 40_000.0
 """Background [e-] at which a_ij without a level are predicted: halfway to a flat of 80,000 e-, at
 which published covariances are quoted."""
+
+Columns = Callable[[Channel], dict[str, NDArray[np.float64]]]
+"""Columns of further linear parameters of a channel, by name, in its unit."""
 
 PHASES = 12
 """Spots whose positions stand for those of an exposure."""
@@ -134,6 +138,8 @@ class Predictor:
                     f"baseline has no shifts at {'/'.join(key)}: the nearest condition's are taken"
                 )
 
+        self.columns: tuple[Columns, ...] = ()
+        self.spot_slopes: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self.effects: tuple[Effect, ...] = ()
         self._add(effects)
 
@@ -154,6 +160,54 @@ class Predictor:
         other.names, other.steps = self.names[:plain], self.steps[:plain]
         other.start = (self.start if point is None else point)[:plain].copy()
         other._add(effects)
+        return other
+
+    def with_columns(
+        self, columns: Columns, point: NDArray[np.float64] | None = None
+    ) -> Predictor:
+        """Copy with further linear parameters; fits begin at ``point``."""
+        other = copy(self)
+        other.columns = (*self.columns, columns)
+        if point is not None:
+            other.start = point[: len(self.names)].copy()
+        return other
+
+    def with_shifts(
+        self,
+        edges: tuple[NDArray[np.float64], NDArray[np.float64]],
+        slopes: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
+    ) -> Predictor:
+        """Copy with shifts of boundaries added to the baseline's [pixel/e-].
+
+        Parameters
+        ----------
+        edges : tuple of ndarray
+            Of right and upper edges; at other conditions scaled as the baseline's own are.
+        slopes : tuple of ndarray, optional
+            Their change with the charge that pushes [pixel/e-^2].
+        """
+        other = copy(self)
+        own = self.baseline
+        scales = {k: own.scale_at(k) for k in own.edges}
+        if slopes is not None:
+            # The baseline's own hold at a level that may not be 0.
+            edges = edges[0] + own.level * slopes[0], edges[1] + own.level * slopes[1]
+        moved = {
+            k: tuple(o + scales[k] * d for o, d in zip(own.edges[k], edges, strict=True))
+            for k in own.edges
+        }
+        changed: dict[str, object] = {"edges": moved}
+        if slopes is not None:
+            nothing = (np.zeros_like(edges[0]),) * 2
+            changed["slopes"] = {
+                k: tuple(
+                    o + scales[k] * d
+                    for o, d in zip(own.slopes.get(k, nothing), slopes, strict=True)
+                )
+                for k in own.edges
+            }
+            other.spot_slopes = slopes
+        other.baseline = replace(own, **changed)  # type: ignore[arg-type]
         return other
 
     def _add(self, effects: Sequence[Effect]) -> None:
@@ -325,7 +379,10 @@ class Predictor:
             "flat_mean": self._mean_columns, "flat_map": self._map_columns,
             "dark_map": self._dark_columns, "spot": self._spot_columns,
         }.get(channel.word)  # fmt: skip
-        return {} if make is None else make(channel)
+        out = {} if make is None else make(channel)
+        for more in self.columns:
+            out |= more(channel)
+        return out
 
     def _flat_cov(
         self,
@@ -402,8 +459,9 @@ class Predictor:
             fluxes = scale * x["flux"][rows]
             if chain is None:
                 found = predict_spots(
-                    *edges, sigma=sigma, phases=self._phases[key], fluxes=fluxes
-                )
+                    *edges, sigma=sigma, phases=self._phases[key], fluxes=fluxes,
+                    slopes=self.spot_slopes,
+                )  # fmt: skip
                 found.pop("flux")
             else:
                 variance, halo, axes = chain.spot_change(self._spot_of[key])
@@ -411,6 +469,7 @@ class Predictor:
                 found = predict_spots(
                     *chain.edges(edges, self._spot_of[key]), sigma=(wide[0], wide[1]),
                     phases=self._phases[key], fluxes=fluxes, halo=halo, law=chain.law,
+                    slopes=self.spot_slopes,
                     change=partial(chain.spot_image, axes=axes),
                 )  # fmt: skip
                 found["flux"] = found["flux"] / scale

@@ -11,7 +11,7 @@ from bfsensor.diagnose.baseline import Baseline, Edges, area_matrix
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
-from bfsensor.diagnose.map_channels import BLOCKS, RINGS, ring_power
+from bfsensor.diagnose.map_channels import BLOCKS, RINGS, map_chess, map_texture, ring_power
 from bfsensor.diagnose.predict_flats import GRID
 from bfsensor.effects.effect import STAGES, Axes, Effect, Law, Layout, Shot
 
@@ -270,7 +270,7 @@ class EffectChain:
 
 
 def reduce_map(change: NDArray[np.float64], axes: Axes) -> NDArray[np.float64]:
-    """What a change of a map does to its columns, rows, blocks and rings."""
+    """What a change of a map does to its columns, rows, blocks, rings, texture and chess pattern."""
     ny, nx = change.shape
     what = axes["what"]
     out = np.zeros(len(what))
@@ -288,6 +288,9 @@ def reduce_map(change: NDArray[np.float64], axes: Axes) -> NDArray[np.float64]:
     if ring.any():
         power = ring_power(change)
         out[ring] = 1e6 * power[(axes["k"][ring] * 2 * RINGS).astype(int)]
+    for name, values in (("texture", map_texture), ("chess", map_chess)):
+        if (own := what == name).any():
+            out[own] = values(change)[0]
     return out
 
 

@@ -75,11 +75,7 @@ def periodic_covariances(
     -------
     covariances : ndarray, shape (n, :data:`GRID`, :data:`GRID`)
     """
-    ny, nx = a.shape[-2:]
-    wide = np.zeros((*a.shape[:-2], GRID, GRID))
-    wide[..., :ny, :nx] = a
-    wide = np.roll(wide, (-(ny // 2), -(nx // 2)), (-2, -1))
-    a_k = np.fft.fft2(wide).real - law.loss
+    a_k = transform_areas(a) - law.loss
     m = np.asarray(levels, float)[:, None, None]
     if law.bend:
         # The integrating factor, over the charge s that a fluctuation came at; smooth.
@@ -100,3 +96,45 @@ def quadrant(c: NDArray[np.float64], lags: int) -> NDArray[np.float64]:
     """Lags from 0, the mean of (i, j) and (i, -j), of periodic covariances."""
     side = np.arange(lags + 1)
     return np.asarray(0.5 * (c[:, side[:, None], side] + c[:, -side[:, None], side]))
+
+
+def flat_response(
+    a: NDArray[np.float64], levels: ArrayLike, *, power: int = 0
+) -> NDArray[np.float64]:
+    r"""Derivative of flats' power by a response that goes with the level to a power.
+
+    .. math:: \delta\tilde C = \delta\hat a \int_0^m 2 s^p\, \tilde C(s)\,
+        e^{2 \hat a (m - s)} ds
+
+    Parameters
+    ----------
+    a, levels
+        As for :func:`periodic_covariances`.
+    power : int
+        p: the change of the area is s^p times a constant where all pixels hold s.
+
+    Returns
+    -------
+    response : ndarray, shape (n, :data:`GRID`, :data:`GRID`)
+        By mode [e-^(2 + p)], to be multiplied by the transform of the change [1/e-^(1 + p)].
+    """
+    a_k = transform_areas(a)
+    m = np.asarray(levels, float)[:, None, None]
+    nodes, weights = np.polynomial.legendre.leggauss(NODES)
+    out = np.zeros(np.broadcast_shapes(a_k.shape, m.shape))
+    for node, weight in zip(0.5 * (nodes + 1), 0.5 * weights, strict=True):
+        s = node * m
+        x = 2 * a_k * s
+        small = np.abs(x) < 1e-9
+        grown = s * np.where(small, 1 + x / 2, np.expm1(x) / np.where(small, 1.0, x))
+        out += weight * m * 2 * s**power * grown * np.exp(2 * a_k * (m - s))
+    return out
+
+
+def transform_areas(a: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Transform of even area changes on the grid of the closed form, shape (..., GRID, GRID)."""
+    ny, nx = a.shape[-2:]
+    wide = np.zeros((*a.shape[:-2], GRID, GRID))
+    wide[..., :ny, :nx] = a
+    wide = np.roll(wide, (-(ny // 2), -(nx // 2)), (-2, -1))
+    return np.asarray(np.fft.fft2(wide).real)

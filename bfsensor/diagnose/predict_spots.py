@@ -80,6 +80,7 @@ def grow_spots(
     steps: int = STEPS,
     halo: tuple[float, float] = (0.0, 1.0),
     law: Law = LINEAR,
+    slopes: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> NDArray[np.float64]:
     """Mean images of Gaussian spots as they build up.
 
@@ -103,6 +104,9 @@ def grow_spots(
         Share of the light in a wide component, and the sigma that it has more [pixel].
     law : Law
         How collection departs from linear shifts; what is beyond the full well is spilled.
+    slopes : tuple of ndarray, optional
+        Change of the shifts per electron with the charge Q of the pixel that pushes
+        [pixel/e-^2]: boundaries move by these times Q^2 / 2 besides.
 
     Returns
     -------
@@ -119,6 +123,7 @@ def grow_spots(
     light = np.sum([part.whole for part in parts], axis=0)
     padded = next_fast_len(size + kx.shape[0] - 1)
     spectra = [rfft2(k, s=(padded, padded)) for k in (kx, ky)]
+    bent = [] if slopes is None else [rfft2(k, s=(padded, padded)) for k in slopes]
     half = kx.shape[0] // 2
     inside = slice(half, half + size)
     charge = np.zeros_like(light)
@@ -126,12 +131,16 @@ def grow_spots(
     each = flux / steps
     for step in range(steps):
         middle = charge + 0.5 * each * light
+        squared = rfft2(0.5 * middle**2, s=(padded, padded)) if bent else None
         if law.bend:
             middle = middle * (1 + 0.5 * law.bend * middle)
         seen = rfft2(middle, s=(padded, padded))
         shift_x, shift_y = (
             irfft2(seen * k, s=(padded, padded))[:, inside, inside] for k in spectra
         )
+        if squared is not None:
+            for shift, k in zip((shift_x, shift_y), bent, strict=True):
+                shift += irfft2(squared * k, s=(padded, padded))[:, inside, inside]
         gained = each * light
         # Light changes across a shift of a tenth of a pixel: its integral, not its value.
         across = each * np.sum([part.across_x(shift_x) for part in parts], axis=0)
@@ -160,6 +169,7 @@ def predict_spots(
     fluxes: ArrayLike,
     halo: tuple[float, float] = (0.0, 1.0),
     law: Law = LINEAR,
+    slopes: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
     change: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
 ) -> dict[str, NDArray[np.float64]]:
     """What the fit of the channels measures of such spots, at given fluxes.
@@ -170,7 +180,7 @@ def predict_spots(
         As for :func:`grow_spots`.
     fluxes : array_like, shape (n,)
         Electrons of a spot [e-].
-    halo, law
+    halo, law, slopes
         As for :func:`grow_spots`.
     change : callable, optional
         What happens to the images [e-] after collection.
@@ -183,7 +193,9 @@ def predict_spots(
     """
     wanted = np.asarray(fluxes, float)
     top = float(wanted.max())
-    images = grow_spots(kx, ky, sigma=sigma, phases=phases, flux=top, halo=halo, law=law)
+    images = grow_spots(
+        kx, ky, sigma=sigma, phases=phases, flux=top, halo=halo, law=law, slopes=slopes
+    )
     names = ["sigma_x", "sigma_y", "skew_x", "skew_y", "wings", "flux"]
     knots, rows = [], []
     margin = (WING - STAMP) // 2
