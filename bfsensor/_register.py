@@ -11,6 +11,7 @@ import importlib.abc
 import importlib.machinery
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from types import ModuleType
 from typing import Any
 
@@ -25,11 +26,10 @@ class _Builder:
 
     def buildSensor(self, config: Any, base: Any, logger: Any) -> Any:  # noqa: N802
         """Build the sensor that a configuration describes."""
-        from galsim.config.sensor import SimpleSensorBuilder
-
         import bfsensor
 
-        builder = SimpleSensorBuilder(getattr(bfsensor, self.name))
+        options = import_module("bfsensor.sensor.config")
+        builder = options.EffectSensorBuilder(getattr(bfsensor, self.name))
         return builder.buildSensor(config, base, logger)
 
 

@@ -34,6 +34,12 @@ from bfsensor.cli_common import Bar
     help="Look for the effects that explain a mismatch, or only for where it is.",
 )  # fmt: skip
 @click.option(
+    "--predict", "asked", metavar="CONDITIONS", multiple=True,
+    help="Write predicted.ecsv: what the accepted model expects of exposures that were not taken. "
+    "Flats by level [e-] or seconds, spots by flux [e-]; wavelength, back_bias, temperature and lamp "
+    "where they differ from the campaign's; several times, or an ECSV file with these columns.",
+)  # fmt: skip
+@click.option(
     "--json", "as_json", is_flag=True, help="Print report.json instead of a summary."
 )
 def diagnose(
@@ -43,6 +49,7 @@ def diagnose(
     output: Path | None,
     seed: int,
     explain: bool,
+    asked: tuple[str, ...],
     as_json: bool,
 ) -> None:
     """Hold the recordings of CAMPAIGN against a baseline; say what is left, and where.
@@ -60,8 +67,14 @@ def diagnose(
       bfsensor diagnose recordings/run_12 --baseline itl_sta3800c --float all
       bfsensor diagnose other_camera --baseline none
       bfsensor diagnose itl_covariances.csv --baseline itl_sta3800c_60
+      bfsensor diagnose recordings/run_12 --predict level=40000,back_bias=-40 --predict flux=5e5
     """
     from bfsensor.diagnose import diagnosis
+    from bfsensor.diagnose.predicted import (
+        predict_conditions,
+        read_conditions,
+        refuse_unheld,
+    )
     from bfsensor.diagnose.reduced_channels import measure_reduced
     from bfsensor.diagnose.report import write_report
     from bfsensor.diagnose.sources import (
@@ -72,6 +85,7 @@ def diagnose(
     )
     from bfsensor.recording.campaign import read_campaign
 
+    conditions = read_conditions(asked)
     folder = output or campaign.with_name(campaign.resolve().stem + "_diagnosis")
     reduced = find_reduced_recording(campaign)
     found = (
@@ -86,6 +100,7 @@ def diagnose(
         )
     else:
         predicted = find_baseline(named, card=None if found is None else found.card)
+    refuse_unheld(conditions, predicted)
     if found is None:
         assert reduced is not None
         measured = measure_reduced(reduced, reach=predicted.reach)
@@ -100,6 +115,12 @@ def diagnose(
             + [f"set aside: {s.path.name}: {s.reason}" for s in found.set_aside],
         )  # fmt: skip
     written = write_report(result, folder)
+    notes: tuple[str, ...] = ()
+    predictor, fit = result.accepted
+    if conditions and predictor is not None:
+        prediction = predict_conditions(predictor, fit, conditions)
+        notes = prediction.notes
+        written.append(prediction.write(folder / "predicted.ecsv"))
     if as_json:
         click.echo(json.dumps(result.to_report(), indent=1))
         return
@@ -107,6 +128,8 @@ def diagnose(
     click.echo(f"{'channel':22s}{'chi2':>10s}{'dof':>8s}{'ratio':>8s}")
     for word, (square, dof) in result.mismatch.chi2.items():
         click.echo(f"{word:22s}{square:10.1f}{dof:8.1f}{square / max(dof, 1e-9):8.2f}")
-    for note in result.notes[result.read :]:
+    for advice in result.plan.said():
+        click.echo(f"advised: {advice}")
+    for note in (*result.notes[result.read :], *notes):
         click.echo(f"note: {note}")
     click.echo(f"{folder}: {', '.join(p.name for p in written if p.suffix != '.png')}")

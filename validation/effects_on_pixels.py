@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.extract import Measured, measure_channels
 from bfsensor.diagnose.mismatch import BaselineFit, fit_baseline
 from bfsensor.diagnose.predict import Predictor, used_channels
@@ -110,11 +111,15 @@ class OnPixels:
 
 
 def residuals(
-    fit: BaselineFit, measured: Measured, effects: Sequence[Effect]
+    fit: BaselineFit,
+    measured: Measured,
+    effects: Sequence[Effect],
+    by: Sequence[Channel],
 ) -> dict[str, NDArray[np.float64]]:
-    """Channels less what is predicted with effects, all else as in a null's fit, by its errors.
+    """Channels less what is predicted with effects, all else as in a null's fit, by errors.
 
-    Linear parameters are left out: they are the same with and without effects.
+    Linear parameters are left out: they are the same with and without effects.  ``by``: the
+    channels that errors are taken from.
     """
     baseline = virtual_baseline()
     count = len(Predictor(measured, baseline).names)
@@ -122,7 +127,7 @@ def residuals(
     point = np.concatenate([fit.values[:count], predictor.start[count:]])
     out: dict[str, list[NDArray]] = {}
     channels = used_channels(measured.channels, FOLDS)
-    for like, channel in zip(fit.channels, channels, strict=True):
+    for like, channel in zip(by, channels, strict=True):
         if len(like) != len(channel):
             raise ValueError(f"{like.word}: {len(channel)} values, the null {len(like)}")
         left = channel.values - predictor.predict(channel, point)
@@ -150,26 +155,30 @@ def compare(
         By channel, the baseline's parameters taken off: length of the prediction [standard
         deviations], factor on it that fits the pixels best, and its error from what noise the
         two campaigns do not share.  Where nothing is predicted: 0, 0 and the length seen.
+        Errors are those that the channels of the campaign with the effect have.
     """
     null, fit = null_campaign(seed, size)
     source = VirtualSource(seed=seed, size=size, effects=[own or OnPixels(effect)])
     other = measure_channels(source)
+    by = used_channels(other.channels, FOLDS)
     before, bare, after = (
-        residuals(fit, m, e) for m, e in ((null, ()), (other, ()), (other, (effect,)))
+        residuals(fit, m, e, by) for m, e in ((null, ()), (other, ()), (other, (effect,)))
     )
-    seen = _without_parameters(fit, {w: bare[w] - before[w] for w in bare})
-    said = _without_parameters(fit, {w: bare[w] - after[w] for w in bare})
+    basis = _basis(fit, by)
+    seen = _without_parameters(fit, basis, {w: bare[w] - before[w] for w in bare})
+    said = _without_parameters(fit, basis, {w: bare[w] - after[w] for w in bare})
     out = {}
     for word in seen:
         p, s = said[word], seen[word]
         norm = float(np.sqrt(p @ p))
         factor = float(p @ s) / max(norm, 1e-9) ** 2 if norm > SHADOW else 0.0
         left = s - factor * p
-        spread = float(np.sqrt(left @ left / max(len(left), 1)))
+        # Noise that is not shared is where the effect is, and large where it is strong.
+        error = float(np.sqrt((p * left) @ (p * left)))
         out[word] = (
             norm,
             factor,
-            spread / norm if norm > SHADOW else spread * len(left) ** 0.5,
+            error / norm**2 if norm > SHADOW else float(np.sqrt(left @ left)),
         )
     return out
 
@@ -178,14 +187,23 @@ SHADOW = 0.1
 """Length [standard deviations] below which a channel has no part in an effect."""
 
 
+def _basis(fit: BaselineFit, by: Sequence[Channel]) -> NDArray[np.float64]:
+    """What the baseline's parameters span where errors are others'."""
+    columns = fit.basis.copy()
+    for like, channel, start in zip(fit.channels, by, fit.starts, strict=False):
+        rows = slice(start, start + len(like))
+        columns[rows] = channel.whiten(like.unwhiten(fit.basis[rows]))
+    return np.asarray(np.linalg.qr(columns)[0])
+
+
 def _without_parameters(
-    fit: BaselineFit, changes: dict[str, NDArray[np.float64]]
+    fit: BaselineFit, basis: NDArray[np.float64], changes: dict[str, NDArray[np.float64]]
 ) -> dict[str, NDArray[np.float64]]:
     """Changes less what the baseline's parameters would take of them, by channel word."""
-    whole = np.zeros(len(fit.basis))
+    whole = np.zeros(len(basis))
     for word, change in changes.items():
         whole[: len(fit.residuals)][fit.of(word)] = change
-    left = whole - fit.basis @ (fit.basis.T @ whole)
+    left = whole - basis @ (basis.T @ whole)
     return {w: left[: len(fit.residuals)][fit.of(w)] for w in changes}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -32,6 +33,7 @@ class Shot:
     lamp: float | None
     mjd: float
     pair: int | None = None
+    withheld: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +99,7 @@ class VirtualSource:
         size: str = "S",
         effects: Sequence[Any] = (),
         amplifiers: int = 2,
+        withheld: bool = False,
     ) -> None:
         pixels = SIZES[size].pixels if isinstance(size, str) else size.pixels
         self._geometry = Geometry(pixels, amplifiers)
@@ -105,14 +108,24 @@ class VirtualSource:
         self.lamp_error = 2e-4
         self.shape = (self._geometry.pixels,) * 2
         for taken in iterate_exposures(
-            size, seed=seed, effects=effects, amplifiers=amplifiers
+            size, seed=seed, effects=effects, amplifiers=amplifiers, withheld=withheld
         ):
             e = taken.exposure
             self.exposures.append(
                 Shot(e.sequence, e.kind.lower(), e.seconds, e.wavelength, e.back_bias,
-                     e.temperature, taken.monitor or None, e.mjd)
+                     e.temperature, taken.monitor or None, e.mjd, withheld=e.withheld)
             )  # fmt: skip
             self._frames[e.sequence] = taken.frames
+
+    def part(self, *, withheld: bool) -> VirtualSource:
+        """Give those that were kept back, with the biases that they need, or all others."""
+        other = copy(self)
+        other.exposures = [
+            e
+            for e in self.exposures
+            if e.withheld == withheld or (withheld and e.kind == "bias")
+        ]
+        return other
 
     def read(self, exposure: Shot) -> list[RawFrame]:
         """Frames of an exposure."""

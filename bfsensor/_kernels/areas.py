@@ -84,7 +84,7 @@ def _integrate(edges, charges, pattern, flux, upright, line, low, low_second, no
     """
     count = charges.nx + 1 if upright else charges.nx
     last = edges.points.size - 1
-    fixed = pattern.rings.size > 0 or pattern.map_x.size > 0
+    fixed = pattern.rings.size > 0 or pattern.map_x.size > 0 or pattern.edge_x.size > 0
     for n in range(count):
         out[0, n] = 0.0
     for point in range(last + 1):

@@ -25,8 +25,8 @@ STALE = np.float32(512.0)
 ) = range(9)  # fmt: skip
 N_COUNTERS = 9
 # Sums, float64.
-IN_BLOCK, BEFORE, TOTAL, ADDED, SPILLED, SPILLED_OFF, CROSSED, OFF_IMAGE = range(8)
-N_SUMS = 8
+IN_BLOCK, BEFORE, TOTAL, ADDED, SPILLED, SPILLED_OFF, CROSSED, OFF_IMAGE, LOST = range(9)
+N_SUMS = 9
 
 
 class Response(NamedTuple):
@@ -484,11 +484,12 @@ def _strike(ledger, j, i, nx):
 
 @numba.njit(cache=True, nogil=True, _nrt=False)
 def deposit(
-    image, charges, ledger, flux, first, i, j, z, words, lo, hi, full_well, along_y
+    image, charges, ledger, flux, first, i, j, z, words, lo, hi, full_well, along_y, loss
 ):
     """Put the electrons lo to hi into the image in their order; returns what stays.
 
-    ``flux`` is indexed from ``first``, all else from 0.
+    ``flux`` is indexed from ``first``, all else from 0.  An electron is lost with
+    probability 1 - exp(-loss Q), Q [e-] the charge that it meets.
     """
     charge, carry = ledger.charge, ledger.carry
     listed, counters = ledger.listed, ledger.counters
@@ -497,6 +498,7 @@ def deposit(
     added = 0.0
     crossed = 0.0
     off = 0.0
+    lost = 0.0
     for n in range(np.uint64(lo), np.uint64(hi)):
         w = flux[np.uint64(first) + n]
         ci = np.int64(i[n])
@@ -507,6 +509,12 @@ def deposit(
             else:
                 off += w
             continue
+        if loss > 0.0:
+            # The lowest bit says where electrons spill to.
+            word = (np.float64(words[n] >> np.uint32(1)) + 0.5) * 2.0**-31
+            if word >= np.exp(-loss * np.float64(image[cj, ci])):
+                lost += w
+                continue
         if w > 0 and image[cj, ci] + w > full_well:
             up = (words[n] & np.uint32(1)) == np.uint32(1)
             _strike(ledger, cj, ci, nx)
@@ -522,4 +530,5 @@ def deposit(
             added += w
     ledger.sums[CROSSED] += crossed
     ledger.sums[OFF_IMAGE] += off
+    ledger.sums[LOST] += lost
     return added

@@ -57,7 +57,8 @@ class Pattern(NamedTuple):
     ``rings`` at radii ``n ring_step`` from (``ring_x``, ``ring_y``) in the coordinates of
     the positions out; none beyond the last.  ``map_x, map_y`` at the points
     (``map_0x`` + i, ``map_0y`` + j); none outside.  The factors belong to heights
-    ``n thickness / (size - 1)``.
+    ``n thickness / (size - 1)``.  ``edge_x, edge_y`` at two points a pixel,
+    (``edge_0x`` + i / 2, ``edge_0y`` + j / 2), the same at all heights; none outside.
     """
 
     rings: np.ndarray
@@ -70,6 +71,10 @@ class Pattern(NamedTuple):
     map_0x: float
     map_0y: float
     map_factor: np.ndarray
+    edge_x: np.ndarray = np.zeros((0, 0), np.float32)
+    edge_y: np.ndarray = np.zeros((0, 0), np.float32)
+    edge_0x: float = 0.0
+    edge_0y: float = 0.0
 
 
 @numba.njit(cache=True, inline="always")
@@ -122,6 +127,31 @@ def fixed_shift(pattern, x, y, part):
                 + b * pattern.map_y[j, i + 1]
                 + c * pattern.map_y[j + 1, i]
                 + d * pattern.map_y[j + 1, i + 1]
+            )
+    if pattern.edge_x.size > 0:
+        u = 2 * (x - pattern.edge_0x)
+        v = 2 * (y - pattern.edge_0y)
+        ny, nx = pattern.edge_x.shape
+        if 0.0 <= u <= nx - 1 and 0.0 <= v <= ny - 1:
+            i = min(int(u), nx - 2)
+            j = min(int(v), ny - 2)
+            u -= i
+            v -= j
+            a = (1 - u) * (1 - v)
+            b = u * (1 - v)
+            c = (1 - u) * v
+            d = u * v
+            dx += (
+                a * pattern.edge_x[j, i]
+                + b * pattern.edge_x[j, i + 1]
+                + c * pattern.edge_x[j + 1, i]
+                + d * pattern.edge_x[j + 1, i + 1]
+            )
+            dy += (
+                a * pattern.edge_y[j, i]
+                + b * pattern.edge_y[j, i + 1]
+                + c * pattern.edge_y[j + 1, i]
+                + d * pattern.edge_y[j + 1, i + 1]
             )
     return dx, dy
 
@@ -253,7 +283,7 @@ def land(
     """
     coloured = light.wavelength.size > 0
     slanted = light.slope_x.size > 0
-    fixed = pattern.rings.size > 0 or pattern.map_x.size > 0
+    fixed = pattern.rings.size > 0 or pattern.map_x.size > 0 or pattern.edge_x.size > 0
     kept = np.inf
     if slanted or not medium.kept_slanted:
         kept = medium.kept_path

@@ -31,7 +31,8 @@ PIECE = 2048
 class Plan(NamedTuple):
     """How the charge is frozen: block size [e-] (0: never renewed), predicted or not.
 
-    With prediction blocks start at 1/64 of the size and double.
+    With prediction blocks start at 1/64 of the size and double.  ``loss`` [1/e-]: see
+    :func:`deposit`.
     """
 
     block: float
@@ -42,6 +43,7 @@ class Plan(NamedTuple):
     y0: float
     key0: np.uint32
     key1: np.uint32
+    loss: float
 
 
 @numba.njit(cache=True, inline="always")
@@ -89,7 +91,7 @@ def _settle(
     """Deposit the electrons lo to hi of a batch; a block that is full ends."""
     ledger.sums[ADDED] += deposit(
         image, charges, ledger, flux, start, i, j, z, words, lo, hi, plan.full_well,
-        plan.spill_along_y,
+        plan.spill_along_y, plan.loss,
     )  # fmt: skip
     ledger.counters[PHOTONS] += hi - lo
     if ledger.sums[IN_BLOCK] >= size:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from bfsensor.diagnose.baseline import Baseline
 from bfsensor.diagnose.found import (
     OUTSIDE_WORD,
     Attribution,
@@ -27,6 +28,7 @@ from bfsensor.diagnose.remainder import (
     stands_out,
 )
 from bfsensor.diagnose.screen import Rival, Screen
+from bfsensor.effects.device_parameter import device_parameters
 from bfsensor.effects.effect import Effect
 from bfsensor.effects.library import LIBRARY
 from bfsensor.errors import ConvergenceError
@@ -39,6 +41,10 @@ WEAK = 6.0
 
 CLOSE = 40.0
 """Difference in gain from the best up to which rivals are fitted again with all parameters."""
+
+HOPELESS, FAR = 3.0, 0.05
+"""Gain of a candidate's best start below which it is not fitted on, and as a part of the best of
+all starts: a fit of its shape makes it a few times as much, not twenty times."""
 
 REFITTED = 5
 """Most rivals that are."""
@@ -60,7 +66,7 @@ def attribute(
     fit: BaselineFit,
     mismatch: Mismatch,
     *,
-    kinds: Sequence[type[Effect]] = LIBRARY,
+    kinds: Sequence[type[Effect]] | None = None,
     seed: int = 1,
 ) -> Attribution:
     """Say which effects explain what a baseline leaves.
@@ -79,11 +85,12 @@ def attribute(
     ----------
     predictor, fit, mismatch
         The baseline, fitted, and what it leaves.
-    kinds : sequence of type
-        Candidates.
+    kinds : sequence of type, optional
+        Candidates; by default :func:`candidates_of` the baseline.
     seed : int
         Of the noise that thresholds come from.
     """
+    kinds = candidates_of(predictor.baseline) if kinds is None else kinds
     base = Model(predictor, fit)
     candidates = (*kinds, *NAMED)
     model, mismatch, rankings, notes = _forward(base, mismatch, candidates, seed)
@@ -117,13 +124,14 @@ def _forward(
 
     Also gives the rankings by number of effects there were, and notes.
     """
-    model, notes = base, []
+    model = base
+    notes: list[str] = []
     rankings: dict[int, list[Rival]] = {}
     while len(model.effects) < MOST and stands_out(
         mismatch, explained_by_word(base.fit, model.fit), fits=len(model.effects)
     ):
         screen = Screen(model.predictor, model.fit, _seen(mismatch))
-        ranking = rank(screen, kinds)
+        ranking = rank(screen, _without(kinds, model.effects))
         critical = threshold(screen, ranking, seed=seed)
         good = [r for r in ranking if r.gain > critical and not r.select < 0]
         rankings[len(model.effects)] = ranking
@@ -136,7 +144,7 @@ def _forward(
             # nothing is left.
             good = [r for r in ranking if r.gain > WEAK and not r.select < 0][:FAINT]
         step = _step(
-            model, good, mismatch, seed, notes, sure=good and good[0].gain > critical
+            model, good, mismatch, seed, notes, sure=bool(good) and good[0].gain > critical
         )
         if step is None:
             break
@@ -231,8 +239,18 @@ def _place(
     model: Model, n: int, kinds: Sequence[type[Effect]], mismatch: Mismatch
 ) -> list[Rival]:
     """All candidates in the place of one effect of a model."""
-    without = model.with_effects([e for k, e in enumerate(model.effects) if k != n])
-    return rank(Screen(without.predictor, without.fit, _seen(mismatch)), kinds)
+    others = [e for k, e in enumerate(model.effects) if k != n]
+    without = model.with_effects(others)
+    screen = Screen(without.predictor, without.fit, _seen(mismatch))
+    return rank(screen, _without(kinds, others))
+
+
+def _without(
+    kinds: Sequence[type[Effect]], effects: Sequence[Effect]
+) -> list[type[Effect]]:
+    """Candidates that are not there already."""
+    there = {e.name for e in effects}
+    return [k for k in kinds if name_of(k) not in there]
 
 
 def _critical(effects: Sequence[Effect]) -> float:
@@ -262,9 +280,26 @@ def _found(model: Model, n: int, ranking: Sequence[Rival]) -> Found:
     )  # fmt: skip
 
 
+def candidates_of(baseline: Baseline) -> tuple[type[Effect], ...]:
+    """Candidates for what a baseline leaves out: the library, and its card's parameters."""
+    own = device_parameters(
+        baseline.edges, baseline.derivatives, baseline.spread, baseline.nominal,
+        baseline.reference,
+    )  # fmt: skip
+    return (*LIBRARY, *own)
+
+
+def name_of(kind: type[Effect]) -> str:
+    """Class, and variant where there are several."""
+    return f"{kind.word}:{kind.variant}" if kind.variant else kind.word
+
+
 def rank(screen: Screen, kinds: Sequence[type[Effect]]) -> list[Rival]:
     """Best of each kind, greatest evidence first."""
-    found = [screen.best(kind) for kind in kinds]
+    starts = [screen.tried(kind) for kind in kinds]
+    best = max((t[0][0] for t in starts if t), default=0.0)
+    least = max(HOPELESS, FAR * best)
+    found = [screen.best(t, least=least) for t in starts]
     return sorted((r for r in found if r is not None), key=lambda r: -r.evidence)
 
 
@@ -332,7 +367,7 @@ def _judge(
                 model, places, swapped = without, {}, True
                 break
             screen = Screen(without.predictor, without.fit, _seen(mismatch))
-            ranking = refine(without, rank(screen, kinds))
+            ranking = refine(without, rank(screen, _without(kinds, others)))
             places[n] = ranking
             here = next(
                 (r for r in ranking if r.effect.name == model.effects[n].name), None

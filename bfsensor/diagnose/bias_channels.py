@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft
 
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Axes, Condition, Exposure, Frame
@@ -20,6 +21,12 @@ UNEVEN = 1.25
 """Scatter of a dark's columns over that of noise from which columns count as uneven by nature:
 four standard deviations of the scatter of 128."""
 
+STANDS_OUT = 5.0
+"""Deviation [sigma] from which a covariance of the noise counts in the errors of all of them."""
+
+FRAME_ERROR = 0.1
+"""Scatter of the bias level from frame to frame that a quiet system may have [ADU] (assumed)."""
+
 LEVEL_ERROR = 0.05
 """How well the overscan's level stands for the image's in a quiet system [ADU] (assumed)."""
 
@@ -29,60 +36,70 @@ class BiasChannels:
 
     def __init__(self, fold: str = "fit") -> None:
         self._fold = fold
-        self._last: Sequence[NDArray[np.float64]] | None = None
-        self._sum: list[NDArray[np.float64]] = []
+        self._last: list[tuple[NDArray[np.float32], float]] = []
+        self._sum: dict[str, NDArray[np.float64]] = {}
         self._names: list[str] = []
         self.frames = 0
         self._spectra: list[list[NDArray[np.float64]]] = []
         self._cross: list[NDArray[np.float64]] = []
-        self._rows: list[list[tuple[float, float]]] = []
+        self._rows: list[list[tuple[float, float, float]]] = []
         self._levels: list[tuple[Exposure, list[tuple[float, float]]]] = []
+        self._long: list[list[NDArray[np.float64]]] = []
+        self._zeros: list[list[tuple[float, float]]] = []
         self._size = 0
         self._condition = Condition(np.nan, np.nan, np.nan)
 
     def add(self, exposure: Exposure, frames: Sequence[Frame]) -> None:
         """Add a bias frame."""
         self._condition = Condition.of(exposure)
-        levelled, levels = [], []
+        self._names = [f.name for f in frames]
+        zeros, levels = [], []
         for frame in frames:
             over = frame.serial_overscan.astype(np.float64)
             # Without an overscan the mean bias is the zero of flats: its level stays in it.
-            zero = float(over.mean()) if over.size else 0.0
-            levelled.append(frame.pixels.astype(np.float64) - zero)
+            zeros.append(float(over.mean()) if over.size else 0.0)
+            if frame.name not in self._sum:
+                self._sum[frame.name] = np.zeros(frame.pixels.shape)
+            self._sum[frame.name] += frame.pixels.astype(np.float64) - zeros[-1]
             image = frame.image.astype(np.float64)
             if over.size:
                 share = image.var() / image.size + over.var() / over.size
-                levels.append((float(image.mean()) - zero, share + LEVEL_ERROR**2))
+                levels.append((float(image.mean()) - zeros[-1], share + LEVEL_ERROR**2))
         if len(levels) == len(frames):
             self._levels.append((exposure, levels))
-        if not self._sum:
-            self._sum = [np.zeros_like(x) for x in levelled]
-            self._names = [f.name for f in frames]
-        for total, one in zip(self._sum, levelled, strict=True):
-            total += one
+            overs = [f.serial_overscan.astype(np.float64) for f in frames]
+            self._zeros.append([(o.mean(), o.var() / o.size) for o in overs])
         self.frames += 1
-        if self._last is None:
-            self._last = levelled
+        here = [(f.pixels, zero) for f, zero in zip(frames, zeros, strict=True)]
+        if not self._last:
+            self._last = here
             return
         # Each frame is used once: differences of frames that follow one another.
-        noise = [
-            _without_outliers((a - b) / np.sqrt(2.0))
-            for a, b in zip(self._last, levelled, strict=True)
-        ]
-        self._last = None
-        self._size = noise[0].size
-        self._spectra.append([_autocovariance(n) for n in noise])
-        self._rows.append([_row_excess(n) for n in noise])
-        flat = np.array([n.ravel() for n in noise])
-        self._cross.append(np.cov(flat) if len(flat) > 1 else np.array([[flat.var()]]))
+        self._size = here[0][0].size
+        flat = np.empty((len(here), self._size))
+        spectra, long, rows = [], [], []
+        for own, (a, zero_a), (b, zero_b) in zip(flat, self._last, here, strict=True):
+            first, second = a.astype(np.float64) - zero_a, b.astype(np.float64) - zero_b
+            noise = _without_outliers((first - second) / np.sqrt(2.0))
+            own[:] = noise.ravel()
+            long.append(_autocovariance(noise))
+            spectra.append(long[-1][: READOUT_LAGS + 1])
+            rows.append(_row_excess(noise))
+        self._last = []
+        self._spectra.append(spectra)
+        self._long.append(long)
+        self._rows.append(rows)
+        flat -= flat.mean(1, keepdims=True)
+        self._cross.append(flat @ flat.T / (self._size - (len(flat) > 1)))
 
-    @property
-    def mean(self) -> dict[str, NDArray[np.float64]]:
-        """Mean bias of each amplifier's whole frame, any overscan's level taken off [ADU]."""
-        return {
-            name: total / self.frames
-            for name, total in zip(self._names, self._sum, strict=True)
-        }
+    def mean(self, name: str) -> NDArray[np.float64] | None:
+        """Mean bias of an amplifier's whole frame, any overscan's level taken off [ADU]."""
+        total = self._sum.get(name)
+        return None if total is None else total / self.frames
+
+    def forget_mean(self) -> None:
+        """Give up what :meth:`mean` is made of, which is large, once it is known."""
+        self._sum.clear()
 
     @property
     def read_noise(self) -> dict[str, float]:
@@ -97,14 +114,12 @@ class BiasChannels:
         if not self._spectra:
             return []
         pairs = len(self._spectra)
-        variance = np.array(list(self.read_noise.values())) ** 2
         values, blocks, axes = [], [], Axes()
-        for amp in range(len(self._names)):
+        found = [self._seen(amp) for amp in range(len(self._names))]
+        for amp, seen in enumerate(found):
             mean = np.mean([s[amp] for s in self._spectra], axis=0)
-            error = variance[amp] ** 2 / (self._size * pairs)
-            factor = np.where(np.arange(len(mean)) == 0, 2.0, 1.0)
             values.append(mean)
-            blocks.append(np.diag(factor * error))
+            blocks.append(_errors_in_order(seen) / (self._size * pairs))
             axes.add(len(mean), self._condition, amp=amp, lag=np.arange(len(mean)))
         out = [
             Channel("bias_cov", np.concatenate(values), tuple(blocks), axes.columns(), "adu2",
@@ -112,39 +127,58 @@ class BiasChannels:
         ]  # fmt: skip
         out.append(self._bias_levels())
         if len(self._names) > 1:
-            out.append(self._shared(variance, pairs))
+            out.append(self._shared(found, pairs))
         return out
 
+    def _seen(self, amp: int) -> NDArray[np.float64]:
+        """Covariances of the noise at all lags, those that do not stand out set to zero."""
+        c = np.mean([s[amp] for s in self._long], axis=0)
+        error = c[0] / np.sqrt(self._size * len(self._long))
+        return np.where(np.abs(c) > STANDS_OUT * error, c, 0.0)
+
     def _bias_levels(self) -> Channel:
-        """Rows' excess variance by pair, and the image's level above the overscan by frame."""
+        """Rows' excess variance by pair, levels above the overscan by frame, frames' scatter."""
         values, blocks, axes = [], [], Axes()
+        excess = np.array([[e for e, *_ in one] for one in self._rows])
+        # The scatter of a variance goes with it, where it is certain that there is more.
+        mean = excess.mean(0)
+        least = STANDS_OUT * np.array([e for _, e, _ in self._rows[0]]) / len(excess) ** 0.5
+        more = np.where(mean > least, 1 + mean, 1.0)
         for n, one in enumerate(self._rows):
-            excess, error = np.array(one).T
-            values.append(excess)
-            blocks.append(np.diag(error**2))
-            axes.add(
-                len(one),
-                self._condition,
-                amp=np.arange(len(one)),
-                exposure=2 * n,
-                what="rows",
-            )
+            value, error, white = np.array(one).T
+            values.append(value)
+            blocks.append(np.diag((more * error) ** 2))
+            axes.add(len(one), self._condition, amp=np.arange(len(one)), exposure=2 * n,
+                     what="rows", white=white)  # fmt: skip
         for exposure, levels in self._levels:
             level, variance = np.array(levels).T
             values.append(level)
             blocks.append(np.diag(variance))
             axes.add(len(level), self._condition, amp=np.arange(len(level)),
-                     exposure=exposure.number, what="level")  # fmt: skip
+                     exposure=exposure.number, what="level", white=variance)  # fmt: skip
+        if len(self._zeros) > 2:
+            zeros = np.array(self._zeros)
+            freedom = len(zeros) - 1
+            white = zeros[..., 1].mean(0) + FRAME_ERROR**2
+            scatter = zeros[..., 0].var(0, ddof=1) + FRAME_ERROR**2
+            values.append(np.log(scatter / white))
+            blocks.append(2.0 / freedom * np.eye(len(white)))
+            axes.add(len(white), self._condition, amp=np.arange(len(white)), exposure=-1,
+                     what="frames", white=white)  # fmt: skip
         return Channel("bias_level", np.concatenate(values), tuple(blocks), axes.columns(), "adu",
                        self._fold)  # fmt: skip
 
-    def _shared(self, variance: NDArray[np.float64], pairs: int) -> Channel:
+    def _shared(self, found: list[NDArray[np.float64]], pairs: int) -> Channel:
         """Covariance of the noise between amplifiers at the same readout time."""
         mean = np.mean(self._cross, axis=0)
         a, b = np.triu_indices(len(mean), 1)
         axes = Axes()
         axes.add(len(a), self._condition, amp=a, other=b, what="noise")
-        error = variance[a] * variance[b] / (self._size * pairs)
+        n = self._size * pairs
+        error = [
+            (2 * found[i] @ found[j] - found[i][0] * found[j][0] + mean[i, j] ** 2) / n
+            for i, j in zip(a, b, strict=True)
+        ]
         return Channel("amp_cross", mean[a, b], tuple(np.array([[e]]) for e in error),
                        axes.columns(), "adu2", self._fold)  # fmt: skip
 
@@ -269,16 +303,33 @@ def _without_outliers(noise: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _autocovariance(noise: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Covariance at lags 0 to :data:`READOUT_LAGS` of pixels as they are read out."""
+    """Covariance of pixels as they are read out, at lags up to a quarter of the frame."""
     series = noise.ravel() - noise.mean()
     n = len(series)
-    return np.array(
-        [series[: n - k] @ series[k:] / (n - k) for k in range(READOUT_LAGS + 1)]
-    )
+    size = next_fast_len(2 * n, real=True)
+    lags = max(n // 4, min(n, READOUT_LAGS + 1))
+    power = np.abs(rfft(series, size)) ** 2
+    return np.asarray(irfft(power, size)[:lags] / (n - np.arange(lags)))
 
 
-def _row_excess(noise: NDArray[np.float64]) -> tuple[float, float]:
-    """Variance of the rows' means beyond what white noise gives, over that, and its error."""
+def _errors_in_order(c: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Covariance matrix of covariances at the first lags of one pixel of a long series (Bartlett).
+
+    Of a wave that keeps its phase through a frame a quarter of the lags tells nearly all.
+    """
+    n = len(c)
+    size = next_fast_len(2 * n + 2 * READOUT_LAGS, real=True)
+    even = np.zeros(size)
+    even[:n] = c
+    even[size - n + 1 :] = c[:0:-1]
+    g = irfft(rfft(even).real ** 2, size)
+    h = np.arange(READOUT_LAGS + 1)
+    return np.asarray(g[np.abs(h[:, None] - h)] + g[h[:, None] + h])
+
+
+def _row_excess(noise: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Variance of the rows' means over what white noise gives, less one; its error; and that."""
     rows, columns = noise.shape
     share = noise.var() / columns
-    return float(noise.mean(1).var(ddof=1) / share - 1.0), float(np.sqrt(2.0 / (rows - 1)))
+    excess = float(noise.mean(1).var(ddof=1) / share - 1.0)
+    return excess, float(np.sqrt(2.0 / (rows - 1))), float(share)

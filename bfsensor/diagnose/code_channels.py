@@ -15,8 +15,20 @@ from bfsensor.diagnose.conditions import Axes, Condition, Frame
 PERIOD = 64
 """Codes that a wide distribution visits alike [ADU]."""
 
+BITS = (6, 7, 8, 9, 10)
+"""Powers of two that multiples of :data:`PERIOD` are told apart by: 10 and beyond together."""
+
+BELOW = (1, 2)
+"""Codes below a multiple that a wrong weight of a bit widens or skips: errors to 2 codes."""
+
+_BOX = np.concatenate([[0.5], np.ones(PERIOD - 1), [0.5]]) / PERIOD
+SMOOTH = 2 * np.pad(_BOX, PERIOD // 2) - np.convolve(_BOX, _BOX)
+"""Weights of the codes around that tell how often one should come: of any pattern of period 64
+the mean, of a parabola its value."""
+
 CLEAR = 7.0
-"""Distance from an amplifier's own spots [pixel] from which on others' traces are sought."""
+"""Distance from an amplifier's own spots, and from its edges, over which spots of the next one
+reach that it knows nothing of [pixel], from which on others' traces are sought."""
 
 HALO_ERROR = 5e-6
 """Crosstalk for which unlike sides of spots' halos may be taken (assumed): 0.2 ADU of 40,000."""
@@ -41,28 +53,64 @@ class CodeChannels:
             width = 1.4826 * np.median(np.abs(codes - middle))
             if width < 1.25 * PERIOD:
                 continue
-            # Of struck pixels the distribution is another.
-            inside = codes[np.abs(codes - middle) < 6 * width]
-            remainder = np.bincount(inside.astype(np.int64) % PERIOD, minlength=PERIOD)
-            self._counts[amp] = (
-                self._counts.get(amp, np.zeros(PERIOD, np.int64)) + remainder
-            )
+            # Of struck pixels the distribution is another; below 0 no converter counts.
+            inside = codes[np.abs(codes - middle) < 6 * width].astype(np.int64)
+            counts = np.bincount(inside[inside >= 0])
+            kept = self._counts.get(amp, np.zeros(0, np.int64))
+            size = -(-max(len(kept), len(counts)) // PERIOD) * PERIOD
+            total = np.zeros(size, np.int64)
+            total[: len(kept)] += kept
+            total[: len(counts)] += counts
+            self._counts[amp] = total
 
     def channels(self) -> list[Channel]:
-        """Share of each remainder over the even one, less one."""
+        """Share of each remainder over the even one, less one; and codes below high powers of two."""
         if not self._counts:
             return []
         values, blocks, axes = [], [], Axes()
         nothing = Condition(np.nan, np.nan, np.nan)
-        for amp, counts in sorted(self._counts.items()):
+        for amp, codes in sorted(self._counts.items()):
+            counts = codes.reshape(-1, PERIOD).sum(0)
             total = counts.sum()
             values.append(counts[:-1] * PERIOD / total - 1.0)
             # Multinomial; the last share follows from the others.
             n = PERIOD - 1
             blocks.append((PERIOD * np.eye(n) - 1.0) / total)
-            axes.add(n, nothing, amp=amp, code=np.arange(n))
+            axes.add(n, nothing, amp=amp, code=np.arange(n), bit=-1, share=0.0)
+            steps = _steps(codes)
+            for bit, (low, expected, share) in steps.items():
+                # One more than expected: none may be where a flat hardly reaches.
+                values.append((low - expected) / (expected + 1.0))
+                scale = np.sqrt(expected + 1.0)
+                shared = float(SMOOTH @ SMOOTH)
+                blocks.append((np.eye(len(BELOW)) + shared) / np.outer(scale, scale))
+                axes.add(
+                    len(BELOW),
+                    nothing,
+                    amp=amp,
+                    code=-np.array(BELOW),
+                    bit=bit,
+                    share=share,
+                )
         return [Channel("code_hist", np.concatenate(values), tuple(blocks), axes.columns(), "",
                         self._fold)]  # fmt: skip
+
+
+def _steps(
+    codes: NDArray[np.int64],
+) -> dict[int, tuple[NDArray[np.int64], NDArray[np.float64], float]]:
+    """Of each of :data:`BITS`: counts below its multiples, those expected, share of all multiples."""
+    multiple = np.arange(PERIOD, len(codes), PERIOD)
+    # The highest power of two in each, by its lowest bit.
+    bit = np.minimum(np.log2(multiple & -multiple).astype(int), BITS[-1])
+    smooth = np.maximum(np.convolve(codes, SMOOTH, "same"), 0.0)
+    out = {}
+    for b in BITS:
+        own = multiple[bit == b]
+        low, mean = (np.array([h[own - k].sum() for k in BELOW]) for h in (codes, smooth))
+        share = float(smooth[own].sum() / max(smooth[multiple].sum(), 1e-9))
+        out[b] = low, mean, share
+    return out
 
 
 class CrosstalkChannels:
@@ -99,20 +147,22 @@ class CrosstalkChannels:
                     np.column_stack([rows, columns])
                 )
                 y, x = (2 * centres[b][which] - np.column_stack([rows, columns])).T
-                ny, nx = victim.shape
-                use = (distance > CLEAR) & (y >= 0) & (y < ny) & (x >= 0) & (x < nx)
-                r, c, y, x = rows[use], columns[use], y[use], x[use]
+                use = (
+                    (distance > CLEAR)
+                    & _is_inside(rows, columns, victim.shape)
+                    & _is_inside(y, x, victim.shape)
+                )
+                aside = columns - centres[b][which][:, 1]
+                r, c, y, x, aside = rows[use], columns[use], y[use], x[use], aside[use]
                 dark = aggressor[y, x] < 0.01 * aggressor[r, c]
-                r, c, y, x = r[dark], c[dark], y[dark], x[dark]
+                r, c, y, x, aside = r[dark], c[dark], y[dark], x[dark], aside[dark]
                 s = aggressor[r, c]
                 rest = victim[r, c] - victim[y, x]
                 good = np.abs(rest) < 6 * np.sqrt(2.0) * noise[b] + 0.01 * s
                 up, down = self._sums.get((a, b), (0.0, 0.0))
                 weight = 0.5 / noise[b] ** 2
-                self._sums[a, b] = (
-                    up + weight * float(s[good] @ rest[good]),
-                    down + weight * float(s[good] @ s[good]),
-                )
+                both = _without_trails(aside[good], s[good], rest[good])
+                self._sums[a, b] = up + weight * both[0], down + weight * both[1]
 
     def channels(self) -> list[Channel]:
         """Fraction of amplifier ``amp`` seen in ``other``."""
@@ -126,6 +176,29 @@ class CrosstalkChannels:
                  what="crosstalk")  # fmt: skip
         blocks = tuple(np.array([[1.0 / self._sums[p][1] + HALO_ERROR**2]]) for p in pairs)
         return [Channel("amp_cross", values, blocks, axes.columns(), "", self._fold)]
+
+
+def _is_inside(
+    y: NDArray[np.int64], x: NDArray[np.int64], shape: tuple[int, ...]
+) -> NDArray[np.bool_]:
+    """Whether pixels lie clear of an image's edges."""
+    ny, nx = shape
+    return (y >= CLEAR) & (y < ny - CLEAR) & (x >= CLEAR) & (x < nx - CLEAR)
+
+
+def _without_trails(
+    aside: NDArray[np.int64], s: NDArray[np.float64], rest: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Sums of s times rest and of s squared, both less their means at each distance in x.
+
+    What a register trails behind the victim's own spot depends on the distance from it in x, not
+    on the light in the other amplifier.
+    """
+    _, group = np.unique(aside, return_inverse=True)
+    group = group.ravel()
+    count = np.maximum(np.bincount(group), 1)
+    s, rest = (v - (np.bincount(group, v) / count)[group] for v in (s, rest))
+    return float(s @ rest), float(s @ s)
 
 
 def _spots(signal: NDArray[np.float64], threshold: float) -> NDArray[np.int64]:

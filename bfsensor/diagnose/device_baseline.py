@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,14 +16,17 @@ from bfsensor.build import build_table
 from bfsensor.device import Device
 from bfsensor.diagnose.baseline import Baseline, Edges
 from bfsensor.diagnose.table_baseline import CHARGE, WAVELENGTHS, edges_at
-from bfsensor.errors import DiagnosisError
+from bfsensor.errors import DeviceError, DiagnosisError
 from bfsensor.files import written_whole
 from bfsensor.table import DistortionTable
 from bfsensor.table_plan import plan_table
 
 CELLS = 16
-"""Cells a pixel of the tables whose differences are taken: a difference needs not the table's own
-accuracy."""
+"""Cells a pixel of the tables whose differences are taken: a difference needs not the accuracy of
+the device's own table, which has those of shipped ones."""
+
+TABLES = "nominal as shipped, differences at 16 cells"
+"""How shifts are made: what was kept of others is not read again."""
 
 STEP = 0.5
 """Shift of a parameter to either side [its uncertainty]."""
@@ -57,21 +61,61 @@ def change_parameter(device: Device, key: str, by: float) -> Device:
     DiagnosisError
         No such quantity.
     """
-    found = re.fullmatch(r"(\w+)(?:\.implant\[(\d+)\])?\.(\w+)", key)
-    section = getattr(device, found[1], None) if found else None
-    if found is None or section is None:
-        raise DiagnosisError(f"no quantity {key!r} in the device {device.name}")
-    name = found[3]
-    if found[2] is None:
-        changed = dataclasses.replace(section, **{name: getattr(section, name) + by})
-    else:
-        implants = list(section.implants)
-        n = int(found[2])
-        implants[n] = dataclasses.replace(
-            implants[n], **{name: getattr(implants[n], name) + by}
+    try:
+        return _changed(device, _steps(device, key), by)
+    except (AttributeError, IndexError, TypeError):
+        raise DiagnosisError(f"no quantity {key!r} in the device {device.name}") from None
+
+
+def parameter_value(device: Device, key: str) -> float:
+    """Give one quantity, also of an implant [internal units].
+
+    Raises
+    ------
+    DiagnosisError
+        No such quantity.
+
+    Examples
+    --------
+    >>> parameter_value(Device.load("itl_sta3800c"), "silicon.thickness")
+    100.0
+    """
+    part: Any = device
+    try:
+        for name, n in _steps(device, key):
+            part = getattr(part, name if n is None else f"{name}s")
+            part = part if n is None else part[n]
+        return float(part)
+    except (AttributeError, IndexError, TypeError):
+        raise DiagnosisError(f"no quantity {key!r} in the device {device.name}") from None
+
+
+def _steps(device: Device, key: str) -> list[tuple[str, int | None]]:
+    """Names, and numbers of implants, from the device down to a quantity."""
+    steps = [
+        (found[1], None if found[2] is None else int(found[2]))
+        for found in (
+            re.fullmatch(r"(\w+?)(?:\[(\d+)\])?", part) for part in key.split(".")
         )
-        changed = dataclasses.replace(section, implants=tuple(implants))
-    return dataclasses.replace(device, **{found[1]: changed})
+        if found is not None
+    ]
+    if len(steps) != len(key.split(".")) or len(steps) < 2 or steps[-1][1] is not None:
+        raise DiagnosisError(f"no quantity {key!r} in the device {device.name}")
+    return steps
+
+
+def _changed(part: Any, steps: list[tuple[str, int | None]], by: float) -> Any:
+    """Copy of a part of a device with the quantity at the end of a path changed."""
+    (name, n), *rest = steps
+    # Files name one implant, Python the tuple of them.
+    field = name if n is None else f"{name}s"
+    old = getattr(part, field)
+    if n is not None:
+        members = list(old)
+        members[n] = _changed(members[n], rest, by)
+        return dataclasses.replace(part, **{field: tuple(members)})
+    new = _changed(old, rest, by) if rest else old + by
+    return dataclasses.replace(part, **{field: new})
 
 
 def baseline_of_device(
@@ -98,7 +142,8 @@ def baseline_of_device(
     Returns
     -------
     Baseline
-        Derivatives from tables half an uncertainty to either side.
+        Derivatives from tables half an uncertainty to either side, or to the one side on which
+        there is such a device.
 
     Raises
     ------
@@ -119,7 +164,7 @@ def baseline_of_device(
     ]
     total, done = len(biases) + 2 * len(chosen), 0
 
-    def table_of(changed: Device) -> DistortionTable:
+    def table_of(changed: Device, cells: int | None = None) -> DistortionTable:
         nonlocal done
         thickness = changed.silicon.thickness
         depths = [5.0, 20.0, 0.5 * thickness, thickness]
@@ -129,7 +174,9 @@ def baseline_of_device(
             backgrounds=[LEVEL],
             depths=depths,
         )
-        table = build_table(dataclasses.replace(plan, cells=CELLS))
+        table = build_table(
+            plan if cells is None else dataclasses.replace(plan, cells=cells)
+        )
         done += 1
         if progress is not None:
             progress(done, total)
@@ -145,24 +192,30 @@ def baseline_of_device(
             )
     derivatives: dict[str, Edges] = {}
     for name in chosen:
-        step = STEP * known[name]
-        sides = [
-            edges_at(
-                table_of(change_parameter(device, name, sign * step)),
-                620.0,
-                temperature,
-                background=LEVEL,
-            )
-            for sign in (1.0, -1.0)
-        ]
-        up, down = sides
+        sides: dict[float, Edges] = {}
+        refused = ""
+        for by in (STEP * known[name], -STEP * known[name]):
+            try:
+                table = table_of(change_parameter(device, name, by), CELLS)
+            except DeviceError as error:
+                # At the end of what can be, such as oxides of equal thickness: from one side.
+                refused = str(error)
+                continue
+            sides[by] = edges_at(table, 620.0, temperature, background=LEVEL)
+        if not sides:
+            raise DiagnosisError(f"{device.name}: {name!r} cannot float: {refused}")
+        if len(sides) == 1:
+            table = table_of(device, CELLS)
+            sides[0.0] = edges_at(table, 620.0, temperature, background=LEVEL)
+        (high, up), (low, down) = sorted(sides.items(), key=lambda s: -s[0])
         derivatives[name] = (
-            (up[0] - down[0]) / (2 * step),
-            (up[1] - down[1]) / (2 * step),
+            (up[0] - down[0]) / (high - low),
+            (up[1] - down[1]) / (high - low),
         )
     return Baseline(
-        device.name, edges, derivatives, {n: known[n] for n in chosen}, (620.0, own)
-    )
+        device.name, edges, derivatives, {n: known[n] for n in chosen}, (620.0, own),
+        nominal={n: parameter_value(device, n) for n in chosen},
+    )  # fmt: skip
 
 
 def write_edges(baseline: Baseline, path: str | os.PathLike[str]) -> None:

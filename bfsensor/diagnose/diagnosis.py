@@ -17,12 +17,16 @@ from bfsensor.diagnose.channels import PER_ELECTRON
 from bfsensor.diagnose.extract import Measured, Source, measure_channels
 from bfsensor.diagnose.locate import ALARM, Finding, Mismatch, locate_mismatch
 from bfsensor.diagnose.mismatch import BaselineFit, fit_baseline
+from bfsensor.diagnose.plan import Plan, plan
 from bfsensor.diagnose.predict import Predictor, used_channels
+from bfsensor.diagnose.untested import find_untested
 
 SCHEMA = "bfsensor-diagnosis-1"
 FITTED = ("fit", "select")
 FARTHEST, OF_EACH = 50, 10
 """Findings that report.json holds: of all, and of each channel at least."""
+
+NO_PLAN = Plan()
 
 NAMES = {
     "flat_cov": "covariances of flats", "flat_mean": "mean of flats against the lamp",
@@ -57,6 +61,10 @@ class Diagnosis:
         How many of them, the first, are of the reading.
     attribution : Attribution, optional
         What explains it; None where nothing stands out.
+    plan : Plan
+        Recordings that tell apart what is tied.
+    predictor : Predictor, optional
+        Of the baseline's fit.
     """
 
     campaign: str
@@ -68,6 +76,14 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     read: int = 0
     attribution: Attribution | None = None
+    plan: Plan = NO_PLAN
+    predictor: Predictor | None = None
+
+    @property
+    def accepted(self) -> tuple[Predictor | None, BaselineFit]:
+        """Predictor and fit of what is believed: with the effects found, or the baseline's."""
+        of = self.attribution or self
+        return of.predictor, of.fit
 
     @property
     def gain(self) -> float:
@@ -136,6 +152,7 @@ class Diagnosis:
             out["channels"] = {
                 word: {"before": b / n, "after": a / n, "values": n}
                 for word, (b, a, n) in self.attribution.heldout.items()
+                if n
             }
         return out
 
@@ -209,7 +226,9 @@ class Diagnosis:
             "alarm": ALARM,
             **reported(self.attribution),
             "location": self.location(),
-            "recommended_recordings": [],
+            "recommended_recordings": self.plan.said(),
+            "plan": self.plan.to_report(),
+            "not_tested": [u.to_report() for u in find_untested(self.measured)],
             "heldout": self._heldout(),
             "channels": {
                 word: {"chi2": s, "dof": d, "p_value": float(chi2_distribution.sf(s, d))}
@@ -284,10 +303,12 @@ def diagnose_measured(
     predictor, fit = fit_bounded(measured, baseline)
     more = _of_free(measured, baseline, fit)
     mismatch = locate_mismatch(fit, seed=seed)
-    attribution = None
+    attribution, advised = None, Plan()
     if mismatch.detected and explain:
         attribution = attribute(predictor, fit, mismatch, seed=seed)
         more += attribution.notes
+        advised = plan(attribution)
+        more += advised.notes
     return Diagnosis(
         campaign=campaign,
         baseline=baseline.name,
@@ -298,6 +319,8 @@ def diagnose_measured(
         notes=(*notes, *measured.notes, *fit.notes, *more),
         read=len(notes),
         attribution=attribution,
+        plan=advised,
+        predictor=predictor,
     )
 
 

@@ -23,6 +23,7 @@ from bfsensor.diagnose.conditions import (
 from bfsensor.diagnose.flat_channels import FlatChannels
 from bfsensor.diagnose.map_channels import MapChannels, MapShare
 from bfsensor.diagnose.pairs import (
+    Flat,
     PairFinder,
     UnlikePair,
     by_level,
@@ -83,6 +84,10 @@ class Measured:
         All exposures in the order of time; levels by the rough gains.
     maps : mapping of (fold, map) to tuple of MapShare
         Of which flats each map is made.
+    neighbours : (float, float)
+        Distance of the next spots in x and y [pixel], and how many of those places hold one.
+    offsets : tuple of float
+        Mean code of each amplifier without light, of one exposure; nan without overscan.
     """
 
     channels: tuple[Channel, ...]
@@ -101,6 +106,8 @@ class Measured:
     segments: tuple[Segment, ...] = ()
     shots: tuple[Shot, ...] = ()
     maps: Mapping[tuple[str, str], tuple[MapShare, ...]] = field(default_factory=dict)
+    neighbours: tuple[float, float] = (np.inf, 0.0)
+    offsets: tuple[float, ...] = ()
 
 
 def measure_channels(
@@ -160,52 +167,41 @@ def measure_channels(
         kinds[kind] for kind in ("flat", "spot", "bias", "dark") if kinds.get(kind)
     )[0]
     layout = source.read(first)
-    means = biases.mean if kinds.get("bias") else {}
     for frame in layout:
-        if frame.name in means:
-            bias_images[frame.name] = _data_section(frame, means[frame.name])
+        if (whole := biases.mean(frame.name)) is not None:
+            bias_images[frame.name] = _data_section(frame, whole)
+    for each in (biases, late_biases):
+        each.forget_mean()
     noise = biases.read_noise
-    flats = FlatChannels(bias_images, noise, lamp_error=source.lamp_error, lags=lags)
-    maps, late_maps = MapChannels(source.shape), MapChannels(source.shape, "held-out")
+    start = min((e.mjd for e in exposures if e.mjd is not None), default=np.nan)
+    flats = FlatChannels(
+        bias_images, noise, lamp_error=source.lamp_error, lags=lags, start=start
+    )
+    longest: dict[tuple[str, ...], float] = {}
+    for flat in kinds.get("flat", []):
+        key = Condition.of(flat).key
+        longest[key] = max(longest.get(key, 0.0), flat.exposure_time or 0.0)
+    maps, late_maps = (
+        MapChannels(source.shape, longest, fold) for fold in ("fit", "held-out")
+    )
     codes, late_codes = CodeChannels(), CodeChannels("held-out")
     gains: list[list[float]] = [[] for _ in layout]
-    levels: dict[int, float] = {}
     finder = PairFinder(read, lambda frames: _mean_level(flats, frames))
-    for members in by_level(groups):
-        folds = iter(
-            assign_folds(range(sum(len(g) // 2 for g in members)), shift=len(levels))
-        )
-        for pair in finder.pairs(members):
-            (one, _), (two, second_frames) = pair
-            fold = next(folds)
-            try:
-                flats.add_pair(*pair, fold=fold)
-            except MeasurementError as error:
-                notes.append(f"flats {one.number}, {two.number}: {error}")
-                continue
-            whole = []
-            for exposure, each in pair:
-                images = [_good(flats, f) for f in each]
-                levels[exposure.number] = float(np.mean([np.nanmean(i) for i in images]))
-                image = np.full(source.shape, np.nan)
-                for frame, values in zip(each, images, strict=True):
-                    place(image, frame, values / np.nanmean(values))
-                whole.append(image)
-                (late_codes if fold == "held-out" else codes).add(each)
-            bias_noise = [
-                noise.get(f.name, 0.0) / np.sqrt(max(biases.frames, 1)) / np.nanmean(i)
-                for f, i in zip(second_frames, images, strict=True)
-            ]
-            (late_maps if fold == "held-out" else maps).add_pair(
-                Condition.of(one), one.exposure_time or 0.0, whole[0], whole[1],
-                level=levels[one.number],
-                shared=float(np.sqrt(np.mean(np.square(bias_noise)))),
-            )  # fmt: skip
+    by_fold = {
+        "fit": (maps, codes),
+        "select": (maps, codes),
+        "held-out": (late_maps, late_codes),
+    }
+    levels = _take_pairs(finder, groups, flats, by_fold, biases, source.shape, notes)
     unlike = scan_unlike(
         sorted([*finder.single, *(g[0] for g in groups if len(g) == 1)], key=lambda f: f.number),
         lambda flat: [_good(flats, f) for f in read(flat)], lags=lags,
     )  # fmt: skip
     notes += [*finder.notes, *describe_unlike(unlike)]
+    # Sums of maps are the largest that is held: they go before the spots come.
+    found_maps, late_found_maps = maps.channels(), late_maps.channels()
+    shares = {(e.fold, k): v for e in (maps, late_maps) for k, v in e.shares().items()}
+    del maps, late_maps, by_fold
     for channel in flats.channels():
         if channel.word == "flat_cov":
             _rough_gains(channel, gains)
@@ -232,7 +228,7 @@ def measure_channels(
     mean_noise = float(
         np.mean([noise.get(f.name, 0.0) * g for f, g in zip(layout, rough, strict=True)])
     )
-    spots = SpotChannels(read_noise=mean_noise, lamp_error=source.lamp_error)
+    spots = SpotChannels(read_noise=mean_noise, lamp_error=source.lamp_error, start=start)
     crosstalk, late_crosstalk = CrosstalkChannels(), CrosstalkChannels("held-out")
     for n, exposure in enumerate(kinds.get("spot", [])):
         held = is_held_out(n, len(kinds["spot"]))
@@ -248,9 +244,9 @@ def measure_channels(
         if reason:
             notes.append(f"spots {exposure.number}: {reason}")
     channels = [
-        *flats.channels(), *maps.channels(), *codes.channels(), *biases.channels(),
+        *flats.channels(), *found_maps, *codes.channels(), *biases.channels(),
         *darks.channels(), *spots.channels(), *crosstalk.channels(),
-        *late_maps.channels(), *late_codes.channels(), *late_biases.channels(),
+        *late_found_maps, *late_codes.channels(), *late_biases.channels(),
         *late_darks.channels(), *late_crosstalk.channels(),
     ]  # fmt: skip
     if not channels:
@@ -280,12 +276,71 @@ def measure_channels(
         unlike=tuple(unlike),
         segments=tuple(_segment(f) for f in layout),
         shots=_shots(exposures, levels, float(np.mean(rough))),
-        maps={
-            (each.fold, name): shares
-            for each in (maps, late_maps)
-            for name, shares in each.shares().items()
-        },
+        maps=shares,
+        neighbours=spots.neighbours,
+        offsets=tuple(
+            float(f.serial_overscan.mean()) if f.serial_overscan.size else np.nan
+            for f in layout
+        ),
     )
+
+
+def _take_pairs(
+    finder: PairFinder,
+    groups: Sequence[Sequence[Exposure]],
+    flats: FlatChannels,
+    by_fold: Mapping[str, tuple[MapChannels, CodeChannels]],
+    biases: BiasChannels,
+    shape: tuple[int, int],
+    notes: list[str],
+) -> dict[int, float]:
+    """Read all pairs of flats, level by level; gives the mean level of each flat [ADU]."""
+    levels: dict[int, float] = {}
+    for members in sorted(by_level(groups), key=lambda m: m[0][0].exposure_time or 0.0):
+        folds = iter(
+            assign_folds(range(sum(len(g) // 2 for g in members)), shift=len(levels))
+        )
+        for pair in finder.pairs(members):
+            fold = next(folds)
+            try:
+                flats.add_pair(*pair, fold=fold)
+            except MeasurementError as error:
+                notes.append(f"flats {pair[0][0].number}, {pair[1][0].number}: {error}")
+                continue
+            levels |= _add_to_maps(pair, flats, *by_fold[fold], biases, shape)
+    return levels
+
+
+def _add_to_maps(
+    pair: Sequence[Flat],
+    flats: FlatChannels,
+    maps: MapChannels,
+    codes: CodeChannels,
+    biases: BiasChannels,
+    shape: tuple[int, int],
+) -> dict[int, float]:
+    """Add a pair of flats to maps and codes; gives the mean level of either [ADU]."""
+    levels, departures = {}, []
+    for exposure, frames in pair:
+        image = np.full(shape, np.nan, np.float32)
+        means = []
+        for frame in frames:
+            values = _good(flats, frame)
+            means.append(float(np.nanmean(values)))
+            place(image, frame, values / means[-1] - 1.0)
+        levels[exposure.number] = float(np.mean(means))
+        departures.append(image)
+        codes.add(frames)
+    first, (_, frames) = pair[0][0], pair[1]
+    noise = [
+        biases.read_noise.get(f.name, 0.0) / np.sqrt(max(biases.frames, 1)) / m
+        for f, m in zip(frames, means, strict=True)
+    ]
+    maps.add_pair(
+        Condition.of(first), first.exposure_time or 0.0, departures[0], departures[1],
+        level=levels[first.number], shared=float(np.sqrt(np.mean(np.square(noise)))),
+    )  # fmt: skip
+    return levels
 
 
 def _segment(frame: Frame) -> Segment:
@@ -311,7 +366,7 @@ def _shots(
     return tuple(out)
 
 
-def place(image: NDArray[np.float64], frame: Frame, values: NDArray[np.float64]) -> None:
+def place(image: NDArray[np.floating], frame: Frame, values: NDArray[np.float64]) -> None:
     """Put an amplifier's values, in readout order, where they lie on the sensor."""
     values = values[:, ::-1] if frame.flip_x else values
     values = values[::-1] if frame.flip_y else values

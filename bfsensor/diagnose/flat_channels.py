@@ -17,6 +17,10 @@ LAGS = 4
 TAIL = 8
 """Last pixels of an overscan, held for free of what was deferred: the profile's zero."""
 
+UNEVEN = 1.25
+"""Variance of overscan profiles between exposures, over that of white noise, from which on it is
+believed."""
+
 LAMP_UNKNOWN = 0.02
 """Relative error of the light of an exposure without a lamp monitor: fluxes repeat to a few
 per cent in shuttered exposures of laboratory lamps; wide enough not to speak of linearity."""
@@ -29,6 +33,7 @@ class _Group:
     covariances: list[NDArray[np.float64]] = field(default_factory=list)
     counts: list[NDArray[np.int64]] = field(default_factory=list)
     levels: list[float] = field(default_factory=list)
+    hours: list[float] = field(default_factory=list)
     serial: list[NDArray[np.float64]] = field(default_factory=list)
     parallel: list[NDArray[np.float64]] = field(default_factory=list)
     clipped: int = 0
@@ -47,6 +52,8 @@ class FlatChannels:
         Relative error of the lamp monitor.
     lags : int
         Largest lag of the covariances [pixel].
+    start : float
+        When the first exposure of all was taken [MJD]; nan where not known.
     """
 
     def __init__(
@@ -56,8 +63,9 @@ class FlatChannels:
         *,
         lamp_error: float,
         lags: int = LAGS,
+        start: float = np.nan,
     ) -> None:
-        self._bias, self._noise = bias, read_noise
+        self._bias, self._noise, self._start = bias, read_noise, start
         self._lamp_error, self._lags = lamp_error, lags
         self._groups: dict[tuple, _Group] = {}
         self._conditions: dict[tuple[str, ...], Condition] = {}
@@ -87,6 +95,7 @@ class FlatChannels:
             group.covariances.append(found.covariances)
             group.counts.append(found.pairs)
             group.levels.append(found.level)
+            group.hours += [self._hours(e) for e, _ in (first, second)]
             group.clipped += found.clipped
             for frame in frames:
                 group.serial.append(profile(frame.serial_overscan, 1))
@@ -112,6 +121,10 @@ class FlatChannels:
         bias = self._bias.get(frame.name)
         return image if bias is None else image - bias
 
+    def _hours(self, exposure: Exposure) -> float:
+        """Since the first exposure of all [h]; nan where not known."""
+        return np.nan if exposure.mjd is None else 24.0 * (exposure.mjd - self._start)
+
     def channels(self) -> list[Channel]:
         """All that was added, by fold."""
         return [*self._covariances(), *self._mean_levels(), *self._overscans()]
@@ -131,7 +144,7 @@ class FlatChannels:
                 level = float(np.mean(group.levels))
                 axes.add(
                     len(j), self._conditions[condition], amp=amp, time=time, level=level,
-                    pairs=len(group.levels), i=i, j=j,
+                    pairs=len(group.levels), hours=float(np.mean(group.hours)), i=i, j=j,
                 )  # fmt: skip
             out.append(
                 Channel("flat_cov", np.concatenate(values), tuple(blocks), axes.columns(),
@@ -155,6 +168,7 @@ class FlatChannels:
                     len(m), condition, amp=np.arange(len(m)), time=exposure.exposure_time,
                     lamp=exposure.lamp if known else 1.0, exposure=exposure.number, level=m,
                     mjd=np.nan if exposure.mjd is None else exposure.mjd,
+                    hours=self._hours(exposure),
                 )  # fmt: skip
             out.append(
                 Channel("flat_mean", np.concatenate(values), tuple(blocks), axes.columns(),
@@ -174,6 +188,7 @@ class FlatChannels:
             ("serial_overscan", "serial"),
             ("parallel_overscan", "parallel"),
         ):
+            uneven = self._unevenness(name)
             for fold in dict.fromkeys(key[3] for key in self._groups):
                 values, blocks, axes = [], [], Axes()
                 for (condition, time, amp, which), group in self._groups.items():
@@ -182,7 +197,7 @@ class FlatChannels:
                         continue
                     mean, matrix = mean_profile(np.array(profiles))
                     values.append(mean)
-                    blocks.append(matrix)
+                    blocks.append(uneven[amp] * matrix)
                     axes.add(
                         len(mean), self._conditions[condition], amp=amp, time=time,
                         level=float(np.mean(group.levels)), k=np.arange(1, len(mean) + 1),
@@ -193,6 +208,34 @@ class FlatChannels:
                                 "adu", fold)
                     )  # fmt: skip
         return out
+
+    def _unevenness(self, name: str) -> dict[int, float]:
+        """Variance of profiles from exposure to exposure over that of white noise, by amplifier.
+
+        Rows that move together, and noise that one pixel hands on to the next, make profiles
+        scatter more than their pixels' noise says; 1 where nothing is seen of that.
+        """
+        seen: dict[int, list[tuple[float, int]]] = {}
+        for (_, _, amp, _), group in self._groups.items():
+            profiles = [p for p in getattr(group, name) if len(p)]
+            if len(profiles) > 1:
+                seen.setdefault(amp, []).append(_scatter(np.array(profiles)))
+        out = {amp: 1.0 for _, _, amp, _ in self._groups}
+        for amp, both in seen.items():
+            total, freedom = np.sum(both, axis=0)
+            if total / freedom - 1 > max(UNEVEN - 1, 5 * np.sqrt(2 / freedom)):
+                out[amp] = float(total / freedom)
+        return out
+
+
+def _scatter(profiles: NDArray[np.float64]) -> tuple[float, int]:
+    """Squares of what profiles above their tails differ by, in their errors; and how many."""
+    values, variance = profiles[..., 0], profiles[..., 1]
+    head = values.shape[1] - TAIL
+    above = values[:, :head] - values[:, head:].mean(1, keepdims=True)
+    error = variance[:, :head] + variance[:, head:].mean(1, keepdims=True) / TAIL
+    square = (above - above.mean(0)) ** 2 / error.mean(0)
+    return float(square.sum()), (len(profiles) - 1) * head
 
 
 def profile(strip: NDArray[np.float32], axis: int) -> NDArray[np.float64]:

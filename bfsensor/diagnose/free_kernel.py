@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.fft import irfft2
 
 from bfsensor.diagnose.baseline import Edges, area_matrix
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
@@ -152,11 +153,13 @@ def _rough(scene: Scene, edges: Edges, p: int, channel: Channel) -> Values | Non
     x = channel.axes
     i, j = x["i"].astype(int), x["j"].astype(int)
     out = np.zeros(len(channel))
-    change = transform_areas(area_matrix(*edges))
+    a = area_matrix(*edges)
     baseline = scene.model.predictor.baseline
     for flats in scene.flats(channel):
         response = scene.responses(flats, p) / SCALE**p
         scale = baseline.scale_at(baseline.nearest(flats.condition))
-        c = np.fft.ifft2(scale * change * response).real / flats.gain[:, None, None] ** 2
+        side = flats.c.shape[-1]
+        changed = scale * transform_areas(a, side) * response
+        c = irfft2(changed, s=(side, side)) / flats.gain[:, None, None] ** 2
         out[flats.rows] = at_lags(c, flats.flat, i[flats.rows], j[flats.rows])
     return out

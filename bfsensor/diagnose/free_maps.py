@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.free_terms import SCALE, Family, Scene, Term, Values
-from bfsensor.diagnose.map_channels import BLOCKS, RINGS, ring_modes
+from bfsensor.diagnose.map_channels import RINGS, block_side, ring_modes
 from bfsensor.diagnose.predict_effects import reduce_map
 
 POWERS = (0, 1)
@@ -190,7 +190,7 @@ def _shapes(
                     else (n - int(3 * length), n)
                 }
                 name = f"{what}s at the {side} end, exp(-d/{length:g})"
-                yield name, where, both(np.exp(-distance / length)), what
+                yield name, where, both(np.asarray(np.exp(-distance / length))), what
         for cycles in range(3, n // 4):
             phase = 2 * np.pi * cycles * (place + 0.5) / n
             for part, word in ((np.cos, "cosine"), (np.sin, "sine")):
@@ -236,7 +236,7 @@ def _map_axes(scene: Scene, channel: Channel) -> _MapAxes:
         column, row, block = (
             np.nonzero(a["what"] == k)[0] for k in ("column", "row", "block")
         )
-        side = int(np.ceil(max(scene.model.predictor.layout.shape) / BLOCKS))
+        side = block_side(scene.model.predictor.layout.shape)
         names, maps = np.unique(a["map"], return_inverse=True)
         bx, by = (((a[k][block] + 0.5) / side).astype(int) for k in "xy")
         axes = _MapAxes(

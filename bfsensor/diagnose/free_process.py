@@ -73,7 +73,7 @@ def process_choice(scene: Scene) -> Choice | None:
     def column(channel: Channel) -> Values | None:
         if channel.word != "flat_cov":
             return None
-        parts = [m * t.column(channel) for m, t in zip(mean, terms, strict=True) if m]  # type: ignore[operator]
+        parts = [m * t.column(channel) for m, t in zip(mean, terms, strict=True) if m]
         return np.asarray(np.sum(parts, axis=0))
 
     where = {"lags": told, "levels": np.exp(knots).tolist(), "values": grid.tolist()}

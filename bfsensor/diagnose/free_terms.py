@@ -267,7 +267,9 @@ def _in_time(flats: list[Channel], hours: dict[int, float], count: int) -> Itera
     span = max(last - first, 1e-9)
 
     def at(channel: Channel) -> Values:
-        return np.array([hours[int(n)] for n in channel.axes["exposure"]]) - first
+        # Of exposures that were not taken nothing is known: the campaign's middle.
+        there = [hours.get(int(n), first + span / 2) for n in channel.axes["exposure"]]
+        return np.array(there) - first
 
     def curve(p: int) -> Callable[[Channel], Values]:
         return lambda c: np.polynomial.legendre.Legendre.basis(p)(2 * at(c) / span - 1)
@@ -309,12 +311,12 @@ def _after_exposure(scene: Scene) -> Iterator[Term]:
     def power(p: int) -> Callable[[Channel], Values]:
         def change(c: Channel) -> Values:
             numbers = [int(n) for n in c.axes["exposure"]]
-            return np.array([before[n] ** p if known[n] else 0.0 for n in numbers])
+            return np.array([before[n] ** p if known.get(n) else 0.0 for n in numbers])
 
         return change
 
     def missing(c: Channel) -> Values:
-        return np.array([0.0 if known[int(n)] else 1.0 for n in c.axes["exposure"]])
+        return np.array([0.0 if known.get(int(n)) else 1.0 for n in c.axes["exposure"]])
 
     for p in (1, 2):
         yield _relative(f"mean x S^{p} of the exposure before", {"power": p}, power(p))

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from scipy.fft import irfft2
 from scipy.stats import chi2
 
 from bfsensor.diagnose.baseline import area_matrix
@@ -114,7 +115,8 @@ def _loss(scene: Scene) -> dict[str, float] | None:
         i, j = x["i"].astype(int), x["j"].astype(int)
         out = np.zeros(len(channel))
         for flats in scene.flats(channel):
-            response = np.fft.ifft2(-LOSS * scene.responses(flats, 0)).real
+            side = flats.c.shape[-1]
+            response = irfft2(-LOSS * scene.responses(flats, 0), s=(side, side))
             c = response / flats.gain[:, None, None] ** 2
             out[flats.rows] = at_lags(c, flats.flat, i[flats.rows], j[flats.rows])
         return out

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -27,6 +29,9 @@ PARTS = 12
 FAINT = 0.2
 """Deviate, relative to the farthest, below which a part counts as what a template's shape,
 chosen of a few, has left over."""
+
+BLOCK = 4_000_000
+"""Numbers of the templates that are put together at a time: 100 MB while they are."""
 
 SMALLEST = 1e-30
 """Least probability that is told apart from zero: no tail is known farther out."""
@@ -98,23 +103,24 @@ class Scanner:
 
     def __init__(self, fit: BaselineFit) -> None:
         self.fit = fit
-        templates = make_templates(fit)
-        n = len(fit.residuals)
-        rows = np.concatenate([np.full(len(t.rows), k) for k, t in enumerate(templates)])
-        columns = np.concatenate([t.rows for t in templates])
-        weights = np.concatenate([t.weights for t in templates])
-        matrix = csr_array((weights, (rows, columns)), shape=(len(templates), n))
-        raw = np.sqrt(np.asarray((matrix * matrix).sum(1)).ravel())
-        inside = matrix @ fit.basis[:n]
-        left = raw**2 - (inside**2).sum(1)
-        # What the parameters take up to a ten-thousandth is no template.
-        keep = left > 1e-4 * raw**2
-        self.templates: list[Template] = [
-            t for t, k in zip(templates, keep, strict=True) if k
-        ]
-        self._matrix = matrix[keep]
-        self._norm = np.sqrt(left[keep])
-        self._inside = inside[keep]
+        self.templates: list[Template] = []
+        self._blocks: list[csr_array] = []
+        inside, norms = [], []
+        for block, some in _stacked(make_templates(fit), len(fit.residuals)):
+            within = block @ fit.basis[: len(fit.residuals)]
+            raw = np.asarray((block * block).sum(1)).ravel()
+            left = raw - (within**2).sum(1)
+            # What the parameters take up to a ten-thousandth is no template.
+            keep = left > 1e-4 * raw
+            kept = block if keep.all() else block[keep]
+            self._blocks.append(kept)
+            inside.append(within[keep])
+            norms.append(np.sqrt(left[keep]))
+            self.templates += _viewed(
+                [t for t, k in zip(some, keep, strict=True) if k], kept
+            )
+        self._norm = np.concatenate(norms)
+        self._inside = inside
         self.words = list(dict.fromkeys(c.word for c in fit.channels))
         self._masks = [fit.of(w) for w in self.words]
         counts = fit.chi2()
@@ -122,12 +128,19 @@ class Scanner:
 
     def templates_z(self, residuals: NDArray[np.float64]) -> NDArray[np.float64]:
         """Of residuals (..., n): the templates' amplitudes over their errors."""
-        return np.asarray((self._matrix @ residuals.T).T / self._norm)
+        return np.asarray(self._product(residuals.T).T / self._norm)
+
+    def _product(self, residuals: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Templates times residuals, shape (n, ...)."""
+        return np.concatenate([block @ residuals for block in self._blocks])
 
     def correlations(self, n: int) -> NDArray[np.float64]:
         """Of the amplitude of template ``n`` with those of all."""
-        shape = self._matrix[[n]].toarray()[0]
-        product = self._matrix @ shape - self._inside @ self._inside[n]
+        template = self.templates[n]
+        shape = np.zeros(len(self.fit.residuals))
+        shape[template.rows] = template.weights
+        own = shape @ self.fit.basis[: len(shape)]
+        product = self._product(shape) - np.concatenate([i @ own for i in self._inside])
         return np.asarray(product / (self._norm * self._norm[n]))
 
     def chi2_z(self, residuals: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -135,6 +148,42 @@ class Scanner:
         squares = np.stack([(residuals[..., m] ** 2).sum(-1) for m in self._masks], axis=-1)
         d = self._dof
         return np.asarray((np.cbrt(squares / d) - (1 - 2 / (9 * d))) / np.sqrt(2 / (9 * d)))
+
+
+def _stacked(
+    templates: Iterable[Template], size: int
+) -> Iterator[tuple[csr_array, list[Template]]]:
+    """Templates as rows of sparse matrices of about :data:`BLOCK` numbers each.
+
+    Maps of large sensors have tens of thousands of templates of thousands of rows: what makes
+    a template is let go before the next are made.
+    """
+    some: list[Template] = []
+    held = 0
+    for template in templates:
+        some.append(template)
+        held += len(template.rows)
+        if held > BLOCK:
+            yield _as_matrix(some, size), some
+            some, held = [], 0
+    if some:
+        yield _as_matrix(some, size), some
+
+
+def _as_matrix(some: list[Template], size: int) -> csr_array:
+    starts = np.concatenate([[0], np.cumsum([len(t.rows) for t in some])])
+    columns = np.concatenate([t.rows for t in some]).astype(np.int32)
+    weights = np.concatenate([t.weights for t in some])
+    return csr_array((weights, columns, starts.astype(np.int32)), shape=(len(some), size))
+
+
+def _viewed(some: list[Template], matrix: csr_array) -> list[Template]:
+    """Templates whose numbers are the matrix's own."""
+    parts = [slice(a, b) for a, b in pairwise(matrix.indptr)]
+    return [
+        replace(t, rows=matrix.indices[p], weights=matrix.data[p])
+        for t, p in zip(some, parts, strict=True)
+    ]
 
 
 class Locator:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft, rfft2
 
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Axes, Condition
@@ -23,9 +25,17 @@ ORDER = 4
 
 NEAREST, FARTHEST = 4, 40
 """Distances in x [pixel] at which a map is held against itself: nearer ones share boundaries."""
+STRIPE = 256
+"""Rows of a map that are transformed at a time."""
+
+FULL = 0.5
+"""Part of the light's noise below which a flat's wells are full."""
 
 LOW = 8
 """Side of the boxes [pixel] that tell noise over many pixels."""
+
+SHORT = 0.25
+"""Part of the longest exposure time below which flats count as short."""
 
 
 class MapShare(NamedTuple):
@@ -50,63 +60,105 @@ class MapShare(NamedTuple):
 class MapChannels:
     """Adds up flats on the sensor, each over its amplifier's mean.
 
+    Of large sensors few maps can be held: exposure times are weighted and added up into two
+    sums of a condition, short ones and long ones, as soon as the next begins.
+
     Parameters
     ----------
     shape : tuple of int
         Rows and columns of the sensor.
+    longest : mapping of tuple to float
+        Longest exposure time [s] of the flats of each condition, by its key.
+    fold : str
+        Which exposures are added.
     """
 
-    def __init__(self, shape: tuple[int, int], fold: str = "fit") -> None:
-        self._shape, self.fold = shape, fold
-        self._groups: dict[tuple, _Group] = {}
-        self._conditions: dict[tuple[str, ...], Condition] = {}
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        longest: Mapping[tuple[str, ...], float],
+        fold: str = "fit",
+    ) -> None:
+        self._shape, self._longest, self.fold = shape, longest, fold
+        self._groups: list[_Group] = []
+        self._sums: dict[tuple[tuple[str, ...], bool], _Sum] = {}
+        self._closed = True
+        self._total = np.zeros((0, 0), np.float32)
+        self._count = np.zeros((0, 0), np.uint16)
 
     def add_pair(
         self,
         condition: Condition,
         time: float,
-        first: NDArray[np.float64],
-        second: NDArray[np.float64],
+        first: NDArray[np.float32],
+        second: NDArray[np.float32],
         shared: float = 0.0,
         level: float = 0.0,
     ) -> None:
-        """Add a pair of flats, each over its amplifiers' means.
+        """Add a pair of flats, each over its amplifiers' means less one.
 
         Parameters
         ----------
         condition : Condition
             Of the light.
         time : float
-            Exposure time [s].
-        first, second : ndarray, shape of the sensor
+            Exposure time [s]; pairs of one should follow one another.
+        first, second : ndarray of float32, shape of the sensor
             nan where no amplifier reads or a pixel is bad.
         shared : float
             Noise that all flats share, that of the mean bias, over the mean.
         level : float
             Mean level [ADU].
         """
-        self._conditions[condition.key] = condition
-        group = self._groups.setdefault(
-            (condition.key, time),
-            _Group(np.zeros(self._shape, np.float32), np.zeros(self._shape, np.uint16)),
-        )
+        last = self._groups[-1] if self._groups else None
+        if last is None or (last.condition.key, last.time) != (condition.key, time):
+            self._close()
+            self._groups.append(_Group(condition, time))
+            self._total = np.zeros(self._shape, np.float32)
+            self._count = np.zeros(self._shape, np.uint16)
+            self._closed = False
+        group = self._groups[-1]
         for image in (first, second):
             good = np.isfinite(image)
-            group.total[good] += image[good]
-            group.count[good] += 1
+            np.add(self._total, image, out=self._total, where=good)
+            self._count += good
         # Charges repel: noise is smaller over few pixels than over many.
-        noise = np.nan_to_num((first - second) / np.sqrt(2.0))
+        noise = first - second
+        noise *= np.float32(np.sqrt(0.5))
+        np.nan_to_num(noise, copy=False)
         side = LOW
         ny, nx = (n // side * side for n in self._shape)
-        low = (
-            noise[:ny, :nx].reshape(ny // side, side, nx // side, side).mean((1, 3)) * side
-        )
-        group.low += float(low.var())
-        group.high += float(np.diff(noise, axis=1).var()) / 2
+        boxes = noise[:ny, :nx].reshape(ny // side, side, nx // side, side)
+        group.low += float((boxes.mean((1, 3), dtype=np.float64) * side).var())
+        group.high += float(np.diff(noise, axis=1).var(dtype=np.float64)) / 2
         group.power += ring_power(noise)
         group.pairs += 1
         group.shared += shared
         group.level += level
+
+    def _close(self) -> None:
+        """Add what is open to the sum of its condition, by inverse variance of its noise."""
+        if self._closed:
+            return
+        self._closed = True
+        group = self._groups[-1]
+        if self._is_full(group):
+            self._groups.pop()
+            return
+        weight = group.weight
+        with np.errstate(invalid="ignore", divide="ignore"):
+            self._total /= self._count
+        self._total *= np.float32(weight)
+        name = group.condition.key, self._is_short(group)
+        if name in self._sums:
+            self._sums[name].image += self._total
+            self._sums[name].weight += weight
+        else:
+            self._sums[name] = _Sum(self._total, weight)
+        self._total = np.zeros((0, 0), np.float32)
+
+    def _is_short(self, group: _Group) -> bool:
+        return group.time < SHORT * self._longest[group.condition.key]
 
     def channels(self) -> list[Channel]:
         """Columns, rows, blocks and rings of the map of all light, and of what differs.
@@ -114,77 +166,74 @@ class MapChannels:
         'all': all flats of the commonest condition together, weighted by their light; 'short':
         its short exposures over its long ones; other conditions over the commonest.
         """
+        self._close()
         if not self._groups:
             return []
-        maps: dict[str, tuple[_Map, Condition]] = {}
-        made: dict[tuple, _Map] = {}
-        for name, (key, times, below) in self._plan().items():
-            for which in filter(None, ((key, times), below)):
-                if which not in made:
-                    made[which] = self._average(which[0], list(which[1]))
-            image = made[key, times]
-            maps[name] = (
-                image if below is None else image.over(made[below]), self._conditions[key]
-            )  # fmt: skip
         values, blocks, axes = [], [], Axes()
-        for name, (image, where) in maps.items():
+        # One map is held, and one that others are divided by: that of the commonest condition.
+        kept: tuple[list[_Group], _Map] | None = None
+        for name, (groups, below) in self._plan().items():
+            image = self._average(groups)
+            if name == "all":
+                kept = groups, image
+            if below:
+                if kept is None or kept[0] is not below:
+                    kept = None
+                    kept = below, self._average(below)
+                image = image.over(kept[1])
             for v, e, columns in self._parts(image, own=name == "all"):
                 values.append(v)
                 blocks.extend(np.square(e)[:, None, None])
-                axes.add(len(v), where, map=name, **columns)
+                axes.add(len(v), groups[0].condition, map=name, **columns)
         return [Channel("flat_map", np.concatenate(values), tuple(blocks), axes.columns(), "",
                         self.fold)]  # fmt: skip
 
-    def _plan(self) -> dict[str, tuple[tuple[str, ...], tuple[float, ...], tuple | None]]:
-        """Of each map: condition, exposure times, and the two of what it is divided by."""
-        times: dict[tuple[str, ...], list[float]] = {}
-        for key, time in self._groups:
-            times.setdefault(key, []).append(time)
-        common = max(times, key=lambda k: sum(self._groups[k, t].pairs for t in times[k]))
-        ordered = tuple(sorted(times[common]))
-        out: dict[str, tuple[tuple[str, ...], tuple[float, ...], tuple | None]] = {
-            "all": (common, ordered, None)
-        }
-        split = tuple(t for t in ordered if t < 0.25 * ordered[-1])
-        if split and len(split) < len(ordered):
-            long = tuple(t for t in ordered if t not in split)
-            out["short"] = (common, split, (common, long))
-        for other, members in times.items():
+    def _plan(self) -> dict[str, tuple[list[_Group], list[_Group]]]:
+        """Flats of each map, and of what it is divided by."""
+        members: dict[tuple[str, ...], list[_Group]] = {}
+        for group in self._groups:
+            members.setdefault(group.condition.key, []).append(group)
+        common = max(members, key=lambda k: sum(g.pairs for g in members[k]))
+        ordered = sorted(members[common], key=lambda g: g.time)
+        out: dict[str, tuple[list[_Group], list[_Group]]] = {"all": (ordered, [])}
+        short = [g for g in ordered if self._is_short(g)]
+        if short and len(short) < len(ordered):
+            out["short"] = short, [g for g in ordered if not self._is_short(g)]
+        for other, own in members.items():
             if other != common:
-                out["/".join(other)] = (other, tuple(members), (common, ordered))
+                out["/".join(other)] = own, ordered
         return out
+
+    def _is_full(self, group: _Group) -> bool:
+        """Whether flats are at the full well: without their light's noise, without its pattern.
+
+        Noise over many pixels is Poisson's whatever charges do to one another: relative
+        variance times level is one number, larger only where read noise adds to it.  Flats come
+        by rising level: those before tell the usual one.
+        """
+        white = [g.low * g.level / g.pairs**2 for g in (*self._groups[:-1], group)]
+        return len(white) > 2 and white[-1] < FULL * float(np.median(white[:-1]))
 
     def shares(self) -> dict[str, tuple[MapShare, ...]]:
         """Of which flats each map is made."""
         out = {}
-        for name, (key, times, below) in (self._plan() if self._groups else {}).items():
-            parts = []
-            for (k, members), sign in (((key, times), 1.0), (below or ((), ()), -1.0)):
-                for t, w in zip(members, self._weights(k, members), strict=True):
-                    group = self._groups[k, t]
-                    parts.append(
-                        MapShare(
-                            sign * float(w),
-                            self._conditions[k],
-                            t,
-                            group.level / group.pairs,
-                        )
-                    )
-            out[name] = tuple(parts)
+        for name, both in (self._plan() if self._groups else {}).items():
+            out[name] = tuple(
+                MapShare(sign * float(w), g.condition, g.time, g.level / g.pairs)
+                for groups, sign in zip(both, (1.0, -1.0), strict=True)
+                for g, w in zip(groups, _weights(groups), strict=True)
+            )
         return out
 
-    def _weights(self, key: tuple[str, ...], times: Sequence[float]) -> NDArray[np.float64]:
-        """Of groups in their mean, by inverse variance of their noise."""
-        groups = [self._groups[key, t] for t in times]
-        weights = np.array([g.pairs**2 / max(g.low, 1e-30) for g in groups])
-        return np.asarray(weights / weights.sum())
-
-    def _average(self, key: tuple[str, ...], times: list[float]) -> _Map:
-        """Map of several exposure times, by inverse variance of their noise."""
-        groups = [self._groups[key, t] for t in times]
-        weights = self._weights(key, times)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            image = sum(w * g.total / g.count for w, g in zip(weights, groups, strict=True))
+    def _average(self, groups: list[_Group]) -> _Map:
+        """Map of all short exposures of a condition, or all long ones, or both."""
+        weights = _weights(groups)
+        which = dict.fromkeys((g.condition.key, self._is_short(g)) for g in groups)
+        sums = [self._sums[name] for name in which]
+        whole = np.float32(sum(s.weight for s in sums))
+        image = sums[0].image / whole
+        for other in sums[1:]:
+            image += other.image / whole
         # The mean bias is the same in all; of it differences of pairs know nothing.
         common = (
             sum(w * g.shared / g.pairs for w, g in zip(weights, groups, strict=True)) ** 2
@@ -199,11 +248,7 @@ class MapChannels:
         pairs = sum(g.pairs for g in groups)
         ratio = sum(g.low / max(g.high, 1e-30) * g.pairs for g in groups) / pairs
         return _Map(
-            np.asarray(image),
-            float(low) + common,
-            np.asarray(power) + common,
-            float(ratio),
-            pairs,
+            image, float(low) + common, np.asarray(power) + common, float(ratio), pairs
         )
 
     def _parts(
@@ -217,14 +262,13 @@ class MapChannels:
         sigma = np.sqrt(image.low)
         if own:
             steps = np.diff(image.values, axis=1).ravel()
-            seen = (
-                1.4826
-                * float(np.nanmedian(np.abs(steps - np.nanmedian(steps))))
-                / np.sqrt(2.0)
-            )
+            steps = steps[np.isfinite(steps)]
+            steps -= np.median(steps)
+            seen = 1.4826 * float(np.median(np.abs(steps, out=steps))) / np.sqrt(2.0)
+            del steps
             sigma = max(sigma, seen * np.sqrt(image.ratio))
         good = np.isfinite(image.values)
-        filled = np.where(good, image.values, 1.0) - 1.0
+        filled = np.where(good, image.values, np.float32(0.0))
         out: list[tuple[NDArray, NDArray, Mapping[str, object]]] = []
         for what, axis, n in (("column", 0, nx), ("row", 1, ny)):
             count = np.maximum(good.sum(axis), 1)
@@ -235,15 +279,15 @@ class MapChannels:
             )
             out.append(
                 (
-                    filled.sum(axis) / count,
+                    filled.sum(axis, dtype=np.float64) / count,
                     sigma / np.sqrt(count),
                     {"what": what, "k": -1.0, **at},
                 )
             )
-        side = int(np.ceil(max(ny, nx) / BLOCKS))
+        side = block_side(self._shape)
         rows, columns = ny // side, nx // side
-        count = _blocks(good.astype(float), side).sum((1, 3))
-        mean = _blocks(filled, side).sum((1, 3)) / np.maximum(count, 1)
+        count = _blocks(good, side).sum((1, 3))
+        mean = _blocks(filled, side).sum((1, 3), dtype=np.float64) / np.maximum(count, 1)
         y, x = ((index + 0.5) * side - 0.5 for index in np.indices((rows, columns)))
         full = count.ravel() > side * side // 2
         out.append(
@@ -268,21 +312,16 @@ class MapChannels:
             )
         )
         texture, dx, dy = map_texture(_without_shape(filled))
-        spread = 1e6 * float(filled.var()) / np.sqrt(max(good.sum(), 1))
+        spread = 1e6 * float(filled.var(dtype=np.float64)) / np.sqrt(max(good.sum(), 1))
         out.append(
             (texture, np.full(len(texture), spread), {"what": "texture", "k": -1.0, "x": dx, "y": dy})
         )  # fmt: skip
-        # Single pixels' noise is not evened out as that over many is.
-        single = np.sqrt(sigma**2 / image.ratio)
         chess, centres = map_chess(filled)
-        count = np.maximum(map_chess(good.astype(float), signed=False)[0] * good.size, 1)
+        # Single pixels' noise is not evened out as that over many is.
+        error = np.sqrt(sigma**2 / image.ratio * len(chess) / max(good.sum(), 1))
         out.append(
-            (
-                chess,
-                single / np.sqrt(count / len(chess)),
-                {"what": "chess", "k": -1.0, "x": centres, "y": -1.0},
-            )
-        )
+            (chess, np.full(len(chess), error), {"what": "chess", "k": -1.0, "x": centres, "y": -1.0})
+        )  # fmt: skip
         return out
 
     @property
@@ -293,10 +332,10 @@ class MapChannels:
 
 @dataclass
 class _Group:
-    """Sums over the pairs of one condition and exposure time: 6 bytes a pixel, of large sensors too."""
+    """What the pairs of one condition and exposure time have in common."""
 
-    total: NDArray[np.float32]
-    count: NDArray[np.uint16]
+    condition: Condition
+    time: float
     low: float = 0.0
     high: float = 0.0
     power: NDArray[np.float64] = field(default_factory=lambda: np.zeros(RINGS))
@@ -304,59 +343,86 @@ class _Group:
     shared: float = 0.0
     level: float = 0.0
 
+    @property
+    def weight(self) -> float:
+        """Inverse variance of the noise of their mean."""
+        return float(self.pairs**2 / max(self.low, 1e-30))
+
+
+@dataclass
+class _Sum:
+    """Weighted sum of the maps of several exposure times: 4 bytes a pixel, of large sensors too."""
+
+    image: NDArray[np.float32]
+    weight: float
+
 
 @dataclass
 class _Map:
-    """A map, its noise over many pixels as a pixel's variance, and by ring.
+    """A map less one, its noise over many pixels as a pixel's variance, and by ring.
 
     ``ratio``: of that variance to the one between neighbours; the effect evens the response of
     single pixels out as it does their noise, to first order.
     """
 
-    values: NDArray[np.float64]
+    values: NDArray[np.float32]
     low: float
     power: NDArray[np.float64]
     ratio: float
     pairs: int
 
     def over(self, other: _Map) -> _Map:
-        """Ratio of two maps."""
+        """Ratio of two maps, less one."""
         return _Map(
-            self.values / other.values, self.low + other.low, self.power + other.power,
-            self.ratio, min(self.pairs, other.pairs),
+            (self.values - other.values) / (1 + other.values), self.low + other.low,
+            self.power + other.power, self.ratio, min(self.pairs, other.pairs),
         )  # fmt: skip
 
 
-def _blocks(image: NDArray[np.float64], side: int) -> NDArray[np.float64]:
+def block_side(shape: tuple[int, int]) -> int:
+    """Side of the blocks of a map [pixel]."""
+    return int(np.ceil(max(shape) / BLOCKS))
+
+
+def _weights(groups: list[_Group]) -> NDArray[np.float64]:
+    """Of groups in their mean, by inverse variance of their noise."""
+    weights = np.array([g.weight for g in groups])
+    return np.asarray(weights / weights.sum())
+
+
+def _blocks(image: NDArray, side: int) -> NDArray:
     ny, nx = (n // side for n in image.shape)
     return image[: ny * side, : nx * side].reshape(ny, side, nx, side)
 
 
-def _ring_bins(shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Ring of each mode, and which are used: rows' and columns' own are not."""
+@lru_cache(maxsize=1)
+def _ring_bins(shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """Ring of each mode, :data:`RINGS` where it is not used: rows' and columns' own are not."""
     fy, fx = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None]
-    bins = np.minimum((np.hypot(fy, fx) * 2 * RINGS).astype(int), RINGS)
-    return bins, (np.abs(fy) > 0) & (fx > 0) & (bins < RINGS)
+    bins = np.minimum((np.hypot(fy, fx) * 2 * RINGS).astype(np.uint8), RINGS)
+    bins[0], bins[:, 0] = RINGS, RINGS
+    bins.setflags(write=False)
+    return bins
 
 
 def ring_modes(shape: tuple[int, int]) -> NDArray[np.int64]:
     """Modes of each ring of a map of that shape."""
-    bins, use = _ring_bins(shape)
-    return np.bincount(bins[use], minlength=RINGS)[:RINGS]
+    return np.bincount(_ring_bins(shape).ravel(), minlength=RINGS)[:RINGS]
 
 
-def ring_power(image: NDArray[np.float64]) -> NDArray[np.float64]:
+def ring_power(image: NDArray) -> NDArray[np.float64]:
     """Mean power of a mode by ring; that of white noise is a pixel's variance."""
-    bins, use = _ring_bins(image.shape)
-    power = np.abs(np.fft.rfft2(image)) ** 2 / image.size
-    count = np.bincount(bins[use], minlength=RINGS)[:RINGS]
-    return np.bincount(bins[use], power[use], minlength=RINGS)[:RINGS] / np.maximum(
-        count, 1
-    )
+    bins = _ring_bins(image.shape).ravel()
+    modes = rfft2(image)
+    power = modes.real**2
+    power += modes.imag**2
+    count = np.bincount(bins, minlength=RINGS + 1)[:RINGS]
+    total = np.bincount(bins, power.ravel(), minlength=RINGS + 1)[:RINGS]
+    return np.asarray(total / image.size / np.maximum(count, 1))
 
 
 def map_texture(
-    image: NDArray[np.float64],
+    image: NDArray,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Hold a map against itself: mean products [1e-6] of pixels (dx, dy) apart, with dx and dy.
 
@@ -372,41 +438,54 @@ def map_texture(
     [-500000.0, 500000.0]
     """
     ny, nx = image.shape
-    image = image - image.mean(0) - image.mean(1)[:, None] + image.mean()
+    columns = image.mean(0, dtype=np.float64)
     reach = min(FARTHEST, nx // 2)
-    spectrum = np.fft.rfft(image, 2 * nx, axis=1)
-    same = np.fft.irfft((spectrum.real**2 + spectrum.imag**2).sum(0), 2 * nx)
-    following = np.fft.irfft((spectrum[:-1].conj() * spectrum[1:]).sum(0), 2 * nx)
-    near, both = np.arange(NEAREST, reach + 1), np.arange(-reach, reach + 1)
-    both = both[np.abs(both) >= NEAREST]
+    side = next_fast_len(nx + reach + 1, real=True)
+    same, following = np.zeros(side), np.zeros(side)
+    # Some rows at a time: transforms of large sensors need not be held.
+    for start in range(0, ny, STRIPE):
+        rows = image[start : start + STRIPE + 1]
+        rows = rows - columns - rows.mean(1, dtype=np.float64)[:, None] + columns.mean()
+        modes = rfft(rows, side, axis=1)
+        own = modes[:STRIPE]
+        same += irfft((own.real**2 + own.imag**2).sum(0), side)
+        following += irfft((modes[:-1].conj() * modes[1:]).sum(0), side)
+    near, all_ = np.arange(NEAREST, reach + 1), np.arange(-reach, reach + 1)
+    all_ = all_[np.abs(all_) >= NEAREST]
     values = [
-        same[near] / (ny * (nx - near)),
-        following[both] / ((ny - 1) * (nx - np.abs(both))),
-    ]
-    dy = np.repeat([0.0, 1.0], [len(near), len(both)])
-    return 1e6 * np.concatenate(values), np.concatenate([near, both]).astype(float), dy
+        same[near] / (ny * (nx - near)), following[all_] / ((ny - 1) * (nx - np.abs(all_)))
+    ]  # fmt: skip
+    dy = np.repeat([0.0, 1.0], [len(near), len(all_)])
+    return 1e6 * np.concatenate(values), np.concatenate([near, all_]).astype(float), dy
 
 
-def map_chess(
-    image: NDArray[np.float64], *, signed: bool = True
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def map_chess(image: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Half of the difference of even and odd pixels (row plus column), in strips, and their x.
 
     Columns and rows do not show it, nor do rings, which end at half a cycle a pixel.
+
+    Examples
+    --------
+    >>> values, x = map_chess(np.indices((32, 32)).sum(0) % 2)
+    >>> float(values.min()), float(values.max()), x[:3].tolist()
+    (-0.5, -0.5, [0.5, 2.5, 4.5])
     """
     ny, nx = image.shape
-    side = int(np.ceil(max(ny, nx) / BLOCKS))
-    sign = 1.0 - 2.0 * (np.indices(image.shape).sum(0) % 2)
-    columns = ((sign if signed else 1.0) * image).mean(0)[: nx // side * side]
-    centres = (np.arange(nx // side) + 0.5) * side - 0.5
-    return columns.reshape(-1, side).mean(1), centres
+    side = block_side((ny, nx))
+    columns = image[::2].sum(0, dtype=np.float64) - image[1::2].sum(0, dtype=np.float64)
+    columns[1::2] *= -1.0
+    kept = columns[: nx // side * side].reshape(-1, side)
+    return np.asarray(kept.mean(1) / ny), np.arange(len(kept)) * float(side) + 0.5 * (
+        side - 1
+    )
 
 
-def _without_shape(image: NDArray[np.float64]) -> NDArray[np.float64]:
+def _without_shape(image: NDArray[np.float32]) -> NDArray[np.float32]:
     """Take a polynomial of order :data:`ORDER` in x and y off."""
     ny, nx = image.shape
     v, u = np.linspace(-1, 1, ny), np.linspace(-1, 1, nx)
     left_y = np.polynomial.legendre.legvander(v, ORDER)
     left_x = np.polynomial.legendre.legvander(u, ORDER)
     q_y, q_x = np.linalg.qr(left_y)[0], np.linalg.qr(left_x)[0]
-    return np.asarray(image - q_y @ (q_y.T @ image @ q_x) @ q_x.T)
+    shape = q_y @ (q_y.T @ image @ q_x) @ q_x.T
+    return np.asarray(image - shape, np.float32)

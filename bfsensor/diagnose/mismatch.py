@@ -140,6 +140,7 @@ def fit_baseline(
     point = predictor.start.astype(float).copy()
     low, high = predictor.bounds()
     effect = np.char.startswith(np.array(predictor.names, str), "effect ")
+    span = np.linalg.qr(linear / scales)[0] if effect.any() else linear[:, :0]
     before, least, halved, arrived = point.copy(), np.inf, 0, False
     moved = np.inf
     history: list[float] = []
@@ -153,9 +154,10 @@ def fit_baseline(
             c.whiten(c.values - p) for c, p in zip(channels, predicted, strict=True)
         ])  # fmt: skip
         if effect.any():
-            square = float(residuals @ residuals) + float(
-                point[predictor.prior_rows] @ point[predictor.prior_rows]
-            )
+            # Of what is left with the linear parameters at their best.
+            given = span.T @ residuals
+            square = float(residuals @ residuals) - float(given @ given)
+            square += float(point[predictor.prior_rows] @ point[predictor.prior_rows])
             # Effects bend: a step that does harm is taken back by half, at last altogether.
             if square > least + 0.01 and halved < HALVINGS:
                 halved += 1

@@ -63,6 +63,8 @@ def compare_held_out(before: Model, after: Model) -> dict[str, tuple[float, floa
     """
     out: dict[str, tuple[float, float, int]] = {}
     for channel in used_channels(before.predictor.measured.channels, ("held-out",)):
+        if not len(channel):
+            continue
         squares = [
             float(left @ left) for left in (m.left(channel) for m in (before, after))
         ]

@@ -155,7 +155,9 @@ def explain_outside(
     fit = free.model.fit
     relative = _gain_error(fit)
     values = dict(zip(fit.names, zip(fit.values, fit.errors, strict=True), strict=True))
-    coefficients, members, found = [], {}, []
+    coefficients: list[Coefficient] = []
+    members: dict[str, tuple[str, ...]] = {}
+    found: list[tuple[Term, float]] = []
     for choice in free.choices:
         names = []
         for term in [each for t in choice.terms for each in (t, *t.more)]:

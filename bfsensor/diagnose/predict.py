@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -14,14 +14,16 @@ from bfsensor.diagnose.baseline import Baseline
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
+from bfsensor.diagnose.map_channels import MapShare, block_side
 from bfsensor.diagnose.predict_effects import ADDED, EffectChain, layout_of, pad_areas
 from bfsensor.diagnose.predict_flats import (
     flat_covariances_of,
     periodic_covariances,
     quadrant,
 )
-from bfsensor.diagnose.predict_spots import predict_spots
-from bfsensor.effects.effect import Effect, Parameter
+from bfsensor.diagnose.predict_spots import predict_spots, representative_phases
+from bfsensor.effects.effect import Effect, Layout, Parameter
+from bfsensor.errors import DiagnosisError
 
 MAP_ORDER = 4
 """Order of the polynomial in x and y that the light on the sensor may have."""
@@ -33,16 +35,13 @@ which published covariances are quoted."""
 Columns = Callable[[Channel], dict[str, NDArray[np.float64]]]
 """Columns of further linear parameters of a channel, by name, in its unit."""
 
-PHASES = 12
-"""Spots whose positions stand for those of an exposure."""
-
 
 class Predictor:
     """Predicts the channels of a campaign; what may float honestly is a parameter.
 
     Non-linear parameters: gain of each amplifier [e-/ADU], variance of its read noise [ADU^2],
     the device's parameters in units of their spread, widths of the spots without charge for
-    each wavelength.  Linear ones, as columns of :meth:`linear`: light by amplifier and
+    each wavelength and temperature.  Linear ones, as columns of :meth:`linear`: light by amplifier and
     condition, dark current, shape of the light, levels of bias and noise, flux of the spots.
 
     Parameters
@@ -66,7 +65,8 @@ class Predictor:
         self._kept: dict[int, tuple[Channel, dict[tuple[str, ...], NDArray[np.int64]]]] = {}
         self._spot_conditions: list[tuple[str, ...]] = []
         self._spot_of: dict[tuple[str, ...], Condition] = {}
-        # Optics know of the wavelength, not of voltages or the silicon's temperature.
+        # Optics know of the wavelength, diffusion of the silicon's temperature, of which cards do
+        # not speak; what goes with voltages at one temperature is left to be found.
         self._widths: list[str] = []
         self._phases: dict[tuple[str, ...], NDArray[np.float64]] = {}
         self.notes: list[str] = []
@@ -83,8 +83,8 @@ class Predictor:
                 if condition.key not in self._spot_of:
                     self._spot_conditions.append(condition.key)
                     self._spot_of[condition.key] = condition
-                    if condition.key[0] not in self._widths:
-                        self._widths.append(condition.key[0])
+                    if _width_of(condition.key) not in self._widths:
+                        self._widths.append(_width_of(condition.key))
                         both = channel.values[row], channel.values[row + 1]
                         start_sigma += [float(v) for v in both]
                     self._phases[condition.key] = phases
@@ -92,19 +92,13 @@ class Predictor:
                     self._phases[condition.key] = np.concatenate(
                         [self._phases[condition.key], phases]
                     )
-        for key, phases in self._phases.items():
-            order = (
-                np.linspace(0, len(phases) - 1, min(PHASES, len(phases)))
-                .round()
-                .astype(int)
-            )
-            self._phases[key] = phases[order]
+        self._phases = {k: representative_phases(p) for k, p in self._phases.items()}
         noise = [0.0 if not np.isfinite(n) else n**2 for n in measured.read_noise]
         self.names = (
             *(f"gain {a}" for a in range(self._amps)),
             *(f"noise {a}" for a in range(self._amps)),
             *(f"device {p}" for p in baseline.parameters),
-            *(f"sigma_{axis} {wavelength}" for wavelength in self._widths for axis in "xy"),
+            *(f"sigma_{axis} {width}" for width in self._widths for axis in "xy"),
         )
         self.start = np.array([
             *measured.gains, *noise, *(0.0 for _ in baseline.parameters), *start_sigma,
@@ -210,6 +204,47 @@ class Predictor:
         other.baseline = replace(own, **changed)  # type: ignore[arg-type]
         return other
 
+    def with_exposures(
+        self,
+        spots: Iterable[Condition] = (),
+        maps: Mapping[tuple[str, str], tuple[MapShare, ...]] | None = None,
+    ) -> Predictor:
+        """Copy that predicts spots at further conditions, and further maps, as well.
+
+        Spots fall on their pixels as others of the same light and temperature do.
+
+        Parameters
+        ----------
+        spots : iterable of Condition
+            Conditions that the campaign may lack.
+        maps : mapping of (fold, map) to tuple of MapShare, optional
+            Of which flats each is made.
+
+        Raises
+        ------
+        DiagnosisError
+            The campaign has no spots of that wavelength and temperature: nothing tells their width.
+        """
+        other = copy(self)
+        other._spot_of, other._phases = dict(self._spot_of), dict(self._phases)
+        other._spot_conditions = list(self._spot_conditions)
+        for condition in spots:
+            key = condition.key
+            if key in other._spot_of:
+                continue
+            width = _width_of(key)
+            like = next((k for k in self._spot_conditions if _width_of(k) == width), None)
+            if like is None:
+                raise DiagnosisError(
+                    f"spots at wavelength/temperature {width}: their width without charge is known "
+                    f"at {', '.join(self._widths) or 'none'} only"
+                )
+            other._spot_of[key], other._phases[key] = condition, self._phases[like]
+            other._spot_conditions.append(key)
+        if maps:
+            other.measured = replace(self.measured, maps={**self.measured.maps, **maps})
+        return other
+
     def _add(self, effects: Sequence[Effect]) -> None:
         """Append the parameters of effects."""
         self.effects = tuple(effects)
@@ -234,7 +269,7 @@ class Predictor:
         parameters : ndarray
             In the order of ``names``.
         only : str, optional
-            Predict spots of this wavelength alone.
+            Predict spots of this wavelength and temperature alone, such as '620/173.15'.
         """
         a = self._amps
         chain = self.chain(parameters)
@@ -269,10 +304,19 @@ class Predictor:
             return None
         return EffectChain(
             self.effects_at(parameters),
-            self.layout,
+            self._layout_at(parameters),
             self.measured,
             self.baseline,
             self._evened,
+        )
+
+    def _layout_at(self, parameters: NDArray[np.float64]) -> Layout:
+        """Layout with the gains and the read noise that parameters say."""
+        gains, noise = parameters[: self._amps], parameters[self._amps : 2 * self._amps]
+        return replace(
+            self.layout,
+            gains=tuple(gains.tolist()),
+            read_noise=tuple(np.sqrt(np.maximum(noise, 0.0)).tolist()),
         )
 
     def effects_at(self, parameters: NDArray[np.float64]) -> tuple[Effect, ...]:
@@ -362,13 +406,13 @@ class Predictor:
         step = parameters.copy()
         step[n] += self.steps[n]
         if channel.word == "spot" and self.names[n].startswith("sigma"):
-            # Of one wavelength's width the others know nothing.
+            # Of one width the spots of others know nothing.
             first = self.names.index(next(m for m in self.names if m.startswith("sigma")))
             only = self._widths[(n - first) // 2]
             moved = self.predict(channel, step, only=only)
             out = np.zeros(len(channel))
             for key, rows in self._rows(channel).items():
-                if key[0] == only:
+                if _width_of(key) == only:
                     out[rows] = (moved[rows] - here[rows]) / self.steps[n]
             return out
         return (self.predict(channel, step) - here) / self.steps[n]
@@ -451,9 +495,9 @@ class Predictor:
         out = np.zeros(len(channel))
         for key in self._spot_conditions:
             rows = self._rows(channel).get(key, np.zeros(0, int))
-            if not len(rows) or (only is not None and key[0] != only):
+            if not len(rows) or (only is not None and _width_of(key) != only):
                 continue
-            n = self._widths.index(key[0])
+            n = self._widths.index(_width_of(key))
             edges, _ = self.baseline.at(self._spot_of[key], device)
             sigma = float(sigmas[2 * n]), float(sigmas[2 * n + 1])
             fluxes = scale * x["flux"][rows]
@@ -462,17 +506,21 @@ class Predictor:
                     *edges, sigma=sigma, phases=self._phases[key], fluxes=fluxes,
                     slopes=self.spot_slopes,
                 )  # fmt: skip
-                found.pop("flux")
             else:
                 variance, halo, axes = chain.spot_change(self._spot_of[key])
-                wide = [float(np.sqrt(max(s * s + variance, 0.01 * s * s))) for s in sigma]
+                if "hours" in x:
+                    axes = {**axes, "hours": float(np.mean(x["hours"][rows]))}
+                wide = sigma
+                if variance:
+                    squares = [max(s * s + variance, 0.01 * s * s) for s in sigma]
+                    wide = float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))
                 found = predict_spots(
-                    *chain.edges(edges, self._spot_of[key]), sigma=(wide[0], wide[1]),
+                    *chain.edges(edges, self._spot_of[key]), sigma=wide,
                     phases=self._phases[key], fluxes=fluxes, halo=halo, law=chain.law,
-                    slopes=self.spot_slopes,
+                    neighbours=self.measured.neighbours, slopes=self.spot_slopes,
                     change=partial(chain.spot_image, axes=axes),
                 )  # fmt: skip
-                found["flux"] = found["flux"] / scale
+            found["flux"] = found["flux"] / scale
             for what, values in found.items():
                 here = x["what"][rows] == what
                 out[rows[here]] = values[here]
@@ -528,34 +576,58 @@ class Predictor:
                     out[f"map {name} rings k{power}"] = np.where(ring, x["k"] ** power, 0.0)
             if name == "all" and ring.any():
                 out["map rings white"] = np.where(ring, 1.0, 0.0)
-            for amp, (flip, origin) in enumerate(
-                zip(self.measured.flips, self.measured.origins, strict=True)
-            ):
-                del flip
-                if amp == 0:
-                    continue
-                # Amplifiers were divided by their means: steps between them are free.
-                side = here & (x["what"] != "ring") & (x["what"] != "row")
-                beyond = (
-                    side & (x["x"] >= origin[0]) if origin[0] > 0 else np.zeros_like(side)
-                )
-                if beyond.any():
-                    for what in ("column", "block"):
-                        out[f"map {name} {what} amp {amp}"] = np.where(
-                            beyond & (x["what"] == what), 1.0, 0.0
-                        )
+            for step, column in self._amplifier_steps(channel, here).items():
+                out[f"map {name} {step}"] = column
+        return out
+
+    def _amplifier_steps(
+        self, channel: Channel, here: NDArray[np.bool_]
+    ) -> dict[str, NDArray[np.float64]]:
+        """Steps between amplifiers, which were divided by their means: free, along x and y."""
+        x, out = channel.axes, {}
+        for what, axis, n in (("column", "x", 0), ("row", "y", 1)):
+            rows = here & (x["what"] == what)
+            for start in sorted({o[n] for o in self.measured.origins} - {0}):
+                beyond = rows & (x[axis] >= start)
+                if beyond.any() and not beyond[rows].all():
+                    out[f"{what} from {start}"] = np.where(beyond, 1.0, 0.0)
+        rows = here & (x["what"] == "block")
+        # Blocks may lie on several amplifiers.
+        half = 0.5 * block_side(self.measured.shape)
+        shares = [
+            np.where(rows, _overlap(x["x"], half, s.x, s.columns), 0.0)
+            * _overlap(x["y"], half, s.y, s.rows)
+            for s in self.measured.segments
+        ]
+        covered = np.maximum(np.sum(shares, axis=0), 1e-9)
+        for amp, share in enumerate(shares[1:], 1):
+            if share.any():
+                out[f"block amp {amp}"] = share / covered
         return out
 
     def _spot_columns(self, channel: Channel) -> dict[str, NDArray[np.float64]]:
         x = channel.axes
         out = {}
         for key, rows in self._rows(channel).items():
-            for what in ("flux", "skew_x", "skew_y", "wings"):
+            for what in ("flux", "skew_x", "skew_y"):
                 here = rows[x["what"][rows] == what]
                 column = np.zeros(len(channel))
                 column[here] = x["light"][here] if what == "flux" else 1.0
                 out[f"spot {what} {'/'.join(key)}"] = column
         return out
+
+
+def _width_of(key: tuple[str, ...]) -> str:
+    """Wavelength and temperature of a condition: what spots have one width at."""
+    return f"{key[0]}/{key[2]}"
+
+
+def _overlap(
+    centre: NDArray[np.float64], half: float, start: int, count: int
+) -> NDArray[np.float64]:
+    """Pixels of intervals about centres that lie in another interval."""
+    low, high = centre + 0.5 - half, centre + 0.5 + half
+    return np.maximum(np.minimum(high, start + count) - np.maximum(low, start), 0.0)
 
 
 def fitted(effect: Effect) -> list[Parameter]:

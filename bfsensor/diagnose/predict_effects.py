@@ -11,8 +11,8 @@ from bfsensor.diagnose.baseline import Baseline, Edges, area_matrix
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
+from bfsensor.diagnose.flat_channels import TAIL
 from bfsensor.diagnose.map_channels import BLOCKS, RINGS, map_chess, map_texture, ring_power
-from bfsensor.diagnose.predict_flats import GRID
 from bfsensor.effects.effect import STAGES, Axes, Effect, Law, Layout, Shot
 
 ADDED = (
@@ -34,7 +34,7 @@ def layout_of(measured: Measured, baseline: Baseline) -> Layout:
         measured.shape, measured.segments, measured.shots, measured.gains,
         (wavelength if np.isfinite(wavelength) else 620.0, bias if np.isfinite(bias) else -60.0,
          float(np.median(reference)) if reference else -100.0),
-        **card,
+        offsets=measured.offsets, read_noise=measured.read_noise, **card,
     )  # fmt: skip
 
 
@@ -114,13 +114,10 @@ class EffectChain:
         level = np.asarray(axes["level"], float)
         for effect in self.effects:
             step = 1e-3 * np.maximum(level, 1.0)
-            up, down = (
-                effect.signal(level + s, {**axes, "level": level + s}, self.layout)
-                for s in (step, -step)
-            )
-            slope = (up - down) / (2 * step)
-            if np.any(slope != 1.0):
-                c = c * (slope**2)[:, None, None]
+            ends = level + step, level - step
+            up, down = (effect.signal(x, {**axes, "level": x}, self.layout) for x in ends)
+            if not (np.array_equal(up, ends[0]) and np.array_equal(down, ends[1])):
+                c = c * (((up - down) / (2 * step)) ** 2)[:, None, None]
             c = effect.covariances(c, axes, self.layout)
         return c
 
@@ -140,23 +137,45 @@ class EffectChain:
         for effect in self.effects:
             if channel.word in effect.touches:
                 out += getattr(effect, channel.word)(axes, self.layout)
+            if channel.word in ("serial_overscan", "parallel_overscan"):
+                out -= self._in_overscan(effect, channel.word, axes, TAIL)
+            if channel.word == "flat_mean":
+                out -= self._in_overscan(effect, "serial_overscan", axes, None)
         if channel.word == "flat_mean":
             level = axes["level"]
             out += self.signal(level, axes) - level
             if self.law.loss:
                 # Light that brings the level m with a loss q: (exp(q m) - 1) / q.
                 out += level - np.expm1(self.law.loss * level) / self.law.loss
+        out = out / _unit(channel, own, gains)
         if channel.word == "bias_level":
-            # Rows' variance is given over that which white noise makes.
-            rows_ = axes["what"] == "rows"
-            out[rows_] /= self._white_rows(gains)[amp[rows_]] / own[rows_]
-        return out / _unit(channel, own, gains)
+            # Variances over those that white noise makes.
+            what, ratio = axes["what"], out / own / axes["white"]
+            out = np.where(what == "rows", ratio, out)
+            out = np.where(what == "frames", np.log1p(np.maximum(ratio, 0.0)), out)
+        return np.asarray(out)
 
-    def _white_rows(self, gains: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Variance of the mean of a frame's row by read noise, by amplifier [e-^2]."""
-        noise = np.array(self.measured.read_noise) * gains
-        columns = [s.prescan + s.columns + s.serial_overscan for s in self.layout.segments]
-        return np.asarray(noise**2 / np.array(columns))
+    def _in_overscan(
+        self, effect: Effect, word: str, axes: dict[str, NDArray], last: int | None
+    ) -> NDArray[np.float64]:
+        """Mean of what an effect adds to an overscan's last pixels, or to its second half [e-]."""
+        out = np.zeros(len(axes["amp"]))
+        if word not in effect.touches:
+            return out
+        depth = self.layout.of_amp(word, axes["amp"]).astype(int)
+        for deep in np.unique(depth[depth > 0]):
+            rows = depth == deep
+            here = {k: v[rows] for k, v in axes.items()}
+            first = deep // 2 if last is None else deep - last
+            pixels = range(first + 1, deep + 1)
+            change = [
+                getattr(effect, word)(
+                    {**here, "k": np.full(rows.sum(), float(k))}, self.layout
+                )
+                for k in pixels
+            ]
+            out[rows] = np.mean(change, axis=0)
+        return out
 
     def spot_change(
         self, condition: Condition
@@ -194,7 +213,7 @@ class EffectChain:
         """
         out = np.zeros(len(channel))
         names = channel.axes["map"]
-        gain = float(np.mean(self.measured.gains or (1.0,)))
+        gain = float(np.mean(self.layout.gains or (1.0,)))
         by_time = any(e.by_time for e in self.effects)
         kept: dict[tuple, NDArray[np.complex128] | None] = {}
         for (fold, name), shares in self.measured.maps.items():
@@ -206,6 +225,10 @@ class EffectChain:
                 if key not in kept:
                     kept[key] = self._map(share.condition, share.seconds)
                 one = kept[key]
+                after = self._pattern(share.condition, share.seconds, gain * share.level)
+                if after is not None:
+                    after = share.weight * after
+                    delta = after if delta is None else delta + after
                 if one is not None:
                     one = (
                         share.weight
@@ -295,8 +318,8 @@ def reduce_map(change: NDArray[np.float64], axes: Axes) -> NDArray[np.float64]:
 
 
 def pad_areas(a: NDArray[np.float64], reach: int) -> NDArray[np.float64]:
-    """Area changes on a wider window, at most that of the closed form."""
-    more = min(reach, GRID // 2 - 1) - a.shape[-1] // 2
+    """Area changes on a wider window."""
+    more = reach - a.shape[-1] // 2
     if more <= 0:
         return a
     return np.pad(a, [(0, 0)] * (a.ndim - 2) + [(more, more)] * 2)

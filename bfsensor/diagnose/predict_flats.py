@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.fft import irfft2, next_fast_len, rfft2
 
 from bfsensor.effects.effect import Law
 
@@ -73,9 +74,12 @@ def periodic_covariances(
 
     Returns
     -------
-    covariances : ndarray, shape (n, :data:`GRID`, :data:`GRID`)
+    covariances : ndarray, shape (n, side, side)
+        The side is :data:`GRID`, or that of wider area changes.
     """
-    a_k = transform_areas(a) - law.loss
+    side = side_of(a)
+    # Of a covariance the even part of the areas counts; it has a real transform.
+    a_k = transform_areas(a, side) - law.loss
     m = np.asarray(levels, float)[:, None, None]
     if law.bend:
         # The integrating factor, over the charge s that a fluctuation came at; smooth.
@@ -89,7 +93,7 @@ def periodic_covariances(
         x = 2 * a_k * m
         small = np.abs(x) < 1e-9
         power = m * np.where(small, 1 + x / 2, np.expm1(x) / np.where(small, 1.0, x))
-    return np.asarray(np.fft.ifft2(power).real)
+    return np.asarray(irfft2(power, s=(side, side)))
 
 
 def quadrant(c: NDArray[np.float64], lags: int) -> NDArray[np.float64]:
@@ -115,10 +119,10 @@ def flat_response(
 
     Returns
     -------
-    response : ndarray, shape (n, :data:`GRID`, :data:`GRID`)
+    response : ndarray, shape (n, side, side // 2 + 1)
         By mode [e-^(2 + p)], to be multiplied by the transform of the change [1/e-^(1 + p)].
     """
-    a_k = transform_areas(a)
+    a_k = transform_areas(a, side_of(a))
     m = np.asarray(levels, float)[:, None, None]
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
     out = np.zeros(np.broadcast_shapes(a_k.shape, m.shape))
@@ -131,10 +135,15 @@ def flat_response(
     return out
 
 
-def transform_areas(a: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Transform of even area changes on the grid of the closed form, shape (..., GRID, GRID)."""
+def side_of(a: NDArray[np.float64]) -> int:
+    """Side of the periodic array of the closed form: :data:`GRID`, or that of wider areas."""
+    return max(GRID, int(next_fast_len(max(a.shape[-2:]), real=True)))
+
+
+def transform_areas(a: NDArray[np.float64], side: int) -> NDArray[np.float64]:
+    """Transform of area changes on a periodic array, shape (..., side, side // 2 + 1)."""
     ny, nx = a.shape[-2:]
-    wide = np.zeros((*a.shape[:-2], GRID, GRID))
+    wide = np.zeros((*a.shape[:-2], side, side))
     wide[..., :ny, :nx] = a
     wide = np.roll(wide, (-(ny // 2), -(nx // 2)), (-2, -1))
-    return np.asarray(np.fft.fft2(wide).real)
+    return np.asarray(rfft2(wide).real)

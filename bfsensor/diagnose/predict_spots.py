@@ -3,53 +3,107 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
+from scipy.interpolate import PchipInterpolator
 from scipy.special import ndtr
 
 from bfsensor.diagnose.spot_channels import STAMP, WING, stamp_moments
+from bfsensor.diagnose.spot_widths import fit_widths
 from bfsensor.effects.effect import Law
-from bfsensor.measure.spot_fit import fit_spots
-from bfsensor.measure.spots import Stamps
 
-STEPS = 16
+STEPS = 12
+"""Of equal light: widths of spots of one pixel and 1e6 e- are 5e-5 pixel off; 1.4e-4 with 8."""
+
+SPILLING = 24
+"""Steps where charge spills: what is measured turns sharply with the flux."""
+
+KNOTS = 4
+"""Fluxes at which spots are measured where nothing spills: nearly straight between them."""
+
+CHANGES = 7
+"""Fluxes, equal steps in their logarithm, at which changes after collection are found."""
+
+MEASURED = ("sigma_x", "sigma_y", "skew_x", "skew_y", "wings", "flux")
+
+LITTLE = 1e-5
+"""Excess charge that is no longer shared out [full wells]."""
+
+FEW = 4
+"""Places of spots that are crossed with one another where charge spills."""
+
 LINEAR = Law()
+NO_HALO = (0.0, 1.0)
+ALONE = (np.inf, 0.0)
 
 
 class _Light(NamedTuple):
-    """One Gaussian of the light of spots, by pixel, and how it lies along the edges."""
+    """One Gaussian of the light of spots: in each pixel along an axis, and at its far edge.
 
-    part: float
-    sigma: tuple[float, float]
-    along: tuple[NDArray[np.float64], NDArray[np.float64]]
-    at: tuple[NDArray[np.float64], NDArray[np.float64]]
-    below: tuple[NDArray[np.float64], NDArray[np.float64]]
+    ``edges``: the light at the edge and its first three derivatives, each over the factorial
+    of its order plus one: what a shift of the edge sweeps over is their power series.
+    """
+
+    along_x: NDArray[np.float64]
+    along_y: NDArray[np.float64]
+    edges_x: NDArray[np.float64]
+    edges_y: NDArray[np.float64]
 
     @classmethod
     def of(
-        cls, part: float, sigma: tuple[float, float], edge: NDArray, x: NDArray, y: NDArray
+        cls,
+        part: float,
+        sigma: tuple[float, float],
+        phases: NDArray[np.float64],
+        neighbours: tuple[float, float] = ALONE,
     ) -> _Light:
-        along_x = part * np.diff(ndtr((edge - x[:, None]) / sigma[0]), axis=1)[:, None]
-        along_y = np.diff(ndtr((edge - y[:, None]) / sigma[1]), axis=1)[:, :, None]
-        at_x = (edge[1:] - x[:, None])[:, None] / sigma[0]
-        at_y = (edge[1:] - y[:, None])[:, :, None] / sigma[1]
-        return cls(part, sigma, (along_x, along_y), (at_x, at_y), (ndtr(at_x), ndtr(at_y)))
+        along_x, edges_x = _lines(phases[:, 0], sigma[0], neighbours)
+        along_y, edges_y = _lines(phases[:, 1], sigma[1], neighbours)
+        return cls(
+            part * along_x[:, None], along_y[:, :, None],
+            part * edges_x[:, :, None], edges_y[:, :, :, None],
+        )  # fmt: skip
 
     @property
     def whole(self) -> NDArray[np.float64]:
-        return self.along[1] * self.along[0]
+        return self.along_y * self.along_x
 
     def across_x(self, shift: NDArray[np.float64]) -> NDArray[np.float64]:
         """Light between right edges and where their shifts put them."""
-        moved = ndtr(self.at[0] + shift / self.sigma[0]) - self.below[0]
-        return self.part * self.along[1] * moved
+        return self.along_y * _swept(self.edges_x, shift)
 
     def across_y(self, shift: NDArray[np.float64]) -> NDArray[np.float64]:
         """Light between upper edges and where their shifts put them."""
-        return self.along[0] * (ndtr(self.at[1] + shift / self.sigma[1]) - self.below[1])
+        return self.along_x * _swept(self.edges_y, shift)
+
+
+def _lines(
+    centre: NDArray[np.float64], sigma: float, neighbours: tuple[float, float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Pixels of a Gaussian along one axis, shape (n, 21), and series at their far edges."""
+    pitch, share = neighbours
+    along: NDArray[np.float64] | float = 0.0
+    series: NDArray[np.float64] | float = 0.0
+    for n in (-1, 0, 1) if share else (0,):
+        part = share if n else 1.0
+        there = centre[:, None] + (n * pitch if n else 0.0)
+        t = (np.arange(WING + 1) - WING / 2 - there) / sigma
+        along = along + part * np.diff(ndtr(t), axis=1)
+        t = t[:, 1:]
+        density = part * np.exp(-0.5 * t * t) / np.sqrt(2 * np.pi)
+        series = series + np.array([
+            density / sigma, -t * density / (2 * sigma**2),
+            (t * t - 1) * density / (6 * sigma**3), (3 - t * t) * t * density / (24 * sigma**4),
+        ])  # fmt: skip
+    return np.asarray(along), np.asarray(series)
+
+
+def _swept(series: NDArray[np.float64], s: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(s * (series[0] + s * (series[1] + s * (series[2] + s * series[3]))))
 
 
 def spill(
@@ -62,8 +116,8 @@ def spill(
     charge = charge.copy()
     for _ in range(rounds):
         excess = np.maximum(charge - full_well, 0.0)
-        if not excess.any():
-            return charge
+        if excess.max() < LITTLE * full_well:
+            break
         charge -= excess
         charge[:, 1:] += 0.5 * excess[:, :-1]
         charge[:, :-1] += 0.5 * excess[:, 1:]
@@ -78,7 +132,8 @@ def grow_spots(
     phases: NDArray[np.float64],
     flux: float,
     steps: int = STEPS,
-    halo: tuple[float, float] = (0.0, 1.0),
+    halo: tuple[float, float] = NO_HALO,
+    neighbours: tuple[float, float] = ALONE,
     law: Law = LINEAR,
     slopes: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> NDArray[np.float64]:
@@ -99,9 +154,12 @@ def grow_spots(
     flux : float
         Electrons of a whole spot at the end [e-].
     steps : int
-        Steps of equal charge; the error falls with their square.
+        Steps of equal charge; the error falls with the third power of their number.
     halo : tuple of float
         Share of the light in a wide component, and the sigma that it has more [pixel].
+    neighbours : tuple of float
+        Distance of the next spots in x and y [pixel], and how many of the places there hold
+        one: of their light the halo alone reaches so far.
     law : Law
         How collection departs from linear shifts; what is beyond the full well is spilled.
     slopes : tuple of ndarray, optional
@@ -113,36 +171,44 @@ def grow_spots(
     images : ndarray, shape (steps, n, 21, 21)
         Electrons at the end of each step [e-].
     """
-    size = WING
-    edge = np.arange(size + 1) - size / 2
-    x, y = np.asarray(phases, float).T
-    parts = [_Light.of(1.0 - halo[0], sigma, edge, x, y)]
+    centres = np.asarray(phases, float)
+    parts = [_Light.of(1.0 - halo[0], sigma, centres)]
     if halo[0]:
         wide = float(np.hypot(sigma[0], halo[1])), float(np.hypot(sigma[1], halo[1]))
-        parts.append(_Light.of(halo[0], wide, edge, x, y))
-    light = np.sum([part.whole for part in parts], axis=0)
-    padded = next_fast_len(size + kx.shape[0] - 1)
-    spectra = [rfft2(k, s=(padded, padded)) for k in (kx, ky)]
-    bent = [] if slopes is None else [rfft2(k, s=(padded, padded)) for k in slopes]
-    half = kx.shape[0] // 2
-    inside = slice(half, half + size)
+        parts.append(_Light.of(halo[0], wide, centres, neighbours))
+    each = flux / steps
+    light = each * np.sum([part.whole for part in parts], axis=0)
+    # Farther than across the image no shift is asked for; a cyclic array need not be wider.
+    half = min(kx.shape[0] // 2, WING - 1)
+    kept = slice(kx.shape[0] // 2 - half, kx.shape[0] // 2 + half + 1)
+    side = next_fast_len(WING + half, real=True)
+    both = np.zeros((2, 1, side, side))
+    both[:, 0, : 2 * half + 1, : 2 * half + 1] = kx[kept, kept], ky[kept, kept]
+    spectra = rfft2(np.roll(both, (-half, -half), (-2, -1)))
+    bent = None
+    if slopes is not None:
+        more = np.zeros_like(both)
+        more[:, 0, : 2 * half + 1, : 2 * half + 1] = (
+            slopes[0][kept, kept],
+            slopes[1][kept, kept],
+        )
+        bent = rfft2(np.roll(more, (-half, -half), (-2, -1)))
     charge = np.zeros_like(light)
     out = np.empty((steps, *light.shape))
-    each = flux / steps
+    # Gains of the last step and of the one before: they go nearly straight with time.
+    last, before = light, light
     for step in range(steps):
-        middle = charge + 0.5 * each * light
-        squared = rfft2(0.5 * middle**2, s=(padded, padded)) if bent else None
+        # In the first step the gain itself has grown by half of what it grows in later ones.
+        coming = last + (last - before) * (2.0 if step == 1 else 1.0)
+        middle = charge + 0.5 * coming - 0.125 * (coming - last)
+        kept_part = np.exp(-law.loss * middle) if law.loss else None
+        squared = None if bent is None else rfft2(0.5 * middle**2, s=(side, side))
         if law.bend:
             middle = middle * (1 + 0.5 * law.bend * middle)
-        seen = rfft2(middle, s=(padded, padded))
-        shift_x, shift_y = (
-            irfft2(seen * k, s=(padded, padded))[:, inside, inside] for k in spectra
-        )
-        if squared is not None:
-            for shift, k in zip((shift_x, shift_y), bent, strict=True):
-                shift += irfft2(squared * k, s=(padded, padded))[:, inside, inside]
-        gained = each * light
-        # Light changes across a shift of a tenth of a pixel: its integral, not its value.
+        seen = rfft2(middle, s=(side, side))
+        moved = seen * spectra if squared is None else seen * spectra + squared * bent
+        shift_x, shift_y = irfft2(moved, s=(side, side))[..., :WING, :WING]
+        gained = light.copy()
         across = each * np.sum([part.across_x(shift_x) for part in parts], axis=0)
         across[..., -1] = 0.0
         gained += across
@@ -151,13 +217,33 @@ def grow_spots(
         across[:, -1] = 0.0
         gained += across
         gained[:, 1:] -= across[:, :-1]
-        if law.loss:
-            gained = gained * np.exp(-law.loss * (charge + 0.5 * gained))
+        if kept_part is not None:
+            gained = gained * kept_part
         charge = charge + gained
+        last, before = gained, last
         if charge.max() > law.full_well:
             charge = spill(charge, law.full_well)
         out[step] = charge
     return out
+
+
+def representative_phases(phases: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Four centres whose mean of what changes smoothly over a pixel is nearly that of all.
+
+    In x and in y the means of the four quarters of the sorted places, of evenly spread ones
+    exact up to three waves a pixel; put together so that x and y do not correlate.
+
+    Parameters
+    ----------
+    phases : ndarray, shape (n, 2)
+        Centres within their pixels [pixel].
+    """
+    quarters = [
+        [part.mean() if part.size else np.nan for part in np.array_split(np.sort(v), 4)]
+        for v in np.asarray(phases, float).T
+    ]
+    out = np.array([quarters[0], [quarters[1][n] for n in (1, 3, 0, 2)]]).T
+    return np.where(np.isfinite(out), out, np.mean(phases, axis=0))
 
 
 def predict_spots(
@@ -167,7 +253,8 @@ def predict_spots(
     sigma: tuple[float, float],
     phases: NDArray[np.float64],
     fluxes: ArrayLike,
-    halo: tuple[float, float] = (0.0, 1.0),
+    halo: tuple[float, float] = NO_HALO,
+    neighbours: tuple[float, float] = ALONE,
     law: Law = LINEAR,
     slopes: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
     change: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
@@ -179,8 +266,9 @@ def predict_spots(
     kx, ky, sigma, phases
         As for :func:`grow_spots`.
     fluxes : array_like, shape (n,)
-        Electrons of a spot [e-].
-    halo, law, slopes
+        Electrons of a spot as they are read, with what is lost or lies beside, after ``change``
+        [e-].
+    halo, neighbours, law, slopes
         As for :func:`grow_spots`.
     change : callable, optional
         What happens to the images [e-] after collection.
@@ -193,32 +281,69 @@ def predict_spots(
     """
     wanted = np.asarray(fluxes, float)
     top = float(wanted.max())
-    images = grow_spots(
-        kx, ky, sigma=sigma, phases=phases, flux=top, halo=halo, law=law, slopes=slopes
-    )
-    names = ["sigma_x", "sigma_y", "skew_x", "skew_y", "wings", "flux"]
-    knots, rows = [], []
+    centres = np.asarray(phases, float)
+    grow = partial(
+        grow_spots, kx, ky, sigma=sigma, flux=top, halo=halo, neighbours=neighbours, law=law,
+        slopes=slopes,
+    )  # fmt: skip
+    every = STEPS // KNOTS
+    images = grow(phases=centres)
+    spilling = bool(images[-1].max() >= law.full_well)
+    if spilling:
+        # Where the first pixels spill depends on places: all in x with all in y.
+        if len(centres) <= FEW:
+            centres = np.array(np.meshgrid(*centres.T)).reshape(2, -1).T
+        every = 1
+        images = grow(phases=centres, steps=SPILLING)
+    measure = partial(_measure, sigma=sigma, centres=centres)
+    light = top * np.arange(every, len(images) + 1, every) / len(images)
+    plain = measure(images[every - 1 :: every])
+    lines = _interpolate(plain[:, -1], np.column_stack([plain[:, :-1], plain[:, -1] - light]),
+                         turning=spilling)  # fmt: skip
+    if change is None or np.array_equal(change(images[-1]), images[-1]):
+        return dict(zip(MEASURED, lines(wanted).T, strict=True))
+    # What comes after collection need not be smooth: between fluxes as they are.
+    knots = np.geomspace(min(wanted.min(), 0.999 * top), top, CHANGES)
+    those = np.array([_image_at(images, flux / top) for flux in knots])
+    both = measure(np.concatenate([those, change(those)]))
+    changes = PchipInterpolator(np.log(knots), both[CHANGES:] - both[:CHANGES])
+    before = wanted
+    for _ in range(2):
+        before = wanted - changes(np.log(before))[:, -1]
+    return dict(zip(MEASURED, (lines(before) + changes(np.log(before))).T, strict=True))
+
+
+def _interpolate(
+    knots: NDArray[np.float64], values: NDArray[np.float64], *, turning: bool
+) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Lines through values at knots of the flux: cubics, or pieces where they turn sharply."""
+    if turning:
+        pieces = PchipInterpolator(knots, values)
+        return lambda flux: np.asarray(pieces(np.maximum(flux, knots[0])))
+    scale = knots[-1]
+    line = np.linalg.solve(np.vander(knots / scale, increasing=True), values)
+    return lambda flux: np.vander(flux / scale, len(knots), increasing=True) @ line
+
+
+def _image_at(images: NDArray[np.float64], part: float) -> NDArray[np.float64]:
+    """Images at a part of their last flux, their shapes being straight in it between steps."""
+    at = part * len(images)
+    low = int(np.clip(np.floor(at), 1, len(images) - 1))
+    one, two = images[low - 1] / low, images[low] / (low + 1)
+    return np.asarray(at * (one + (at - low) * (two - one)))
+
+
+def _measure(
+    wide: NDArray[np.float64], sigma: tuple[float, float], centres: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """What the channels measure of k images, shape (k, 6), in the order of :data:`MEASURED`."""
+    count, n = wide.shape[:2]
     margin = (WING - STAMP) // 2
-    for step in range(STEPS // 4 - 1, STEPS, STEPS // 4):
-        wide = images[step] if change is None else change(images[step])
-        stamps = wide[:, margin:-margin, margin:-margin]
-        fit = fit_spots(
-            Stamps(stamps),
-            weights="equal",
-            largest_offset=2.0,
-            limit=1e6,
-            correct_bias=False,
-        )
-        moments = stamp_moments(stamps, wide, fit.centre_x, fit.centre_y)
-        rows.append(
-            [fit.sigma_x, fit.sigma_y, *(float(moments[n].mean()) for n in names[2:])]
-        )
-        knots.append(top * (step + 1) / STEPS)
-        rows[-1][-1] -= knots[-1]
-    table = np.array(rows)
-    # Nearly straight in the flux: the cubic through four points.
-    out = {}
-    for n, name in enumerate(names):
-        line = np.polynomial.Polynomial.fit(np.array(knots), table[:, n], 3)
-        out[name] = line(wanted)
-    return out
+    stamps = wide[..., margin:-margin, margin:-margin]
+    fit = fit_widths(stamps, sigma, centres)
+    moments = stamp_moments(
+        stamps.reshape(count * n, STAMP, STAMP), wide.reshape(count * n, WING, WING),
+        fit.centre_x.ravel(), fit.centre_y.ravel(),
+    )  # fmt: skip
+    means = [moments[name].reshape(count, n).mean(1) for name in MEASURED[2:]]
+    return np.array([fit.sigma_x, fit.sigma_y, *means]).T

@@ -44,8 +44,8 @@ class Template:
     where: Mapping[str, object] = field(default_factory=dict)
 
 
-def make_templates(fit: BaselineFit) -> list[Template]:
-    """All templates that the channels of a fit allow.
+def make_templates(fit: BaselineFit) -> Iterator[Template]:
+    """Make all templates that the channels of a fit allow, one after another.
 
     Every template is a pattern in the units of its channel, spread over all folds that the fit
     holds: a flux power of one lag, a step in time, a strip.
@@ -53,7 +53,6 @@ def make_templates(fit: BaselineFit) -> list[Template]:
     by_word: dict[str, list[tuple[Channel, int]]] = {}
     for channel, start in zip(fit.channels, fit.starts, strict=False):
         by_word.setdefault(channel.word, []).append((channel, int(start)))
-    out: list[Template] = []
     makers = {
         "flat_cov": _covariances, "flat_mean": _means, "flat_map": _maps,
         "serial_overscan": _overscan, "parallel_overscan": _overscan, "bias_cov": _noise,
@@ -65,8 +64,7 @@ def make_templates(fit: BaselineFit) -> list[Template]:
         for family, pattern, where in makers[word](group):
             template = group.template(family, pattern, where)
             if template is not None:
-                out.append(template)
-    return out
+                yield template
 
 
 class Group:
@@ -412,20 +410,27 @@ def _spots(g: Group) -> Iterator[Pattern]:
 def _codes(g: Group) -> Iterator[Pattern]:
     """Bits, single codes, by amplifier."""
     x = g.axes
-    code = x["code"].astype(int)
-    for name, here in _amplifiers(x):
+    code, multiple = x["code"].astype(int), x["bit"].astype(int)
+    for name, amp in _amplifiers(x):
+        here = amp & (code >= 0)
         bit = 1
         while bit <= code.max():
             yield "code bits", np.where(here, np.where(code & bit, 1.0, -1.0), 0.0), {
                 "amp": name, "bit": bit,
             }  # fmt: skip
             bit *= 2
-        for one in np.unique(code):
+        for one in np.unique(code[here]):
             yield (
                 "codes",
                 np.where(here & (code == one), 1.0, 0.0),
                 {"amp": name, "code": int(one)},
             )
+        for power, below in sorted(
+            set(zip(multiple[code < 0], code[code < 0], strict=True))
+        ):
+            yield "codes below high bits", np.where(
+                amp & (multiple == power) & (code == below), 1.0, 0.0
+            ), {"amp": name, "bit": 2 ** int(power), "code": int(below)}  # fmt: skip
 
 
 def _single(g: Group) -> Iterator[Pattern]:

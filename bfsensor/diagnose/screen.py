@@ -17,6 +17,10 @@ from bfsensor.effects.effect import Effect, Parameter
 REFINED = 2
 """Best starts of a candidate that are refined."""
 
+OCCAM = 5.0
+"""Logarithm of the evidence that a parameter costs a candidate that is not fitted on, for it is
+far from the best (a third of a per cent of its range is about what data allow)."""
+
 MOST_CALLS = 15
 """Evaluations of a refinement for each of its parameters."""
 
@@ -98,8 +102,12 @@ class Screen:
             out[start : start + len(channel)] = channel.whiten(moved)
         return np.asarray(out - self.fit.basis @ (self.fit.basis.T @ out))
 
-    def best(self, kind: type[Effect]) -> Rival | None:
-        """Best parameters of a kind of effect; None where nothing of it could be seen."""
+    def tried(self, kind: type[Effect]) -> list[tuple[float, Effect]]:
+        """Places where a fit of a kind of effect may begin, with their gains, greatest first.
+
+        Amplitudes are those that fit best, to first order; empty where nothing of it could be
+        seen.
+        """
         starts = kind.starts(self.predictor.layout, self.seen)
         tried: list[tuple[float, Effect]] = []
         for values in starts:
@@ -114,10 +122,26 @@ class Screen:
                 tried.append((0.0, effect))
                 continue
             tried.append((factor**2 * length, _inside(effect.scaled(factor))))
+        return sorted(tried, key=lambda t: -t[0])
+
+    def best(
+        self, tried: Sequence[tuple[float, Effect]], *, least: float = 0.0
+    ) -> Rival | None:
+        """Best parameters of a kind of effect; None where nothing of it could be seen.
+
+        Parameters
+        ----------
+        tried : sequence of (float, Effect)
+            From :meth:`tried`.
+        least : float
+            Gain of a start below which it is not worth while to fit on from there.
+        """
         if not tried:
             return None
-        tried.sort(key=lambda t: -t[0])
-        rivals = [self._refine(effect) for _, effect in tried[:REFINED]]
+        if tried[0][0] < least:
+            gain, effect = tried[0]
+            return Rival(effect, gain, 0.5 * gain - OCCAM, self.change(effect))
+        rivals = [self._refine(effect) for gain, effect in tried[:REFINED] if gain >= least]
         return max(rivals, key=lambda r: r.gain)
 
     def _refine(self, effect: Effect) -> Rival:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from bfsensor.device import Device
 from bfsensor.diagnose.baseline import Baseline, read_edges
-from bfsensor.diagnose.device_baseline import baseline_of_device, write_edges
+from bfsensor.diagnose.device_baseline import TABLES, baseline_of_device, write_edges
 from bfsensor.diagnose.free_baseline import free_baseline
 from bfsensor.diagnose.table_baseline import baseline_of_table
 from bfsensor.errors import DeviceError, DiagnosisError
@@ -175,7 +175,9 @@ def simulate_baseline(
         device = Device.load(given)
     except DeviceError as error:
         raise DiagnosisError(f"parameters float for a device: {error}") from None
-    text = "\n".join([device.to_toml(), *parameters, *(f"{b:g}" for b in back_biases)])
+    text = "\n".join([
+        TABLES, device.to_toml(), *parameters, *(f"{b:g}" for b in back_biases)
+    ])  # fmt: skip
     path = keep / f"baseline_{hashlib.sha256(text.encode()).hexdigest()[:12]}.json"
     if not path.exists():
         baseline = baseline_of_device(

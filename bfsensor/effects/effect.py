@@ -109,6 +109,9 @@ class Layout:
         Exposures in the order of time.
     gains : tuple of float
         Of the amplifiers [e-/ADU].
+    offsets, read_noise : tuple of float
+        Mean code without light and read noise of the amplifiers [ADU]; empty, or nan, where not
+        known.
     reference : tuple of float
         Wavelength [nm], back bias [V] and temperature [C] that a baseline is given for.
     pixel, thickness : float
@@ -128,6 +131,27 @@ class Layout:
     thickness: float = 100.0
     front: float = 8.0
     absorption: Mapping[float, float] = field(default_factory=dict)
+    offsets: tuple[float, ...] = ()
+    read_noise: tuple[float, ...] = ()
+
+    def of_amp(self, name: str, amp: NDArray) -> Values:
+        """Give an attribute of the segments, by name, of given amplifiers."""
+        if not self.segments:
+            # A reduced recording: nothing of it lies anywhere on a sensor.
+            return np.zeros(np.shape(amp))
+        every = np.array([getattr(s, name) for s in self.segments], float)
+        return np.asarray(every[np.asarray(amp).astype(int)])
+
+    def frame_width(self, amp: NDArray) -> Values:
+        """Columns of given amplifiers' frames, prescan and overscan among them."""
+        names = "prescan", "columns", "serial_overscan"
+        return np.asarray(np.sum([self.of_amp(n, amp) for n in names], axis=0))
+
+    def backwards(self, axis: str) -> float:
+        """Share of the light that is read against an axis, 'x' or 'y'."""
+        area = np.array([s.columns * s.rows for s in self.segments], float)
+        flipped = np.array([getattr(s, f"flip_{axis}") for s in self.segments])
+        return float((area * flipped).sum() / area.sum())
 
 
 class Law(NamedTuple):
@@ -218,6 +242,9 @@ class Effect:
 
     def __reduce__(self) -> tuple[type[Effect], tuple[dict[str, float]]]:
         return type(self), (dict(self.values),)
+
+    def __hash__(self) -> int:
+        return hash((type(self), tuple(sorted(self.values.items()))))
 
     def __getitem__(self, name: str) -> float:
         return self.values[name]
@@ -379,7 +406,8 @@ class Effect:
         c : ndarray, shape (n, ny, nx)
             Periodic, lag (0, 0) in the corner, by flat.
         axes : mapping
-            Of the flats, shape (n,): 'amp', 'level' [e-], 'time' [s], conditions.
+            Of the flats, shape (n,): 'amp', 'level' [e-], 'time' [s], 'hours' since the first
+            exposure, conditions.
         layout : Layout
             Of the sensor.
         """
@@ -398,7 +426,11 @@ class Effect:
         return _nothing(axes)
 
     def serial_overscan(self, axes: Axes, layout: Layout) -> Values:
-        """Added to the k-th pixel of the serial overscan behind flats [e-]."""
+        """Added to the k-th pixel of the serial overscan behind flats [e-].
+
+        The profile's zero, its last pixels, is taken off by the caller, and so is the zero of
+        the means of flats, the overscan's second half.
+        """
         return _nothing(axes)
 
     def parallel_overscan(self, axes: Axes, layout: Layout) -> Values:
@@ -410,7 +442,11 @@ class Effect:
         return _nothing(axes)
 
     def bias_level(self, axes: Axes, layout: Layout) -> Values:
-        """Added to bias levels [e-]; where 'what' is 'rows' to their variance [e-^2]."""
+        """Added to bias levels [e-], or to variances [e-^2].
+
+        Where 'what' is 'rows': to the variance of rows' means over that of white noise of the
+        same total; where it is 'frames': to that of frames' levels.
+        """
         return _nothing(axes)
 
     def dark_map(self, axes: Axes, layout: Layout) -> Values:
@@ -422,7 +458,12 @@ class Effect:
         return _nothing(axes)
 
     def code_hist(self, axes: Axes, layout: Layout) -> Values:
-        """Added to the relative frequencies of codes by remainder."""
+        """Added to the relative frequencies of codes.
+
+        By remainder; where 'bit' is n > 0, of the ``-code``-th code below those that 2^n is the
+        highest power of two in, over its neighbours', 'share' being the part that those make of
+        all multiples of 64.
+        """
         return _nothing(axes)
 
 

@@ -4,22 +4,59 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from bfsensor.effects.adc_bits import AdcBits
+from bfsensor.effects.amp_crosstalk import AmpCrosstalk
+from bfsensor.effects.bf_anisotropy import BrighterFatterAnisotropy
+from bfsensor.effects.bf_chromatic import BrighterFatterChromatic
+from bfsensor.effects.bf_long_range import BrighterFatterLongRange
+from bfsensor.effects.bf_nonlinear import BrighterFatterNonlinear
+from bfsensor.effects.bias_instability import BiasByFrame, BiasByRow, BiasRamp
 from bfsensor.effects.charge_loss import ChargeLoss
+from bfsensor.effects.correlated_noise import CommonNoise, NoiseInTime, Pickup
+from bfsensor.effects.cti_parallel import CtiParallel
+from bfsensor.effects.cti_serial import CtiSerial
 from bfsensor.effects.effect import Effect
+from bfsensor.effects.electronic_memory import ElectronicMemory
+from bfsensor.effects.gain_drift import GainDrift
 from bfsensor.effects.gain_nonlinearity import GainNonlinearity
 from bfsensor.effects.interpixel_coupling import InterpixelCoupling
+from bfsensor.effects.lateral_diffusion import LateralDiffusion
+from bfsensor.effects.psf_wings import PsfWings
+from bfsensor.effects.saturation import Saturation
 from bfsensor.effects.tearing import Tearing
 from bfsensor.effects.trap_serial import TrapSerial
+from bfsensor.effects.voltage_dependence import VoltageDependence
 from bfsensor.errors import EffectError
 
 LIBRARY: tuple[type[Effect], ...] = (
+    BrighterFatterAnisotropy,
+    BrighterFatterChromatic,
+    BrighterFatterLongRange,
+    BrighterFatterNonlinear,
+    AdcBits,
+    AmpCrosstalk,
+    BiasByFrame,
+    BiasByRow,
+    BiasRamp,
     ChargeLoss,
+    CommonNoise,
+    CtiParallel,
+    CtiSerial,
+    ElectronicMemory,
+    GainDrift,
     GainNonlinearity,
     InterpixelCoupling,
+    LateralDiffusion,
+    PsfWings,
+    Saturation,
+    NoiseInTime,
+    Pickup,
     Tearing,
     TrapSerial,
+    VoltageDependence,
 )
-"""Every candidate, one for each variant of a class."""
+"""Every candidate, one for each variant of a class; those of a device's parameters are made for a
+baseline, by :func:`bfsensor.effects.device_parameter.device_parameters`."""
 
 
 def make_effect(word: str, values: Mapping[str, float], variant: str = "") -> Effect:

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Seen, Values
+from bfsensor.effects.effect import (
+    Axes,
+    Effect,
+    Image,
+    Layout,
+    Parameter,
+    Seen,
+    Segment,
+    Shot,
+    Values,
+)
 
 
 class TrapSerial(Effect):
@@ -14,7 +24,8 @@ class TrapSerial(Effect):
 
     ``amp`` counts the amplifiers from zero.  Each row meets it empty: the parallel transfer
     takes far longer than the release.  Behind a row of light the first k-th pixel of the
-    overscan holds size (1 - exp(-1/tau)) exp(-(k-1)/tau) electrons.
+    overscan holds size (1 - exp(-1/tau)) exp(-(k-1)/tau) electrons; what it holds there is
+    missing in the first column.
     """
 
     word = "trap_serial"
@@ -24,10 +35,10 @@ class TrapSerial(Effect):
         Parameter("tau", "pixel times", 0.7, 4.0),
         Parameter("amp", "", 0, 1, law="whole"),
     )
-    touches = ("serial_overscan",)
+    touches = ("serial_overscan", "flat_map", "flat_mean", "spot")
     source = (
         "Single-species trap with instant capture: ArCTIc, Massey et al. 2014, MNRAS 439, 887; "
-        "fixed serial traps of ITL sensors: Snyder & Roodman 2019, Proc. SPIE 11117"
+        "fixed serial traps of ITL sensors: Snyder & Roodman 2019, JATIS 5, 041509"
     )
 
     @classmethod
@@ -39,12 +50,52 @@ class TrapSerial(Effect):
         ]
 
     def shift(self, frame: Image, amp: int, layout: Layout) -> Image:
-        size, tau = self["size"], self["tau"]
-        if amp != int(self["amp"]) or size == 0:
+        if amp != int(self["amp"]) or self["size"] == 0:
             return frame
+        return self._through(frame)
+
+    def pattern(self, shot: Shot, layout: Layout) -> Values | None:
+        segment = self._segment(layout)
+        if segment is None or shot.level <= 0:
+            return None
+        out = np.zeros(layout.shape)
+        column = segment.x + (segment.columns - 1 if segment.flip_x else 0)
+        out[segment.y : segment.y + segment.rows, column] = -min(
+            self["size"] / shot.level, 1.0
+        )
+        return out
+
+    def flat_mean(self, axes: Axes, layout: Layout) -> Values:
+        return -self._held(axes) / layout.of_amp("columns", axes["amp"])
+
+    def serial_overscan(self, axes: Axes, layout: Layout) -> Values:
+        # Full behind any light that exceeds it: the last pixel of a flat refills what it lost.
+        fall = np.exp(-(axes["k"] - 1) / self["tau"])
+        return -np.expm1(-1 / self["tau"]) * self._held(axes) * fall
+
+    def spot_image(
+        self, images: Values, axes: Mapping[str, float], layout: Layout
+    ) -> Values:
+        segment = self._segment(layout)
+        if segment is None or self["size"] == 0:
+            return images
+        # Spots are far enough apart to find the trap empty; measured are means of all spots.
+        share = (
+            segment.columns
+            * segment.rows
+            / sum(s.columns * s.rows for s in layout.segments)
+        )
+        order = slice(None, None, -1 if segment.flip_x else 1)
+        lines = images[..., order].reshape(-1, images.shape[-1])
+        read = self._through(lines).reshape(images.shape)[..., order]
+        return images + share * (read - images)
+
+    def _through(self, frame: Image) -> Image:
+        """Rows after the trap, first pixel first."""
+        size = self["size"]
         out = np.empty_like(frame)
         held = np.zeros(len(frame))
-        released = -np.expm1(-1 / tau)
+        released = -np.expm1(-1 / self["tau"])
         for column in range(frame.shape[1]):
             free = held * released
             held = held - free
@@ -54,9 +105,12 @@ class TrapSerial(Effect):
             held = held + caught
         return out
 
-    def serial_overscan(self, axes: Axes, layout: Layout) -> Values:
-        # Full behind any light that exceeds it: the last pixel of a flat refills what it lost.
-        held = np.minimum(self["size"], np.maximum(axes["level"], 0.0))
-        fall = np.exp(-(axes["k"] - 1) / self["tau"])
+    def _held(self, axes: Axes) -> Values:
+        """Behind the light of a flat, in the trap's amplifier [e-]."""
         mine = axes["amp"].astype(int) == int(self["amp"])
-        return np.where(mine, -np.expm1(-1 / self["tau"]) * held * fall, 0.0)
+        held = np.minimum(self["size"], np.maximum(axes["level"], 0.0))
+        return np.where(mine, held, 0.0)
+
+    def _segment(self, layout: Layout) -> Segment | None:
+        n = int(self["amp"])
+        return layout.segments[n] if n < len(layout.segments) else None

@@ -13,6 +13,7 @@ from bfsensor._kernels.areas import convolved_areas, pixel_areas
 from bfsensor._kernels.photons import Light
 from bfsensor._kernels.shifts import Charges
 from bfsensor.errors import SensorError
+from bfsensor.sensor.applied import AppliedEffects
 from bfsensor.sensor.areas import AreaKernels, area_kernels
 from bfsensor.sensor.exposure import Exposure, Physics
 from bfsensor.sensor.pattern import ShiftMap, make_pattern, sample_rings
@@ -32,6 +33,7 @@ class EngineSensor(galsim.SiliconSensor):
 
     threads: int = 1
     shift_map: ShiftMap | None = None
+    _applied: AppliedEffects | None = None
     treering_func: Any
     rng: Any
 
@@ -47,6 +49,10 @@ class EngineSensor(galsim.SiliconSensor):
 
     def _check_charge(self, image: NDArray[np.floating]) -> None:
         """Refuse charge that the sensor was told to refuse."""
+
+    def _change_light(self, light: Light) -> Light:
+        """Change light before it enters the silicon."""
+        return light
 
     # -- set up ------------------------------------------------------------------------
 
@@ -98,6 +104,7 @@ class EngineSensor(galsim.SiliconSensor):
         ``photons``: their number; ``spilled`` electrons beyond the full well,
         ``spilled_off_image`` those of them that left along the column; ``off_image``: flux
         beside the image; ``crossed``: flux that crossed the silicon unconverted;
+        ``lost``: flux that an effect takes from where charge is;
         ``beyond_table``: renewals of a pixel with more charge than table and full well
         reach, for which the response of the last level was held.
         """
@@ -158,7 +165,7 @@ class EngineSensor(galsim.SiliconSensor):
                     "accumulate was called with resume, but with an image other than that of "
                     "the call before"
                 )
-        array = _pixels(image)
+        array = pixels_of(image)
         light = _light(photons)
         if resume and array.shape != (self._exposure.charges.ny, self._exposure.charges.nx):
             raise galsim.GalSimError(
@@ -172,7 +179,7 @@ class EngineSensor(galsim.SiliconSensor):
         assert self._exposure is not None
         if resume and recalc:
             self._exposure.renew(array)
-        return self._exposure.add(array, light)
+        return self._exposure.add(array, self._change_light(light))
 
     def _expose(
         self,
@@ -227,11 +234,11 @@ class EngineSensor(galsim.SiliconSensor):
         areas : galsim.Image
             In units of the nominal area, same bounds and type.
         """
-        array = _pixels(image, write=False)
+        array = pixels_of(image, write=False)
         self._check_finite(array)
         pattern = self._place_pattern(image, orig_center)
         out = np.empty(array.shape)
-        fixed = pattern.rings.size > 0 or pattern.map_x.size > 0
+        fixed = any(p.size > 0 for p in (pattern.rings, pattern.map_x, pattern.edge_x))
         if not use_flux:
             charges = _no_charges(array.shape, self._physics)
         else:
@@ -309,7 +316,7 @@ def _no_charges(shape: tuple[int, int], physics: Physics) -> Charges:
     )
 
 
-def _pixels(image: galsim.Image, *, write: bool = True) -> NDArray[np.floating]:
+def pixels_of(image: galsim.Image, *, write: bool = True) -> NDArray[np.floating]:
     """Give the array of an image that the engine can use."""
     if not image.bounds.isDefined():
         raise galsim.GalSimUndefinedBoundsError(

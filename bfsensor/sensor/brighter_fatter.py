@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from functools import lru_cache
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,24 +13,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor._kernels.photons import Medium
-from bfsensor._kernels.shifts import Edges
 from bfsensor.device import Device
-from bfsensor.errors import SensorError, TableError
-from bfsensor.resources import tables_dir
-from bfsensor.sensor.base import EngineSensor
+from bfsensor.effects.effect import Layout
+from bfsensor.errors import SensorError
 from bfsensor.sensor.drift import MEASURED, STEPS, solve_drift
-from bfsensor.sensor.edges import make_edges, transpose_sides
+from bfsensor.sensor.effect_sensor import EffectSensor
 from bfsensor.sensor.exposure import Physics
+from bfsensor.sensor.options import (
+    check_number,
+    check_table,
+    check_word,
+    find_table,
+    load_table,
+)
 from bfsensor.sensor.pattern import ShiftMap
-from bfsensor.sensor.response import EffectiveCharge, factor_table
+from bfsensor.sensor.shifts import make_shifts
 from bfsensor.sensor.silicon_sensor import check_rings
 from bfsensor.table import DistortionTable
 
 _WAVELENGTHS = np.arange(250.0, 1451.0, 1.0)  # nm
 _TRANSPARENT = 1e30  # um; length of light that is not absorbed
+_CELSIUS = 273.15  # K
 
 
-class BrighterFatterSensor(EngineSensor):
+class BrighterFatterSensor(EffectSensor):
     r"""A thick CCD: photons become electrons where the stored charge lets them land.
 
     Every pixel's charge moves the boundaries around it by what the distortion table of the
@@ -99,6 +105,28 @@ class BrighterFatterSensor(EngineSensor):
         Threads of one call.
     table : DistortionTable, optional
         A table in memory, in place of ``name``.
+    effects : path-like, mapping or sequence, optional
+        Physics that a diagnosis found missing: the report.json of ``bfsensor diagnose``, what it
+        holds, its list of effects, or :class:`bfsensor.effects.effect.Effect` objects.  See Notes.
+    conditions : mapping, optional
+        What effects may ask of the exposures: ``wavelength`` [nm] of the light, ``back_bias`` [V],
+        ``temperature`` [C], ``seconds``, ``hours`` since the first, ``number``, ``kind`` ('spot';
+        'flat' for effects that flats alone show).  By default those of the layout's reference.
+    layout : Layout or mapping, optional
+        Sensor that the effects were found on, by default the report's: ``shape`` (rows, columns),
+        its first pixel (1, 1) of the original image; ``segments`` (by default one amplifier
+        covers it); ``reference``, wavelength [nm], back bias [V] and temperature [C] that the
+        effects count from, by default 620 nm and the device's own.
+
+    Notes
+    -----
+    Effects act on photons before they enter the silicon (light is thinned out, or its flux
+    scaled where a factor is above 1; halos), on the boundaries (factors on every vertex of the
+    table, shifts of its edges, standing displacements), on electrons that meet charge (loss) and
+    through the full well in :meth:`accumulate`; what acts once on stored charge and while it is
+    shifted out, in :meth:`finish`.  Photons' own wavelengths change no effect.  Shifts are added
+    up to 7 pixels from a charge, at all heights alike, and saturate as the table's do.  Effects of
+    amplifiers and converters are left out, with one warning.
 
     Raises
     ------
@@ -117,6 +145,16 @@ class BrighterFatterSensor(EngineSensor):
     >>> off = BrighterFatterSensor("e2v_ccd250", strength=0.0, rng=galsim.BaseDeviate(4171))
     >>> bool(1.015 < size(sensor) / size(off) < 1.03)
     True
+
+    What a diagnosis found, carried into an image; ``effects="report.json"`` does the same.
+
+    >>> loss = {"class": "charge_loss", "parameters": {"q": {"value": 1e-6}}}
+    >>> found = BrighterFatterSensor(effects=[loss], rng=galsim.BaseDeviate(4171))
+    >>> image = star.drawImage(nx=25, ny=25, scale=0.2, method="phot", sensor=found,
+    ...                        rng=galsim.BaseDeviate(4172))
+    >>> found.finish(image)
+    >>> bool(0.95 < image.array.sum() / 5e5 < 0.99)
+    True
     """
 
     _opt_params = {  # noqa: RUF012
@@ -126,6 +164,7 @@ class BrighterFatterSensor(EngineSensor):
         "charge_response": bool, "background": bool, "depth": bool, "red": str,
         "absorption": str, "temperature": float, "diffusion": str, "full_well": float,
         "beyond": str, "predict": bool, "conversion_depth": float, "threads": int,
+        "effects": str, "conditions": dict, "layout": dict,
     }  # fmt: skip
     _takes_rng = True
 
@@ -155,14 +194,17 @@ class BrighterFatterSensor(EngineSensor):
         conversion_depth: float = 1.0,
         threads: int = 1,
         table: DistortionTable | None = None,
+        effects: Any = None,
+        conditions: Mapping[str, Any] | None = None,
+        layout: Layout | Mapping[str, Any] | None = None,
     ) -> None:
         self.name = str(name) if table is None else "table"
         # Where the table came from: it is pickled by that, not by its 18 MB.
-        self._source = _find(name) if table is None else None
-        self.table = _load(*self._source) if self._source else _checked(table)
-        self.strength = _finite("strength", strength)
+        self._source = find_table(name) if table is None else None
+        self.table = load_table(*self._source) if self._source else check_table(table)
+        self.strength = check_number("strength", strength)
         self.rng = galsim.UniformDeviate(rng)
-        self.diffusion_factor = _finite("diffusion_factor", diffusion_factor, low=0.0)
+        self.diffusion_factor = check_number("diffusion_factor", diffusion_factor, low=0.0)
         reach = self.table.reach
         self.qdist = reach if qdist is None else int(qdist)
         if not 0 <= self.qdist <= reach:
@@ -170,7 +212,7 @@ class BrighterFatterSensor(EngineSensor):
                 f"qdist = {qdist} must be from 0 to {reach}: the table of {self.name} holds "
                 "charge no further away"
             )
-        self.nrecalc = _finite("nrecalc", nrecalc, low=0.0)
+        self.nrecalc = check_number("nrecalc", nrecalc, low=0.0)
         check_rings(treering_func, treering_center)
         self.treering_func = treering_func
         self.treering_center = treering_center
@@ -181,12 +223,12 @@ class BrighterFatterSensor(EngineSensor):
         self.charge_response = bool(charge_response)
         self.background = bool(background)
         self.depth = bool(depth)
-        self.red = _one_of("red", red, ("lost", "kept"))
-        self.absorption = _one_of("absorption", absorption, ("law", "galsim"))
-        self.diffusion = _one_of("diffusion", diffusion, ("einstein", "measured"))
-        self.beyond = _one_of("beyond", beyond, ("hold", "error"))
+        self.red = check_word("red", red, ("lost", "kept"))
+        self.absorption = check_word("absorption", absorption, ("law", "galsim"))
+        self.diffusion = check_word("diffusion", diffusion, ("einstein", "measured"))
+        self.beyond = check_word("beyond", beyond, ("hold", "error"))
         self.predict = bool(predict)
-        self.conversion_depth = _finite(
+        self.conversion_depth = check_number(
             "conversion_depth", conversion_depth, low=0.0, high=self.table.thickness
         )
         self.threads = int(threads)
@@ -200,13 +242,36 @@ class BrighterFatterSensor(EngineSensor):
         self._device = Device.from_toml(self.table.device_text)
         if temperature is None:
             temperature = self._device.operating_point.temperature
-        self.temperature = _finite("temperature", temperature, low=77.0, high=400.0)
+        self.temperature = check_number("temperature", temperature, low=77.0, high=400.0)
         well = self.table.full_well if full_well is None else float(full_well)
         if not (math.isnan(well) or well > 0):
             raise SensorError(f"full_well = {full_well} must be above 0 e- (inf: none)")
         self.full_well = math.inf if math.isnan(well) else well
         self._warned = False
+        self._init_effects(effects, layout, conditions, self._usual, self.transpose)
         self._init_silicon()
+
+    def _usual(self) -> dict[str, Any]:
+        """What effects count from where nothing else is said."""
+        from bfsensor.silicon import absorption_length
+
+        waves = np.arange(300.0, 1101.0, 10.0)
+        lengths = np.asarray(absorption_length(waves, self.temperature), float)
+        bias = float(self._device.operating_point.back_bias)
+        return {
+            "reference": (620.0, bias, self.temperature - _CELSIUS),
+            "pixel": float(self.table.pitch[0]),
+            "thickness": float(self.table.thickness),
+            "front": Layout.front,
+            "absorption": dict(zip(waves.tolist(), lengths.tolist(), strict=True)),
+        }
+
+    @property
+    def _well(self) -> float:
+        """Full well with that of effects [e-]."""
+        if self._applied is None:
+            return self.full_well
+        return min(self.full_well, self._applied.law.full_well)
 
     @property
     def effective_nrecalc(self) -> float:
@@ -221,12 +286,16 @@ class BrighterFatterSensor(EngineSensor):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         if "table" not in state:
-            state["table"] = _load(*state["_source"])
+            state["table"] = load_table(*state["_source"])
         super().__setstate__(state)
 
     def _make_physics(self) -> tuple[Physics, NDArray[np.float64]]:
         table = self.table
-        factors, edges = self._factors()
+        factors, edges = make_shifts(
+            table, charge_response=self.charge_response, background=self.background,
+            depth=self.depth, strength=self.strength, transpose=self.transpose,
+            reach=self.qdist, applied=self._applied,
+        )  # fmt: skip
         self.residual = factors.residual
         # Below the lowest height that was traced the wells hold the electrons.
         start = table.depths[1] if len(table.depths) > 1 else 0.0
@@ -234,6 +303,10 @@ class BrighterFatterSensor(EngineSensor):
         sigma = self.diffusion_factor * (MEASURED if self.diffusion == "measured" else 1.0)
         pitch = table.pitch[::-1] if self.transpose else table.pitch
         lengths, first, step = self._lengths()
+        variance, wider = sigma**2 * drift.variance, 0.0
+        if self._applied is not None:
+            wider = self._applied.spot_variance * pitch[0] * pitch[1]
+            variance = variance + wider
         medium = Medium(
             thickness=table.thickness,
             pitch_x=pitch[0],
@@ -244,41 +317,16 @@ class BrighterFatterSensor(EngineSensor):
             surface_path=self.conversion_depth,
             kept_path=table.thickness - 1.0 if self.red == "kept" else math.inf,
             kept_slanted=False,
-            variance=sigma**2 * drift.variance,
-            diffuse=sigma > 0,
+            variance=variance,
+            diffuse=sigma > 0 or wider > 0,
         )
         # Whole electrons, so that images of whole electrons stay such.
-        well = math.floor(self.full_well) if math.isfinite(self.full_well) else math.inf
+        well = math.floor(self._well) if math.isfinite(self._well) else math.inf
         physics = Physics(
             edges, factors.response, medium, float(well), not self.transpose, self.nrecalc,
-            self.predict,
+            self.predict, 0.0 if self._applied is None else self._applied.law.loss,
         )  # fmt: skip
         return physics, drift.ripple if self.depth else np.ones(STEPS + 1)
-
-    def _factors(self) -> tuple[EffectiveCharge, Edges]:
-        """Factor the table; kept with it, for it takes half a second."""
-        table = self.table
-        kept = table.__dict__.setdefault("_kept_factors", {})
-        key = (
-            self.charge_response, self.background, self.depth, self.strength,
-            self.transpose, self.qdist,
-        )  # fmt: skip
-        if key not in kept:
-            factors = factor_table(
-                table, linear=not self.charge_response, background=self.background,
-                top=not self.depth,
-            )  # fmt: skip
-            modes = []
-            for sides in (factors.first, factors.second):
-                if sides is not None:
-                    turned = transpose_sides(*sides) if self.transpose else sides
-                    modes.append((self.strength * turned[0], self.strength * turned[1]))
-            edges = make_edges(
-                modes[0], modes[1] if len(modes) > 1 else None, factors.points,
-                factors.heights, self.qdist,
-            )  # fmt: skip
-            kept[key] = factors, edges
-        return kept[key]
 
     def _lengths(self) -> tuple[NDArray[np.float64], float, float]:
         """Absorption lengths [um] on equal steps of the wavelength [nm]."""
@@ -342,7 +390,7 @@ class BrighterFatterSensor(EngineSensor):
         assert self._exposure is not None
         if self._warned or not self._exposure.diagnostics["beyond_table"]:
             return
-        if math.isfinite(self.full_well) and self.full_well <= self._table_well():
+        if math.isfinite(self._well) and self._well <= self._table_well():
             return
         self._warned = True
         warnings.warn(
@@ -354,7 +402,10 @@ class BrighterFatterSensor(EngineSensor):
         )
 
     def _key(self) -> tuple[Any, ...]:
-        return (self.table, *(getattr(self, key) for key in _COMPARED))
+        return (
+            self.table, self.effects, self.layout, self.conditions,
+            *(getattr(self, key) for key in _COMPARED),
+        )  # fmt: skip
 
     def __str__(self) -> str:
         return f"bfsensor.BrighterFatterSensor({self.name!r})"
@@ -362,6 +413,7 @@ class BrighterFatterSensor(EngineSensor):
     def __repr__(self) -> str:
         parts = [f"{k}={getattr(self, k)!r}" for k in ("name", *_COMPARED)]
         parts.insert(2, f"rng={self.rng!r}")
+        parts += self._effects_repr()
         return f"bfsensor.BrighterFatterSensor({', '.join(parts)})"
 
 
@@ -370,57 +422,3 @@ _COMPARED = (
     "transpose", "shift_map", "charge_response", "background", "depth", "red", "absorption",
     "temperature", "diffusion", "full_well", "beyond", "predict", "conversion_depth", "threads",
 )  # fmt: skip
-
-
-def _find(name: str) -> tuple[str, int]:
-    """Find a built-in table or a file, and when it was changed."""
-    folder = tables_dir()
-    if str(name).endswith((".fits", ".fits.gz")) or Path(name).is_file():
-        path = Path(name)
-    else:
-        path = folder / str(name) / "table.fits"
-        if not path.is_file():
-            known = sorted(p.parent.name for p in folder.glob("*/table.fits"))
-            raise SensorError(
-                f"name = {str(name)!r} is neither a built-in table ({', '.join(known)}) nor "
-                "a .fits file"
-            )
-    return str(path.resolve()), path.stat().st_mtime_ns if path.exists() else 0
-
-
-def _load(path: str, changed: int) -> DistortionTable:
-    """Read a table; another than when the sensor was made is refused."""
-    try:
-        table = _read(path, changed)
-    except TableError as error:
-        raise SensorError(str(error)) from None
-    return table
-
-
-def _checked(table: DistortionTable | None) -> DistortionTable:
-    if not isinstance(table, DistortionTable):
-        raise SensorError(f"table must be a DistortionTable, not {type(table).__name__}")
-    return table
-
-
-@lru_cache(maxsize=8)
-def _read(path: str, changed: int) -> DistortionTable:
-    """Read a table once for all sensors of a process."""
-    return DistortionTable.read(path)
-
-
-def _finite(
-    name: str, value: float, *, low: float = -math.inf, high: float = math.inf
-) -> float:
-    number = float(value)
-    if not (math.isfinite(number) and low <= number <= high):
-        allowed = f" from {low:g}" if math.isfinite(low) else ""
-        allowed += f" to {high:g}" if math.isfinite(high) else ""
-        raise SensorError(f"{name} = {value} must be a finite number{allowed}")
-    return number
-
-
-def _one_of(name: str, value: str, allowed: tuple[str, ...]) -> str:
-    if value not in allowed:
-        raise SensorError(f"{name} = {value!r} must be one of {', '.join(allowed)}")
-    return value

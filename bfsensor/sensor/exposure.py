@@ -39,6 +39,8 @@ class Physics:
         Electrons between two renewals of the boundaries, 0: only by hand.
     predict : bool
         Use the charge expected in the middle of the block.
+    loss : float
+        q [1/e-]: an electron is lost with probability 1 - exp(-q Q), Q the charge it meets.
     """
 
     edges: Edges
@@ -48,6 +50,7 @@ class Physics:
     spill_along_y: bool
     block: float
     predict: bool
+    loss: float = 0.0
 
 
 class Exposure:
@@ -81,6 +84,9 @@ class Exposure:
     ) -> None:
         self.physics = physics
         self.pattern = pattern
+        # Factor on the light by pixel of the sensor, and what takes positions to its frame.
+        self.light_factor: NDArray[np.float64] | None = None
+        self.to_sensor = (0.0, 0.0)
         self.threads = threads
         self.charges, self.ledger = _allocate(image, physics)
         self.hot = _no_hot_edges(physics.edges, self.ledger.flags.size)
@@ -93,6 +99,7 @@ class Exposure:
             y0=float(origin[1]),
             key0=np.uint32(key[0]),
             key1=np.uint32(key[1]),
+            loss=float(physics.loss),
         )
         batch = _shoot.BATCH
         self._buffers = (
@@ -134,7 +141,7 @@ class Exposure:
 
     @property
     def diagnostics(self) -> dict[str, float]:
-        """Electrons that spilled, left the image or crossed the silicon, and held pixels."""
+        """Electrons that spilled, left the image, crossed or were lost, and held pixels."""
         sums, counters = self.ledger.sums, self.ledger.counters
         return {
             "photons": int(counters[_charge.PHOTONS]),
@@ -142,6 +149,7 @@ class Exposure:
             "spilled_off_image": float(sums[_charge.SPILLED_OFF]),
             "off_image": float(sums[_charge.OFF_IMAGE]),
             "crossed": float(sums[_charge.CROSSED]),
+            "lost": float(sums[_charge.LOST]),
             "beyond_table": int(counters[_charge.BEYOND]),
         }
 

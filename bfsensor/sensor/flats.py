@@ -8,8 +8,11 @@ import galsim
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor.effects.effect import Law
 from bfsensor.errors import SensorError
+from bfsensor.sensor.applied import AppliedEffects
 from bfsensor.sensor.base import EngineSensor
+from bfsensor.sensor.effect_sensor import EffectSensor
 
 
 def draw_flat(
@@ -27,7 +30,9 @@ def draw_flat(
 
     In each step every pixel collects a Poisson number of electrons about its area times the
     step; the areas are those of the charge in the middle of the step, as expected.  All
-    light converts near the back surface; a flat in the far red needs photons.
+    light converts near the back surface; a flat in the far red needs photons.  Effects of the
+    sensor act as on an exposure of the kind 'flat' that begins at its first pixel,
+    :meth:`BrighterFatterSensor.finish` included.
 
     Parameters
     ----------
@@ -72,6 +77,8 @@ def draw_flat(
         sensor, shape, level, step=step, rng=rng, illumination=illumination, border=border,
         dtype=dtype,
     )  # fmt: skip
+    if isinstance(sensor, EffectSensor):
+        sensor.finish(image)
     return image
 
 
@@ -91,7 +98,8 @@ def iterate_flat(
     Yields
     ------
     galsim.Image
-        A view of the image as it is; the last is complete.
+        A view of the image as it is; of the last all charge is collected, and effects at the
+        end of an exposure have not acted.
     """
     ny, nx = shape
     if not (level > 0 and np.isfinite(level)):
@@ -112,6 +120,10 @@ def iterate_flat(
         light = np.pad(given, border, mode="edge")
     seed = galsim.BaseDeviate(rng).raw()
     generator = np.random.Generator(np.random.SFC64(seed))
+    law = Law()
+    if sensor._applied is not None:
+        law = sensor._applied.law
+        light *= _light_of_effects(sensor._applied, shape, border, seed)
     whole = galsim.Image(light.shape[1], light.shape[0], dtype=dtype)
     inside = galsim.BoundsI(border + 1, border + nx, border + 1, border + ny)
     steps = int(np.ceil(level / step))
@@ -125,12 +137,34 @@ def iterate_flat(
     for _ in range(steps):
         middle = whole.copy()
         # Half of the last step's fluctuations count twice: they were not felt in their own.
-        middle.array[...] += (0.5 * each) * light * areas + 0.5 * excess
+        kept = np.exp(-law.loss * whole.array.astype(float)) if law.loss else 1.0
+        middle.array[...] += (0.5 * each) * light * areas * kept + 0.5 * excess
         areas = sensor.calculate_pixel_areas(middle, centre).array
         expected = np.maximum(each * light * areas, 0.0)
+        if law.loss:
+            expected *= np.exp(-law.loss * middle.array.astype(float))
         came = generator.poisson(expected).astype(float)
         whole.array[...] += came
         excess = came - expected
+        if whole.array.max() > law.full_well:
+            raise SensorError(
+                f"level = {level} e-: pixels reach the full well of effects, "
+                f"{law.full_well:.0f} e-; flats from areas do not spill, photons do"
+            )
         flat = whole[inside]
         flat.setOrigin(1, 1)
         yield flat
+
+
+def _light_of_effects(
+    applied: AppliedEffects, shape: tuple[int, int], border: int, seed: int
+) -> NDArray[np.float64]:
+    """Factor of effects on the light of a flat, with its border; nearest pixels outside."""
+    factor = applied.light_map("flat", np.random.default_rng(seed))
+    if factor is None:
+        return np.ones((1, 1))
+    rows, columns = (
+        np.clip(np.arange(-border, n + border), 0, whole - 1)
+        for n, whole in zip(shape, factor.shape, strict=True)
+    )
+    return np.asarray(factor[rows[:, None], columns])

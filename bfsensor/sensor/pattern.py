@@ -18,6 +18,9 @@ _FINER = 16
 _NOTHING = np.zeros(0)
 _NO_MAP = np.zeros((0, 0))
 
+Stills = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""Displacements of edges between columns and between rows [pixel], or dx and dy of points."""
+
 
 @dataclass(frozen=True, eq=False)
 class ShiftMap:
@@ -272,3 +275,41 @@ def make_pattern(
         map_0y=0.0 if shift_map is None else shift_map.y0 - corner[1],
         map_factor=np.ones(2) if uniform else ring_factor,
     )
+
+
+def fine_stills(stills: Stills, rows: tuple[int, int], columns: tuple[int, int]) -> Stills:
+    r"""Displacements of edges at two points a pixel, whose means along each edge they are.
+
+    Corners lie at the mean of the edges that meet there, the middle m of an edge of mean e
+    between corners c so that :math:`(c_0 + 2 m + c_1) / 4 = e`.  Around the sensor the rim's are
+    held.
+
+    Parameters
+    ----------
+    stills : pair of ndarray
+        Of the edges between columns, (ny, nx + 1), and between rows, (ny + 1, nx) [pixel].
+    rows, columns : tuple of int
+        Where to begin and end, in pixels from the sensor's corner.
+
+    Returns
+    -------
+    dx, dy : ndarray, shape (2 (rows[1] - rows[0]) + 1, 2 (columns[1] - columns[0]) + 1)
+    """
+    x = _fine(stills[0], rows, columns)
+    y = _fine(stills[1].T, columns, rows).T
+    return np.ascontiguousarray(x), np.ascontiguousarray(y)
+
+
+def _fine(
+    edge: NDArray[np.float32], along: tuple[int, int], lines: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Of the edges of lines, (pixels along, lines)."""
+    line = np.clip(np.arange(lines[0], lines[1] + 1), 0, edge.shape[1] - 1)
+    pixel = np.clip(np.arange(along[0] - 1, along[1] + 1), 0, edge.shape[0] - 1)
+    mean = edge[pixel[:, None], line]
+    corner = 0.5 * (mean[:-1] + mean[1:])
+    out = np.empty((2 * (along[1] - along[0]) + 1, 2 * len(line) - 1), np.float32)
+    out[::2, ::2] = corner
+    out[1::2, ::2] = 2 * mean[1:-1] - 0.5 * (corner[:-1] + corner[1:])
+    out[:, 1::2] = 0.5 * (out[:, :-1:2] + out[:, 2::2])
+    return out

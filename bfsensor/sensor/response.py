@@ -68,6 +68,7 @@ def factor_table(
     linear: bool = False,
     background: bool = True,
     top: bool = False,
+    bend: float = 0.0,
 ) -> EffectiveCharge:
     """Factor a table into weights and effective charges.
 
@@ -81,6 +82,9 @@ def factor_table(
         Let the background of a pixel count.
     top : bool
         Use the shifts of the highest depth for all heights.
+    bend : float
+        b [1/e-]: shifts grow by (1 + b Q / 2) besides; of a small charge on a background B by
+        (1 + b B).
 
     Returns
     -------
@@ -134,8 +138,9 @@ def factor_table(
             k2.append(np.where(near, both[1], 0.0).reshape(s.shape[2:]))
     residual = _residual(flat, weight, g1, g2, k1, k2, lengths)
     response = _grid(
-        table, g1.reshape(levels), g2.reshape(levels), linear=linear, background=background
-    )
+        table, g1.reshape(levels), g2.reshape(levels), linear=linear, background=background,
+        bend=bend,
+    )  # fmt: skip
     z = table.depths[-1:] if top else table.depths
     heights = z
     if len(z) > 1:
@@ -233,9 +238,10 @@ def _grid(
     *,
     linear: bool,
     background: bool,
+    bend: float,
 ) -> Response:
     """Effective charges on equal steps of charge and background."""
-    if linear or len(table.charges) == 1:
+    if (linear or len(table.charges) == 1) and not bend:
         empty = np.zeros((0, 0), np.float32)
         return Response(empty, empty, 1.0, 1.0, np.inf, np.inf)
     last = table.charges[-1]
@@ -262,11 +268,17 @@ def _grid(
         if background:
             response = wq @ g @ wb.T
             diagonal = np.einsum("nq,qb,nb->n", fq, g, fb)
+            if bend:
+                # So that of a linear response Q (1 + bend Q / 2) is left.
+                response = response * (1 + 0.5 * bend * (q[:, None] + b))
+                diagonal = diagonal * (1 + bend * fine)
             steps = 125.0 * (diagonal[1:] + diagonal[:-1])
             integral = np.interp(b, fine, np.concatenate([[0.0], np.cumsum(steps)]))
             grids.append(integral + (q[:, None] - b) * response)
         else:
             alone = wq @ g @ wb[0]
+            if bend:
+                alone = alone * (1 + 0.5 * bend * q)
             grids.append(np.repeat((q * alone)[:, None], len(b), 1))
     return Response(
         grids[0].astype(np.float32),

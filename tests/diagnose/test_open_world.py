@@ -208,7 +208,9 @@ def test_exchanged_axes_are_the_transposes():
     assert np.allclose(moved[0], ky.T) and np.allclose(moved[1], kx.T)
 
 
-@pytest.mark.parametrize(("word", "counted"), [("flat_cov", True), ("serial_overscan", False)])
+@pytest.mark.parametrize(
+    ("word", "counted"), [("flat_cov", True), ("serial_overscan", False)]
+)
 def test_a_remainder_counts_against_what_is_explained_in_its_channel(word, counted):
     finding = Finding("lags", word, 8.0, 1e-12)
     left = Mismatch(1e-12, 0.5, 1e-12, (finding,), {word: (100.0, 100.0)})

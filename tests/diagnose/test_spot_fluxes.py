@@ -32,7 +32,7 @@ def test_fluxes_scatter_between_exposures_as_their_errors_say(scatter: float) ->
     for number in range(24):
         shot = SimpleNamespace(
             number=number, exposure_time=5.0, lamp=1.0, wavelength=None, back_bias=None,
-            temperature=None,
+            temperature=None, mjd=None,
         )  # fmt: skip
         assert channels.add(shot, exposure_of(rng, scatter)) is None
     channel = channels.channels()[0]

@@ -18,8 +18,9 @@ from tests.kernels.plain_edges import (
 
 
 def put(
-    exposure, image, i, j, *, flux=1.0, words=None, z=None, full_well=np.inf, along_y=True
-):
+    exposure, image, i, j, *, flux=1.0, words=None, z=None, full_well=np.inf, along_y=True,
+    loss=0.0,
+):  # fmt: skip
     """Deposit electrons in pixels (i, j); returns what stays."""
     count = len(i)
     return kernel.deposit(
@@ -28,7 +29,7 @@ def put(
         np.asarray(i, np.int32), np.asarray(j, np.int32),
         np.full(count, 50.0, np.float32) if z is None else np.asarray(z, np.float32),
         np.zeros(count, np.uint32) if words is None else np.asarray(words, np.uint32),
-        0, count, float(full_well), along_y,
+        0, count, float(full_well), along_y, loss,
     )  # fmt: skip
 
 
@@ -109,6 +110,24 @@ def test_deposit_adds_in_place_and_keeps_the_books(dtype):
     assert sorted(listed) == sorted(
         {5 * b + a for a, b in zip(i, j, strict=True) if a >= 0}
     )
+
+
+@pytest.mark.kernels
+def test_electrons_that_meet_charge_are_lost_one_by_one():
+    """The plain law, electron by electron, of the charge that is there at its turn."""
+    rng, loss = np.random.default_rng(711), 0.02
+    i, j = rng.integers(0, 3, 300), rng.integers(0, 2, 300)
+    words = rng.integers(0, 2**32, 300, dtype=np.uint32)
+    image = np.zeros((2, 3))
+    exposure = expose(silicon_sensor(), image)
+    added = put(exposure, image, i, j, words=words, loss=loss)
+    plain = np.zeros((2, 3))
+    for column, row, word in zip(i, j, words, strict=True):
+        chance = (int(word) // 2 + 0.5) / 2**31
+        plain[row, column] += chance < np.exp(-loss * plain[row, column])
+    assert np.array_equal(image, plain)
+    assert added == plain.sum() < 220
+    assert exposure.ledger.sums[kernel.LOST] == 300 - added
 
 
 # -- effective charge ------------------------------------------------------------------

@@ -241,7 +241,16 @@ def make_both():
     )
 
 
-PATTERNS = {"rings": make_rings, "map": make_map, "both": make_both}
+def make_edges():
+    """At two points a pixel, the same at all heights."""
+    smooth = np.add.outer(np.sin(np.arange(140) / 10.0), np.cos(np.arange(142) / 8.0))
+    return NO_PATTERN._replace(
+        edge_x=(0.05 * smooth).astype(np.float32),
+        edge_y=(-0.03 * smooth).astype(np.float32), edge_0x=-8.25, edge_0y=-6.5,
+    )  # fmt: skip
+
+
+PATTERNS = {"rings": make_rings, "map": make_map, "both": make_both, "edges": make_edges}
 
 
 def plain_shift(pattern, x, y, part):
@@ -265,6 +274,13 @@ def plain_shift(pattern, x, y, part):
             for n, field in enumerate((pattern.map_x, pattern.map_y)):
                 rows = [np.interp(x, xs, row) for row in field]
                 shift[n] += factor * np.interp(y, ys, rows)
+    if pattern.edge_x.size:
+        ny, nx = pattern.edge_x.shape
+        xs, ys = pattern.edge_0x + np.arange(nx) / 2, pattern.edge_0y + np.arange(ny) / 2
+        if xs[0] <= x <= xs[-1] and ys[0] <= y <= ys[-1]:
+            for n, field in enumerate((pattern.edge_x, pattern.edge_y)):
+                rows = [np.interp(x, xs, row) for row in field.astype(float)]
+                shift[n] += np.interp(y, ys, rows)
     return shift
 
 

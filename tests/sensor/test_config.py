@@ -229,7 +229,9 @@ def test_no_option_is_missing_from_the_configuration():
     known = set(bfsensor.BrighterFatterSensor._opt_params)
     # A generator comes from the configuration; a table in memory cannot.
     assert accepted - known == {"rng", "table"}
-    assert known - set(CHANGED) == {"treering_func", "treering_center", "shift_map"}
+    assert known - set(CHANGED) == {
+        "treering_func", "treering_center", "shift_map", "effects", "conditions", "layout",
+    }  # fmt: skip
 
 
 def test_rings_come_from_a_file_or_an_expression(tmp_path):

@@ -18,6 +18,13 @@ The road, one module each; nothing is imported from ``bfsensor``:
     sensor                 one chip: light to codes
     campaign, __main__     folders, truth, commitment, command line
 
+and, for the challenge that such campaigns make:
+
+    submit                 reports made once, by subprocess, fixed by hash before truths open
+    conventions            one table: how a truth and a report are held against one another
+    score, tally, misses   one campaign; many beside the goals; what went wrong, in words
+    opening, rows          truths opened; results
+
 Every campaign, nulls too, has: a device scattered by its card's spread, gains (3 %), read noise
 (4 %), offsets, 0.05 e- row noise, 0.3 % pixel response, 3e-4 pixel edge scatter, illumination
 gradients, a lamp that walks by 2e-4 per exposure and a monitor that errs by 2e-4, dark current,

@@ -1,4 +1,4 @@
-"""``python -m validation.concealed make``: campaigns whose truth is sealed."""
+"""``python -m validation.concealed make|run|open``: campaigns whose truth is sealed until scored."""
 
 from __future__ import annotations
 
@@ -12,12 +12,31 @@ from tqdm import tqdm
 from validation.concealed.campaign import write_campaign
 from validation.concealed.effect import Effect
 from validation.concealed.library import EFFECTS, draw_effect, draw_effects, make_effect
+from validation.concealed.misses import print_misses
+from validation.concealed.opening import (
+    COMMAND,
+    add_results,
+    open_truths,
+    to_row,
+    write_summary,
+)
 from validation.concealed.plan import SIZES
+from validation.concealed.submit import read_json, run_campaigns
+from validation.concealed.tally import print_lines, tally
+
+RESULTS = Path(__file__).parents[1] / "results" / "challenge.ecsv"
 
 
 @click.group()
 def main() -> None:
-    """Concealed campaigns of a virtual sensor."""
+    """Concealed campaigns of a virtual sensor: made, diagnosed, opened and scored.
+
+    \b
+    Example:
+      python -m validation.concealed make campaigns --count 40 --truth-folder sealed
+      python -m validation.concealed run campaigns -o reports
+      python -m validation.concealed open campaigns reports sealed
+    """
 
 
 def _asked(words, variant, strength, amplitudes, rng) -> tuple[Effect, ...]:
@@ -115,6 +134,89 @@ def make(
             )
     except ValueError as error:
         raise click.ClickException(str(error)) from None
+
+
+@main.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(path_type=Path),
+              help="Folder of results [FOLDER_results].")  # fmt: skip
+@click.option(
+    "--command",
+    default="bfsensor diagnose",
+    show_default=True,
+    help="Called with a campaign, -o and a folder.",
+)
+def run(folder: Path, output: Path | None, command: str) -> None:
+    """Diagnose each campaign of FOLDER, once; truths are neither needed nor read.
+
+    The hash of each report is written to submissions.json: what is opened later is what was
+    said before.  Interrupted at any moment, the same command goes on where it was; campaigns with
+    a report are not run again.  Time and peak memory of each are in its cost.json.
+
+    \b
+    Example:
+      python -m validation.concealed run campaigns -o reports
+      python -m validation.concealed run campaigns --command "bfsensor diagnose --seed 5"
+    """
+    output = output or folder.with_name(folder.resolve().name + "_results")
+    try:
+        done = run_campaigns(
+            folder, output, command=command, progress=lambda c: tqdm(c, desc="campaigns")
+        )
+    except ValueError as error:
+        raise click.ClickException(str(error)) from None
+    except KeyboardInterrupt:
+        click.echo(f"{output}: interrupted; the same command goes on", err=True)
+        raise click.exceptions.Exit(130) from None
+    click.echo(
+        f"{output}: {len(done.made)} diagnosed, {len(done.there)} were there already"
+    )
+    if done.failed:
+        raise click.ClickException(
+            f"no report of {', '.join(done.failed)}; what the command said is in "
+            f"{output}/NAME.failed.txt"
+        )
+
+
+@main.command(name="open")
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.argument("results", type=click.Path(path_type=Path))
+@click.argument("truths", type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(path_type=Path), default=RESULTS, show_default=True,
+              help="ECSV that a row for each campaign is added to.")  # fmt: skip
+@click.option(
+    "--more",
+    type=click.Path(path_type=Path),
+    help="JSON, by campaign: snr, where, tie_broken (as `validation.concealed_trials snr` writes).",
+)
+def open_(
+    folder: Path, results: Path, truths: Path, output: Path, more: Path | None
+) -> None:
+    """Open TRUTHS, hold them against their commitments, and score RESULTS.
+
+    Refused, by name: truths that do not have the hash committed to, reports that were changed
+    after their submission.  Each goal is printed with its trials and 95 % bounds, then all
+    misses.  A row for each campaign and the table (NAME_summary.ecsv) are kept.
+
+    \b
+    Example:
+      python -m validation.concealed open campaigns reports sealed
+    """
+    try:
+        added = read_json(more, "file of SNRs") if more else None
+        opened = open_truths(folder, results, truths, more=added)
+        group = folder.resolve().name
+        kept = add_results(output, [to_row(o, "pixel", group) for o in opened], COMMAND)
+    except ValueError as error:
+        raise click.ClickException(str(error)) from None
+    scores = [o.score() for o in opened]
+    lines = tally(scores)
+    summary = output.with_name(f"{output.stem}_summary.ecsv")
+    write_summary(summary, lines, group, "pixel", COMMAND)
+    print_lines(lines, click.echo)
+    click.echo("\nMisses:")
+    print_misses(scores, click.echo)
+    click.echo(f"\n{output}: {kept} rows added of {len(scores)}; {summary}")
 
 
 if __name__ == "__main__":

@@ -101,7 +101,7 @@ def write_campaign(
         "seed": seed,
         "salt": secrets.token_hex(16) if salt is None else salt,
     }
-    _seal(folder, truth, truth_folder)
+    seal(folder, truth, truth_folder)
     return truth
 
 
@@ -191,7 +191,7 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=1))
 
 
-def _seal(folder: Path, truth: dict[str, Any], truth_folder: str | Path | None) -> None:
+def seal(folder: Path, truth: dict[str, Any], truth_folder: str | Path | None) -> None:
     """Write the truth, and its hash beside the campaign."""
     path = folder / "truth.json"
     if truth_folder is not None:

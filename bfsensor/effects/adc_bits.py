@@ -1,0 +1,193 @@
+"""Converter bits: the weight of one bit is off, codes are skipped or too wide."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Seen, Values
+
+REMAINDERS = 64
+"""Codes whose remainders the channel counts; beyond, powers of two are told apart."""
+
+LARGEST = 65536
+
+READ_NOISE = 2.5
+"""Read noise [ADU] where it is not known: that of most converters of CCDs is set so (assumed)."""
+
+STEPS = 3
+"""Periods on either side of a level that its error is summed over; wider noise sees the mean."""
+
+
+class AdcBits(Effect):
+    """The weight of bit ``bit`` of a converter that approximates by halves is off by ``delta``.
+
+    With it on, all codes are ``delta`` too low: the code below is wider by as much, and as many
+    below the next multiple of 2^(bit + 1) never come.
+    """
+
+    word = "adc_bits"
+    stage = "converter"
+    parameters = (
+        Parameter("delta", "ADU", 0.2, 2.0, signed=True, amplitude=True),
+        Parameter("bit", "", 2, 9, law="whole"),
+    )
+    touches = ("code_hist", "flat_mean", "flat_cov", "bias_cov", "spot")
+    source = (
+        "Counts of 0 and 1 by bit in flats: Abbott 1995, In-situ CCD testing (CTIO), bit biases; "
+        "effects of converters on CCD data: Boone et al. 2018, PASP 130, 064504; range assumed"
+    )
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        low, high = (int(v) for v in cls.parameters[1][2:4])
+        return [
+            {"delta": sign * 0.6, "bit": float(bit)}
+            for bit in range(low, high + 1)
+            for sign in (1, -1)
+        ]
+
+    def convert(self, levels: Image) -> Image:
+        delta, half = self["delta"], 2.0 ** int(self["bit"])
+        if delta == 0:
+            return levels
+        level = np.clip(levels + 0.5, 0, LARGEST - 1e-3)
+        above = level % (2 * half)
+        on = above >= half + delta
+        # The bits below can hold no more than all ones.
+        rest = np.minimum(np.floor(above - on * (half + delta)), half - 1)
+        return level - above + on * half + rest
+
+    def code_hist(self, axes: Axes, layout: Layout) -> Values:
+        code, bit, own = axes["code"].astype(int), axes["bit"].astype(int), int(self["bit"])
+        out = np.zeros(len(code))
+        high, half = bit >= 0, 2**own
+        for odd in (True, False):
+            here = high & ((bit == own) if odd else (bit > own))
+            change = self._width(-code[here], odd=odd)
+            # Of high bits the codes beside, which tell what is expected, have the change too.
+            total = self["delta"] * (1 if odd else -1) if 2 * half > REMAINDERS else 0.0
+            out[here] += (1 + change) / (1 + total / REMAINDERS) - 1
+        if 2 * half <= REMAINDERS:
+            place = code % (2 * half)
+            out[~high] += self._width(half - place[~high], odd=True)
+            out[~high] += self._width(2 * half - place[~high], odd=False)
+            return out
+        # Of multiples of 64 some are odd multiples of the bit and some are even: those that the
+        # flats' codes lie at count.
+        for amp in np.unique(axes["amp"]):
+            mine = axes["amp"] == amp
+            bits, first = np.unique(np.where(mine & high, bit, -1), return_index=True)
+            share = dict(zip(bits.tolist(), axes["share"][first].tolist(), strict=True))
+            even = sum(v for b, v in share.items() if b > own)
+            below = np.arange(1, REMAINDERS + 1)
+            change = share.get(own, 0.0) * self._width(below, odd=True)
+            change = change + even * self._width(below, odd=False)
+            # Shares of all: those of the others fall where one code comes more often.
+            change = (1 + change) / (1 + change.mean()) - 1
+            rows = mine & ~high
+            out[rows] += change[REMAINDERS - code[rows] - 1]
+        return out
+
+    def bias_cov(self, axes: Axes, layout: Layout) -> Values:
+        out = np.zeros(len(axes["amp"]))
+        if self["delta"] == 0 or not _known(layout):
+            return out
+        start, noise = self._zeros(layout)
+        place = np.linspace(-6.0, 6.0, 2001)
+        weight = np.exp(-(place**2) / 2) / np.exp(-(place**2) / 2).sum()
+        levels = start[:, None] + noise[:, None] * place
+        wrong, right = (
+            weight @ (c - (c @ weight)[:, None]).T ** 2
+            for c in (np.rint(self.convert(levels)), np.rint(levels))
+        )
+        change = np.array(layout.gains) ** 2 * (wrong - right)
+        return np.where(axes["lag"] == 0, change[axes["amp"].astype(int)], out)
+
+    def signal(self, level: Values, axes: Axes, layout: Layout) -> Values:
+        if self["delta"] == 0 or not _known(layout):
+            return level
+        start, noise = self._zeros(layout)
+        error = self._error(start, noise)
+
+        def read(amp: NDArray[np.int64]) -> Values:
+            return level + self._light_error(level, amp, layout) - gains[amp] * error[amp]
+
+        gains = np.array(layout.gains)
+        if "amp" in axes:
+            return read(axes["amp"].astype(int))
+        # Spots lie on all amplifiers.
+        count = len(layout.segments)
+        return np.asarray(np.mean([read(np.array(n)) for n in range(count)], axis=0))
+
+    def covariances(self, c: Values, axes: Axes, layout: Layout) -> Values:
+        if self["delta"] == 0 or not _known(layout):
+            return c
+        # Whether the bit is on is a noise of its own.
+        amp = axes["amp"].astype(int)
+        mean = self._light_error(axes["level"], amp, layout)
+        out = c.copy()
+        out[:, 0, 0] -= mean * (self["delta"] * np.array(layout.gains)[amp] + mean)
+        return out
+
+    def _light_error(self, level: Values, amp: NDArray[np.int64], layout: Layout) -> Values:
+        """Mean error of codes of pixels with light and its noise [e-]."""
+        gain, (start, noise) = np.array(layout.gains)[amp], self._zeros(layout)
+        wide = np.sqrt(noise[amp] ** 2 + np.maximum(level, 0.0) / gain**2)
+        return np.asarray(gain * self._error(start[amp] + level / gain, wide))
+
+    def _zeros(self, layout: Layout) -> tuple[Values, Values]:
+        """True levels without light, and read noise, of the amplifiers [ADU]."""
+        zero = np.array(layout.offsets)
+        noise = np.array(layout.read_noise or np.full(len(zero), READ_NOISE))
+        noise = np.where(np.isfinite(noise) & (noise > 0), noise, READ_NOISE)
+        return _levels(self, tuple(zero.tolist()), tuple(noise.tolist())), noise
+
+    def _error(self, level: Values, sigma: Values) -> Values:
+        """Mean error of the codes [ADU] of levels with noise."""
+        delta, half = self["delta"], 2.0 ** int(self["bit"])
+        period, s = 2 * half, abs(delta)
+        # One end is a jump, at the other codes that are too wide make a slope as long as delta.
+        if delta > 0:
+            ends = (half - 1 + s / 2, s), (period - 0.5, 0.0)
+        else:
+            ends = (half - s - 0.5, 0.0), (period - 1 - s / 2, s)
+        place = np.asarray(level % period)
+        on = np.zeros(place.shape)
+        for k in range(-STEPS, STEPS + 1):
+            for sign, (where, slope) in zip((1, -1), ends, strict=True):
+                wide = np.sqrt(sigma**2 + slope**2 / 12)
+                on += sign * ndtr((place - where - k * period) / wide)
+        even = (ends[1][0] - ends[0][0]) / period
+        return np.asarray(-delta * np.where(sigma > 0.75 * period, even, on))
+
+    def _width(self, below: NDArray[np.int64], *, odd: bool) -> Values:
+        """Change of the width of the n-th code below odd or even multiples of the bit [codes]."""
+        delta, half = self["delta"], 2 ** int(self["bit"])
+        if (delta > 0) == odd:
+            out = np.where(below == 1, abs(delta), 0.0)
+        else:
+            out = -np.clip(abs(delta) - (below - 1.0), 0.0, 1.0)
+        return np.asarray(np.where((below >= 1) & (below <= half), out, 0.0))
+
+
+def _known(layout: Layout) -> bool:
+    """Whether codes without light are known."""
+    return bool(layout.offsets) and bool(np.isfinite(layout.offsets).all())
+
+
+@lru_cache(maxsize=64)
+def _levels(effect: AdcBits, zero: tuple[float, ...], noise: tuple[float, ...]) -> Values:
+    """True levels [ADU] whose mean codes, wrong as they are, are given."""
+    given, spread = np.array(zero), np.array(noise)
+    reach = abs(effect["delta"])
+    low, high = given - reach, given + reach
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        more = middle + effect._error(middle, spread) < given
+        low, high = np.where(more, middle, low), np.where(more, high, middle)
+    return np.asarray(0.5 * (low + high))

@@ -1,0 +1,23 @@
+"""Ratio of the boundary shifts in x and y that differs beyond what the card allows."""
+
+from __future__ import annotations
+
+from bfsensor.effects.effect import Edges, Effect, Layout, Parameter, Shot, Values
+
+
+class BrighterFatterAnisotropy(Effect):
+    """Shifts in x are (1 - eps / 2) times the baseline's, those in y (1 + eps / 2) times."""
+
+    word = "bf_anisotropy"
+    stage = "collect"
+    parameters = (Parameter("eps", "", 0.02, 0.3, signed=True, amplitude=True),)
+    touches = ("flat_cov", "spot")
+    source = (
+        "Boundaries between rows and columns are made by other barriers (electrostatic fits of "
+        "Astier & Regnault 2023, A&A 670, A118); law and range assumed"
+    )
+
+    def edges(self, kx: Values, ky: Values, shot: Shot, layout: Layout) -> Edges:
+        del shot, layout
+        half = 0.5 * self["eps"]
+        return (kx, ky) if half == 0.0 else ((1 - half) * kx, (1 + half) * ky)

@@ -1,0 +1,26 @@
+"""Brighter-fatter strength that depends on wavelength otherwise than the baseline says."""
+
+from __future__ import annotations
+
+from bfsensor.effects.effect import Edges, Effect, Layout, Parameter, Shot, Values
+
+ZERO, STEP = 620.0, 330.0
+"""Wavelength [nm] at which nothing changes, and that over which shifts change by kappa."""
+
+
+class BrighterFatterChromatic(Effect):
+    """Shifts are (1 + kappa (wavelength - 620 nm) / 330 nm) times the baseline's."""
+
+    word = "bf_chromatic"
+    stage = "collect"
+    parameters = (Parameter("kappa", "", 0.01, 0.2, signed=True, amplitude=True),)
+    touches = ("flat_cov", "spot")
+    source = (
+        "Light that converts deeper is pushed over a shorter path (Astier & Regnault 2023, A&A "
+        "670, A118, model the bands of one camera); law and range assumed"
+    )
+
+    def edges(self, kx: Values, ky: Values, shot: Shot, layout: Layout) -> Edges:
+        del layout
+        factor = 1 + self["kappa"] * (shot.wavelength - ZERO) / STEP
+        return (kx, ky) if factor == 1.0 else (factor * kx, factor * ky)

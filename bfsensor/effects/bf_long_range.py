@@ -1,0 +1,83 @@
+"""Boundary shifts that fall slower with distance than the electrostatic baseline."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from bfsensor.effects.effect import Edges, Effect, Layout, Parameter, Shot, Values
+
+REACH = 30
+"""Lag [pixel] up to which areas change."""
+
+
+class BrighterFatterLongRange(Effect):
+    """Areas at the distance r grow by ``amp`` / r^power per electron besides, r in pixels.
+
+    The pixel of the charge loses what the others, up to 30 pixels away, gain.  The edges move
+    along a potential on the lattice, so that their shifts have no curl.
+    """
+
+    word = "bf_long_range"
+    stage = "collect"
+    parameters = (
+        Parameter("amp", "1/e-", 5e-9, 1e-7, amplitude=True),
+        Parameter("power", "", 1.7, 2.5, law="flat"),
+    )
+    touches = ("flat_cov", "spot")
+    source = (
+        "Assumed: what is left far out where the back plane's image or the thickness are wrong; "
+        "field of a charge between planes: Astier & Regnault 2023, A&A 670, A118"
+    )
+
+    def edges(self, kx: Values, ky: Values, shot: Shot, layout: Layout) -> Edges:
+        del shot
+        if self["amp"] == 0.0:
+            return kx, ky
+        # Half of a small sensor: farther, a charge would act on itself around the rim.
+        half = max(min(REACH, min(layout.shape) // 2 - 2), kx.shape[0] // 2)
+        moved = []
+        for old, new in zip((kx, ky), shifts_of_tail(self["power"], half), strict=True):
+            margin = half - old.shape[0] // 2
+            moved.append(np.pad(old, margin) + self["amp"] * new)
+        return moved[0], moved[1]
+
+
+@lru_cache(maxsize=32)
+def shifts_of_tail(power: float, reach: int) -> Edges:
+    """Shifts of right and upper edges that make areas grow by 1 / r^power, charge conserved.
+
+    Parameters
+    ----------
+    power : float
+        Of the distance.
+    reach : int
+        Largest lag in x and y [pixel].
+
+    Returns
+    -------
+    kx, ky : ndarray, shape (2 reach + 1, 2 reach + 1)
+        Row dy, column dx; beyond, edges stand still in effect: what is cut off there changes
+        areas at the rim alone.
+    """
+    lag = np.arange(-reach, reach + 1)
+    r = np.hypot(lag, lag[:, None])
+    r[reach, reach] = np.inf
+    area = r**-power
+    area[reach, reach] = -area.sum()
+    # Shifts are differences of a potential whose lattice Laplacian is the area change.  The
+    # periodic lattice is twice as wide: the images lie beyond what is kept.
+    side = 4 * (reach + 1)
+    turn = 2 * np.pi * np.fft.fftfreq(side)
+    modes = 2 * np.cos(turn) + 2 * np.cos(turn)[:, None] - 4
+    # The mean of a potential moves nothing.
+    modes[0, 0] = 1.0
+    spectrum = np.fft.fft2(area, s=(side, side)) / modes
+    potential = np.fft.ifft2(spectrum).real
+    kept = np.s_[: 2 * reach + 1, : 2 * reach + 1]
+    kx = (np.roll(potential, -1, 1) - potential)[kept]
+    ky = (np.roll(potential, -1, 0) - potential)[kept]
+    for shifts in (kx, ky):
+        shifts.flags.writeable = False
+    return kx, ky

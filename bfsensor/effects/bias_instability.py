@@ -1,0 +1,106 @@
+"""Bias instability: the bias level moves from frame to frame, row to row, or along rows."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Values
+from bfsensor.effects.noise import ReadNoise, added
+
+SOURCE = (
+    "Bias jumps and shapes beyond the overscan's level, typically above 1 ADU, of LSST sensors: "
+    "SITCOMTN-148 (Rubin Observatory 2024), bias stability; range assumed"
+)
+
+
+class BiasByFrame(Effect):
+    """The level of a whole frame moves by ``rms``; the overscan's level takes it off again."""
+
+    word = "bias_instability"
+    variant = "frame"
+    parameters = (Parameter("rms", "e-", 0.3, 10.0, amplitude=True),)
+    touches = ("bias_level",)
+    source = SOURCE
+
+    def noise(
+        self, frames: list[Image], layout: Layout, rng: np.random.Generator
+    ) -> list[Image]:
+        if self["rms"] == 0:
+            return frames
+        return added(frames, [self["rms"] * rng.standard_normal((1, 1)) for _ in frames])
+
+    def bias_level(self, axes: Axes, layout: Layout) -> Values:
+        return np.where(axes["what"] == "frames", self["rms"] ** 2, 0.0)
+
+
+class BiasByRow(ReadNoise):
+    """The level moves from row to row by ``rms``, in each amplifier for itself."""
+
+    word = "bias_instability"
+    variant = "row"
+    parameters = (Parameter("rms", "e-", 0.3, 3.0, amplitude=True),)
+    touches = ("bias_cov", "bias_level", "flat_cov")
+    source = SOURCE
+
+    def noise(
+        self, frames: list[Image], layout: Layout, rng: np.random.Generator
+    ) -> list[Image]:
+        if self["rms"] == 0:
+            return frames
+        return added(
+            frames, [self["rms"] * rng.standard_normal((len(f), 1)) for f in frames]
+        )
+
+    def in_order(self, lag: NDArray, width: NDArray) -> Values:
+        # So many of a row's pixels have one of their own row so much later.
+        return np.asarray(self["rms"] ** 2 * np.clip(1 - np.abs(lag) / width, 0, None))
+
+    def on_frame(self, i: NDArray, j: NDArray, width: float) -> Values:
+        return np.where(np.broadcast_arrays(i, j)[1] == 0, self["rms"] ** 2, 0.0)
+
+
+class BiasRamp(Effect):
+    """Each row begins ``amp`` too high and settles with ``length`` pixels, always alike."""
+
+    word = "bias_instability"
+    variant = "ramp"
+    parameters = (
+        Parameter("amp", "e-", 2.0, 30.0, amplitude=True),
+        Parameter("length", "pixel", 5.0, 60.0),
+    )
+    touches = ("bias_level", "serial_overscan", "flat_mean")
+    source = SOURCE
+
+    def noise(
+        self, frames: list[Image], layout: Layout, rng: np.random.Generator
+    ) -> list[Image]:
+        if self["amp"] == 0:
+            return frames
+        return added(frames, [self._at(np.arange(f.shape[1]))[None] for f in frames])
+
+    def bias_level(self, axes: Axes, layout: Layout) -> Values:
+        image = self._mean(axes, layout, "image") - self._mean(axes, layout, "overscan")
+        return np.where(axes["what"] == "level", image, 0.0)
+
+    def serial_overscan(self, axes: Axes, layout: Layout) -> Values:
+        first = layout.of_amp("prescan", axes["amp"]) + layout.of_amp(
+            "columns", axes["amp"]
+        )
+        return self._at(first + axes["k"] - 1)
+
+    def flat_mean(self, axes: Axes, layout: Layout) -> Values:
+        # The mean bias has the ramp too, over the mean of its whole overscan.
+        return self._mean(axes, layout, "overscan")
+
+    def _at(self, column: NDArray) -> Values:
+        return np.asarray(self["amp"] * np.exp(-column / self["length"]))
+
+    def _mean(self, axes: Axes, layout: Layout, part: str) -> Values:
+        """Mean of the ramp over a part of the rows, by value."""
+        every = []
+        for s in layout.segments:
+            first = s.prescan + (s.columns if part == "overscan" else 0)
+            count = s.serial_overscan if part == "overscan" else s.columns
+            every.append(self._at(first + np.arange(count)).mean() if count else 0.0)
+        return np.array(every)[axes["amp"].astype(int)]

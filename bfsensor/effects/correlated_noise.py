@@ -1,0 +1,113 @@
+"""Correlated noise: in time, between amplifiers, or a wave that is picked up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from bfsensor.effects.effect import Axes, Image, Layout, Parameter, Seen, Values
+from bfsensor.effects.noise import ReadNoise, added
+
+RMS = Parameter("rms", "e-", 0.5, 4.0, amplitude=True)
+
+FREQUENCIES = 20
+"""Where fits of a wave begin: 0.01 cycles a pixel apart, the resolution of 32 lags being 0.016."""
+
+
+class NoiseInTime(ReadNoise):
+    """Each pixel's noise of ``rms`` keeps ``corr`` of that of the pixel before."""
+
+    word = "correlated_noise"
+    variant = "ar1"
+    parameters = (RMS, Parameter("corr", "", 0.3, 0.95, law="flat"))
+    touches = ("bias_cov", "bias_level", "flat_cov")
+    source = "First-order autoregression (Box & Jenkins 1970, section 3.2); range assumed"
+
+    def noise(
+        self, frames: list[Image], layout: Layout, rng: np.random.Generator
+    ) -> list[Image]:
+        rms, keep = self["rms"], self["corr"]
+        if rms == 0:
+            return frames
+        out = []
+        for frame in frames:
+            fresh = rms * rng.standard_normal(frame.size)
+            fresh[1:] *= np.sqrt(1 - keep**2)  # the first pixel's as wide as all others'
+            out.append(lfilter([1.0], [1.0, -keep], fresh).reshape(frame.shape))
+        return added(frames, out)
+
+    def in_order(self, lag: NDArray, width: NDArray) -> Values:
+        # Fits may try values at which it would not die out.
+        keep = float(np.clip(self["corr"], -0.999, 0.999))
+        return np.asarray(self["rms"] ** 2 * keep ** np.abs(lag))
+
+
+class CommonNoise(ReadNoise):
+    """Noise of ``rms``, white in time and the same in all amplifiers."""
+
+    word = "correlated_noise"
+    variant = "common"
+    parameters = (RMS,)
+    touches = ("bias_cov", "amp_cross", "flat_cov")
+    source = (
+        "Common-mode noise of the outputs of one CCD: Proc. SPIE 9154, 91542S (2014), where dummy "
+        "outputs tell it; range assumed"
+    )
+
+    def noise(
+        self, frames: list[Image], layout: Layout, rng: np.random.Generator
+    ) -> list[Image]:
+        if self["rms"] == 0:
+            return frames
+        shared = self["rms"] * rng.standard_normal(frames[0].shape)
+        return added(frames, [shared] * len(frames))
+
+    def in_order(self, lag: NDArray, width: NDArray) -> Values:
+        return np.where(lag == 0, self["rms"] ** 2, 0.0)
+
+    def amp_cross(self, axes: Axes, layout: Layout) -> Values:
+        return np.where(axes["what"] == "noise", self["rms"] ** 2, 0.0)
+
+
+class Pickup(ReadNoise):
+    """A wave of ``rms`` and ``period`` in all amplifiers, its phase another in each frame.
+
+    Differences of two frames hold between nothing and twice its power: over n pairs the power
+    scatters by sqrt(1 / 2n) of itself.
+    """
+
+    word = "correlated_noise"
+    variant = "pickup"
+    parameters = (
+        Parameter("rms", "e-", 0.3, 3.0, amplitude=True),
+        Parameter("period", "pixel times", 5.0, 60.0),
+    )
+    touches = ("bias_cov", "bias_level", "amp_cross", "flat_cov")
+    source = "Pickup of a few e- in the video chain: Proc. SPIE 9154, 91542S (2014); range assumed"
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        low, high = (1 / p for p in (cls.parameters[1].high, cls.parameters[1].low))
+        found = [
+            float(s["period"]) for s in seen if s["word"] == "bias_cov" and "period" in s
+        ]
+        grid = 1 / np.linspace(low, high, FREQUENCIES)
+        return [{"rms": 1.0, "period": float(p)} for p in (*found[:3], *grid)]
+
+    def noise(
+        self, frames: list[Image], layout: Layout, rng: np.random.Generator
+    ) -> list[Image]:
+        if self["rms"] == 0:
+            return frames
+        turns = np.arange(frames[0].size).reshape(frames[0].shape) / self["period"]
+        wave = np.sqrt(2.0) * self["rms"] * np.cos(2 * np.pi * (turns - rng.random()))
+        return added(frames, [wave] * len(frames))
+
+    def in_order(self, lag: NDArray, width: NDArray) -> Values:
+        return np.asarray(self["rms"] ** 2 * np.cos(2 * np.pi * lag / self["period"]))
+
+    def amp_cross(self, axes: Axes, layout: Layout) -> Values:
+        return np.where(axes["what"] == "noise", self["rms"] ** 2, 0.0)

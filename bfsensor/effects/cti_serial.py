@@ -1,0 +1,49 @@
+"""Serial transfer inefficiency: charge is left behind at each transfer along the rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Values
+from bfsensor.effects.transfer import (
+    behind_flat,
+    leave_behind,
+    trail_covariances,
+    trail_image,
+)
+
+
+class CtiSerial(Effect):
+    """Each serial transfer leaves ``cti`` of the charge behind; the next packet takes it along.
+
+    The pixel in column c, prescan included, takes c + 1 transfers.  Behind a flat the first
+    pixel of the overscan holds N cti of the level, N being the transfers of the last column.
+    """
+
+    word = "cti_serial"
+    stage = "shift"
+    parameters = (Parameter("cti", "", 1e-7, 5e-6, amplitude=True),)
+    touches = ("serial_overscan", "flat_cov", "spot")
+    source = (
+        "Janesick 2001, Scientific Charge-Coupled Devices, SPIE Press, chapter 5; proportional "
+        "loss of LSST sensors: Snyder & Roodman 2019, JATIS 5, 041509"
+    )
+
+    def shift(self, frame: Image, amp: int, layout: Layout) -> Image:
+        return leave_behind(frame, self["cti"], 1)
+
+    def serial_overscan(self, axes: Axes, layout: Layout) -> Values:
+        columns, before = (layout.of_amp(n, axes["amp"]) for n in ("columns", "prescan"))
+        return axes["level"] * behind_flat(axes["k"], columns, before, self["cti"])
+
+    def covariances(self, c: Values, axes: Axes, layout: Layout) -> Values:
+        columns, before = (layout.of_amp(n, axes["amp"]) for n in ("columns", "prescan"))
+        return trail_covariances(c, self["cti"] * (before + (columns + 1) / 2), -1)
+
+    def spot_image(
+        self, images: Values, axes: Mapping[str, float], layout: Layout
+    ) -> Values:
+        mean = np.mean([s.prescan + (s.columns + 1) / 2 for s in layout.segments])
+        return trail_image(images, self["cti"] * float(mean), layout.backwards("x"), -1)

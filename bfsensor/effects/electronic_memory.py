@@ -1,0 +1,64 @@
+"""Electronic memory: the amplifier has not forgotten the pixel before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Shot, Values
+from bfsensor.effects.transfer import trail_image
+
+
+class ElectronicMemory(Effect):
+    """``alpha`` of the pixel that was read before is added to each, in readout order.
+
+    The same in all columns, where charge that transfers leave behind grows with the column.
+    """
+
+    word = "electronic_memory"
+    parameters = (Parameter("alpha", "", 1e-5, 1e-3, amplitude=True),)
+    touches = ("serial_overscan", "flat_mean", "flat_cov", "flat_map", "spot")
+    source = (
+        "Electronic offset drift of ITL sensors, here of one pixel: Snyder et al. 2021, JATIS 7, "
+        "048002; range assumed"
+    )
+
+    def amplify(self, frames: list[Image], shot: Shot, layout: Layout) -> list[Image]:
+        if self["alpha"] == 0:
+            return frames
+        out = []
+        for frame in frames:
+            before = np.zeros_like(frame)
+            before.ravel()[1:] = frame.ravel()[:-1]
+            out.append(frame + np.asarray(self["alpha"], frame.dtype) * before)
+        return out
+
+    def pattern(self, shot: Shot, layout: Layout) -> Values | None:
+        # Before the first column there was no light.
+        out = np.zeros(layout.shape)
+        for s in layout.segments:
+            column = s.x + (s.columns - 1 if s.flip_x else 0)
+            out[s.y : s.y + s.rows, column] = -self._share
+        return out
+
+    def signal(self, level: Values, axes: Axes, layout: Layout) -> Values:
+        return level * (1.0 + self["alpha"])
+
+    def covariances(self, c: Values, axes: Axes, layout: Layout) -> Values:
+        # Each pixel is a mean of two, the gain being that of smooth light.
+        both = np.roll(c, 1, -1) + np.roll(c, -1, -1)
+        part = self._share
+        return np.asarray(c + part * (1 - part) * (both - 2 * c))
+
+    def spot_image(
+        self, images: Values, axes: Mapping[str, float], layout: Layout
+    ) -> Values:
+        return trail_image(images, self._share, layout.backwards("x"), -1)
+
+    def serial_overscan(self, axes: Axes, layout: Layout) -> Values:
+        return np.where(axes["k"] == 1, self["alpha"] * axes["level"], 0.0)
+
+    @property
+    def _share(self) -> float:
+        return self["alpha"] / (1.0 + self["alpha"])

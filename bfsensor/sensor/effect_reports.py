@@ -1,0 +1,217 @@
+"""Effects as a sensor is given them: a report, its block, or effects."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from bfsensor.effects.effect import STAGES, Effect, Layout, Segment, Shot
+from bfsensor.effects.library import LIBRARY, make_effect
+from bfsensor.errors import EffectError, SensorError
+
+SCHEMA = "bfsensor-diagnosis-1"
+"""Of the report.json that ``bfsensor diagnose`` writes."""
+
+STORED = STAGES[:4]
+"""Stages that a sensor applies; what comes later happens in the readout electronics."""
+
+_INTERNAL = ("type", "index_key", "rng_num", "rng_index_key")
+_LAYOUT = ("shape", "segments", "reference", "pixel", "thickness", "front")
+_NUMBERS = tuple(n for n in Shot._fields if n != "kind")
+_KINDS = ("bias", "dark", "flat", "spot")
+
+
+def read_effects(given: Any) -> tuple[tuple[Effect, ...], Mapping[str, Any] | None]:
+    """Read effects as a sensor is given them.
+
+    Parameters
+    ----------
+    given : path-like, mapping, or sequence
+        A report.json; what it holds, or that much of it that has 'effects'; a list of its
+        entries or of effects.
+
+    Returns
+    -------
+    effects : tuple of Effect
+        In the order given.
+    layout : mapping, or None
+        The report's 'layout', where it has one.
+
+    Raises
+    ------
+    SensorError
+        Not a report of this schema; a class that is not known; parameters that are not its.
+
+    Examples
+    --------
+    >>> block = [{"class": "charge_loss", "parameters": {"q": {"value": 1e-7}}}]
+    >>> effects, layout = read_effects({"effects": block})
+    >>> effects[0].name, effects[0]["q"], layout
+    ('charge_loss', 1e-07, None)
+    """
+    where, layout = "effects", None
+    if isinstance(given, str | os.PathLike):
+        where = os.fspath(given)
+        given = _read_report(where)
+        if given.get("schema") != SCHEMA:
+            raise SensorError(
+                f"{where}: schema = {given.get('schema')!r} must be {SCHEMA!r}, as in the "
+                "report.json of bfsensor diagnose"
+            )
+    if isinstance(given, Mapping):
+        if given.get("schema", SCHEMA) != SCHEMA:
+            raise SensorError(f"{where}: schema = {given['schema']!r} must be {SCHEMA!r}")
+        layout = given.get("layout")
+        given = given.get("effects")
+    if isinstance(given, str) or not isinstance(given, Sequence):
+        raise SensorError(
+            f"{where}: effects must be a list of effects or of entries with 'class' and "
+            f"'parameters', not {type(given).__name__}"
+        )
+    found = [
+        entry if isinstance(entry, Effect) else _make(entry, f"{where}: effects[{n}]")
+        for n, entry in enumerate(given)
+    ]
+    return tuple(found), layout
+
+
+def _read_report(path: str) -> dict[str, Any]:
+    try:
+        report = json.loads(Path(path).read_text())
+    except OSError as error:
+        raise SensorError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except ValueError as error:
+        raise SensorError(f"{path}: not a report.json: {error}") from None
+    if not isinstance(report, dict):
+        raise SensorError(f"{path}: not a report.json: it holds no object")
+    return report
+
+
+def _make(entry: Any, where: str) -> Effect:
+    """Make the effect of an entry; a variant that is not named is known by its parameters."""
+    if not isinstance(entry, Mapping) or not isinstance(entry.get("class"), str):
+        raise SensorError(f"{where} must be an effect, or have a 'class', not {entry!r}")
+    word = entry["class"]
+    parameters = entry.get("parameters", {})
+    if not isinstance(parameters, Mapping):
+        raise SensorError(f"{where}: {word}: parameters must be an object with names")
+    values = {}
+    for name, given in parameters.items():
+        value = given.get("value") if isinstance(given, Mapping) else given
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise SensorError(
+                f"{where}: {word}: {name} = {given!r} has no number as 'value'"
+            )
+        values[name] = float(value)
+    variant = entry.get("variant")
+    if variant is None:
+        own = [
+            kind.variant for kind in LIBRARY
+            if kind.word == word and {p.name for p in kind.parameters} == set(values)
+        ]  # fmt: skip
+        variant = own[0] if len(own) == 1 else ""
+    try:
+        return make_effect(word, values, variant)
+    except EffectError as error:
+        raise SensorError(f"{where}: {error}") from None
+
+
+def write_entries(effects: Iterable[Effect]) -> list[dict[str, Any]]:
+    """Entries of a report that say the same as effects."""
+    return [
+        {
+            "class": e.word,
+            "variant": e.variant,
+            "parameters": {n: {"value": v} for n, v in e.values.items()},
+        }
+        for e in effects
+    ]
+
+
+def make_layout(given: Any, usual: Mapping[str, Any]) -> Layout:
+    """Make the layout of a sensor.
+
+    Parameters
+    ----------
+    given : Layout or mapping
+        'shape' (rows, columns) and any of 'segments', 'reference', 'pixel', 'thickness',
+        'front', as in :class:`bfsensor.effects.effect.Layout`.  Without segments one amplifier
+        covers the sensor.
+    usual : mapping
+        What holds where nothing is given.
+
+    Raises
+    ------
+    SensorError
+        Something that is unknown or has no meaning.
+    """
+    if isinstance(given, Layout):
+        return given
+    if not isinstance(given, Mapping):
+        raise SensorError(f"layout must have 'shape', not be {given!r}")
+    values = {k: v for k, v in given.items() if k not in _INTERNAL}
+    for name in values:
+        if name not in _LAYOUT:
+            raise SensorError(f"layout: {name!r} must be one of {', '.join(_LAYOUT)}")
+    try:
+        ny, nx = (int(n) for n in values["shape"])
+        segments = tuple(
+            Segment(**s) if isinstance(s, Mapping) else Segment(*s)
+            for s in values.get("segments") or ()
+        )
+        reference = tuple(float(n) for n in values.get("reference", usual["reference"]))
+        pixel, thickness, front = (
+            float(values.get(k, usual[k])) for k in ("pixel", "thickness", "front")
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise SensorError(f"layout = {values!r} is no layout: {error!r}") from None
+    if ny < 1 or nx < 1 or len(reference) != 3:
+        raise SensorError(
+            f"layout: shape = {ny, nx} must be rows and columns, reference = {reference} "
+            "wavelength [nm], back bias [V] and temperature [C]"
+        )
+    for s in segments:
+        if s.x < 0 or s.y < 0 or s.x + s.columns > nx or s.y + s.rows > ny:
+            raise SensorError(f"layout: {s} does not lie in {ny} rows x {nx} columns")
+    return Layout(
+        (ny, nx),
+        segments or (Segment(0, 0, nx, ny),),
+        reference=(reference[0], reference[1], reference[2]),
+        pixel=pixel,
+        thickness=thickness,
+        front=front,
+        absorption=usual.get("absorption", {}),
+    )
+
+
+def make_conditions(given: Any) -> dict[str, Any]:
+    """Check what is said of exposures: fields of :class:`bfsensor.effects.effect.Shot`.
+
+    Raises
+    ------
+    SensorError
+        Something that is unknown or no number.
+    """
+    if given is None:
+        return {}
+    if isinstance(given, Shot):
+        given = {k: v for k, v in given._asdict().items() if v == v}
+    if not isinstance(given, Mapping):
+        raise SensorError(f"conditions must be names and values, not {given!r}")
+    out: dict[str, Any] = {}
+    for name, value in given.items():
+        if name in _INTERNAL:
+            continue
+        if name == "kind" and value in _KINDS:
+            out[name] = value
+        elif name in _NUMBERS and not isinstance(value, bool | str):
+            out[name] = int(value) if name == "number" else float(value)
+        else:
+            raise SensorError(
+                f"conditions: {name} = {value!r} must be one of {', '.join(_NUMBERS)} with a "
+                f"number, or kind with one of {', '.join(_KINDS)}"
+            )
+    return out

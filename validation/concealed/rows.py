@@ -1,0 +1,96 @@
+"""Results as rows of an ECSV file, added one by one; the file is whole at every moment."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+Row = Mapping[str, Any]
+
+
+def read_rows(path: str | Path) -> list[dict[str, Any]]:
+    """Read the rows of a file; none if it is not there.  Empty cells of text are ""."""
+    if not Path(path).exists():
+        return []
+    table = Table.read(path, format="ascii.ecsv")
+    out = []
+    for row in table:
+        values = {n: row[n] for n in table.colnames}
+        out.append({n: _plain(v, table[n].dtype.kind) for n, v in values.items()})
+    return out
+
+
+def _plain(value: Any, kind: str) -> Any:
+    if np.ma.is_masked(value):
+        return "" if kind in "USO" else np.nan
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def write_rows(path: str | Path, rows: Sequence[Row], command: str) -> None:
+    """Write rows that have the same columns; command and commit go into the header.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> target = Path(tempfile.mkdtemp()) / "two.ecsv"
+    >>> write_rows(target, [{"name": "a", "p": 0.5}, {"name": "", "p": 0.1}], "python -m this")
+    >>> read_rows(target)
+    [{'name': 'a', 'p': 0.5}, {'name': '', 'p': 0.1}]
+    """
+    table = Table({name: [row[name] for row in rows] for name in (rows[0] if rows else {})})
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
+    )
+    table.meta = {"command": command, "commit": commit.stdout.strip()}
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        table.write(beside, format="ascii.ecsv", overwrite=True)
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def append_rows(
+    path: str | Path, rows: Iterable[Row], command: str, *, key: Sequence[str]
+) -> int:
+    """Add rows whose ``key`` columns no row has yet; return how many were added.
+
+    Several processes may add to one file: each waits for the other.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with locked(path.parent):
+        old = read_rows(path)
+        known = {tuple(r[k] for k in key) for r in old}
+        new = [r for r in rows if tuple(r[k] for k in key) not in known]
+        if new:
+            write_rows(path, [*old, *new], command)
+    return len(new)
+
+
+@contextlib.contextmanager
+def locked(folder: str | Path, *, wait: bool = True) -> Iterator[None]:
+    """Hold a folder that one process at a time can hold; it is let go when the process dies.
+
+    Raises
+    ------
+    BlockingIOError
+        Another process holds it and ``wait`` is false.
+    """
+    import fcntl
+
+    held = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        yield
+    finally:
+        os.close(held)
