@@ -190,7 +190,12 @@ def _shapes(
                     else (n - int(3 * length), n)
                 }
                 name = f"{what}s at the {side} end, exp(-d/{length:g})"
-                yield name, where, both(np.asarray(np.exp(-distance / length))), what
+                yield (
+                    name,
+                    where,
+                    both(np.asarray(np.exp(-distance / length), np.float64)),
+                    what,
+                )
         for cycles in range(3, n // 4):
             phase = 2 * np.pi * cycles * (place + 0.5) / n
             for part, word in ((np.cos, "cosine"), (np.sin, "sine")):

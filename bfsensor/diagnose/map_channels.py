@@ -297,7 +297,8 @@ class MapChannels:
                 {"what": "block", "k": -1.0, "x": x.ravel()[full], "y": y.ravel()[full]},
             )
         )
-        power = ring_power(_without_shape(filled))
+        free = _without_shape(filled)
+        power = ring_power(free)
         keep = self._modes > 50
         frequency = (np.arange(RINGS) + 0.5) / (2 * RINGS)
         # Of n modes, each exponential; in parts per million of a pixel.
@@ -311,11 +312,10 @@ class MapChannels:
                 {"what": "ring", "k": frequency[keep], "x": -1.0, "y": -1.0},
             )
         )
-        texture, dx, dy = map_texture(_without_shape(filled))
-        spread = 1e6 * float(filled.var(dtype=np.float64)) / np.sqrt(max(good.sum(), 1))
-        out.append(
-            (texture, np.full(len(texture), spread), {"what": "texture", "k": -1.0, "x": dx, "y": dy})
-        )  # fmt: skip
+        texture, dx, dy = map_texture(free)
+        products = good.sum() * (1 - np.abs(dx) / nx) * (1 - dy / ny)
+        spread = 1e6 * float(free.var(dtype=np.float64)) / np.sqrt(np.maximum(products, 1))
+        out.append((texture, spread, {"what": "texture", "k": -1.0, "x": dx, "y": dy}))
         chess, centres = map_chess(filled)
         # Single pixels' noise is not evened out as that over many is.
         error = np.sqrt(sigma**2 / image.ratio * len(chess) / max(good.sum(), 1))
@@ -452,8 +452,9 @@ def map_texture(
         following += irfft((modes[:-1].conj() * modes[1:]).sum(0), side)
     near, all_ = np.arange(NEAREST, reach + 1), np.arange(-reach, reach + 1)
     all_ = all_[np.abs(all_) >= NEAREST]
+    # A row's mean, taken off, leaves white noise anticorrelated by 1/nx.
     values = [
-        same[near] / (ny * (nx - near)), following[all_] / ((ny - 1) * (nx - np.abs(all_)))
+        same[near] / (ny * (nx - near)) + same[0] / (ny * nx**2), following[all_] / ((ny - 1) * (nx - np.abs(all_)))
     ]  # fmt: skip
     dy = np.repeat([0.0, 1.0], [len(near), len(all_)])
     return 1e6 * np.concatenate(values), np.concatenate([near, all_]).astype(float), dy
