@@ -3,20 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bfsensor.diagnose.baseline import Baseline
-from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.found import (
+    OUTSIDE_WORD,
+    Attribution,
+    Found,
+    class_probabilities,
+    tied_classes,
+)
 from bfsensor.diagnose.locate import ALARM, Mismatch, locate_mismatch
-from bfsensor.diagnose.mismatch import BaselineFit, fit_baseline
-from bfsensor.diagnose.predict import Predictor, fitted, used_channels
+from bfsensor.diagnose.mismatch import BaselineFit
+from bfsensor.diagnose.model import Model, compare_held_out
+from bfsensor.diagnose.named import NAMED
+from bfsensor.diagnose.open_world import FreeFit, OpenWorld, explain_outside, fit_free_form
+from bfsensor.diagnose.predict import Predictor, fitted
+from bfsensor.diagnose.remainder import (
+    ACCURACY,
+    OUTSIDE_ALARM,
+    explained_by_word,
+    stands_out,
+)
 from bfsensor.diagnose.screen import Rival, Screen
 from bfsensor.effects.device_parameter import device_parameters
-from bfsensor.effects.effect import Effect, Parameter
+from bfsensor.effects.effect import Effect
 from bfsensor.effects.library import LIBRARY
 from bfsensor.errors import ConvergenceError
 
@@ -25,12 +38,6 @@ MOST = 4
 
 WEAK = 6.0
 """Increase of the chi-square when it is left out, below which an effect is dropped again."""
-
-TIED = 3.0
-"""Difference of the log-likelihood from the best within which a rival cannot be told apart."""
-
-ALIKE = 0.95
-"""Cosine between templates from which on rivals are of one class."""
 
 CLOSE = 40.0
 """Difference in gain from the best up to which rivals are fitted again with all parameters."""
@@ -46,148 +53,16 @@ all starts: a fit of its shape makes it a few times as much, not twenty times.""
 REFITTED = 5
 """Most rivals that are."""
 
-OUTSIDE = 0.02
-"""Prior probability that what a clean fit explains is none of the library after all (assumed)."""
+FAINT = 2
+"""Candidates below the threshold that are tried."""
+
+NEEDED = 0.5
+"""Part of what an effect explains by itself that it must explain beside a free form to be named."""
+
+TAKEN = 9.0
+"""Chi-square that a parameter of an effect takes by chance, as the best of a library."""
 
 FOLDS = ("fit", "select")
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """One effect of an attribution.
-
-    Attributes
-    ----------
-    effect : Effect
-        With its best parameters.
-    gain : float
-        Increase of the chi-square when it is left out.
-    errors : dict of str to float
-        Standard errors of the fitted parameters.
-    probability : dict of str to float
-        Of each class word in its place.
-    tied : tuple of str
-        Classes that cannot be told from it, its own first.
-    rivals : tuple of Rival
-        Best of each kind in its place, best first.
-    """
-
-    effect: Effect
-    gain: float
-    errors: dict[str, float]
-    probability: dict[str, float]
-    tied: tuple[str, ...]
-    rivals: tuple[Rival, ...] = ()
-
-    def intervals(self, scale: float = 1.0) -> dict[str, dict[str, float]]:
-        """Values with intervals of 68 and 95 %, as report.json has them.
-
-        Of positive shape parameters and amplitudes that are badly known the logarithm is taken
-        for Gaussian, of all others the parameter.
-
-        Parameters
-        ----------
-        scale : float
-            Factor on errors, from calibration.
-        """
-        out = {}
-        for p in self.effect.parameters:
-            value = self.effect[p.name]
-            told = {"value": value}
-            if p.name in self.errors:
-                for level, width in (("68", 1.0), ("95", 1.96)):
-                    told[f"lo{level}"], told[f"hi{level}"] = _interval(
-                        value, scale * width * self.errors[p.name], p
-                    )
-            out[p.name] = told
-        return out
-
-
-@dataclass(frozen=True, eq=False)
-class Attribution:
-    """What explains a mismatch.
-
-    Attributes
-    ----------
-    found : tuple of Found
-        Effects, the one that explains most first; empty where none does.
-    fit : BaselineFit
-        With them.
-    predictor : Predictor
-        Of that fit.
-    mismatch : Mismatch
-        What is left with them.
-    open_world : bool
-        Whether something is left that no effect of the library explains.
-    heldout : dict of str to (float, float, int)
-        Chi-square before and after, and number of values, by channel, of what was not fitted.
-    notes : tuple of str
-        How it went.
-    """
-
-    found: tuple[Found, ...]
-    fit: BaselineFit
-    predictor: Predictor
-    mismatch: Mismatch
-    open_world: bool
-    heldout: dict[str, tuple[float, float, int]] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-
-    @property
-    def probability(self) -> dict[str, float]:
-        """Of each class to be among what was left out, most probable first."""
-        out: dict[str, float] = {}
-        for found in self.found:
-            for word, p in found.probability.items():
-                out[word] = 1 - (1 - out.get(word, 0.0)) * (1 - p)
-        outside = 0.9 if self.open_world else OUTSIDE
-        if not self.found:
-            return {"outside_library": 1.0} if self.open_world else {}
-        scaled = {w: p * (1 - outside) for w, p in out.items()}
-        scaled["outside_library"] = outside
-        return dict(sorted(scaled.items(), key=lambda t: -t[1]))
-
-    @property
-    def tied(self) -> list[str]:
-        """Classes that may be what was left out."""
-        words = [w for f in self.found for w in f.tied]
-        if self.open_world:
-            words.append("outside_library")
-        return list(dict.fromkeys(words))
-
-    def chi2dof(self) -> tuple[float, float]:
-        """Chi-square over number of all values that were not fitted, before and after."""
-        count = sum(n for *_, n in self.heldout.values())
-        if not count:
-            return np.nan, np.nan
-        before, after = (sum(v[k] for v in self.heldout.values()) for k in (0, 1))
-        return before / count, after / count
-
-
-class Model:
-    """The baseline with some effects, fitted."""
-
-    def __init__(self, predictor: Predictor, fit: BaselineFit) -> None:
-        self.predictor, self.fit = predictor, fit
-
-    @property
-    def effects(self) -> tuple[Effect, ...]:
-        """Effects with their fitted parameters."""
-        return self.predictor.effects_at(self.fit.values[: len(self.predictor.names)])
-
-    def with_effects(self, effects: Sequence[Effect]) -> Model:
-        """Fit again, with these effects."""
-        predictor = self.predictor.with_effects(effects, self.fit.values)
-        return Model(predictor, fit_baseline(predictor, self.fit.channels, like=self.fit))
-
-    def errors(self, n: int) -> dict[str, float]:
-        """Standard errors of the parameters of the n-th effect."""
-        start = f"effect {n} "
-        return {
-            name.split()[-1]: float(e)
-            for name, e in zip(self.fit.names, self.fit.errors, strict=True)
-            if name.startswith(start)
-        }
 
 
 def attribute(
@@ -206,6 +81,10 @@ def attribute(
     out.  Then each effect is taken out once and held against all others in its place: a better
     one replaces it, those as good are its class.
 
+    What is left after that and counts (see :mod:`bfsensor.diagnose.remainder`) is outside the
+    library and modelled freely, first without any effect: those that explained part of it are
+    named only if the free form cannot do without them.
+
     Parameters
     ----------
     predictor, fit, mismatch
@@ -216,62 +95,193 @@ def attribute(
         Of the noise that thresholds come from.
     """
     kinds = candidates_of(predictor.baseline) if kinds is None else kinds
-    model = Model(predictor, fit)
-    notes: list[str] = []
-    open_world = False
-    rankings: dict[int, list[Rival]] = {}
-    while mismatch.detected and len(model.effects) < MOST:
-        screen = Screen(model.predictor, model.fit, _seen(mismatch))
-        there = {e.name for e in model.effects}
-        ranking = rank(screen, [k for k in kinds if name_of(k) not in there])
-        critical = threshold(screen, ranking, seed=seed)
-        good = [r for r in ranking if r.gain > critical and not r.select < 0]
-        if not good:
-            open_world = True
-            break
-        ranking = refine(model, ranking)
-        best = next((r for r in ranking if r.gain > critical and not r.select < 0), good[0])
-        try:
-            model = model.with_effects((*model.effects, best.effect))
-        except ConvergenceError as error:
-            notes.append(f"{best.effect.name}: {error}")
-            open_world = True
-            break
-        rankings[len(model.effects) - 1] = ranking
-        mismatch = locate_mismatch(model.fit, seed=seed)
-    else:
-        open_world = mismatch.detected
-    found, model, mismatch = _judge(model, rankings, mismatch, kinds, seed)
-    if open_world and mismatch.detected and found:
-        rest = remainder(mismatch)
-        if rest < REMAINDER * (fit.total - model.fit.total):
-            # Closed forms of effects are good to a per cent: what is seen at a hundred standard
-            # deviations leaves some.
-            open_world = False
-            notes.append(
-                f"{np.sqrt(rest):.1f} standard deviations are left in "
-                f"{', '.join(dict.fromkeys(p.word for p in mismatch.parts))}: laid to the effects' "
-                "closed forms"
-            )
+    base = Model(predictor, fit)
+    candidates = (*kinds, *NAMED)
+    model, mismatch, rankings, notes = _forward(base, mismatch, candidates, seed)
+    free: OpenWorld | None = None
+    outside = _is_outside(base, model, mismatch)
+    if not outside:
+        places = {n: r for n, r in rankings.items() if n < len(model.effects)}
+        found, model, mismatch = _judge(model, places, mismatch, candidates, seed)
+        outside = _is_outside(base, model, mismatch)
+    if outside:
+        found, model, mismatch, free = _outside(
+            base, model, mismatch, rankings, candidates, seed
+        )
+    named = any(f.effect.word == OUTSIDE_WORD for f in found)
     return Attribution(
         found=tuple(sorted(found, key=lambda f: -f.gain)),
         fit=model.fit,
         predictor=model.predictor,
         mismatch=mismatch,
-        open_world=open_world and mismatch.detected,
-        heldout=compare_held_out(Model(predictor, fit), model),
+        open_world=outside or named,
+        heldout=compare_held_out(base, model),
         notes=tuple(notes),
+        free_form=free,
     )
 
 
-def remainder(mismatch: Mismatch) -> float:
-    """Chi-square beyond noise of all channels that something is left in; infinite of none."""
-    out = 0.0
-    for word in dict.fromkeys(p.word for p in mismatch.parts):
-        square, dof = mismatch.chi2[word]
-        parts = sum(p.z**2 for p in mismatch.parts if p.word == word)
-        out += max(square - dof, parts)
-    return out or np.inf
+def _forward(
+    base: Model, mismatch: Mismatch, kinds: Sequence[type[Effect]], seed: int
+) -> tuple[Model, Mismatch, dict[int, list[Rival]], list[str]]:
+    """Add effects one by one while something counts and a candidate explains it.
+
+    Also gives the rankings by number of effects there were, and notes.
+    """
+    model = base
+    notes: list[str] = []
+    rankings: dict[int, list[Rival]] = {}
+    while len(model.effects) < MOST and stands_out(
+        mismatch, explained_by_word(base.fit, model.fit), fits=len(model.effects)
+    ):
+        screen = Screen(model.predictor, model.fit, _seen(mismatch))
+        ranking = rank(screen, _without(kinds, model.effects))
+        critical = threshold(screen, ranking, seed=seed)
+        good = [r for r in ranking if r.gain > critical and not r.select < 0]
+        rankings[len(model.effects)] = ranking
+        if good:
+            ranking = refine(model, ranking)
+            good = [r for r in ranking if r.gain > critical and not r.select < 0] or good
+            rankings[len(model.effects)] = ranking
+        else:
+            # That something is there is proved already: a fainter candidate will do, if with it
+            # nothing is left.
+            good = [r for r in ranking if r.gain > WEAK and not r.select < 0][:FAINT]
+        step = _step(
+            model, good, mismatch, seed, notes, sure=bool(good) and good[0].gain > critical
+        )
+        if step is None:
+            break
+        model, mismatch = step
+    return model, mismatch, rankings, notes
+
+
+def _step(
+    model: Model,
+    good: Sequence[Rival],
+    mismatch: Mismatch,
+    seed: int,
+    notes: list[str],
+    *,
+    sure: bool,
+) -> tuple[Model, Mismatch] | None:
+    """Fit with the first of some candidates that can be fitted; an unsure one must leave nothing."""
+    for rival in good:
+        try:
+            further = model.with_effects((*model.effects, rival.effect))
+        except ConvergenceError as error:
+            notes.append(f"{rival.effect.name}: {error}")
+            continue
+        left = locate_mismatch(further.fit, seed=seed)
+        if sure or not left.detected:
+            return further, left
+    return None
+
+
+def _is_outside(base: Model, model: Model, mismatch: Mismatch) -> bool:
+    """Whether what is left is outside the library: see :mod:`bfsensor.diagnose.remainder`."""
+    explained = explained_by_word(base.fit, model.fit)
+    return stands_out(mismatch, explained, fits=len(model.effects), alarm=OUTSIDE_ALARM)
+
+
+def _outside(
+    base: Model,
+    model: Model,
+    mismatch: Mismatch,
+    rankings: dict[int, list[Rival]],
+    kinds: Sequence[type[Effect]],
+    seed: int,
+) -> tuple[list[Found], Model, Mismatch, OpenWorld | None]:
+    """Model freely what is left, and say which effects are needed beside that.
+
+    An effect that explains part of something foreign is no cause of it: what the free form
+    explains alone, without any effect, names none.  Effects stay if it does not, each if it
+    takes more of the chi-square than :data:`NEEDED` of what it takes by itself.
+    """
+    first = locate_mismatch(base.fit, seed=seed) if model.effects else mismatch
+    alone = fit_free_form(base, first, seed=seed)
+    chosen, effects, ranking = alone, base, rankings.get(0, [])
+    if model.effects:
+        beside = fit_free_form(model, mismatch, before=base.fit, seed=seed)
+        if not _does_without(base, alone, model, beside):
+            chosen, effects = beside, model
+            ranking = rankings.get(len(model.effects), [])
+            kept = _needed(chosen.model, base)
+            if len(kept) < len(model.effects):
+                effects = model.with_effects(kept)
+                left = locate_mismatch(effects.fit, seed=seed)
+                chosen = fit_free_form(effects, left, before=base.fit, seed=seed)
+                ranking = []
+    told = explain_outside(effects, mismatch, ranking, free=chosen, seed=seed)
+    if told is None:
+        free, last, left = None, effects, mismatch
+    else:
+        free, last = told
+        left = chosen.mismatch
+    found = [
+        _found(last, n, _place(last, n, kinds, left)) for n in range(len(last.effects))
+    ]
+    return found, last, left, free
+
+
+def _does_without(base: Model, alone: FreeFit, model: Model, beside: FreeFit) -> bool:
+    """Whether a free form alone explains as much as effects do with another one beside them.
+
+    Each term and parameter is charged with what chance gives; of free forms of as many groups
+    that are seen far beyond noise, the inaccuracy of the columns decides nothing.
+    """
+    if not alone.choices:
+        return False
+    charged = beside.model.fit.total + beside.penalty + _critical(model.effects)
+    cost = alone.model.fit.total + alone.penalty - charged
+    if len(alone.choices) > len(beside.choices):
+        return bool(cost <= 0)
+    return bool(cost <= ACCURACY**2 * (base.fit.total - model.fit.total))
+
+
+def _place(
+    model: Model, n: int, kinds: Sequence[type[Effect]], mismatch: Mismatch
+) -> list[Rival]:
+    """All candidates in the place of one effect of a model."""
+    others = [e for k, e in enumerate(model.effects) if k != n]
+    without = model.with_effects(others)
+    screen = Screen(without.predictor, without.fit, _seen(mismatch))
+    return rank(screen, _without(kinds, others))
+
+
+def _without(
+    kinds: Sequence[type[Effect]], effects: Sequence[Effect]
+) -> list[type[Effect]]:
+    """Candidates that are not there already."""
+    there = {e.name for e in effects}
+    return [k for k in kinds if name_of(k) not in there]
+
+
+def _critical(effects: Sequence[Effect]) -> float:
+    """Chi-square that as many effects take by chance."""
+    return TAKEN * sum(len(fitted(e)) for e in effects)
+
+
+def _needed(model: Model, base: Model) -> list[Effect]:
+    """Effects that a model with a free form cannot do without."""
+    out = []
+    for n, effect in enumerate(model.effects):
+        others = [e for k, e in enumerate(model.effects) if k != n]
+        gain = model.with_effects(others).fit.total - model.fit.total
+        alone = base.fit.total - base.with_effects([effect]).fit.total
+        if gain > max(_critical([effect]), NEEDED * alone):
+            out.append(effect)
+    return out
+
+
+def _found(model: Model, n: int, ranking: Sequence[Rival]) -> Found:
+    """One effect of a model with those that may stand in its place."""
+    effect = model.effects[n]
+    gain = next((r.gain for r in ranking if r.effect.name == effect.name), np.nan)
+    return Found(
+        effect, gain, model.errors(n), class_probabilities(ranking),
+        tied_classes(effect, ranking), tuple(ranking),
+    )  # fmt: skip
 
 
 def candidates_of(baseline: Baseline) -> tuple[type[Effect], ...]:
@@ -361,10 +371,7 @@ def _judge(
                 model, places, swapped = without, {}, True
                 break
             screen = Screen(without.predictor, without.fit, _seen(mismatch))
-            there = {e.name for e in others}
-            ranking = refine(
-                without, rank(screen, [k for k in kinds if name_of(k) not in there])
-            )
+            ranking = refine(without, rank(screen, _without(kinds, others)))
             places[n] = ranking
             here = next(
                 (r for r in ranking if r.effect.name == model.effects[n].name), None
@@ -379,97 +386,11 @@ def _judge(
                     break
     if rounds and model.effects:
         mismatch = locate_mismatch(model.fit, seed=seed)
-    out = []
-    for n, effect in enumerate(model.effects):
-        ranking = places.get(n, [])
-        gain = next((r.gain for r in ranking if r.effect.name == effect.name), np.nan)
-        out.append(
-            Found(
-                effect, gain, model.errors(n), class_probabilities(ranking),
-                tied_classes(effect, ranking), tuple(ranking),
-            )
-        )  # fmt: skip
+    out = [_found(model, n, places.get(n, [])) for n in range(len(model.effects))]
     return out, model, mismatch
-
-
-def class_probabilities(
-    ranking: Sequence[Rival], temperature: float = 1.0
-) -> dict[str, float]:
-    """Of each class in one place: evidence over the sum of all, variants of a class together."""
-    if not ranking:
-        return {}
-    z = np.array([r.evidence for r in ranking]) / temperature
-    # Variants share their class's prior.
-    counts = {w: sum(r.word == w for r in ranking) for w in {r.word for r in ranking}}
-    weights = np.exp(z - z.max()) / np.array([counts[r.word] for r in ranking])
-    out: dict[str, float] = {}
-    for rival, w in zip(ranking, weights / weights.sum(), strict=True):
-        out[rival.word] = out.get(rival.word, 0.0) + float(w)
-    return {w: p for w, p in out.items() if p > 1e-4}
-
-
-def tied_classes(effect: Effect, ranking: Sequence[Rival]) -> tuple[str, ...]:
-    """Classes that cannot be told from an effect, its own first."""
-    own = next((r for r in ranking if r.effect.name == effect.name), None)
-    words = [effect.word]
-    if own is not None:
-        for rival in ranking:
-            close = 0.5 * (own.gain - rival.gain) < TIED
-            if close or (_cosine(own, rival) > ALIKE and own.gain - rival.gain < 4 * TIED):
-                words.append(rival.word)
-    return tuple(dict.fromkeys(words))
-
-
-def compare_held_out(before: Model, after: Model) -> dict[str, tuple[float, float, int]]:
-    """Chi-squares of what was not fitted, by channel, without and with effects."""
-    out: dict[str, tuple[float, float, int]] = {}
-    channels = used_channels(before.predictor.measured.channels, ("held-out",))
-    for channel in channels:
-        if not len(channel):
-            continue
-        squares = []
-        for model in (before, after):
-            left = _left(model, channel)
-            squares.append(float(left @ left))
-        old = out.get(channel.word, (0.0, 0.0, 0))
-        out[channel.word] = (
-            old[0] + squares[0], old[1] + squares[1], old[2] + len(channel)
-        )  # fmt: skip
-    return out
-
-
-def _left(model: Model, channel: Channel) -> NDArray[np.float64]:
-    """Residuals of a channel over errors and chance, all parameters as fitted."""
-    values = dict(zip(model.fit.names, model.fit.values, strict=True))
-    point = model.fit.values[: len(model.predictor.names)]
-    predicted = model.predictor.predict(channel, point)
-    for name, column in model.predictor.linear(channel).items():
-        predicted = predicted + values.get(name, 0.0) * column
-    left = channel.whiten(channel.values - predicted)
-    modes = model.predictor.modes(channel, point)
-    if not modes.shape[1]:
-        return left
-    shapes, sizes, _ = np.linalg.svd(channel.whiten(modes), full_matrices=False)
-    wider = 1 - 1 / np.sqrt(1 + sizes**2)
-    return np.asarray(left - shapes @ (wider * (shapes.T @ left)))
 
 
 def _seen(mismatch: Mismatch) -> list[dict[str, Any]]:
     """What the scans found, farthest first, as effects take it."""
     parts = [*mismatch.parts, *mismatch.findings[:200]]
     return [{**p.where, "word": p.word, "z": p.z, "family": p.family} for p in parts]
-
-
-def _cosine(one: Rival, other: Rival) -> float:
-    a, b = one.template, other.template
-    norm = np.sqrt((a @ a) * (b @ b))
-    return float(abs(a @ b) / norm) if norm else 0.0
-
-
-def _interval(value: float, width: float, p: Parameter) -> tuple[float, float]:
-    """Ends of an interval."""
-    away = value - p.neutral if p.law == "log" else value
-    if p.law == "log" and not p.signed and away > 0 and width > 0.15 * away:
-        factor = float(np.exp(min(width / away, 50.0)))
-        return p.neutral + away / factor, p.neutral + away * factor
-    return value - width, value + width

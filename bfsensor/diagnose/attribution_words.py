@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from bfsensor.diagnose.attribute import Attribution, Found
+from bfsensor.diagnose.named import AxesExchanged, says_exchanged
+from bfsensor.diagnose.open_world_words import reported_freely
 
 OUTSIDE = "outside_library"
 
@@ -17,15 +19,17 @@ def reported(attribution: Attribution | None) -> dict[str, Any]:
             "class_probability": {},
             "equivalence_class": [],
             "open_world": False,
+            "free_form": None,
         }
     effects: list[dict[str, Any]] = [_effect(f) for f in attribution.found]
-    if attribution.open_world:
+    if attribution.open_world and not any(e["class"] == OUTSIDE for e in effects):
         effects.append({"class": OUTSIDE, "parameters": {}})
     return {
         "effects": effects,
         "class_probability": attribution.probability,
         "equivalence_class": attribution.tied,
         "open_world": attribution.open_world,
+        "free_form": reported_freely(attribution.free_form),
         "p_value_after": attribution.mismatch.p_value,
     }
 
@@ -44,6 +48,11 @@ def said_of(attribution: Attribution) -> list[str]:
     """Sentences: what explains it, what would as well, what is left, what it does to new data."""
     out = []
     for found in attribution.found:
+        if isinstance(found.effect, AxesExchanged):
+            out.append(
+                says_exchanged(found.effect["amp"], found.errors.get("amp", 0.0)) + "."
+            )
+            continue
         values = ", ".join(
             f"{name} = {_value(told)}" for name, told in found.intervals().items()
         )
@@ -52,11 +61,18 @@ def said_of(attribution: Attribution) -> list[str]:
         if others:
             text += f"; these recordings cannot tell it from {' or '.join(others)}"
         out.append(text + ".")
-    if attribution.open_world:
+    named = any(f.effect.word == OUTSIDE for f in attribution.found)
+    if attribution.open_world and not (named and attribution.free_form is None):
         what = "what is left" if attribution.found else "it"
         out.append(f"No effect of the library explains {what}.")
+    elif not attribution.found and attribution.mismatch.detected:
+        out.append(
+            "No effect explains it; it is too faint to be called outside the library."
+        )
+    if attribution.free_form is not None:
+        out.append(attribution.free_form.said)
     before, after = attribution.chi2dof()
-    if attribution.found and before == before:
+    if (attribution.found or attribution.free_form is not None) and before == before:
         out.append(
             f"On recordings that were not fitted chi-square per value goes from {before:.2f} to "
             f"{after:.2f}."

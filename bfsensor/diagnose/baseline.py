@@ -120,14 +120,18 @@ class Baseline:
         )
         if not change:
             return (kx, ky), exact
-        reference = self.edges.get(self.reference, (kx, ky))
-        nominal = centre(*reference)
-        factor = centre(kx, ky) / nominal if nominal else 1.0
+        factor = self.scale_at(key)
         for name, value in change.items():
             dkx, dky = self.derivatives[name]
             kx = kx + factor * value * dkx
             ky = ky + factor * value * dky
         return (kx, ky), exact
+
+    def scale_at(self, key: tuple[float, float]) -> float:
+        """Factor on changes of the shifts at a condition that is held: that of a_00."""
+        own = self.edges[key]
+        nominal = centre(*self.edges.get(self.reference, own))
+        return centre(*own) / nominal if nominal else 1.0
 
     def areas_on(
         self, condition: Condition, change: Mapping[str, float] | None, background: float

@@ -145,8 +145,9 @@ class Diagnosis:
         out: dict[str, Any] = {
             "chi2dof_before": _finite(self.heldout), "chi2dof_after": None, "channels": {},
         }  # fmt: skip
-        if self.attribution is not None and self.attribution.found:
-            out["chi2dof_after"] = _finite(self.attribution.chi2dof()[1])
+        told = self.attribution
+        if told is not None and (told.found or told.free_form is not None):
+            out["chi2dof_after"] = _finite(told.chi2dof()[1])
         if self.attribution is not None:
             out["channels"] = {
                 word: {"before": b / n, "after": a / n, "values": n}

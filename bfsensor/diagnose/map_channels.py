@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import rfft2
+from scipy.fft import irfft, next_fast_len, rfft, rfft2
 
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Axes, Condition
@@ -20,6 +20,12 @@ BLOCKS = 16
 
 RINGS = 24
 """Bins of the spatial frequency, from 0 to half a cycle a pixel."""
+
+NEAREST, FARTHEST = 4, 40
+"""Distances in x [pixel] at which a map is held against itself: nearer ones share boundaries."""
+
+STRIPE = 256
+"""Rows of a map that are transformed at a time."""
 
 FULL = 0.5
 """Part of the light's noise below which a flat's wells are full."""
@@ -302,7 +308,8 @@ class MapChannels:
                 {"what": "block", "k": -1.0, "x": x.ravel()[full], "y": y.ravel()[full]},
             )
         )
-        power = ring_power(without_shape(filled))
+        free = without_shape(filled)
+        power = ring_power(free)
         keep = self._modes > 50
         frequency = (np.arange(RINGS) + 0.5) / (2 * RINGS)
         # Of n modes, each exponential; in parts per million of a pixel.
@@ -316,12 +323,22 @@ class MapChannels:
                 {"what": "ring", "k": frequency[keep], "x": -1.0, "y": -1.0},
             )
         )
+        texture, dx, dy = map_texture(free)
+        products = good.sum() * (1 - np.abs(dx) / nx) * (1 - dy / ny)
+        spread = 1e6 * float(free.var(dtype=np.float64)) / np.sqrt(np.maximum(products, 1))
+        out.append((texture, spread, {"what": "texture", "k": -1.0, "x": dx, "y": dy}))
+        chess, centres = map_chess(filled)
+        # Single pixels' noise is not evened out as that over many is.
+        error = np.sqrt(sigma**2 / image.ratio * len(chess) / max(good.sum(), 1))
+        out.append(
+            (chess, np.full(len(chess), error), {"what": "chess", "k": -1.0, "x": centres, "y": -1.0})
+        )  # fmt: skip
         return out
 
     @property
     def _modes(self) -> NDArray[np.int64]:
         """Modes of each ring."""
-        return np.bincount(_ring_bins(self._shape).ravel(), minlength=RINGS)[:RINGS]
+        return ring_modes(self._shape)
 
 
 @dataclass
@@ -399,6 +416,11 @@ def _ring_bins(shape: tuple[int, int]) -> NDArray[np.uint8]:
     return bins
 
 
+def ring_modes(shape: tuple[int, int]) -> NDArray[np.int64]:
+    """Modes of each ring of a map of that shape."""
+    return np.bincount(_ring_bins(shape).ravel(), minlength=RINGS)[:RINGS]
+
+
 def ring_power(image: NDArray) -> NDArray[np.float64]:
     """Mean power of a mode by ring; that of white noise is a pixel's variance."""
     ny, nx = image.shape
@@ -413,3 +435,63 @@ def spectrum_rings(modes: NDArray, shape: tuple[int, int]) -> NDArray[np.float64
     count = np.bincount(bins, minlength=RINGS + 1)[:RINGS]
     total = np.bincount(bins, power.ravel(), minlength=RINGS + 1)[:RINGS]
     return np.asarray(total / (shape[0] * shape[1]) / np.maximum(count, 1))
+
+
+def map_texture(
+    image: NDArray,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Hold a map against itself: mean products [1e-6] of pixels (dx, dy) apart, with dx and dy.
+
+    In the same row and from one row to the next: patterns that go with the time of readout
+    keep step along a row and start the next one with another phase.  Means of columns and of
+    rows are taken off: they are told by themselves.
+
+    Examples
+    --------
+    >>> wave = np.sin(2 * np.pi * np.arange(64 * 100) / 8.1).reshape(64, 100)
+    >>> values, dx, dy = map_texture(wave)
+    >>> [float(values[(dx == n) & (dy == 0)][0].round(-5)) for n in (4, 8)]
+    [-500000.0, 500000.0]
+    """
+    ny, nx = image.shape
+    columns = image.mean(0, dtype=np.float64)
+    reach = min(FARTHEST, nx // 2)
+    side = next_fast_len(nx + reach + 1, real=True)
+    same, following = np.zeros(side), np.zeros(side)
+    # Some rows at a time: transforms of large sensors need not be held.
+    for start in range(0, ny, STRIPE):
+        rows = image[start : start + STRIPE + 1]
+        rows = rows - columns - rows.mean(1, dtype=np.float64)[:, None] + columns.mean()
+        modes = rfft(rows, side, axis=1)
+        own = modes[:STRIPE]
+        same += irfft((own.real**2 + own.imag**2).sum(0), side)
+        following += irfft((modes[:-1].conj() * modes[1:]).sum(0), side)
+    near, all_ = np.arange(NEAREST, reach + 1), np.arange(-reach, reach + 1)
+    all_ = all_[np.abs(all_) >= NEAREST]
+    # A row's mean, taken off, leaves white noise anticorrelated by 1/nx.
+    values = [
+        same[near] / (ny * (nx - near)) + same[0] / (ny * nx**2),
+        following[all_] / ((ny - 1) * (nx - np.abs(all_))),
+    ]
+    dy = np.repeat([0.0, 1.0], [len(near), len(all_)])
+    return 1e6 * np.concatenate(values), np.concatenate([near, all_]).astype(float), dy
+
+
+def map_chess(image: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Half of the difference of even and odd pixels (row plus column), in strips, and their x.
+
+    Columns and rows do not show it, nor do rings, which end at half a cycle a pixel.
+
+    Examples
+    --------
+    >>> values, x = map_chess(np.indices((32, 32)).sum(0) % 2)
+    >>> float(values.min()), float(values.max()), x[:3].tolist()
+    (-0.5, -0.5, [0.5, 2.5, 4.5])
+    """
+    ny, nx = image.shape
+    side = block_side((ny, nx))
+    columns = image[::2].sum(0, dtype=np.float64) - image[1::2].sum(0, dtype=np.float64)
+    columns[1::2] *= -1.0
+    kept = columns[: nx // side * side].reshape(-1, side)
+    centres = np.arange(len(kept), dtype=np.float64) * side + 0.5 * (side - 1)
+    return np.asarray(kept.mean(1) / ny, float), centres

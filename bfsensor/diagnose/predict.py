@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -32,6 +32,9 @@ MAP_ORDER = 4
 REDUCED_LEVEL = 40_000.0
 """Background [e-] at which a_ij without a level are predicted: halfway to a flat of 80,000 e-, at
 which published covariances are quoted."""
+
+Columns = Callable[[Channel], dict[str, NDArray[np.float64]]]
+"""Columns of further linear parameters of a channel, by name, in its unit."""
 
 
 class Predictor:
@@ -133,6 +136,8 @@ class Predictor:
                     f"baseline has no shifts at {'/'.join(key)}: the nearest condition's are taken"
                 )
 
+        self.columns: tuple[Columns, ...] = ()
+        self.spot_slopes: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self.effects: tuple[Effect, ...] = ()
         self._add(effects)
 
@@ -153,6 +158,56 @@ class Predictor:
         other.names, other.steps = self.names[:plain], self.steps[:plain]
         other.start = (self.start if point is None else point)[:plain].copy()
         other._add(effects)
+        return other
+
+    def with_columns(
+        self, columns: Columns, point: NDArray[np.float64] | None = None
+    ) -> Predictor:
+        """Copy with further linear parameters; fits begin at ``point``."""
+        other = copy(self)
+        other.columns = (*self.columns, columns)
+        if point is not None:
+            other.start = point[: len(self.names)].copy()
+        return other
+
+    def with_shifts(
+        self,
+        edges: tuple[NDArray[np.float64], NDArray[np.float64]],
+        slopes: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
+    ) -> Predictor:
+        """Copy with shifts of boundaries added to the baseline's [pixel/e-].
+
+        Parameters
+        ----------
+        edges : tuple of ndarray
+            Of right and upper edges; at other conditions scaled as the baseline's own are.
+        slopes : tuple of ndarray, optional
+            Their change with the charge that pushes [pixel/e-^2].
+        """
+        other = copy(self)
+        own = self.baseline
+        scales = {k: own.scale_at(k) for k in own.edges}
+        if slopes is not None:
+            # The baseline's own hold at a level that may not be 0.
+            edges = edges[0] + own.level * slopes[0], edges[1] + own.level * slopes[1]
+        moved = {
+            k: tuple(o + scales[k] * d for o, d in zip(own.edges[k], edges, strict=True))
+            for k in own.edges
+        }
+        changed: dict[str, object] = {"edges": moved}
+        if slopes is not None:
+            nothing = (np.zeros_like(edges[0]),) * 2
+            changed["slopes"] = {
+                k: tuple(
+                    o + scales[k] * d
+                    for o, d in zip(own.slopes.get(k, nothing), slopes, strict=True)
+                )
+                for k in own.edges
+            }
+            other.spot_slopes = slopes
+        other.baseline = replace(own, **changed)  # type: ignore[arg-type]
+        # What was kept goes with the baseline.
+        other._evened, other._grown = {}, {}
         return other
 
     def with_exposures(
@@ -396,7 +451,10 @@ class Predictor:
             "flat_mean": self._mean_columns, "flat_map": self._map_columns,
             "dark_map": self._dark_columns, "spot": self._spot_columns,
         }.get(channel.word)  # fmt: skip
-        return {} if make is None else make(channel)
+        out = {} if make is None else make(channel)
+        for more in self.columns:
+            out |= more(channel)
+        return out
 
     def _flat_cov(
         self,
@@ -484,7 +542,7 @@ class Predictor:
                 found = predict_spots(
                     *chain.edges(edges, self._spot_of[key]), sigma=wide,
                     phases=self._phases[key], fluxes=fluxes, halo=halo, law=chain.law,
-                    neighbours=self.measured.neighbours,
+                    neighbours=self.measured.neighbours, slopes=self.spot_slopes,
                     change=partial(chain.spot_image, axes=axes),
                 )  # fmt: skip
             found["flux"] = found["flux"] / scale
@@ -506,7 +564,7 @@ class Predictor:
             kx, ky, sigma, fluxes = state
             found = predict_spots(
                 kx, ky, sigma=(float(sigma[0]), float(sigma[1])), phases=self._phases[key],
-                fluxes=fluxes,
+                fluxes=fluxes, slopes=self.spot_slopes,
             )  # fmt: skip
             kept = self._grown[key] = state, found
         return kept[1]

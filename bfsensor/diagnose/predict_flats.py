@@ -77,13 +77,9 @@ def periodic_covariances(
     covariances : ndarray, shape (n, side, side)
         The side is :data:`GRID`, or that of wider area changes.
     """
-    ny, nx = a.shape[-2:]
-    side = max(GRID, next_fast_len(max(ny, nx), real=True))
-    wide = np.zeros((*a.shape[:-2], side, side))
-    wide[..., :ny, :nx] = a
-    wide = np.roll(wide, (-(ny // 2), -(nx // 2)), (-2, -1))
+    side = side_of(a)
     # Of a covariance the even part of the areas counts; it has a real transform.
-    a_k = rfft2(wide).real - law.loss
+    a_k = transform_areas(a, side) - law.loss
     m = np.asarray(levels, float)[:, None, None]
     if law.bend:
         # The integrating factor, over the charge s that a fluctuation came at; smooth.
@@ -104,3 +100,50 @@ def quadrant(c: NDArray[np.float64], lags: int) -> NDArray[np.float64]:
     """Lags from 0, the mean of (i, j) and (i, -j), of periodic covariances."""
     side = np.arange(lags + 1)
     return np.asarray(0.5 * (c[:, side[:, None], side] + c[:, -side[:, None], side]))
+
+
+def flat_response(
+    a: NDArray[np.float64], levels: ArrayLike, *, power: int = 0
+) -> NDArray[np.float64]:
+    r"""Derivative of flats' power by a response that goes with the level to a power.
+
+    .. math:: \delta\tilde C = \delta\hat a \int_0^m 2 s^p\, \tilde C(s)\,
+        e^{2 \hat a (m - s)} ds
+
+    Parameters
+    ----------
+    a, levels
+        As for :func:`periodic_covariances`.
+    power : int
+        p: the change of the area is s^p times a constant where all pixels hold s.
+
+    Returns
+    -------
+    response : ndarray, shape (n, side, side // 2 + 1)
+        By mode [e-^(2 + p)], to be multiplied by the transform of the change [1/e-^(1 + p)].
+    """
+    a_k = transform_areas(a, side_of(a))
+    m = np.asarray(levels, float)[:, None, None]
+    nodes, weights = np.polynomial.legendre.leggauss(NODES)
+    out = np.zeros(np.broadcast_shapes(a_k.shape, m.shape))
+    for node, weight in zip(0.5 * (nodes + 1), 0.5 * weights, strict=True):
+        s = node * m
+        x = 2 * a_k * s
+        small = np.abs(x) < 1e-9
+        grown = s * np.where(small, 1 + x / 2, np.expm1(x) / np.where(small, 1.0, x))
+        out += weight * m * 2 * s**power * grown * np.exp(2 * a_k * (m - s))
+    return out
+
+
+def side_of(a: NDArray[np.float64]) -> int:
+    """Side of the periodic array of the closed form: :data:`GRID`, or that of wider areas."""
+    return max(GRID, int(next_fast_len(max(a.shape[-2:]), real=True)))
+
+
+def transform_areas(a: NDArray[np.float64], side: int) -> NDArray[np.float64]:
+    """Transform of area changes on a periodic array, shape (..., side, side // 2 + 1)."""
+    ny, nx = a.shape[-2:]
+    wide = np.zeros((*a.shape[:-2], side, side))
+    wide[..., :ny, :nx] = a
+    wide = np.roll(wide, (-(ny // 2), -(nx // 2)), (-2, -1))
+    return np.asarray(rfft2(wide).real)

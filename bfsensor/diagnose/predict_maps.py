@@ -17,6 +17,8 @@ from bfsensor.diagnose.map_channels import (
     RINGS,
     MapShare,
     block_side,
+    map_chess,
+    map_texture,
     spectrum_rings,
 )
 from bfsensor.diagnose.map_waves import smooth_shapes
@@ -212,20 +214,37 @@ class MapChange:
         if kept is None or kept[0] is not channel:
             rows = np.nonzero(channel.axes["map"] == name)[0]
             axes = {k: channel.axes[k][rows] for k in ("what", "x", "y", "k")}
-            axes = {w: np.nonzero(axes["what"] == w)[0] for w in PARTS} | {
-                k: axes[k] for k in ("x", "y", "k")
-            }
-            kept = self._kept[key] = channel, rows, axes
+            kept = self._kept[key] = channel, rows, parts_of(axes)
         return kept[1], kept[2]
 
 
-PARTS = ("column", "row", "block", "ring")
+PARTS = ("column", "row", "block", "ring", "texture", "chess")
+
+
+def parts_of(axes: Axes) -> dict[str, NDArray[Any]]:
+    """Axes 'x', 'y', 'k' of a map's values, and which of them are each of :data:`PARTS`."""
+    found = {w: np.nonzero(axes["what"] == w)[0] for w in PARTS}
+    return found | {k: axes[k] for k in ("x", "y", "k")}
+
+
+def reduce_map(change: NDArray[np.float64], axes: Axes) -> NDArray[np.float64]:
+    """What a change of a map does to its values.
+
+    Parameters
+    ----------
+    change : ndarray, shape (ny, nx)
+        Relative.
+    axes : mapping
+        'what', 'x', 'y', 'k' of the values.
+    """
+    ny, nx = change.shape
+    return reduce_spectrum(np.fft.rfft2(change), (ny, nx), parts_of(axes))
 
 
 def reduce_spectrum(
     delta: Spectrum, shape: tuple[int, int], axes: Axes
 ) -> NDArray[np.float64]:
-    """What a change of a map does to its columns, rows, blocks and rings.
+    """What a change of a map does to its columns, rows, blocks, rings, texture and chess pattern.
 
     Parameters
     ----------
@@ -237,11 +256,11 @@ def reduce_spectrum(
         'x', 'y', 'k' of the values, and which of them are each of :data:`PARTS`.
     """
     ny, nx = shape
-    column, row, block, ring = (axes[w] for w in PARTS)
+    column, row, block, ring, texture, chess = (axes[w] for w in PARTS)
     out = np.zeros(len(axes["x"]))
     out[column] = (np.fft.irfft(delta[0], n=nx) / ny)[axes["x"][column].astype(int)]
     out[row] = (np.fft.ifft(delta[:, 0]).real / nx)[axes["y"][row].astype(int)]
-    if not len(block) and not len(ring):
+    if not sum(map(len, (block, ring, texture, chess))):
         return out
     change = np.fft.irfft2(delta, s=shape)
     if len(block):
@@ -250,13 +269,17 @@ def reduce_spectrum(
         mean = mean.reshape(ny // side, side, nx // side, side).mean((1, 3))
         y, x = (((axes[n][block] + 0.5) / side).astype(int) for n in "yx")
         out[block] = mean[y, x]
-    if len(ring):
-        # Rings are those of a map without its smooth shape.
+    if len(chess):
+        out[chess] = map_chess(change)[0]
+    if len(ring) or len(texture):
+        # Rings and texture are those of a map without its smooth shape.
         q_y, q_x = (smooth_shapes(n) for n in shape)
         (f_y, _), (_, f_x) = (_smooth_spectra(n) for n in shape)
         rough = delta - f_y @ (q_y.T @ change @ q_x) @ f_x.T
         power = spectrum_rings(rough, shape)
         out[ring] = 1e6 * power[(axes["k"][ring] * 2 * RINGS).astype(int)]
+        if len(texture):
+            out[texture] = map_texture(np.fft.irfft2(rough, s=shape))[0]
     return out
 
 

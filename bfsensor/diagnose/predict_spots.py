@@ -135,6 +135,7 @@ def grow_spots(
     halo: tuple[float, float] = NO_HALO,
     neighbours: tuple[float, float] = ALONE,
     law: Law = LINEAR,
+    slopes: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> NDArray[np.float64]:
     """Mean images of Gaussian spots as they build up.
 
@@ -161,6 +162,9 @@ def grow_spots(
         one: of their light the halo alone reaches so far.
     law : Law
         How collection departs from linear shifts; what is beyond the full well is spilled.
+    slopes : tuple of ndarray, optional
+        Change of the shifts per electron with the charge Q of the pixel that pushes
+        [pixel/e-^2]: boundaries move by these times Q^2 / 2 besides.
 
     Returns
     -------
@@ -181,6 +185,14 @@ def grow_spots(
     both = np.zeros((2, 1, side, side))
     both[:, 0, : 2 * half + 1, : 2 * half + 1] = kx[kept, kept], ky[kept, kept]
     spectra = rfft2(np.roll(both, (-half, -half), (-2, -1)))
+    bent = None
+    if slopes is not None:
+        more = np.zeros_like(both)
+        more[:, 0, : 2 * half + 1, : 2 * half + 1] = (
+            slopes[0][kept, kept],
+            slopes[1][kept, kept],
+        )
+        bent = rfft2(np.roll(more, (-half, -half), (-2, -1)))
     charge = np.zeros_like(light)
     out = np.empty((steps, *light.shape))
     # Gains of the last step and of the one before: they go nearly straight with time.
@@ -190,10 +202,12 @@ def grow_spots(
         coming = last + (last - before) * (2.0 if step == 1 else 1.0)
         middle = charge + 0.5 * coming - 0.125 * (coming - last)
         kept_part = np.exp(-law.loss * middle) if law.loss else None
+        squared = None if bent is None else rfft2(0.5 * middle**2, s=(side, side))
         if law.bend:
             middle = middle * (1 + 0.5 * law.bend * middle)
         seen = rfft2(middle, s=(side, side))
-        shift_x, shift_y = irfft2(seen * spectra, s=(side, side))[..., :WING, :WING]
+        moved = seen * spectra if squared is None else seen * spectra + squared * bent
+        shift_x, shift_y = irfft2(moved, s=(side, side))[..., :WING, :WING]
         gained = light.copy()
         across = each * np.sum([part.across_x(shift_x) for part in parts], axis=0)
         across[..., -1] = 0.0
@@ -242,6 +256,7 @@ def predict_spots(
     halo: tuple[float, float] = NO_HALO,
     neighbours: tuple[float, float] = ALONE,
     law: Law = LINEAR,
+    slopes: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
     change: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None,
 ) -> dict[str, NDArray[np.float64]]:
     """What the fit of the channels measures of such spots, at given fluxes.
@@ -253,7 +268,7 @@ def predict_spots(
     fluxes : array_like, shape (n,)
         Electrons of a spot as they are read, with what is lost or lies beside, after ``change``
         [e-].
-    halo, neighbours, law
+    halo, neighbours, law, slopes
         As for :func:`grow_spots`.
     change : callable, optional
         What happens to the images [e-] after collection.
@@ -268,8 +283,9 @@ def predict_spots(
     top = float(wanted.max())
     centres = np.asarray(phases, float)
     grow = partial(
-        grow_spots, kx, ky, sigma=sigma, flux=top, halo=halo, neighbours=neighbours, law=law
-    )
+        grow_spots, kx, ky, sigma=sigma, flux=top, halo=halo, neighbours=neighbours, law=law,
+        slopes=slopes,
+    )  # fmt: skip
     every = STEPS // KNOTS
     images = grow(phases=centres)
     spilling = bool(images[-1].max() >= law.full_well)

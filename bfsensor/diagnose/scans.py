@@ -271,6 +271,34 @@ def _maps(g: Group) -> Iterator[Pattern]:
             }  # fmt: skip
         if rows.any():
             yield "rings", np.where(rows, 1.0, 0.0), {"map": str(name), "what": "ring"}
+        yield from _fine_patterns(x, here, str(name))
+
+
+def _fine_patterns(
+    x: Mapping[str, NDArray], here: NDArray[np.bool_], name: str
+) -> Iterator[Pattern]:
+    """Waves of the texture along x, in the same and in the next row; chess patterns."""
+    dx = x["x"].astype(float)
+    for dy in (0, 1):
+        rows = here & (x["what"] == "texture") & (x["y"] == dy)
+        if not rows.any():
+            continue
+        for period in np.geomspace(2.0, dx[rows].max(), 40):
+            phase = 2 * np.pi * dx / period
+            for wave in (np.cos, np.sin)[: dy + 1]:
+                yield "texture waves", np.where(rows, wave(phase), 0.0), {
+                    "map": name, "what": "texture", "period": float(period),
+                }  # fmt: skip
+    rows = here & (x["what"] == "chess")
+    if rows.any():
+        strips = np.unique(dx[rows])
+        width = 2 * float(strips[0]) + 1
+        for part in (1, 2, 4):
+            for own in np.array_split(strips, part):
+                span = (int(own[0] + 0.5 - width / 2), int(own[-1] + 0.5 + width / 2))
+                yield "chess pattern", np.where(rows & np.isin(dx, own), 1.0, 0.0), {
+                    "map": name, "what": "chess", "x": span,
+                }  # fmt: skip
 
 
 def _overscan(g: Group) -> Iterator[Pattern]:

@@ -1,0 +1,353 @@
+"""Terms that free-form models are made of: means against anything, and covariances by lag."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.channels import PER_ELECTRON, Channel
+from bfsensor.diagnose.conditions import Condition
+from bfsensor.diagnose.model import Model
+from bfsensor.diagnose.predict import fitted
+from bfsensor.diagnose.predict_flats import flat_response, periodic_covariances
+from bfsensor.effects.effect import Effect
+
+SCALE = 1e5
+"""Signal [e-] that coefficients of powers of it are given at."""
+
+LEVEL_POWERS = (1, 2, 3, 4)
+"""Of the relative change of the mean with the level."""
+
+LAG_POWERS = (0, 1, 2, 3)
+"""Of the covariances at one lag with the level."""
+
+CURVES, CYCLES = 5, 10
+"""Highest order of the polynomial in time, most waves over the campaign."""
+
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """One column of a free-form model.
+
+    Attributes
+    ----------
+    name : str
+        Of the coefficient.
+    where : mapping
+        What it stands for, for words: 'lag', 'power', 'period', ...
+    column : callable
+        Gives the change of a channel for a coefficient of 1, in its unit; None where there is none.
+    rough : callable, optional
+        The same, quicker, good enough to be searched with.
+    more : tuple of Term
+        What goes with it beyond the first order, each with a coefficient of its own.
+    """
+
+    name: str
+    where: Mapping[str, Any]
+    column: Callable[[Channel], Values | None]
+    rough: Callable[[Channel], Values | None] | None = None
+    more: tuple[Term, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """Terms of one kind, among which a few are chosen.
+
+    Attributes
+    ----------
+    group : str
+        Which of the free-form models.
+    terms : tuple of Term
+    words : tuple of str
+        Channels that the search looks at; the fit looks at all.
+    """
+
+    group: str
+    terms: tuple[Term, ...]
+    words: tuple[str, ...]
+
+
+class Flats(NamedTuple):
+    """Flats of one condition in a channel of covariances.
+
+    ``rows`` of the channel; ``flat``: which of the flats each belongs to; ``gain`` [e-/ADU],
+    ``level`` [e-], changes of areas ``a`` [1/e-] and covariances ``c`` [e-^2] at all lags of a
+    periodic array, by flat.
+    """
+
+    condition: Condition
+    rows: NDArray[np.int64]
+    flat: NDArray[np.int64]
+    gain: Values
+    level: Values
+    a: Values
+    c: Values
+
+
+@dataclass(eq=False)
+class Scene:
+    """A fitted model as terms see it.
+
+    Attributes
+    ----------
+    model : Model
+        Whose remainder is to be explained.
+    """
+
+    model: Model
+    kept: dict[Any, Any] = field(default_factory=dict)
+    _flats: dict[int, tuple[Channel, list[Flats]]] = field(default_factory=dict)
+    _here: dict[int, tuple[Channel, Values]] = field(default_factory=dict)
+    _responses: dict[tuple[int, int], tuple[Flats, Values]] = field(default_factory=dict)
+
+    @property
+    def gains(self) -> Values:
+        """Of the amplifiers, as fitted [e-/ADU]."""
+        count = len(self.model.predictor.measured.amplifiers)
+        return np.asarray(self.model.fit.values[:count])
+
+    @property
+    def device(self) -> dict[str, float]:
+        """Device parameters as fitted, away from nominal."""
+        p, baseline = self.model.predictor, self.model.predictor.baseline
+        return {
+            name: float(self.model.fit.values[row]) * baseline.spread[name]
+            for name, row in zip(baseline.parameters, p.prior_rows, strict=True)
+        }
+
+    def changed_by(self, effect: Effect, channel: Channel) -> Values:
+        """What an effect adds to the prediction of a channel, in its unit."""
+        p = self.model.predictor
+        point = self.model.fit.values[: len(p.names)]
+        more = p.with_effects((*p.effects, effect), point)
+        both = np.concatenate([point, more.start[len(more.names) - len(fitted(effect)) :]])
+        return np.asarray(more.predict(channel, both) - self.here(channel))
+
+    def here(self, channel: Channel) -> Values:
+        """What the model predicts of a channel, linear terms left out."""
+        kept = self._here.get(id(channel))
+        if kept is None or kept[0] is not channel:
+            p = self.model.predictor
+            predicted = p.predict(channel, self.model.fit.values[: len(p.names)])
+            kept = self._here[id(channel)] = channel, predicted
+        return kept[1]
+
+    def responses(self, flats: Flats, p: int) -> Values:
+        """Change of the flats' power for a response that goes with the level to the power p."""
+        kept = self._responses.get((id(flats), p))
+        if kept is None or kept[0] is not flats:
+            response = flat_response(flats.a, flats.level, power=p)
+            kept = self._responses[id(flats), p] = flats, response
+        return kept[1]
+
+    def flats(self, channel: Channel) -> list[Flats]:
+        """Flats of a channel of covariances, by condition; what effects do to them is left out."""
+        kept = self._flats.get(id(channel))
+        if kept is not None and kept[0] is channel:
+            return kept[1]
+        out, x = [], channel.axes
+        predictor = self.model.predictor
+        chain = predictor.chain(self.model.fit.values[: len(predictor.names)])
+        for where, rows in conditions_of(channel):
+            pairs = np.stack([x["amp"][rows].astype(float), x["level"][rows]], axis=1)
+            flats, index = np.unique(pairs, axis=0, return_inverse=True)
+            gain = self.gains[flats[:, 0].astype(int)]
+            level = gain * flats[:, 1]
+            a = predictor.baseline.flat_areas(where, self.device, level)
+            law = {} if chain is None else {"law": chain.law}
+            c = periodic_covariances(a, level, **law)
+            out.append(Flats(where, rows, index.ravel(), gain, level, a, c))
+        self._flats[id(channel)] = channel, out
+        return out
+
+
+def conditions_of(channel: Channel) -> Iterator[tuple[Condition, NDArray[np.int64]]]:
+    """Conditions of a channel with their rows."""
+    columns = np.column_stack([channel.axes[n].astype(float) for n in Condition._fields])
+    kinds, index = np.unique(np.nan_to_num(columns, nan=-1e99), axis=0, return_inverse=True)
+    for n in range(len(kinds)):
+        rows = np.nonzero(index.ravel() == n)[0]
+        yield Condition(*(float(v) for v in columns[rows[0]])), rows
+
+
+def at_lags(
+    c: Values, flat: NDArray[np.int64], i: NDArray[np.int64], j: NDArray[np.int64]
+) -> Values:
+    """Periodic covariances by flat, at lags: the mean of (i, j) and (i, -j)."""
+    return np.asarray(0.5 * (c[flat, j, i] + c[flat, -j, i]))
+
+
+def mean_families(scene: Scene) -> list[Family]:
+    """Means of flats, and fluxes of spots: by level, in time, by the exposure before."""
+    flats = [c for c in scene.model.fit.channels if c.word == "flat_mean"]
+    if not flats:
+        return []
+    out = [Family("mean by level", tuple(_by_level(scene, flats)), ("flat_mean",))]
+    shots = scene.model.predictor.measured.shots
+    hours = {s.number: s.hours for s in shots}
+    if len(set(hours.values())) < len(hours):
+        # Without times of their own exposures follow one another evenly.
+        hours = {s.number: float(n) for n, s in enumerate(shots)}
+    if hours:
+        terms = tuple(_in_time(flats, hours, len(scene.gains)))
+        out.append(Family("mean in time", terms, ("flat_mean",)))
+        terms = tuple(_after_exposure(scene))
+        out.append(Family("mean by the exposure before", terms, ("flat_mean",)))
+    return out
+
+
+def _relative(
+    name: str,
+    where: Mapping[str, Any],
+    change: Callable[[Channel], Values],
+    *,
+    spots: bool = True,
+) -> Term:
+    """Term that multiplies means of flats, and of spots the flux."""
+
+    def column(channel: Channel) -> Values | None:
+        x = channel.axes
+        if channel.word == "flat_mean":
+            return np.asarray(x["level"] * change(channel))
+        if channel.word == "spot" and spots:
+            return np.where(x["what"] == "flux", x["flux"] * change(channel), 0.0)
+        return None
+
+    return Term(name, where, column)
+
+
+def _by_level(scene: Scene, flats: list[Channel]) -> Iterator[Term]:
+    """Powers of the level, and single levels, of all amplifiers and of each."""
+    times = np.unique(np.concatenate([c.axes["time"] for c in flats]))
+
+    def own(channel: Channel, amp: int | None) -> Values:
+        return np.where(amp is None or channel.axes["amp"] == amp, 1.0, 0.0)
+
+    def power(p: int, amp: int | None) -> Callable[[Channel], Values]:
+        def change(c: Channel) -> Values:
+            level = scene.gains[c.axes["amp"].astype(int)] * c.axes["level"]
+            return np.asarray(own(c, amp) * (level / SCALE) ** p)
+
+        return change
+
+    def single(time: float, amp: int | None) -> Callable[[Channel], Values]:
+        return lambda c: own(c, amp) * (c.axes["time"] == time)
+
+    for amp, label in _amplifiers(scene):
+        for p in LEVEL_POWERS:
+            yield _relative(
+                f"mean x S^{p}{label}", {"power": p, "amp": amp}, power(p, amp), spots=False
+            )
+        for time in times if len(times) > 3 else ():
+            level = np.concatenate([c.axes["level"][c.axes["time"] == time] for c in flats])
+            told = {"level": float(level.mean() * scene.gains.mean()), "amp": amp}
+            yield _relative(
+                f"mean at {time:g} s{label}", told, single(float(time), amp), spots=False
+            )
+
+
+def _amplifiers(scene: Scene) -> list[tuple[int | None, str]]:
+    """All amplifiers together, and each."""
+    count = len(scene.gains)
+    each = [(n, f", amplifier {n + 1}") for n in range(count)] if count > 1 else []
+    return [(None, ""), *each]
+
+
+def _in_time(flats: list[Channel], hours: dict[int, float], count: int) -> Iterator[Term]:
+    """Polynomials, waves and steps in time."""
+    taken = np.unique(np.concatenate([c.axes["exposure"] for c in flats]))
+    first, last = hours[int(taken[0])], hours[int(taken[-1])]
+    span = max(last - first, 1e-9)
+
+    def at(channel: Channel) -> Values:
+        # Of exposures that were not taken nothing is known: the campaign's middle.
+        there = [hours.get(int(n), first + span / 2) for n in channel.axes["exposure"]]
+        return np.array(there) - first
+
+    def curve(p: int) -> Callable[[Channel], Values]:
+        return lambda c: np.polynomial.legendre.Legendre.basis(p)(2 * at(c) / span - 1)
+
+    def wave(
+        period: float, part: Callable[[Values], Values]
+    ) -> Callable[[Channel], Values]:
+        return lambda c: part(2 * np.pi * at(c) / period)
+
+    def step(number: int) -> Callable[[Channel], Values]:
+        return lambda c: np.where(c.axes["exposure"] >= number, 1.0, 0.0)
+
+    for p in range(1, CURVES + 1):
+        yield _relative(f"mean, order {p} in time", {"order": p}, curve(p))
+    for cycles in range(1, min(CYCLES, len(taken) // 6) + 1):
+        for part, word in ((np.cos, "cosine"), (np.sin, "sine")):
+            period = span / cycles
+            yield _relative(
+                f"mean, {word} of {period:.3g} h", {"period": period}, wave(period, part)
+            )
+    for number in taken[2:-1:2]:
+        yield _relative(
+            f"mean from exposure {int(number)}",
+            {"exposure": int(number)},
+            step(int(number)),
+        )
+
+
+def _after_exposure(scene: Scene) -> Iterator[Term]:
+    """Powers of the mean level of the exposure before; what that was where one is missing."""
+    before: dict[int, float] = {}
+    known: dict[int, bool] = {}
+    last = None
+    for shot in scene.model.predictor.measured.shots:
+        before[shot.number] = 0.0 if last is None else last.level / SCALE
+        known[shot.number] = last is None or last.number == shot.number - 1
+        last = shot
+
+    def power(p: int) -> Callable[[Channel], Values]:
+        def change(c: Channel) -> Values:
+            numbers = [int(n) for n in c.axes["exposure"]]
+            return np.array([before[n] ** p if known.get(n) else 0.0 for n in numbers])
+
+        return change
+
+    def missing(c: Channel) -> Values:
+        return np.array([0.0 if known.get(int(n)) else 1.0 for n in c.axes["exposure"]])
+
+    for p in (1, 2):
+        yield _relative(f"mean x S^{p} of the exposure before", {"power": p}, power(p))
+    if not all(known.values()):
+        yield _relative("mean after exposures not given", {"missing": True}, missing)
+
+
+def lag_family(scene: Scene) -> Family | None:
+    """Covariances of flats at single lags, by power of the level."""
+    channels = [c for c in scene.model.fit.channels if c.word == "flat_cov"]
+    if not channels or channels[0].unit == PER_ELECTRON:
+        return None
+    lags = sorted({
+        (int(i), int(j)) for c in channels
+        for i, j in zip(c.axes["i"], c.axes["j"], strict=True)
+    })  # fmt: skip
+
+    def column(lag: tuple[int, int], p: int) -> Callable[[Channel], Values | None]:
+        def change(channel: Channel) -> Values | None:
+            if channel.word != "flat_cov":
+                return None
+            x = channel.axes
+            gain = scene.gains[x["amp"].astype(int)]
+            here = (x["i"] == lag[0]) & (x["j"] == lag[1])
+            level = gain * x["level"] / SCALE
+            return np.where(here, level**p / gain**2, 0.0)
+
+        return change
+
+    terms = tuple(
+        Term(f"covariance ({i}, {j}) x S^{p}", {"lags": [(i, j)], "power": p}, column((i, j), p))
+        for i, j in lags for p in LAG_POWERS
+    )  # fmt: skip
+    return Family("covariances by lag", terms, ("flat_cov",))

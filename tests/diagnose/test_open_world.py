@@ -1,0 +1,226 @@
+"""Free-form models of mismatches that are foreign to the library, on small campaigns."""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from bfsensor.diagnose.attribute import attribute
+from bfsensor.diagnose.attribution_words import reported, said_of
+from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.diagnosis import fit_bounded
+from bfsensor.diagnose.extract import measure_channels
+from bfsensor.diagnose.free_kernel import edge_names, shifts_of
+from bfsensor.diagnose.free_terms import Scene
+from bfsensor.diagnose.locate import Finding, Mismatch, locate_mismatch
+from bfsensor.diagnose.model import Model
+from bfsensor.diagnose.named import AxesExchanged
+from bfsensor.diagnose.open_world import compete, explain_outside
+from bfsensor.diagnose.remainder import ACCURACY, counts, stands_out
+from bfsensor.effects.interpixel_coupling import InterpixelCoupling
+from bfsensor.effects.tearing import Tearing
+from bfsensor.effects.trap_serial import TrapSerial
+from validation.concealed.electrostatics import EdgeShifts
+from validation.concealed.library import make_effect
+from validation.concealed.outside import OutsideLibrary
+from validation.concealed.plan import Size
+from validation.virtual_source import VirtualSource, virtual_baseline
+
+SMALL = Size(128, 4, 1, dithers=1)
+KINDS = (TrapSerial, InterpixelCoupling, Tearing)
+
+
+@lru_cache(maxsize=1)
+def _null():
+    return measure_channels(VirtualSource(seed=9137, size=SMALL))
+
+
+def _changed(word, change):
+    """The null's channels, those of one word changed by code that shares nothing with the models."""
+    measured = _null()
+    channels = tuple(
+        c if c.word != word
+        else Channel(c.word, c.values + change(c.axes, c.values), c.blocks, c.axes, c.unit, c.fold)
+        for c in measured.channels
+    )  # fmt: skip
+    return replace(measured, channels=channels)
+
+
+def _located(measured):
+    predictor, fit = fit_bounded(measured, virtual_baseline())
+    return Model(predictor, fit), locate_mismatch(fit)
+
+
+def _explained(measured):
+    model, mismatch = _located(measured)
+    told = explain_outside(model, mismatch)
+    return (None if told is None else told[0]), mismatch
+
+
+def _one(found, part):
+    """The coefficient whose name holds a text."""
+    return next(c for c in found.coefficients if part in c.name)
+
+
+def test_of_nothing_there_is_no_free_form():
+    found, mismatch = _explained(_null())
+    assert found is None and not mismatch.detected
+
+
+# -- mismatches that none of the models was made for, put on channels
+
+
+def test_a_lone_lag_is_told_as_one_that_breaks_the_sum_rule():
+    # 2.5e-9 mu^2 at lag (2, 1), about 10 sigma; no shift of boundaries has that alone.
+    def change(x, values):
+        return np.where((x["i"] == 2) & (x["j"] == 1), 1e-8 * x["level"] ** 2, 0.0)
+
+    found, mismatch = _explained(_changed("flat_cov", change))
+    assert mismatch.detected
+    assert found.group == "covariances by lag" and "(2, 1)" in found.said
+    assert [c.where["lags"] for c in found.coefficients] == [[(2, 1)]]
+    assert (
+        found.tests["sum rule"]["p_value"] < 1e-6 and found.tests["sum rule"]["value"] > 0
+    )
+    before, after = found.chi2dof()
+    assert after < before
+
+
+def test_a_wave_of_the_mean_with_the_time_of_day():
+    hours = {s.number: s.hours for s in _null().shots}
+    span = max(hours.values())
+
+    def change(x, values):
+        time = np.array([hours[int(n)] for n in x["exposure"]])
+        return 1.5e-3 * values * np.sin(2 * np.pi * time / (0.31 * span))
+
+    found, _ = _explained(_changed("flat_mean", change))
+    assert found.group == "mean in time"
+    before, after = found.folds["held-out"]["flat_mean"][:2]
+    assert after < 0.4 * before and "changes with time" in found.said
+
+
+def test_a_patch_of_the_sensor_that_is_dimmer_in_all_flats():
+    ny, nx = _null().shape
+
+    def change(x, values):
+        here = (x["map"] == "all") & (x["x"] > nx / 2) & (x["y"] > ny / 2)
+        block = here & (x["what"] == "block")
+        column = (x["map"] == "all") & (x["what"] == "column") & (x["x"] >= nx // 2)
+        row = (x["map"] == "all") & (x["what"] == "row") & (x["y"] >= ny // 2)
+        return -4e-3 * (1.0 * block + 0.5 * column + 0.5 * row)
+
+    found, _ = _explained(_changed("flat_map", change))
+    assert found.group == "pattern of position" and "all levels alike" in found.said
+    assert found.coefficients[0].value < 0
+    before, after = found.folds["held-out"]["flat_map"][:2]
+    assert after < before
+
+
+# -- pixels of the virtual sensor
+
+
+@dataclass(frozen=True)
+class _OddInY(OutsideLibrary):
+    """Shifts to +y on either side of a charge, which the virtual sensor has no variant of."""
+
+    variants: ClassVar = {"": {}}
+
+    def shifts(self, shifts, context):
+        return EdgeShifts(shifts.kx, shifts.ky + 0.3 * np.abs(shifts.ky))
+
+
+def _campaign(*effects):
+    return measure_channels(VirtualSource(seed=9137, size=SMALL, effects=effects))
+
+
+def test_a_kernel_that_is_odd_in_y():
+    found, _ = _explained(_campaign(_OddInY({})))
+    assert found.group == "odd boundary shifts"
+    own = found.coefficients[0]
+    assert own.where["odd"] == "y" and abs(own.value - 0.3) < 4 * own.error + 0.01
+    assert found.tests["even in y"]["p_value"] < 1e-6 < found.tests["even in x"]["p_value"]
+    assert found.tests["reciprocity"]["p_value"] < 1e-6
+    assert found.chi2dof()[1] < found.chi2dof()[0]
+
+
+def test_an_echo_names_no_trap():
+    # What a trap explains of an echo is much; that does not make it the cause.
+    echo = make_effect("outside_library", {"amp": 3e-4}, "echo")
+    model, mismatch = _located(_campaign(echo))
+    told = attribute(model.predictor, model.fit, mismatch, kinds=KINDS)
+    assert told.open_world and not told.found
+    assert set(told.probability) == {"outside_library"}
+    assert told.free_form.group == "readout filter"
+    own = _one(told.free_form, "h_7 S^2")
+    assert abs(own.value - 3e-4) < 4 * own.error + 1e-6
+    report = reported(told)
+    assert report["free_form"]["groups"][0] == "readout filter"
+    assert report["effects"] == [{"class": "outside_library", "parameters": {}}]
+    assert "7 pixel times before" in " ".join(said_of(told))
+    before, after = told.chi2dof()
+    assert after < 1.2 < before
+
+
+def test_pixels_of_two_parities_and_a_ripple_are_told_apart():
+    chess = make_effect("outside_library", {"amp": 2e-3}, "checkerboard")
+    ripple = make_effect("outside_library", {"amp": 2e-3, "period": 11.3}, "ripple")
+    found, _ = _explained(_campaign(chess, ripple))
+    assert {"pattern of two-pixel parity", "ripple in readout time"} <= set(found.groups)
+    parity = _one(found, "checkerboard x S^1")
+    assert abs(abs(parity.value) - 2e-3) < 4 * parity.error + 4e-5
+    wave = _one(found, "ripple of")
+    assert abs(wave.where["period"] - 11.3) < 0.1
+    assert abs(np.sqrt(wave.value * 1e-6) - 2e-3) < 2e-4
+
+
+def test_the_gain_depends_on_the_exposure_before():
+    last = make_effect("outside_library", {"amp": 5e-3}, "last_level")
+    found, _ = _explained(_campaign(last))
+    assert found.group == "mean by the exposure before"
+    own = _one(found, "S^1 of the exposure before")
+    # The level before is that of whole frames, their overscans too.
+    assert -5.5e-3 < own.value < -3e-3
+    before, after = found.folds["held-out"]["flat_mean"][:2]
+    assert after < 0.5 * before
+
+
+# -- the parts
+
+
+def test_edges_of_a_free_kernel_conserve_charge_and_are_even_or_odd():
+    for edge in edge_names():
+        kx, ky = shifts_of(edge, (21, 21))
+        assert np.allclose(kx[:, 1:-1], -kx[:, -3::-1], atol=0)
+        assert np.allclose(kx, kx[::-1]) and np.allclose(ky, ky[:, ::-1])
+        assert np.allclose(ky[1:-1], -ky[-3::-1])
+        assert np.abs(kx).max() + np.abs(ky).max() > 0
+    kx, ky = shifts_of(("x", 0, 0), (21, 21), odd="x")
+    assert kx[10, 10] == kx[10, 9] > 0 and not ky.any()
+
+
+def test_exchanged_axes_are_the_transposes():
+    rng = np.random.default_rng(8231)
+    kx, ky = rng.normal(size=(2, 5, 5))
+    moved = AxesExchanged({"amp": 1.0}).edges(kx, ky, None, None)
+    assert np.allclose(moved[0], ky.T) and np.allclose(moved[1], kx.T)
+
+
+@pytest.mark.parametrize(
+    ("word", "counted"), [("flat_cov", True), ("serial_overscan", False)]
+)
+def test_a_remainder_counts_against_what_is_explained_in_its_channel(word, counted):
+    finding = Finding("lags", word, 8.0, 1e-12)
+    left = Mismatch(1e-12, 0.5, 1e-12, (finding,), {word: (100.0, 100.0)})
+    explained = {"serial_overscan": (1.2 * 8.0 / ACCURACY) ** 2, "flat_cov": 50.0}
+    assert counts(finding, left, explained) is counted
+    assert stands_out(left, explained) is counted
+    assert not stands_out(left, explained, alarm=1e-13)
+
+
+def test_families_compete_on_what_stands_out_alone():
+    model, mismatch = _located(_null())
+    quiet = replace(mismatch, findings=())
+    assert compete(Scene(model), quiet) == []
