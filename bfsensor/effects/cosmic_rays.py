@@ -242,8 +242,10 @@ def make_tracks(
     rest, x0 = np.divmod(pixels, 2 * wide + 1)
     track, y0 = np.divmod(rest, 2 * wide + 1)
     y0, x0 = y0 - wide, x0 - wide
+    # Reduced recordings do not tell how large the sensor is: of a large one no track leaves.
     inside = [
-        np.maximum(1 - np.abs(v) / n, 0.0) for v, n in zip((y0, x0), shape, strict=True)
+        np.maximum(1 - np.abs(v) / n, 0.0) if n else np.ones(len(v))
+        for v, n in zip((y0, x0), shape, strict=True)
     ]
     total = np.asarray(np.bincount(which.ravel(), lump), float)
     return Tracks(count, track, y0, x0, total, inside[0] * inside[1])
