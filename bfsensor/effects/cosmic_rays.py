@@ -54,6 +54,7 @@ class CosmicRays(Effect):
     stage = "store"
     parameters = (Parameter("rate", "1/min", 0.3, 30.0, amplitude=True),)
     touches = ("dark_map", "flat_cov", "bias_level")
+    of_pixels = True
     source = (
         "Groom 2002, Exp. Astron. 14, 45 (straight muon tracks in thick CCDs; the muon rate is "
         "irreducible); about one a minute and cm^2 at sea level, 80 e-/um: Particle Data Group, from "

@@ -36,6 +36,7 @@ class TrapSerial(Effect):
         Parameter("amp", "", 0, 1, law="whole"),
     )
     touches = ("serial_overscan", "flat_map", "flat_mean", "spot")
+    of_pixels = True
     source = (
         "Single-species trap with instant capture: ArCTIc, Massey et al. 2014, MNRAS 439, 887; "
         "fixed serial traps of ITL sensors: Snyder & Roodman 2019, JATIS 5, 041509"
