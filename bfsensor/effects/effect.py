@@ -455,7 +455,11 @@ class Effect:
     def spot_image(
         self, images: Values, axes: Mapping[str, float], layout: Layout
     ) -> Values:
-        """Mean images of spots [e-] on the sensor's axes after this effect, shape (..., ny, nx)."""
+        """Mean images of spots [e-] on the sensor's axes after this effect, shape (..., ny, nx).
+
+        ``axes``: the condition, 'hours', and 'background', electrons of a pixel beside a spot over
+        the spot's flux.
+        """
         del axes, layout
         return images
 
