@@ -26,7 +26,7 @@ from astropy.table import Table, vstack
 
 from bfsensor.effects.effect import Effect, Parameter
 from bfsensor.effects.library import LIBRARY
-from validation.concealed.library import make_effect
+from validation.concealed.library import EFFECTS, make_effect
 from validation.effects_on_pixels import compare, null_campaign
 from validation.write_results import write_results
 
@@ -85,7 +85,13 @@ def compare_at(
     """
     own = None
     if engine != ENGINES[0]:
-        own = make_effect(effect.word, dict(effect.values), effect.variant)
+        # What the virtual sensor does not know of is left out on both sides.
+        known = EFFECTS[effect.word].variants[effect.variant]
+        effect = effect.with_values(**{
+            p.name: p.neutral for p in effect.parameters if p.name not in known
+        })  # fmt: skip
+        values = {k: v for k, v in effect.values.items() if k in known}
+        own = make_effect(effect.word, values, effect.variant)
     fit = null_campaign(seed, size)[1]
     out = []
     for word, (said, factor, error) in compare(effect, seed, size, own).items():

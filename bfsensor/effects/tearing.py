@@ -127,7 +127,8 @@ class Tearing(Effect):
     def _open(self, ny: int) -> Values:
         """Part of the exposures in which rows are open."""
         row, never = np.arange(ny) + 0.5, self["open"] * ny
-        return np.asarray(np.clip((ny - row) / max(ny - never, 1.0), 0.0, 1.0))
+        above = np.clip((ny - row) / max(ny - never, 1.0), 0.0, 1.0)
+        return np.where(row <= never, 1.0, above)
 
     def _chance(self, ny: int) -> Values:
         """Covariance of two rows' being open."""
