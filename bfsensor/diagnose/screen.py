@@ -12,10 +12,20 @@ from scipy.optimize import least_squares
 
 from bfsensor.diagnose.mismatch import BaselineFit
 from bfsensor.diagnose.predict import Predictor, fitted, widened
+from bfsensor.diagnose.predict_maps import lines_of_map
 from bfsensor.effects.effect import Effect, Parameter
 
 REFINED = 2
 """Best starts of a candidate that are refined."""
+
+MANY, LIKELY = 8, 6
+"""More starts than these are held against one channel first, and so many of them against all."""
+
+TELLING = "code_hist", "bias_cov", "flat_map"
+"""Channels that are quickly predicted, and tell starts that are many apart."""
+
+ASTRAY = 0.1
+"""Part by which the best amplitude may be off the start's before the path to it is tried."""
 
 OCCAM = 5.0
 """Logarithm of the evidence that a parameter costs a candidate that is not fitted on, for it is
@@ -111,24 +121,67 @@ class Screen:
     def tried(self, kind: type[Effect]) -> list[tuple[float, Effect]]:
         """Places where a fit of a kind of effect may begin, with their gains, greatest first.
 
-        Amplitudes are those that fit best, to first order; empty where nothing of it could be
-        seen.
+        Amplitudes are those that fit best, what changes being a multiple of them and of their
+        square; empty where nothing of it could be seen.
         """
-        starts = kind.starts(self.predictor.layout, self.seen)
-        tried: list[tuple[float, Effect]] = []
-        for values in starts:
-            effect = kind(values)
-            template = self.change(effect)
-            length = float(template @ template)
-            if length <= 0:
-                continue
-            factor = float(template @ self.fit.left) / length
-            signed = any(p.signed for p in kind.parameters if p.amplitude)
-            if factor <= 0 and not signed:
-                tried.append((0.0, effect))
-                continue
-            tried.append((factor**2 * length, _inside(effect.scaled(factor))))
-        return sorted(tried, key=lambda t: -t[0])
+        starts = [_inside(kind(v)) for v in kind.starts(self.predictor.layout, self.seen)]
+        tried = [self._scaled(effect) for effect in self._likely(kind, starts)]
+        return sorted((t for t in tried if t is not None), key=lambda t: -t[0])
+
+    def _scaled(self, effect: Effect) -> tuple[float, Effect] | None:
+        """Gain of an effect of the best amplitude; None of what cannot be seen."""
+        template = self.change(effect)
+        length = float(template @ template)
+        if length <= 0:
+            return None
+        factor = float(template @ self.fit.left) / length
+        signed = any(p.signed for p in effect.parameters if p.amplitude)
+        if factor <= 0 and not signed:
+            return 0.0, effect
+        gain = factor**2 * length
+        if not effect.bends or abs(factor - 1) < ASTRAY:
+            return gain, _inside(effect.scaled(factor))
+        # What it changes is f t1 + f^2 t2: both from another amplitude.
+        other = self.change(effect.scaled(0.5))
+        both = 4 * other - template, 2 * template - 4 * other
+        likely = _best_factor(both, self.fit.left, signed=signed)
+        tries = [_inside(effect.scaled(f)) for f in (likely, factor) if f]
+        gains = [self._gain(e) for e in tries]
+        best = int(np.argmax(gains))
+        return (gains[best], tries[best]) if gains[best] > 0 else (0.0, effect)
+
+    def _gain(self, effect: Effect) -> float:
+        """Decrease of the chi-square by an effect as it is."""
+        template = self.change(effect)
+        return float(template @ (2 * self.fit.left - template))
+
+    def _likely(self, kind: type[Effect], starts: list[Effect]) -> list[Effect]:
+        """Those of many starts that one channel finds likeliest."""
+        word = next((w for w in TELLING if w in kind.touches), "")
+        channels = [
+            (c, start) for c, start in zip(self.fit.channels, self.fit.starts, strict=False)
+            if c.word == word and c.fold == "fit"
+        ]  # fmt: skip
+        if len(starts) <= MANY or not channels:
+            return starts
+        (channel, first), gains = channels[0], []
+        own = slice(first, first + len(channel))
+        basis, left = self.fit.basis[own], self.fit.left[own]
+        for effect in starts:
+            if word == "flat_map":
+                change = lines_of_map(effect, channel, self.predictor.layout)
+            else:
+                chain = self.predictor.with_effects((effect,), self.point)
+                more = chain.start[len(chain.start) - len(fitted(effect)) :]
+                plain = self.predictor.with_effects((), self.point)
+                change = chain.predict(channel, np.append(plain.start, more))
+                change = change - plain.predict(channel, plain.start)
+            template = channel.whiten(change)
+            along = basis.T @ template
+            length = float(template @ template) - float(along @ along)
+            gains.append(float(template @ left) ** 2 / length if length > 0 else 0.0)
+        order = np.argsort(gains)[::-1][:LIKELY]
+        return [starts[n] for n in order]
 
     def best(
         self, tried: Sequence[tuple[float, Effect]], *, least: float = 0.0
@@ -266,3 +319,23 @@ def _inside(effect: Effect) -> Effect:
         low, high = widened(p)
         values[p.name] = float(np.clip(effect[p.name], low, high))
     return effect.with_values(**values)
+
+
+def _best_factor(
+    parts: tuple[NDArray[np.float64], NDArray[np.float64]],
+    left: NDArray[np.float64],
+    *,
+    signed: bool,
+) -> float:
+    """Factor f of f t1 + f^2 t2 that explains most of what is left; 0 if none does."""
+    one, two = parts
+    p = 2 * float(one @ left), 2 * float(two @ left) - float(one @ one)
+    q = -2 * float(one @ two), -float(two @ two)
+    # Gain p0 f + p1 f^2 + q0 f^3 + q1 f^4, whose slope is a cubic.
+    roots = np.roots([4 * q[1], 3 * q[0], 2 * p[1], p[0]])
+    best, most = 0.0, 0.0
+    for f in roots[np.abs(roots.imag) < 1e-6 * (1 + np.abs(roots))].real:
+        gain = float(f * (p[0] + f * (p[1] + f * (q[0] + f * q[1]))))
+        if gain > most and (f > 0 or signed):
+            best, most = float(f), gain
+    return best

@@ -252,6 +252,8 @@ class Effect:
         flats.
     of_pixels : bool
         Whether its predictions need the amplifiers' pixels, which reduced recordings do not tell.
+    bends : bool
+        Whether what it changes goes with the square of its amplitude as well.
     """
 
     values: Mapping[str, float]
@@ -265,6 +267,7 @@ class Effect:
     by_time: ClassVar[bool] = False
     standing: ClassVar[bool] = False
     of_pixels: ClassVar[bool] = False
+    bends: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         needed = {p.name for p in self.parameters}

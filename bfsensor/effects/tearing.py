@@ -42,6 +42,7 @@ class Tearing(Effect):
     )
     touches = ("flat_map", "flat_cov")
     of_pixels = True
+    bends = True
     source = (
         "Juramy et al. 2020, Proc. SPIE 11454, 1145412 (arXiv 2002.09439: holes in channel stops "
         "moved by clocks, worst beside segments' edges); exponential, rows and range are assumed"
