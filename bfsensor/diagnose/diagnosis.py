@@ -143,7 +143,9 @@ class Diagnosis:
     def _heldout(self) -> dict[str, Any]:
         """Chi-square over number of what was not fitted, before and after, by channel too."""
         out: dict[str, Any] = {
-            "chi2dof_before": _finite(self.heldout), "chi2dof_after": None, "channels": {},
+            "chi2dof_before": _finite(self.heldout), "chi2dof_after": None,
+            "values": sum(map(len, used_channels(self.measured.channels, ("held-out",)))),
+            "channels": {},
         }  # fmt: skip
         told = self.attribution
         if told is not None and (told.found or told.free_form is not None):
