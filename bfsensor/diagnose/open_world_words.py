@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 NEAR = 30.0
 """Angle [degrees] below which a candidate of the library is said to look alike."""
 
+TOLD_ALIKE = ("pattern of position", "odd boundary shifts", "mean in time", "mean by level")
+"""Groups whose terms may stand for one another, and are told."""
+
 REFUSED = 1e-3
 """Probability of a constraint below which it is said to be broken."""
 
@@ -25,6 +28,9 @@ def said_freely(found: OpenWorld) -> str:
         say = WORDS.get(group)
         if own and say is not None:
             parts.append(say(own) + ".")
+        if group in TOLD_ALIKE and found.alike.get(group):
+            text = "; ".join(f"{name}: {value:.3g}" for name, value in found.alike[group])
+            parts.append(f"In place of the first these recordings allow as well: {text}.")
     tests = _tests(found.tests)
     if tests:
         parts.append(tests)
@@ -50,6 +56,9 @@ def reported_freely(found: OpenWorld | None) -> dict[str, Any] | None:
             for c in found.coefficients
         },
         "by_group": {k: list(v) for k, v in found.by_group.items()},
+        "alike": {
+            k: [{"name": n, "value": float(x)} for n, x in v] for k, v in found.alike.items()
+        },
         "scores": {k: float(v) for k, v in found.scores.items()},
         "tests": {k: {n: float(v) for n, v in t.items()} for k, t in found.tests.items()},
         "nearest": [{"name": n, "angle_degrees": a} for n, a in found.nearest],
@@ -205,7 +214,8 @@ def _by_level(own: Sequence[Coefficient]) -> str:
 
 
 def _in_time(own: Sequence[Coefficient]) -> str:
-    text = "; ".join(f"{c.name}: {_amount(c)} of the mean" for c in own[:5])
+    main = [c for c in own if "quarter" not in c.where][:5]
+    text = "; ".join(f"{c.name}: {_amount(c)} of the mean" for c in main)
     return f"The mean changes with time: {text}"
 
 
