@@ -13,11 +13,12 @@ from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.diagnosis import fit_bounded
 from bfsensor.diagnose.extract import measure_channels
 from bfsensor.diagnose.free_kernel import edge_names, shifts_of
+from bfsensor.diagnose.free_process import process_choice
 from bfsensor.diagnose.free_terms import Scene
 from bfsensor.diagnose.locate import Finding, Mismatch, locate_mismatch
 from bfsensor.diagnose.model import Model
 from bfsensor.diagnose.named import AxesExchanged
-from bfsensor.diagnose.open_world import compete, explain_outside
+from bfsensor.diagnose.open_world import Columns, compete, explain_outside
 from bfsensor.diagnose.remainder import ACCURACY, counts, stands_out
 from bfsensor.effects.interpixel_coupling import InterpixelCoupling
 from bfsensor.effects.tearing import Tearing
@@ -254,3 +255,50 @@ def test_families_compete_on_what_stands_out_alone():
     model, mismatch = _located(_null())
     quiet = replace(mismatch, findings=())
     assert compete(Scene(model), quiet) == []
+
+
+# -- the process over lag and level
+
+
+def _bumpy(x, values):
+    """A change of no simple law: over neighbouring lags, up and down with the level."""
+    near = np.exp(-0.5 * ((x["i"] - 3) ** 2 + (x["j"] - 2) ** 2) / 1.5**2)
+    level = x["level"] / 4e4
+    return 1e-2 * x["level"] * near * np.sin(2.5 * level)
+
+
+def test_the_process_is_orthogonal_to_what_the_fit_floats():
+    model, _ = _located(_changed("flat_cov", _bumpy))
+    choice = process_choice(Scene(model))
+    assert choice is not None and choice.score > 50
+    inside = model.fit.basis.T @ choice.template
+    assert np.linalg.norm(inside) < 1e-6 * np.linalg.norm(choice.template)
+    # The parameters stay where they are without what is foreign, and as well known.
+    null, _ = _located(_null())
+    after = model.with_columns(Columns(choice.terms))
+    assert after.fit.total < model.fit.total - 50
+    own = len(model.predictor.names)
+    moved = (after.fit.values[:own] - null.fit.values[:own]) / null.fit.errors[:own]
+    assert np.abs(moved).max() < 1.0
+    assert (after.fit.errors[:own] / null.fit.errors[:own]).max() < 1.1
+
+
+def test_the_process_leaves_to_parameters_what_is_theirs():
+    # What a gain and a device parameter other by five of their errors do to covariances.
+    null, _ = _located(_null())
+    point = null.fit.values[: len(null.predictor.names)].copy()
+    for name in ("gain 0", null.predictor.names[null.predictor.prior_rows[0]]):
+        row = null.predictor.names.index(name)
+        point[row] += 5 * null.fit.errors[row]
+    measured = _null()
+    channels = tuple(
+        Channel(c.word, c.values + null.predictor.predict(c, point)
+                - null.predictor.predict(c, null.fit.values[: len(point)]),
+                c.blocks, c.axes, c.unit, c.fold)
+        for c in measured.channels
+    )  # fmt: skip
+    model, _ = _located(replace(measured, channels=channels))
+    row = null.predictor.names.index("gain 0")
+    moved = (model.fit.values[row] - null.fit.values[row]) / null.fit.errors[row]
+    assert moved == pytest.approx(5, abs=0.5)
+    assert process_choice(Scene(model)) is None
