@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -98,7 +99,8 @@ def _shifts(own: Sequence[Coefficient]) -> str:
     )  # fmt: skip
     sizes = "; ".join(
         f"edges along {'x and y' if c.where['axis'] == 'xy' else c.where['axis']} at "
-        f"({c.where['along']:g}, {c.where['across']}) pixels {_way(c)} by {_amount(c, ' 1e-8 pixel/e-')}"
+        f"({c.where['along']:g}, {c.where['across']}) pixels {_way(c)} by "
+        + _amount(replace(c, value=abs(c.value)), " 1e-8 pixel/e-")
         + (" per 1e5 e-" if c.where["power"] else "")
         for c in own[:4]
     )

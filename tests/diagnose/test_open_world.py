@@ -20,6 +20,7 @@ from bfsensor.diagnose.model import Model
 from bfsensor.diagnose.named import AxesExchanged
 from bfsensor.diagnose.open_world import Columns, compete, explain_outside
 from bfsensor.diagnose.remainder import ACCURACY, counts, stands_out
+from bfsensor.effects.gain_nonlinearity import GainNonlinearity
 from bfsensor.effects.interpixel_coupling import InterpixelCoupling
 from bfsensor.effects.tearing import Tearing
 from bfsensor.effects.trap_serial import TrapSerial
@@ -302,3 +303,38 @@ def test_the_process_leaves_to_parameters_what_is_theirs():
     moved = (model.fit.values[row] - null.fit.values[row]) / null.fit.errors[row]
     assert moved == pytest.approx(5, abs=0.5)
     assert process_choice(Scene(model)) is None
+
+
+def _after_bright(amp):
+    """The null, means lower by ``amp`` per 1e5 e- (true gain) of the exposure before."""
+    level = {s.number: s.level / np.mean(_null().gains) * 2.17 for s in _null().shots}
+
+    def change(x, values):
+        last = np.array([level.get(int(n) - 1, 0.0) for n in x["exposure"]])
+        return -amp * values * last / 1e5
+
+    return _changed("flat_mean", change)
+
+
+def test_an_effect_that_leaves_nothing_is_not_believed_where_a_free_form_explains_far_more():
+    # Levels follow one another up and down a ladder: much looks like the exposure's own.
+    model, mismatch = _located(_after_bright(7e-4))
+    told = attribute(model.predictor, model.fit, mismatch, kinds=(GainNonlinearity,))
+    left = locate_mismatch(
+        model.with_effects([GainNonlinearity({"c2": 1e-4, "c3": 0.0})]).fit
+    )
+    assert not left.detected
+    assert told.open_world and not told.found
+    assert told.free_form.group == "mean by the exposure before"
+    own = _one(told.free_form, "S^1 of the exposure before")
+    assert abs(own.value + 7e-4) < 3 * own.error
+
+
+def test_a_gain_that_bends_is_no_open_world():
+    def change(x, values):
+        return 2e-3 * values * x["level"] * 2.17 / 1e5
+
+    model, mismatch = _located(_changed("flat_mean", change))
+    told = attribute(model.predictor, model.fit, mismatch, kinds=(GainNonlinearity,))
+    assert mismatch.detected and not told.open_world
+    assert [f.effect.word for f in told.found] == ["gain_nonlinearity"]
