@@ -356,6 +356,11 @@ class Predictor:
         )
 
     @property
+    def kept(self) -> dict[tuple, Any]:
+        """What copies with other effects share; filled by those who use it."""
+        return self._evened
+
+    @property
     def _effect_count(self) -> int:
         return sum(len(fitted(e)) for e in self.effects)
 

@@ -27,6 +27,9 @@ from bfsensor.effects.effect import Axes, Effect, Layout, Shot
 
 Spectrum = NDArray[np.complex128]
 
+FAINT = 0.01
+"""Part of its error that a texture's change must reach to be worked out."""
+
 KEPT, KEPT_PIXELS = 12, 2_000_000
 """Changes by single effects that are kept, and up to which size of a sensor."""
 
@@ -204,7 +207,7 @@ class MapChange:
             shot = self._shot(share)
             parts = [
                 p for e in self.effects
-                if (p := self._part((word, *key), e, shot, change)) is not None
+                if (p := self._part(word, e, shot, change)) is not None
             ]  # fmt: skip
             self._made[word, *key] = (
                 self._transform(np.sum(parts, axis=0)) if parts else None
@@ -213,7 +216,7 @@ class MapChange:
 
     def _part(
         self,
-        name: tuple,
+        word: str,
         effect: Effect,
         shot: Shot,
         change: Callable[[Effect, Shot], NDArray[np.float64] | None],
@@ -221,8 +224,8 @@ class MapChange:
         """Change by one effect; of some effects that stay as they are it is kept."""
         if len(self.effects) == 1 or np.prod(self.layout.shape) > KEPT_PIXELS:
             return change(effect, shot)
-        # Different exposures of one effect's law are told apart by the shot.
-        kept, key = self._kept.setdefault(("parts",), {}), (name, effect, shot)
+        kept = self._kept.setdefault(("parts",), {})
+        key = word, effect, None if effect.standing else shot
         if key not in kept:
             if len(kept) >= KEPT:
                 del kept[next(iter(kept))]
@@ -248,7 +251,10 @@ class MapChange:
         if kept is None or kept[0] is not channel:
             rows = np.nonzero(channel.axes["map"] == name)[0]
             axes = {k: channel.axes[k][rows] for k in ("what", "x", "y", "k")}
-            kept = self._kept[key] = channel, rows, parts_of(axes)
+            parts = parts_of(axes)
+            errors = [channel.blocks[n][0, 0] ** 0.5 for n in rows[parts["texture"]]]
+            parts["faint"] = np.array(1e-6 * FAINT * min(errors, default=0.0))
+            kept = self._kept[key] = channel, rows, parts
         return kept[1], kept[2]
 
 
@@ -318,7 +324,8 @@ def reduce_spectrum(
     shape : tuple of int
         Rows and columns.
     axes : mapping
-        'x', 'y', 'k' of the values, and which of them are each of :data:`PARTS`.
+        'x', 'y', 'k' of the values, and which of them are each of :data:`PARTS`; 'faint': mean
+        square up to which a change has no texture.
     """
     ny, nx = shape
     column, row, block, ring, texture, chess = (axes[w] for w in PARTS)
@@ -344,7 +351,8 @@ def reduce_spectrum(
         rough = delta - f_y @ smooth @ f_x.T
         power = spectrum_rings(rough, shape)
         out[ring] = 1e6 * power[(axes["k"][ring] * 2 * RINGS).astype(int)]
-        if len(texture):
+        square = 2 * float((rough.real**2).sum() + (rough.imag**2).sum()) / (ny * nx) ** 2
+        if len(texture) and square > axes.get("faint", 0.0):
             out[texture] = map_texture(change - q_y @ smooth @ q_x.T)[0]
     return out
 

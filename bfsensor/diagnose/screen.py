@@ -98,14 +98,34 @@ class Screen:
         select = [np.full(len(c), c.fold == "select") for c in fit.channels]
         priors = np.zeros(len(fit.left) - len(fit.residuals), bool)
         self._select = np.concatenate([*select, priors])
+        # Of starts: what they change hardly depends on the effects that there are.
+        self._kept = predictor.kept.setdefault(("starts", *map(id, fit.channels)), {})
+        self._channels = predictor.kept.setdefault(("channels",), set())
+        self._channels.add(fit.channels)
+        self._scaled_templates: dict[Effect, NDArray[np.float64]] = {}
 
     def change(self, effect: Effect) -> NDArray[np.float64]:
         """What an effect changes: whitened, priors' rows after it, parameters projected out."""
+        return self._projected(self._change(effect))
+
+    def _projected(self, change: NDArray[np.float64]) -> NDArray[np.float64]:
+        out = np.zeros(len(self.fit.left))
+        out[: len(change)] = change
+        return np.asarray(out - self.fit.basis @ (self.fit.basis.T @ out))
+
+    def _change_of_start(self, effect: Effect) -> NDArray[np.float64]:
+        """As :meth:`change`, found once for all screens of an attribution."""
+        if effect not in self._kept:
+            self._kept[effect] = self._change(effect).astype(np.float32)
+        return self._projected(self._kept[effect])
+
+    def _change(self, effect: Effect) -> NDArray[np.float64]:
+        """What an effect changes, whitened."""
         both = self.predictor.with_effects((*self.predictor.effects, effect), self.point)
         more = both.start[len(both.names) - len(fitted(effect)) :]
         # Parameters of effects that are there already stay where the fit put them.
         point = np.concatenate([self.point, more])
-        out = np.zeros(len(self.fit.left))
+        out = np.zeros(len(self.fit.residuals))
         for n, (channel, start) in enumerate(
             zip(self.fit.channels, self.fit.starts, strict=False)
         ):
@@ -116,7 +136,7 @@ class Screen:
                 here = self._here[n] = self.predictor.predict(channel, self.point)
             moved = both.predict(channel, point) - here
             out[start : start + len(channel)] = channel.whiten(moved)
-        return np.asarray(out - self.fit.basis @ (self.fit.basis.T @ out))
+        return out
 
     def tried(self, kind: type[Effect]) -> list[tuple[float, Effect]]:
         """Places where a fit of a kind of effect may begin, with their gains, greatest first.
@@ -130,30 +150,28 @@ class Screen:
 
     def _scaled(self, effect: Effect) -> tuple[float, Effect] | None:
         """Gain of an effect of the best amplitude; None of what cannot be seen."""
-        template = self.change(effect)
+        template = self._change_of_start(effect)
         length = float(template @ template)
         if length <= 0:
             return None
         factor = float(template @ self.fit.left) / length
         signed = any(p.signed for p in effect.parameters if p.amplitude)
         if factor <= 0 and not signed:
+            self._scaled_templates[effect] = template
             return 0.0, effect
-        gain = factor**2 * length
         if not effect.bends or abs(factor - 1) < ASTRAY:
-            return gain, _inside(effect.scaled(factor))
+            best = _inside(effect.scaled(factor))
+            self._scaled_templates[best] = factor * template
+            return factor**2 * length, best
         # What it changes is f t1 + f^2 t2: both from another amplitude.
-        other = self.change(effect.scaled(0.5))
-        both = 4 * other - template, 2 * template - 4 * other
-        likely = _best_factor(both, self.fit.left, signed=signed)
-        tries = [_inside(effect.scaled(f)) for f in (likely, factor) if f]
-        gains = [self._gain(e) for e in tries]
-        best = int(np.argmax(gains))
-        return (gains[best], tries[best]) if gains[best] > 0 else (0.0, effect)
-
-    def _gain(self, effect: Effect) -> float:
-        """Decrease of the chi-square by an effect as it is."""
-        template = self.change(effect)
-        return float(template @ (2 * self.fit.left - template))
+        other = self._change_of_start(effect.scaled(0.5))
+        one, two = 4 * other - template, 2 * template - 4 * other
+        factor = _best_factor((one, two), self.fit.left, signed=signed)
+        best = _inside(effect.scaled(factor)) if factor else effect
+        template = self.change(best)
+        self._scaled_templates[best] = template
+        # As it is: far from the start what it changes is another thing.
+        return max(float(template @ (2 * self.fit.left - template)), 0.0), best
 
     def _likely(self, kind: type[Effect], starts: list[Effect]) -> list[Effect]:
         """Those of many starts that one channel finds likeliest."""
@@ -199,7 +217,10 @@ class Screen:
             return None
         if tried[0][0] < least:
             gain, effect = tried[0]
-            return Rival(effect, gain, 0.5 * gain - OCCAM, self.change(effect))
+            template = self._scaled_templates.get(effect)
+            if template is None:
+                template = self.change(effect)
+            return Rival(effect, gain, 0.5 * gain - OCCAM, template)
         rivals = [self._refine(effect) for gain, effect in tried[:REFINED] if gain >= least]
         return max(rivals, key=lambda r: r.gain)
 
