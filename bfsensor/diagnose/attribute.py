@@ -287,9 +287,8 @@ def _found(model: Model, n: int, ranking: Sequence[Rival]) -> Found:
 def candidates_of(baseline: Baseline) -> tuple[type[Effect], ...]:
     """Candidates for what a baseline leaves out: the library, and its card's parameters."""
     own = device_parameters(
-        baseline.edges, baseline.derivatives, baseline.spread, baseline.nominal,
-        baseline.reference,
-    )  # fmt: skip
+        baseline.derivatives_by_condition(), baseline.spread, baseline.nominal
+    )
     return (*LIBRARY, *own)
 
 
