@@ -64,6 +64,9 @@ MIX = {"null": 150, "outside": 60, "several": 80, "single": 210}
 FAINTEST, STRONGEST = 3.0, 30.0
 """Projected SNRs between which effects are drawn."""
 
+QUIET = 100.0
+"""Square that noise may add to one chip's difference, a sixteenth of that of an SNR of 40."""
+
 Calibration = Mapping[tuple[str, str], Amplitudes]
 
 
@@ -99,13 +102,20 @@ def _one_amplitude(effect: Effect) -> bool:
 def _twin(effect: Effect, told: Amplitudes) -> tuple[float, float, Any]:
     """Factor of an effect at the top of its range that was taken, its SNR, its fluxes.
 
-    Twins of two chips: its own shape may be one that the channels do not show, and one chip's
-    difference is as long from noise alone (a wrong bit of the converter beyond those counted).
+    The twin of one chip, in the channels that its class shows in and less the noise that it
+    leaves there; where that is not well below the signal, twins of two chips: an effect's own
+    shape may be one that no channel shows (a wrong bit of the converter beyond those counted).
     """
     factor = min(told.high, 1.0)
+    one = told.noise < QUIET
     for turn in range(3):
         try:
-            found = take_signal(effect.scaled(factor))
+            strong = effect.scaled(factor)
+            found = (
+                take_like(strong, told.shown, told.noise) if one else take_signal(strong)
+            )
+            if one and found.snr**2 < 4 * told.noise and factor == 1.0:
+                found = take_signal(strong)
         except ValueError:
             factor /= 2
             continue

@@ -95,6 +95,8 @@ def attribute(
         Of the noise that thresholds come from.
     """
     kinds = candidates_of(predictor.baseline) if kinds is None else kinds
+    if not predictor.layout.segments:
+        kinds = [k for k in kinds if not k.of_pixels]
     base = Model(predictor, fit)
     candidates = (*kinds, *NAMED)
     model, mismatch, rankings, notes = _forward(base, mismatch, candidates, seed)

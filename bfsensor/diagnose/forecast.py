@@ -284,7 +284,8 @@ class Forecaster:
         like = next((c for c in self.fit.channels if c.word == "flat_map"), None)
         if like is None:
             return []
-        rows = (like.axes["map"] == "all") & (like.axes["what"] != "ring")
+        linear = np.isin(like.axes["what"], ("column", "row", "block"))
+        rows = (like.axes["map"] == "all") & linear
         shares = tuple(
             MapShare(sign, where, seconds, float(levels.mean()))
             for sign, where in ((1.0, condition), (-1.0, self.usual))

@@ -535,6 +535,10 @@ class Predictor:
                 variance, halo, axes = chain.spot_change(self._spot_of[key])
                 if "hours" in x:
                     axes = {**axes, "hours": float(np.mean(x["hours"][rows]))}
+                if "background" in x:
+                    # Dark current grows with the time that the flux takes.
+                    per = float(x["background"][rows].sum() / x["flux"][rows].sum())
+                    axes = {**axes, "background": per}
                 wide = sigma
                 if variance:
                     squares = [max(s * s + variance, 0.01 * s * s) for s in sigma]

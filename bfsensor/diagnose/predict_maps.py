@@ -109,13 +109,14 @@ class MapChange:
         total: Spectrum | None = None
         for key, group in self._groups(shares).items():
             first = group[0]
-            for part, factor in (
-                (self._areas, self._left), (self._light, self._weights),
-                (self._pattern, self._weights),
-            ):  # fmt: skip
-                one = part(key, first)
+            found = [
+                None if one is None else one * factor((*name, *key), group)
+                for one, factor in (
+                    (self._areas(key, first), self._left), (self._light(key, first), self._weights),
+                )
+            ]  # fmt: skip
+            for one in (*found, self._patterns(group)):
                 if one is not None:
-                    one = one * factor((*name, *key), group)
                     total = one if total is None else total + one
         return total
 
@@ -175,11 +176,20 @@ class MapChange:
 
         return self._sum("light", key, share, change)
 
-    def _pattern(self, key: tuple, share: MapShare) -> Spectrum | None:
-        """Of what comes after collection."""
-        return self._sum(
-            "pattern", key, share, lambda effect, shot: effect.pattern(shot, self.layout)
-        )
+    def _patterns(self, group: Sequence[MapShare]) -> Spectrum | None:
+        """Of what comes after collection, which goes with each flat's own level."""
+        total: NDArray[np.float64] | None = None
+        for share in group:
+            shot = self._shot(share)
+            for effect in self.effects:
+                one = effect.pattern(shot, self.layout)
+                if one is not None:
+                    total = share.weight * one + (0.0 if total is None else total)
+        return None if total is None else self._transform(total)
+
+    def _shot(self, share: MapShare) -> Shot:
+        shot = shot_at(self.layout, share.condition, "flat", share.seconds)
+        return shot._replace(level=self._gain * share.level)
 
     def _sum(
         self,
@@ -190,8 +200,7 @@ class MapChange:
     ) -> Spectrum | None:
         """Transform of what all effects change, made once."""
         if (word, *key) not in self._made:
-            shot = shot_at(self.layout, share.condition, "flat", share.seconds)
-            shot = shot._replace(level=self._gain * share.level)
+            shot = self._shot(share)
             parts = [p for e in self.effects if (p := change(e, shot)) is not None]
             self._made[word, *key] = (
                 self._transform(np.sum(parts, axis=0)) if parts else None

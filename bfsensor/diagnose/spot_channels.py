@@ -35,6 +35,7 @@ class SpotChannels:
     ) -> None:
         self._noise, self._lamp_error, self._start = read_noise, lamp_error, start
         self._rows: list[tuple[Exposure, dict[str, tuple[float, float]], NDArray, str]] = []
+        self._backgrounds: dict[int, float] = {}
         self.dropped: dict[str, int] = {}
         self._grids: list[tuple[float, float]] = []
 
@@ -73,6 +74,7 @@ class SpotChannels:
             "sigma_x": (fit.sigma_x, float(errors[0])),
             "sigma_y": (fit.sigma_y, float(errors[1])),
         }
+        self._backgrounds[exposure.number] = float(np.mean(values.pop("background")))
         flux = values.pop("flux")
         total = float(flux.mean())
         out["flux"] = (total, float(flux.std(ddof=1) / np.sqrt(n)))
@@ -114,6 +116,7 @@ class SpotChannels:
                 blocks.append(np.array([[max(variance, 1e-30)]]))
                 axes.add(1, Condition.of(exposure), what=what, light=light,
                          flux=found["flux"][0], time=exposure.exposure_time or 0.0,
+                         background=self._backgrounds[exposure.number],
                          exposure=exposure.number, hours=24.0 * (mjd - self._start))  # fmt: skip
         return Channel("spot", np.concatenate(values), tuple(blocks), axes.columns(), "",
                        fold)  # fmt: skip
@@ -186,7 +189,7 @@ def stamp_moments(
     x: NDArray[np.float64],
     y: NDArray[np.float64],
 ) -> dict[str, NDArray[np.float64]]:
-    """Flux, skewness along x and y, and the share of the flux in the wings, spot by spot.
+    """Flux, skewness along x and y, share of the flux in the wings, background, spot by spot.
 
     Skewness: the third power of the distance from the fitted centre, with a Gaussian weight of
     2 pixels, over the flux.  Wings: what lies in the wide stamp outside the fitted one.
@@ -210,5 +213,6 @@ def stamp_moments(
         "skew_x": (signal * weight * dx[:, None] ** 3).sum((1, 2)) / flux,
         "skew_y": (signal * weight * dy[..., None] ** 3).sum((1, 2)) / flux,
         "flux": total,
+        "background": background[:, 0, 0],
         "wings": 1.0 - signal.sum((1, 2)) / total,
     }

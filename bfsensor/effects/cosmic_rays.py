@@ -54,6 +54,7 @@ class CosmicRays(Effect):
     stage = "store"
     parameters = (Parameter("rate", "1/min", 0.3, 30.0, amplitude=True),)
     touches = ("dark_map", "flat_cov", "bias_level")
+    of_pixels = True
     source = (
         "Groom 2002, Exp. Astron. 14, 45 (straight muon tracks in thick CCDs; the muon rate is "
         "irreducible); about one a minute and cm^2 at sea level, 80 e-/um: Particle Data Group, from "
@@ -242,8 +243,10 @@ def make_tracks(
     rest, x0 = np.divmod(pixels, 2 * wide + 1)
     track, y0 = np.divmod(rest, 2 * wide + 1)
     y0, x0 = y0 - wide, x0 - wide
+    # Reduced recordings do not tell how large the sensor is: of a large one no track leaves.
     inside = [
-        np.maximum(1 - np.abs(v) / n, 0.0) for v, n in zip((y0, x0), shape, strict=True)
+        np.maximum(1 - np.abs(v) / n, 0.0) if n else np.ones(len(v))
+        for v, n in zip((y0, x0), shape, strict=True)
     ]
     total = np.asarray(np.bincount(which.ravel(), lump), float)
     return Tracks(count, track, y0, x0, total, inside[0] * inside[1])

@@ -108,6 +108,7 @@ class DarkCurrent(_Dark):
     variant = "dark"
     parameters = (Parameter("rate", "e-/s", 0.02, 1.0, amplitude=True),)
     touches = ("dark_map",)
+    of_pixels = True
 
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:

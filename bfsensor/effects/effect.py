@@ -250,6 +250,8 @@ class Effect:
     standing : bool
         Whether :meth:`light_map`, :meth:`displacements` and :meth:`pattern` are the same in all
         flats.
+    of_pixels : bool
+        Whether its predictions need the amplifiers' pixels, which reduced recordings do not tell.
     """
 
     values: Mapping[str, float]
@@ -262,6 +264,7 @@ class Effect:
     source: ClassVar[str] = ""
     by_time: ClassVar[bool] = False
     standing: ClassVar[bool] = False
+    of_pixels: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         needed = {p.name for p in self.parameters}
@@ -452,7 +455,11 @@ class Effect:
     def spot_image(
         self, images: Values, axes: Mapping[str, float], layout: Layout
     ) -> Values:
-        """Mean images of spots [e-] on the sensor's axes after this effect, shape (..., ny, nx)."""
+        """Mean images of spots [e-] on the sensor's axes after this effect, shape (..., ny, nx).
+
+        ``axes``: the condition, 'hours', and 'background', electrons of a pixel beside a spot over
+        the spot's flux.
+        """
         del axes, layout
         return images
 

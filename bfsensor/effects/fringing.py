@@ -36,6 +36,7 @@ class Fringing(Effect):
         Parameter("phase", "cycle", -0.5, 0.5, law="flat"),
     )
     touches = ("flat_map",)
+    of_pixels = True
     source = (
         "Howell 2012, PASP 124, 263 (small variations of thickness make the pattern; from about "
         "700 nm in thinned CCDs); range of thick ones assumed"

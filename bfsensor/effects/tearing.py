@@ -41,6 +41,7 @@ class Tearing(Effect):
         Parameter("open", "", 0.0, 1.0, law="flat"),
     )
     touches = ("flat_map", "flat_cov")
+    of_pixels = True
     source = (
         "Juramy et al. 2020, Proc. SPIE 11454, 1145412 (arXiv 2002.09439: holes in channel stops "
         "moved by clocks, worst beside segments' edges); exponential, rows and range are assumed"

@@ -36,6 +36,7 @@ class TrapSerial(Effect):
         Parameter("amp", "", 0, 1, law="whole"),
     )
     touches = ("serial_overscan", "flat_map", "flat_mean", "spot")
+    of_pixels = True
     source = (
         "Single-species trap with instant capture: ArCTIc, Massey et al. 2014, MNRAS 439, 887; "
         "fixed serial traps of ITL sensors: Snyder & Roodman 2019, JATIS 5, 041509"
@@ -79,22 +80,29 @@ class TrapSerial(Effect):
         segment = self._segment(layout)
         if segment is None or self["size"] == 0:
             return images
-        # Spots are far enough apart to find the trap empty; measured are means of all spots.
+        # Spots are far enough apart to find the trap as the background leaves it; measured are
+        # means of all spots.
         share = (
             segment.columns
             * segment.rows
             / sum(s.columns * s.rows for s in layout.segments)
         )
         order = slice(None, None, -1 if segment.flip_x else 1)
-        lines = images[..., order].reshape(-1, images.shape[-1])
-        read = self._through(lines).reshape(images.shape)[..., order]
+        # The background fills it up to where it catches what it releases.
+        level = axes.get("background", 0.0) * images.sum((-2, -1), keepdims=True)
+        level = np.maximum(
+            np.broadcast_to(level, (*images.shape[:-1], 1)).reshape(-1, 1), 0.0
+        )
+        lines = images[..., order].reshape(-1, images.shape[-1]) + level
+        held = np.minimum(level[:, 0] / -np.expm1(-1 / self["tau"]), self["size"])
+        read = (self._through(lines, held) - level).reshape(images.shape)[..., order]
         return images + share * (read - images)
 
-    def _through(self, frame: Image) -> Image:
-        """Rows after the trap, first pixel first."""
+    def _through(self, frame: Image, held: Values | None = None) -> Image:
+        """Rows after the trap, first pixel first; what it holds before them is nothing by default."""
         size = self["size"]
         out = np.empty_like(frame)
-        held = np.zeros(len(frame))
+        held = np.zeros(len(frame)) if held is None else held
         released = -np.expm1(-1 / self["tau"])
         for column in range(frame.shape[1]):
             free = held * released

@@ -31,6 +31,7 @@ class TreeRings(Effect):
         Parameter("phase", "cycle", -0.5, 0.5, law="flat"),
     )
     touches = ("flat_map",)
+    of_pixels = True
     source = (
         "Plazas, Bernstein & Sheldon 2014, PASP 126, 750 (DECam: rings in flats and in positions "
         "of stars, from memory); Baumer, Davis & Roodman 2017, PASP 129, 084502; range assumed"

@@ -32,7 +32,12 @@ def calibration(monkeypatch):
         factor = 1 / headroom(effect)
         return amplitudes.Signal(200.0 * factor, ("flat_cov",), 1.0, np.zeros(1), flux)
 
+    def take_like(effect, shown, noise):
+        assert shown == ("flat_cov",) and noise == 1.0
+        return take_signal(effect)
+
     monkeypatch.setattr(trials, "take_signal", take_signal)
+    monkeypatch.setattr(trials, "take_like", take_like)
     return told
 
 

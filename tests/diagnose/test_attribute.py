@@ -97,7 +97,13 @@ def rival(kind, values, gain, z, template):
 def test_probabilities_and_ties_follow_evidence_and_gain():
     loss = rival(ChargeLoss, {"q": 1e-7}, 40.0, 15.0, [1, 0, 0])
     bent = rival(GainNonlinearity, {"c2": 1e-3, "c3": 0.0}, 38.0, 13.0, [0.99, 0.1, 0])
-    torn = rival(Tearing, {"amp": 0.1, "length": 2.0, "column": 0.5}, 9.0, 0.0, [0, 0, 1])
+    torn = rival(
+        Tearing,
+        {"amp": 0.1, "length": 2.0, "column": 0.5, "open": 0.4},
+        9.0,
+        0.0,
+        [0, 0, 1],
+    )
     out = class_probabilities([loss, bent, torn])
     assert out["charge_loss"] == pytest.approx(1 / (1 + np.exp(-2.0)), rel=1e-5)
     assert tied_classes(loss.effect, [loss, bent, torn]) == (
