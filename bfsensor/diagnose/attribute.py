@@ -291,7 +291,7 @@ def candidates_of(baseline: Baseline) -> tuple[type[Effect], ...]:
     own = device_parameters(
         baseline.derivatives_by_condition(), baseline.spread, baseline.nominal
     )
-    return (*LIBRARY, *own)
+    return (*LIBRARY, *own, *baseline.pieces)
 
 
 def name_of(kind: type[Effect]) -> str:

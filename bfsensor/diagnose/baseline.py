@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.diagnose.conditions import Condition
+from bfsensor.effects.effect import Effect
 from bfsensor.errors import DiagnosisError
 
 Edges = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -64,6 +65,9 @@ class Baseline:
     spots_bend : bool
         Whether spots follow the slopes, as flats do: charge then moves boundaries less and less
         while it gathers.
+    pieces : tuple of type
+        Physics that the simulation may leave out, as candidates
+        (:func:`bfsensor.diagnose.left_out.physics_left_out`).
     """
 
     name: str
@@ -81,6 +85,7 @@ class Baseline:
     warming: Mapping[Key, Edges] = field(default_factory=dict)
     temperature: float = np.nan
     spots_bend: bool = False
+    pieces: tuple[type[Effect], ...] = ()
 
     def __post_init__(self) -> None:
         if not self.edges:
@@ -231,18 +236,42 @@ class Baseline:
         a : ndarray, shape (n, ny, nx), or (ny, nx) where the response does not change
         """
         a = area_matrix(*self.at(condition, change)[0])
-        slopes = self.slopes.get(self.nearest(condition))
-        if slopes is None:
+        key = self.nearest(condition)
+        if key not in self.slopes:
             return a
-        away = (2 / 3 * levels - self.level)[:, None, None]
-        a = a + away * area_matrix(*slopes)
-        bends = self.bends.get(self.nearest(condition))
-        if bends is not None:
-            # The mean of the square over a flat's growth, weighted by the level, is 1/2 of its
-            # level's, against 4/9 of the square of the mean.
-            spread = (levels**2 / 18)[:, None, None]
-            a = a + (away**2 + spread) * area_matrix(*bends)
-        return np.asarray(a)
+        return a + level_areas(self.slopes[key], self.bends.get(key), self.level, levels)
+
+
+def level_areas(
+    slope: Edges,
+    bend: Edges | None,
+    level: float,
+    levels: NDArray[np.float64],
+    *,
+    grown: bool = True,
+) -> NDArray[np.float64]:
+    """Change of the areas per electron [1/e-] by a response that goes with the level.
+
+    Parameters
+    ----------
+    slope, bend : tuple of ndarray
+        Change of the shifts per electron of the level, and half the second derivative.
+    level : float
+        At which nothing changes [e-].
+    levels : ndarray, shape (n,)
+        Of the flats, or of the background.
+    grown : bool
+        Whether flats grew up to the level, as in :meth:`Baseline.flat_areas`, or a background
+        of it stands.
+    """
+    away = ((2 / 3 if grown else 1.0) * levels - level)[:, None, None]
+    a = away * area_matrix(*slope)
+    if bend is not None:
+        # The mean of the square over a flat's growth, weighted by the level, is 1/2 of its
+        # level's, against 4/9 of the square of the mean.
+        spread = (levels**2 / 18)[:, None, None] if grown else 0.0
+        a = a + (away**2 + spread) * area_matrix(*bend)
+    return np.asarray(a)
 
 
 def _off(one: float, other: float) -> float:

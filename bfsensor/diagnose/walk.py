@@ -118,40 +118,44 @@ def walk(
     """
     thickness = device.silicon.thickness
     depths = (5.0, 20.0, 0.5 * thickness, thickness)
+    both = [_at(device, cells, float(b), depths, keep) for b in backgrounds]
+    kx, ky = (np.array([b[n] for b in both]) for n in range(2))
+    return Walk(tuple(map(float, backgrounds)), np.array(depths), kx, ky)
+
+
+def _at(
+    device: Device,
+    cells: int,
+    background: float,
+    depths: tuple[float, ...],
+    keep: Path | None,
+) -> Edges:
+    """Shifts by depth about one background, walked or read."""
     text = "\n".join([
         "walk 1", bfsensor.__version__, device.to_toml(), f"{cells} {VERTICES} {REACH}",
-        " ".join(f"{v:.9g}" for v in (*backgrounds, *depths)),
+        " ".join(f"{v:.9g}" for v in (background, *depths)),
     ])  # fmt: skip
     name = f"walk_{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
     path = None if keep is None else keep / name
     if path is not None and path.exists():
         return _read(path)
-    both = []
-    for background in map(float, backgrounds):
-        # The full well is not asked for: it takes as long as the table.
-        plan = Plan(
-            device, (background, background + BEYOND), (background,), depths, VERTICES, REACH,
-            cells, 0, max(4 * background, 2e5),
-        )  # fmt: skip
-        both.append(edges_by_depth(build_table(plan), background=background))
-    kx, ky = (np.array([b[n] for b in both]) for n in range(2))
-    found = Walk(tuple(map(float, backgrounds)), np.array(depths), kx, ky)
+    # The full well is not asked for: it takes as long as the table.
+    plan = Plan(
+        device, (background, background + BEYOND), (background,), depths, VERTICES, REACH,
+        cells, 0, max(4 * background, 2e5),
+    )  # fmt: skip
+    kx, ky = edges_by_depth(build_table(plan), background=background)
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with written_whole(path, DiagnosisError) as beside, open(beside, "wb") as stream:
-            np.savez(stream, **found.__dict__)
-    return found
+            np.savez(stream, kx=kx, ky=ky)
+    return kx, ky
 
 
-def _read(path: Path) -> Walk:
+def _read(path: Path) -> Edges:
     try:
         with path.open("rb") as stream, np.load(stream) as data:
-            return Walk(
-                tuple(map(float, data["backgrounds"])),
-                data["depths"],
-                data["kx"],
-                data["ky"],
-            )
+            return data["kx"], data["ky"]
     except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise DiagnosisError(
             f"{path}: not a finished walk; delete it to walk again ({error})"
