@@ -317,6 +317,75 @@ def _found(model: Model, n: int, ranking: Sequence[Rival]) -> Found:
     )  # fmt: skip
 
 
+<<<<<<< HEAD
+=======
+def candidates_of(baseline: Baseline) -> tuple[type[Effect], ...]:
+    """Candidates for what a baseline leaves out: the library, and its card's parameters."""
+    own = device_parameters(
+        baseline.derivatives_by_condition(), baseline.spread, baseline.nominal
+    )
+    return (*LIBRARY, *own, *baseline.pieces)
+
+
+def name_of(kind: type[Effect]) -> str:
+    """Class, and variant where there are several."""
+    return f"{kind.word}:{kind.variant}" if kind.variant else kind.word
+
+
+def rank(screen: Screen, kinds: Sequence[type[Effect]]) -> list[Rival]:
+    """Best of each kind, greatest evidence first."""
+    starts = [screen.tried(kind) for kind in kinds]
+    best = max((t[0][0] for t in starts if t), default=0.0)
+    least = max(HOPELESS, FAR * best)
+    found = [screen.best(t, least=least) for t in starts]
+    return sorted((r for r in found if r is not None), key=lambda r: -r.evidence)
+
+
+def refine(model: Model, ranking: Sequence[Rival]) -> list[Rival]:
+    """Fit the closest of a ranking again with all parameters, beyond the first order."""
+    best = max(r.gain for r in ranking)
+    out = []
+    close = [r for r in ranking if best - r.gain < max(CLOSE, 0.02 * best)][:REFITTED]
+    for rival in ranking:
+        if any(rival is r for r in close) and len(close) > 1:
+            try:
+                other = model.with_effects((*model.effects, rival.effect))
+            except ConvergenceError:
+                out.append(rival)
+                continue
+            gain = model.fit.total - other.fit.total
+            out.append(
+                Rival(
+                    other.effects[-1], gain, rival.evidence + 0.5 * (gain - rival.gain),
+                    rival.template, rival.select,
+                )
+            )  # fmt: skip
+        else:
+            out.append(rival)
+    return sorted(out, key=lambda r: -r.evidence)
+
+
+def threshold(
+    screen: Screen, ranking: Sequence[Rival], *, seed: int, draws: int = 400
+) -> float:
+    """Gain that noise alone gives the best of all candidates once in a hundred times."""
+    templates = np.array([
+        r.template / np.sqrt(r.template @ r.template)
+        for r in ranking if r.template @ r.template > 0
+    ])  # fmt: skip
+    extra = max((len(fitted(r.effect)) for r in ranking), default=1) - 1
+    if not len(templates):
+        return np.inf
+    rng = np.random.default_rng(seed)
+    largest = []
+    for _ in range(draws // 50):
+        noise = rng.standard_normal((50, templates.shape[1]))
+        largest.append(((noise @ templates.T) ** 2).max(1))
+    # Shapes that are fitted follow the noise: each takes about one of it more.
+    return float(np.quantile(np.concatenate(largest), 1 - ALARM)) + 2.0 * extra
+
+
+>>>>>>> wt-physics
 def _judge(
     model: Model,
     rankings: dict[int, list[Rival]],

@@ -34,6 +34,8 @@ CLASS_WORDS = {
     "psf_wings": "spots have an extended halo",
     "cosmic_rays": "tracks of particles",
     "illumination_turbulence": "the illumination changes from frame to frame",
+    "free_holes": "holes that move in the channel stops and under the barrier gates",
+    "stop_diffusion": "implants of the channel stops spread sideways",
     "outside_library": "none of the effects that are known here",
 }
 """By class word."""

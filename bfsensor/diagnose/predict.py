@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.baseline import Baseline
+from bfsensor.diagnose.baseline import Baseline, Edges
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
@@ -484,6 +484,9 @@ class Predictor:
                     a = a * (1 + chain.law.bend * REDUCED_LEVEL)
                     reach = max(more.shape[-1], a.shape[-1]) // 2
                     a = pad_areas(a, reach) + pad_areas(more, reach)
+                    bent = chain.level_change(where, np.array([REDUCED_LEVEL]), grown=False)
+                    if bent is not None:
+                        a = a + pad_areas(bent[0], reach)
                 y, x0 = (n // 2 for n in a.shape)
                 out[rows] = 0.5 * (
                     a[y + j[rows], x0 + i[rows]] + a[y - j[rows], x0 + i[rows]]
@@ -507,6 +510,9 @@ class Predictor:
                 a = self.baseline.flat_areas(where, device, levels)
                 reach = max(more.shape[-1], a.shape[-1]) // 2
                 a = pad_areas(a, reach) + pad_areas(more, reach)
+                bent = chain.level_change(where, levels)
+                if bent is not None:
+                    a = a + pad_areas(bent, reach)
                 whole = periodic_covariances(a, levels, law=chain.law)
                 c = quadrant(chain.covariances(whole, axes), lags) / own[:, None, None] ** 2
             c[:, 0, 0] += noise[groups[:, 0].astype(int)]
@@ -531,11 +537,13 @@ class Predictor:
             if not len(rows) or (only is not None and _width_of(key) != only):
                 continue
             n = self._widths.index(_width_of(key))
-            edges, _ = self.baseline.at(self._spot_of[key], device)
+            edges, slopes = self._spot_shifts(self._spot_of[key], device)
             sigma = float(sigmas[2 * n]), float(sigmas[2 * n + 1])
             fluxes = scale * x["flux"][rows]
             if chain is None or chain.leaves_spots:
-                found = dict(self._unchanged(key, (*edges, np.array(sigma), fluxes)))
+                found = dict(
+                    self._unchanged(key, (*edges, np.array(sigma), fluxes), slopes)
+                )
             else:
                 variance, halo, axes = chain.spot_change(self._spot_of[key])
                 if "hours" in x:
@@ -548,10 +556,11 @@ class Predictor:
                 if variance:
                     squares = [max(s * s + variance, 0.01 * s * s) for s in sigma]
                     wide = float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))
+                edges, slopes = chain.spot_edges(edges, slopes, self._spot_of[key])
                 found = predict_spots(
-                    *chain.edges(edges, self._spot_of[key]), sigma=wide,
+                    *edges, sigma=wide,
                     phases=self._phases[key], fluxes=fluxes, halo=halo, law=chain.law,
-                    neighbours=self.measured.neighbours, slopes=self.spot_slopes,
+                    neighbours=self.measured.neighbours, slopes=slopes,
                     change=partial(chain.spot_image, axes=axes),
                 )  # fmt: skip
             found["flux"] = found["flux"] / scale
@@ -564,8 +573,24 @@ class Predictor:
             out[here] += chain.spot_flux(axes) / scale
         return out
 
+    def _spot_shifts(
+        self, condition: Condition, device: dict[str, float]
+    ) -> tuple[Edges, Edges | None]:
+        """Shifts of spots, without charge where they go with it, and their slopes."""
+        (kx, ky), _ = self.baseline.at(condition, device)
+        key = self.baseline.nearest(condition)
+        if not self.baseline.spots_bend or key not in self.baseline.slopes:
+            return (kx, ky), self.spot_slopes
+        # Slopes of free forms are among them.
+        sx, sy = self.baseline.slopes[key]
+        level = self.baseline.level
+        return (kx - level * sx, ky - level * sy), (sx, sy)
+
     def _unchanged(
-        self, key: tuple[str, ...], state: tuple[NDArray[np.float64], ...]
+        self,
+        key: tuple[str, ...],
+        state: tuple[NDArray[np.float64], ...],
+        slopes: Edges | None,
     ) -> dict[str, NDArray[np.float64]]:
         """Spots that no effect changes, at a condition; kept while effects' parameters alone move."""
         kept = self._grown.get(key)
@@ -573,7 +598,7 @@ class Predictor:
             kx, ky, sigma, fluxes = state
             found = predict_spots(
                 kx, ky, sigma=(float(sigma[0]), float(sigma[1])), phases=self._phases[key],
-                fluxes=fluxes, slopes=self.spot_slopes,
+                fluxes=fluxes, slopes=slopes,
             )  # fmt: skip
             kept = self._grown[key] = state, found
         return kept[1]

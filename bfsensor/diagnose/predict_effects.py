@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.baseline import Baseline, Edges, area_matrix
+from bfsensor.diagnose.baseline import Baseline, Edges, area_matrix, level_areas
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
@@ -94,7 +94,7 @@ class EffectChain:
     @property
     def leaves_spots(self) -> bool:
         """Whether spots grow and are read as without effects, their light apart."""
-        own = ("edges", "law", "spot_light", "spot_image", "signal")
+        own = ("edges", "law", "level_response", "spot_light", "spot_image", "signal")
         return all(
             getattr(type(e), name) is getattr(Effect, name)
             for e in self.effects
@@ -112,6 +112,30 @@ class EffectChain:
         # Shifts may reach farther than the baseline's.
         margin = (more.shape[0] - a.shape[0]) // 2
         return np.asarray(more - np.pad(a, margin))
+
+    def level_change(
+        self, condition: Condition, levels: NDArray[np.float64], *, grown: bool = True
+    ) -> NDArray[np.float64] | None:
+        """What effects that go with the level add to the areas [1/e-]; None: nothing."""
+        total = None
+        for level, slope, bend in self._level_responses(condition):
+            one = level_areas(slope, bend, level, levels, grown=grown)
+            total = one if total is None else total + one
+        return total
+
+    def _level_responses(self, condition: Condition) -> list[tuple[float, Edges, Edges]]:
+        found = [e.level_response(self.shot(condition), self.layout) for e in self.effects]
+        return [f for f in found if f is not None]
+
+    def spot_edges(
+        self, edges: Edges, slopes: Edges | None, condition: Condition
+    ) -> tuple[Edges, Edges | None]:
+        """Shifts without charge and their slopes, of spots, with all effects."""
+        kx, ky = self.edges(edges, condition)
+        for level, (sx, sy), _ in self._level_responses(condition):
+            kx, ky = kx - level * sx, ky - level * sy
+            slopes = (sx, sy) if slopes is None else (slopes[0] + sx, slopes[1] + sy)
+        return (kx, ky), slopes
 
     def signal(self, level: NDArray[np.float64], axes: Axes) -> NDArray[np.float64]:
         """Signal after the amplifier of collected charge [e-]."""

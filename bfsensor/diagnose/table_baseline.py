@@ -128,25 +128,35 @@ def edges_at(
     kx, ky : ndarray, shape (2 reach + 3, 2 reach + 3)
         With a ring of pixels around the table's whose outer edges do not move.
     """
-    weights = _conversion(table.depths, table.thickness, wavelength, temperature)
-    kx: NDArray[np.float64] | float = 0.0
-    ky: NDArray[np.float64] | float = 0.0
-    for depth, weight in zip(table.depths, weights, strict=True):
+    weights = conversion_weights(table.depths, table.thickness, wavelength, temperature)
+    kx, ky = edges_by_depth(table, background=background)
+    return np.tensordot(weights, kx, 1), np.tensordot(weights, ky, 1)
+
+
+def edges_by_depth(table: DistortionTable, *, background: float = 0.0) -> Edges:
+    """Mean shifts of right and upper edges [pixel/e-] by conversion depth.
+
+    Parameters
+    ----------
+    table, background
+        As for :func:`edges_at`.
+
+    Returns
+    -------
+    kx, ky : ndarray, shape (depths, 2 reach + 3, 2 reach + 3)
+    """
+    scale = CHARGE * np.array(table.pitch)
+    n = 2 * table.reach + 3
+    out_x, out_y = np.zeros((2, len(table.depths), n, n))
+    for k, depth in enumerate(table.depths):
         moved = table.displacements(
             charge=background + CHARGE, background=background, depth=float(depth)
         )
-        kx = kx + weight * _along(
-            moved.corners[..., 0], moved.vertical[..., 0], table, axis=0
-        )
-        ky = ky + weight * _along(
-            moved.corners[..., 1], moved.horizontal[..., 1], table, axis=1
-        )
-    scale = CHARGE * np.array(table.pitch)
-    n = 2 * table.reach + 3
-    out_x, out_y = np.zeros((n, n)), np.zeros((n, n))
-    # The line left of the first pixel is the right edge of a pixel outside the table.
-    out_x[1:-1, :-1] = np.asarray(kx) / scale[0]
-    out_y[:-1, 1:-1] = np.asarray(ky) / scale[1]
+        x = _along(moved.corners[..., 0], moved.vertical[..., 0], table, axis=0)
+        y = _along(moved.corners[..., 1], moved.horizontal[..., 1], table, axis=1)
+        # The line left of the first pixel is the right edge of a pixel outside the table.
+        out_x[k, 1:-1, :-1] = x / scale[0]
+        out_y[k, :-1, 1:-1] = y / scale[1]
     return out_x, out_y
 
 
@@ -169,7 +179,7 @@ def _along(
     return np.asarray(np.moveaxis(mean, 0, axis))
 
 
-def _conversion(
+def conversion_weights(
     depths: NDArray[np.float64], thickness: float, wavelength: float, temperature: float
 ) -> NDArray[np.float64]:
     """Share of the light that the response at each depth stands for, linear between them."""

@@ -25,18 +25,15 @@ class Floating(NamedTuple):
         As on the card.
     nominal, spread : float
         Value on the card and its standard deviation, in the card's unit.
-    dkx, dky : ndarray, odd sides
-        Change of the shifts for a unit more, at the reference [pixel/e- per unit].
-    scales : tuple of ((float, float), float)
-        Wavelength [nm] and back bias [V], and the factor on that change there.
+    slopes : tuple of ((float, float), (ndarray, ndarray))
+        Wavelength [nm] and back bias [V], and change of the shifts for a unit more there
+        [pixel/e- per unit], odd sides.
     """
 
     name: str
     nominal: float
     spread: float
-    dkx: Values
-    dky: Values
-    scales: tuple[tuple[tuple[float, float], float], ...]
+    slopes: tuple[tuple[tuple[float, float], Edges], ...]
 
 
 class DeviceParameter(Effect):
@@ -79,39 +76,43 @@ class DeviceParameter(Effect):
         change = self[own.name] - own.nominal
         if change == 0.0:
             return kx, ky
-        _, factor = min(
-            own.scales,
-            key=lambda s: (abs(s[0][1] - shot.back_bias), abs(s[0][0] - shot.wavelength)),
-        )
-        moved = []
-        for shifts, slope in ((kx, own.dkx), (ky, own.dky)):
-            reach = max(len(shifts), len(slope)) // 2
-            wide, slope = (np.pad(a, reach - len(a) // 2) for a in (shifts, slope))
-            moved.append(wide + factor * change * slope)
-        return moved[0], moved[1]
+        slopes = nearest_edges(own.slopes, shot)
+        return add_edges((kx, ky), slopes, change)
+
+
+def nearest_edges(held: Sequence[tuple[tuple[float, float], Edges]], shot: Shot) -> Edges:
+    """Those of the nearest back bias, and of the nearest wavelength there."""
+    _, found = min(
+        held,
+        key=lambda s: (abs(s[0][1] - shot.back_bias), abs(s[0][0] - shot.wavelength)),
+    )
+    return found
+
+
+def add_edges(edges: Edges, more: Edges, factor: float) -> Edges:
+    """Add so much of other shifts, which may reach farther."""
+    moved = []
+    for shifts, slope in zip(edges, more, strict=True):
+        reach = max(len(shifts), len(slope)) // 2
+        wide, slope = (np.pad(a, reach - len(a) // 2) for a in (shifts, slope))
+        moved.append(wide + factor * slope)
+    return moved[0], moved[1]
 
 
 def device_parameters(
-    edges: Conditions,
-    derivatives: Mapping[str, Edges],
+    derivatives: Mapping[str, Conditions],
     spread: Mapping[str, float],
     nominal: Mapping[str, float],
-    reference: tuple[float, float],
 ) -> tuple[type[DeviceParameter], ...]:
     """Make the candidates for a baseline: one class for each parameter that floats.
 
     Parameters
     ----------
-    edges : mapping of (wavelength, back_bias) to (kx, ky)
-        The baseline's shifts: the derivatives are scaled by the ratio of their areas a_00 to
-        that of the reference.
-    derivatives : mapping of str to (dkx, dky)
-        Change of the shifts for a unit of each parameter, at ``reference``.
+    derivatives : mapping of str to mapping of (wavelength, back_bias) to (dkx, dky)
+        Change of the shifts for a unit of each parameter, at each condition.
     spread, nominal : mapping of str to float
         Of the card; a parameter without a nominal value has no true one to be told, and is left
         out.
-    reference : tuple of float
-        Wavelength [nm] and back bias [V] of the derivatives.
 
     Raises
     ------
@@ -123,37 +124,22 @@ def device_parameters(
     >>> k = np.zeros((5, 5))
     >>> k[2, 2], k[2, 1] = -1e-6, 1e-6
     >>> kinds = device_parameters(
-    ...     {(620.0, -60.0): (k, k.T)}, {"h": (k / 2, k.T / 2)}, {"h": 0.06}, {"h": 1.2},
-    ...     (620.0, -60.0))
+    ...     {"h": {(620.0, -60.0): (k / 2, k.T / 2)}}, {"h": 0.06}, {"h": 1.2})
     >>> effect = kinds[0]({"h": 1.4})
     >>> effect.name, effect.scaled(0.5)["h"].__round__(3)
     ('device_parameter:h', 1.3)
     """
-    own = _centre(*edges[reference]) if reference in edges else 0.0
-    scales = tuple(
-        (condition, _centre(*pair) / own if own else 1.0)
-        for condition, pair in edges.items()
-    )
     out = []
-    for name, (dkx, dky) in derivatives.items():
+    for name, slopes in derivatives.items():
         if name not in nominal:
             continue
         if not spread[name] > 0:
             raise EffectError(
                 f"device_parameter: spread of {name} = {spread[name]!r}, above 0"
             )
-        out.append(
-            _kind(
-                Floating(name, float(nominal[name]), float(spread[name]), dkx, dky, scales)
-            )
-        )
+        held = tuple(slopes.items())
+        out.append(_kind(Floating(name, float(nominal[name]), float(spread[name]), held)))
     return tuple(out)
-
-
-def _centre(kx: Values, ky: Values) -> float:
-    """Change of the charge's own pixel's area per electron [1/e-]."""
-    y, x = (n // 2 for n in kx.shape)
-    return float(kx[y, x] - kx[y, x - 1] + ky[y, x] - ky[y - 1, x])
 
 
 _KINDS: dict[tuple[Any, ...], type[DeviceParameter]] = {}
@@ -161,7 +147,7 @@ _KINDS: dict[tuple[Any, ...], type[DeviceParameter]] = {}
 
 def _kind(own: Floating) -> type[DeviceParameter]:
     """Class of a parameter; the same for the same arrays, so that copies are equal."""
-    key = (*own[:3], own.dkx.tobytes(), own.dky.tobytes(), own.scales)
+    key = (*own[:3], tuple((c, *(a.tobytes() for a in pair)) for c, pair in own.slopes))
     if key not in _KINDS:
         parameter = Parameter(
             own.name, "as on the card", NEAREST * own.spread, FARTHEST * own.spread,

@@ -353,6 +353,21 @@ class Effect:
         del shot, layout
         return kx, ky
 
+    def level_response(
+        self, shot: Shot, layout: Layout
+    ) -> tuple[float, Edges, Edges] | None:
+        """Give how shifts change with the charge that is there; None: no other than the baseline's.
+
+        Returns
+        -------
+        level : float
+            Charge at which nothing changes [e-].
+        slope, bend : tuple of ndarray
+            Change per electron [pixel/e-^2], and half the second derivative [pixel/e-^3].
+        """
+        del shot, layout
+        return None
+
     def law(self) -> Law:
         """How collection departs from linear shifts."""
         return Law()

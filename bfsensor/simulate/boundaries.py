@@ -36,6 +36,10 @@ RIDGE_MARGIN, RIDGE_CLEARANCE = 0.1, 1.5
 """If the ridge over the stops comes that near to it, boundaries are bisected this far above
 the ridge instead [um]."""
 
+STEEP = 0.15
+"""Part of the mean field above that the weakest one at that height must have, else they are too: at
+0.05 of it (ITL at -30 V) backward traces ran away from some points, at 0.19 (-35 V) none did."""
+
 BISECTION = 1e-5  # um; a thirtieth of the tracing error that is promised
 COARSENESS = 0.25
 """Step of the forward trace relative to the local scale."""
@@ -316,7 +320,11 @@ def _split_height(potential: Potential, surfaces: Surfaces) -> float:
     z = potential.mesh.z
     rises = np.diff(potential.phi, axis=0).max(axis=(1, 2)) >= 0
     ridge = float(z[np.flatnonzero(rises)[-1] + 1])
-    if ridge + RIDGE_MARGIN > split:
+    above = int(np.searchsorted(z, split))
+    mean, gap = potential.phi[above].mean() - potential.phi[-1].mean(), z[-1] - z[above]
+    weakest = -np.diff(potential.phi[above - 1 : above + 1], axis=0).max()
+    weak = weakest / (z[above] - z[above - 1]) < STEEP * mean / gap
+    if ridge + RIDGE_MARGIN > split or weak:
         split = ridge + RIDGE_CLEARANCE
     return split
 

@@ -311,7 +311,7 @@ def _kinds():
     b = virtual_baseline()
     return {
         k.variant: k
-        for k in device_parameters(b.edges, b.derivatives, b.spread, b.nominal, b.reference)
+        for k in device_parameters(b.derivatives_by_condition(), b.spread, b.nominal)
     }
 
 
@@ -362,6 +362,6 @@ def test_device_parameters_are_linear_to_what_is_said(name, five, ten):
 def test_device_parameters_without_nominal_value_or_spread():
     k = np.zeros((5, 5))
     pair = {(620.0, -60.0): (k, k)}
-    assert not device_parameters(pair, {"a10": (k, k)}, {"a10": 1.0}, {}, (620.0, -60.0))
+    assert not device_parameters({"a10": pair}, {"a10": 1.0}, {})
     with pytest.raises(EffectError, match="spread of h = 0"):
-        device_parameters(pair, {"h": (k, k)}, {"h": 0.0}, {"h": 1.2}, (620.0, -60.0))
+        device_parameters({"h": pair}, {"h": 0.0}, {"h": 1.2})

@@ -166,11 +166,9 @@ def check_device_parameter(
     """Change that a parameter's shift makes, none of it taken by the baseline's own."""
     baseline = virtual_baseline()
     kinds = device_parameters(
-        baseline.edges,
-        baseline.derivatives,
+        baseline.derivatives_by_condition(),
         baseline.spread,
         baseline.nominal,
-        baseline.reference,
     )
     kind = next(k for k in kinds if k.variant == name)
     effect = kind({name: NOMINAL[name] + spreads * SPREAD[name]})
