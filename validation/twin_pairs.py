@@ -23,6 +23,7 @@ from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
+from astropy.table import Table
 from numpy.typing import NDArray
 
 from bfsensor.diagnose.diagnosis import Diagnosis, diagnose_measured
@@ -30,10 +31,12 @@ from bfsensor.diagnose.extract import Measured, measure_channels
 from bfsensor.diagnose.predict import Predictor
 from bfsensor.diagnose.recordings import RULES
 from bfsensor.effects.effect import Effect
+from validation.concealed.library import make_effect
 from validation.concealed.outside import OutsideLibrary
 from validation.concealed.plan import Geometry, Size
 from validation.concealed.sensor import VirtualSensor
 from validation.virtual_source import VirtualSource, virtual_baseline
+from validation.write_results import write_results
 
 RESULTS = Path(__file__).parent / "results" / "twin_pairs.ecsv"
 COMMAND = "python -m validation.twin_pairs"

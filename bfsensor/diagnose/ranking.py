@@ -31,10 +31,9 @@ REFITTED = 5
 def candidates_of(baseline: Baseline) -> tuple[type[Effect], ...]:
     """Candidates for what a baseline leaves out: the library, and its card's parameters."""
     own = device_parameters(
-        baseline.edges, baseline.derivatives, baseline.spread, baseline.nominal,
-        baseline.reference,
-    )  # fmt: skip
-    return (*LIBRARY, *own)
+        baseline.derivatives_by_condition(), baseline.spread, baseline.nominal
+    )
+    return (*LIBRARY, *own, *baseline.pieces)
 
 
 def name_of(kind: type[Effect]) -> str:
