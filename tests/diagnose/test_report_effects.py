@@ -96,7 +96,8 @@ def test_the_page_is_whole_and_says_it_all(written):
     assert page.headings == [
         "What explains it", "What to record next", "Where the recordings differ",
         "On recordings that were not fitted", "Channels as fitted",
-        "Residuals, channel by channel", "What stands out of the baseline", "What was not tested", "Notes",
+        "Residuals, channel by channel", "What stands out of the baseline",
+        "What was not tested", "Notes",
     ]  # fmt: skip
     text = " ".join(page.words)
     assert "a <small> campaign" in text and "a note" in text
