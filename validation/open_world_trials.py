@@ -49,7 +49,7 @@ POWER = {"ripple": 2.0}
 
 PROBES = {
     "axes_exchanged": {"amp": 1.0},
-    "checkerboard": {"amp": 1e-3},
+    "checkerboard": {"amp": 2.5e-4},
     "echo": {"amp": 2e-4},
     "last_level": {"amp": 1e-3},
     "odd_kernel": {"amp": 0.1},
@@ -118,7 +118,7 @@ def diagnosed(effect: Effect, snr: float, measured: Measured, name: str) -> dict
     truth = {"campaign": name, "effects": [effect.truth() | {"snr": snr}], "where": {}}
     score = score_campaign(truth, report)
     free = found.attribution.free_form if found.attribution is not None else None
-    square, values = _noise_free_excess(report["heldout"])
+    square, values = _excess(report["heldout"])
     return {
         "snr": round(snr, 2), "detected": score.detected, "outside": score.outside,
         "named": " ".join(score.named),
@@ -128,9 +128,15 @@ def diagnosed(effect: Effect, snr: float, measured: Measured, name: str) -> dict
     }  # fmt: skip
 
 
-def _noise_free_excess(held: Mapping[str, Any]) -> tuple[tuple[float, float], int]:
-    """Held-out chi-square before and after, less the number of values, and that number."""
-    parts = held["channels"].values()
+def _excess(held: Mapping[str, Any]) -> tuple[tuple[float, float], int]:
+    """Held-out chi-square before and after, less the number of values, and that number.
+
+    Of channels that the model changes: the noise of all others would hide it.
+    """
+    parts = [
+        p for p in held["channels"].values()
+        if abs(p["before"] - p["after"]) * p["values"] > 1
+    ]  # fmt: skip
     n = sum(p["values"] for p in parts)
     sums = [sum(p[k] * p["values"] for p in parts) - n for k in ("before", "after")]
     return (float(sums[0]), float(sums[1])), int(n)

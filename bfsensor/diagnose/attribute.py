@@ -34,6 +34,7 @@ from bfsensor.diagnose.ranking import (
     refine,
     seen_of,
     threshold,
+    with_hypotheses,
 )
 from bfsensor.diagnose.remainder import (
     ACCURACY,
@@ -153,7 +154,8 @@ def _forward(
         mismatch, explained_by_word(base.fit, model.fit), fits=len(model.effects)
     ):
         screen = Screen(model.predictor, model.fit, seen_of(mismatch))
-        ranking = rank(screen, further(concerned(kinds, mismatch), model.effects))
+        others = further(concerned(kinds, mismatch), model.effects)
+        ranking = with_hypotheses(model, others, rank(screen, others))
         critical = threshold(screen, ranking, seed=seed)
         good = [r for r in ranking if r.gain > critical and not r.select < 0]
         rankings[len(model.effects)] = ranking

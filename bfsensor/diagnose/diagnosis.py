@@ -191,7 +191,7 @@ class Diagnosis:
                 parts.append(f"It is also seen in: {', '.join(others)}.")
             if self.attribution is not None:
                 parts += said_of(self.attribution)
-        far = {k: v for k, v in self.fit.pulls.items() if abs(v) > 3}
+        far = {k: v for k, v in self.accepted[1].pulls.items() if abs(v) > 3}
         if far:
             text = ", ".join(f"{k} {v:+.1f}" for k, v in far.items())
             parts.append(f"Device parameters off the card, in units of its spread: {text}.")

@@ -10,8 +10,9 @@ import numpy as np
 from bfsensor.diagnose.baseline import Baseline
 from bfsensor.diagnose.locate import ALARM, Mismatch
 from bfsensor.diagnose.model import Model
+from bfsensor.diagnose.named import NAMED
 from bfsensor.diagnose.predict import fitted
-from bfsensor.diagnose.screen import Rival, Screen
+from bfsensor.diagnose.screen import OCCAM, Rival, Screen
 from bfsensor.effects.device_parameter import device_parameters
 from bfsensor.effects.effect import Effect
 from bfsensor.effects.library import LIBRARY
@@ -23,6 +24,9 @@ CLOSE = 40.0
 HOPELESS, FAR = 3.0, 0.05
 """Gain of a candidate's best start below which it is not fitted on, and as a part of the best of
 all starts: a fit of its shape makes it a few times as much, not twenty times."""
+
+PULLED = 3.0
+"""Distance of a device parameter from its card, in its spread, that is far."""
 
 REFITTED = 5
 """Most rivals that are."""
@@ -60,6 +64,29 @@ def rank(screen: Screen, kinds: Sequence[type[Effect]]) -> list[Rival]:
     least = max(HOPELESS, FAR * best)
     found = [screen.best(t, least=least) for t in starts]
     return sorted((r for r in found if r is not None), key=lambda r: -r.evidence)
+
+
+def with_hypotheses(
+    model: Model, kinds: Sequence[type[Effect]], ranking: Sequence[Rival]
+) -> list[Rival]:
+    """Fit named hypotheses anew, where device parameters have been pulled far off the card.
+
+    Parameters that imitate a mistake in the baseline hide it from a fit that is linear about
+    them: exchanged axes are then exchanged back.  In the full fit they return to the card.
+    """
+    pulled = any(abs(v) > PULLED for v in model.fit.pulls.values())
+    named = [k for k in kinds if k in NAMED] if pulled else []
+    out = [r for r in ranking if type(r.effect) not in named]
+    for kind in named:
+        start = kind({p.name: 0.5 * (p.low + p.high) for p in kind.parameters})
+        try:
+            other = model.with_effects((*model.effects, start))
+        except ConvergenceError:
+            continue
+        gain = model.fit.total - other.fit.total
+        template = model.fit.left - other.fit.left
+        out.append(Rival(other.effects[-1], gain, 0.5 * gain - OCCAM, template))
+    return sorted(out, key=lambda r: -r.evidence)
 
 
 def refine(model: Model, ranking: Sequence[Rival]) -> list[Rival]:

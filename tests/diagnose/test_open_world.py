@@ -19,6 +19,7 @@ from bfsensor.diagnose.locate import Finding, Mismatch, locate_mismatch
 from bfsensor.diagnose.model import Model
 from bfsensor.diagnose.named import AxesExchanged
 from bfsensor.diagnose.open_world import Columns, compete, explain_outside
+from bfsensor.diagnose.ranking import PULLED
 from bfsensor.diagnose.remainder import ACCURACY, counts, stands_out
 from bfsensor.effects.gain_nonlinearity import GainNonlinearity
 from bfsensor.effects.interpixel_coupling import InterpixelCoupling
@@ -338,3 +339,15 @@ def test_a_gain_that_bends_is_no_open_world():
     told = attribute(model.predictor, model.fit, mismatch, kinds=(GainNonlinearity,))
     assert mismatch.detected and not told.open_world
     assert [f.effect.word for f in told.found] == ["gain_nonlinearity"]
+
+
+def test_exchanged_axes_are_seen_behind_device_parameters_that_imitate_them():
+    exchanged = make_effect("outside_library", {"amp": 1.0}, "axes_exchanged")
+    model, mismatch = _located(_campaign(exchanged))
+    pulls = {k: abs(v) for k, v in model.fit.pulls.items()}
+    assert mismatch.detected and max(pulls.values()) > PULLED
+    told = attribute(model.predictor, model.fit, mismatch, kinds=KINDS)
+    assert [f.effect.name for f in told.found] == ["outside_library:axes_exchanged"]
+    own = told.found[0]
+    assert told.open_world and abs(own.effect["amp"] - 1) < 3 * own.errors["amp"]
+    assert max(abs(v) for v in told.fit.pulls.values()) < PULLED
