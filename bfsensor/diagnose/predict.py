@@ -310,7 +310,7 @@ class Predictor:
             self.baseline,
             self._evened,
             # Patterns are evened out as where the fit began: they hardly depend on it.
-            (float(np.mean(self.start[: self._amps])), self._device(self.start)),
+            (_mean_gain(self.start[: self._amps]), self._device(self.start)),
         )
 
     def modes(
@@ -339,7 +339,7 @@ class Predictor:
         """Layout with the gains and the read noise that parameters say."""
         gains, noise = parameters[: self._amps], parameters[self._amps : 2 * self._amps]
         # Levels of exposures are by the rough gains, which may be a quarter off.
-        scale = float(np.mean(gains)) / float(np.mean(self.layout.gains or (1.0,)))
+        scale = _mean_gain(gains) / _mean_gain(np.array(self.layout.gains))
         return replace(
             self.layout,
             gains=tuple(gains.tolist()),
@@ -693,6 +693,11 @@ def _effect_step(effect: Effect, p: Parameter) -> float:
         return p.step
     scale = abs(effect[p.name] - p.neutral)
     return 0.02 * max(scale, p.low) if p.law == "log" else 0.01 * (p.high - p.low)
+
+
+def _mean_gain(gains: NDArray[np.float64]) -> float:
+    """Mean over amplifiers; 1 for a_ij, which have none."""
+    return float(np.mean(gains)) if len(gains) else 1.0
 
 
 def _noise_told(measured: Measured) -> NDArray[np.bool_]:
