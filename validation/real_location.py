@@ -1,9 +1,9 @@
 """Recordings of real sensors, diagnosed: flats of another camera, and measured a_ij beside tables.
 
-``python -m validation.real_recordings SHARED`` reads ``SHARED/recordings/sbig_flats`` (two runs of
+``python -m validation.real_location SHARED`` reads ``SHARED/recordings/sbig_flats`` (two runs of
 an SBIG ST-7-type CCD, Astr480/CCDChar @ ccdc2a3) and ``SHARED/reference/*_covariances_21oct19.csv``
 (a_ij of LSST's two vendors, Poisson_CCD repository @ 876adb8).  Four tables go to
-``validation/results``: ``real_recordings.ecsv``, a row for each diagnosis and channel;
+``validation/results``: ``real_location.ecsv``, a row for each diagnosis and channel;
 ``real_unlike.ecsv``, flats of unlike exposure of the first; ``real_lags.ecsv``, lags of the second;
 ``real_nulls.ecsv``, p-values of drawn covariances that the baseline 'none' describes.
 """
@@ -34,7 +34,7 @@ from bfsensor.recording.covariance_tables import CovarianceTable
 from validation.write_results import write_results
 
 RESULTS = Path(__file__).parent / "results"
-COMMAND = "python -m validation.real_recordings SHARED"
+COMMAND = "python -m validation.real_location SHARED"
 RIM = ["[1:16,1:495]", "[642:657,1:495]", "[1:657,1:16]", "[1:657,480:495]"]
 """Left out of the SBIG frames: dark or masked in places."""
 
@@ -223,7 +223,7 @@ def main() -> None:
     nulls["p"].info.format = ".4g"
     cpu = round(time.process_time() - begin, 1)
     for made, name in (
-        (table, "real_recordings"),
+        (table, "real_location"),
         (ladder, "real_unlike"),
         (areas, "real_lags"),
         (nulls, "real_nulls"),

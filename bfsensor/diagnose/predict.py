@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.baseline import Baseline
+from bfsensor.diagnose.baseline import Baseline, area_matrix
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
@@ -473,9 +473,10 @@ class Predictor:
             del key
             if channel.unit == PER_ELECTRON:
                 where = _condition(channel, rows[0])
-                a = self.baseline.areas_on(where, device, REDUCED_LEVEL)
+                edges = self.baseline.edges_on(where, device, REDUCED_LEVEL)
+                a = area_matrix(*edges)
                 if chain is not None:
-                    more = chain.area_change(self.baseline.at(where, device)[0], where)
+                    more = chain.area_change(edges, where)
                     a = a * (1 + chain.law.bend * REDUCED_LEVEL)
                     reach = max(more.shape[-1], a.shape[-1]) // 2
                     a = pad_areas(a, reach) + pad_areas(more, reach)

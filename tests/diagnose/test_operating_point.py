@@ -64,6 +64,20 @@ def test_without_the_candidate_the_operating_point_is_not_named():
     assert found.mismatch.detected and "back_bias" not in found.said()
 
 
+@pytest.mark.parametrize("name", ["e2v_ccd250_70", "itl_sta3800c_60"])
+def test_a_transposed_table_is_named_as_a_whole_exchange(name):
+    """The change of the response with the background is exchanged with it."""
+    table = recorded(name, seed=5111)
+    turned = AreaChangeTable(table.path, table.a.T, table.errors.T, table.independent.T)
+    found = diagnose_measured(measure_reduced(turned, reach=4), baseline_of_table(name))
+    (one,) = found.attribution.found
+    assert one.effect.name == "outside_library:axes_exchanged"
+    # A wrong size of 0.89 was 6 standard deviations off where the background's part stayed.
+    assert abs(one.effect["amp"] - 1.0) < 3 * one.errors["amp"]
+    assert "as a whole exchange has it" in found.said()
+    assert not found.attribution.mismatch.detected
+
+
 def test_line_ends_at_the_other_table():
     line = with_operating_point("itl_sta3800c", "itl_sta3800c_60")
     moved, _ = line.at((np.nan,) * 3, {BACK_BIAS: -10.0})
