@@ -116,7 +116,7 @@ def _rings(left: Any, right: Any, table: Table) -> None:
         ylabel="ring amplitude over that at 0 V",
         ylim=(0, 1.1),
     )
-    right.legend(frameon=False, fontsize=7.5)
+    right.legend(frameon=False, fontsize=7.5, loc="center right")
 
 
 def _spots(left: Any, right: Any, table: Table) -> None:
@@ -163,7 +163,8 @@ def _areas(left: Any, right: Any, table: Table) -> None:
         shown = ax.imshow(image, origin="lower", cmap="RdBu_r", vmin=-10, vmax=10)
         for (j, i), z in np.ndenumerate(image):
             if np.isfinite(z):
-                ax.text(i, j, f"{z:+.1f}", ha="center", va="center", fontsize=8)
+                ax.text(i, j, f"{z:+.1f}", ha="center", va="center", fontsize=8,
+                        color="w" if abs(z) > 6 else "k")  # fmt: skip
         ax.set(xlabel="lag x", ylabel="lag y", title=f"E2V against e2v_ccd250, {title}")
         ax.title.set_fontsize(9)
         ax.figure.colorbar(shown, ax=ax, label="(measured - predicted) / error")
@@ -283,8 +284,8 @@ def _say_areas(table: Table) -> list[str]:
     out.append(
         "Not concluded: anything of ITL's operating point (errors too large); of E2V back bias and "
         "gate low (-6 to -7.2 V) move together and are not told apart, and quantities of the card "
-        "within two spreads each, all together, do as well as the voltage: that it was -70 V is known from the "
-        "published run, not from these a_ij; a_00 and conservation of "
+        "within two spreads each, all together, do as well as the voltage: that it was -70 V is "
+        "known from the published run, not from these a_ij; a_00 and conservation of "
         "charge are not tested; errors are taken as independent."
     )
     return out
