@@ -123,7 +123,7 @@ def with_operating_point(
     Notes
     -----
     The shifts are taken as straight in the back bias between the tables: exact at both.  In truth
-    they go about with its inverse: halfway from -50 to -70 V they are 2 % nearer to zero.
+    they go about with its inverse, which halfway from -50 to -70 V is 3 % below the line.
 
     Examples
     --------
