@@ -19,6 +19,7 @@ from bfsensor.diagnose.locate import ALARM, Finding, Mismatch, locate_mismatch
 from bfsensor.diagnose.mismatch import BaselineFit, fit_baseline
 from bfsensor.diagnose.plan import Plan, plan
 from bfsensor.diagnose.predict import Predictor, used_channels
+from bfsensor.diagnose.scans import DEVICE, DEVICE_SEEN
 from bfsensor.diagnose.untested import find_untested
 
 SCHEMA = "bfsensor-diagnosis-1"
@@ -105,9 +106,10 @@ class Diagnosis:
         seen = {p.word for p in self.mismatch.parts}
         others = {f.word: f for f in reversed(found) if f.word not in seen}
         parts = [*self.mismatch.parts, *list(others.values())[::-1]]
-        out["channels"] = list(
-            dict.fromkeys(f.word for f in (*parts, *self.mismatch.findings))
-        )
+        words = dict.fromkeys(f.word for f in (*parts, *self.mismatch.findings))
+        there = {c.word for c in self.fit.channels}
+        shown = [w for word in words for w in (DEVICE_SEEN if word == DEVICE else (word,))]
+        out["channels"] = [w for w in dict.fromkeys(shown) if w in there]
         best: dict[str, Any] = {}
         for part in parts:
             for key in part.where:

@@ -12,6 +12,7 @@ from bfsensor.diagnose.locate import ALARM, Mismatch
 from bfsensor.diagnose.model import Model
 from bfsensor.diagnose.named import NAMED
 from bfsensor.diagnose.predict import fitted
+from bfsensor.diagnose.scans import DEVICE, DEVICE_SEEN
 from bfsensor.diagnose.screen import OCCAM, Rival, Screen
 from bfsensor.effects.device_parameter import device_parameters
 from bfsensor.effects.effect import Effect
@@ -48,6 +49,7 @@ def name_of(kind: type[Effect]) -> str:
 def concerned(kinds: Sequence[type[Effect]], *seen: Mismatch) -> list[type[Effect]]:
     """Candidates that touch any channel in which something stands out."""
     words = {f.word for mismatch in seen for f in mismatch.findings}
+    words |= set(DEVICE_SEEN) if DEVICE in words else set()
     return [k for k in kinds if words & set(k.touches)]
 
 

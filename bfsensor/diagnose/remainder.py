@@ -16,6 +16,7 @@ import numpy as np
 
 from bfsensor.diagnose.locate import Finding, Mismatch
 from bfsensor.diagnose.mismatch import BaselineFit
+from bfsensor.diagnose.scans import DEVICE, DEVICE_SEEN
 
 ACCURACY = 0.02
 """Of the predictions: part of an effect's own deviate that may be left over (closed forms are
@@ -47,7 +48,8 @@ def counts(
     fits : int
         How many effects are found; their inaccuracies add up.
     """
-    reach = ACCURACY**2 * explained.get(finding.word, 0.0) * max(fits, 1)
+    own = DEVICE_SEEN if finding.word == DEVICE else (finding.word,)
+    reach = ACCURACY**2 * sum(explained.get(w, 0.0) for w in own) * max(fits, 1)
     if finding.family != "chi-square":
         return finding.z**2 > reach
     square, dof = mismatch.chi2[finding.word]

@@ -19,6 +19,13 @@ OCTAVES = 4
 """Sizes of strips and boxes, from the whole side on."""
 
 
+DEVICE, DEVICE_SCAN = "device", "device parameter off its card"
+"""Word and family of the scan of the device's parameters, which have no channel of their own."""
+
+DEVICE_SEEN = "flat_cov", "spot"
+"""Channels that they are seen in."""
+
+
 @dataclass(frozen=True, eq=False)
 class Template:
     """A shape sought in the whitened residuals.
@@ -65,6 +72,21 @@ def make_templates(fit: BaselineFit) -> Iterator[Template]:
             template = group.template(family, pattern, where)
             if template is not None:
                 yield template
+    yield from _device(fit)
+
+
+def _device(fit: BaselineFit) -> Iterator[Template]:
+    """Pulls of the device's parameters from its card: what each changes.
+
+    The fit gives way along them, held by their spread: what is left along one in the data is its
+    pull, of which noise and scatter as wide as the spread leave a known part.
+    """
+    for n, name in enumerate(fit.names[: fit.slopes.shape[1]]):
+        if name.startswith("device "):
+            rows = np.nonzero(fit.slopes[:, n])[0]
+            if len(rows):
+                where = {"device": name.removeprefix("device ")}
+                yield Template(DEVICE_SCAN, DEVICE, rows, fit.slopes[rows, n], where)
 
 
 class Group:
