@@ -20,6 +20,7 @@ from bfsensor.diagnose.mismatch import BaselineFit, fit_baseline
 from bfsensor.diagnose.plan import Plan, plan
 from bfsensor.diagnose.predict import Predictor, used_channels
 from bfsensor.diagnose.scans import DEVICE, DEVICE_SEEN
+from bfsensor.diagnose.suspects import suspect_effects
 from bfsensor.diagnose.untested import find_untested
 
 SCHEMA = "bfsensor-diagnosis-1"
@@ -307,6 +308,8 @@ def diagnose_measured(
     predictor, fit = fit_bounded(measured, baseline)
     more = _of_free(measured, baseline, fit)
     mismatch = locate_mismatch(fit, seed=seed)
+    if explain:
+        mismatch = suspect_effects(predictor, fit, mismatch)
     attribution, advised = None, Plan()
     if mismatch.detected and explain:
         attribution = attribute(predictor, fit, mismatch, seed=seed)

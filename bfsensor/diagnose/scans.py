@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.mismatch import BaselineFit
-from bfsensor.diagnose.scan_shapes import boundaries, middle, own_shapes
+from bfsensor.diagnose.scan_shapes import boundaries, frames, middle, own_shapes
 
 POWERS = (0, 1, 2, 3)
 """Powers of the level that covariances and means may go with."""
@@ -293,6 +293,9 @@ def _maps(g: Group) -> Iterator[Pattern]:
             }  # fmt: skip
         if rows.any():
             yield "rings", np.where(rows, 1.0, 0.0), {"map": str(name), "what": "ring"}
+        if name == "all":
+            for family, pattern, where in frames(x, here):
+                yield family, pattern, {"map": str(name), **where}
         yield from _fine_patterns(x, here, str(name))
 
 

@@ -250,6 +250,8 @@ class Effect:
     standing : bool
         Whether :meth:`light_map`, :meth:`displacements` and :meth:`pattern` are the same in all
         flats.
+    from_sightings : bool
+        Whether :meth:`starts` are taken from waves that were sought in maps.
     of_pixels : bool
         Whether its predictions need the amplifiers' pixels, which reduced recordings do not tell.
     bends : bool
@@ -267,6 +269,7 @@ class Effect:
     by_time: ClassVar[bool] = False
     standing: ClassVar[bool] = False
     of_pixels: ClassVar[bool] = False
+    from_sightings: ClassVar[bool] = False
     bends: ClassVar[bool] = False
 
     def __post_init__(self) -> None:

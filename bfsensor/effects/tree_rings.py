@@ -24,6 +24,7 @@ class _Rings(Effect):
     stage = "collect"
     touches = ("flat_map",)
     of_pixels = True
+    from_sightings = True
     bends = True
     source = (
         "Plazas, Bernstein & Sheldon 2014, PASP 126, 750 (DECam: rings in flats and in positions "
