@@ -31,6 +31,7 @@ from bfsensor.diagnose.extract import Measured, measure_channels
 from bfsensor.diagnose.predict import Predictor
 from bfsensor.diagnose.recordings import RULES
 from bfsensor.effects.effect import Effect
+from validation.concealed.effect import Range
 from validation.concealed.library import make_effect
 from validation.concealed.outside import OutsideLibrary
 from validation.concealed.plan import Geometry, Size
@@ -188,7 +189,7 @@ def take(twin: Twin, truth: Any) -> dict[str, Any]:
 class Excess(OutsideLibrary):
     """Light whose number scatters more than Poisson's law by a part ``amp`` of its variance."""
 
-    variants: ClassVar = {"": {}}
+    variants: ClassVar = {"": {"amp": Range(1e-3, 0.1, amplitude=True)}}
 
     def store(self, charge: Any, context: Any) -> Any:
         """Add white noise of a part of the signal's variance."""

@@ -31,6 +31,7 @@ FARTHEST, OF_EACH = 50, 10
 NO_PLAN = Plan()
 
 NAMES = {
+    DEVICE: "device's parameters",
     "flat_cov": "covariances of flats", "flat_mean": "mean of flats against the lamp",
     "flat_map": "flats against position", "serial_overscan": "serial overscan",
     "parallel_overscan": "parallel overscan", "bias_cov": "noise in readout order",

@@ -8,9 +8,11 @@ from astropy.table import Table
 from click.testing import CliRunner
 
 from bfsensor.cli import main
-from bfsensor.diagnose.diagnosis import SCHEMA, diagnose
+from bfsensor.diagnose.diagnosis import SCHEMA, diagnose, diagnose_measured
+from bfsensor.diagnose.extract import measure_channels
 from bfsensor.diagnose.locate import Scanner, locate_mismatch, tail_probability
 from bfsensor.diagnose.report import write_report
+from bfsensor.diagnose.scans import DEVICE_SCAN
 from validation.concealed.campaign import write_campaign
 from validation.concealed.library import make_effect
 from validation.concealed.plan import Size
@@ -130,3 +132,21 @@ def test_the_command_diagnoses_a_folder(tmp_path):
     assert again.exit_code == 1 and "nowhere" in again.stderr
     none = CliRunner().invoke(main, ["diagnose", str(folder), "--baseline", "nothing"])
     assert none.exit_code == 1 and "nothing: not a baseline" in none.stderr
+
+
+def test_a_device_off_its_card_is_told_and_not_absorbed(tmp_path):
+    """The fit takes a parameter far off its card: the pull is a finding, named and in words."""
+    far = make_effect("device_parameter", {"doping": 1.6e12}, "doping")
+    found = diagnose_measured(
+        measure_channels(
+            VirtualSource(seed=8112, size=Size(128, 8, 2, dithers=2), effects=[far])
+        ),
+        virtual_baseline(),
+    )
+    assert found.mismatch.detected
+    assert any(f.family == DEVICE_SCAN for f in found.mismatch.findings)
+    report = found.to_report()
+    assert "device_parameter" in report["equivalence_class"]
+    assert set(report["location"]["channels"]) <= {c.word for c in found.fit.channels}
+    assert "device" in report["said"]
+    write_report(found, tmp_path)
