@@ -1,6 +1,7 @@
 """Small campaigns of the virtual sensor, diagnosed: a null, and effects in four channels."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,8 @@ from astropy.table import Table
 from click.testing import CliRunner
 
 from bfsensor.cli import main
-from bfsensor.diagnose.diagnosis import SCHEMA, diagnose, diagnose_measured
+from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.diagnosis import SCHEMA, diagnose, diagnose_measured, fit_bounded
 from bfsensor.diagnose.extract import measure_channels
 from bfsensor.diagnose.locate import Scanner, locate_mismatch, tail_probability
 from bfsensor.diagnose.report import write_report
@@ -136,13 +138,18 @@ def test_the_command_diagnoses_a_folder(tmp_path):
 
 def test_a_device_off_its_card_is_told_and_not_absorbed(tmp_path):
     """The fit takes a parameter far off its card: the pull is a finding, named and in words."""
-    far = make_effect("device_parameter", {"doping": 1.6e12}, "doping")
-    found = diagnose_measured(
-        measure_channels(
-            VirtualSource(seed=8112, size=Size(128, 8, 2, dithers=2), effects=[far])
-        ),
-        virtual_baseline(),
-    )
+    small = Size(128, 4, 1, dithers=1)
+    measured = measure_channels(VirtualSource(seed=8112, size=small))
+    predictor, fit = fit_bounded(measured, virtual_baseline())
+    point = fit.values[: len(predictor.names)]
+    moved = point.copy()
+    moved[predictor.names.index("device h")] += 8.0
+    channels = tuple(
+        Channel(c.word, c.values + predictor.predict(c, moved) - predictor.predict(c, point),
+                c.blocks, c.axes, c.unit, c.fold)
+        for c in measured.channels
+    )  # fmt: skip
+    found = diagnose_measured(replace(measured, channels=channels), virtual_baseline())
     assert found.mismatch.detected
     assert any(f.family == DEVICE_SCAN for f in found.mismatch.findings)
     report = found.to_report()
