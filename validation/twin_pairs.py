@@ -234,7 +234,7 @@ def take_excess(amp: float = 0.02) -> dict[str, Any]:
 TWINS = (
     Twin(
         ("cti_serial", "electronic_memory"),
-        (make_effect("cti_serial", {"cti": 1e-6}), make_effect("electronic_memory", {"alpha": 5e-4})),
+        (make_effect("cti_serial", {"cti": 2e-5}), make_effect("electronic_memory", {"alpha": 4e-3})),
         ("serial_overscan",), "overscan", "serial_overscan",
     ),
     Twin(

@@ -43,6 +43,7 @@ from bfsensor.diagnose.remainder import (
     stands_out,
 )
 from bfsensor.diagnose.screen import Rival, Screen
+from bfsensor.diagnose.suspects import suspect_effects
 from bfsensor.effects.effect import Effect
 from bfsensor.errors import ConvergenceError
 
@@ -157,18 +158,18 @@ def _forward(
         others = further(concerned(kinds, mismatch), model.effects)
         ranking = with_hypotheses(model, others, rank(screen, others))
         critical = threshold(screen, ranking, seed=seed)
-        good = [r for r in ranking if r.gain > critical and not r.select < 0]
+        good = [r for r in ranking if r.gain > critical and not r.refuted]
         rankings[len(model.effects)] = ranking
         if good:
             ranking = refine(model, ranking)
-            good = [r for r in ranking if r.gain > critical and not r.select < 0] or good
+            good = [r for r in ranking if r.gain > critical and not r.refuted] or good
             rankings[len(model.effects)] = ranking
         else:
             # That something is there is proved already: a fainter candidate will do, if with it
             # nothing is left.
-            good = [r for r in ranking if r.gain > WEAK and not r.select < 0][:FAINT]
+            good = [r for r in ranking if r.gain > WEAK and not r.refuted][:FAINT]
         step = _step(
-            model, good, mismatch, seed, notes, sure=bool(good) and good[0].gain > critical
+            model, good, kinds, seed, notes, sure=bool(good) and good[0].gain > critical
         )
         if step is None:
             break
@@ -182,7 +183,7 @@ def _forward(
 def _step(
     model: Model,
     good: Sequence[Rival],
-    mismatch: Mismatch,
+    kinds: Sequence[type[Effect]],
     seed: int,
     notes: list[str],
     *,
@@ -197,7 +198,7 @@ def _step(
             continue
         left = locate_mismatch(further.fit, seed=seed)
         if sure or not left.detected:
-            return further, left
+            return further, suspect_effects(further.predictor, further.fit, left, kinds)
     return None
 
 

@@ -20,6 +20,9 @@ DRAWS = 500
 ALARM = 0.01
 """Family-wise probability below which a mismatch is called detected."""
 
+FAMILY = "effect of the library"
+"""Of findings by the library's own shapes: see :mod:`bfsensor.diagnose.suspects`."""
+
 HOPELESS = 2.3
 """Deviate below which a lone statistic is not below :data:`ALARM`: one-sided p = 0.0107."""
 

@@ -107,7 +107,7 @@ def refine(model: Model, ranking: Sequence[Rival]) -> list[Rival]:
             out.append(
                 Rival(
                     other.effects[-1], gain, rival.evidence + 0.5 * (gain - rival.gain),
-                    rival.template, rival.select,
+                    rival.template, rival.select, rival.share,
                 )
             )  # fmt: skip
         else:

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bfsensor.diagnose.locate import Finding, Mismatch
+from bfsensor.diagnose.locate import FAMILY, Finding, Mismatch
 from bfsensor.diagnose.mismatch import BaselineFit
 from bfsensor.diagnose.scans import DEVICE, DEVICE_SEEN
 
@@ -75,7 +75,6 @@ def stands_out(
     if not mismatch.detected:
         return False
     limit = np.inf if alarm is None else alarm
-    return any(
-        f.p_value < limit and counts(f, mismatch, explained, fits)
-        for f in mismatch.findings
-    )
+    # What an effect of the library would explain is not outside it.
+    found = [f for f in mismatch.findings if alarm is None or f.family != FAMILY]
+    return any(f.p_value < limit and counts(f, mismatch, explained, fits) for f in found)

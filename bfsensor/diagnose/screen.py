@@ -56,6 +56,8 @@ class Rival:
     select : float
         Decrease of the chi-square of the fold that selects, amplitude fitted without it; nan
         where the effect is not in that fold.
+    share : float
+        Part of what it changes, squared, that is in that fold.
     """
 
     effect: Effect
@@ -63,6 +65,16 @@ class Rival:
     evidence: float
     template: NDArray[np.float64]
     select: float = np.nan
+    share: float = 0.0
+
+    @property
+    def refuted(self) -> bool:
+        """Whether the fold that selects speaks against it: a loss far below the gain due there.
+
+        Of a gain G, of which the share s is due in that fold, noise leaves s G +- 2 (s G)^(1/2).
+        """
+        due = self.share * self.gain
+        return self.select < min(0.0, due - 3 * 2 * float(np.sqrt(max(due, 0.0))))
 
     @property
     def word(self) -> str:
@@ -256,21 +268,22 @@ class Screen:
         template = self.fit.left - found.fun
         return Rival(
             best, gain, evidence(best, names, gain, found.jac / scales), template,
-            self._select_gain(template),
+            *self._select_gain(template),
         )  # fmt: skip
 
-    def _select_gain(self, template: NDArray[np.float64]) -> float:
-        """Gain on the fold that selects, the amplitude from the others."""
+    def _select_gain(self, template: NDArray[np.float64]) -> tuple[float, float]:
+        """Gain on the fold that selects, the amplitude from the others; what is due there."""
         own = self._select
         inside = float(template[own] @ template[own])
         outside = float(template[~own] @ template[~own])
         # Of an effect that this fold hardly sees it cannot judge.
         if inside < 0.05 * (inside + outside) or outside == 0:
-            return float("nan")
+            return float("nan"), 0.0
         factor = float(template[~own] @ self.fit.left[~own]) / outside
         residuals = self.fit.left[own]
         after = residuals - factor * template[own]
-        return float(residuals @ residuals - after @ after)
+        gain = float(residuals @ residuals - after @ after)
+        return gain, inside / (inside + outside)
 
 
 def evidence(

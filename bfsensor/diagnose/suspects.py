@@ -14,15 +14,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
-from bfsensor.diagnose.locate import ALARM, Finding, Mismatch
+from bfsensor.diagnose.locate import ALARM, FAMILY, Finding, Mismatch
 from bfsensor.diagnose.mismatch import BaselineFit
 from bfsensor.diagnose.predict import Predictor, fitted
-from bfsensor.diagnose.ranking import candidates_of, seen_of
+from bfsensor.diagnose.ranking import candidates_of, further, seen_of
 from bfsensor.diagnose.screen import Rival, Screen
 from bfsensor.effects.effect import Effect
-
-FAMILY = "effect of the library"
-"""Of the findings."""
 
 LOOKED = 1e4
 """Waves that maps are searched for; starts that such sightings give are charged with all."""
@@ -49,12 +46,12 @@ def suspect_effects(
     mismatch : Mismatch
         What the scans found.
     kinds : sequence of type, optional
-        Candidates; by default all of the baseline.
+        Candidates; by default all of the baseline.  Effects that are there are none.
 
     Returns
     -------
     Mismatch
-        With the probability of both, and a finding of :data:`FAMILY` where that is what stands out.
+        With the probability of both, and a finding of that family where that is what stands out.
     """
     both = 1 - (1 - mismatch.p_value) ** 2
     if mismatch.p_value < ALARM / 2:
@@ -63,7 +60,8 @@ def suspect_effects(
         kinds = candidates_of(predictor.baseline)
     if not predictor.layout.segments:
         kinds = [k for k in kinds if not k.of_pixels]
-    found = _likeliest(Screen(predictor, fit, seen_of(mismatch)), kinds)
+    there = predictor.effects_at(fit.values[: len(predictor.names)])
+    found = _likeliest(Screen(predictor, fit, seen_of(mismatch)), further(kinds, there))
     if found is None or found[0] >= mismatch.p_value:
         return replace(mismatch, p_value=both)
     p, rival = found
@@ -88,7 +86,7 @@ def _likeliest(screen: Screen, kinds: Sequence[type[Effect]]) -> tuple[float, Ri
     judged = []
     for kind, tried in sorted(starts, key=lambda s: -s[1][0][0])[:CLOSEST]:
         rival = screen.best(tried[:1])
-        if rival is None or rival.select < 0:
+        if rival is None or rival.refuted:
             continue
         charged = trials_of(kind, screen)
         p = float(chi2.sf(rival.gain, max(len(fitted(rival.effect)), 1))) * charged
