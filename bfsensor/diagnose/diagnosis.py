@@ -17,6 +17,7 @@ from bfsensor.diagnose.channels import PER_ELECTRON
 from bfsensor.diagnose.extract import Measured, Source, measure_channels
 from bfsensor.diagnose.locate import ALARM, Finding, Mismatch, locate_mismatch
 from bfsensor.diagnose.mismatch import BaselineFit, fit_baseline
+from bfsensor.diagnose.placed import place_effects
 from bfsensor.diagnose.plan import Plan, plan
 from bfsensor.diagnose.predict import Predictor, used_channels
 from bfsensor.diagnose.scans import DEVICE, DEVICE_SEEN
@@ -102,6 +103,11 @@ class Diagnosis:
         }  # fmt: skip
         if not self.mismatch.detected:
             return out
+        if self.attribution is not None:
+            count = len(self.measured.amplifiers)
+            placed = place_effects(self.attribution, self.fit, self.measured.shape, count)
+            if placed is not None:
+                return placed
         # Of all that stands out most is shadow of the same: the parts are what makes it up.
         # Channels cast none on one another: those that no part is in follow by their farthest.
         found = [f for f in self.mismatch.findings if f.family != "chi-square"]

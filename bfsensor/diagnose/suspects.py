@@ -86,7 +86,8 @@ def _likeliest(screen: Screen, kinds: Sequence[type[Effect]]) -> tuple[float, Ri
     judged = []
     for kind, tried in sorted(starts, key=lambda s: -s[1][0][0])[:CLOSEST]:
         rival = screen.best(tried[:1])
-        if rival is None or rival.refuted:
+        # Beyond plausible ranges a shape may follow anything.
+        if rival is None or rival.refuted or rival.evidence < 0:
             continue
         charged = trials_of(kind, screen)
         p = float(chi2.sf(rival.gain, max(len(fitted(rival.effect)), 1))) * charged

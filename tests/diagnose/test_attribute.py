@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from bfsensor.diagnose.attribute import (
 from bfsensor.diagnose.diagnosis import fit_bounded
 from bfsensor.diagnose.extract import measure_channels
 from bfsensor.diagnose.locate import locate_mismatch
+from bfsensor.diagnose.placed import place_effects
 from bfsensor.diagnose.screen import Rival, Screen, evidence
 from bfsensor.effects.charge_loss import ChargeLoss
 from bfsensor.effects.gain_nonlinearity import GainNonlinearity
@@ -126,3 +129,13 @@ def test_evidence_falls_with_the_room_a_parameter_has():
     assert evidence(effect, [p], 100.0, np.array([[1 / sigma]])) == pytest.approx(
         expected, abs=0.1
     )
+
+
+def test_a_found_effect_says_itself_where_it_is(torn):
+    """A tear of two pixels' length at column 38 of 128: columns around it, by its own template."""
+    placed = place_effects(torn, torn.fit, (128, 128), 2)
+    assert placed["channels"][0] == "flat_map"
+    low, high = placed["x"]
+    assert 26 <= low < 38 < high <= 52
+    none = replace(torn, found=())
+    assert place_effects(none, torn.fit, (128, 128), 2) is None
