@@ -25,7 +25,7 @@ FAINT = 0.1
 """Part of the largest change of a column or row below which it does not count."""
 
 ALONE = 0.8
-"""Part from which on one wavelength is where it shows."""
+"""Part of what all wavelengths show, value for value, from which on one is where it is."""
 
 Values = NDArray[np.float64]
 
@@ -176,9 +176,10 @@ def _wavelength(parts: list[tuple[Channel, Values]], words: list[str]) -> list[f
     every = np.unique(light[np.isfinite(light)])
     if len(every) < 2:
         return []
-    sums = {float(v): float(square[light == v].sum()) for v in every}
-    best = max(sums, key=lambda v: sums[v])
-    return [best] if sums[best] > ALONE * square.sum() else []
+    # By value, for most are recorded at one wavelength.
+    means = {float(v): float(square[light == v].mean()) for v in every}
+    best = max(means, key=lambda v: means[v])
+    return [best] if means[best] > ALONE * sum(means.values()) else []
 
 
 def _exposures(parts: list[tuple[Channel, Values]]) -> list[int]:
