@@ -6,8 +6,8 @@ The truth is a chip: the ITL device with doping, channel dose and back bias scat
 (1.5 %, 1 %, 0.1 V), from tables at 32 cells a pixel with all physics.  The baseline is the card's
 device, at 32 cells too, which lacks one piece in turn, its three quantities floating within those
 spreads; templates are differences of tables at 16 cells.  Recordings: covariances of flats to lags
-of 4 at three levels, 500 pairs of 2048 x 4096 pixels in all at each condition (Bartlett's errors), maps of a
-section of 256 x 256 pixels of their mean, and a ladder of 8 spots, sizes to 3e-4 pixel.  Four
+of 4 at three levels, 500 pairs of 2048 x 4096 pixels in all at each condition (Bartlett's errors),
+maps of a section of 256 x 256 pixels of their mean, and a ladder of 8 spots, sizes to 3e-4 pixel.  Four
 conditions are fitted: 620 nm at -50 V, 950 nm, -40 V, and 10 K more; the fifth, with all three
 changed, is held out.  Truth and fit share the closed forms from shifts to channels, not the meshes of
 the templates, nor the chip.
@@ -21,9 +21,10 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import gettempdir
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -55,6 +56,7 @@ from bfsensor.measure.bartlett import bartlett_matrix
 from validation.write_results import write_results
 
 RESULTS = "validation/results/concealed_physics.ecsv"
+FIGURE = "validation/figures/concealed_physics.png"
 COMMAND = "python -m validation.concealed_physics"
 DEVICE = "itl_sta3800c"
 COLD = 173.0 - 273.15
@@ -90,14 +92,21 @@ class Case(NamedTuple):
     truth: str = ""
     value: float = np.nan
     lacks: tuple[str, ...] = ()
-    card: dict[str, float] = {}
-    off: dict[str, float] = {}
-    extra: dict[str, float] = {}
+    card: Mapping[str, float] = MappingProxyType({})
+    off: Mapping[str, float] = MappingProxyType({})
+    extra: Mapping[str, float] = MappingProxyType({})
     chip: int = 1
     ladders: bool = False
 
 
-RINGS = {"strength": 0.4, "period": 30.0, "xc": -220.0, "yc": 90.0, "chirp": 0.0, "phase": 0.2}
+RINGS = {
+    "strength": 0.4,
+    "period": 30.0,
+    "xc": -220.0,
+    "yc": 90.0,
+    "chirp": 0.0,
+    "phase": 0.2,
+}
 
 CASES = (
     Case("control 1"),
@@ -120,7 +129,7 @@ CASES = (
 """``off`` in spreads; ``value`` of parameters of the card is the chip's own."""
 
 
-def card(changes: dict[str, float]) -> Device:
+def card(changes: Mapping[str, float]) -> Device:
     """The device of the card with what is known of it, quantities changed by so much."""
     device = Device.load(DEVICE)
     device = dataclasses.replace(
@@ -134,9 +143,7 @@ def card(changes: dict[str, float]) -> Device:
 def chip(case: Case) -> tuple[Device, dict[str, float]]:
     """A chip: the card with its quantities scattered, and off where the case says so."""
     rng = np.random.default_rng([6031, case.chip])
-    by = {
-        k: float(np.clip(rng.standard_normal(), -2, 2)) * v for k, v in SPREADS.items()
-    }
+    by = {k: float(np.clip(rng.standard_normal(), -2, 2)) * v for k, v in SPREADS.items()}
     for name, spreads in case.off.items():
         by[name] = spreads * SPREADS[name]
     return card(by), by
@@ -162,12 +169,14 @@ def empty_channels(truth: Baseline, ladders: bool) -> list[Channel]:
             blocks.append(bartlett_matrix(c, counts))
         size = len(LEVELS) * len(i)
         out.append(
-            Channel(
-                "flat_cov", np.zeros(size), tuple(blocks), axes.columns(), "adu2", fold
-            )
+            Channel("flat_cov", np.zeros(size), tuple(blocks), axes.columns(), "adu2", fold)
         )
     for condition in (*FITTED, HELD) if ladders else (REFERENCE,):
-        for fold, chosen in (("fit", (0, 1, 3, 5, 7)), ("select", (2, 6)), ("held-out", (4,))):
+        for fold, chosen in (
+            ("fit", (0, 1, 3, 5, 7)),
+            ("select", (2, 6)),
+            ("held-out", (4,)),
+        ):
             if (fold == "held-out") != (condition == HELD) and ladders:
                 continue
             rows = range(len(FLUXES)) if condition == HELD else chosen
@@ -205,7 +214,9 @@ def _measured(
         Shot("flat", n, 1.0, *c, 0.0, LEVELS[1]) for n, c in enumerate((*FITTED, HELD))
     )
     rng = np.random.default_rng(77)
-    spots = sum(int((c.axes["what"] == "sigma_x").sum()) for c in channels if c.word == "spot")
+    spots = sum(
+        int((c.axes["what"] == "sigma_x").sum()) for c in channels if c.word == "spot"
+    )
     return Measured(
         channels=tuple(channels), amplifiers=("all",), gains=(1.0,), read_noise=(NOISE,),
         phases=tuple(rng.uniform(-0.5, 0.5, (64, 2)) for _ in range(spots)), columns=(SIDE,),
@@ -327,7 +338,9 @@ def run(case: Case, keep: Path) -> dict[str, Any]:
     clean = record(truth, effects, case, noisy=False)
     predictor = Predictor(clean, baseline)
     bare = fit_baseline(predictor, used_channels(clean.channels, ("fit", "select")))
-    snr = float(np.sqrt(max(bare.total, 0.0)))
+    # The chip's own scatter costs the true model its priors.
+    scatter = sum((by[n] / SPREADS[n]) ** 2 for n in SPREADS if n not in case.off)
+    snr = float(np.sqrt(max(bare.total - scatter, 0.0)))
     measured = record(truth, effects, case, noisy=True)
     predictor = Predictor(measured, baseline)
     fit = fit_baseline(predictor, used_channels(measured.channels, ("fit", "select")))
@@ -403,6 +416,38 @@ def _as_card(truth: Baseline, biases: Sequence[float]) -> Baseline:
     )  # fmt: skip
 
 
+def draw(table: Table, path: str) -> None:
+    """Draw all rows: how visible, how much of what is held out is explained, what was found."""
+    import matplotlib.pyplot as plt
+
+    colours = {"right": "tab:green", "tied": "tab:olive", "right, and more": "tab:olive",
+               "not visible": "tab:gray", "wrong": "tab:red"}  # fmt: skip
+    fig, (left, middle, right) = plt.subplots(1, 3, figsize=(12, 4.6), sharey=True)
+    for n, row in enumerate(table):
+        colour = colours[row["verdict"]]
+        left.barh(n, max(row["snr"], 0.1), color=colour)
+        middle.plot([row["held_before"], row["held_after"]], [n, n], "-", color=colour)
+        middle.plot(row["held_before"], n, "o", mfc="w", color=colour)
+        middle.plot(row["held_after"], n, "o", color=colour)
+        if np.isfinite(row["value"]) and row["true_value"]:
+            scaled = [row[k] / row["true_value"] for k in ("value", "low95", "high95")]
+            right.plot(scaled[1:], [n, n], "-", color=colour)
+            right.plot(scaled[0], n, "o", color=colour)
+    left.set_yticks(range(len(table)), [f"{r['case']}: {r['verdict']}" for r in table])
+    left.invert_yaxis()
+    left.axvline(5, color="k", ls=":")
+    left.set(xscale="log", xlabel="projected SNR (dotted: 5)")
+    middle.axvline(1, color="k", ls=":")
+    middle.set(
+        xscale="log", xlabel="chi2 / values of the condition not fitted\n(open: before)"
+    )
+    right.axvline(1, color="k", ls=":")
+    right.set(xlabel="parameter over truth, 95 % interval")
+    fig.tight_layout()
+    fig.savefig(path, dpi=120)
+    plt.close(fig)
+
+
 def main() -> None:
     """Run what is not there yet and write the rows."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -422,7 +467,10 @@ def main() -> None:
             continue
         rows.append(run(case, given.keep))
         print(
-            {k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in rows[-1].items()},
+            {
+                k: float(f"{v:.4g}") if isinstance(v, float) else v
+                for k, v in rows[-1].items()
+            },
             flush=True,
         )
         table = Table(rows)
@@ -431,6 +479,7 @@ def main() -> None:
                 column.info.format = ".4g"
         total = round(float(sum(r["cpu_s"] for r in rows)), 1)
         write_results(table, RESULTS, COMMAND, cpu_s=total, pairs=PAIRS)
+        draw(table, FIGURE)
 
 
 if __name__ == "__main__":

@@ -22,20 +22,21 @@ STRENGTH = Parameter("strength", "", 0.05, 2.0, signed=True, amplitude=True)
 """1: all of it, as simulated; 0: as the baseline."""
 
 
-class Moved(NamedTuple):
-    """Change of the shifts [pixel/e-] by all of a piece, and with the temperature [per K]."""
-
-    edges: Held
-    warming: Held = ()
-    temperature: float = np.nan
-
-
 class Bent(NamedTuple):
     """Change of the shifts with the charge about a level [e-], and half its second derivative."""
 
     level: float
     slopes: Held
     bends: Held
+
+
+class Moved(NamedTuple):
+    """Change of the shifts [pixel/e-] by all of a piece, with the temperature [per K], with charge."""
+
+    edges: Held
+    warming: Held = ()
+    temperature: float = np.nan
+    bent: Bent | None = None
 
 
 class Widths(NamedTuple):
@@ -92,6 +93,12 @@ class MovedEdges(LeftOut):
             moved = add_edges(moved, nearest_edges(told.warming, shot), strength * warmer)
         return moved
 
+    def level_response(
+        self, shot: Shot, layout: Layout
+    ) -> tuple[float, Edges, Edges] | None:
+        del layout
+        return _response(self.template.bent, self["strength"], shot)
+
 
 class BentResponse(LeftOut):
     """Shifts change with the charge that is there, each lag as its table says."""
@@ -102,14 +109,17 @@ class BentResponse(LeftOut):
         self, shot: Shot, layout: Layout
     ) -> tuple[float, Edges, Edges] | None:
         del layout
-        strength, told = self["strength"], self.template
-        if strength == 0.0:
-            return None
-        slope, bend = (
-            tuple(strength * a for a in nearest_edges(held, shot))
-            for held in (told.slopes, told.bends)
-        )
-        return told.level, (slope[0], slope[1]), (bend[0], bend[1])
+        return _response(self.template, self["strength"], shot)
+
+
+def _response(
+    told: Bent | None, strength: float, shot: Shot
+) -> tuple[float, Edges, Edges] | None:
+    """So much of a response by level; None of none."""
+    if told is None or strength == 0.0:
+        return None
+    (sx, sy), (bx, by) = (nearest_edges(h, shot) for h in (told.slopes, told.bends))
+    return told.level, (strength * sx, strength * sy), (strength * bx, strength * by)
 
 
 class FieldDiffusion(LeftOut):
