@@ -5,12 +5,12 @@
 The truth is a chip: the ITL device with doping, channel dose and back bias scattered about its card
 (1.5 %, 1 %, 0.1 V), from tables at 32 cells a pixel with all physics.  The baseline is the card's
 device, at 32 cells too, which lacks one piece in turn, its three quantities floating within those
-spreads; templates are differences of tables at 16 cells.  Recordings: covariances of flats to lags
+spreads; templates are differences of tables at 32 cells too.  Recordings: covariances of flats to lags
 of 4 at three levels, 500 pairs of 2048 x 4096 pixels in all at each condition (Bartlett's errors),
 maps of a section of 256 x 256 pixels of their mean, and a ladder of 8 spots, sizes to 3e-4 pixel.  Four
 conditions are fitted: 620 nm at -50 V, 950 nm, -40 V, and 10 K more; the fifth, with all three
-changed, is held out.  Truth and fit share the closed forms from shifts to channels, not the meshes of
-the templates, nor the chip.
+changed, is held out.  Truth and fit share the closed forms from shifts to channels and
+the mesh, not the chip.
 
 Rows go to ``validation/results/concealed_physics.ecsv``, one after another: what is there is
 not taken again.

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from bfsensor.device import Device
 from bfsensor.device_parts import Edge, EdgeStrip
 from bfsensor.diagnose.baseline import Baseline, Edges, Key
-from bfsensor.diagnose.device_baseline import WARMER, change_parameter
+from bfsensor.diagnose.device_baseline import FINE, WARMER, change_parameter
 from bfsensor.diagnose.table_baseline import conversion_weights
 from bfsensor.diagnose.walk import LEVEL, SPAN, Walk, walk
 from bfsensor.effects.effect import Effect
@@ -42,11 +42,10 @@ from bfsensor.simulate.edge_field import front_plane, solve_edge
 from bfsensor.simulate.edge_shift import trace_edge
 from bfsensor.units import VACUUM_PERMITTIVITY
 
-CELLS = 16
-"""Of the meshes of templates, a pixel: at 8 the nearest areas are 5 to 10 % off, at 16 1 to 3 %."""
-
-COARSE = 8
-"""Of the meshes that tell how a template changes with the level, which is little of it."""
+CELLS = FINE
+"""Of the meshes of templates, a pixel: as fine as the device's own tables.  From 16 cells templates of
+side diffusion and levels left more than 2 % of themselves, which at 70 standard deviations is
+said to be outside the library; at 8 cells the nearest areas are 5 to 10 % off."""
 
 BACKGROUNDS = LEVEL - SPAN, LEVEL, LEVEL + SPAN
 
@@ -130,13 +129,12 @@ def physics_left_out(
 
     bent = bool(baseline.slopes)
 
-    def walked(one: Device) -> tuple[Walk, Walk | None]:
-        return (
-            walk(one, cells=cells, keep=keep),
-            walk(one, cells=COARSE, backgrounds=BACKGROUNDS, keep=keep) if bent else None,
+    def walked(one: Device) -> Walk:
+        return walk(
+            one, cells=cells, backgrounds=BACKGROUNDS if bent else (LEVEL,), keep=keep
         )
 
-    def changed(quantity: str, by: float) -> dict[float, tuple[Walk, Walk | None]]:
+    def changed(quantity: str, by: float) -> dict[float, Walk]:
         return {b: walked(change_parameter(one, quantity, by)) for b, one in here.items()}
 
     def differences(quantity: str, all_of_it: float) -> Moved:
@@ -154,11 +152,10 @@ def physics_left_out(
         levels: list[tuple[Key, tuple[Edges, Edges]]] = []
         for bias in here:
             for w, colour in seen.items():
-                ends = [
-                    (d[bias][0].edges(colour, kelvin), _bent(d[bias][1], colour, kelvin))
+                (new, high), (old, low) = (
+                    (d[bias].edges(colour, kelvin), _bent(d[bias], colour, kelvin))
                     for d in (more, less)
-                ]
-                (new, high), (old, low) = ends
+                )
                 edges.append(((w, bias), _less(new, old, sign)))
                 if high is not None and low is not None:
                     both = _less(high[0], low[0], sign), _less(high[1], low[1], sign)
@@ -192,10 +189,9 @@ def _less(new: Edges, old: Edges, sign: float = 1.0) -> Edges:
     return sign * (new[0] - old[0]), sign * (new[1] - old[1])
 
 
-def _bent(
-    walked: Walk | None, colour: float | None, kelvin: float
-) -> tuple[Edges, Edges] | None:
-    return None if walked is None else walked.bent(colour, kelvin)
+def _bent(walked: Walk, colour: float | None, kelvin: float) -> tuple[Edges, Edges] | None:
+    """Change with the level, where it was walked."""
+    return None if len(walked.backgrounds) == 1 else walked.bent(colour, kelvin)
 
 
 def _as_bent(levels: list[tuple[Key, tuple[Edges, Edges]]]) -> Bent | None:
@@ -235,14 +231,14 @@ def _depths(
     warming: list[tuple[Key, Edges]] = []
     levels: list[tuple[Key, tuple[Edges, Edges]]] = []
     for bias, one in here.items():
-        walked = walk(one, cells=cells, keep=keep)
-        wide = walk(one, cells=COARSE, backgrounds=BACKGROUNDS, keep=keep) if bent else None
-        top, above = walked.edges(None, kelvin), _bent(wide, None, kelvin)
+        levels_too = BACKGROUNDS if bent else (LEVEL,)
+        walked = walk(one, cells=cells, backgrounds=levels_too, keep=keep)
+        top, above = walked.edges(None, kelvin), _bent(walked, None, kelvin)
         for w in colours:
             now, hot = walked.edges(w, kelvin), walked.edges(w, kelvin + WARMER)
             edges.append(((w, bias), _less(now, top)))
             warming.append(((w, bias), _less(hot, now, 1 / WARMER)))
-            there = _bent(wide, w, kelvin)
+            there = _bent(walked, w, kelvin)
             if there is not None and above is not None:
                 both = _less(there[0], above[0]), _less(there[1], above[1])
                 levels.append(((w, bias), both))

@@ -23,6 +23,7 @@ from bfsensor.diagnose.left_out import (
 )
 from bfsensor.diagnose.predict import Predictor
 from bfsensor.diagnose.walk import walk
+from bfsensor.effects.bf_long_range import BrighterFatterLongRange
 from bfsensor.effects.effect import Layout, Shot
 from bfsensor.sensor.drift import STEPS, Drift
 from validation.concealed_physics import REFERENCE, _measured
@@ -173,3 +174,29 @@ def test_a_guard_ring_shifts_the_outer_boundaries_inwards(device, lacking):
     assert moved[0][0, 3] == pytest.approx(0.1 * inwards[-1, 3], rel=0.1)
     assert moved[0][0, -4] == -moved[0][0, 3]
     assert np.array_equal(moved[1][:, 0][:20], moved[0][0, :20])
+
+
+def test_spots_follow_the_levels_whatever_reaches_farther(lacking, folder):
+    """A far-reaching effect beside slopes that reach less far; without slopes sizes differ."""
+    poor = change_parameter(Device.load("itl_sta3800c"), LEVEL_OF_HOLES, -HOLES)
+    full = baseline_of_device(
+        poor, back_biases=[-40.0], lacks=["depths"], cells=CELLS, keep=folder
+    )
+    axes = Axes()
+    for flux in (5e4, 5e5):
+        axes.add(1, REFERENCE, what="sigma_x", light=flux, flux=flux, time=1.0, hours=0.0)
+    channel = Channel("spot", np.ones(2), (np.eye(2),), axes.columns(), "")
+    measured = _measured([channel], (), {})
+    far = BrighterFatterLongRange({
+        p.name: 1e-3 * p.low if p.amplitude else p.low
+        for p in BrighterFatterLongRange.parameters
+    })  # fmt: skip
+    levels = piece(lacking, "bf_nonlinear:simulated")({"strength": 1.0})
+    bent, with_far, told, straight = (
+        p.predict(channel, p.start)
+        for p in (Predictor(measured, full), Predictor(measured, full, [far]),
+                  Predictor(measured, lacking, [levels]), Predictor(measured, lacking))
+    )  # fmt: skip
+    np.testing.assert_allclose(with_far, bent, atol=2e-5)
+    np.testing.assert_allclose(told, bent, rtol=1e-12)
+    assert abs(straight - bent).max() > 3e-4
