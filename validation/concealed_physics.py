@@ -171,17 +171,15 @@ def empty_channels(truth: Baseline, ladders: bool) -> list[Channel]:
         out.append(
             Channel("flat_cov", np.zeros(size), tuple(blocks), axes.columns(), "adu2", fold)
         )
-    for condition in (*FITTED, HELD) if ladders else (REFERENCE,):
+    # Of light and temperature that no fitted ladder has the width is not known.
+    for condition in FITTED if ladders else (REFERENCE,):
         for fold, chosen in (
             ("fit", (0, 1, 3, 5, 7)),
             ("select", (2, 6)),
             ("held-out", (4,)),
         ):
-            if (fold == "held-out") != (condition == HELD) and ladders:
-                continue
-            rows = range(len(FLUXES)) if condition == HELD else chosen
             axes, errors = Axes(), []
-            for n in rows:
+            for n in chosen:
                 for what in ("sigma_x", "sigma_y", "flux"):
                     axes.add(1, condition, what=what, light=FLUXES[n], flux=FLUXES[n],
                              time=1.0, background=0.0, exposure=n, hours=0.0)  # fmt: skip
@@ -274,7 +272,8 @@ def _evened(
     at = np.arange(len(a)) - len(a) // 2
     wide[np.ix_(at, at)] = a
     power = np.fft.rfft2(wide).real * LEVELS[1]
-    left = np.where(np.abs(power) < 1e-9, 1.0, np.expm1(power) / power)
+    small = np.abs(power) < 1e-9
+    left = np.where(small, 1.0, np.expm1(power) / np.where(small, 1.0, power))
     return np.fft.irfft2(np.fft.rfft2(total) * left, s=total.shape)
 
 
@@ -383,7 +382,7 @@ def run(case: Case, keep: Path) -> dict[str, Any]:
 
 
 def verdict(row: dict[str, Any]) -> str:
-    """right, tied (the truth's class among those that cannot be told apart), wrong, not visible."""
+    """Judge a row: right, of the right class, tied with it, wrong, not visible."""
     if row["truth"] == "nothing":
         return "wrong" if row["detected"] else "right"
     if not row["detected"]:
@@ -393,7 +392,9 @@ def verdict(row: dict[str, Any]) -> str:
         return "right" if len(names) == 1 else "right, and more"
     word = row["truth"].partition(":")[0]
     first = names[0].partition(":")[0]
-    return "tied" if word == first or word in row["tied"].split() else "wrong"
+    if word == first and not row["open_world"]:
+        return "right class"
+    return "tied" if word in row["tied"].split() else "wrong"
 
 
 def _about(own: Device, biases: Sequence[float]) -> list[float]:
@@ -420,8 +421,9 @@ def draw(table: Table, path: str) -> None:
     """Draw all rows: how visible, how much of what is held out is explained, what was found."""
     import matplotlib.pyplot as plt
 
-    colours = {"right": "tab:green", "tied": "tab:olive", "right, and more": "tab:olive",
-               "not visible": "tab:gray", "wrong": "tab:red"}  # fmt: skip
+    colours = {"right": "tab:green", "right class": "tab:green", "tied": "tab:olive",
+               "right, and more": "tab:olive", "not visible": "tab:gray",
+               "wrong": "tab:red"}  # fmt: skip
     fig, (left, middle, right) = plt.subplots(1, 3, figsize=(12, 4.6), sharey=True)
     for n, row in enumerate(table):
         colour = colours[row["verdict"]]
@@ -429,7 +431,8 @@ def draw(table: Table, path: str) -> None:
         middle.plot([row["held_before"], row["held_after"]], [n, n], "-", color=colour)
         middle.plot(row["held_before"], n, "o", mfc="w", color=colour)
         middle.plot(row["held_after"], n, "o", color=colour)
-        if np.isfinite(row["value"]) and row["true_value"]:
+        # Of a class's other law the parameter is another.
+        if np.isfinite(row["value"]) and row["verdict"] != "right class":
             scaled = [row[k] / row["true_value"] for k in ("value", "low95", "high95")]
             right.plot(scaled[1:], [n, n], "-", color=colour)
             right.plot(scaled[0], n, "o", color=colour)
@@ -442,7 +445,7 @@ def draw(table: Table, path: str) -> None:
         xscale="log", xlabel="chi2 / values of the condition not fitted\n(open: before)"
     )
     right.axvline(1, color="k", ls=":")
-    right.set(xlabel="parameter over truth, 95 % interval")
+    right.set(xlim=(0.94, 1.06), xlabel="parameter over truth, 95 % interval")
     fig.tight_layout()
     fig.savefig(path, dpi=120)
     plt.close(fig)

@@ -18,8 +18,9 @@ Key = tuple[float, float]
 Held = tuple[tuple[Key, Edges], ...]
 """Wavelength [nm] and back bias [V], and what belongs to them."""
 
-STRENGTH = Parameter("strength", "", 0.05, 2.0, signed=True, amplitude=True)
-"""1: all of it, as simulated; 0: as the baseline."""
+STRENGTH = Parameter("strength", "", -2.0, 2.0, law="flat", signed=True, amplitude=True)
+"""1: all of it, as simulated; 0: as the baseline.  Flat, so that fits stay within 4: straight lines
+mean nothing at ten times the piece."""
 
 
 class Bent(NamedTuple):
@@ -204,7 +205,9 @@ def _nearest(held: Sequence[tuple[Key, Any]], shot: Shot) -> Any:
 def ring_parameters(size: float) -> tuple[Parameter, ...]:
     """Parameters of doping rings whose displacement is ``size`` pixels at strength 1."""
     amp, *shape = TreeRings.parameters
-    strength = STRENGTH._replace(low=amp.low / size, high=amp.high / size, signed=False)
+    strength = STRENGTH._replace(
+        low=amp.low / size, high=amp.high / size, law="log", signed=False
+    )
     return (strength, *shape)
 
 
