@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from bfsensor import Device
 from bfsensor.device_parts import Provenance
-from bfsensor.diagnose.attribute import attribute, name_of
+from bfsensor.diagnose.attribute import attribute
 from bfsensor.diagnose.baseline import Baseline, area_matrix
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Axes, Condition
@@ -51,6 +51,7 @@ from bfsensor.diagnose.mismatch import fit_baseline
 from bfsensor.diagnose.model import Model, compare_held_out
 from bfsensor.diagnose.predict import Predictor, used_channels
 from bfsensor.diagnose.predict_maps import shot_at
+from bfsensor.diagnose.ranking import name_of
 from bfsensor.effects.effect import Effect, Segment, Shot
 from bfsensor.measure.bartlett import bartlett_matrix
 from validation.write_results import write_results

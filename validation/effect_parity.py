@@ -26,7 +26,7 @@ from astropy.table import Table, vstack
 
 from bfsensor.effects.effect import Effect, Parameter
 from bfsensor.effects.library import LIBRARY
-from validation.concealed.library import make_effect
+from validation.concealed.library import EFFECTS, make_effect
 from validation.effects_on_pixels import compare, null_campaign
 from validation.write_results import write_results
 
@@ -64,9 +64,51 @@ def value_at(p: Parameter, place: float) -> float:
     return p.neutral + (-size if p.signed and place == 0.5 else size)
 
 
-def effect_at(kind: type[Effect], place: float) -> Effect:
-    """Make an effect with all parameters at a place of their ranges."""
-    return kind({p.name: value_at(p, place) for p in kind.parameters})
+NEAR = {
+    "tree_rings": {"xc": -95.0, "yc": 330.0, "period": 24.0},
+    "tree_rings:uneven": {"xc": -95.0, "yc": 330.0, "period": 24.0, "length": 400.0},
+    "tearing": {"column": 55 / 128},
+}
+"""Shapes whose ranges reach far beyond a small sensor, or far off the middle of one."""
+
+OWN = {
+    "trap_serial": {"reach": 0.0},
+    "tree_rings": {"phase": 0.0},
+    "mask_stitch": {"phase": 0.0},
+    "tearing": {"open": 0.4},
+    "fringing": {"tilt": 0.6, "xx": 0.7, "xy": -0.5, "yy": 0.4, "phase": 0.0},
+    "dark_hot:hot": {f"x{n}": n * 0.61803 % 1 for n in range(1, 7)},
+}
+"""What the sensor's own effects leave no choice of; columns as parts of the sensor's width."""
+
+
+def effect_at(kind: type[Effect], place: float, width: int = 256) -> Effect:
+    """Make an effect with all parameters at a place of their ranges.
+
+    What the sensor's own effects leave no choice of is theirs, on a sensor of so many columns.
+    """
+    values = {p.name: value_at(p, place) for p in kind.parameters}
+    name = f"{kind.word}:{kind.variant}".rstrip(":")
+    values |= NEAR.get(name, {}) | OWN.get(name, {})
+    if name == "dark_hot:hot":
+        count = int(values["columns"])
+        values |= {
+            f"x{n}": float(int(values[f"x{n}"] * width)) if n <= count else 0.0
+            for n in range(1, 7)
+        }
+    return kind(values)
+
+
+def known_to_the_sensor(kind: type[Effect]) -> bool:
+    """Whether the virtual sensor has the effect too."""
+    return kind.word in EFFECTS and kind.variant in EFFECTS[kind.word].variants
+
+
+def own_effect(effect: Effect) -> Any:
+    """Give the sensor's own effect of the same parameters, which shares no code."""
+    fixed = set(OWN.get(effect.name, ()))
+    values = {k: v for k, v in effect.values.items() if k not in fixed}
+    return make_effect(effect.word, values, effect.variant)
 
 
 def compare_at(
@@ -85,7 +127,7 @@ def compare_at(
     """
     own = None
     if engine != ENGINES[0]:
-        own = make_effect(effect.word, dict(effect.values), effect.variant)
+        own = own_effect(effect)
     fit = null_campaign(seed, size)[1]
     out = []
     for word, (said, factor, error) in compare(effect, seed, size, own).items():
@@ -112,7 +154,7 @@ def main() -> None:
             continue
         for name, place in PLACES.items():
             effect = effect_at(kind, place)
-            for engine in ENGINES:
+            for engine in ENGINES[: 1 + known_to_the_sensor(kind)]:
                 old = Table.read(PATH, format="ascii.ecsv") if PATH.exists() else None
                 key = {"effect": effect.name, "amplitude": name, "engine": engine}
                 if there(old, **key):

@@ -115,23 +115,25 @@ def residuals(
     measured: Measured,
     effects: Sequence[Effect],
     by: Sequence[Channel],
+    chance: Sequence[Effect] = (),
 ) -> dict[str, NDArray[np.float64]]:
     """Channels less what is predicted with effects, all else as in a null's fit, by errors.
 
     Linear parameters are left out: they are the same with and without effects.  ``by``: the
-    channels that errors are taken from.
+    channels that errors are taken from; those are wider by what ``chance`` leaves open.
     """
     baseline = virtual_baseline()
     count = len(Predictor(measured, baseline).names)
     predictor = Predictor(measured, baseline).with_effects(effects, fit.values)
     point = np.concatenate([fit.values[:count], predictor.start[count:]])
+    random = Predictor(measured, baseline).with_effects(chance, fit.values)
     out: dict[str, list[NDArray]] = {}
     channels = used_channels(measured.channels, FOLDS)
     for like, channel in zip(by, channels, strict=True):
         if len(like) != len(channel):
             raise ValueError(f"{like.word}: {len(channel)} values, the null {len(like)}")
-        left = channel.values - predictor.predict(channel, point)
-        out.setdefault(channel.word, []).append(like.whiten(left))
+        left = like.whiten(channel.values - predictor.predict(channel, point))
+        out.setdefault(channel.word, []).append(_widened(left, like, random))
     return {w: np.concatenate(v) for w, v in out.items()}
 
 
@@ -162,9 +164,11 @@ def compare(
     other = measure_channels(source)
     by = used_channels(other.channels, FOLDS)
     before, bare, after = (
-        residuals(fit, m, e, by) for m, e in ((null, ()), (other, ()), (other, (effect,)))
+        residuals(fit, m, e, by, (effect,))
+        for m, e in ((null, ()), (other, ()), (other, (effect,)))
     )
-    basis = _basis(fit, by)
+    random = Predictor(other, virtual_baseline()).with_effects((effect,), fit.values)
+    basis = _basis(fit, by, random)
     seen = _without_parameters(fit, basis, {w: bare[w] - before[w] for w in bare})
     said = _without_parameters(fit, basis, {w: bare[w] - after[w] for w in bare})
     out = {}
@@ -187,12 +191,28 @@ SHADOW = 0.1
 """Length [standard deviations] below which a channel has no part in an effect."""
 
 
-def _basis(fit: BaselineFit, by: Sequence[Channel]) -> NDArray[np.float64]:
+def _widened(
+    left: NDArray[np.float64], channel: Channel, random: Predictor
+) -> NDArray[np.float64]:
+    """Whitened values over errors that hold what random effects leave to chance."""
+    modes = random.modes(channel, random.start)
+    if not modes.shape[1]:
+        return left
+    shapes, sizes, _ = np.linalg.svd(channel.whiten(modes), full_matrices=False)
+    wider = 1 - 1 / np.sqrt(1 + sizes**2)
+    wide = shapes * wider
+    return np.asarray(left - wide @ (shapes.T @ left))
+
+
+def _basis(
+    fit: BaselineFit, by: Sequence[Channel], random: Predictor
+) -> NDArray[np.float64]:
     """What the baseline's parameters span where errors are others'."""
     columns = fit.basis.copy()
     for like, channel, start in zip(fit.channels, by, fit.starts, strict=False):
         rows = slice(start, start + len(like))
-        columns[rows] = channel.whiten(like.unwhiten(fit.basis[rows]))
+        moved = channel.whiten(like.unwhiten(fit.basis[rows]))
+        columns[rows] = _widened(moved, channel, random)
     return np.asarray(np.linalg.qr(columns)[0])
 
 

@@ -1,242 +1,224 @@
-"""Recordings of real sensors, diagnosed: flats of another camera, and measured a_ij beside tables.
+"""Recordings of real sensors, explained: four figures and what is said of each.
 
-``python -m validation.real_recordings SHARED`` reads ``SHARED/recordings/sbig_flats`` (two runs of
-an SBIG ST-7-type CCD, Astr480/CCDChar @ ccdc2a3) and ``SHARED/reference/*_covariances_21oct19.csv``
-(a_ij of LSST's two vendors, Poisson_CCD repository @ 876adb8).  Four tables go to
-``validation/results``: ``real_recordings.ecsv``, a row for each diagnosis and channel;
-``real_unlike.ecsv``, flats of unlike exposure of the first; ``real_lags.ecsv``, lags of the second;
-``real_nulls.ecsv``, p-values of drawn covariances that the baseline 'none' describes.
+``python -m validation.real_recordings SHARED`` (about a minute) runs, where the recordings are,
+
+(a) flats of an SBIG camera: one run diagnosed, the other predicted (:mod:`validation.real_sbig`);
+(b) tree rings at eight wavelengths and two back biases (:mod:`validation.real_rings`);
+(c) spots on four segments of an ITL sensor (:mod:`validation.real_spots`);
+(d) a_ij of ITL and E2V against tables (:mod:`validation.real_areas`);
+
+prints each figure's file and its sentences, and writes ``validation/results/real_recordings.ecsv``:
+a row for each number, with its error and what it is of, enough for
+``validation/real_recordings.ipynb`` to draw the figures again without the recordings.  Where
+mismatches lie, and false alarms: :mod:`validation.real_location`.
 """
 
 from __future__ import annotations
 
 import argparse
-import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable
 from pathlib import Path
+from tempfile import gettempdir
+from typing import Any
 
 import numpy as np
 from astropy.table import Table
-from scipy.linalg import block_diag
-from scipy.stats import chi2 as chi2_distribution
+from numpy.typing import NDArray
 
-from bfsensor.diagnose.baseline import Baseline
-from bfsensor.diagnose.diagnosis import Diagnosis, diagnose, diagnose_measured
-from bfsensor.diagnose.free_baseline import free_baseline
-from bfsensor.diagnose.reduced_channels import measure_reduced
-from bfsensor.diagnose.sources import CampaignSource, find_baseline
-from bfsensor.measure.bartlett import bartlett_matrix, image_weights
-from bfsensor.measure.covariance_model import model_covariances
-from bfsensor.recording.area_changes import AreaChangeTable, read_area_changes
-from bfsensor.recording.campaign import read_campaign
-from bfsensor.recording.covariance_tables import CovarianceTable
+from bfsensor.device import Device
+from bfsensor.diagnose.diagnosis import Diagnosis
+from bfsensor.diagnose.table_baseline import BACK_BIAS, with_operating_point
+from bfsensor.recording.area_changes import read_area_changes
+from validation import real_areas, real_figures, real_rings, real_sbig, real_spots
 from validation.write_results import write_results
 
-RESULTS = Path(__file__).parent / "results"
+RESULTS = Path(__file__).parent / "results" / "real_recordings.ecsv"
 COMMAND = "python -m validation.real_recordings SHARED"
-RIM = ["[1:16,1:495]", "[642:657,1:495]", "[1:657,1:16]", "[1:657,480:495]"]
-"""Left out of the SBIG frames: dark or masked in places."""
 
-BASELINES = {
-    "itl": ("lsst_itl_50_32", "lsst_itl_32", "itl_sta3800c", "itl_sta3800c_60", "none"),
-    "e2v": ("lsst_e2v_50_32", "lsst_e2v_32", "e2v_ccd250", "e2v_ccd250_70", "none"),
-}  # fmt: skip
-"""Tables of GalSim (-50 V, -60 V) and ours (-50 V, and -60 or -70 V); near a_ij that float."""
+Rows = list[dict[str, Any]]
 
 
-def sbig_baselines() -> dict[str, Baseline]:
-    """White noise alone, and with any near brighter-fatter effect."""
-    free = free_baseline()
-    return {"white noise": free.without(free.parameters), "none": free}
+def row(part: str, what: str, value: float, error: float = np.nan, **more: Any) -> dict:
+    """One number: of which recording, what, and where (``at``, ``of``), with a remark in words."""
+    blank = {"at": np.nan, "of": "", "said": ""}
+    return {"part": part, "what": what, "value": value, "error": error, **blank, **more}
 
 
-def diagnose_sbig(folders: Sequence[Path], baseline: Baseline, *, rim: bool) -> Diagnosis:
-    """Diagnose the frames of one run, or of several as one campaign; without their rim."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        for one in folders:
-            for path in one.glob("*.FIT"):
-                (folder / f"{one.name}-{path.name}").symlink_to(path)
-        masks = "".join(f"  - '{section}'\n" for section in RIM)
-        (folder / "campaign.yaml").write_text(
-            "schema: bfsensor-campaign-1\n" + (f"masks:\n{masks}" if rim else "")
-        )
-        return diagnose(CampaignSource(read_campaign(folder)), baseline, explain=False)
+def explain_sbig(shared: Path) -> Rows:
+    """(a): each run diagnosed by itself, the other held against it."""
+    folder = shared / "recordings" / "sbig_flats"
+    blocks = {run: real_sbig.measure_blocks(folder / run) for run in real_sbig.RUNS}
+    out: Rows = []
+    for fitted, other in (real_sbig.RUNS, real_sbig.RUNS[::-1]):
+        found, carried, without = real_sbig.carry_with_range(blocks, fitted, other)
+        more = {"of": f"{fitted} to {other}"}
+        out += named("sbig", fitted, found)
+        for which in ("before", "after"):
+            out.append(row("sbig", f"chi2 {which}", carried.chi2(which), **more))
+        out.append(row("sbig", "values", len(carried.levels), **more))
+        out.append(row("sbig", "removed", carried.removed, **more))
+        out += [row("sbig", "removed without a flat", v, **more) for v in without]
+        for level, value, error, after in zip(
+            carried.levels, carried.correlations, carried.errors, carried.after, strict=True
+        ):
+            out.append(row("sbig", "measured", value, error, at=level, **more))
+            out.append(row("sbig", "predicted", after, at=level, **more))
+    return out
 
 
-def diagnose_areas(table: AreaChangeTable, name: str) -> Diagnosis:
-    """Hold measured a_ij against a baseline."""
-    predicted = find_baseline(name)
-    return diagnose_measured(
-        measure_reduced(table, reach=predicted.reach), predicted, explain=False
-    )
-
-
-def exchanged(table: AreaChangeTable) -> AreaChangeTable:
-    """The table with its axes exchanged, as real pipelines had them."""
-    return AreaChangeTable(table.path, table.a.T, table.errors.T, table.independent.T)
-
-
-def draw_covariances(seed: int, areas: dict[str, float]) -> CovarianceTable:
-    """Covariances of eight levels to 120,000 e- with given near areas, noise after Bartlett.
-
-    By the series of Astier et al. (2019), which the diagnosis does not use.
-    """
-    rng = np.random.default_rng(seed)
-    a = np.zeros((5, 5))
-    for name, value in areas.items():
-        a[int(name[2]), int(name[1])] = value
-    a[0, 0] = -(image_weights(4) * a).sum()
-    levels = np.geomspace(3e3, 1.2e5, 8)
-    true = model_covariances(levels, a)
-    true[:, 0, 0] += 30.0
-    blocks = [bartlett_matrix(c, np.full(c.shape, 1_000_000)) for c in true]
-    values = [
-        rng.multivariate_normal(c.ravel(), m) for c, m in zip(true, blocks, strict=True)
-    ]
-    matrix = block_diag(*blocks)
-    j, i = (np.tile(index.ravel(), len(levels)) for index in np.indices((5, 5)))
-    n = len(matrix)
-    return CovarianceTable(
-        Path(f"drawn {seed}"), np.full(n, "one"), np.repeat(levels, 25), i, j,
-        np.concatenate(values), np.sqrt(np.diag(matrix)), np.full(n, 1_000_000),
-        np.ones(n, int), np.full(n, np.nan), np.full(n, np.nan), matrix,
-    )  # fmt: skip
-
-
-def diagnose_nulls(count: int) -> list[dict]:
-    """P-values of draws with the areas of a thick CCD, and with none: at the bound of all."""
-    thick = {"a10": 1.0e-7, "a01": 2.4e-7, "a20": 2.0e-8, "a02": 3.0e-8, "a11": 5.0e-8}
-    out = []
-    for areas, values in (("thick CCD", thick), ("none", dict.fromkeys(thick, 0.0))):
-        for seed in range(9000, 9000 + count):
-            measured = measure_reduced(draw_covariances(seed, values), reach=4)
-            found = diagnose_measured(measured, free_baseline(), seed=seed, explain=False)
+def named(part: str, of: str, found: Diagnosis) -> Rows:
+    """What a diagnosis says, and the effects that it names with their ties."""
+    out = [row(part, "p", found.mismatch.p_value, of=of, said=found.said())]
+    (square, dof), *_ = found.mismatch.chi2.values()
+    out.append(row(part, "chi2", square, of=of, at=dof))
+    told = found.attribution
+    if told is None:
+        return out
+    (after, left), *_ = told.mismatch.chi2.values()
+    out.append(row(part, "chi2 explained", after, of=of, at=left))
+    for one in told.found:
+        for name, value in one.effect.values.items():
+            tied = ", ".join(one.tied[1:]) or "nothing"
             out.append(
-                {"areas": areas, "seed": seed, "p": found.mismatch.p_value,
-                 "held": len(thick) - len(found.fit.pulls)}
+                row(part, f"{one.effect.name} {name}", value, one.errors.get(name, np.nan),
+                    of=of, said=f"tied to {tied}")
             )  # fmt: skip
+    for word, probability in told.probability.items():
+        if probability > 0.01:
+            out.append(row(part, f"probability {word}", probability, of=of))
     return out
 
 
-def rows_of(found: Diagnosis, recording: str, baseline: str) -> list[dict]:
-    """A row for each channel of a diagnosis."""
-    out = []
-    for word, (square, dof) in found.mismatch.chi2.items():
-        own = [
-            f
-            for f in found.mismatch.findings
-            if f.word == word and f.family != "chi-square"
-        ]
-        single = [f for f in own if len(f.where.get("lags", [])) == 1]
-        first = (single or own or [None])[0]
-        lags = None if first is None else first.where.get("lags")
-        out.append(
-            {
-                "recording": recording, "baseline": baseline, "family_p": found.mismatch.p_value,
-                "channel": word, "values": int(found.fit.of(word).sum()),
-                "chi2": round(square, 2), "dof": round(dof, 2),
-                "p": float(chi2_distribution.sf(square, dof)),
-                "found": "" if first is None else first.family + (f": {lags[0]}" if lags else ""),
-                "z": 0.0 if first is None else round(first.z, 2),
-            }
-        )  # fmt: skip
-    return out
-
-
-def lags_of(found: Diagnosis, recording: str, baseline: str) -> list[dict]:
-    """A row for each lag of measured a_ij."""
-    (channel,) = found.fit.channels
-    left = found.fit.residuals * channel.errors
-    return [
-        {
-            "recording": recording, "baseline": baseline, "x": int(i), "y": int(j),
-            "measured": v, "error": e, "predicted": v - d, "pull": round(d / e, 2),
-        }
-        for i, j, v, e, d in zip(
-            channel.axes["i"], channel.axes["j"], channel.values, channel.errors, left, strict=True
+def explain_rings(shared: Path) -> Rows:
+    """(b): amplitudes by wavelength and bias, and the depth and field that they ask for."""
+    folder = shared / "recordings" / "bnl_treerings"
+    names = [f"itl-098-{w}nm" for w in real_rings.WAVELENGTHS]
+    found = real_rings.measure_amplitudes(
+        real_rings.read_profiles(folder, names), real_rings.REFERENCE
+    )
+    device = Device.load("itl_sta3800c")
+    fits = real_rings.fit_depths(found, device)
+    out = [row("rings", "wave number", found.wave_number)]
+    for n, w in enumerate(real_rings.WAVELENGTHS):
+        out.append(row("rings", "amplitude", found.values[n], found.errors[n], at=w))
+        out.append(row("rings", "predicted", fits["card"].predicted[n], at=w))
+        if n != real_rings.REFERENCE:
+            left = real_rings.fit_depths(found, device, without=n)["card"].predicted[n]
+            out.append(
+                row("rings", "left out, error %", 100 * (left / found.values[n] - 1),
+                    100 * found.errors[n] / found.values[n], at=w)
+            )  # fmt: skip
+    for name, fit in fits.items():
+        out.append(row("rings", "factor", fit.factor, fit.error, of=name))
+        out += [row("rings", f"chi2 {k}", v, of=name) for k, v in fit.chi2.items()]
+    low, high, best = real_rings.temperatures(found, device)
+    out.append(row("rings", "temperature", best, 0.5 * (high - low), at=low))
+    pair = real_rings.measure_amplitudes(
+        real_rings.read_profiles(folder, ("e2v-260-0V", "e2v-260-70V")), 0
+    )
+    out.append(row("rings", "bias ratio", pair.values[1], pair.errors[1]))
+    for doping in (0.0, 0.8, 1.6, 2.4):
+        volts, error = real_rings.volts_of_gates(
+            pair.values[1], pair.errors[1], doping, pair.wave_number
         )
-    ]  # fmt: skip
-
-
-def serial_models(
-    level: np.ndarray, rho: np.ndarray, error: np.ndarray
-) -> dict[str, tuple]:
-    """Chi-square and degrees of freedom of a lag's correlation against level.
-
-    White noise; in proportion to the level, as the brighter-fatter effect, not below 0; a
-    cubic in the square root of the level.
-    """
-    root = np.sqrt(level / level.max())
-    designs = {
-        "white noise": np.zeros((len(level), 0)),
-        "in proportion to the level": level[:, None],
-        "any smooth response": np.vander(root, 4),
-    }
-    out = {}
-    for name, design in designs.items():
-        whitened = design / error[:, None]
-        fit = np.linalg.lstsq(whitened, rho / error, rcond=None)[0]
-        if name.startswith("in proportion"):
-            fit = np.maximum(fit, 0.0)
-        left = (rho / error) - whitened @ fit
-        out[name] = float(left @ left), len(level) - design.shape[1]
+        out.append(row("rings", "volts of the gates", volts, error, at=doping))
     return out
+
+
+def explain_spots(shared: Path) -> Rows:
+    """(c): which segment differs, and whether its gain explains that."""
+    path = shared / "recordings" / "ucd_bf_kernel" / "spot_size_vs_flux_ITL029.csv"
+    read = real_spots.read_spots(path)
+    out: Rows = []
+    for name, shared_off in (("all scatter", False), ("shared scatter taken off", True)):
+        growth = real_spots.fit_growth(*read, shared=shared_off)
+        told = real_spots.single_out(growth, shared=shared_off)
+        for n, segment in enumerate(growth.segments):
+            for k, axis in enumerate("xy"):
+                out.append(
+                    row("spots", f"slope {axis}", 100 * growth.slopes[n, k],
+                        100 * growth.errors[n, k], of=f"{segment}, {name}")
+                )  # fmt: skip
+            out.append(
+                row("spots", "stands out", told.decrease[n], of=f"{segment}, {name}")
+            )
+        for what in ("chi2_same", "chi2_gain", "p_gain", "p_single", "p_others"):
+            out.append(row("spots", what, getattr(told, what), of=name))
+        left = float(told.chi2_but.min())
+        out.append(row("spots", "chi2 of the others", left, of=name))
+    return out
+
+
+def explain_areas(shared: Path) -> Rows:
+    """(d): a_ij against tables, with the operating point as a candidate, and transposed."""
+    out: Rows = []
+    for kind, pair in real_areas.PAIRS.items():
+        table = read_area_changes(shared / "reference" / f"{kind}_covariances_21oct19.csv")
+        for name in (*real_areas.GALSIM[kind], *pair):
+            found = real_areas.explain(table, real_areas.find(name))
+            out += named("areas", f"{kind}: {name}", found)
+        free = with_operating_point(*pair)
+        out += named(
+            "areas", f"{kind}: operating point free", real_areas.explain(table, free)
+        )
+        turned = real_areas.explain(real_areas.exchanged(table), real_areas.find(pair[1]))
+        out += named("areas", f"{kind}: {pair[1]}, axes exchanged", turned)
+        card = real_areas.explain(table, real_areas.find(pair[0]))
+        out += lags("residual", kind, card.fit.residuals, card)
+        free_found = real_areas.explain(table, free)
+        out += lags(
+            "residual explained", kind, free_found.accepted[1].residuals, free_found
+        )
+    table = read_area_changes(shared / "reference" / "e2v_covariances_21oct19.csv")
+    keep = Path(gettempdir()) / "bfsensor_floating"
+    whole = real_areas.with_device(*real_areas.PAIRS["e2v"], keep=keep)
+    found = real_areas.explain(table, whole)
+    out += named("areas", "e2v: device free", found)
+    for name, pull in found.fit.pulls.items():
+        out.append(row("areas", "pull", pull, of=f"e2v: device free, {name}"))
+    for name in whole.derivatives:
+        value, error, square, p = real_areas.free_one(table, real_areas.only(whole, name))
+        off = (value - whole.nominal[name]) / whole.spread[name]
+        out.append(row("areas", "one parameter", value, error, at=square, of=name,
+                       said=f"{off:+.1f} spreads from the card, p of what is left {p:.2g}"))  # fmt: skip
+    return out
+
+
+def lags(what: str, of: str, left: NDArray[np.float64], found: Diagnosis) -> Rows:
+    """Residuals over errors by lag: 10 j + i."""
+    (channel,) = found.fit.channels
+    return [
+        row("areas", what, float(z), at=10 * int(j) + int(i), of=of)
+        for i, j, z in zip(channel.axes["i"], channel.axes["j"], left, strict=False)
+    ]
+
+
+PARTS: dict[str, Callable[[Path], Rows]] = {
+    "sbig": explain_sbig, "rings": explain_rings, "spots": explain_spots, "areas": explain_areas,
+}  # fmt: skip
 
 
 def main() -> None:
-    """Diagnose everything, write the tables, print what they say."""
+    """Run all four, write rows and figures, print what they say."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("shared", type=Path)
-    shared = parser.parse_args().shared
+    parser.add_argument(
+        "--figures", type=Path, default=Path(gettempdir()) / "real_recordings"
+    )
+    given = parser.parse_args()
     begin = time.process_time()
-    rows, unlike, lags = [], [], []
-    sbig = [shared / "recordings" / "sbig_flats" / n for n in ("langford", "bergeson")]
-    campaigns = {"langford": sbig[:1], "bergeson": sbig[1:], "both runs": sbig}
-    for name, folders in campaigns.items():
-        for word, baseline in sbig_baselines().items():
-            found = diagnose_sbig(folders, baseline, rim=True)
-            rows += rows_of(found, f"SBIG {name}", word)
-            print(f"SBIG {name}, {word}: {found.said()}")
-            if word == "none":
-                print(*(f"  {n}" for n in found.notes[found.read :]), sep="\n")
-                if name != "both runs":
-                    unlike += [{"recording": f"SBIG {name}", **vars(p), "rises": p.rises}
-                               for p in found.measured.unlike]  # fmt: skip
-    for kind, names in BASELINES.items():
-        table = read_area_changes(shared / "reference" / f"{kind}_covariances_21oct19.csv")
-        for name in names:
-            found = diagnose_areas(table, name)
-            rows += rows_of(found, f"a_ij {kind}", name)
-            lags += lags_of(found, f"a_ij {kind}", name)
-        found = diagnose_areas(exchanged(table), names[3])
-        rows += rows_of(found, f"a_ij {kind}, axes exchanged", names[3])
-    table, ladder, areas = Table(rows), Table(unlike), Table(lags)
-    for column in ladder.colnames[3:-1]:
-        ladder[column].info.format = ".5g"
-    for column in ("measured", "error", "predicted"):
-        areas[column].info.format = ".5g"
-    for column in ("family_p", "p"):
-        table[column].info.format = ".3g"
-    nulls = Table(diagnose_nulls(120))
-    nulls["p"].info.format = ".4g"
+    table = Table([r for make in PARTS.values() for r in make(given.shared)])
+    for name in ("value", "error", "at"):
+        table[name].info.format = ".6g"
     cpu = round(time.process_time() - begin, 1)
-    for made, name in (
-        (table, "real_recordings"),
-        (ladder, "real_unlike"),
-        (areas, "real_lags"),
-        (nulls, "real_nulls"),
-    ):
-        write_results(made, str(RESULTS / f"{name}.ecsv"), COMMAND, cpu_s=cpu)
-    table.pprint_all()
-    for name in [*dict.fromkeys(ladder["recording"]), ""]:
-        quiet = ladder[~np.array(ladder["rises"], bool)]
-        if name:
-            quiet = quiet[quiet["recording"] == name]
-        for lag in ("serial", "parallel"):
-            columns = (np.array(quiet[c]) for c in ("level", lag, "near_error"))
-            print(name or "both runs", lag, serial_models(*columns))
+    write_results(table, str(RESULTS), COMMAND, cpu_s=cpu)
+    given.figures.mkdir(parents=True, exist_ok=True)
+    for name in PARTS:
+        figure = real_figures.draw(name, table)
+        figure.savefig(given.figures / f"{name}.png", dpi=110)
+        print(f"\n{given.figures / name}.png", *real_figures.say(name, table), sep="\n  ")
+    print(f"{cpu} CPU s; {BACK_BIAS} is the operating point's parameter")
 
 
 if __name__ == "__main__":

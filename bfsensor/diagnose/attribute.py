@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from bfsensor.diagnose.baseline import Baseline
 from bfsensor.diagnose.found import (
     OUTSIDE_WORD,
     Attribution,
@@ -15,12 +13,29 @@ from bfsensor.diagnose.found import (
     class_probabilities,
     tied_classes,
 )
-from bfsensor.diagnose.locate import ALARM, Mismatch, locate_mismatch
+from bfsensor.diagnose.free_terms import Scene
+from bfsensor.diagnose.locate import Mismatch, locate_mismatch
 from bfsensor.diagnose.mismatch import BaselineFit
 from bfsensor.diagnose.model import Model, compare_held_out
 from bfsensor.diagnose.named import NAMED
-from bfsensor.diagnose.open_world import FreeFit, OpenWorld, explain_outside, fit_free_form
+from bfsensor.diagnose.open_world import (
+    FreeFit,
+    OpenWorld,
+    compete,
+    explain_outside,
+    fit_free_form,
+)
 from bfsensor.diagnose.predict import Predictor, fitted
+from bfsensor.diagnose.ranking import (
+    candidates_of,
+    concerned,
+    further,
+    rank,
+    refine,
+    seen_of,
+    threshold,
+    with_hypotheses,
+)
 from bfsensor.diagnose.remainder import (
     ACCURACY,
     OUTSIDE_ALARM,
@@ -28,9 +43,8 @@ from bfsensor.diagnose.remainder import (
     stands_out,
 )
 from bfsensor.diagnose.screen import Rival, Screen
-from bfsensor.effects.device_parameter import device_parameters
+from bfsensor.diagnose.suspects import suspect_effects
 from bfsensor.effects.effect import Effect
-from bfsensor.effects.library import LIBRARY
 from bfsensor.errors import ConvergenceError
 
 MOST = 4
@@ -39,25 +53,19 @@ MOST = 4
 WEAK = 6.0
 """Increase of the chi-square when it is left out, below which an effect is dropped again."""
 
-CLOSE = 40.0
-"""Difference in gain from the best up to which rivals are fitted again with all parameters."""
-
 REMAINDER = 0.02
 """Part of the chi-square that effects explain up to which what is left is laid to their closed
 forms: seven standard deviations of fifty."""
-
-HOPELESS, FAR = 3.0, 0.05
-"""Gain of a candidate's best start below which it is not fitted on, and as a part of the best of
-all starts: a fit of its shape makes it a few times as much, not twenty times."""
-
-REFITTED = 5
-"""Most rivals that are."""
 
 FAINT = 2
 """Candidates below the threshold that are tried."""
 
 NEEDED = 0.5
 """Part of what an effect explains by itself that it must explain beside a free form to be named."""
+
+FAR_BETTER = 8.0
+"""Chi-square by which one free form must explain more than effects that leave nothing, each charged
+with what chance gives, before these are not believed: likelihoods as 1 to 55."""
 
 TAKEN = 9.0
 """Chi-square that a parameter of an effect takes by chance, as the best of a library."""
@@ -83,7 +91,9 @@ def attribute(
 
     What is left after that and counts (see :mod:`bfsensor.diagnose.remainder`) is outside the
     library and modelled freely, first without any effect: those that explained part of it are
-    named only if the free form cannot do without them.
+    named only if the free form cannot do without them.  One free form that leaves nothing and
+    explains far more than the effects found so far (:data:`FAR_BETTER`), whether these leave
+    anything or not, ends the search.
 
     Parameters
     ----------
@@ -99,16 +109,21 @@ def attribute(
         kinds = [k for k in kinds if not k.of_pixels]
     base = Model(predictor, fit)
     candidates = (*kinds, *NAMED)
-    model, mismatch, rankings, notes = _forward(base, mismatch, candidates, seed)
+    first = mismatch
+    model, mismatch, rankings, notes, better = _forward(base, mismatch, candidates, seed)
     free: OpenWorld | None = None
-    outside = _is_outside(base, model, mismatch)
+    outside = better is not None or _is_outside(base, model, mismatch)
     if not outside:
         places = {n: r for n, r in rankings.items() if n < len(model.effects)}
-        found, model, mismatch = _judge(model, places, mismatch, candidates, seed)
+        judged = concerned(candidates, first, mismatch)
+        found, model, mismatch = _judge(model, places, mismatch, judged, seed)
         outside = _is_outside(base, model, mismatch)
-    if outside:
+    if better is not None:
+        free, model = better
+        found, mismatch = [], free.mismatch
+    elif outside:
         found, model, mismatch, free = _outside(
-            base, model, mismatch, rankings, candidates, seed
+            base, model, mismatch, rankings, concerned(candidates, first, mismatch), seed
         )
     named = any(f.effect.word == OUTSIDE_WORD for f in found)
     return Attribution(
@@ -125,43 +140,50 @@ def attribute(
 
 def _forward(
     base: Model, mismatch: Mismatch, kinds: Sequence[type[Effect]], seed: int
-) -> tuple[Model, Mismatch, dict[int, list[Rival]], list[str]]:
+) -> tuple[
+    Model, Mismatch, dict[int, list[Rival]], list[str], tuple[OpenWorld, Model] | None
+]:
     """Add effects one by one while something counts and a candidate explains it.
 
-    Also gives the rankings by number of effects there were, and notes.
+    Also gives the rankings by number of effects there were, notes, and a free form that is
+    better than all that.
     """
-    model = base
+    model, first = base, mismatch
     notes: list[str] = []
     rankings: dict[int, list[Rival]] = {}
     while len(model.effects) < MOST and stands_out(
         mismatch, explained_by_word(base.fit, model.fit), fits=len(model.effects)
     ):
-        screen = Screen(model.predictor, model.fit, _seen(mismatch))
-        ranking = rank(screen, _without(kinds, model.effects))
+        screen = Screen(model.predictor, model.fit, seen_of(mismatch))
+        others = further(concerned(kinds, mismatch), model.effects)
+        ranking = with_hypotheses(model, others, rank(screen, others))
         critical = threshold(screen, ranking, seed=seed)
-        good = [r for r in ranking if r.gain > critical and not r.select < 0]
+        good = [r for r in ranking if r.gain > critical and not r.refuted]
         rankings[len(model.effects)] = ranking
         if good:
             ranking = refine(model, ranking)
-            good = [r for r in ranking if r.gain > critical and not r.select < 0] or good
+            good = [r for r in ranking if r.gain > critical and not r.refuted] or good
             rankings[len(model.effects)] = ranking
         else:
             # That something is there is proved already: a fainter candidate will do, if with it
             # nothing is left.
-            good = [r for r in ranking if r.gain > WEAK and not r.select < 0][:FAINT]
+            good = [r for r in ranking if r.gain > WEAK and not r.refuted][:FAINT]
         step = _step(
-            model, good, mismatch, seed, notes, sure=bool(good) and good[0].gain > critical
+            model, good, kinds, seed, notes, sure=bool(good) and good[0].gain > critical
         )
         if step is None:
             break
         model, mismatch = step
-    return model, mismatch, rankings, notes
+        better = _better(base, first, model, rankings, seed)
+        if better is not None:
+            return model, mismatch, rankings, notes, better
+    return model, mismatch, rankings, notes, None
 
 
 def _step(
     model: Model,
     good: Sequence[Rival],
-    mismatch: Mismatch,
+    kinds: Sequence[type[Effect]],
     seed: int,
     notes: list[str],
     *,
@@ -176,7 +198,7 @@ def _step(
             continue
         left = locate_mismatch(further.fit, seed=seed)
         if sure or not left.detected:
-            return further, left
+            return further, suspect_effects(further.predictor, further.fit, left, kinds)
     return None
 
 
@@ -226,6 +248,26 @@ def _outside(
     return found, last, left, free
 
 
+def _better(
+    base: Model,
+    mismatch: Mismatch,
+    model: Model,
+    rankings: Mapping[int, list[Rival]],
+    seed: int,
+) -> tuple[OpenWorld, Model] | None:
+    """Model freely what a baseline leaves, if one free form does, and far better than effects."""
+    least = base.fit.total - model.fit.total - _critical(model.effects) + FAR_BETTER
+    choices = compete(Scene(base), mismatch)
+    if not choices or choices[0].score < least:
+        return None
+    alone = fit_free_form(base, mismatch, seed=seed)
+    gain = base.fit.total - alone.model.fit.total - alone.penalty
+    explained = explained_by_word(base.fit, alone.model.fit)
+    if len(alone.choices) != 1 or gain < least or stands_out(alone.mismatch, explained):
+        return None
+    return explain_outside(base, alone.mismatch, rankings.get(0, []), free=alone, seed=seed)
+
+
 def _does_without(base: Model, alone: FreeFit, model: Model, beside: FreeFit) -> bool:
     """Whether a free form alone explains as much as effects do with another one beside them.
 
@@ -247,16 +289,8 @@ def _place(
     """All candidates in the place of one effect of a model."""
     others = [e for k, e in enumerate(model.effects) if k != n]
     without = model.with_effects(others)
-    screen = Screen(without.predictor, without.fit, _seen(mismatch))
-    return rank(screen, _without(kinds, others))
-
-
-def _without(
-    kinds: Sequence[type[Effect]], effects: Sequence[Effect]
-) -> list[type[Effect]]:
-    """Candidates that are not there already."""
-    there = {e.name for e in effects}
-    return [k for k in kinds if name_of(k) not in there]
+    screen = Screen(without.predictor, without.fit, seen_of(mismatch))
+    return rank(screen, further(kinds, others))
 
 
 def _critical(effects: Sequence[Effect]) -> float:
@@ -286,72 +320,6 @@ def _found(model: Model, n: int, ranking: Sequence[Rival]) -> Found:
     )  # fmt: skip
 
 
-def candidates_of(baseline: Baseline) -> tuple[type[Effect], ...]:
-    """Candidates for what a baseline leaves out: the library, and its card's parameters."""
-    own = device_parameters(
-        baseline.derivatives_by_condition(), baseline.spread, baseline.nominal
-    )
-    return (*LIBRARY, *own, *baseline.pieces)
-
-
-def name_of(kind: type[Effect]) -> str:
-    """Class, and variant where there are several."""
-    return f"{kind.word}:{kind.variant}" if kind.variant else kind.word
-
-
-def rank(screen: Screen, kinds: Sequence[type[Effect]]) -> list[Rival]:
-    """Best of each kind, greatest evidence first."""
-    starts = [screen.tried(kind) for kind in kinds]
-    best = max((t[0][0] for t in starts if t), default=0.0)
-    least = max(HOPELESS, FAR * best)
-    found = [screen.best(t, least=least) for t in starts]
-    return sorted((r for r in found if r is not None), key=lambda r: -r.evidence)
-
-
-def refine(model: Model, ranking: Sequence[Rival]) -> list[Rival]:
-    """Fit the closest of a ranking again with all parameters, beyond the first order."""
-    best = max(r.gain for r in ranking)
-    out = []
-    close = [r for r in ranking if best - r.gain < max(CLOSE, 0.02 * best)][:REFITTED]
-    for rival in ranking:
-        if any(rival is r for r in close) and len(close) > 1:
-            try:
-                other = model.with_effects((*model.effects, rival.effect))
-            except ConvergenceError:
-                out.append(rival)
-                continue
-            gain = model.fit.total - other.fit.total
-            out.append(
-                Rival(
-                    other.effects[-1], gain, rival.evidence + 0.5 * (gain - rival.gain),
-                    rival.template, rival.select,
-                )
-            )  # fmt: skip
-        else:
-            out.append(rival)
-    return sorted(out, key=lambda r: -r.evidence)
-
-
-def threshold(
-    screen: Screen, ranking: Sequence[Rival], *, seed: int, draws: int = 400
-) -> float:
-    """Gain that noise alone gives the best of all candidates once in a hundred times."""
-    templates = np.array([
-        r.template / np.sqrt(r.template @ r.template)
-        for r in ranking if r.template @ r.template > 0
-    ])  # fmt: skip
-    extra = max((len(fitted(r.effect)) for r in ranking), default=1) - 1
-    if not len(templates):
-        return np.inf
-    rng = np.random.default_rng(seed)
-    largest = []
-    for _ in range(draws // 50):
-        noise = rng.standard_normal((50, templates.shape[1]))
-        largest.append(((noise @ templates.T) ** 2).max(1))
-    # Shapes that are fitted follow the noise: each takes about one of it more.
-    return float(np.quantile(np.concatenate(largest), 1 - ALARM)) + 2.0 * extra
-
-
 def _judge(
     model: Model,
     rankings: dict[int, list[Rival]],
@@ -371,8 +339,8 @@ def _judge(
             if without.fit.total - model.fit.total < WEAK:
                 model, places, swapped = without, {}, True
                 break
-            screen = Screen(without.predictor, without.fit, _seen(mismatch))
-            ranking = refine(without, rank(screen, _without(kinds, others)))
+            screen = Screen(without.predictor, without.fit, seen_of(mismatch))
+            ranking = refine(without, rank(screen, further(kinds, others)))
             places[n] = ranking
             here = next(
                 (r for r in ranking if r.effect.name == model.effects[n].name), None
@@ -389,9 +357,3 @@ def _judge(
         mismatch = locate_mismatch(model.fit, seed=seed)
     out = [_found(model, n, places.get(n, [])) for n in range(len(model.effects))]
     return out, model, mismatch
-
-
-def _seen(mismatch: Mismatch) -> list[dict[str, Any]]:
-    """What the scans found, farthest first, as effects take it."""
-    parts = [*mismatch.parts, *mismatch.findings[:200]]
-    return [{**p.where, "word": p.word, "z": p.z, "family": p.family} for p in parts]

@@ -200,17 +200,23 @@ class Baseline:
         nominal = centre(*self.edges.get(self.reference, own))
         return centre(*own) / nominal if nominal else 1.0
 
+    def edges_on(
+        self, condition: Condition, change: Mapping[str, float] | None, background: float
+    ) -> Edges:
+        """Shifts per electron where all pixels hold a background [e-]."""
+        kx, ky = self.at(condition, change)[0]
+        away, key = background - self.level, self.nearest(condition)
+        for power, more in ((1, self.slopes), (2, self.bends)):
+            if key in more:
+                kx = kx + away**power * more[key][0]
+                ky = ky + away**power * more[key][1]
+        return kx, ky
+
     def areas_on(
         self, condition: Condition, change: Mapping[str, float] | None, background: float
     ) -> NDArray[np.float64]:
         """Change of the areas per electron [1/e-] where all pixels hold a background [e-]."""
-        a = area_matrix(*self.at(condition, change)[0])
-        away, key = background - self.level, self.nearest(condition)
-        if key in self.slopes:
-            a = a + away * area_matrix(*self.slopes[key])
-        if key in self.bends:
-            a = a + away**2 * area_matrix(*self.bends[key])
-        return np.asarray(a)
+        return area_matrix(*self.edges_on(condition, change, background))
 
     def flat_areas(
         self,

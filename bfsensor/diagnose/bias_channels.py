@@ -17,6 +17,9 @@ READOUT_LAGS = 32
 OUTLIER = 6.0
 """Deviation [sigma] from which a pixel of a dark or bias counts as struck: one in 5e8 by noise."""
 
+TRACK = 20.0
+"""Deviation [sigma] from which a pixel has no part in the bias level: more than ghosts of spots."""
+
 UNEVEN = 1.25
 """Scatter of a dark's columns over that of noise from which columns count as uneven by nature:
 four standard deviations of the scatter of 128."""
@@ -66,6 +69,8 @@ class BiasChannels:
             self._sum[frame.name] += frame.pixels.astype(np.float64) - zeros[-1]
             image = frame.image.astype(np.float64)
             if over.size:
+                # Tracks of particles would tell their own number, not the level.
+                image = image[~_struck(image, TRACK)]
                 share = image.var() / image.size + over.var() / over.size
                 levels.append((float(image.mean()) - zeros[-1], share + LEVEL_ERROR**2))
         if len(levels) == len(frames):
@@ -312,9 +317,13 @@ def without_hot_columns(image: NDArray[np.float64], noise: float) -> NDArray[np.
 
 def _without_outliers(noise: NDArray[np.float64]) -> NDArray[np.float64]:
     """Set struck pixels to the mean: 6 median deviations, as of a Gaussian."""
-    middle = np.median(noise)
-    sigma = 1.4826 * np.median(np.abs(noise - middle))
-    return np.where(np.abs(noise - middle) > OUTLIER * sigma, 0.0, noise - middle)
+    return np.where(_struck(noise), 0.0, noise - np.median(noise))
+
+
+def _struck(noise: NDArray[np.float64], limit: float = OUTLIER) -> NDArray[np.bool_]:
+    """Pixels beyond so many median deviations, as of a Gaussian; a converter's steps are none."""
+    away = np.abs(noise - np.median(noise))
+    return np.asarray(away > limit * max(1.4826 * float(np.median(away)), 0.3))
 
 
 def _autocovariance(noise: NDArray[np.float64]) -> NDArray[np.float64]:

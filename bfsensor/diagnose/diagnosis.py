@@ -19,6 +19,8 @@ from bfsensor.diagnose.locate import ALARM, Finding, Mismatch, locate_mismatch
 from bfsensor.diagnose.mismatch import BaselineFit, fit_baseline
 from bfsensor.diagnose.plan import Plan, plan
 from bfsensor.diagnose.predict import Predictor, used_channels
+from bfsensor.diagnose.scans import DEVICE, DEVICE_SEEN
+from bfsensor.diagnose.suspects import suspect_effects
 from bfsensor.diagnose.untested import find_untested
 
 SCHEMA = "bfsensor-diagnosis-1"
@@ -29,6 +31,7 @@ FARTHEST, OF_EACH = 50, 10
 NO_PLAN = Plan()
 
 NAMES = {
+    DEVICE: "device's parameters",
     "flat_cov": "covariances of flats", "flat_mean": "mean of flats against the lamp",
     "flat_map": "flats against position", "serial_overscan": "serial overscan",
     "parallel_overscan": "parallel overscan", "bias_cov": "noise in readout order",
@@ -105,9 +108,10 @@ class Diagnosis:
         seen = {p.word for p in self.mismatch.parts}
         others = {f.word: f for f in reversed(found) if f.word not in seen}
         parts = [*self.mismatch.parts, *list(others.values())[::-1]]
-        out["channels"] = list(
-            dict.fromkeys(f.word for f in (*parts, *self.mismatch.findings))
-        )
+        words = dict.fromkeys(f.word for f in (*parts, *self.mismatch.findings))
+        there = {c.word for c in self.fit.channels}
+        shown = [w for word in words for w in (DEVICE_SEEN if word == DEVICE else (word,))]
+        out["channels"] = [w for w in dict.fromkeys(shown) if w in there]
         best: dict[str, Any] = {}
         for part in parts:
             for key in part.where:
@@ -143,7 +147,9 @@ class Diagnosis:
     def _heldout(self) -> dict[str, Any]:
         """Chi-square over number of what was not fitted, before and after, by channel too."""
         out: dict[str, Any] = {
-            "chi2dof_before": _finite(self.heldout), "chi2dof_after": None, "channels": {},
+            "chi2dof_before": _finite(self.heldout), "chi2dof_after": None,
+            "values": sum(map(len, used_channels(self.measured.channels, ("held-out",)))),
+            "channels": {},
         }  # fmt: skip
         told = self.attribution
         if told is not None and (told.found or told.free_form is not None):
@@ -189,7 +195,7 @@ class Diagnosis:
                 parts.append(f"It is also seen in: {', '.join(others)}.")
             if self.attribution is not None:
                 parts += said_of(self.attribution)
-        far = {k: v for k, v in self.fit.pulls.items() if abs(v) > 3}
+        far = {k: v for k, v in self.accepted[1].pulls.items() if abs(v) > 3}
         if far:
             text = ", ".join(f"{k} {v:+.1f}" for k, v in far.items())
             parts.append(f"Device parameters off the card, in units of its spread: {text}.")
@@ -303,6 +309,8 @@ def diagnose_measured(
     predictor, fit = fit_bounded(measured, baseline)
     more = _of_free(measured, baseline, fit)
     mismatch = locate_mismatch(fit, seed=seed)
+    if explain:
+        mismatch = suspect_effects(predictor, fit, mismatch)
     attribution, advised = None, Plan()
     if mismatch.detected and explain:
         attribution = attribute(predictor, fit, mismatch, seed=seed)

@@ -339,6 +339,8 @@ class Forecaster:
 
     def _darks(self, planned: Planned) -> list[Forecast]:
         """Levels and columns of darks, all of them together."""
+        if not self.measured.segments or not self.amps:
+            return []
         condition, axes, blocks = self.condition(planned), Axes(), []
         common = {"time": planned.seconds, "after": planned.after / self.gains.mean()}
         for amp, segment in enumerate(self.measured.segments):
@@ -350,8 +352,6 @@ class Forecaster:
             ):
                 axes.add(len(x), condition, what=what, x=x, amp=amp, exposure=-1, **common)
                 blocks += [np.array([[3 * variance / lines]])] * len(x)
-        if not blocks:
-            return []
         channel = Channel("dark_map", np.zeros(len(blocks)), tuple(blocks), axes.columns(),
                           "adu")  # fmt: skip
         return [self.forecast(channel)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -104,7 +105,8 @@ def odd_terms(scene: Scene) -> Iterator[Term]:
         own = np.abs(k), np.zeros_like(k)
         edges = own if axis == "x" else own[::-1]
         where = {"odd": axis, "axis": axis, "shape": "baseline", "power": 0}
-        yield _kernel_term(scene, where, edges, 0)
+        # What spots tell of a shape of its own is little: the baseline's, if that does.
+        yield replace(_kernel_term(scene, where, edges, 0), simple=True)
         for edge in edge_names(ODD_REACH):
             if edge[2] >= ODD_REACH:
                 continue

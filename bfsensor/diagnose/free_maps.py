@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.free_search import Dictionary
 from bfsensor.diagnose.free_terms import SCALE, Family, Scene, Term, Values
 from bfsensor.diagnose.map_channels import RINGS, block_side, ring_modes
 from bfsensor.diagnose.predict_maps import reduce_map
@@ -25,6 +27,10 @@ PERIODS = 160
 
 FINE = 61
 """Tried of each between its neighbours."""
+
+FINEST, WIDE = 9, 4.0
+"""Tried with all that a ripple does, twice: over so many of those steps to either side, as the
+closed form leaks, and between neighbours of the best."""
 
 SHORTEST, LONGEST = 4.0, 100.0
 """Period of ripples in readout time [pixel times]."""
@@ -100,14 +106,28 @@ def map_families(scene: Scene) -> list[Family]:
     return out
 
 
-def refine_ripple(scene: Scene, terms: Sequence[Term]) -> Family:
-    """Ripples of frequencies about those of some, down to what the texture resolves."""
+def refine_ripple(scene: Scene, term: Term) -> Family:
+    """The ripple of the frequency near one's that fits best, down to what the texture resolves.
+
+    One alone: beside it a neighbour would share its amplitude.
+    """
     step = (1 / SHORTEST - 1 / LONGEST) / (PERIODS - 1)
-    fine = [
-        _ripple(scene, 1 / t.where["period"] + d)
-        for t in terms for d in np.linspace(-1, 1, FINE) * step
-    ]  # fmt: skip
-    return Family("ripple in readout time", tuple(fine), ("flat_map",))
+    for count, rough, wider in (
+        (FINE, True, 1.0),
+        (FINEST, False, WIDE),
+        (FINEST, False, 1.0),
+    ):
+        step *= wider
+        middle = 1 / term.where["period"]
+        near = [_ripple(scene, middle + d) for d in np.linspace(-1, 1, count) * step]
+        near = near if rough else [replace(t, rough=None) for t in near]
+        family = Family("ripple in readout time", tuple(near), ("flat_map",))
+        d = Dictionary(family, scene.model.fit)
+        b = d.products(scene.model.fit.left)
+        gain = np.where(d.free > 0, b / np.sqrt(np.where(d.free > 0, d.free, 1.0)), -np.inf)
+        term = near[int(np.argmax(gain))]
+        step *= 2 / (count - 1)
+    return replace(family, terms=(term,), tried=PERIODS)
 
 
 def _pattern(

@@ -22,6 +22,13 @@ good to about a per cent, has left over."""
 SPANNED = 1e-3
 """Part of a column's square that the fit's parameters must leave for it to be a term."""
 
+SAME = 6.0
+"""Increase of the chi-square up to which another term in the first one's place explains as much:
+three in the logarithm of the likelihood."""
+
+MOST_ALIKE = 3
+"""Such terms that are told."""
+
 VISIBLE = 0.05
 """Part of a template's square in the select fold from which on that fold judges."""
 
@@ -44,6 +51,8 @@ class Choice:
         does not see them.
     template : ndarray
         What they change together, whitened, the fit's parameters projected out.
+    alike : tuple of (Term, float)
+        Others that explain as much in the first one's place, with their coefficients there.
     """
 
     family: Family
@@ -52,6 +61,7 @@ class Choice:
     score: float
     select: float
     template: Values
+    alike: tuple[tuple[Term, float], ...] = ()
 
 
 class Dictionary:
@@ -91,7 +101,8 @@ class Dictionary:
     @property
     def critical(self) -> float:
         """Square of the deviate that noise gives the best of all terms once in a hundred times."""
-        return float(chi2.isf(ALARM / max(int((self.free > 0).sum()), 1), 1))
+        count = max(int((self.free > 0).sum()), self.family.tried, 1)
+        return float(chi2.isf(ALARM / count, 1))
 
     def products(self, left: Values) -> Values:
         """Of all columns with a remainder."""
@@ -113,7 +124,7 @@ class Dictionary:
             open_ = (free > 0.02 * first) & (free > 0)
             z = np.where(open_, b / np.sqrt(np.where(open_, free, 1.0)), 0.0)
             size = z if positive else np.abs(z)
-            n = int(np.argmax(size)) if len(size) else 0
+            n = self._farthest(size)
             if not len(size) or size[n] ** 2 < self.critical:
                 break
             if path and size[n] < ACCURACY * abs(path[0][1]):
@@ -127,6 +138,32 @@ class Dictionary:
             b = b - new * z[n]
             free = free - new**2
         return path
+
+    def _farthest(self, size: Values) -> int:
+        """Place of the largest deviate; of a simple term's, if that explains as much."""
+        if not len(size):
+            return 0
+        best = int(np.argmax(size))
+        simple = np.where([t.simple for t in self.family.terms], size, 0.0)
+        n = int(np.argmax(simple))
+        return n if size[n] ** 2 > size[best] ** 2 - self._same(size[best]) else best
+
+    def _same(self, z: float) -> float:
+        """Difference of chi-squares that tells no two terms apart: by chance, or by inaccuracy."""
+        return SAME + (ACCURACY * z) ** 2
+
+    def alike(self, n: int, *, positive: bool = False) -> tuple[tuple[Term, float], ...]:
+        """Other terms that explain as much alone as a term does, with their coefficients."""
+        b = self.products(self.fit.left)
+        z = np.where(
+            self.free > 0, b / np.sqrt(np.where(self.free > 0, self.free, 1.0)), 0.0
+        )
+        size = np.where((z > 0) | (not positive), np.abs(z), 0.0)
+        close = size**2 > size[n] ** 2 - self._same(size[n])
+        order = [int(m) for m in np.argsort(-size) if close[m] and m != n]
+        return tuple(
+            (self.family.terms[m], float(b[m] / self.free[m])) for m in order[:MOST_ALIKE]
+        )
 
     def choose(self, *, positive: bool = False) -> Choice | None:
         """Choose terms: as many of those that noise does not reach as the select fold agrees to."""
@@ -149,7 +186,7 @@ class Dictionary:
         return Choice(
             self.family, tuple(self.family.terms[n] for n, _ in path[:count]),
             tuple(z for _, z in path[:count]), float(score), float(gain),
-            templates[:, :count] @ coefficients,
+            templates[:, :count] @ coefficients, self.alike(path[0][0], positive=positive),
         )  # fmt: skip
 
     def gains(self) -> tuple[float, int]:

@@ -1,4 +1,4 @@
-"""Terms that free-form models are made of: means against anything, and covariances by lag."""
+"""Terms that free-form models are made of: what they see, and covariances by lag."""
 
 from __future__ import annotations
 
@@ -19,14 +19,8 @@ from bfsensor.effects.effect import Effect
 SCALE = 1e5
 """Signal [e-] that coefficients of powers of it are given at."""
 
-LEVEL_POWERS = (1, 2, 3, 4)
-"""Of the relative change of the mean with the level."""
-
 LAG_POWERS = (0, 1, 2, 3)
 """Of the covariances at one lag with the level."""
-
-CURVES, CYCLES = 5, 10
-"""Highest order of the polynomial in time, most waves over the campaign."""
 
 Values = NDArray[np.float64]
 
@@ -47,6 +41,8 @@ class Term:
         The same, quicker, good enough to be searched with.
     more : tuple of Term
         What goes with it beyond the first order, each with a coefficient of its own.
+    simple : bool
+        Taken before others that explain as much.
     """
 
     name: str
@@ -54,6 +50,7 @@ class Term:
     column: Callable[[Channel], Values | None]
     rough: Callable[[Channel], Values | None] | None = None
     more: tuple[Term, ...] = ()
+    simple: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +64,14 @@ class Family:
     terms : tuple of Term
     words : tuple of str
         Channels that the search looks at; the fit looks at all.
+    tried : int
+        Terms that these were chosen from before, if more than there are.
     """
 
     group: str
     terms: tuple[Term, ...]
     words: tuple[str, ...]
+    tried: int = 0
 
 
 class Flats(NamedTuple):
@@ -182,146 +182,6 @@ def at_lags(
 ) -> Values:
     """Periodic covariances by flat, at lags: the mean of (i, j) and (i, -j)."""
     return np.asarray(0.5 * (c[flat, j, i] + c[flat, -j, i]))
-
-
-def mean_families(scene: Scene) -> list[Family]:
-    """Means of flats, and fluxes of spots: by level, in time, by the exposure before."""
-    flats = [c for c in scene.model.fit.channels if c.word == "flat_mean"]
-    if not flats:
-        return []
-    out = [Family("mean by level", tuple(_by_level(scene, flats)), ("flat_mean",))]
-    shots = scene.model.predictor.measured.shots
-    hours = {s.number: s.hours for s in shots}
-    if len(set(hours.values())) < len(hours):
-        # Without times of their own exposures follow one another evenly.
-        hours = {s.number: float(n) for n, s in enumerate(shots)}
-    if hours:
-        terms = tuple(_in_time(flats, hours, len(scene.gains)))
-        out.append(Family("mean in time", terms, ("flat_mean",)))
-        terms = tuple(_after_exposure(scene))
-        out.append(Family("mean by the exposure before", terms, ("flat_mean",)))
-    return out
-
-
-def _relative(
-    name: str,
-    where: Mapping[str, Any],
-    change: Callable[[Channel], Values],
-    *,
-    spots: bool = True,
-) -> Term:
-    """Term that multiplies means of flats, and of spots the flux."""
-
-    def column(channel: Channel) -> Values | None:
-        x = channel.axes
-        if channel.word == "flat_mean":
-            return np.asarray(x["level"] * change(channel))
-        if channel.word == "spot" and spots:
-            return np.where(x["what"] == "flux", x["flux"] * change(channel), 0.0)
-        return None
-
-    return Term(name, where, column)
-
-
-def _by_level(scene: Scene, flats: list[Channel]) -> Iterator[Term]:
-    """Powers of the level, and single levels, of all amplifiers and of each."""
-    times = np.unique(np.concatenate([c.axes["time"] for c in flats]))
-
-    def own(channel: Channel, amp: int | None) -> Values:
-        return np.where(amp is None or channel.axes["amp"] == amp, 1.0, 0.0)
-
-    def power(p: int, amp: int | None) -> Callable[[Channel], Values]:
-        def change(c: Channel) -> Values:
-            level = scene.gains[c.axes["amp"].astype(int)] * c.axes["level"]
-            return np.asarray(own(c, amp) * (level / SCALE) ** p)
-
-        return change
-
-    def single(time: float, amp: int | None) -> Callable[[Channel], Values]:
-        return lambda c: own(c, amp) * (c.axes["time"] == time)
-
-    for amp, label in _amplifiers(scene):
-        for p in LEVEL_POWERS:
-            yield _relative(
-                f"mean x S^{p}{label}", {"power": p, "amp": amp}, power(p, amp), spots=False
-            )
-        for time in times if len(times) > 3 else ():
-            level = np.concatenate([c.axes["level"][c.axes["time"] == time] for c in flats])
-            told = {"level": float(level.mean() * scene.gains.mean()), "amp": amp}
-            yield _relative(
-                f"mean at {time:g} s{label}", told, single(float(time), amp), spots=False
-            )
-
-
-def _amplifiers(scene: Scene) -> list[tuple[int | None, str]]:
-    """All amplifiers together, and each."""
-    count = len(scene.gains)
-    each = [(n, f", amplifier {n + 1}") for n in range(count)] if count > 1 else []
-    return [(None, ""), *each]
-
-
-def _in_time(flats: list[Channel], hours: dict[int, float], count: int) -> Iterator[Term]:
-    """Polynomials, waves and steps in time."""
-    taken = np.unique(np.concatenate([c.axes["exposure"] for c in flats]))
-    first, last = hours[int(taken[0])], hours[int(taken[-1])]
-    span = max(last - first, 1e-9)
-
-    def at(channel: Channel) -> Values:
-        # Of exposures that were not taken nothing is known: the campaign's middle.
-        there = [hours.get(int(n), first + span / 2) for n in channel.axes["exposure"]]
-        return np.array(there) - first
-
-    def curve(p: int) -> Callable[[Channel], Values]:
-        return lambda c: np.polynomial.legendre.Legendre.basis(p)(2 * at(c) / span - 1)
-
-    def wave(
-        period: float, part: Callable[[Values], Values]
-    ) -> Callable[[Channel], Values]:
-        return lambda c: part(2 * np.pi * at(c) / period)
-
-    def step(number: int) -> Callable[[Channel], Values]:
-        return lambda c: np.where(c.axes["exposure"] >= number, 1.0, 0.0)
-
-    for p in range(1, CURVES + 1):
-        yield _relative(f"mean, order {p} in time", {"order": p}, curve(p))
-    for cycles in range(1, min(CYCLES, len(taken) // 6) + 1):
-        for part, word in ((np.cos, "cosine"), (np.sin, "sine")):
-            period = span / cycles
-            yield _relative(
-                f"mean, {word} of {period:.3g} h", {"period": period}, wave(period, part)
-            )
-    for number in taken[2:-1:2]:
-        yield _relative(
-            f"mean from exposure {int(number)}",
-            {"exposure": int(number)},
-            step(int(number)),
-        )
-
-
-def _after_exposure(scene: Scene) -> Iterator[Term]:
-    """Powers of the mean level of the exposure before; what that was where one is missing."""
-    before: dict[int, float] = {}
-    known: dict[int, bool] = {}
-    last = None
-    for shot in scene.model.predictor.measured.shots:
-        before[shot.number] = 0.0 if last is None else last.level / SCALE
-        known[shot.number] = last is None or last.number == shot.number - 1
-        last = shot
-
-    def power(p: int) -> Callable[[Channel], Values]:
-        def change(c: Channel) -> Values:
-            numbers = [int(n) for n in c.axes["exposure"]]
-            return np.array([before[n] ** p if known.get(n) else 0.0 for n in numbers])
-
-        return change
-
-    def missing(c: Channel) -> Values:
-        return np.array([0.0 if known.get(int(n)) else 1.0 for n in c.axes["exposure"]])
-
-    for p in (1, 2):
-        yield _relative(f"mean x S^{p} of the exposure before", {"power": p}, power(p))
-    if not all(known.values()):
-        yield _relative("mean after exposures not given", {"missing": True}, missing)
 
 
 def lag_family(scene: Scene) -> Family | None:

@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from bfsensor.diagnose.mismatch import BaselineFit
-from bfsensor.diagnose.scans import Template, make_templates
+from bfsensor.diagnose.scans import DEVICE, Template, make_templates
 
 DRAWS = 500
 """Draws of the noise that calibrate the family of all statistics."""
 
 ALARM = 0.01
 """Family-wise probability below which a mismatch is called detected."""
+
+FAMILY = "effect of the library"
+"""Of findings by the library's own shapes: see :mod:`bfsensor.diagnose.suspects`."""
 
 HOPELESS = 2.3
 """Deviate below which a lone statistic is not below :data:`ALARM`: one-sided p = 0.0107."""
@@ -110,8 +113,10 @@ class Scanner:
             within = block @ fit.basis[: len(fit.residuals)]
             raw = np.asarray((block * block).sum(1)).ravel()
             left = raw - (within**2).sum(1)
-            # What the parameters take up to a ten-thousandth is no template.
-            keep = left > 1e-4 * raw
+            # What the parameters take up to a ten-thousandth is no template; those of the device
+            # are held by their card alone.
+            device = np.array([t.word == DEVICE for t in some])
+            keep = left > np.where(device, 1e-9, 1e-4) * raw
             kept = block if keep.all() else block[keep]
             self._blocks.append(kept)
             inside.append(within[keep])

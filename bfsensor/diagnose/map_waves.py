@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from bfsensor.diagnose.map_rings import find_rings
 
 ORDER = 4
 """Order of the smooth shape of the light in x and in y that maps are freed of."""
@@ -80,7 +82,7 @@ class Wave(NamedTuple):
 
 def find_patterns(
     image: NDArray[Any], name: str, amplifiers: Sequence[Part] = ()
-) -> list[Mapping[str, Any]]:
+) -> list[dict[str, Any]]:
     """Find waves in a map, and the rings that those of the map of all light may be.
 
     Plane waves stand out of windows' spectra; each is followed outwards, its frequency free to
@@ -97,10 +99,10 @@ def find_patterns(
 
     Returns
     -------
-    list of mapping
+    list of dict
         At most two, the clearest first: 'map', 'z', 'shape' ('wave': 'fx', 'fy', 'xx', 'xy',
         'yy' of :class:`Wave` about the middle, pixel n / 2, 'phase' [cycles], 'amp'; 'rings':
-        'xc', 'yc', 'period', 'chirp', 'phase', 'amp' of tree rings).
+        those of :func:`bfsensor.diagnose.map_rings.find_rings`).
 
     Examples
     --------
@@ -131,7 +133,7 @@ def find_patterns(
         if gain > GAIN and not like:
             out.append((gain, wave))
     out.sort(key=lambda found: -found[0])
-    told: list[Mapping[str, Any]] = []
+    told: list[dict[str, Any]] = []
     ny_all, nx_all = image.shape
     for gain, wave in out[:2]:
         # Centre of a binned pixel on the sensor.
@@ -141,16 +143,18 @@ def find_patterns(
             wave.fx / side, wave.fy / side, wave.xx / side**2, wave.xy / side**2,
             wave.yy / side**2, wave.sine * spread, wave.cosine * spread,
         ).about(nx_all / 2, ny_all / 2)  # fmt: skip
-        if name == "all":
+        if name == "all" and not told:
             y, x = (
                 side * g + first + c
                 for g, c in zip(np.indices(values.shape), corner, strict=True)
             )
-            rings = _as_rings(values * spread, x, y, whole)
-            if rings is not None:
-                told.append(
-                    {"map": name, "shape": "rings", "z": float(np.sqrt(gain)), **rings}
-                )
+            near = _circles(whole, 20.0 * side * max(values.shape))
+            told += [
+                {"map": name, "shape": "rings", "z": float(np.sqrt(own)), **rings}
+                for own, rings in find_rings(values, x, y, near)
+            ]
+            for rings in told:
+                rings["amp"] *= spread
         told.append({
             "map": name, "shape": "wave", "z": float(np.sqrt(gain)), "amp": whole.amp,
             "phase": float(np.arctan2(whole.cosine, whole.sine) / (2 * np.pi)),
@@ -285,15 +289,18 @@ def _fit(values: Values, x: Values, y: Values, wave: Wave, bent: bool) -> Wave |
     return wave
 
 
-def _as_rings(values: Values, x: Values, y: Values, wave: Wave) -> dict[str, float] | None:
-    """Circles that a bent wave is part of: its crests' curvature tells how far the centre is."""
+def _circles(wave: Wave, far: float) -> tuple[float, float, float, float]:
+    """Circles that a bent wave is part of: its crests' curvature tells how far the centre is.
+
+    ``far``: the farthest it may be [pixel].  Gives the centre, the period at the pixel (0, 0)
+    and the relative change of the frequency per 100 pixels.
+    """
     frequency = float(np.hypot(wave.fx, wave.fy))
     ux, uy = wave.fx / frequency, wave.fy / frequency
     across = wave.xx * uy * uy - 2 * wave.xy * ux * uy + wave.yy * ux * ux
     along = wave.xx * ux * ux + 2 * wave.xy * ux * uy + wave.yy * uy * uy
     if across < 0:
         ux, uy, across, along = -ux, -uy, -across, -along
-    far = 20.0 * max(values.shape) * (x[0, 1] - x[0, 0])
     radius = frequency / max(across, frequency / far)
     xc, yc = wave.x - radius * ux, wave.y - radius * uy
     start = np.hypot(xc, yc)
@@ -301,56 +308,4 @@ def _as_rings(values: Values, x: Values, y: Values, wave: Wave) -> dict[str, flo
     inverse = frequency - rate * (2 * radius - start) / 200.0
     if not inverse > 0.2 * frequency:
         inverse, rate = frequency, 0.0
-    point = np.array([xc, yc, 1.0 / inverse, rate / inverse])
-    return _fit_rings(values, x, y, point)
-
-
-def _fit_rings(
-    values: Values, x: Values, y: Values, point: Values
-) -> dict[str, float] | None:
-    """Least squares of centre, period and chirp, strength and phase linear."""
-
-    def parts(p: Values) -> Values:
-        r = np.hypot(x - p[0], y - p[1])
-        start = np.hypot(p[0], p[1])
-        turns = 2 * np.pi * r / p[2] * (1 + p[3] * (r - start) / 200.0)
-        # Areas change as the slope of a displacement along the radius.
-        rate = 2 * np.pi / p[2] * (1 + p[3] * (2 * r - start) / 200.0)
-        return np.stack([(rate * np.cos(turns)).ravel(), (-rate * np.sin(turns)).ravel()])
-
-    def solve(p: Values) -> tuple[float, Values, Values]:
-        basis = parts(p)
-        found = np.linalg.solve(basis @ basis.T, basis @ values.ravel())
-        model = found @ basis
-        return float(((values.ravel() - model) ** 2).sum()), np.asarray(found, float), model
-
-    steps = np.array([0.5, 0.5, 1e-3 * point[2], 1e-3])
-    square, found, model = solve(point)
-    damping, unit = 1e-3, square / values.size
-    for _ in range(15):
-        slopes = np.stack([
-            (solve(point + d)[2] - model) / d.sum() for d in np.diag(steps)
-        ])  # fmt: skip
-        normal = slopes @ slopes.T
-        scale = np.sqrt(np.diag(normal))
-        normal = normal / np.outer(scale, scale) + damping * np.eye(4)
-        step = np.linalg.solve(normal, slopes @ (values.ravel() - model) / scale) / scale
-        new = point + step
-        if not new[2] > 2.0:
-            damping *= 8
-            continue
-        left, more, there = solve(new)
-        if left < square:
-            done = square - left < 1e-3 * unit
-            point, square, found, model, damping = new, left, more, there, damping / 5
-            if done:
-                break
-        else:
-            damping *= 8
-    if not np.isfinite(point).all():
-        return None
-    names = ("xc", "yc", "period", "chirp")
-    return dict(zip(names, (float(v) for v in point), strict=True)) | {
-        "amp": float(np.hypot(*found)),
-        "phase": float(np.arctan2(found[1], found[0]) / (2 * np.pi)),
-    }
+    return float(xc), float(yc), float(1.0 / inverse), float(rate / inverse)

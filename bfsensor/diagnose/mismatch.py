@@ -17,6 +17,9 @@ ROUNDS = 20
 HALVINGS = 4
 """Of a step that does harm, before it is given up and the fit taken for arrived."""
 
+STALLED = 4
+"""Rounds without gain after which a fit with effects has arrived, whatever their steps."""
+
 REFRESHED = 2, 4
 """Rounds in which what is left to chance is taken as strong as the effects then are."""
 
@@ -152,6 +155,7 @@ def fit_baseline(
     before, least, halved, arrived = point.copy(), np.inf, 0, False
     moved = np.inf
     history: list[float] = []
+    squares: list[float] = []
     slopes = np.zeros((total, count))
     plain = int((~effect).sum())
     if like is not None:
@@ -175,7 +179,10 @@ def fit_baseline(
                 point = 0.5 * (point + before) if halved < HALVINGS else before
                 history.append(np.nan)
                 continue
-            arrived = halved == HALVINGS
+            squares.append(square)
+            # Steps that gain nothing any more, of derivatives that are not quite those here.
+            stalled = len(squares) > STALLED + 1 and np.ptp(squares[-STALLED:]) < 0.02
+            arrived = halved == HALVINGS or stalled
             least, halved = square, 0
         # Derivatives hardly change: those of the second round serve all later ones; effects
         # with a shape are not as straight.

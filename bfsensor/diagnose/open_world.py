@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.free_kernel import kernel_families
 from bfsensor.diagnose.free_maps import map_families, refine_ripple
+from bfsensor.diagnose.free_means import mean_families, refine_wave
 from bfsensor.diagnose.free_process import process_choice
 from bfsensor.diagnose.free_readout import filter_family
 from bfsensor.diagnose.free_search import Choice, Dictionary
-from bfsensor.diagnose.free_terms import Family, Scene, Term, lag_family, mean_families
+from bfsensor.diagnose.free_terms import Family, Scene, Term, lag_family
 from bfsensor.diagnose.free_tests import test_constraints
 from bfsensor.diagnose.locate import Mismatch, locate_mismatch
 from bfsensor.diagnose.mismatch import BaselineFit
@@ -39,6 +40,9 @@ WITH_TESTS = (
     "smooth covariances over lag and level",
 )  # fmt: skip
 """Groups that are held against what physics asks of shifts."""
+
+HIDDEN = ("edges", "wave")
+"""What terms keep to be made again."""
 
 By = dict[str, tuple[float, float, int]]
 """Chi-square before and after, and number of values, by channel."""
@@ -85,6 +89,8 @@ class OpenWorld:
         Constraints: 'p_value', and 'value' with 'error' where there is one.
     nearest : tuple of (str, float)
         Candidates of the library with the angle [degrees] between what they and this change.
+    alike : mapping of str to tuple of (str, float)
+        By group: terms that explain as much in the place of its first, with their coefficients.
     said : str
         In plain words.
     mismatch : Mismatch
@@ -98,6 +104,7 @@ class OpenWorld:
     scores: Mapping[str, float]
     tests: Mapping[str, Mapping[str, float]]
     nearest: tuple[tuple[str, float], ...]
+    alike: Mapping[str, tuple[tuple[str, float], ...]]
     said: str
     mismatch: Mismatch
 
@@ -184,7 +191,8 @@ def explain_outside(
     nearest = nearest_of(free.choices[0].template, rivals)
     groups = tuple(dict.fromkeys(c.family.group for c in free.choices))
     out = OpenWorld(
-        groups, tuple(coefficients), members, folds, free.scores, tests, tuple(nearest[:5]), "",
+        groups, tuple(coefficients), members, folds, free.scores, tests, tuple(nearest[:5]),
+        {c.family.group: tuple((t.name, v) for t, v in c.alike) for c in free.choices}, "",
         free.mismatch,
     )  # fmt: skip
     return replace(out, said=said_freely(out)), free.model
@@ -203,7 +211,7 @@ def _gain_error(fit: BaselineFit) -> float:
 def _plain(where: Mapping[str, Any]) -> dict[str, Any]:
     """What a report can hold: without kernels."""
     return {
-        k: v for k, v in where.items() if not isinstance(v, np.ndarray) and k != "edges"
+        k: v for k, v in where.items() if not isinstance(v, np.ndarray) and k not in HIDDEN
     }
 
 
@@ -295,9 +303,10 @@ def compete(scene: Scene, mismatch: Mismatch) -> list[Choice]:
         if family.group == "boundary shifts":
             choice = _with_spots(choice, fit) or choice
         if positive:
-            choice = Dictionary(refine_ripple(scene, choice.terms[:1]), fit).choose(
-                positive=True
-            )
+            refined = refine_ripple(scene, choice.terms[0])
+            choice = Dictionary(refined, fit).choose(positive=True)
+        if choice is not None and family.group == "mean in time":
+            choice = refine_wave(choice, scene)
         if choice is not None:
             out.append(choice)
     if "flat_cov" in words and (process := process_choice(scene)) is not None:

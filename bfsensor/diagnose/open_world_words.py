@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +13,9 @@ if TYPE_CHECKING:
 
 NEAR = 30.0
 """Angle [degrees] below which a candidate of the library is said to look alike."""
+
+TOLD_ALIKE = ("pattern of position", "odd boundary shifts", "mean in time", "mean by level")
+"""Groups whose terms may stand for one another, and are told."""
 
 REFUSED = 1e-3
 """Probability of a constraint below which it is said to be broken."""
@@ -25,6 +29,9 @@ def said_freely(found: OpenWorld) -> str:
         say = WORDS.get(group)
         if own and say is not None:
             parts.append(say(own) + ".")
+        if group in TOLD_ALIKE and found.alike.get(group):
+            text = "; ".join(f"{name}: {value:.3g}" for name, value in found.alike[group])
+            parts.append(f"In place of the first these recordings allow as well: {text}.")
     tests = _tests(found.tests)
     if tests:
         parts.append(tests)
@@ -50,6 +57,9 @@ def reported_freely(found: OpenWorld | None) -> dict[str, Any] | None:
             for c in found.coefficients
         },
         "by_group": {k: list(v) for k, v in found.by_group.items()},
+        "alike": {
+            k: [{"name": n, "value": float(x)} for n, x in v] for k, v in found.alike.items()
+        },
         "scores": {k: float(v) for k, v in found.scores.items()},
         "tests": {k: {n: float(v) for n, v in t.items()} for k, t in found.tests.items()},
         "nearest": [{"name": n, "angle_degrees": a} for n, a in found.nearest],
@@ -89,7 +99,8 @@ def _shifts(own: Sequence[Coefficient]) -> str:
     )  # fmt: skip
     sizes = "; ".join(
         f"edges along {'x and y' if c.where['axis'] == 'xy' else c.where['axis']} at "
-        f"({c.where['along']:g}, {c.where['across']}) pixels {_way(c)} by {_amount(c, ' 1e-8 pixel/e-')}"
+        f"({c.where['along']:g}, {c.where['across']}) pixels {_way(c)} by "
+        + _amount(replace(c, value=abs(c.value)), " 1e-8 pixel/e-")
         + (" per 1e5 e-" if c.where["power"] else "")
         for c in own[:4]
     )
@@ -205,7 +216,8 @@ def _by_level(own: Sequence[Coefficient]) -> str:
 
 
 def _in_time(own: Sequence[Coefficient]) -> str:
-    text = "; ".join(f"{c.name}: {_amount(c)} of the mean" for c in own[:5])
+    main = [c for c in own if "quarter" not in c.where][:5]
+    text = "; ".join(f"{c.name}: {_amount(c)} of the mean" for c in main)
     return f"The mean changes with time: {text}"
 
 

@@ -61,8 +61,10 @@ class Advice:
     def said(self) -> str:
         """Give the advice in a sentence."""
         one, other = self.separates
+        # Of a reduced recording it is not known how many were taken.
+        count = f"{self.exposures} exposures" if self.exposures else f"{self.times} times"
         text = (
-            f"{self.recording.words} ({self.exposures} exposures{_levels(self)}): expected to tell "
+            f"{self.recording.words} ({count}{_levels(self)}): expected to tell "
             f"{one} from {other} by a chi-square difference of {self.expected:.3g}"
         )
         if not self.decides:
@@ -235,6 +237,8 @@ def ruled(
         return 0.0
     layout = here.predictor.layout
     if rule.strength is not None:
+        if not layout.segments:
+            return 0.0  # A reduced recording tells neither pixels nor read noise.
         noise = float(np.nanmean(np.array(here.measured.read_noise) * here.gains))
         seen = found.effect if own else rival.effect
         return times * recording.exposures * rule.strength(seen, layout, noise)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.baseline import Baseline, Edges
+from bfsensor.diagnose.baseline import Baseline, Edges, area_matrix
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
@@ -310,7 +310,7 @@ class Predictor:
             self.baseline,
             self._evened,
             # Patterns are evened out as where the fit began: they hardly depend on it.
-            (float(np.mean(self.start[: self._amps])), self._device(self.start)),
+            (_mean_gain(self.start[: self._amps]), self._device(self.start)),
         )
 
     def modes(
@@ -339,7 +339,7 @@ class Predictor:
         """Layout with the gains and the read noise that parameters say."""
         gains, noise = parameters[: self._amps], parameters[self._amps : 2 * self._amps]
         # Levels of exposures are by the rough gains, which may be a quarter off.
-        scale = float(np.mean(gains)) / float(np.mean(self.layout.gains or (1.0,)))
+        scale = _mean_gain(gains) / _mean_gain(np.array(self.layout.gains))
         return replace(
             self.layout,
             gains=tuple(gains.tolist()),
@@ -354,6 +354,11 @@ class Predictor:
             e.with_values(**{p.name: float(next(values)) for p in fitted(e)})
             for e in self.effects
         )
+
+    @property
+    def kept(self) -> dict[tuple, Any]:
+        """What copies with other effects share; filled by those who use it."""
+        return self._evened
 
     @property
     def _effect_count(self) -> int:
@@ -473,9 +478,10 @@ class Predictor:
             del key
             if channel.unit == PER_ELECTRON:
                 where = _condition(channel, rows[0])
-                a = self.baseline.areas_on(where, device, REDUCED_LEVEL)
+                edges = self.baseline.edges_on(where, device, REDUCED_LEVEL)
+                a = area_matrix(*edges)
                 if chain is not None:
-                    more = chain.area_change(self.baseline.at(where, device)[0], where)
+                    more = chain.area_change(edges, where)
                     a = a * (1 + chain.law.bend * REDUCED_LEVEL)
                     reach = max(more.shape[-1], a.shape[-1]) // 2
                     a = pad_areas(a, reach) + pad_areas(more, reach)
@@ -722,6 +728,11 @@ def _effect_step(effect: Effect, p: Parameter) -> float:
         return p.step
     scale = abs(effect[p.name] - p.neutral)
     return 0.02 * max(scale, p.low) if p.law == "log" else 0.01 * (p.high - p.low)
+
+
+def _mean_gain(gains: NDArray[np.float64]) -> float:
+    """Mean over amplifiers; 1 for a_ij, which have none."""
+    return float(np.mean(gains)) if len(gains) else 1.0
 
 
 def _noise_told(measured: Measured) -> NDArray[np.bool_]:

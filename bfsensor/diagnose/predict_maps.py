@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import fft, ifft, irfft, irfft2, rfft, rfft2
 
 from bfsensor.diagnose.baseline import Baseline, area_matrix
 from bfsensor.diagnose.channels import Channel
@@ -25,6 +26,12 @@ from bfsensor.diagnose.map_waves import smooth_shapes
 from bfsensor.effects.effect import Axes, Effect, Layout, Shot
 
 Spectrum = NDArray[np.complex128]
+
+FAINT = 0.01
+"""Part of its error that a texture's change must reach to be worked out."""
+
+KEPT, KEPT_PIXELS = 12, 2_000_000
+"""Changes by single effects that are kept, and up to which size of a sensor."""
 
 
 def shot_at(
@@ -152,7 +159,7 @@ class MapChange:
         half = a.shape[0] // 2
         rows, columns = (np.arange(-half, half + 1) % n for n in self.layout.shape)
         np.add.at(wide, (rows[:, None], columns[None]), a)
-        x = np.fft.rfft2(wide).real * level
+        x = rfft2(wide).real * level
         small = np.abs(x) < 1e-9
         return np.where(small, 1 + x / 2, np.expm1(x) / np.where(small, 1.0, x))
 
@@ -160,10 +167,7 @@ class MapChange:
         """Of the pixels' areas in a weak flat."""
 
         def change(effect: Effect, shot: Shot) -> NDArray[np.float64] | None:
-            moved = effect.displacements(shot, self.layout)
-            if moved is None:
-                return None
-            return np.asarray(np.diff(moved[0], axis=1) + np.diff(moved[1], axis=0))
+            return area_change(effect, shot, self.layout)
 
         return self._sum("areas", key, share, change)
 
@@ -201,11 +205,34 @@ class MapChange:
         """Transform of what all effects change, made once."""
         if (word, *key) not in self._made:
             shot = self._shot(share)
-            parts = [p for e in self.effects if (p := change(e, shot)) is not None]
+            parts = [
+                p for e in self.effects
+                if (p := self._part(word, e, shot, change)) is not None
+            ]  # fmt: skip
             self._made[word, *key] = (
                 self._transform(np.sum(parts, axis=0)) if parts else None
             )
         return self._made[word, *key]
+
+    def _part(
+        self,
+        word: str,
+        effect: Effect,
+        shot: Shot,
+        change: Callable[[Effect, Shot], NDArray[np.float64] | None],
+    ) -> NDArray[np.float64] | None:
+        """Change by one effect; of some effects that stay as they are it is kept."""
+        if len(self.effects) == 1 or np.prod(self.layout.shape) > KEPT_PIXELS:
+            return change(effect, shot)
+        kept = self._kept.setdefault(("parts",), {})
+        key = word, effect, None if effect.standing else shot
+        if key not in kept:
+            if len(kept) >= KEPT:
+                del kept[next(iter(kept))]
+            kept[key] = change(effect, shot)
+        else:
+            kept[key] = kept.pop(key)
+        return kept[key]
 
     def _transform(self, change: NDArray[np.float64]) -> Spectrum:
         """Spatial frequencies of a relative change, each amplifier over its mean."""
@@ -214,7 +241,8 @@ class MapChange:
             part = np.s_[segment.y : segment.y + segment.rows,
                          segment.x : segment.x + segment.columns]  # fmt: skip
             total[part] /= total[part].mean()
-        return np.asarray(np.fft.rfft2(total - 1.0))
+        total -= 1.0
+        return np.asarray(rfft2(total))
 
     def _rows(self, channel: Channel, name: str) -> tuple[NDArray[np.int64], Axes]:
         """Values of a map, found once: channels do not change."""
@@ -223,8 +251,42 @@ class MapChange:
         if kept is None or kept[0] is not channel:
             rows = np.nonzero(channel.axes["map"] == name)[0]
             axes = {k: channel.axes[k][rows] for k in ("what", "x", "y", "k")}
-            kept = self._kept[key] = channel, rows, parts_of(axes)
+            parts = parts_of(axes)
+            errors = [channel.blocks[n][0, 0] ** 0.5 for n in rows[parts["texture"]]]
+            parts["faint"] = np.array(1e-6 * FAINT * min(errors, default=0.0))
+            kept = self._kept[key] = channel, rows, parts
         return kept[1], kept[2]
+
+
+def area_change(effect: Effect, shot: Shot, layout: Layout) -> NDArray[np.float64] | None:
+    """Relative change of the pixels' areas by an effect; None of none."""
+    moved = effect.displacements(shot, layout)
+    if moved is None:
+        return None
+    return np.asarray(np.diff(moved[0], axis=1) + np.diff(moved[1], axis=0))
+
+
+def lines_of_map(effect: Effect, channel: Channel, layout: Layout) -> NDArray[np.float64]:
+    """Change of the columns and rows of the map of all light alone, nothing evened out."""
+    x, out = channel.axes, np.zeros(len(channel))
+    own = np.nonzero(x["map"] == "all")[0]
+    if not len(own):
+        return out
+    where = Condition(*(float(x[n][own[0]]) for n in Condition._fields))
+    shot = shot_at(layout, where)
+    light, change = effect.light_map(shot, layout), area_change(effect, shot, layout)
+    total = np.zeros(layout.shape)
+    for part in (change, None if light is None else light - 1.0):
+        if part is not None:
+            total += part
+    for segment in layout.segments:
+        box = np.s_[segment.y : segment.y + segment.rows,
+                    segment.x : segment.x + segment.columns]  # fmt: skip
+        total[box] -= total[box].mean()
+    for what, axis, name in (("column", 0, "x"), ("row", 1, "y")):
+        rows = own[x["what"][own] == what]
+        out[rows] = total.mean(axis)[x[name][rows].astype(int)]
+    return out
 
 
 PARTS = ("column", "row", "block", "ring", "texture", "chess")
@@ -247,7 +309,7 @@ def reduce_map(change: NDArray[np.float64], axes: Axes) -> NDArray[np.float64]:
         'what', 'x', 'y', 'k' of the values.
     """
     ny, nx = change.shape
-    return reduce_spectrum(np.fft.rfft2(change), (ny, nx), parts_of(axes))
+    return reduce_spectrum(rfft2(change), (ny, nx), parts_of(axes))
 
 
 def reduce_spectrum(
@@ -262,16 +324,17 @@ def reduce_spectrum(
     shape : tuple of int
         Rows and columns.
     axes : mapping
-        'x', 'y', 'k' of the values, and which of them are each of :data:`PARTS`.
+        'x', 'y', 'k' of the values, and which of them are each of :data:`PARTS`; 'faint': mean
+        square up to which a change has no texture.
     """
     ny, nx = shape
     column, row, block, ring, texture, chess = (axes[w] for w in PARTS)
     out = np.zeros(len(axes["x"]))
-    out[column] = (np.fft.irfft(delta[0], n=nx) / ny)[axes["x"][column].astype(int)]
-    out[row] = (np.fft.ifft(delta[:, 0]).real / nx)[axes["y"][row].astype(int)]
+    out[column] = (irfft(delta[0], n=nx) / ny)[axes["x"][column].astype(int)]
+    out[row] = (ifft(delta[:, 0]).real / nx)[axes["y"][row].astype(int)]
     if not sum(map(len, (block, ring, texture, chess))):
         return out
-    change = np.fft.irfft2(delta, s=shape)
+    change = irfft2(delta, s=shape)
     if len(block):
         side = block_side(shape)
         mean = change[: ny // side * side, : nx // side * side]
@@ -284,11 +347,13 @@ def reduce_spectrum(
         # Rings and texture are those of a map without its smooth shape.
         q_y, q_x = (smooth_shapes(n) for n in shape)
         (f_y, _), (_, f_x) = (_smooth_spectra(n) for n in shape)
-        rough = delta - f_y @ (q_y.T @ change @ q_x) @ f_x.T
+        smooth = q_y.T @ change @ q_x
+        rough = delta - f_y @ smooth @ f_x.T
         power = spectrum_rings(rough, shape)
         out[ring] = 1e6 * power[(axes["k"][ring] * 2 * RINGS).astype(int)]
-        if len(texture):
-            out[texture] = map_texture(np.fft.irfft2(rough, s=shape))[0]
+        square = 2 * float((rough.real**2).sum() + (rough.imag**2).sum()) / (ny * nx) ** 2
+        if len(texture) and square > axes.get("faint", 0.0):
+            out[texture] = map_texture(change - q_y @ smooth @ q_x.T)[0]
     return out
 
 
@@ -296,4 +361,4 @@ def reduce_spectrum(
 def _smooth_spectra(n: int) -> tuple[Spectrum, Spectrum]:
     """Transforms of the smooth shapes along a side, all frequencies and those from 0 on."""
     shapes = smooth_shapes(n)
-    return np.fft.fft(shapes, axis=0), np.fft.rfft(shapes, axis=0)
+    return fft(shapes, axis=0), rfft(shapes, axis=0)

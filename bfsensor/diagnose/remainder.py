@@ -14,8 +14,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bfsensor.diagnose.locate import Finding, Mismatch
+from bfsensor.diagnose.locate import FAMILY, Finding, Mismatch
 from bfsensor.diagnose.mismatch import BaselineFit
+from bfsensor.diagnose.scans import DEVICE, DEVICE_SEEN
 
 ACCURACY = 0.02
 """Of the predictions: part of an effect's own deviate that may be left over (closed forms are
@@ -47,7 +48,8 @@ def counts(
     fits : int
         How many effects are found; their inaccuracies add up.
     """
-    reach = ACCURACY**2 * explained.get(finding.word, 0.0) * max(fits, 1)
+    own = DEVICE_SEEN if finding.word == DEVICE else (finding.word,)
+    reach = ACCURACY**2 * sum(explained.get(w, 0.0) for w in own) * max(fits, 1)
     if finding.family != "chi-square":
         return finding.z**2 > reach
     square, dof = mismatch.chi2[finding.word]
@@ -73,7 +75,6 @@ def stands_out(
     if not mismatch.detected:
         return False
     limit = np.inf if alarm is None else alarm
-    return any(
-        f.p_value < limit and counts(f, mismatch, explained, fits)
-        for f in mismatch.findings
-    )
+    # What an effect of the library would explain is not outside it.
+    found = [f for f in mismatch.findings if alarm is None or f.family != FAMILY]
+    return any(f.p_value < limit and counts(f, mismatch, explained, fits) for f in found)

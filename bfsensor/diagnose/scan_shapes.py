@@ -101,3 +101,30 @@ def boundaries(
             yield f"{where['what']} boundaries", np.where(rows, shape, 0.0), {
                 **where, axis: (lo, hi),
             }  # fmt: skip
+
+
+def frames(
+    x: Mapping[str, NDArray], here: NDArray[np.bool_]
+) -> Iterator[tuple[str, NDArray[np.float64], dict[str, object]]]:
+    """All four rims of a map together, and columns beside every n-th boundary from the rim."""
+    sides = []
+    for what, axis in (("column", "x"), ("row", "y")):
+        rows = here & (x["what"] == what)
+        if rows.any():
+            place = np.where(rows, x[axis], 0).astype(float)
+            sides.append((rows, place, int(place.max()) + 1))
+    for length in (1.5, 3.0, 6.0):
+        pattern = np.zeros(len(here))
+        for rows, place, n in sides:
+            both = np.exp(-place / length) + np.exp(-(n - 1 - place) / length)
+            pattern += np.where(rows, both, 0.0)
+        if sides:
+            yield "rims", pattern, {"what": "rim", "length": length}
+    columns = here & (x["what"] == "column")
+    if columns.any():
+        place = x["x"].astype(int)
+        for period in range(16, 65):
+            inside = (place > 0) & (place < int(place[columns].max()))
+            before, behind = (inside & (place % period == k) for k in (period - 1, 0))
+            pattern = np.where(columns, before * 1.0 - behind, 0.0)
+            yield "combs", pattern, {"what": "comb", "period": float(period)}

@@ -10,13 +10,20 @@ from numpy.typing import NDArray
 
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.mismatch import BaselineFit
-from bfsensor.diagnose.scan_shapes import boundaries, middle, own_shapes
+from bfsensor.diagnose.scan_shapes import boundaries, frames, middle, own_shapes
 
 POWERS = (0, 1, 2, 3)
 """Powers of the level that covariances and means may go with."""
 
 OCTAVES = 4
 """Sizes of strips and boxes, from the whole side on."""
+
+
+DEVICE, DEVICE_SCAN = "device", "device parameter off its card"
+"""Word and family of the scan of the device's parameters, which have no channel of their own."""
+
+DEVICE_SEEN = "flat_cov", "spot"
+"""Channels that they are seen in."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +72,21 @@ def make_templates(fit: BaselineFit) -> Iterator[Template]:
             template = group.template(family, pattern, where)
             if template is not None:
                 yield template
+    yield from _device(fit)
+
+
+def _device(fit: BaselineFit) -> Iterator[Template]:
+    """Pulls of the device's parameters from its card: what each changes.
+
+    The fit gives way along them, held by their spread: what is left along one in the data is its
+    pull, of which noise and scatter as wide as the spread leave a known part.
+    """
+    for n, name in enumerate(fit.names[: fit.slopes.shape[1]]):
+        if name.startswith("device "):
+            rows = np.nonzero(fit.slopes[:, n])[0]
+            if len(rows):
+                where = {"device": name.removeprefix("device ")}
+                yield Template(DEVICE_SCAN, DEVICE, rows, fit.slopes[rows, n], where)
 
 
 class Group:
@@ -271,6 +293,9 @@ def _maps(g: Group) -> Iterator[Pattern]:
             }  # fmt: skip
         if rows.any():
             yield "rings", np.where(rows, 1.0, 0.0), {"map": str(name), "what": "ring"}
+        if name == "all":
+            for family, pattern, where in frames(x, here):
+                yield family, pattern, {"map": str(name), **where}
         yield from _fine_patterns(x, here, str(name))
 
 

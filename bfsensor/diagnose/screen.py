@@ -12,10 +12,20 @@ from scipy.optimize import least_squares
 
 from bfsensor.diagnose.mismatch import BaselineFit
 from bfsensor.diagnose.predict import Predictor, fitted, widened
+from bfsensor.diagnose.predict_maps import lines_of_map
 from bfsensor.effects.effect import Effect, Parameter
 
 REFINED = 2
 """Best starts of a candidate that are refined."""
+
+MANY, LIKELY = 8, 6
+"""More starts than these are held against one channel first, and so many of them against all."""
+
+TELLING = "code_hist", "bias_cov", "flat_map"
+"""Channels that are quickly predicted, and tell starts that are many apart."""
+
+ASTRAY = 0.1
+"""Part by which the best amplitude may be off the start's before the path to it is tried."""
 
 OCCAM = 5.0
 """Logarithm of the evidence that a parameter costs a candidate that is not fitted on, for it is
@@ -46,6 +56,8 @@ class Rival:
     select : float
         Decrease of the chi-square of the fold that selects, amplitude fitted without it; nan
         where the effect is not in that fold.
+    share : float
+        Part of what it changes, squared, that is in that fold.
     """
 
     effect: Effect
@@ -53,6 +65,16 @@ class Rival:
     evidence: float
     template: NDArray[np.float64]
     select: float = np.nan
+    share: float = 0.0
+
+    @property
+    def refuted(self) -> bool:
+        """Whether the fold that selects speaks against it: a loss far below the gain due there.
+
+        Of a gain G, of which the share s is due in that fold, noise leaves s G +- 2 (s G)^(1/2).
+        """
+        due = self.share * self.gain
+        return self.select < min(0.0, due - 3 * 2 * float(np.sqrt(max(due, 0.0))))
 
     @property
     def word(self) -> str:
@@ -88,14 +110,34 @@ class Screen:
         select = [np.full(len(c), c.fold == "select") for c in fit.channels]
         priors = np.zeros(len(fit.left) - len(fit.residuals), bool)
         self._select = np.concatenate([*select, priors])
+        # Of starts: what they change hardly depends on the effects that there are.
+        self._kept = predictor.kept.setdefault(("starts", *map(id, fit.channels)), {})
+        self._channels = predictor.kept.setdefault(("channels",), set())
+        self._channels.add(fit.channels)
+        self._scaled_templates: dict[Effect, NDArray[np.float64]] = {}
 
     def change(self, effect: Effect) -> NDArray[np.float64]:
         """What an effect changes: whitened, priors' rows after it, parameters projected out."""
+        return self._projected(self._change(effect))
+
+    def _projected(self, change: NDArray[np.float64]) -> NDArray[np.float64]:
+        out = np.zeros(len(self.fit.left))
+        out[: len(change)] = change
+        return np.asarray(out - self.fit.basis @ (self.fit.basis.T @ out))
+
+    def _change_of_start(self, effect: Effect) -> NDArray[np.float64]:
+        """As :meth:`change`, found once for all screens of an attribution."""
+        if effect not in self._kept:
+            self._kept[effect] = self._change(effect).astype(np.float32)
+        return self._projected(self._kept[effect])
+
+    def _change(self, effect: Effect) -> NDArray[np.float64]:
+        """What an effect changes, whitened."""
         both = self.predictor.with_effects((*self.predictor.effects, effect), self.point)
         more = both.start[len(both.names) - len(fitted(effect)) :]
         # Parameters of effects that are there already stay where the fit put them.
         point = np.concatenate([self.point, more])
-        out = np.zeros(len(self.fit.left))
+        out = np.zeros(len(self.fit.residuals))
         for n, (channel, start) in enumerate(
             zip(self.fit.channels, self.fit.starts, strict=False)
         ):
@@ -106,29 +148,70 @@ class Screen:
                 here = self._here[n] = self.predictor.predict(channel, self.point)
             moved = both.predict(channel, point) - here
             out[start : start + len(channel)] = channel.whiten(moved)
-        return np.asarray(out - self.fit.basis @ (self.fit.basis.T @ out))
+        return out
 
     def tried(self, kind: type[Effect]) -> list[tuple[float, Effect]]:
         """Places where a fit of a kind of effect may begin, with their gains, greatest first.
 
-        Amplitudes are those that fit best, to first order; empty where nothing of it could be
-        seen.
+        Amplitudes are those that fit best, what changes being a multiple of them and of their
+        square; empty where nothing of it could be seen.
         """
-        starts = kind.starts(self.predictor.layout, self.seen)
-        tried: list[tuple[float, Effect]] = []
-        for values in starts:
-            effect = kind(values)
-            template = self.change(effect)
-            length = float(template @ template)
-            if length <= 0:
-                continue
-            factor = float(template @ self.fit.left) / length
-            signed = any(p.signed for p in kind.parameters if p.amplitude)
-            if factor <= 0 and not signed:
-                tried.append((0.0, effect))
-                continue
-            tried.append((factor**2 * length, _inside(effect.scaled(factor))))
-        return sorted(tried, key=lambda t: -t[0])
+        starts = [_inside(kind(v)) for v in kind.starts(self.predictor.layout, self.seen)]
+        tried = [self._scaled(effect) for effect in self._likely(kind, starts)]
+        return sorted((t for t in tried if t is not None), key=lambda t: -t[0])
+
+    def _scaled(self, effect: Effect) -> tuple[float, Effect] | None:
+        """Gain of an effect of the best amplitude; None of what cannot be seen."""
+        template = self._change_of_start(effect)
+        length = float(template @ template)
+        if length <= 0:
+            return None
+        factor = float(template @ self.fit.left) / length
+        signed = any(p.signed for p in effect.parameters if p.amplitude)
+        if factor <= 0 and not signed:
+            self._scaled_templates[effect] = template
+            return 0.0, effect
+        if not effect.bends or abs(factor - 1) < ASTRAY:
+            best = _inside(effect.scaled(factor))
+            self._scaled_templates[best] = factor * template
+            return factor**2 * length, best
+        # What it changes is f t1 + f^2 t2: both from another amplitude.
+        other = self._change_of_start(effect.scaled(0.5))
+        one, two = 4 * other - template, 2 * template - 4 * other
+        factor = _best_factor((one, two), self.fit.left, signed=signed)
+        best = _inside(effect.scaled(factor)) if factor else effect
+        template = self.change(best)
+        self._scaled_templates[best] = template
+        # As it is: far from the start what it changes is another thing.
+        return max(float(template @ (2 * self.fit.left - template)), 0.0), best
+
+    def _likely(self, kind: type[Effect], starts: list[Effect]) -> list[Effect]:
+        """Those of many starts that one channel finds likeliest."""
+        word = next((w for w in TELLING if w in kind.touches), "")
+        channels = [
+            (c, start) for c, start in zip(self.fit.channels, self.fit.starts, strict=False)
+            if c.word == word and c.fold == "fit"
+        ]  # fmt: skip
+        if len(starts) <= MANY or not channels:
+            return starts
+        (channel, first), gains = channels[0], []
+        own = slice(first, first + len(channel))
+        basis, left = self.fit.basis[own], self.fit.left[own]
+        for effect in starts:
+            if word == "flat_map":
+                change = lines_of_map(effect, channel, self.predictor.layout)
+            else:
+                chain = self.predictor.with_effects((effect,), self.point)
+                more = chain.start[len(chain.start) - len(fitted(effect)) :]
+                plain = self.predictor.with_effects((), self.point)
+                change = chain.predict(channel, np.append(plain.start, more))
+                change = change - plain.predict(channel, plain.start)
+            template = channel.whiten(change)
+            along = basis.T @ template
+            length = float(template @ template) - float(along @ along)
+            gains.append(float(template @ left) ** 2 / length if length > 0 else 0.0)
+        order = np.argsort(gains)[::-1][:LIKELY]
+        return [starts[n] for n in order]
 
     def best(
         self, tried: Sequence[tuple[float, Effect]], *, least: float = 0.0
@@ -146,7 +229,10 @@ class Screen:
             return None
         if tried[0][0] < least:
             gain, effect = tried[0]
-            return Rival(effect, gain, 0.5 * gain - OCCAM, self.change(effect))
+            template = self._scaled_templates.get(effect)
+            if template is None:
+                template = self.change(effect)
+            return Rival(effect, gain, 0.5 * gain - OCCAM, template)
         rivals = [self._refine(effect) for gain, effect in tried[:REFINED] if gain >= least]
         return max(rivals, key=lambda r: r.gain)
 
@@ -182,21 +268,22 @@ class Screen:
         template = self.fit.left - found.fun
         return Rival(
             best, gain, evidence(best, names, gain, found.jac / scales), template,
-            self._select_gain(template),
+            *self._select_gain(template),
         )  # fmt: skip
 
-    def _select_gain(self, template: NDArray[np.float64]) -> float:
-        """Gain on the fold that selects, the amplitude from the others."""
+    def _select_gain(self, template: NDArray[np.float64]) -> tuple[float, float]:
+        """Gain on the fold that selects, the amplitude from the others; what is due there."""
         own = self._select
         inside = float(template[own] @ template[own])
         outside = float(template[~own] @ template[~own])
         # Of an effect that this fold hardly sees it cannot judge.
         if inside < 0.05 * (inside + outside) or outside == 0:
-            return float("nan")
+            return float("nan"), 0.0
         factor = float(template[~own] @ self.fit.left[~own]) / outside
         residuals = self.fit.left[own]
         after = residuals - factor * template[own]
-        return float(residuals @ residuals - after @ after)
+        gain = float(residuals @ residuals - after @ after)
+        return gain, inside / (inside + outside)
 
 
 def evidence(
@@ -266,3 +353,23 @@ def _inside(effect: Effect) -> Effect:
         low, high = widened(p)
         values[p.name] = float(np.clip(effect[p.name], low, high))
     return effect.with_values(**values)
+
+
+def _best_factor(
+    parts: tuple[NDArray[np.float64], NDArray[np.float64]],
+    left: NDArray[np.float64],
+    *,
+    signed: bool,
+) -> float:
+    """Factor f of f t1 + f^2 t2 that explains most of what is left; 0 if none does."""
+    one, two = parts
+    p = 2 * float(one @ left), 2 * float(two @ left) - float(one @ one)
+    q = -2 * float(one @ two), -float(two @ two)
+    # Gain p0 f + p1 f^2 + q0 f^3 + q1 f^4, whose slope is a cubic.
+    roots = np.roots([4 * q[1], 3 * q[0], 2 * p[1], p[0]])
+    best, most = 0.0, 0.0
+    for f in roots[np.abs(roots.imag) < 1e-6 * (1 + np.abs(roots))].real:
+        gain = float(f * (p[0] + f * (p[1] + f * (q[0] + f * q[1]))))
+        if gain > most and (f > 0 or signed):
+            best, most = float(f), gain
+    return best

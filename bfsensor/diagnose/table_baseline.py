@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,9 @@ WAVELENGTHS = (400.0, 480.0, 550.0, 620.0, 700.0, 750.0, 870.0, 950.0)
 
 SPAN = 0.15, 0.6
 """Parts of the largest background of a table between which the response is taken as a parabola."""
+
+BACK_BIAS = "operating_point.back_bias"
+"""Parameter of :func:`with_operating_point`."""
 
 CHARGE = 100.0
 """Charge above the background [e-] that stands for the differential response."""
@@ -90,6 +95,73 @@ def baseline_of_table(given: str | os.PathLike[str]) -> Baseline:
         bends=bends,
         level=0.5 * (low + high),
     )
+
+
+def with_operating_point(
+    given: str | os.PathLike[str], other: str | os.PathLike[str], *, spread: float = 2.0
+) -> Baseline:
+    """Baseline of a table whose operating point floats on the line to that of another table.
+
+    Of one device at two operating points: the parameter is the back bias, and whatever else
+    differs between the two (gates, as the E2V tables') goes with it in proportion.  It stands among
+    the candidates of an attribution like any parameter of the device.
+
+    Parameters
+    ----------
+    given, other : str or path-like
+        As for :func:`baseline_of_table`; shifts are those of ``given`` until the parameter moves.
+    spread : float
+        Of the back bias about its value [V].  The default is assumed: 2 V, as of a set point that
+        is told in whole volts and dropped over cables.
+
+    Raises
+    ------
+    DiagnosisError
+        The two are of devices that differ by more than the operating point, of one back bias, or
+        of unlike reach.
+
+    Notes
+    -----
+    The shifts are taken as straight in the back bias between the tables: exact at both.  In truth
+    they go about with its inverse, which halfway from -50 to -70 V is 3 % below the line.
+
+    Examples
+    --------
+    >>> with_operating_point("e2v_ccd250", "e2v_ccd250_70").nominal
+    {'operating_point.back_bias': -50.0}
+    """
+    one, two = baseline_of_table(given), baseline_of_table(other)
+    cards = [_card(g) for g in (given, other)]
+    if cards[0] is None or cards[0] != cards[1]:
+        raise DiagnosisError(
+            f"{given} and {other} are not of one device at two operating points"
+        )
+    step = two.reference[1] - one.reference[1]
+    here, there = (b.edges[b.reference] for b in (one, two))
+    if not step or here[0].shape != there[0].shape:
+        raise DiagnosisError(
+            f"{given} and {other}: back bias {one.reference[1]:g} and {two.reference[1]:g} V, reach "
+            f"{one.reach} and {two.reach}; they must differ in the first alone"
+        )
+    change = (there[0] - here[0]) / step, (there[1] - here[1]) / step
+    return replace(
+        one,
+        name=f"{one.name}, operating point free towards {two.name}",
+        derivatives={BACK_BIAS: change},
+        spread={BACK_BIAS: spread},
+        nominal={BACK_BIAS: one.reference[1]},
+    )
+
+
+def _card(given: str | os.PathLike[str]) -> dict[str, object] | None:
+    """What a table's device is made of; None where the table does not know it."""
+    shipped = tables_dir() / os.fspath(given) / "table.fits"
+    path = shipped if shipped.exists() else Path(given)
+    text = DistortionTable.read(path).device_text if path.suffix == ".fits" else ""
+    if not text:
+        return None
+    known = tomllib.loads(text)
+    return {k: v for k, v in known.items() if k not in ("name", "operating_point")}
 
 
 def _stem(path: Path) -> Path:

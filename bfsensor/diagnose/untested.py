@@ -89,6 +89,17 @@ class Untested(NamedTuple):
         return {"class": self.word, "because": self.because, "recording": self.recording}
 
 
+ALWAYS = (
+    Untested(
+        "outside_library",
+        "noise of the light beyond Poisson's in proportion to it (Fano noise, several electrons a "
+        "photon) is the same as another gain",
+        "exposures of Fe55, which tell the gain by themselves",
+    ),
+)
+"""What flats and spots alone never tell."""
+
+
 def find_untested(measured: Measured) -> tuple[Untested, ...]:
     """Classes of effects that a campaign's recordings cannot show.
 
@@ -102,7 +113,7 @@ def find_untested(measured: Measured) -> tuple[Untested, ...]:
         because = _missing(measured, need)
         if because:
             out.append(Untested(word, because, need.recording))
-    return tuple(out)
+    return (*out, *ALWAYS)
 
 
 def _missing(measured: Measured, need: Need) -> str:

@@ -53,7 +53,7 @@ class CosmicRays(Effect):
     word = "cosmic_rays"
     stage = "store"
     parameters = (Parameter("rate", "1/min", 0.3, 30.0, amplitude=True),)
-    touches = ("dark_map", "flat_cov", "bias_level")
+    touches = ("dark_map", "flat_cov")
     of_pixels = True
     source = (
         "Groom 2002, Exp. Astron. 14, 45 (straight muon tracks in thick CCDs; the muon rate is "
@@ -110,18 +110,7 @@ class CosmicRays(Effect):
             out[rows] = mean + always
         return out
 
-    def bias_level(self, axes: Axes, layout: Layout) -> Values:
-        total = _tracks(layout.thickness, layout.pixel, layout.shape).total()
-        mean = float(self._each(0.0)) * float(total.mean())
-        return np.where(axes["what"] == "level", mean, 0.0)
-
     def modes(self, word: str, axes: Axes, layout: Layout) -> Values | None:
-        if word == "bias_level":
-            total = _tracks(layout.thickness, layout.pixel, layout.shape).total()
-            square = float(self._each(0.0)) * float((total**2).mean())
-            pixels = np.array([s.rows * s.columns for s in layout.segments])
-            own = np.sqrt(square / pixels)[np.asarray(axes["amp"]).astype(int)]
-            return np.diag(np.where(axes["what"] == "level", own, 0.0))
         if word == "flat_cov":
             return scatter_of_pairs(self, axes, layout, partial(self._few, layout=layout))
         if word != "dark_map":
@@ -193,12 +182,6 @@ class Tracks(NamedTuple):
         """Pixels of each track with more charge."""
         weight = np.where(self.charge > limit, self.share, 0.0)
         return np.asarray(np.bincount(self.owner, weight, self.number), float)
-
-    def total(self) -> Values:
-        """Charge of each track on the sensor [e-]."""
-        return np.asarray(
-            np.bincount(self.owner, self.share * self.charge, self.number), float
-        )
 
 
 def make_tracks(

@@ -43,7 +43,7 @@ def struck_pixels(
     >>> struck_pixels(0.0, 0.0, 5.0)[0] < 1e-8, struck_pixels(3000.0, 0.0, 5.0)
     (True, (1.0, 3000.0))
     """
-    if not noise > 0:
+    if not noise > 0 or not mean:
         return 0.0, mean
     if mean < LARGE:
         number = np.arange(int(mean + 12 * np.sqrt(mean) + 20))

@@ -20,6 +20,7 @@ class EdgeRolloff(Effect):
     )
     touches = ("flat_map",)
     of_pixels = True
+    bends = True
     source = (
         "Bradshaw et al. 2015, JINST 10, C04034 (arXiv 1507.02683): spots displaced near the edge of "
         "an LSST prototype; an exponential and its range are assumed"

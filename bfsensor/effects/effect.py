@@ -250,8 +250,12 @@ class Effect:
     standing : bool
         Whether :meth:`light_map`, :meth:`displacements` and :meth:`pattern` are the same in all
         flats.
+    from_sightings : bool
+        Whether :meth:`starts` are taken from waves that were sought in maps.
     of_pixels : bool
         Whether its predictions need the amplifiers' pixels, which reduced recordings do not tell.
+    bends : bool
+        Whether what it changes goes with the square of its amplitude as well.
     """
 
     values: Mapping[str, float]
@@ -265,6 +269,8 @@ class Effect:
     by_time: ClassVar[bool] = False
     standing: ClassVar[bool] = False
     of_pixels: ClassVar[bool] = False
+    from_sightings: ClassVar[bool] = False
+    bends: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         needed = {p.name for p in self.parameters}

@@ -37,6 +37,8 @@ class Fringing(Effect):
     )
     touches = ("flat_map",)
     of_pixels = True
+    from_sightings = True
+    bends = True
     source = (
         "Howell 2012, PASP 124, 263 (small variations of thickness make the pattern; from about "
         "700 nm in thinned CCDs); range of thick ones assumed"

@@ -33,7 +33,7 @@ from bfsensor.effects.saturation import Saturation
 from bfsensor.effects.shutter_timing import ShutterTiming
 from bfsensor.effects.tearing import Tearing
 from bfsensor.effects.trap_serial import TrapSerial
-from bfsensor.effects.tree_rings import TreeRings
+from bfsensor.effects.tree_rings import TreeRings, UnevenTreeRings
 from bfsensor.effects.voltage_dependence import VoltageDependence
 from bfsensor.errors import EffectError
 
@@ -72,6 +72,7 @@ LIBRARY: tuple[type[Effect], ...] = (
     Tearing,
     TrapSerial,
     TreeRings,
+    UnevenTreeRings,
     VoltageDependence,
 )
 """Every candidate, one for each variant of a class; those of a device's parameters are made for a

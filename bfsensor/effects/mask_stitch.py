@@ -28,6 +28,7 @@ class MaskStitch(Effect):
     )
     touches = ("flat_map",)
     of_pixels = True
+    bends = True
     source = (
         "Pixel sizes that vary by 0.3 % in an LSST prototype: Baumer & Roodman 2015, JINST 10, "
         "C05024 (arXiv 1504.06088); that they repeat with the mask's field, and the range, are assumed"

@@ -42,6 +42,7 @@ class Tearing(Effect):
     )
     touches = ("flat_map", "flat_cov")
     of_pixels = True
+    bends = True
     source = (
         "Juramy et al. 2020, Proc. SPIE 11454, 1145412 (arXiv 2002.09439: holes in channel stops "
         "moved by clocks, worst beside segments' edges); exponential, rows and range are assumed"
@@ -127,7 +128,8 @@ class Tearing(Effect):
     def _open(self, ny: int) -> Values:
         """Part of the exposures in which rows are open."""
         row, never = np.arange(ny) + 0.5, self["open"] * ny
-        return np.asarray(np.clip((ny - row) / max(ny - never, 1.0), 0.0, 1.0))
+        above = np.clip((ny - row) / max(ny - never, 1.0), 0.0, 1.0)
+        return np.where(row <= never, 1.0, above)
 
     def _chance(self, ny: int) -> Values:
         """Covariance of two rows' being open."""

@@ -22,10 +22,12 @@ from bfsensor.effects.effect import (
 class TrapSerial(Effect):
     """A trap fills to ``size`` electrons at once and releases with ``tau`` pixel times.
 
-    ``amp`` counts the amplifiers from zero.  Each row meets it empty: the parallel transfer
-    takes far longer than the release.  Behind a row of light the first k-th pixel of the
-    overscan holds size (1 - exp(-1/tau)) exp(-(k-1)/tau) electrons; what it holds there is
-    missing in the first column.
+    It takes them from what of a packet exceeds ``reach`` electrons: smaller packets pass it by, for
+    it lies where only larger ones spread to (0: it sees all; flats hardly tell).  ``amp`` counts
+    the amplifiers from zero.  Each row meets it empty: the parallel transfer takes far longer than
+    the release.  Behind a row of light the first k-th pixel of the overscan holds
+    size (1 - exp(-1/tau)) exp(-(k-1)/tau) electrons; what it holds there is missing in the first
+    column.
     """
 
     word = "trap_serial"
@@ -34,18 +36,20 @@ class TrapSerial(Effect):
         Parameter("size", "e-", 5.0, 100.0, amplitude=True),
         Parameter("tau", "pixel times", 0.7, 4.0),
         Parameter("amp", "", 0, 1, law="whole"),
+        Parameter("reach", "e-", 0.0, 1000.0, law="flat"),
     )
     touches = ("serial_overscan", "flat_map", "flat_mean", "spot")
     of_pixels = True
     source = (
-        "Single-species trap with instant capture: ArCTIc, Massey et al. 2014, MNRAS 439, 887; "
+        "Single-species trap with instant capture, beyond a depth in the well ('notch'): ArCTIc, "
+        "Massey et al. 2014, MNRAS 439, 887; range of reach assumed; "
         "fixed serial traps of ITL sensors: Snyder & Roodman 2019, JATIS 5, 041509"
     )
 
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
         return [
-            {"size": 20.0, "tau": tau, "amp": float(n)}
+            {"size": 20.0, "tau": tau, "amp": float(n), "reach": 100.0}
             for n in range(len(layout.segments))
             for tau in (0.8, 1.5, 3.0)
         ]
@@ -61,9 +65,8 @@ class TrapSerial(Effect):
             return None
         out = np.zeros(layout.shape)
         column = segment.x + (segment.columns - 1 if segment.flip_x else 0)
-        out[segment.y : segment.y + segment.rows, column] = -min(
-            self["size"] / shot.level, 1.0
-        )
+        held = min(self["size"], max(shot.level - max(self["reach"], 0.0), 0.0))
+        out[segment.y : segment.y + segment.rows, column] = -held / shot.level
         return out
 
     def flat_mean(self, axes: Axes, layout: Layout) -> Values:
@@ -94,13 +97,14 @@ class TrapSerial(Effect):
             np.broadcast_to(level, (*images.shape[:-1], 1)).reshape(-1, 1), 0.0
         )
         lines = images[..., order].reshape(-1, images.shape[-1]) + level
-        held = np.minimum(level[:, 0] / -np.expm1(-1 / self["tau"]), self["size"])
+        reached = np.maximum(level[:, 0] - max(self["reach"], 0.0), 0.0)
+        held = np.minimum(reached / -np.expm1(-1 / self["tau"]), self["size"])
         read = (self._through(lines, held) - level).reshape(images.shape)[..., order]
         return images + share * (read - images)
 
     def _through(self, frame: Image, held: Values | None = None) -> Image:
         """Rows after the trap, first pixel first; what it holds before them is nothing by default."""
-        size = self["size"]
+        size, reach = self["size"], max(self["reach"], 0.0)
         out = np.empty_like(frame)
         held = np.zeros(len(frame)) if held is None else held
         released = -np.expm1(-1 / self["tau"])
@@ -108,7 +112,7 @@ class TrapSerial(Effect):
             free = held * released
             held = held - free
             packet = frame[:, column]
-            caught = np.clip(np.minimum(packet, size - held), 0, None)
+            caught = np.clip(np.minimum(packet - reach, size - held), 0, None)
             out[:, column] = packet - caught + free
             held = held + caught
         return out
@@ -116,7 +120,8 @@ class TrapSerial(Effect):
     def _held(self, axes: Axes) -> Values:
         """Behind the light of a flat, in the trap's amplifier [e-]."""
         mine = axes["amp"].astype(int) == int(self["amp"])
-        held = np.minimum(self["size"], np.maximum(axes["level"], 0.0))
+        reached = axes["level"] - max(self["reach"], 0.0)
+        held = np.minimum(self["size"], np.maximum(reached, 0.0))
         return np.where(mine, held, 0.0)
 
     def _segment(self, layout: Layout) -> Segment | None:

@@ -1,6 +1,7 @@
 """Small campaigns of the virtual sensor, diagnosed: a null, and effects in four channels."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,9 +9,12 @@ from astropy.table import Table
 from click.testing import CliRunner
 
 from bfsensor.cli import main
-from bfsensor.diagnose.diagnosis import SCHEMA, diagnose
+from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.diagnosis import SCHEMA, diagnose, diagnose_measured, fit_bounded
+from bfsensor.diagnose.extract import measure_channels
 from bfsensor.diagnose.locate import Scanner, locate_mismatch, tail_probability
 from bfsensor.diagnose.report import write_report
+from bfsensor.diagnose.scans import DEVICE_SCAN
 from validation.concealed.campaign import write_campaign
 from validation.concealed.library import make_effect
 from validation.concealed.plan import Size
@@ -130,3 +134,26 @@ def test_the_command_diagnoses_a_folder(tmp_path):
     assert again.exit_code == 1 and "nowhere" in again.stderr
     none = CliRunner().invoke(main, ["diagnose", str(folder), "--baseline", "nothing"])
     assert none.exit_code == 1 and "nothing: not a baseline" in none.stderr
+
+
+def test_a_device_off_its_card_is_told_and_not_absorbed(tmp_path):
+    """The fit takes a parameter far off its card: the pull is a finding, named and in words."""
+    small = Size(128, 4, 1, dithers=1)
+    measured = measure_channels(VirtualSource(seed=8112, size=small))
+    predictor, fit = fit_bounded(measured, virtual_baseline())
+    point = fit.values[: len(predictor.names)]
+    moved = point.copy()
+    moved[predictor.names.index("device h")] += 8.0
+    channels = tuple(
+        Channel(c.word, c.values + predictor.predict(c, moved) - predictor.predict(c, point),
+                c.blocks, c.axes, c.unit, c.fold)
+        for c in measured.channels
+    )  # fmt: skip
+    found = diagnose_measured(replace(measured, channels=channels), virtual_baseline())
+    assert found.mismatch.detected
+    assert any(f.family == DEVICE_SCAN for f in found.mismatch.findings)
+    report = found.to_report()
+    assert "device_parameter" in report["equivalence_class"]
+    assert set(report["location"]["channels"]) <= {c.word for c in found.fit.channels}
+    assert "device" in report["said"]
+    write_report(found, tmp_path)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bfsensor import Device
-from bfsensor.diagnose.attribute import candidates_of, name_of
+from bfsensor.diagnose.attribute import candidates_of
 from bfsensor.diagnose.baseline import area_matrix
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.conditions import Axes, Condition
@@ -22,6 +22,7 @@ from bfsensor.diagnose.left_out import (
     ring_shifts,
 )
 from bfsensor.diagnose.predict import Predictor
+from bfsensor.diagnose.ranking import name_of
 from bfsensor.diagnose.walk import walk
 from bfsensor.effects.bf_long_range import BrighterFatterLongRange
 from bfsensor.effects.effect import Layout, Shot

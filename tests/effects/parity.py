@@ -1,8 +1,13 @@
 """Whether a prediction agrees with pixels, channel by channel; of any effects of the library."""
 
-from validation.concealed.library import EFFECTS
 from validation.concealed.plan import Size
-from validation.effect_parity import ENGINES, PLACES, compare_at, effect_at
+from validation.effect_parity import (
+    ENGINES,
+    PLACES,
+    compare_at,
+    effect_at,
+    known_to_the_sensor,
+)
 
 SMALL = Size(
     128, 2, 0, dithers=2, flat_seconds=(5.0, 20.0, 40.0, 60.0), spot_seconds=(7.5, 30.0)
@@ -24,11 +29,6 @@ FEW = 0.05
 
 UNSEEN = 1.5
 """Error of a prediction [standard deviations of all that a campaign tells] that hides nothing."""
-
-
-def known_to_the_sensor(kind):
-    """Whether the virtual sensor has the effect too."""
-    return kind.word in EFFECTS and kind.variant in EFFECTS[kind.word].variants
 
 
 def disagreements(effect, engine, size="S", few=FEW):

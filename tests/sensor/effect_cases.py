@@ -123,8 +123,8 @@ PLAIN = {"charge_response": False, "background": False, "depth": False}
 REPORTED = {
     "charge_loss": {"q": 1e-7},
     "interpixel_coupling": {"ax": 0.02, "ay": 0.01},
-    "tearing": {"amp": 0.1, "length": 2.0, "column": 0.5},
-    "trap_serial": {"size": 40.0, "tau": 1.5, "amp": 0.0},
+    "tearing": {"amp": 0.1, "length": 2.0, "column": 0.5, "open": 1.0},
+    "trap_serial": {"size": 40.0, "tau": 1.5, "amp": 0.0, "reach": 50.0},
 }
 
 

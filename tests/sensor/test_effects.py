@@ -176,7 +176,7 @@ def test_added_and_scaled_shifts_follow_one_another():
 
 def test_transposed_sensors_turn_effects():
     charges = np.random.default_rng(8).poisson(2e4, (19, 27)).astype(float)
-    tear = make_effect("tearing", {"amp": 0.1, "length": 2.0, "column": 0.5})
+    tear = make_effect("tearing", {"amp": 0.1, "length": 2.0, "column": 0.5, "open": 1.0})
     layout = {"shape": (19, 27)}
     effects = Ratio({"eps": 0.3}), tear, Rough({"amp": 0.01})
     upright = areas_of(sensor_with(*effects, layout=layout), charges)
@@ -306,13 +306,11 @@ def test_full_well_of_effects_spills_along_the_column():
 
 
 def test_tearing_in_areas_of_columns():
-    tear = make_effect("tearing", {"amp": 0.1, "length": 2.0, "column": 0.5})
+    tear = make_effect("tearing", {"amp": 0.1, "length": 2.0, "column": 0.5, "open": 1.0})
     sensor = sensor_with(
         tear, layout={"shape": (24, 64)}, strength=0.0, diffusion_factor=0.0
     )
-    moved = 0.07 * np.exp(
-        -np.abs(np.arange(65) - 32) / 2.0
-    )  # 0.7 of it: CLOSED of the effect
+    moved = 0.1 * np.exp(-np.abs(np.arange(65) - 32) / 2.0)
     areas = areas_of(sensor, np.zeros((24, 64)))
     np.testing.assert_allclose(areas, np.tile(1 + np.diff(moved), (24, 1)), atol=2e-6)
     count = 3_000_000

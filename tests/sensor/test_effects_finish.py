@@ -204,7 +204,7 @@ def test_coupling_in_covariances():
 def test_trap_per_amplifier_in_readout_order():
     """Two amplifiers read outwards; a trap at the second alone."""
     size, tau = 40.0, 1.5
-    trap = make_effect("trap_serial", {"size": size, "tau": tau, "amp": 1.0})
+    trap = make_effect("trap_serial", {"size": size, "tau": tau, "amp": 1.0, "reach": 0.0})
     layout = {
         "shape": (3, 40),
         "segments": [
@@ -233,7 +233,10 @@ def test_trap_per_amplifier_in_readout_order():
 
 def test_turned_sensors_turn_what_is_stored():
     charge = np.random.default_rng(3).poisson(100.0, (5, 8)).astype(float)
-    effects = COUPLING, make_effect("trap_serial", {"size": 40.0, "tau": 1.5, "amp": 0.0})
+    effects = (
+        COUPLING,
+        make_effect("trap_serial", {"size": 40.0, "tau": 1.5, "amp": 0.0, "reach": 0.0}),
+    )
     images = galsim.ImageD(charge.copy()), galsim.ImageD(charge.T.copy())
     for image, transpose in zip(images, (False, True), strict=True):
         sensor_with(*effects, transpose=transpose, layout={"shape": (5, 8)}).finish(image)
