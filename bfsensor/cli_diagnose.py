@@ -82,6 +82,7 @@ def diagnose(
         find_baseline,
         find_reduced_recording,
         simulate_baseline,
+        with_physics,
     )
     from bfsensor.recording.campaign import read_campaign
 
@@ -95,9 +96,13 @@ def diagnose(
     if floating:
         exposures = () if found is None else found.exposures
         biases = sorted({e.back_bias for e in exposures if e.back_bias is not None})
+        warm = {round(e.temperature) for e in exposures if e.temperature is not None}
         predicted = simulate_baseline(
-            named, floating, biases, keep=folder, progress=Bar("simulations")
-        )
+            named, floating, biases, keep=folder, warming=len(warm) > 1,
+            progress=Bar("simulations"),
+        )  # fmt: skip
+        if explain and named is not None:
+            predicted = with_physics(predicted, named, keep=folder / "walks")
     else:
         predicted = find_baseline(named, card=None if found is None else found.card)
     refuse_unheld(conditions, predicted)

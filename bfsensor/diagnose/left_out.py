@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from bfsensor.device import Device
 from bfsensor.device_parts import Edge, EdgeStrip
 from bfsensor.diagnose.baseline import Baseline, Edges, Key
-from bfsensor.diagnose.device_baseline import WARMER, change_parameter
+from bfsensor.diagnose.device_baseline import FINE, WARMER, change_parameter
 from bfsensor.diagnose.table_baseline import conversion_weights
 from bfsensor.diagnose.walk import LEVEL, SPAN, Walk, walk
 from bfsensor.effects.effect import Effect
@@ -28,7 +29,6 @@ from bfsensor.effects.left_out import (
     DopingRings,
     EdgeField,
     FieldDiffusion,
-    Held,
     Moved,
     MovedEdges,
     Rim,
@@ -38,13 +38,16 @@ from bfsensor.effects.left_out import (
     ring_parameters,
 )
 from bfsensor.errors import DeviceError
-from bfsensor.sensor.drift import Drift, solve_drift
 from bfsensor.simulate.edge_field import front_plane, solve_edge
 from bfsensor.simulate.edge_shift import trace_edge
 from bfsensor.units import VACUUM_PERMITTIVITY
 
-CELLS = 16
-"""Of the meshes of templates, a pixel: at 8 the nearest areas are 5 to 10 % off, at 16 1 to 3 %."""
+CELLS = FINE
+"""Of the meshes of templates, a pixel: as fine as the device's own tables.  From 16 cells templates of
+side diffusion and levels left more than 2 % of themselves, which at 70 standard deviations is
+said to be outside the library; at 8 cells the nearest areas are 5 to 10 % off."""
+
+BACKGROUNDS = LEVEL - SPAN, LEVEL, LEVEL + SPAN
 
 HOLES = 3.0
 """Rise of the quasi-Fermi level of the stops' holes that is all of the piece [V]: 3 V below 0 V,
@@ -64,6 +67,9 @@ GUARD = Edge("x", (EdgeStrip(50.0, 20.0, "none"), EdgeStrip(200.0)))
 
 RIM = 40
 """Boundaries from the edge of which displacements are held."""
+
+if TYPE_CHECKING:
+    from bfsensor.sensor.drift import Drift
 
 LEVEL_OF_HOLES = "operating_point.hole_quasi_fermi_level"
 SPREAD_OF_STOPS = "channel_stop.side_diffusion"
@@ -121,45 +127,55 @@ def physics_left_out(
     }
     seen = {w: None if surface else w for w in colours}
 
-    def changed(quantity: str, by: float) -> dict[float, Walk]:
-        return {
-            b: walk(change_parameter(one, quantity, by), cells=cells, keep=keep)
-            for b, one in here.items()
-        }
+    bent = bool(baseline.slopes)
 
-    def differences(quantity: str, all_of_it: float) -> Held:
+    def walked(one: Device) -> Walk:
+        return walk(
+            one, cells=cells, backgrounds=BACKGROUNDS if bent else (LEVEL,), keep=keep
+        )
+
+    def changed(quantity: str, by: float) -> dict[float, Walk]:
+        return {b: walked(change_parameter(one, quantity, by)) for b, one in here.items()}
+
+    def differences(quantity: str, all_of_it: float) -> Moved:
         """Of the shifts, with so much more of a quantity, at every condition.
 
         Or with so much less, and turned round, where a device cannot have more of it.
         """
-        less = {b: walk(one, cells=cells, keep=keep) for b, one in here.items()}
+        less = {b: walked(one) for b, one in here.items()}
         sign = 1.0
         try:
             more = changed(quantity, all_of_it)
         except DeviceError:
             sign, more = -1.0, changed(quantity, -all_of_it)
-        out: list[tuple[Key, Edges]] = []
+        edges: list[tuple[Key, Edges]] = []
+        levels: list[tuple[Key, tuple[Edges, Edges]]] = []
         for bias in here:
             for w, colour in seen.items():
-                new, old = (d[bias].edges(colour, kelvin) for d in (more, less))
-                moved = sign * (new[0] - old[0]), sign * (new[1] - old[1])
-                out.append(((w, bias), moved))
-        return tuple(out)
+                (new, high), (old, low) = (
+                    (d[bias].edges(colour, kelvin), _bent(d[bias], colour, kelvin))
+                    for d in (more, less)
+                )
+                edges.append(((w, bias), _less(new, old, sign)))
+                if high is not None and low is not None:
+                    both = _less(high[0], low[0], sign), _less(high[1], low[1], sign)
+                    levels.append(((w, bias), both))
+        return Moved(tuple(edges), bent=_as_bent(levels))
 
     found: list[type[Effect]] = [
         left_out(
-            MovedEdges, "free_holes", "", Moved(differences(LEVEL_OF_HOLES, HOLES)),
+            MovedEdges, "free_holes", "", differences(LEVEL_OF_HOLES, HOLES),
             SOURCE.format(f"quasi-Fermi level of the stops' holes {HOLES:g} V higher"),
         ),
         left_out(
-            MovedEdges, "stop_diffusion", "", Moved(differences(SPREAD_OF_STOPS, SIDE)),
+            MovedEdges, "stop_diffusion", "", differences(SPREAD_OF_STOPS, SIDE),
             SOURCE.format(f"side diffusion of the channel stops {SIDE:g} um more"),
         ),
     ]  # fmt: skip
     if not baseline.slopes:
         found.append(_levels(here, seen, kelvin, cells, keep))
     if surface:
-        found.append(_depths(here, list(colours), kelvin, cells, keep))
+        found.append(_depths(here, list(colours), kelvin, cells, keep, bent))
     drifts = {bias: _drift(one) for bias, one in here.items()}
     found.append(_diffusion(drifts, list(colours), device))
     found.append(_rings(drifts, list(colours), plain))
@@ -169,6 +185,23 @@ def physics_left_out(
     return tuple(found)
 
 
+def _less(new: Edges, old: Edges, sign: float = 1.0) -> Edges:
+    return sign * (new[0] - old[0]), sign * (new[1] - old[1])
+
+
+def _bent(walked: Walk, colour: float | None, kelvin: float) -> tuple[Edges, Edges] | None:
+    """Change with the level, where it was walked."""
+    return None if len(walked.backgrounds) == 1 else walked.bent(colour, kelvin)
+
+
+def _as_bent(levels: list[tuple[Key, tuple[Edges, Edges]]]) -> Bent | None:
+    """Slopes and bends of all conditions; None of none."""
+    if not levels:
+        return None
+    slopes, bends = (tuple((k, pair[n]) for k, pair in levels) for n in range(2))
+    return Bent(LEVEL, slopes, bends)
+
+
 def _levels(
     here: dict[float, Device],
     seen: dict[float, float | None],
@@ -176,17 +209,12 @@ def _levels(
     cells: int,
     keep: Path | None,
 ) -> type[Effect]:
-    backgrounds = LEVEL - SPAN, LEVEL, LEVEL + SPAN
-    slopes: list[tuple[Key, Edges]] = []
-    bends: list[tuple[Key, Edges]] = []
+    levels: list[tuple[Key, tuple[Edges, Edges]]] = []
     for bias, one in here.items():
-        walked = walk(one, cells=cells, backgrounds=backgrounds, keep=keep)
-        for w, colour in seen.items():
-            slope, bend = walked.bent(colour, kelvin)
-            slopes.append(((w, bias), slope))
-            bends.append(((w, bias), bend))
+        walked = walk(one, cells=cells, backgrounds=BACKGROUNDS, keep=keep)
+        levels += [((w, bias), walked.bent(colour, kelvin)) for w, colour in seen.items()]
     return left_out(
-        BentResponse, "bf_nonlinear", "simulated", Bent(LEVEL, tuple(slopes), tuple(bends)),
+        BentResponse, "bf_nonlinear", "simulated", _as_bent(levels),
         SOURCE.format("response at three backgrounds"),
     )  # fmt: skip
 
@@ -197,18 +225,24 @@ def _depths(
     kelvin: float,
     cells: int,
     keep: Path | None,
+    bent: bool,
 ) -> type[Effect]:
     edges: list[tuple[Key, Edges]] = []
     warming: list[tuple[Key, Edges]] = []
+    levels: list[tuple[Key, tuple[Edges, Edges]]] = []
     for bias, one in here.items():
-        walked: Walk = walk(one, cells=cells, keep=keep)
-        top = walked.edges(None, kelvin)
+        levels_too = BACKGROUNDS if bent else (LEVEL,)
+        walked = walk(one, cells=cells, backgrounds=levels_too, keep=keep)
+        top, above = walked.edges(None, kelvin), _bent(walked, None, kelvin)
         for w in colours:
             now, hot = walked.edges(w, kelvin), walked.edges(w, kelvin + WARMER)
-            edges.append(((w, bias), (now[0] - top[0], now[1] - top[1])))
-            changes = ((hot[n] - now[n]) / WARMER for n in range(2))
-            warming.append(((w, bias), (next(changes), next(changes))))
-    told = Moved(tuple(edges), tuple(warming), kelvin - ZERO_CELSIUS)
+            edges.append(((w, bias), _less(now, top)))
+            warming.append(((w, bias), _less(hot, now, 1 / WARMER)))
+            there = _bent(walked, w, kelvin)
+            if there is not None and above is not None:
+                both = _less(there[0], above[0]), _less(there[1], above[1])
+                levels.append(((w, bias), both))
+    told = Moved(tuple(edges), tuple(warming), kelvin - ZERO_CELSIUS, _as_bent(levels))
     return left_out(
         MovedEdges, "bf_chromatic", "simulated", told,
         SOURCE.format("light converts where it is absorbed, not at the back surface"),
@@ -217,6 +251,9 @@ def _depths(
 
 def _drift(device: Device) -> Drift:
     """The mean field above the plane that stands for the pixels."""
+    # Sensors import GalSim, which takes a second.
+    from bfsensor.sensor.drift import solve_drift
+
     return solve_drift(
         device.to_toml(), device.operating_point.temperature, front_plane(device).height
     )

@@ -132,7 +132,12 @@ class EffectChain:
     ) -> tuple[Edges, Edges | None]:
         """Shifts without charge and their slopes, of spots, with all effects."""
         kx, ky = self.edges(edges, condition)
-        for level, (sx, sy), _ in self._level_responses(condition):
+        # Shifts may reach farther than their slopes do.
+        reach = kx.shape[0] // 2
+        if slopes is not None:
+            slopes = pad_areas(slopes[0], reach), pad_areas(slopes[1], reach)
+        for level, slope, _ in self._level_responses(condition):
+            sx, sy = (pad_areas(s, reach) for s in slope)
             kx, ky = kx - level * sx, ky - level * sy
             slopes = (sx, sy) if slopes is None else (slopes[0] + sx, slopes[1] + sy)
         return (kx, ky), slopes

@@ -12,6 +12,7 @@ from bfsensor.device import Device
 from bfsensor.diagnose.baseline import Baseline, read_edges
 from bfsensor.diagnose.device_baseline import TABLES, baseline_of_device, write_edges
 from bfsensor.diagnose.free_baseline import free_baseline
+from bfsensor.diagnose.left_out import physics_left_out
 from bfsensor.diagnose.table_baseline import baseline_of_table
 from bfsensor.errors import DeviceError, DiagnosisError
 from bfsensor.recording.amplifiers import AmplifierFrame, read_exposure
@@ -145,6 +146,7 @@ def simulate_baseline(
     back_biases: Sequence[float],
     *,
     keep: Path,
+    warming: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Baseline:
     """Simulate a device with floating parameters, or read what an earlier run kept.
@@ -159,6 +161,8 @@ def simulate_baseline(
         Of the recordings [V].
     keep : Path
         Folder where the shifts are kept as ``baseline_KEY.json``.
+    warming : bool
+        Whether shifts follow the temperature, which recordings at several ask for.
     progress : callable, optional
         Called with (tables made, tables in all).
 
@@ -176,13 +180,35 @@ def simulate_baseline(
     except DeviceError as error:
         raise DiagnosisError(f"parameters float for a device: {error}") from None
     text = "\n".join([
-        TABLES, device.to_toml(), *parameters, *(f"{b:g}" for b in back_biases)
+        TABLES, device.to_toml(), *parameters, *(f"{b:g}" for b in back_biases), *["warming"] * warming,
     ])  # fmt: skip
     path = keep / f"baseline_{hashlib.sha256(text.encode()).hexdigest()[:12]}.json"
     if not path.exists():
         baseline = baseline_of_device(
-            device, parameters=parameters, back_biases=back_biases, progress=progress
+            device,
+            parameters=parameters,
+            back_biases=back_biases,
+            warming=warming,
+            progress=progress,
         )
         keep.mkdir(parents=True, exist_ok=True)
         write_edges(baseline, path)
     return read_edges(path, card=path)
+
+
+def with_physics(
+    baseline: Baseline, given: str | os.PathLike[str], *, keep: Path
+) -> Baseline:
+    """Give a simulated device's baseline what the simulation may leave out, as candidates.
+
+    Parameters
+    ----------
+    baseline : Baseline
+        From :func:`simulate_baseline`.
+    given : str or path-like
+        The device that it was made of.
+    keep : Path
+        Folder where tables are kept: half a minute of CPU time the first time.
+    """
+    pieces = physics_left_out(Device.load(given), baseline, keep=keep)
+    return replace(baseline, pieces=pieces)

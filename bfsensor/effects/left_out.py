@@ -18,16 +18,9 @@ Key = tuple[float, float]
 Held = tuple[tuple[Key, Edges], ...]
 """Wavelength [nm] and back bias [V], and what belongs to them."""
 
-STRENGTH = Parameter("strength", "", 0.05, 2.0, signed=True, amplitude=True)
-"""1: all of it, as simulated; 0: as the baseline."""
-
-
-class Moved(NamedTuple):
-    """Change of the shifts [pixel/e-] by all of a piece, and with the temperature [per K]."""
-
-    edges: Held
-    warming: Held = ()
-    temperature: float = np.nan
+STRENGTH = Parameter("strength", "", -2.0, 2.0, law="flat", signed=True, amplitude=True)
+"""1: all of it, as simulated; 0: as the baseline.  Flat, so that fits stay within 4: straight lines
+mean nothing at ten times the piece."""
 
 
 class Bent(NamedTuple):
@@ -36,6 +29,15 @@ class Bent(NamedTuple):
     level: float
     slopes: Held
     bends: Held
+
+
+class Moved(NamedTuple):
+    """Change of the shifts [pixel/e-] by all of a piece, with the temperature [per K], with charge."""
+
+    edges: Held
+    warming: Held = ()
+    temperature: float = np.nan
+    bent: Bent | None = None
 
 
 class Widths(NamedTuple):
@@ -92,6 +94,12 @@ class MovedEdges(LeftOut):
             moved = add_edges(moved, nearest_edges(told.warming, shot), strength * warmer)
         return moved
 
+    def level_response(
+        self, shot: Shot, layout: Layout
+    ) -> tuple[float, Edges, Edges] | None:
+        del layout
+        return _response(self.template.bent, self["strength"], shot)
+
 
 class BentResponse(LeftOut):
     """Shifts change with the charge that is there, each lag as its table says."""
@@ -102,14 +110,17 @@ class BentResponse(LeftOut):
         self, shot: Shot, layout: Layout
     ) -> tuple[float, Edges, Edges] | None:
         del layout
-        strength, told = self["strength"], self.template
-        if strength == 0.0:
-            return None
-        slope, bend = (
-            tuple(strength * a for a in nearest_edges(held, shot))
-            for held in (told.slopes, told.bends)
-        )
-        return told.level, (slope[0], slope[1]), (bend[0], bend[1])
+        return _response(self.template, self["strength"], shot)
+
+
+def _response(
+    told: Bent | None, strength: float, shot: Shot
+) -> tuple[float, Edges, Edges] | None:
+    """So much of a response by level; None of none."""
+    if told is None or strength == 0.0:
+        return None
+    (sx, sy), (bx, by) = (nearest_edges(h, shot) for h in (told.slopes, told.bends))
+    return told.level, (strength * sx, strength * sy), (strength * bx, strength * by)
 
 
 class FieldDiffusion(LeftOut):
@@ -194,7 +205,9 @@ def _nearest(held: Sequence[tuple[Key, Any]], shot: Shot) -> Any:
 def ring_parameters(size: float) -> tuple[Parameter, ...]:
     """Parameters of doping rings whose displacement is ``size`` pixels at strength 1."""
     amp, *shape = TreeRings.parameters
-    strength = STRENGTH._replace(low=amp.low / size, high=amp.high / size, signed=False)
+    strength = STRENGTH._replace(
+        low=amp.low / size, high=amp.high / size, law="log", signed=False
+    )
     return (strength, *shape)
 
 
