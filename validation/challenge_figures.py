@@ -58,7 +58,7 @@ def tempered(told: dict[str, float], temperature: float) -> dict[str, float]:
     """
     total = sum(told.values())
     powers = {w: p ** (1 / temperature) for w, p in told.items() if p > 0}
-    scale = total / sum(powers.values())
+    scale = total / sum(powers.values()) if powers else 0.0
     return {w: scale * p for w, p in powers.items()}
 
 

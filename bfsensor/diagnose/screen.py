@@ -14,6 +14,7 @@ from bfsensor.diagnose.mismatch import BaselineFit
 from bfsensor.diagnose.predict import Predictor, fitted, widened
 from bfsensor.diagnose.predict_maps import lines_of_map
 from bfsensor.effects.effect import Effect, Parameter
+from bfsensor.errors import BFSensorError
 
 REFINED = 2
 """Best starts of a candidate that are refined."""
@@ -157,7 +158,13 @@ class Screen:
         square; empty where nothing of it could be seen.
         """
         starts = [_inside(kind(v)) for v in kind.starts(self.predictor.layout, self.seen)]
-        tried = [self._scaled(effect) for effect in self._likely(kind, starts)]
+        tried = []
+        for effect in self._likely(kind, starts):
+            try:
+                tried.append(self._scaled(effect))
+            except BFSensorError:
+                # So far off that what is measured cannot be worked out.
+                continue
         return sorted((t for t in tried if t is not None), key=lambda t: -t[0])
 
     def _scaled(self, effect: Effect) -> tuple[float, Effect] | None:
@@ -233,8 +240,14 @@ class Screen:
             if template is None:
                 template = self.change(effect)
             return Rival(effect, gain, 0.5 * gain - OCCAM, template)
-        rivals = [self._refine(effect) for gain, effect in tried[:REFINED] if gain >= least]
-        return max(rivals, key=lambda r: r.gain)
+        rivals = []
+        for gain, effect in tried[:REFINED]:
+            try:
+                rivals += [self._refine(effect)] if gain >= least else []
+            except BFSensorError:
+                # On its way the fit came to where nothing can be measured.
+                continue
+        return max(rivals, key=lambda r: r.gain, default=None)
 
     def _refine(self, effect: Effect) -> Rival:
         """Fit all parameters of a candidate from where it is."""
