@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.flat_channels import TAIL
 from bfsensor.diagnose.free_maps import pattern_column, share_powers
 from bfsensor.diagnose.free_terms import SCALE, Family, Scene, Term, Values, at_lags
@@ -33,7 +33,8 @@ def filter_family(scene: Scene) -> Family | None:
     columns, which lack it; in covariances along the row at the lag n; in the mean (p = 2); in
     spots.  Amplifiers that read from the other side are mirrored.
     """
-    words = {c.word for c in scene.model.fit.channels}
+    # Area changes know no level that a response could go with.
+    words = {c.word for c in scene.model.fit.channels if c.unit != PER_ELECTRON}
     if not words & {"serial_overscan", "flat_cov"}:
         return None
     terms = tuple(
@@ -76,6 +77,8 @@ def _beside_spots(scene: Scene, n: int, p: int) -> Iterator[Term]:
 def _column(
     scene: Scene, n: int, p: int, channel: Channel, *, spots: bool
 ) -> Values | None:
+    if channel.unit == PER_ELECTRON:
+        return None
     make: dict[str, Callable[[Scene, int, int, Channel], Values | None]] = {
         "serial_overscan": _overscan, "flat_cov": _covariances, "flat_mean": _means,
         "flat_map": _maps,

@@ -157,6 +157,8 @@ def _amplifiers(
     parts: list[tuple[Channel, Values]], words: list[str], count: int
 ) -> list[int]:
     """Amplifiers, counted from one, that show it; all where no channel tells."""
+    if not count:
+        return []
     sums = np.zeros(count)
     for name in ("amp", "other"):
         amp, square = _gathered(parts, lambda c: c.word in words and c.word != "spot", name)

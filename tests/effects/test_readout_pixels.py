@@ -10,11 +10,10 @@ from bfsensor.effects.library import LIBRARY, make_effect
 from bfsensor.effects.transfer import behind_flat, late_shares
 from tests.effects.parity import RANDOM
 from tests.effects.test_readout_parity import KINDS, NAMES
-from validation.concealed.library import make_effect as sensors_own
 from validation.concealed.plan import Exposure as Taken
 from validation.concealed.plan import Geometry
 from validation.concealed.readout import Context, Electronics
-from validation.effect_parity import effect_at
+from validation.effect_parity import effect_at, own_effect
 
 SEGMENTS = (
     Segment(0, 0, 10, 12, False, False, 3, 8, 8),
@@ -99,7 +98,7 @@ def test_pixels_are_those_of_the_sensors_own_effect(kind):
     """Noise apart, that each draws for itself."""
     effect = effect_at(kind, 0.9)
     geometry = Geometry(32, 2, 3, 8, 8)
-    own = sensors_own(effect.word, dict(effect.values), effect.variant)
+    own = own_effect(effect)
     taken = Taken("FLAT", 3, 60000.0 + 1.5 / 24, 5.0)
     context = Context(
         taken, geometry, lambda word: np.random.default_rng(7),
@@ -166,7 +165,9 @@ def test_behind_flat_is_the_overscan_of_a_flat_frame():
 
 
 def test_trap_lowers_the_first_column_and_fills_the_overscan():
-    effect = make_effect("trap_serial", {"size": 50.0, "tau": 2.0, "amp": 1.0})
+    effect = make_effect(
+        "trap_serial", {"size": 50.0, "tau": 2.0, "amp": 1.0, "reach": 0.0}
+    )
     frame = np.zeros((4, 21))
     frame[:, 3:13] = 3000.0
     assert effect.shift(frame, 0, LAYOUT) is frame
