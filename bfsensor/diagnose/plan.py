@@ -159,7 +159,10 @@ def plan(attribution: Attribution, candidates: Sequence[Recording] | None = None
         there = Forecaster(other.predictor, other.fit)
         judged = []
         for recording in candidates:
-            values = _expected(recording, here, there, made, found_, rival)
+            try:
+                values = _expected(recording, here, there, made, found_, rival)
+            except DiagnosisError:
+                continue  # Where one of the two predicts what cannot be measured.
             if values is not None:
                 judged.append((recording, values))
         taken = sum(model.predictor.measured.counts.values())
