@@ -118,7 +118,7 @@ def _effects(
         )
         gain = effect.get("gain_chi2")
         if gain is not None and gain == gain:
-            tags += f"<span class=tag>chi-square falls by {gain:.4g}</span>"
+            tags += f"<span class=tag>chi-square falls by {gain:,.0f}</span>"
         source = (
             f"<p class=source>{_text(effect['source'])}</p>" if effect.get("source") else ""
         )
