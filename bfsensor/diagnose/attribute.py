@@ -157,6 +157,9 @@ def _forward(
         screen = Screen(model.predictor, model.fit, seen_of(mismatch))
         others = further(concerned(kinds, mismatch), model.effects)
         ranking = with_hypotheses(model, others, rank(screen, others))
+        notes += [
+            f"{name}, tried at one place: {why}" for name, why in screen.passed_over.items()
+        ]
         critical = threshold(screen, ranking, seed=seed)
         good = [r for r in ranking if r.gain > critical and not r.refuted]
         rankings[len(model.effects)] = ranking

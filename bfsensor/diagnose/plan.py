@@ -161,8 +161,12 @@ def plan(attribution: Attribution, candidates: Sequence[Recording] | None = None
         for recording in candidates:
             try:
                 values = _expected(recording, here, there, made, found_, rival)
-            except DiagnosisError:
-                continue  # Where one of the two predicts what cannot be measured.
+            except DiagnosisError as error:
+                notes.append(
+                    f"no forecast of {recording.name} for {found_.effect.word} and "
+                    f"{rival.word}: {error}"
+                )
+                continue
             if values is not None:
                 judged.append((recording, values))
         taken = sum(model.predictor.measured.counts.values())

@@ -115,6 +115,8 @@ class Screen:
         self._kept = predictor.kept.setdefault(("starts", *map(id, fit.channels)), {})
         self._channels = predictor.kept.setdefault(("channels",), set())
         self._channels.add(fit.channels)
+        self.passed_over: dict[str, str] = {}
+        """Candidates of which a start or a fit could not be worked out, and why."""
         self._scaled_templates: dict[Effect, NDArray[np.float64]] = {}
 
     def change(self, effect: Effect) -> NDArray[np.float64]:
@@ -162,9 +164,9 @@ class Screen:
         for effect in self._likely(kind, starts):
             try:
                 tried.append(self._scaled(effect))
-            except BFSensorError:
+            except BFSensorError as error:
                 # So far off that what is measured cannot be worked out.
-                continue
+                self.passed_over[effect.name] = str(error)
         return sorted((t for t in tried if t is not None), key=lambda t: -t[0])
 
     def _scaled(self, effect: Effect) -> tuple[float, Effect] | None:
@@ -244,9 +246,9 @@ class Screen:
         for gain, effect in tried[:REFINED]:
             try:
                 rivals += [self._refine(effect)] if gain >= least else []
-            except BFSensorError:
+            except BFSensorError as error:
                 # On its way the fit came to where nothing can be measured.
-                continue
+                self.passed_over[effect.name] = str(error)
         return max(rivals, key=lambda r: r.gain, default=None)
 
     def _refine(self, effect: Effect) -> Rival:

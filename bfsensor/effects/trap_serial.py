@@ -23,7 +23,8 @@ class TrapSerial(Effect):
     """A trap fills to ``size`` electrons at once and releases with ``tau`` pixel times.
 
     It takes them from what of a packet exceeds ``reach`` electrons: smaller packets pass it by, for
-    it lies where only larger ones spread to (0: it sees all; flats hardly tell).  ``amp`` counts
+    it lies where only larger ones spread to (0: it sees all; flats hardly tell; a sharp limit is
+    assumed, a capture that grows with the packet describes spots as well).  ``amp`` counts
     the amplifiers from zero.  Each row meets it empty: the parallel transfer takes far longer than
     the release.  Behind a row of light the first k-th pixel of the overscan holds
     size (1 - exp(-1/tau)) exp(-(k-1)/tau) electrons; what it holds there is missing in the first
