@@ -9,6 +9,7 @@ from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.diagnosis import fit_bounded
 from bfsensor.diagnose.extract import measure_channels
 from bfsensor.diagnose.locate import ALARM, FAMILY, locate_mismatch
+from bfsensor.diagnose.model import Model
 from bfsensor.diagnose.screen import Screen
 from bfsensor.diagnose.suspects import suspect_effects, trials_of
 from bfsensor.effects.persistence import Persistence
@@ -63,9 +64,10 @@ def test_what_scans_hardly_see_is_found_by_its_own_shape(null):
     first = found.findings[0]
     assert (first.family, first.where["effect"]) == (FAMILY, "persistence")
     assert abs(first.z - 8.0) < 3.0
-    # What is there already is not suspected again.
-    model = predictor.with_effects((effect,), fit.values)
-    assert model.effects[0].word == "persistence"
+    # What is there already is not suspected again, and nothing else is.
+    model = Model(predictor, fit).with_effects((effect,))
+    left = suspect_effects(model.predictor, model.fit, locate_mismatch(model.fit))
+    assert not left.detected and not left.findings
 
 
 def test_places_that_are_tried_are_charged(null):

@@ -326,3 +326,27 @@ def test_waves_begin_close_enough_for_a_fit_to_arrive(period):
     )
     assert fit.cost < 1e-12
     assert abs(fit.x[1] / period - 1) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("level", "reach"), [(0.0, 0.0), (8.0, 0.0), (40.0, 0.0), (8.0, 100.0)]
+)
+def test_a_trap_meets_spots_as_the_background_leaves_it(level, reach):
+    """A spot of few electrons on a background, against long rows that begin with that background."""
+    values = {"size": 30.0, "tau": 1.5, "amp": 0.0, "reach": reach}
+    effect = make_effect("trap_serial", values)
+    alone = Layout((12, 20), SEGMENTS[:1])
+    x = np.arange(15) - 7.0
+    spot = np.exp(-np.add.outer(x**2, x**2) / 4.0)[None]
+    spot *= 8000 / spot.sum()
+    axes = {"background": level / spot.sum()}
+    seen = effect.spot_image(spot, axes, alone)[0] - spot[0]
+    rows = np.concatenate([np.full((15, 300), level), spot[0] + level], axis=1)
+    frame = effect.shift(rows, 0, alone)
+    np.testing.assert_allclose(seen, frame[:, 300:] - rows[:, 300:], atol=1e-9)
+    # A background that keeps the trap full leaves it nothing to take; small packets pass it by.
+    full = level > 30.0
+    assert (np.abs(seen).max() < 1e-9) == full
+    if reach:
+        none = effect.spot_image(spot * reach / spot.max(), {"background": 0.0}, alone)
+        np.testing.assert_allclose(none, spot * reach / spot.max(), atol=1e-9)
