@@ -43,7 +43,7 @@ from bfsensor.diagnose.remainder import (
     stands_out,
 )
 from bfsensor.diagnose.screen import Rival, Screen
-from bfsensor.diagnose.suspects import suspect_effects
+from bfsensor.diagnose.suspects import locate_effects
 from bfsensor.effects.effect import Effect
 from bfsensor.errors import ConvergenceError
 
@@ -199,9 +199,8 @@ def _step(
         except ConvergenceError as error:
             notes.append(f"{rival.effect.name}: {error}")
             continue
-        left = locate_mismatch(further.fit, seed=seed)
-        if sure or not left.detected:
-            return further, suspect_effects(further.predictor, further.fit, left, kinds)
+        if sure or not locate_mismatch(further.fit, seed=seed).detected:
+            return further, locate_effects(further.predictor, further.fit, kinds, seed=seed)
     return None
 
 

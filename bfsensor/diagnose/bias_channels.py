@@ -10,9 +10,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Axes, Condition, Exposure, Frame
-
-READOUT_LAGS = 32
-"""Largest lag of the noise in readout order [pixel times]."""
+from bfsensor.effects.noise import READOUT_LAGS, near_lags
 
 OUTLIER = 6.0
 """Deviation [sigma] from which a pixel of a dark or bias counts as struck: one in 5e8 by noise."""
@@ -352,8 +350,18 @@ def _errors_in_order(c: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _row_excess(noise: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Variance of the rows' means over what white noise gives, less one; its error; and that."""
+    """Variance of the rows' means over what white noise gives, less one; its error; and that.
+
+    Without the share of pixels that are few lags apart: those covariances are told by themselves,
+    and what is told twice would count twice.
+    """
     rows, columns = noise.shape
     share = noise.var() / columns
     excess = float(noise.mean(1).var(ddof=1) / share - 1.0)
-    return excess, float(np.sqrt(2.0 / (rows - 1))), float(share)
+    noise = noise - noise.mean()
+    lags = near_lags(columns)
+    near = sum((noise[:, k:] * noise[:, :-k]).sum() / rows / columns for k in lags.tolist())
+    excess -= 2 * float(near) / float(noise.var())
+    # All products of two pixels of a row have the same variance, and no covariance.
+    far = 2.0 / (rows - 1) - 4.0 / rows / columns * float((1 - lags / columns).sum())
+    return excess, float(np.sqrt(far)), float(share)

@@ -109,10 +109,13 @@ class BaselineFit:
 
     def draw(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Residuals that noise alone leaves, shape (count, n), the fit linear about its end."""
-        total, n = len(self.basis), len(self.residuals)
-        noise = rng.standard_normal((count, total))
+        return self.draw_all(rng, count)[:, : len(self.residuals)]
+
+    def draw_all(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """As :meth:`draw`, those of the priors after them."""
+        noise = rng.standard_normal((count, len(self.basis)))
         noise -= (noise @ self.basis) @ self.basis.T
-        return np.asarray(noise[:, :n])
+        return noise
 
 
 def fit_baseline(
