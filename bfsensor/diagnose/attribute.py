@@ -33,6 +33,7 @@ from bfsensor.diagnose.ranking import (
     rank,
     refine,
     seen_of,
+    tellable,
     threshold,
     with_hypotheses,
 )
@@ -105,8 +106,7 @@ def attribute(
         Of the noise that thresholds come from.
     """
     kinds = candidates_of(predictor.baseline) if kinds is None else kinds
-    if not predictor.layout.segments:
-        kinds = [k for k in kinds if not k.of_pixels]
+    kinds = tellable(kinds, predictor, fit.channels)
     base = Model(predictor, fit)
     candidates = (*kinds, *NAMED)
     first = mismatch

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from bfsensor.diagnose.locate import ALARM, FAMILY, Finding, Known, Locator, Mismatch
 from bfsensor.diagnose.mismatch import BaselineFit
 from bfsensor.diagnose.predict import Predictor, fitted
-from bfsensor.diagnose.ranking import candidates_of, further, name_of, seen_of
+from bfsensor.diagnose.ranking import candidates_of, further, name_of, seen_of, tellable
 from bfsensor.diagnose.screen import Screen
 from bfsensor.effects.effect import Effect
 
@@ -57,8 +57,7 @@ def locate_effects(
         return replace(mismatch, p_value=2 * mismatch.p_value)
     if kinds is None:
         kinds = candidates_of(predictor.baseline)
-    if not predictor.layout.segments:
-        kinds = [k for k in kinds if not k.of_pixels]
+    kinds = tellable(kinds, predictor, fit.channels)
     kinds = further(kinds, predictor.effects_at(fit.values[: len(predictor.names)]))
     screen = Screen(predictor, fit, seen_of(mismatch))
     mismatch = locator.with_library(known_shapes(screen, kinds)).locate()
