@@ -1,6 +1,6 @@
 r"""Tables as the pipelines of LSST correct with them: kernels and distortion matrices.
 
-The mean shifts of all edges by one electron (:mod:`bfsensor.edge_shifts`) become a distortion
+The mean shifts of all edges by one electron (:mod:`bfsensor.quadrant_shifts`) become a distortion
 matrix; their divergence, the a-matrix, becomes a kernel.  Arrays of lags are
 [j, i]; the files have [i][j], which :mod:`bfsensor.recording.lsst_datasets` sees to.
 """
@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import diags, identity, kron
 from scipy.sparse.linalg import spsolve
 
-from bfsensor.edge_shifts import EdgeShifts
 from bfsensor.errors import TableError
+from bfsensor.quadrant_shifts import QuadrantShifts
 from bfsensor.recording.lsst_datasets import BrighterFatterKernel, DistortionMatrix
 
 _POSITIVE = 0.025
@@ -77,7 +77,7 @@ def _tiled(quadrant: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def make_kernel(
-    shifts: EdgeShifts,
+    shifts: QuadrantShifts,
     gains: Mapping[str, float],
     *,
     noises: Mapping[str, float] | None = None,
@@ -88,8 +88,8 @@ def make_kernel(
 
     Parameters
     ----------
-    shifts : EdgeShifts
-        From :func:`bfsensor.edge_shifts.edge_shifts`.
+    shifts : QuadrantShifts
+        From :func:`bfsensor.quadrant_shifts.quadrant_shifts`.
     gains : mapping of str to float
         Gain [e-/ADU] by name of amplifier.
     noises : mapping of str to float, optional
@@ -113,7 +113,7 @@ def make_kernel(
 
     Examples
     --------
-    >>> shifts = EdgeShifts(np.full((2, 2), -1e-7), np.full((2, 2), -1e-7))
+    >>> shifts = QuadrantShifts(np.full((2, 2), -1e-7), np.full((2, 2), -1e-7))
     >>> make_kernel(shifts, {"C00": 1.6}).columns["KERNEL"].shape
     (1, 5, 5)
     """
@@ -143,10 +143,10 @@ def make_kernel(
 
 
 def make_distortion_matrix(
-    shifts: EdgeShifts,
+    shifts: QuadrantShifts,
     gains: Mapping[str, float],
     *,
-    filters: Mapping[str, EdgeShifts] | None = None,
+    filters: Mapping[str, QuadrantShifts] | None = None,
     thickness: float = float("nan"),
     pitch: float = float("nan"),
     meta: Mapping[str, Any] | None = None,
@@ -155,11 +155,12 @@ def make_distortion_matrix(
 
     Parameters
     ----------
-    shifts : EdgeShifts
-        From :func:`bfsensor.edge_shifts.edge_shifts`, for light that converts at the back surface.
+    shifts : QuadrantShifts
+        From :func:`bfsensor.quadrant_shifts.quadrant_shifts`, for light that converts at
+        the back surface.
     gains : mapping of str to float
         Gain [e-/ADU] by name of amplifier.
-    filters : mapping of str to EdgeShifts, optional
+    filters : mapping of str to QuadrantShifts, optional
         By the pipeline's name of the physical filter, for its light.  Without any the
         version is 1.0, which has no such columns.
     thickness, pitch : float
@@ -181,7 +182,7 @@ def make_distortion_matrix(
 
     Examples
     --------
-    >>> shifts = EdgeShifts(np.full((2, 2), -1e-7), np.full((2, 2), -1e-7))
+    >>> shifts = QuadrantShifts(np.full((2, 2), -1e-7), np.full((2, 2), -1e-7))
     >>> found = make_distortion_matrix(shifts, {"C00": 1.6}, filters={"y_10": shifts})
     >>> found.columns["A_N_BY_FILTER"].shape
     (1, 1, 2, 2)

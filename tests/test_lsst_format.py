@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bfsensor.edge_shifts import EdgeShifts, edge_shifts
 from bfsensor.errors import TableError
 from bfsensor.lsst_format import make_distortion_matrix, make_kernel, solve_kernel
+from bfsensor.quadrant_shifts import QuadrantShifts, quadrant_shifts
 from bfsensor.recording.lsst_datasets import BrighterFatterKernel, DistortionMatrix
 from tests.smooth_tables import make_rough_table, make_table, pull
 
@@ -29,7 +29,7 @@ def table_of(**options):
 
 def test_shifts_are_those_of_the_field():
     """Mean over an edge of the field, by Gauss's quadrature."""
-    shifts = edge_shifts(table_of(), lags=4)
+    shifts = quadrant_shifts(table_of(), lags=4)
     nodes, weights = np.polynomial.legendre.leggauss(40)
     for j in range(4):
         for i in range(4):
@@ -45,7 +45,7 @@ def test_shifts_are_those_of_the_field():
 def test_areas_are_those_of_the_polygons():
     table = make_table(reach=3)
     for background in (0.0, 40_000.0):
-        shifts = edge_shifts(table, background=background, lags=4)
+        shifts = quadrant_shifts(table, background=background, lags=4)
         change = table.area_changes(
             charge=background + 1.0, background=background, depth=100.0
         )
@@ -57,14 +57,14 @@ def test_areas_are_those_of_the_polygons():
 
 
 def test_opposite_sides_mirror_one_another():
-    shifts = edge_shifts(make_rough_table(5501, pitch=(10.0, 10.0)), lags=3)
+    shifts = quadrant_shifts(make_rough_table(5501, pitch=(10.0, 10.0)), lags=3)
     np.testing.assert_array_equal(shifts.south[0], shifts.north[0])
     np.testing.assert_array_equal(shifts.south[1:], -shifts.north[:-1])
     np.testing.assert_array_equal(shifts.west[:, 1:], -shifts.east[:, :-1])
 
 
 def test_without_tail_the_areas_add_up_to_nothing():
-    shifts = edge_shifts(table_of(), tail_slope=None)
+    shifts = quadrant_shifts(table_of(), tail_slope=None)
     areas = shifts.areas
     twice = np.outer(*[np.where(np.arange(8) > 0, 2, 1)] * 2)
     assert areas[3, 0] != 0 and areas[4, 0] != 0
@@ -79,8 +79,8 @@ def test_a_tail_goes_on_as_the_power_that_it_is():
         x, y = np.broadcast_arrays(x, y)
         return np.stack([-x, -y], -1) * ((x**2 + y**2 + 1e-9) ** -1.35)[..., None]
 
-    wide = edge_shifts(table_of(field=power), lags=4)
-    near = edge_shifts(make_table(response=flat_response, reach=2, field=power), lags=4)
+    wide = quadrant_shifts(table_of(field=power), lags=4)
+    near = quadrant_shifts(make_table(response=flat_response, reach=2, field=power), lags=4)
     for one, other in zip(near, wide, strict=True):
         # The tail is taken at the middle of an edge, the table's is its mean: 3 % at
         # three pixels.
@@ -89,11 +89,11 @@ def test_a_tail_goes_on_as_the_power_that_it_is():
 
 def test_light_converts_where_its_absorption_says():
     table = make_table(response=deep_response, reach=2)
-    surface = edge_shifts(table, lags=3, tail_slope=None)
-    blue = edge_shifts(
+    surface = quadrant_shifts(table, lags=3, tail_slope=None)
+    blue = quadrant_shifts(
         table, wavelengths=[450.0], temperature=173.0, lags=3, tail_slope=None
     )
-    red = edge_shifts(
+    red = quadrant_shifts(
         table, wavelengths=[1000.0], photons=[3.0], temperature=173.0, lags=3,
         tail_slope=None,
     )  # fmt: skip
@@ -122,7 +122,7 @@ def test_a_kernel_known_in_closed_form():
 
 
 def test_a_kernel_gives_back_its_areas():
-    areas = edge_shifts(make_table(reach=3)).areas
+    areas = quadrant_shifts(make_table(reach=3)).areas
     kernel = solve_kernel(areas)
     assert kernel.shape == (17, 17)
     assert not kernel[0].any() and not kernel[:, -1].any()
@@ -138,8 +138,8 @@ def test_a_kernel_gives_back_its_areas():
 
 def test_files_come_back_equal(tmp_path):
     table = make_table(reach=3)
-    shifts = edge_shifts(table)
-    red = edge_shifts(table, wavelengths=[1000.0], temperature=173.0)
+    shifts = quadrant_shifts(table)
+    red = quadrant_shifts(table, wavelengths=[1000.0], temperature=173.0)
     kernel = make_kernel(shifts, GAINS, noises={"C01": 6.0}, meta={"DETECTOR": 94})
     kernel.write(tmp_path / "bfk.fits")
     assert BrighterFatterKernel.read(tmp_path / "bfk.fits") == kernel
@@ -151,13 +151,13 @@ def test_files_come_back_equal(tmp_path):
         assert DistortionMatrix.read(tmp_path / f"{name}.fits") == matrix
         assert matrix.parameters == {"thickness": 100.0, "pixelsize": 10.0}
         assert matrix.version == (1.1 if filters else 1.0)
-    changed = make_kernel(EdgeShifts(shifts.north * 1.000001, shifts.east), GAINS)
+    changed = make_kernel(QuadrantShifts(shifts.north * 1.000001, shifts.east), GAINS)
     assert changed != kernel
 
 
 def test_exchanged_axes_are_noticed(tmp_path):
     """In the files the first axis is the serial lag; reading them as [j, i] exchanges axes."""
-    shifts = edge_shifts(make_table(reach=3))
+    shifts = quadrant_shifts(make_table(reach=3))
     assert shifts.areas[1, 0] > 1.2 * shifts.areas[0, 1]
     make_kernel(shifts, GAINS).write(tmp_path / "bfk.fits")
     make_distortion_matrix(shifts, GAINS, filters={"y_10": shifts}).write(
@@ -183,7 +183,7 @@ def test_exchanged_axes_are_noticed(tmp_path):
 
 
 def test_what_was_not_measured_is_not_made_up():
-    shifts = edge_shifts(make_table(reach=3))
+    shifts = quadrant_shifts(make_table(reach=3))
     kernel = make_kernel(shifts, GAINS).columns
     assert not kernel["EXP_ID_MASK"].any()
     for name in ("RAW_MEANS", "RAW_VARIANCES", "RAW_XCORRS", "NOISE"):
@@ -192,40 +192,43 @@ def test_what_was_not_measured_is_not_made_up():
     for name in ("A_MATRIX_SIGMA", "ATH", "FIT_CHI2", "FIT_PARAM_ERRORS"):
         assert np.isnan(matrix[name]).all()
     assert make_kernel(shifts, GAINS).columns["VALID"].tolist() == [1, 1]
-    away = EdgeShifts(-shifts.north, -shifts.east)
+    away = QuadrantShifts(-shifts.north, -shifts.east)
     assert make_kernel(away, GAINS).columns["VALID"].tolist() == [0, 0]
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda t: edge_shifts(t, lags=1), "lags = 1 must be a whole number from 2"),
-        (lambda t: edge_shifts(t, tail_slope=-0.5), "tail_slope = -0.5 must be below -1"),
-        (lambda t: edge_shifts(t, background=1e6), "background = 1e\\+06 is outside"),
-        (lambda t: edge_shifts(t, photons=[1.0]), "photons need their wavelengths"),
-        (lambda t: edge_shifts(t, wavelengths=[500.0]), "the table holds no device"),
+        (lambda t: quadrant_shifts(t, lags=1), "lags = 1 must be a whole number from 2"),
         (
-            lambda t: edge_shifts(
+            lambda t: quadrant_shifts(t, tail_slope=-0.5),
+            "tail_slope = -0.5 must be below -1",
+        ),
+        (lambda t: quadrant_shifts(t, background=1e6), "background = 1e\\+06 is outside"),
+        (lambda t: quadrant_shifts(t, photons=[1.0]), "photons need their wavelengths"),
+        (lambda t: quadrant_shifts(t, wavelengths=[500.0]), "the table holds no device"),
+        (
+            lambda t: quadrant_shifts(
                 t, wavelengths=[500.0, 600.0], photons=[1.0], temperature=173.0
             ),
             r"shapes \(2,\) and \(1,\)",
         ),
         (
-            lambda t: edge_shifts(t, wavelengths=[1500.0], temperature=173.0),
+            lambda t: quadrant_shifts(t, wavelengths=[1500.0], temperature=173.0),
             "none of this light converts",
         ),
         (
-            lambda t: edge_shifts(
+            lambda t: quadrant_shifts(
                 t, wavelengths=[500.0], photons=[-1.0], temperature=173.0
             ),
             "photons must be finite, not negative",
         ),
         (lambda t: solve_kernel(np.zeros((2, 3))), r"areas of shape \(2, 3\)"),
-        (lambda t: make_kernel(edge_shifts(t), {}), "at least one amplifier"),
-        (lambda t: make_kernel(edge_shifts(t), {"C00": 0.0}), "gain of C00 = 0.0"),
+        (lambda t: make_kernel(quadrant_shifts(t), {}), "at least one amplifier"),
+        (lambda t: make_kernel(quadrant_shifts(t), {"C00": 0.0}), "gain of C00 = 0.0"),
         (
             lambda t: make_distortion_matrix(
-                edge_shifts(t), GAINS, filters={"y_10": edge_shifts(t, lags=4)}
+                quadrant_shifts(t), GAINS, filters={"y_10": quadrant_shifts(t, lags=4)}
             ),
             r"shifts of y_10 have the shape \(4, 4\), not \(8, 8\)",
         ),
@@ -239,6 +242,6 @@ def test_refusals(make, message):
 
 def test_tables_that_cannot_serve():
     with pytest.raises(TableError, match="reaches no neighbour"):
-        edge_shifts(make_table(reach=0))
+        quadrant_shifts(make_table(reach=0))
     with pytest.raises(TableError, match="one depth knows no wavelengths"):
-        edge_shifts(make_table(depths=[50.0]), wavelengths=[500.0], temperature=173.0)
+        quadrant_shifts(make_table(depths=[50.0]), wavelengths=[500.0], temperature=173.0)

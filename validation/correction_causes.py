@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 from scipy.special import ndtr
 
-from bfsensor.edge_shifts import EdgeShifts, edge_shifts
 from bfsensor.measure.correct import correct_edges
+from bfsensor.quadrant_shifts import QuadrantShifts, quadrant_shifts
+from bfsensor.simulate.image_charge import ImageCharge, edge_shifts
 from validation.correction_round_trip import (
     PEAKS,
     SIDE,
@@ -39,7 +40,7 @@ Correction = Callable[[NDArray], NDArray]
 
 
 def model_growth(
-    shifts: EdgeShifts, sigma: float, peak: float, place: tuple[float, float],
+    shifts: QuadrantShifts, sigma: float, peak: float, place: tuple[float, float],
     correct: Correction, *, exact: bool, steps: int = 40,
 ) -> tuple[NDArray, NDArray]:  # fmt: skip
     """Growth [%] before and after a correction, of expected charge.
@@ -90,8 +91,8 @@ def model_residuals(
     device: str, sigma: float, *, exact: bool, strength: float = 1.0, places: int = 3
 ) -> tuple[NDArray, NDArray]:
     """Slopes in x and y of the model before and after the edge correction, over many places."""
-    shifts = EdgeShifts(
-        *(strength * part for part in edge_shifts(table_of(device), tail_slope=None))
+    shifts = QuadrantShifts(
+        *(strength * part for part in quadrant_shifts(table_of(device), tail_slope=None))
     )
     peaks = np.array(PEAKS)
     at = (np.arange(places) + 0.5) / places - 0.5
@@ -127,3 +128,23 @@ def find_causes(rows: Table, device: str, sigma: float) -> dict[str, NDArray]:
         )
     steps = np.diff([np.zeros(2), *left], axis=0)
     return dict(zip(("order", "boundary", "within", "response"), steps, strict=True))
+
+
+def share_beyond(sigma: float, reach: int, *, peak: float = 60e3) -> NDArray[np.float64]:
+    """Part [%] of a star's growth, x and y, by shifts of edges beyond so many pixels from charge.
+
+    By image charges between planes 100 um apart, like the ITL device; no table reaches so far.
+    """
+    model = ImageCharge(0.32, 1.21, 2.57, 0.2, 3.8, drift_field=((0, 0.74), (100, 0.36)))
+    far = 9
+    shifts = edge_shifts(model, depth=99.9, reach=far)
+    whole = QuadrantShifts(shifts.north[far:, far:], shifts.east[far:, far:])
+    near = QuadrantShifts(*(part.copy() for part in whole))
+    for part in near:
+        part[reach + 1 :] = 0.0
+        part[:, reach + 1 :] = 0.0
+    grown = [
+        model_growth(s, sigma, peak, (0.1, 0.2), lambda image: image, exact=True)[0]
+        for s in (near, whole)
+    ]
+    return 100 * (1 - grown[0] / grown[1])

@@ -31,9 +31,9 @@ from astropy.table import Table, vstack
 from numpy.typing import NDArray
 
 from bfsensor import BrighterFatterSensor, DistortionTable
-from bfsensor.edge_shifts import EdgeShifts, edge_shifts
 from bfsensor.lsst_format import make_distortion_matrix, make_kernel, solve_kernel
 from bfsensor.measure.correct import correct_edges, correct_kernel
+from bfsensor.quadrant_shifts import QuadrantShifts, quadrant_shifts
 from bfsensor.recording.lsst_datasets import BrighterFatterKernel, DistortionMatrix
 from bfsensor.resources import tables_dir
 from bfsensor.sensor.flats import draw_flat
@@ -74,8 +74,8 @@ def export(device: str, folder: Path) -> tuple[BrighterFatterKernel, DistortionM
     """Write both formats and read them: what a pipeline would have of the table."""
     table = table_of(device)
     # The sensor's shifts end with the table, and so do these.
-    surface = edge_shifts(table, tail_slope=None)
-    band = edge_shifts(table, tail_slope=None, wavelengths=BAND)
+    surface = quadrant_shifts(table, tail_slope=None)
+    band = quadrant_shifts(table, tail_slope=None, wavelengths=BAND)
     kernel = make_kernel(surface, {"C00": 1.5})
     matrix = make_distortion_matrix(
         surface, {"C00": 1.5}, filters={"y": band}, thickness=table.thickness,
@@ -98,9 +98,9 @@ def corrections(device: str) -> dict[str, Correction]:
     kernel, north, east = kernels.columns["KERNEL"][0], columns["A_N"][0], columns["A_E"][0]
     # The second lag axis of a filter's shifts is x as well.
     north_y, east_y = (columns[f"A_{side}_BY_FILTER"][0, 0] for side in "NE")
-    areas_y = EdgeShifts(north_y, east_y).areas
-    tail = edge_shifts(table_of(device))
-    half_full = edge_shifts(table_of(device), background=50e3, tail_slope=None)
+    areas_y = QuadrantShifts(north_y, east_y).areas
+    tail = quadrant_shifts(table_of(device))
+    half_full = quadrant_shifts(table_of(device), background=50e3, tail_slope=None)
     flat = expected(device, FLAT_KERNEL, linear=False)
     flat[0, 0] -= FLAT_KERNEL
 
@@ -218,7 +218,7 @@ def expected(device: str, level: float, *, linear: bool, steps: int = 40) -> NDA
     spectrum = np.zeros((n, n))
     for k in range(steps):
         at = 0.0 if linear else (k + 0.5) * step
-        a = edge_shifts(table_of(device), background=at, tail_slope=None).areas
+        a = quadrant_shifts(table_of(device), background=at, tail_slope=None).areas
         lag = np.minimum(np.arange(n), n - np.arange(n))
         wide = np.zeros((n // 2 + 1,) * 2)
         wide[: len(a), : len(a)] = a
