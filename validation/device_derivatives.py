@@ -15,13 +15,14 @@ from pathlib import Path
 import click
 import numpy as np
 from astropy.table import Table, vstack
+from numpy.typing import NDArray
 
 from bfsensor import Device
 from bfsensor.errors import DeviceError
 from bfsensor.fit.emulator import DeviceEmulator
 from bfsensor.fit.emulator_nodes import STEP
 from bfsensor.fit.parameters import change_parameter, device_parameters
-from bfsensor.response import EdgeResponse, area_matrix, solve_response
+from bfsensor.response import REFINE_Z, EdgeResponse, area_matrix, solve_response
 from validation.write_results import write_results
 
 RESULTS = Path(__file__).parent / "results" / "device_derivatives.ecsv"
@@ -32,7 +33,9 @@ NEAR, FAR = 0.1, 0.5
 LAGS = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
 
 
-def differences(device: Device, name: str, step: float, cells: int, remeshed: bool):
+def differences(
+    device: Device, name: str, step: float, mesh: dict[str, int], remeshed: bool
+) -> NDArray[np.float64]:
     """Change of the shifts for a unit, from solutions to either side or to the one there is."""
     sides: list[tuple[float, EdgeResponse]] = []
     for by in (step, -step):
@@ -41,17 +44,20 @@ def differences(device: Device, name: str, step: float, cells: int, remeshed: bo
         except DeviceError:
             continue
         sides.append((by, solve_response(
-            there, cells=cells, laid_for=None if remeshed else device,
+            there, laid_for=None if remeshed else device, **mesh,
         )))  # fmt: skip
     if len(sides) == 1:
-        sides.append((0.0, solve_response(device, cells=cells)))
+        sides.append((0.0, solve_response(device, **mesh)))
     (a, one), (b, other) = sides
     return np.stack([one.kx - other.kx, one.ky - other.ky])[:, -1] / (a - b)
 
 
-def compare_derivatives(device: Device, cells: int) -> Table:
+def compare_derivatives(
+    device: Device, cells: int, refine_z: int, names: tuple[str, ...] = ()
+) -> Table:
     """One row a parameter: errors of the derivatives, and what they are at the nearest lags."""
-    known = device_parameters(device)
+    known = {k: s for k, s in device_parameters(device).items() if not names or k in names}
+    mesh = {"cells": cells, "refine_z": refine_z}
     changed = []
     for name, spread in known.items():
         step = STEP * spread
@@ -60,28 +66,29 @@ def compare_derivatives(device: Device, cells: int) -> Table:
         except DeviceError:
             changed.append((change_parameter(device, name, -step), -step))
     solve_response(device, cells=8, changed=changed[:1])  # kernels are compiled
-    found = solve_response(device, cells=cells, changed=changed)
+    found = solve_response(device, changed=changed, **mesh)
     a = area_matrix(found.kx[-1], found.ky[-1])
     rows = []
     for n, (name, spread) in enumerate(known.items()):
         own = np.stack([found.dkx[n, -1], found.dky[n, -1]])
 
         def error(by: float, remeshed: bool, name=name, spread=spread, own=own) -> float:
-            wanted = differences(device, name, by * spread, cells, remeshed)
+            wanted = differences(device, name, by * spread, mesh, remeshed)
             return float(np.sqrt(np.sum((own - wanted) ** 2) / np.sum(wanted**2)))
 
-        change = area_matrix(*own) * spread / a
+        middle = np.s_[5:8, 5:8]
+        change = (area_matrix(*own)[middle] * spread) / a[middle]
         row = {
-            "device": device.name, "cells": cells, "parameter": name, "spread": spread,
+            "device": device.name, **mesh, "parameter": name, "spread": spread,
             "error_moved": round(error(NEAR, False), 5),
             "error_remeshed": round(error(FAR, True), 5),
-            **{f"change_{i}{j}": round(float(change[5 + j, 5 + i]), 5) for i, j in LAGS},
+            **{f"change_{i}{j}": round(float(change[j, i]), 5) for i, j in LAGS},
             "solve_s": round(found.seconds[0], 2), "derivatives_s": round(found.seconds[1], 2),
         }  # fmt: skip
         rows.append(row)
         click.echo(
-            f"{name:38s} {100 * row['error_moved']:6.2f} %, own mesh {100 * row['error_remeshed']:6.2f} %"
-            f"  a_00 {100 * row['change_00']:+.2f} % a spread"
+            f"{name:38s} {100 * row['error_moved']:6.2f} %"
+            f"  own mesh {100 * row['error_remeshed']:6.2f} %  a_00 {100 * row['change_00']:+.2f} %"
         )
     ratio = found.seconds[1] / found.seconds[0]
     click.echo(
@@ -91,11 +98,16 @@ def compare_derivatives(device: Device, cells: int) -> Table:
 
 
 def check_emulator(
-    device: Device, cells: int, points: int, keep: Path | None, remeshed: bool
+    device: Device,
+    cells: int,
+    refine_z: int,
+    points: int,
+    keep: Path | None,
+    remeshed: bool,
 ) -> Table:
     """One row a lag: error of the emulator at random points, and what the prior leaves open."""
     began = time.process_time()
-    emulator = DeviceEmulator.build(device, cells=cells, keep=keep)
+    emulator = DeviceEmulator.build(device, cells=cells, refine_z=refine_z, keep=keep)
     built = time.process_time() - began
     check = emulator.check(points, 20_260, remeshed=remeshed)
     median, most = check.quantile(0.5), check.quantile(0.95)
@@ -103,11 +115,13 @@ def check_emulator(
     nominal = emulator.predict(emulator.nominal).areas
     rows = [
         {
-            "device": device.name, "cells": cells, "parameters": len(emulator.parameters),
+            "device": device.name, "cells": cells, "refine_z": refine_z,
+            "parameters": len(emulator.parameters),
             "points": points, "remeshed": remeshed, "i": i, "j": j, "a": float(nominal[j, i]),
             "prior_spread": round(float(spread[j, i]), 5),
             "error_median": round(float(median[j, i]), 5),
-            "error_95": round(float(most[j, i]), 5), "build_cpu_s": round(built, 1),
+            "error_95": round(float(most[j, i]), 5), "unsolved": check.unsolved,
+            "build_cpu_s": round(built, 1),
         }
         for j in range(nominal.shape[0]) for i in range(nominal.shape[1])
     ]  # fmt: skip
@@ -134,27 +148,39 @@ def main() -> None:
 @main.command()
 @click.option("--device", "names", multiple=True, default=("itl_sta3800c", "e2v_ccd250"))
 @click.option("--cells", default=16, show_default=True)
-def derivatives(names: tuple[str, ...], cells: int) -> None:
+@click.option("--refine-z", default=REFINE_Z, show_default=True)
+@click.option("--parameter", "parameters", multiple=True, help="By default all.")
+def derivatives(
+    names: tuple[str, ...], cells: int, refine_z: int, parameters: tuple[str, ...]
+) -> None:
     """Hold derivatives against differences."""
     for name in names:
-        add_results(compare_derivatives(Device.load(name), cells), RESULTS)
+        rows = compare_derivatives(Device.load(name), cells, refine_z, parameters)
+        add_results(rows, RESULTS)
 
 
 @main.command()
 @click.option("--device", "names", multiple=True, default=("itl_sta3800c", "e2v_ccd250"))
 @click.option("--cells", default=16, show_default=True)
+@click.option("--refine-z", default=REFINE_Z, show_default=True)
 @click.option("--points", default=20, show_default=True)
 @click.option(
     "--keep", type=click.Path(path_type=Path), help="Folder of finished solutions."
 )
 @click.option("--remeshed", is_flag=True, help="Solve every point on a mesh of its own.")
 def emulator(
-    names: tuple[str, ...], cells: int, points: int, keep: Path | None, remeshed: bool
+    names: tuple[str, ...],
+    cells: int,
+    refine_z: int,
+    points: int,
+    keep: Path | None,
+    remeshed: bool,
 ) -> None:
     """Hold the emulator against solutions."""
     path = RESULTS.with_name("device_emulator.ecsv")
     for name in names:
-        add_results(check_emulator(Device.load(name), cells, points, keep, remeshed), path)
+        rows = check_emulator(Device.load(name), cells, refine_z, points, keep, remeshed)
+        add_results(rows, path)
 
 
 if __name__ == "__main__":

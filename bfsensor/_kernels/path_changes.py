@@ -13,6 +13,9 @@ import numpy as np
 
 from bfsensor._kernels.drift import _cell, _weights, gradient
 
+SADDLE = 0.5
+"""Longest step relative to the length over which the field changes by itself."""
+
 
 class Changes(NamedTuple):
     """Changes of a potential.
@@ -194,6 +197,14 @@ def boundary_changes(
                     phi, changes, xs, ys, zs, q, trial, cell, weights, g, hess, push,
                     kp[stage], ks[stage],
                 )  # fmt: skip
+                if stage == 0:
+                    # All paths on the boundary lead to a saddle, where the field vanishes:
+                    # a step over it would make deviations of any size.
+                    bend = 0.0
+                    for m in range(6):
+                        bend += (1.0 if m == 0 or m == 3 or m == 5 else 2.0) * hess[m] ** 2
+                    field = np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
+                    h = min(h, max(SADDLE * field / max(np.sqrt(bend), 1e-12), 1e-4))
             for m in range(3):
                 p[m] += h / 6.0 * (kp[0, m] + 2.0 * kp[1, m] + 2.0 * kp[2, m] + kp[3, m])
             for r in range(n + 1):

@@ -24,12 +24,19 @@ from numpy.typing import ArrayLike, NDArray
 
 import bfsensor
 from bfsensor.device import Device
-from bfsensor.errors import DeviceError, FitError
+from bfsensor.errors import ConvergenceError, DeviceError, FitError
 from bfsensor.files import written_whole
 from bfsensor.fit.emulator_nodes import Node, Solved, make_node, solve_nodes
 from bfsensor.fit.parameters import change_parameter, device_parameters, parameter_value
 from bfsensor.recording.exposures import Condition
-from bfsensor.response import LEVEL, area_matrix, mixed, response_depths, solve_response
+from bfsensor.response import (
+    LEVEL,
+    REFINE_Z,
+    area_matrix,
+    mixed,
+    response_depths,
+    solve_response,
+)
 
 SCHEMA = "bfsensor emulator 1"
 VOLTAGES = ("back_bias", "gate_high", "gate_low", "temperature")
@@ -72,11 +79,15 @@ class EmulatorCheck:
         Parameters [internal units].
     solved, emulated : ndarray, shape (points, n + 1, n + 1)
         a_ij [1/e-], [j, i].
+    unsolved : int
+        Points drawn besides at which the device has no solution, such as silicon that is not
+        depleted.
     """
 
     values: NDArray[np.float64]
     solved: NDArray[np.float64]
     emulated: NDArray[np.float64]
+    unsolved: int
 
     @property
     def relative(self) -> NDArray[np.float64]:
@@ -124,8 +135,8 @@ class DeviceEmulator:
         Values and standard deviations [internal units].
     level : float
         Electrons in every pixel, about which the response is taken [e-].
-    cells : int
-        Of the mesh, a pixel.
+    cells, refine_z : int
+        Of the mesh: cells a pixel, and halvings in z.
     """
 
     def __init__(
@@ -134,13 +145,14 @@ class DeviceEmulator:
         spreads: Mapping[str, float],
         level: float,
         cells: int,
+        refine_z: int,
         expansions: Mapping[tuple[float | None, ...], _Expansion],
     ) -> None:
         self.device = device
         self.parameters = tuple(spreads)
         self.spread = np.array([spreads[n] for n in spreads], float)
         self.nominal = np.array([parameter_value(device, n) for n in spreads], float)
-        self.level, self.cells = float(level), int(cells)
+        self.level, self.cells, self.refine_z = float(level), int(cells), int(refine_z)
         self._expansions = dict(expansions)
 
     @classmethod
@@ -152,6 +164,7 @@ class DeviceEmulator:
         conditions: Sequence[Condition] = (Condition(),),
         level: float = LEVEL,
         cells: int = 16,
+        refine_z: int = REFINE_Z,
         keep: Path | None = None,
         executor: Executor | None = None,
         progress: Callable[[int, int], None] | None = None,
@@ -172,6 +185,8 @@ class DeviceEmulator:
             Electrons in every pixel [e-].
         cells : int
             Of the mesh, a pixel.
+        refine_z : int
+            Halvings of its steps in z.
         keep : Path, optional
             Folder that keeps finished solutions; a run that finds them goes on from there.
         executor : Executor, optional
@@ -198,7 +213,9 @@ class DeviceEmulator:
         for number, point in enumerate(points):
             here = _operated(device, point)
             own = {n: s for n, s in spreads.items() if not _held(n, point)}
-            nodes.append(make_node(here, here, level, cells, own, (number, -1, 0)))
+            nodes.append(
+                make_node(here, here, level, cells, refine_z, own, (number, -1, 0))
+            )
             for n, (name, spread) in enumerate(own.items()):
                 for side in (1, -1):
                     try:
@@ -206,7 +223,9 @@ class DeviceEmulator:
                     except DeviceError:
                         continue  # the other side tells
                     nodes.append(
-                        make_node(there, here, level, cells, own, (number, n, side))
+                        make_node(
+                            there, here, level, cells, refine_z, own, (number, n, side)
+                        )
                     )
         solved = solve_nodes(nodes, keep=keep, progress=progress, executor=executor)
         expansions = {}
@@ -216,7 +235,7 @@ class DeviceEmulator:
             units = np.array([spreads[n] for n in names])
             of_point = {at[1:]: s for at, s in solved.items() if at[0] == number}
             expansions[point] = _expand(of_point, np.array(free, int), names, units)
-        return cls(device, spreads, level, cells, expansions)
+        return cls(device, spreads, level, cells, refine_z, expansions)
 
     @property
     def conditions(self) -> tuple[Condition, ...]:
@@ -336,25 +355,32 @@ class DeviceEmulator:
         laid_for = _operated(self.device, _point(asked))
         values: list[NDArray[np.float64]] = []
         solved, emulated = [], []
+        unsolved = 0
         while len(values) < points:
             drawn = self.nominal + self.spread * rng.standard_normal(len(self.nominal))
             try:
                 device = self.device_at(drawn, asked)
             except DeviceError:
                 continue
-            found = solve_response(
-                device,
-                level=self.level,
-                cells=self.cells,
-                laid_for=None if remeshed else laid_for,
-            )
+            try:
+                found = solve_response(
+                    device, level=self.level, cells=self.cells, refine_z=self.refine_z,
+                    laid_for=None if remeshed else laid_for,
+                )  # fmt: skip
+            except (DeviceError, ConvergenceError):
+                unsolved += 1
+                if unsolved > 10 * points:
+                    raise
+                continue
             edges = found.edges(asked.wavelength, device.operating_point.temperature)
             values.append(drawn)
             solved.append(_lags(area_matrix(*edges)))
             emulated.append(self.predict(drawn, asked).areas)
             if progress is not None:
                 progress(len(values), points)
-        return EmulatorCheck(np.array(values), np.array(solved), np.array(emulated))
+        return EmulatorCheck(
+            np.array(values), np.array(solved), np.array(emulated), unsolved
+        )
 
     # -- files -------------------------------------------------------------------------
 
@@ -367,6 +393,7 @@ class DeviceEmulator:
             "parameters": dict(zip(self.parameters, self.spread.tolist(), strict=True)),
             "level": self.level,
             "cells": self.cells,
+            "refine_z": self.refine_z,
             "points": list(self._expansions),
         }
         arrays = {
@@ -422,7 +449,7 @@ class DeviceEmulator:
             )
         return cls(
             Device.from_toml(header["device"]), header["parameters"], header["level"],
-            header["cells"], expansions,
+            header["cells"], header["refine_z"], expansions,
         )  # fmt: skip
 
 

@@ -37,6 +37,7 @@ class Node:
     laid_for: str
     level: float
     cells: int
+    refine_z: int
     names: tuple[str, ...]
     steps: tuple[float, ...]
     at: tuple[int, int, int]
@@ -45,7 +46,7 @@ class Node:
     def key(self) -> str:
         """Digest of everything that determines the result."""
         text = "\n".join([
-            "node 1", bfsensor.__version__, self.device, self.laid_for, f"{self.level:.9g} {self.cells}",
+            "node 2", bfsensor.__version__, self.device, self.laid_for, f"{self.level:.9g} {self.cells} {self.refine_z}",
             *(f"{n} {s:.9g}" for n, s in zip(self.names, self.steps, strict=True)),
         ])  # fmt: skip
         return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -56,6 +57,7 @@ def make_node(
     laid_for: Device,
     level: float,
     cells: int,
+    refine_z: int,
     spreads: dict[str, float],
     at: tuple[int, int, int],
 ) -> Node:
@@ -69,7 +71,14 @@ def make_node(
             step = -step
         steps.append(step)
     return Node(
-        device.to_toml(), laid_for.to_toml(), level, cells, tuple(spreads), tuple(steps), at
+        device.to_toml(),
+        laid_for.to_toml(),
+        level,
+        cells,
+        refine_z,
+        tuple(spreads),
+        tuple(steps),
+        at,
     )
 
 
@@ -81,7 +90,12 @@ def solve_node(node: Node) -> EdgeResponse:
         for name, step in zip(node.names, node.steps, strict=True)
     ]
     return solve_response(
-        device, level=node.level, cells=node.cells, laid_for=laid_for, changed=changed
+        device,
+        level=node.level,
+        cells=node.cells,
+        refine_z=node.refine_z,
+        laid_for=laid_for,
+        changed=changed,
     )
 
 
