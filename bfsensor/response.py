@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bfsensor import silicon
 from bfsensor.device import Device
 from bfsensor.levels import SAMPLES, Images
-from bfsensor.simulate.boundaries import Feet, PixelBoundaries, find_boundaries
+from bfsensor.simulate.boundaries import TURN, Feet, PixelBoundaries, find_boundaries
 from bfsensor.simulate.boundary_tangent import boundary_changes
 from bfsensor.simulate.far_field import FarField
 from bfsensor.simulate.mesh import Surfaces, make_mesh
@@ -194,7 +194,13 @@ def solve_response(
     depths = np.array(response_depths(device))
     feet: list[Feet] = []
     lines = find_boundaries(
-        potential, depths, reach=REACH, samples=SAMPLES, precision=PRECISION, feet=feet
+        potential,
+        depths,
+        reach=REACH,
+        samples=SAMPLES,
+        precision=PRECISION,
+        turn=TURN,
+        feet=feet,
     )
     edges = _Edges.of(unit, depths)
     moved = edges.moved(lines)

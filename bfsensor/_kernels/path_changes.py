@@ -11,10 +11,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from bfsensor._kernels.drift import _cell, _weights, gradient
-
-SADDLE = 0.5
-"""Longest step relative to the length over which the field changes by itself."""
+from bfsensor._kernels.drift import _SHORTEST, _cell, _weights, gradient, turns
 
 
 class Changes(NamedTuple):
@@ -152,14 +149,15 @@ def _descent(phi, changes, xs, ys, zs, p, delta, cell, weights, g, hess, push, o
 
 @numba.njit(cache=True)
 def boundary_changes(
-    phi, changes, xs, ys, zs, seeds, axis, zone, coarseness, max_steps, growth, out
+    phi, changes, xs, ys, zs, seeds, axis, zone, coarseness, turn, max_steps, growth, out
 ):
     """Shift along ``axis`` of points ``seeds`` (n, 3) of a boundary, to ``out`` (n, changes).
 
     An electron that starts on the boundary must stay on it: of its deviation some way down,
     the part that a shift of the start makes cancels that which the change of the potential
     makes.  The first grows on the way; what is further down counts with its inverse, and
-    beyond a ``growth`` of 1e4 for nothing.
+    beyond a ``growth`` of 1e3 for next to nothing.  Steps are those with which the seeds were found, for
+    on the boundary of another step the deviation would leave before it has grown.
     """
     n = out.shape[1]
     p = np.zeros(3)
@@ -186,25 +184,27 @@ def boundary_changes(
                 if abs(ox) < zone[2] and abs(oy) < zone[3]:
                     break
             h = coarseness * (0.3 + 0.12 * max(p[2] - 1.0, 0.0))
-            for stage in range(4):
+            stage = 0
+            while stage < 4:
                 part = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
+                last = max(stage - 1, 0)
                 for m in range(3):
-                    q[m] = p[m] + part * h * kp[max(stage - 1, 0), m]
+                    q[m] = p[m] + part * h * kp[last, m]
                 for r in range(n + 1):
                     for m in range(3):
-                        trial[r, m] = delta[r, m] + part * h * ks[max(stage - 1, 0), r, m]
+                        trial[r, m] = delta[r, m] + part * h * ks[last, r, m]
                 _descent(
                     phi, changes, xs, ys, zs, q, trial, cell, weights, g, hess, push,
                     kp[stage], ks[stage],
                 )  # fmt: skip
-                if stage == 0:
-                    # All paths on the boundary lead to a saddle, where the field vanishes:
-                    # a step over it would make deviations of any size.
-                    bend = 0.0
-                    for m in range(6):
-                        bend += (1.0 if m == 0 or m == 3 or m == 5 else 2.0) * hess[m] ** 2
-                    field = np.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
-                    h = min(h, max(SADDLE * field / max(np.sqrt(bend), 1e-12), 1e-4))
+                stage += 1
+                if (
+                    stage == 4
+                    and turns(kp[0], kp[1], kp[2], kp[3]) >= turn * turn
+                    and h >= _SHORTEST
+                ):
+                    h *= 0.5
+                    stage = 1
             for m in range(3):
                 p[m] += h / 6.0 * (kp[0, m] + 2.0 * kp[1, m] + 2.0 * kp[2, m] + kp[3, m])
             for r in range(n + 1):

@@ -46,7 +46,8 @@ class Node:
     def key(self) -> str:
         """Digest of everything that determines the result."""
         text = "\n".join([
-            "node 2", bfsensor.__version__, self.device, self.laid_for, f"{self.level:.9g} {self.cells} {self.refine_z}",
+            "node 2", bfsensor.__version__, self.device, self.laid_for,
+            f"{self.level:.9g} {self.cells} {self.refine_z}",
             *(f"{n} {s:.9g}" for n, s in zip(self.names, self.steps, strict=True)),
         ])  # fmt: skip
         return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -47,6 +47,9 @@ COARSENESS = 0.25
 RATIO = 0.10
 """Step of the backward trace relative to the height."""
 
+TURN = 0.3
+"""Of the direction within a step, where steps are not to lead over a saddle."""
+
 _MAX_STEPS = 3000
 _CORNER_PASSES = 20
 _CORNER_TOLERANCE = 1e-7  # um
@@ -258,6 +261,7 @@ def find_boundaries(
     coarseness: float = COARSENESS,
     ratio: float = RATIO,
     precision: float = BISECTION,
+    turn: float = drift.ANY_TURN,
     feet: list[Feet] | None = None,
 ) -> PixelBoundaries:
     """Trace the boundaries of the pixels around pixel (0, 0).
@@ -277,6 +281,10 @@ def find_boundaries(
         error below 3e-4 um.
     precision : float
         Of the bisection [um]; differences between devices want a finer one.
+    turn : float
+        Largest change of direction within a step of the forward traces (of a unit vector); by
+        default any.  Derivatives want :data:`TURN`: a step over a saddle of the potential makes
+        single points jump.
     feet : list, optional
         Gets where the lines were bisected, for both axes, which their derivatives start from.
 
@@ -325,7 +333,7 @@ def find_boundaries(
                 f"reach = {reach} pixels does not fit a period of {mesh.period} um"
             )
         traced, below = _trace_lines(
-            field, axis, edges, seeds, levels, split, coarseness, ratio, precision
+            field, axis, edges, seeds, levels, split, coarseness, ratio, precision, turn
         )
         lines.append(traced)
         if feet is not None:
@@ -393,6 +401,7 @@ def _trace_lines(
     coarseness: float,
     ratio: float,
     precision: float,
+    turn: float,
 ) -> tuple[NDArray[np.float64], tuple[tuple[NDArray[np.float64], NDArray[np.bool_]], ...]]:
     """Points of the lines across ``axis`` at every depth, (nd, lines, seeds, 2), and feet."""
     shape = (len(edges), len(along))
@@ -413,7 +422,7 @@ def _trace_lines(
             field.phi, field.x, field.y, field.z, seeds.reshape(-1, 3), axis,
             np.broadcast_to(edges[:, None], shape).ravel().copy(),
             (guess - margin).ravel(), (guess + margin).ravel(),
-            precision, field.zone, coarseness, _MAX_STEPS, position,
+            precision, field.zone, coarseness, _MAX_STEPS, position, turn,
         )  # fmt: skip
         if failed:
             raise ConvergenceError(

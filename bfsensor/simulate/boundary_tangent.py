@@ -16,6 +16,7 @@ from bfsensor._kernels import path_changes
 from bfsensor.simulate.boundaries import (
     COARSENESS,
     RATIO,
+    TURN,
     Feet,
     PixelBoundaries,
     unfold,
@@ -24,7 +25,7 @@ from bfsensor.simulate.field import Field
 from bfsensor.simulate.poisson import Potential
 from bfsensor.simulate.tangent import PotentialChange
 
-GROWTH = 1e4
+GROWTH = 1e3
 """Of a deviation from a boundary, beyond which the way down is no longer followed."""
 
 _MAX_STEPS = 3000
@@ -44,7 +45,8 @@ def boundary_changes(
     potential : Potential
         Whose lines they are.
     lines, feet
-        From :func:`~bfsensor.simulate.boundaries.find_boundaries`, called with ``feet=[]``.
+        From :func:`~bfsensor.simulate.boundaries.find_boundaries`, called with ``feet=[]`` and
+        ``turn=TURN``.
     changes : sequence of PotentialChange
         From :meth:`~bfsensor.simulate.tangent.Tangent.change`.
     deeper : ndarray, shape (changes, nd), optional
@@ -68,7 +70,7 @@ def boundary_changes(
             first = np.zeros((len(flat), n))
             path_changes.boundary_changes(
                 field.phi, made, field.x, field.y, field.z, flat, foot.axis, field.zone,
-                COARSENESS, _MAX_STEPS, GROWTH, first,
+                COARSENESS, TURN, _MAX_STEPS, GROWTH, first,
             )  # fmt: skip
             depths = lines.depths[reached]
             up = np.zeros((len(flat), len(depths), n, 2))
