@@ -110,13 +110,36 @@ def _slope_along(phi, xs, ys, zs, p, sign, cell, weights, g, out):
     out[2] = g[2] * norm
 
 
+ANY_TURN = 3.0
+"""More than the difference of two unit vectors: steps are not shortened."""
+
+_SHORTEST = 1e-3  # um; shorter steps change nothing that is told apart
+
+
+@numba.njit(cache=True, inline="always")
+def turns(a, b, c, d):
+    """Largest difference of the directions within a step from that at its start, squared."""
+    first = 0.0
+    middle = 0.0
+    last = 0.0
+    for m in range(3):
+        first += (b[m] - a[m]) ** 2
+        middle += (c[m] - a[m]) ** 2
+        last += (d[m] - a[m]) ** 2
+    return max(first, middle, last)
+
+
 @numba.njit(cache=True)
-def find_well(phi, xs, ys, zs, start, zone, coarseness, max_steps, scratch, cell, out):
+def find_well(
+    phi, xs, ys, zs, start, zone, coarseness, max_steps, scratch, cell, out, turn=ANY_TURN
+):
     """Follow an electron from ``start`` to its well; write where it ended to ``out``.
 
     ``zone`` is (pitch_x, pitch_y, half width, half height, top): the electron has arrived
     when it is below ``top`` and within the half width and height of a pixel centre.  Steps
-    are Runge-Kutta of fourth order in arc length.  Returns True if it arrived.
+    are Runge-Kutta of fourth order in arc length; within one the direction changes by less than
+    ``turn`` (of a unit vector), or it is halved: by default any length will do, and a step may
+    lead over a saddle of the potential.
     """
     p = scratch[0]
     q = scratch[1]
@@ -136,15 +159,19 @@ def find_well(phi, xs, ys, zs, start, zone, coarseness, max_steps, scratch, cell
                 break
         h = coarseness * (0.3 + 0.12 * max(p[2] - 1.0, 0.0))
         _slope_along(phi, xs, ys, zs, p, 1.0, cell, weights, g, a)
-        for m in range(3):
-            q[m] = p[m] + 0.5 * h * a[m]
-        _slope_along(phi, xs, ys, zs, q, 1.0, cell, weights, g, b)
-        for m in range(3):
-            q[m] = p[m] + 0.5 * h * b[m]
-        _slope_along(phi, xs, ys, zs, q, 1.0, cell, weights, g, c)
-        for m in range(3):
-            q[m] = p[m] + h * c[m]
-        _slope_along(phi, xs, ys, zs, q, 1.0, cell, weights, g, d)
+        while True:
+            for m in range(3):
+                q[m] = p[m] + 0.5 * h * a[m]
+            _slope_along(phi, xs, ys, zs, q, 1.0, cell, weights, g, b)
+            for m in range(3):
+                q[m] = p[m] + 0.5 * h * b[m]
+            _slope_along(phi, xs, ys, zs, q, 1.0, cell, weights, g, c)
+            for m in range(3):
+                q[m] = p[m] + h * c[m]
+            _slope_along(phi, xs, ys, zs, q, 1.0, cell, weights, g, d)
+            if turns(a, b, c, d) < turn * turn or h < _SHORTEST:
+                break
+            h *= 0.5
         for m in range(3):
             p[m] += h / 6.0 * (a[m] + 2.0 * b[m] + 2.0 * c[m] + d[m])
     for m in range(3):
@@ -167,13 +194,14 @@ def bisect_edge(
     coarseness,
     max_steps,
     out,
+    turn=ANY_TURN,
 ):
     """Find, for every seed, where the well that an electron reaches changes across an edge.
 
     ``seeds`` (n, 3) are points on the nominal edge; the coordinate ``axis`` (0: x, 1: y) is
     searched from ``edge + low`` to ``edge + high``, which are widened while both ends reach
     the same side.  ``out`` (n,) gets the position; returns the number of seeds that failed
-    (nan in ``out``).
+    (nan in ``out``).  ``turn`` as in :func:`find_well`.
     """
     scratch = np.zeros((13, 4))
     cell = np.ones(3, np.int64)
@@ -190,12 +218,34 @@ def bisect_edge(
         for _ in range(8):
             point[axis] = nominal + a
             find_well(
-                phi, xs, ys, zs, point, zone, coarseness, max_steps, scratch, cell, end
+                phi,
+                xs,
+                ys,
+                zs,
+                point,
+                zone,
+                coarseness,
+                max_steps,
+                scratch,
+                cell,
+                end,
+                turn,
             )
             below = end[axis] < nominal
             point[axis] = nominal + b
             find_well(
-                phi, xs, ys, zs, point, zone, coarseness, max_steps, scratch, cell, end
+                phi,
+                xs,
+                ys,
+                zs,
+                point,
+                zone,
+                coarseness,
+                max_steps,
+                scratch,
+                cell,
+                end,
+                turn,
             )
             above = end[axis] > nominal
             if below and above:
@@ -214,7 +264,18 @@ def bisect_edge(
             middle = 0.5 * (a + b)
             point[axis] = nominal + middle
             find_well(
-                phi, xs, ys, zs, point, zone, coarseness, max_steps, scratch, cell, end
+                phi,
+                xs,
+                ys,
+                zs,
+                point,
+                zone,
+                coarseness,
+                max_steps,
+                scratch,
+                cell,
+                end,
+                turn,
             )
             if end[axis] < nominal:
                 a = middle

@@ -1,0 +1,45 @@
+"""The response from one solution: the table's, and its derivatives by differences."""
+
+import numpy as np
+import pytest
+
+from bfsensor import Device
+from bfsensor.diagnose.walk import walk
+from bfsensor.fit.parameters import change_parameter
+from bfsensor.response import area_matrix, solve_response
+
+MESH = {"cells": 8, "refine_z": 0}
+
+
+def test_as_the_table_has_it():
+    """Boundaries of tables are bisected to 1e-5 um: 1e-7 of the response by means of them."""
+    device = Device.load("e2v_ccd250")
+    found, wanted = solve_response(device, **MESH), walk(device, cells=8)
+    np.testing.assert_array_equal(found.depths, wanted.depths)
+    for one, other in ((found.kx, wanted.kx[0]), (found.ky, wanted.ky[0])):
+        np.testing.assert_allclose(one[1:], other[1:], atol=2e-3 * np.abs(other).max())
+    for one, other in zip(
+        found.edges(900.0, 173.0), wanted.edges(900.0, 173.0), strict=True
+    ):
+        np.testing.assert_allclose(one, other, atol=2e-3 * np.abs(other).max())
+
+
+@pytest.mark.parametrize(
+    ("name", "step"), [("silicon.thickness", 0.5), ("channel_stop.width", 0.02)]
+)
+def test_derivatives(name, step):
+    """Depths, images and nodes move as well; asked for: 2 % of the change, at every depth."""
+    device = Device.load("itl_sta3800c")
+    small = 1e-3 * step
+    changed = [(change_parameter(device, name, small), small)]
+    found = solve_response(device, changed=changed, **MESH)
+    up, down = (
+        solve_response(change_parameter(device, name, s * step), laid_for=device, **MESH)
+        for s in (1, -1)
+    )
+    for depth in (1, 2, 3):
+        one = area_matrix(found.dkx[0, depth], found.dky[0, depth])
+        other = area_matrix(up.kx - down.kx, up.ky - down.ky)[depth] / (2 * step)
+        assert np.abs(one - other).max() < 0.02 * np.abs(other).max()
+        far = np.s_[1:3, 1:-1]  # rows at lags -4 and -3: images count there
+        assert np.abs(one - other)[far].max() < 0.05 * np.abs(other)[far].max()
