@@ -37,6 +37,10 @@ class DiagnosisError(BFSensorError, ValueError):
     """Recordings and prediction cannot be held against one another as asked."""
 
 
+class FitError(BFSensorError, ValueError):
+    """A device cannot be fitted to the measurements as asked."""
+
+
 class EffectError(BFSensorError, ValueError):
     """An effect was given parameters or data that it has no meaning for."""
 
