@@ -17,8 +17,12 @@ from bfsensor.device import Device
 from bfsensor.errors import FitError
 from bfsensor.files import written_whole
 from bfsensor.fit.quantities import DIFFUSION, Quantity, describe, quantities
+from bfsensor.fit.ties import name_combination
 
 SCHEMA = "bfsensor device fit 1"
+
+WELL_KNOWN = 0.5
+"""Posterior over prior width below which a combination is told on the terminal."""
 
 Values = NDArray[np.float64]
 
@@ -222,7 +226,12 @@ class FitResult:
         ]
 
     def _told(self) -> list[str]:
-        out = [f"not told apart: {tie}" for tie in self.ties]
+        out = [
+            f"measured to {part:.2f} of its prior: {name_combination(self.parameters, weights)}"
+            for part, weights in zip(self.remains, self.weights, strict=True)
+            if part < WELL_KNOWN and len(self.parameters) > 1
+        ]
+        out += [f"not told apart: {tie}" for tie in self.ties]
         if self.silent:
             out.append(
                 f"the data are silent on: {', '.join(describe(n) for n in self.silent)}"
