@@ -125,6 +125,91 @@ def solve_level(plan: Plan, charge: float, background: float) -> Level:
     )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Images:
+    """Shifts that the periodic images of a unit dipole make, and what gives its amplitude.
+
+    Attributes
+    ----------
+    shifts : list of (ndarray, ndarray, ndarray) or None
+        Of corners and vertices, by depth; None where nothing moves.
+    models : list of (ndarray, ndarray) or None
+        Dipole and images together, across vertical and horizontal edges.
+    near : tuple of ndarray
+        Vertices of vertical and horizontal edges that stand for the outermost boundaries.
+    """
+
+    shifts: list[tuple[NDArray[np.float64], ...] | None]
+    models: list[tuple[NDArray[np.float64], ...] | None]
+    near: tuple[NDArray[np.bool_], ...]
+
+    @classmethod
+    def of(
+        cls,
+        far: FarField,
+        reach: int,
+        pitch: tuple[float, float],
+        period: tuple[float, float],
+        fractions: NDArray[np.float64],
+    ) -> Images:
+        """Sum the images of a far field at the vertices of a neighbourhood."""
+        at = nominal_positions(pitch, reach, fractions)
+        near = (
+            np.abs(at.vertical[..., 1]) < 1.5 * pitch[1],
+            np.abs(at.horizontal[..., 0]) < 1.5 * pitch[0],
+        )
+        shifts: list[tuple[NDArray[np.float64], ...] | None] = []
+        models: list[tuple[NDArray[np.float64], ...] | None] = []
+        for d in range(len(far.depths)):
+            if far.shifts[d].max() <= 0:
+                shifts.append(None)
+                models.append(None)
+                continue
+            images = tuple(
+                image_shifts(far, points, d, period)
+                for points in (at.corners, at.horizontal, at.vertical)
+            )
+            shifts.append(images)
+            models.append((
+                (far.vectors(at.vertical, d) + images[2])[..., 0],
+                (far.vectors(at.horizontal, d) + images[1])[..., 1],
+            ))  # fmt: skip
+        return cls(shifts, models, near)
+
+    def taken_off(
+        self, moved: tuple[NDArray[np.float64], ...]
+    ) -> tuple[tuple[NDArray[np.float64], ...], float]:
+        """Displacements without the images, linear in them; and their share at the corner."""
+        corners, horizontal, vertical = (a.copy() for a in moved)
+        share = 0.0
+        for d, (images, models) in enumerate(zip(self.shifts, self.models, strict=True)):
+            if images is None or models is None:
+                continue
+            amplitudes = []
+            for model, data, facing, near in (
+                (models[0], vertical[d, ..., 0], (slice(None), [0, -1]), self.near[0]),
+                (models[1], horizontal[d, ..., 1], ([0, -1], slice(None)), self.near[1]),
+            ):
+                use = near[facing]
+                amplitudes.append(
+                    (model[facing][use] @ data[facing][use])
+                    / (model[facing][use] @ model[facing][use])
+                )
+            amplitude = float(np.mean(amplitudes))
+            for a, shift in zip(
+                (corners[d], horizontal[d], vertical[d]), images, strict=True
+            ):
+                a -= amplitude * shift
+            share = max(
+                share,
+                float(
+                    np.abs(amplitude * images[0][-1, -1]).max()
+                    / np.abs(moved[0][d, -1, -1]).max()
+                ),
+            )
+        return (corners, horizontal, vertical), share
+
+
 def without_images(
     far: FarField,
     moved: tuple[NDArray[np.float64], ...],
@@ -137,40 +222,4 @@ def without_images(
     The amplitude is the one with which dipole and images together give the outermost
     boundaries that face the source.
     """
-    corners, horizontal, vertical = (a.copy() for a in moved)
-    at = nominal_positions(pitch, horizontal.shape[2] // 2, fractions)
-    share = 0.0
-    for d in range(len(far.depths)):
-        if far.shifts[d].max() <= 0:
-            continue
-        images = [
-            image_shifts(far, points, d, period)
-            for points in (at.corners, at.horizontal, at.vertical)
-        ]
-        facing_x = (slice(None), [0, -1])
-        facing_y = ([0, -1], slice(None))
-        near_y = np.abs(at.vertical[..., 1]) < 1.5 * pitch[1]
-        near_x = np.abs(at.horizontal[..., 0]) < 1.5 * pitch[0]
-        model_x = (far.vectors(at.vertical, d) + images[2])[..., 0]
-        model_y = (far.vectors(at.horizontal, d) + images[1])[..., 1]
-        amplitudes = []
-        for model, data, facing, near in (
-            (model_x, vertical[d, ..., 0], facing_x, near_y),
-            (model_y, horizontal[d, ..., 1], facing_y, near_x),
-        ):
-            use = near[facing]
-            amplitudes.append(
-                (model[facing][use] @ data[facing][use])
-                / (model[facing][use] @ model[facing][use])
-            )
-        amplitude = float(np.mean(amplitudes))
-        for a, shift in zip((corners[d], horizontal[d], vertical[d]), images, strict=True):
-            a -= amplitude * shift
-        share = max(
-            share,
-            float(
-                np.abs(amplitude * images[0][-1, -1]).max()
-                / np.abs(moved[0][d, -1, -1]).max()
-            ),
-        )
-    return (corners, horizontal, vertical), share
+    return Images.of(far, moved[1].shape[2] // 2, pitch, period, fractions).taken_off(moved)

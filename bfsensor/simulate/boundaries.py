@@ -232,6 +232,23 @@ def _line_fit(n_pixels: int, vertices: int, fractions: tuple[float, ...]) -> _Li
     return _LineFit(points_, solution[:n_knots])
 
 
+@dataclass(frozen=True)
+class Feet:
+    """Where the lines across one axis were bisected, of a quadrant if it is mirrored.
+
+    Attributes
+    ----------
+    axis : int
+        0: lines between columns, 1: between rows.
+    below : tuple of (ndarray, ndarray)
+        Points (x, y, z) of the boundary [um], shape (lines, seeds, 3), and which of the depths
+        were reached from them.
+    """
+
+    axis: int
+    below: tuple[tuple[NDArray[np.float64], NDArray[np.bool_]], ...]
+
+
 def find_boundaries(
     potential: Potential,
     depths: ArrayLike,
@@ -240,6 +257,8 @@ def find_boundaries(
     samples: int = 24,
     coarseness: float = COARSENESS,
     ratio: float = RATIO,
+    precision: float = BISECTION,
+    feet: list[Feet] | None = None,
 ) -> PixelBoundaries:
     """Trace the boundaries of the pixels around pixel (0, 0).
 
@@ -256,6 +275,10 @@ def find_boundaries(
     coarseness, ratio : float
         Step lengths of the forward and backward traces; the defaults give a tracing
         error below 3e-4 um.
+    precision : float
+        Of the bisection [um]; differences between devices want a finer one.
+    feet : list, optional
+        Gets where the lines were bisected, for both axes, which their derivatives start from.
 
     Returns
     -------
@@ -301,12 +324,15 @@ def find_boundaries(
             raise TableError(
                 f"reach = {reach} pixels does not fit a period of {mesh.period} um"
             )
-        lines.append(
-            _trace_lines(field, axis, edges, seeds, levels, split, coarseness, ratio)
+        traced, below = _trace_lines(
+            field, axis, edges, seeds, levels, split, coarseness, ratio, precision
         )
+        lines.append(traced)
+        if feet is not None:
+            feet.append(Feet(axis, below))
     columns, rows = lines
     if symmetric:
-        columns, rows = _unfold(columns, 0), _unfold(rows, 1)
+        columns, rows = unfold(columns, 0), unfold(rows, 1)
     return PixelBoundaries(levels, mesh.pitch, reach, columns, rows, symmetric)
 
 
@@ -366,14 +392,16 @@ def _trace_lines(
     split: float,
     coarseness: float,
     ratio: float,
-) -> NDArray[np.float64]:
-    """Points of the lines across ``axis`` at every depth: (nd, lines, seeds, 2)."""
+    precision: float,
+) -> tuple[NDArray[np.float64], tuple[tuple[NDArray[np.float64], NDArray[np.bool_]], ...]]:
+    """Points of the lines across ``axis`` at every depth, (nd, lines, seeds, 2), and feet."""
     shape = (len(edges), len(along))
     out = np.zeros((len(depths), *shape, 2))
     high = depths >= split
     heights = [split] if high.any() else []
     heights += list(depths[~high])
     guess = np.zeros(shape)
+    feet = []
     for number, z in enumerate(heights):
         seeds = np.zeros((*shape, 3))
         seeds[..., axis] = edges[:, None]
@@ -385,7 +413,7 @@ def _trace_lines(
             field.phi, field.x, field.y, field.z, seeds.reshape(-1, 3), axis,
             np.broadcast_to(edges[:, None], shape).ravel().copy(),
             (guess - margin).ravel(), (guess + margin).ravel(),
-            BISECTION, field.zone, coarseness, _MAX_STEPS, position,
+            precision, field.zone, coarseness, _MAX_STEPS, position,
         )  # fmt: skip
         if failed:
             raise ConvergenceError(
@@ -394,6 +422,7 @@ def _trace_lines(
                 [],
             )
         seeds[..., axis] = position.reshape(shape)
+        feet.append((seeds, high if number == 0 and high.any() else depths == z))
         if number == 0 and high.any():
             traced = np.zeros((position.size, int(high.sum()), 2))
             drift.trace_up(
@@ -409,10 +438,10 @@ def _trace_lines(
             out[high] = np.moveaxis(traced.reshape(*shape, -1, 2), 2, 0)
         else:
             out[int(np.argmin(np.abs(depths - z)))] = seeds[..., :2]
-    return out
+    return out, tuple(feet)
 
 
-def _unfold(lines: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+def unfold(lines: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
     """Mirror the lines of a quadrant to the whole neighbourhood."""
     flip_across = np.array([-1.0, 1.0]) if axis == 0 else np.array([1.0, -1.0])
     full = np.concatenate([lines[:, ::-1] * flip_across, lines], axis=1)

@@ -25,6 +25,9 @@ SILICON_CONSUMED = 4.0 / 9.0
 Molar volumes of Si and SiO2 give 0.44 (Deal & Grove 1965, J. Appl. Phys. 36, 3770);
 4/9 puts the gate of the published ITL device at its 0.5 um above the field-oxide top."""
 
+FINE_ABOVE = 0.4
+"""Planes are at their finest up to this far above the highest silicon surface [um]."""
+
 _FINEST_Z = 0.05
 _GROWTH_Z = 1.2
 _COARSEST_Z = 5.0
@@ -242,7 +245,7 @@ def _z_nodes(device: Device, refine: int) -> NDArray[np.float64]:
     levels = sorted(
         {0.0, surfaces.gate_channel, surfaces.silicon_channel, surfaces.silicon_stop}
     )
-    fine_end = levels[-1] + 0.4
+    fine_end = levels[-1] + FINE_ABOVE
     nodes = [0.0]
     for a, b in zip(levels, [*levels[1:], fine_end], strict=True):
         if b - a < 1e-9:

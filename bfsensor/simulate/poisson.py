@@ -13,7 +13,7 @@ preconditioner.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -109,12 +109,16 @@ class Electrostatics:
         The sensor.
     mesh : Mesh
         From :func:`~bfsensor.simulate.mesh.make_mesh`.
+    n_front : int, optional
+        Planes that may hold carriers; by default those up to the end of the deepest implant.
     """
 
-    def __init__(self, device: Device, mesh: Mesh) -> None:
+    def __init__(self, device: Device, mesh: Mesh, *, n_front: int | None = None) -> None:
         self.device = device
         self.mesh = mesh
         self.coefficients = discretise(device, mesh)
+        if n_front is not None:
+            self.coefficients = replace(self.coefficients, n_front=n_front)
         self.multigrid = Multigrid(self.coefficients)
         temperature = device.operating_point.temperature
         self._kt = device.material.thermal_voltage(temperature)
@@ -137,6 +141,9 @@ class Electrostatics:
         self._direction = np.zeros(self._shape)
         self._product = np.zeros(self._shape)
         self._preconditioned = np.zeros(self._shape)
+        self._linearised: Potential | None = (
+            None  # whose carriers multigrid and fields hold
+        )
 
     @property
     def pixel_shape(self) -> tuple[int, int]:
@@ -176,12 +183,11 @@ class Electrostatics:
         charges = np.array(np.broadcast_to(np.asarray(charges, float), self.pixel_shape))
         if not np.all(charges >= 0):
             raise DeviceError(f"stored charge {charges.min():g} e- must not be negative")
-        count = (charges * self._share_y[:, None] * self._share_x[None, :]).ravel()
+        count = self._counts(charges)
+        self._linearised = None
         if start is None:
             start = self._empty_start()
-        phi = np.zeros(self._shape)
-        phi[1:-1, :, 1:-1] = np.moveaxis(start, 0, 1)
-        self._fill_halo(phi)
+        phi = self._padded(start)
         history: list[NewtonStep] = []
         new = self._open_wells(phi, charges.ravel())
         if new is not None:
@@ -213,7 +219,106 @@ class Electrostatics:
             history=tuple(history),
         )
 
+    def imbalance(
+        self, phi: NDArray[np.float64], charges: ArrayLike
+    ) -> NDArray[np.float64]:
+        """Charge that a potential leaves unbalanced [e-], node by node.
+
+        Parameters
+        ----------
+        phi : ndarray, shape (nz, ny, nx)
+            Potential [V], not necessarily a solution.
+        charges : array_like, shape ``pixel_shape`` or scalar
+            Electrons in each pixel [e-].
+
+        Returns
+        -------
+        residual : ndarray, shape (ny + 2, nz, nx + 2)
+            With halo; :meth:`respond` takes it.
+        """
+        self._linearised = None
+        padded, count = self._padded(phi), self._counts(charges)
+        c = self.coefficients
+        carrier_kernels.mobile_charge(
+            padded, c.silicon[:, : c.n_front], c.kind, c.dy, self._pixels_y, self._pixels_x,
+            len(self._share_x), self._fermi_levels(padded, count), count > 0, self._fermi_h,
+            self._ni, self._kt, self._electrons, self._holes,
+        )  # fmt: skip
+        self._stiffness[...] = 0.0
+        out = np.zeros(self._shape)
+        relaxation.residual(
+            padded, c.source, self._stiffness, c.cx, c.cy, c.cz, c.cd, c.kind, c.north,
+            c.south, c.dy, out,
+        )  # fmt: skip
+        out[:, : c.n_front] += self._holes - self._electrons
+        return out
+
+    def respond(
+        self,
+        at: Potential,
+        unbalanced: NDArray[np.float64],
+        *,
+        start: NDArray[np.float64] | None = None,
+        tolerance: float = 1e-3,
+    ) -> tuple[NDArray[np.float64], int]:
+        """Change of a solution for a small charge that unbalances it: J^-1 of it.
+
+        Parameters
+        ----------
+        at : Potential
+            A solution of this solver, about which is linearised.
+        unbalanced : ndarray, shape (ny + 2, nz, nx + 2)
+            Charge [e-], as :meth:`imbalance` gives it.
+        start : ndarray, shape (nz, ny, nx), optional
+            What is known of the change [V].
+        tolerance : float
+            Error of what ``start`` leaves to be found, relative, in the norm of the energy.
+
+        Returns
+        -------
+        change : ndarray, shape (nz, ny, nx)
+            Of the potential [V].
+        iterations : int
+            Of the conjugate gradients.
+        """
+        c = self.coefficients
+        count = self._counts(at.charges)
+        if self._linearised is not at:
+            self.imbalance(at.phi, at.charges)
+            np.add(self._electrons, self._holes, out=self._stiffness)
+            self._stiffness /= self._kt
+            self.multigrid.set_carriers(self._stiffness)
+            self._linearised = at
+        self._residual[...] = unbalanced
+        if start is not None:
+            known = self._padded(start)
+            relaxation.apply_operator(
+                known, self._stiffness, c.cx, c.cy, c.cz, c.cd, c.kind, c.north, c.south, c.dy,
+                self._product,
+            )  # fmt: skip
+            if np.any(count > 0):
+                carrier_kernels.subtract_common_shift(
+                    self._electrons, self._pixels_y, self._pixels_x, len(self._share_x), count,
+                    self._kt, known, np.zeros(count.size), self._product,
+                )  # fmt: skip
+            self._residual -= self._product
+        iterations = self._linear_solve(count, tolerance)
+        change = np.moveaxis(self._step[1:-1, :, 1:-1], 1, 0)
+        return (change.copy() if start is None else change + start), iterations
+
     # -- the pieces ------------------------------------------------------------------
+
+    def _counts(self, charges: ArrayLike) -> NDArray[np.float64]:
+        """Electrons of each pixel inside the domain."""
+        whole = np.broadcast_to(np.asarray(charges, float), self.pixel_shape)
+        return np.asarray(whole * self._share_y[:, None] * self._share_x[None, :]).ravel()
+
+    def _padded(self, a: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A field as the kernels want it: ``[y, z, x]`` with halo."""
+        out = np.zeros(self._shape)
+        out[1:-1, :, 1:-1] = np.moveaxis(a, 0, 1)
+        self._fill_halo(out)
+        return out
 
     def _fill_halo(self, a: NDArray[np.float64]) -> None:
         relaxation.fill_halo(

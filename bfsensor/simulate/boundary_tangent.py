@@ -1,0 +1,117 @@
+"""How pixel boundaries move when the potential changes a little.
+
+The field lines of a boundary are followed once, with the linearised equations of their
+deviations: as exact as differences of boundaries traced again, at a tenth of the cost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor._kernels import path_changes
+from bfsensor.simulate.boundaries import (
+    COARSENESS,
+    RATIO,
+    Feet,
+    PixelBoundaries,
+    unfold,
+)
+from bfsensor.simulate.field import Field
+from bfsensor.simulate.poisson import Potential
+from bfsensor.simulate.tangent import PotentialChange
+
+GROWTH = 1e4
+"""Of a deviation from a boundary, beyond which the way down is no longer followed."""
+
+_MAX_STEPS = 3000
+
+
+def boundary_changes(
+    potential: Potential,
+    lines: PixelBoundaries,
+    feet: Sequence[Feet],
+    changes: Sequence[PotentialChange],
+    deeper: NDArray[np.float64] | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Differentiate the points of boundary lines.
+
+    Parameters
+    ----------
+    potential : Potential
+        Whose lines they are.
+    lines, feet
+        From :func:`~bfsensor.simulate.boundaries.find_boundaries`, called with ``feet=[]``.
+    changes : sequence of PotentialChange
+        From :meth:`~bfsensor.simulate.tangent.Tangent.change`.
+    deeper : ndarray, shape (changes, nd), optional
+        Change of the depths themselves [um a unit]; by default they stay.
+
+    Returns
+    -------
+    columns, rows : ndarray, shape (changes, nd, lines, seeds, 2)
+        Shifts (x, y) of the points [um a unit], at depths that move by ``deeper``.
+    """
+    field = Field.of(potential)
+    order, made = _on_nodes(potential, field, changes)
+    nd, n = len(lines.depths), len(changes)
+    given = np.zeros((n, nd)) if deeper is None else deeper
+    out = []
+    for foot in feet:
+        shape = foot.below[0][0].shape[:2]
+        moved = np.zeros((*shape, nd, n, 2))
+        for seeds, reached in foot.below:
+            flat = np.ascontiguousarray(seeds.reshape(-1, 3))
+            first = np.zeros((len(flat), n))
+            path_changes.boundary_changes(
+                field.phi, made, field.x, field.y, field.z, flat, foot.axis, field.zone,
+                COARSENESS, _MAX_STEPS, GROWTH, first,
+            )  # fmt: skip
+            depths = lines.depths[reached]
+            up = np.zeros((len(flat), len(depths), n, 2))
+            slopes = np.zeros((len(flat), len(depths), 2))
+            path_changes.trace_changes_up(
+                field.phi, made, field.x, field.y, field.z, flat, first, foot.axis, depths,
+                RATIO, up, slopes,
+            )  # fmt: skip
+            up = up[:, :, np.argsort(order)]
+            up += slopes[:, :, None, :] * given[:, reached].T[None, :, :, None]
+            moved[:, :, reached] = up.reshape(*shape, len(depths), n, 2)
+        # Axes to (changes, nd, lines, seeds, 2).
+        ordered = np.moveaxis(moved, (3, 2), (0, 1))
+        if lines.symmetric:
+            ordered = np.stack([unfold(one, foot.axis) for one in ordered])
+        out.append(ordered)
+    return out[0], out[1]
+
+
+def _on_nodes(
+    potential: Potential, field: Field, changes: Sequence[PotentialChange]
+) -> tuple[list[int], path_changes.Changes]:
+    """Changes as the kernels want them, and in which order they stand there."""
+    still = [n for n, c in enumerate(changes) if not c.moves]
+    moving = [n for n, c in enumerate(changes) if c.moves]
+    padded = [Field.of(replace(potential, phi=changes[n].at_nodes)).phi for n in still]
+    steps = np.array([changes[n].step for n in moving])
+    mesh = potential.mesh
+    moved = []
+    for n, step in zip(moving, steps, strict=True):
+        vx, vy, vz = changes[n].velocity
+        nodes = replace(
+            mesh, x=mesh.x + step * vx, y=mesh.y + step * vy, z=mesh.z + step * vz
+        )
+        phi = potential.phi + step * changes[n].at_nodes
+        moved.append(Field.of(replace(potential, mesh=nodes, phi=phi)))
+    shape = field.phi.shape
+    return still + moving, path_changes.Changes(
+        np.ascontiguousarray(np.stack(padded, -1)) if padded else np.zeros((*shape, 0)),
+        np.stack([f.phi for f in moved]) if moved else np.zeros((0, *shape)),
+        *(
+            np.stack([getattr(f, a) for f in moved]) if moved else np.zeros((0, 0))
+            for a in ("x", "y", "z")
+        ),
+        steps,
+    )

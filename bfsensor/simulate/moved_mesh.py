@@ -1,0 +1,123 @@
+"""The mesh of a device that differs a little: the same nodes, moved with what they lie on.
+
+A mesh laid anew may have another number of planes or cells, and what is solved on it jumps
+by the error of the mesh.  Differences between two devices on nodes that move with surfaces
+and edges are free of that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.errors import DeviceError
+from bfsensor.simulate.mesh import FINE_ABOVE, Mesh, Surfaces
+
+if TYPE_CHECKING:
+    from bfsensor.device import Device
+
+_SAME = 1e-6  # um; nearer than that two surfaces or edges are one
+
+
+def move_mesh(mesh: Mesh, device: Device, moved: Device) -> Mesh:
+    """Move the nodes of a device's mesh to where another device of the same kind needs them.
+
+    Nodes on gates, channel stops, dots, oxide and silicon surfaces and the back stay on
+    them; those between keep their place in proportion.  The end of the side diffusion moves
+    none, for the doping goes to 0 there without a step.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Of ``device``, from :func:`~bfsensor.simulate.mesh.make_mesh` or moved itself.
+    device, moved : Device
+        The device of the mesh, and the one wanted, of the same pitch.
+
+    Returns
+    -------
+    Mesh
+        With as many nodes.
+
+    Raises
+    ------
+    DeviceError
+        Another pitch, or surfaces that change places.
+
+    Examples
+    --------
+    >>> from bfsensor.device import Device
+    >>> from bfsensor.simulate.mesh import make_mesh
+    >>> device = Device.load("itl_sta3800c")
+    >>> thicker = device.with_value("thickness", "105 um")
+    >>> mesh = make_mesh(device, pixels=(1, 1), cells=8)
+    >>> moved = move_mesh(mesh, device, thicker)
+    >>> moved.shape == mesh.shape, float(moved.z[-1])
+    (True, 105.0)
+    """
+    if (device.pixel, device.gates.phases) != (moved.pixel, moved.gates.phases):
+        raise DeviceError(
+            f"{moved.name}: a mesh moves between devices of one pitch and gate pattern only"
+        )
+    nodes = []
+    for axis, old in ((0, mesh.x), (1, mesh.y)):
+        pitch = mesh.pitch[axis]
+        here, there = (_in_pixel(d, axis) for d in (device, moved))
+        centre = pitch * np.round(old / pitch)
+        offset = old - centre
+        shifted = _follow(np.abs(offset), here, there, moved, "xy"[axis])
+        nodes.append(
+            np.where(shifted == np.abs(offset), old, centre + np.sign(offset) * shifted)
+        )
+    z = _follow(mesh.z, _heights(device), _heights(moved), moved, "z")
+    z[-1] = moved.silicon.thickness
+    return replace(mesh, x=nodes[0], y=nodes[1], z=z)
+
+
+def _in_pixel(device: Device, axis: int) -> list[float]:
+    """Distances from the pixel's centre [um] at which nodes lie on something."""
+    half = (device.pixel.pitch_x, device.pixel.pitch_y)[axis] / 2
+    stop = device.channel_stop
+    if axis == 0:
+        edge = half - stop.width / 2
+        return [0.0, edge, edge - device.gates.field_oxide_taper, half]
+    points = [0.0, max(device.gates.edges_y(device.pixel.pitch_y))]
+    if stop.dots is not None:
+        offset = abs(stop.dots.centre - half)
+        points += [abs(offset - stop.dots.height / 2), offset + stop.dots.height / 2]
+    return [*points, half]
+
+
+def _heights(device: Device) -> list[float]:
+    """Heights above the gates [um] at which planes lie on something."""
+    surfaces = Surfaces.of(device)
+    top = max(surfaces.silicon_channel, surfaces.silicon_stop)
+    return [
+        0.0, surfaces.gate_channel, surfaces.silicon_channel, surfaces.silicon_stop,
+        top + FINE_ABOVE, device.silicon.thickness,
+    ]  # fmt: skip
+
+
+def _follow(
+    nodes: NDArray[np.float64],
+    here: list[float],
+    there: list[float],
+    moved: Device,
+    axis: str,
+) -> NDArray[np.float64]:
+    """Positions of nodes when points go from ``here`` to ``there``, linear between them."""
+    order = sorted(range(len(here)), key=lambda n: here[n])
+    kept: list[int] = []
+    for n in order:
+        # Of points in one place the first named leads; the other lies between nodes then.
+        if not kept or here[n] - here[kept[-1]] > _SAME:
+            kept.append(n)
+    old, new = np.array(here)[kept], np.array(there)[kept]
+    if np.any(np.diff(new) <= 0):
+        raise DeviceError(
+            f"{moved.name}: along {axis} surfaces or edges at {np.round(new, 4).tolist()} um are not in "
+            f"the order of those at {np.round(old, 4).tolist()} um that the mesh was laid for"
+        )
+    return nodes + np.interp(nodes, old, new - old)
