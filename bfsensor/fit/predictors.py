@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,6 @@ from bfsensor.fit.quantities import Prior
 from bfsensor.fit.spot_response import slope_weights
 from bfsensor.recording.exposures import Condition
 
-STEP = 0.02
-"""Of a parameter, to either side, for the slopes' derivatives [its spread]."""
-
 Prediction = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Values, shape (n,), and their derivatives by all parameters, shape (n, p)."""
 
@@ -25,7 +22,8 @@ class Response(Protocol):
     """Response of a flat at one condition.
 
     ``kx``, ``ky``: mean shifts of right and upper edges [pixel/e-], odd sides, (0, 0) in the
-    middle.  ``areas``: a_ij [1/e-], [j, i] from (0, 0).  ``jacobian``: shape (p, j, i).
+    middle.  ``areas``: a_ij [1/e-], [j, i] from (0, 0).  ``dkx``, ``dky``, ``jacobian``: their
+    derivatives by the emulator's parameters, along the first axis.
     """
 
     @property
@@ -35,6 +33,14 @@ class Response(Protocol):
     @property
     def ky(self) -> NDArray[np.float64]:
         """Of upper edges."""
+
+    @property
+    def dkx(self) -> NDArray[np.float64]:
+        """By parameter."""
+
+    @property
+    def dky(self) -> NDArray[np.float64]:
+        """By parameter."""
 
     @property
     def areas(self) -> NDArray[np.float64]:
@@ -52,7 +58,7 @@ class Emulator(Protocol):
     def parameters(self) -> Sequence[str]:
         """Dotted names."""
 
-    def predict(self, values: Any, condition: Any) -> Any:
+    def predict(self, values: NDArray[np.float64], condition: Condition) -> Response:
         """Response at parameters [internal units] and a condition."""
 
 
@@ -91,7 +97,7 @@ class _Responses:
 
     def predict(
         self, values: NDArray[np.float64], condition: Condition
-    ) -> tuple[Any, NDArray[np.float64]]:
+    ) -> tuple[Response, NDArray[np.int64]]:
         """Response, and the fit's parameters that the jacobian's rows are of, -1 where held."""
         stated = held(self._names, condition)
         own = np.where(stated, self._means, values[self._at])
@@ -125,12 +131,11 @@ class AreaPredictor:
 
 
 class SlopePredictor:
-    """Slopes of spots, linear in the shifts; derivatives by differences of the emulator."""
+    """Slopes of spots, linear in the shifts."""
 
     def __init__(self, data: DataSet, emulator: Emulator, priors: Sequence[Prior]) -> None:
         self._data, self._responses = data, _Responses(emulator, priors)
         self._groups = _by_condition(data)
-        self._spreads = np.array([prior.spread for prior in priors])
         self._weights = slope_weights(data.sigma)
 
     def __call__(self, values: NDArray[np.float64]) -> Prediction:
@@ -139,20 +144,12 @@ class SlopePredictor:
         found = np.zeros(len(axes))
         slopes = np.zeros((len(axes), len(values)))
         for condition, rows in self._groups.items():
-            both, at = self._both(values, condition)
-            found[rows] = both[axes[rows]]
-            for column in at[at >= 0]:
-                step = np.zeros(len(values))
-                step[column] = STEP * self._spreads[column]
-                up, down = (self._both(values + s * step, condition)[0] for s in (1, -1))
-                slopes[rows, column] = (up - down)[axes[rows]] / (2 * step[column])
+            response, at = self._responses.predict(values, condition)
+            found[rows] = self._weights.slopes(response.kx, response.ky)[axes[rows]]
+            changes = self._weights.slopes(response.dkx, response.dky)
+            for n in np.flatnonzero(at >= 0).tolist():
+                slopes[rows, at[n]] = changes[n, axes[rows]]
         return found, slopes
-
-    def _both(
-        self, values: NDArray[np.float64], condition: Condition
-    ) -> tuple[NDArray[np.float64], NDArray[Any]]:
-        response, at = self._responses.predict(values, condition)
-        return self._weights.slopes(np.asarray(response.kx), np.asarray(response.ky)), at
 
 
 class TangentPredictor:

@@ -29,6 +29,15 @@ from bfsensor.fit.quantities import Prior
 FEWEST = 5.0
 """Degrees of freedom of a data set from which its scale is estimated; 1 below."""
 
+ORDERED = (
+    ("gates.gate_oxide", "gates.field_oxide"),
+    ("operating_point.gate_low", "operating_point.gate_high"),
+)
+"""Pairs of which the first is not above the second in any device."""
+
+STEEP = 1e4
+"""Of what keeps them so, a spread that they are the wrong way round [standard deviations]."""
+
 ROUNDS = 60
 TOLERANCE = 1e-4
 """Of the scales, from one round to the next."""
@@ -177,6 +186,9 @@ def _minimise(
                 slopes.append(slope * spreads / error[:, None])
             parts.append((whole - means) / spreads)
             slopes.append(np.eye(len(means)))
+            wrong, turned = _disorder(problem, whole)
+            parts.append(wrong)
+            slopes.append(turned)
             cache[key] = np.concatenate(parts), np.concatenate(slopes)
         return cache[key]
 
@@ -195,9 +207,11 @@ def _minimise(
             raise ConvergenceError(f"the fit did not settle: {found.message}")
         x = found.x
     residual, slope = both(x)
-    whole = np.array(whole)
-    n = len(residual) - len(means)
-    normal = slope[:, free].T @ slope[:, free]
+    whole = _ordered(problem, whole)
+    n = sum(len(problem.sets[k].values) for k in fitted)
+    # Priors count, the order of pairs does not: it only cuts intervals off.
+    told = slice(0, n + len(means))
+    normal = slope[told, free].T @ slope[told, free]
     covariance = np.zeros((len(means), len(means)))
     covariance[np.ix_(free, free)] = np.linalg.inv(normal) if free.any() else 0.0
     chi2, determined = np.zeros(len(problem.sets)), np.zeros(len(problem.sets))
@@ -215,6 +229,31 @@ def _minimise(
         whole, covariance * np.outer(spreads, spreads), scales, determined, chi2,
         float(residual @ residual), slope[:n],
     )  # fmt: skip
+
+
+def _pairs(problem: Problem) -> list[tuple[int, int]]:
+    names = [prior.name for prior in problem.priors]
+    return [(names.index(a), names.index(b)) for a, b in ORDERED if {a, b} <= set(names)]
+
+
+def _disorder(problem: Problem, values: Values) -> tuple[Values, Values]:
+    """Residuals of pairs that are the wrong way round, and their slopes in spreads."""
+    pairs, spreads = _pairs(problem), problem.spreads
+    out, slopes = np.zeros(len(pairs)), np.zeros((len(pairs), len(values)))
+    for row, (low, high) in enumerate(pairs):
+        unit = spreads[low] / STEEP
+        if values[low] > values[high]:
+            out[row] = (values[low] - values[high]) / unit
+            slopes[row, low], slopes[row, high] = STEEP, -spreads[high] / unit
+    return out, slopes
+
+
+def _ordered(problem: Problem, values: Values) -> Values:
+    """Copy in which pairs that are a hair the wrong way round are equal."""
+    out = np.array(values)
+    for low, high in _pairs(problem):
+        out[low] = min(out[low], out[high])
+    return out
 
 
 def _rescaled(problem: Problem, found: Solution) -> Values:

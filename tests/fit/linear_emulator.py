@@ -1,25 +1,25 @@
-"""Emulators that are straight in the parameters: of given arrays, and of our device's walks."""
+"""Emulators that are straight in the parameters: of given arrays, and of our device's tangents."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor import Device
-from bfsensor.diagnose.baseline import area_matrix
-from bfsensor.diagnose.walk import walk
 from bfsensor.fit.changing import device_at
 from bfsensor.fit.quantities import Prior
 from bfsensor.recording.exposures import Condition
+from bfsensor.response import area_matrix, solve_response
 
 
 @dataclass(frozen=True)
 class LinearResponse:
     kx: NDArray
     ky: NDArray
+    dkx: NDArray
+    dky: NDArray
     areas: NDArray
     jacobian: NDArray
 
@@ -41,7 +41,7 @@ class LinearEmulator:
             e + np.tensordot(by, s, 1) for e, s in zip(self.edges, self.slopes, strict=True)
         )
         rows = [quadrant(*pair) for pair in zip(*self.slopes, strict=True)]
-        return LinearResponse(kx, ky, quadrant(kx, ky), np.array(rows))
+        return LinearResponse(kx, ky, *self.slopes, quadrant(kx, ky), np.array(rows))
 
 
 def quadrant(kx, ky):
@@ -50,24 +50,19 @@ def quadrant(kx, ky):
     return a[n:-1, n:-1]
 
 
-def emulator_of_walks(
-    device: Device, priors: tuple[Prior, ...], keep: Path, cells: int = 8
+def emulator_of_tangents(
+    device: Device, priors: tuple[Prior, ...], *, condition: Condition, cells: int = 8
 ) -> LinearEmulator:
-    """Tangent of the device's own walks, half a spread to either side."""
-
-    def edges(values):
-        there = device_at(device, Condition(), priors, values)
-        return walk(there, cells=cells, keep=keep).edges(None, 173.0)
-
+    """Tangent of the device's own response at one condition."""
     middle = np.array([prior.mean for prior in priors])
-    slopes = []
+    here = device_at(device, condition)
+    changed = []
     for n, prior in enumerate(priors):
-        step = np.zeros(len(priors))
-        step[n] = 0.5 * prior.spread
-        up, down = edges(middle + step), edges(middle - step)
-        slopes.append([(u - d) / prior.spread for u, d in zip(up, down, strict=True)])
-    both = edges(middle)
+        # To the one side where the other is no device: oxides of equal thickness.
+        step = 1e-3 * prior.spread * (-1 if prior.name == "gates.gate_oxide" else 1)
+        changed.append((device_at(here, Condition(), (prior,), middle[[n]] + step), step))
+    found = solve_response(here, cells=cells, changed=changed)
     return LinearEmulator(
-        tuple(prior.name for prior in priors), middle, both,
-        (np.array([s[0] for s in slopes]), np.array([s[1] for s in slopes])),
+        tuple(prior.name for prior in priors), middle, (found.kx[-1], found.ky[-1]),
+        (found.dkx[:, -1], found.dky[:, -1]),
     )  # fmt: skip

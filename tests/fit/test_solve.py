@@ -125,3 +125,26 @@ def test_refusals():
     saturation = replace(data, kind="saturation")
     with pytest.raises(FitError, match="toy: nothing predicts saturation"):
         problem(saturation)
+
+
+def test_a_pair_stays_in_order_and_otherwise_does_not_matter():
+    """Oxides: the gate's may be as thick as the field's, not thicker."""
+    emulator = replace(
+        toy_emulator(count=2), parameters=("gates.gate_oxide", "gates.field_oxide")
+    )
+    truth = np.array([MEANS[0] + 4.0, MEANS[1] - 0.4])
+    data = toy_data(emulator, truth, 12, scaled=False)
+    priors = (
+        Prior("gates.gate_oxide", MEANS[0], SPREADS[0]),
+        Prior("gates.field_oxide", MEANS[1], SPREADS[1]),
+    )
+    # The first is far above the second here: pulled together at whatever cost.
+    tied = solve(problem(data, priors=priors, emulator=emulator))
+    assert tied.values[0] == pytest.approx(tied.values[1], abs=1e-2)
+    assert tied.values[0] <= tied.values[1]
+    turned = replace(emulator, parameters=("gates.field_oxide", "gates.gate_oxide"))
+    named = tuple(
+        replace(p, name=n) for p, n in zip(priors, turned.parameters, strict=True)
+    )
+    free = solve(problem(data, priors=named, emulator=turned))
+    assert free.values[0] == pytest.approx(truth[0], abs=4 * np.sqrt(free.covariance[0, 0]))
