@@ -68,6 +68,9 @@ def parse_conditions(
 @click.option("--profile", "profiles", multiple=True, metavar="NAME",
               help="Profile likelihood of a free quantity; repeatable.")  # fmt: skip
 @click.option("--cells", default=16, show_default=True, help="Mesh cells a pixel.")
+@click.option("--fine", default=32, show_default=True, type=click.IntRange(min=0),
+              help="Cells of the mesh on which the device itself is solved; derivatives are those of "
+              "--cells. 0: --cells for both.")  # fmt: skip
 @click.option("-o", "--output", type=click.Path(path_type=Path),
               help="Folder for fit.json, device.toml and fit.png [DEVICE_fit].")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print fit.json instead of a table.")
@@ -82,6 +85,7 @@ def fit(
     errors: str,
     profiles: tuple[str, ...],
     cells: int,
+    fine: int,
     output: Path | None,
     as_json: bool,
 ) -> None:
@@ -123,7 +127,12 @@ def fit(
     emulator = None
     if {"areas", "slopes"} & {data.kind for data in sets}:
         emulator = build_emulator(
-            known, [n for n in names if n not in (SPILL, DIFFUSION)], sets, cells, folder
+            known,
+            [n for n in names if n not in (SPILL, DIFFUSION)],
+            sets,
+            cells,
+            fine,
+            folder,
         )
     result = fit_device(
         known, sets, priors, emulator,
@@ -146,23 +155,34 @@ def fit(
 
 
 def build_emulator(
-    device: Any, parameters: list[str], sets: Sequence[DataSet], cells: int, folder: Path
+    device: Any,
+    parameters: list[str],
+    sets: Sequence[DataSet],
+    cells: int,
+    fine: int,
+    folder: Path,
 ) -> Any:
     """Build the emulator of a device at the conditions of all areas and slopes."""
-    import importlib
+    from bfsensor.fit.emulator import DeviceEmulator
+    from bfsensor.fit.finer import refine
 
-    # The module comes with the tangents of the solve.
-    builder = importlib.import_module("bfsensor.fit.emulator").DeviceEmulator
-    wanted = dict.fromkeys(
-        condition
-        for data in sets
-        if data.kind in ("areas", "slopes")
-        for condition in data.conditions
+    wanted = tuple(
+        dict.fromkeys(
+            condition
+            for data in sets
+            if data.kind in ("areas", "slopes")
+            for condition in data.conditions
+        )
     )
-    return builder.build(
-        device, parameters, conditions=tuple(wanted), cells=cells, keep=folder / "emulator",
+    emulator = DeviceEmulator.build(
+        device, parameters, conditions=wanted, cells=cells, keep=folder / "emulator",
         progress=Bar("emulator"),
     )  # fmt: skip
+    if not fine or fine == cells:
+        return emulator
+    return refine(
+        emulator, device, emulator.nominal, wanted, cells=fine, progress=Bar("fine mesh")
+    )
 
 
 def _data_sets(

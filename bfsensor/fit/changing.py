@@ -63,12 +63,18 @@ def device_at(
         if stated is not None:
             wanted[f"operating_point.{key}"] = float(stated)
     out = device
-    try:
-        for name, value in wanted.items():
-            if value != known[name].value:
+    left = {name: v for name, v in wanted.items() if v != known[name].value}
+    # What needs another change first, such as thicker oxides, waits for it.
+    while left:
+        later, refused = {}, None
+        for name, value in left.items():
+            try:
                 out = change(out, name, value - known[name].value)
-    except BFSensorError as error:
-        raise FitError(f"no such device: {error}") from None
+            except BFSensorError as error:
+                later[name], refused = value, error
+        if len(later) == len(left):
+            raise FitError(f"no such device: {refused}")
+        left = later
     return out
 
 
