@@ -1,9 +1,9 @@
 """Mock a_ij of devices drawn from their priors, and what the fit returns of them.
 
-``python -m validation.fit_recovery [DEVICE] [--errors FILE] [--mocks 50] [--truth emulator|walks]``
+``python -m validation.fit_recovery [DEVICE] [--errors FILE] [--mocks 50] [--truth emulator|solved]``
 draws true parameters from the priors of a device, gives its a_ij errors like those of a measured
 table (times ``--times``), fits them, and counts how often the truth lies within 1 and 1.96 posterior
-errors.  ``walks``: true a_ij come from full solutions of each drawn device, so that the
+errors.  ``solved``: true a_ij come from full solutions of each drawn device, so that the
 emulator's own error counts; ``emulator``: from the emulator, so that it does not.  ``--misstated 3``
 tells the fit errors wrong by that factor, which the estimated scale has to find.
 
@@ -185,7 +185,7 @@ def main() -> None:
     parser.add_argument("--times", type=float, default=1.0, help="of those errors")
     parser.add_argument("--misstated", type=float, default=1.0)
     parser.add_argument("--mocks", type=int, default=50)
-    parser.add_argument("--truth", choices=("emulator", "walks"), default="emulator")
+    parser.add_argument("--truth", choices=("emulator", "solved"), default="emulator")
     parser.add_argument("--cells", type=int, default=8)
     parser.add_argument("--seed", type=int, default=7301)
     parser.add_argument("--keep", type=Path, help="folder of the emulator's solves")
@@ -205,7 +205,7 @@ def main() -> None:
         options.times * read_area_changes(options.errors).errors[: LAGS + 1, : LAGS + 1]
     )
     areas = (
-        None if options.truth == "emulator" else walked_areas(device, priors, options.cells)
+        None if options.truth == "emulator" else solved_areas(device, priors, options.cells)
     )
     begin = time.process_time()
     rows, told = recover(
@@ -228,16 +228,15 @@ def main() -> None:
     append(table, run, told)
 
 
-def walked_areas(device: Device, priors: Sequence[Prior], cells: int) -> Areas:
-    """a_ij of full solutions of a device with other parameters."""
-    from bfsensor.diagnose.baseline import area_matrix
-    from bfsensor.diagnose.walk import walk
+def solved_areas(device: Device, priors: Sequence[Prior], cells: int) -> Areas:
+    """a_ij of full solutions of a device with other parameters, on its mesh moved with it."""
     from bfsensor.fit.changing import device_at
+    from bfsensor.response import area_matrix, solve_response
 
     def areas(values: NDArray[np.float64]) -> NDArray[np.float64]:
         there = device_at(device, Condition(), priors, values)
-        temperature = there.operating_point.temperature
-        a = area_matrix(*walk(there, cells=cells).edges(None, temperature))
+        found = solve_response(there, cells=cells, laid_for=device)
+        a = area_matrix(*found.edges(None, there.operating_point.temperature))
         return np.asarray(a[len(a) // 2 :, len(a) // 2 :])
 
     return areas
