@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.effects.effect import Effect
 from bfsensor.errors import DiagnosisError
+from bfsensor.response import Edges, area_matrix
 
-Edges = tuple[NDArray[np.float64], NDArray[np.float64]]
 Key = tuple[float, float]
 """Wavelength [nm] and back bias [V] of shifts that are held."""
 
@@ -288,11 +288,6 @@ def _off(one: float, other: float) -> float:
 def _signed(one: float, other: float) -> float:
     """Difference; 0 where either is not known."""
     return one - other if np.isfinite(one) and np.isfinite(other) else 0.0
-
-
-def area_matrix(kx: NDArray[np.float64], ky: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Change of the areas per electron [1/e-], from the shifts of right and upper edges."""
-    return kx - np.roll(kx, 1, 1) + ky - np.roll(ky, 1, 0)
 
 
 def centre(kx: NDArray[np.float64], ky: NDArray[np.float64]) -> float:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,6 +16,7 @@ from bfsensor.diagnose.walk import LEVEL, SPAN, Walk, walk
 from bfsensor.effects.lateral_diffusion import ZERO_CELSIUS
 from bfsensor.errors import DeviceError, DiagnosisError
 from bfsensor.files import written_whole
+from bfsensor.fit.parameters import change_parameter, device_parameters, parameter_value
 from bfsensor.simulate.edge_field import front_plane
 
 CELLS, FINE = 16, 32
@@ -36,89 +34,6 @@ WARMER = 10.0
 
 PARTS = ("levels", "depths")
 """What a baseline can be made without."""
-
-UNUSED = ("well.spill_barrier",)
-"""Uncertain quantities that move no boundary."""
-
-
-def device_parameters(device: Device) -> dict[str, float]:
-    """Quantities of a device whose file states an uncertainty, with it [internal units].
-
-    Examples
-    --------
-    >>> device_parameters(Device.load("itl_sta3800c"))["silicon.thickness"]
-    5.0
-    """
-    return {
-        key: float(known.uncertainty)
-        for key, known in device.provenance.items()
-        if known.uncertainty and key not in UNUSED
-    }
-
-
-def change_parameter(device: Device, key: str, by: float) -> Device:
-    """Give a copy with one quantity, also of an implant, changed by so much [internal units].
-
-    Raises
-    ------
-    DiagnosisError
-        No such quantity.
-    """
-    try:
-        return _changed(device, _steps(device, key), by)
-    except (AttributeError, IndexError, TypeError):
-        raise DiagnosisError(f"no quantity {key!r} in the device {device.name}") from None
-
-
-def parameter_value(device: Device, key: str) -> float:
-    """Give one quantity, also of an implant [internal units].
-
-    Raises
-    ------
-    DiagnosisError
-        No such quantity.
-
-    Examples
-    --------
-    >>> parameter_value(Device.load("itl_sta3800c"), "silicon.thickness")
-    100.0
-    """
-    part: Any = device
-    try:
-        for name, n in _steps(device, key):
-            part = getattr(part, name if n is None else f"{name}s")
-            part = part if n is None else part[n]
-        return float(part)
-    except (AttributeError, IndexError, TypeError):
-        raise DiagnosisError(f"no quantity {key!r} in the device {device.name}") from None
-
-
-def _steps(device: Device, key: str) -> list[tuple[str, int | None]]:
-    """Names, and numbers of implants, from the device down to a quantity."""
-    steps = [
-        (found[1], None if found[2] is None else int(found[2]))
-        for found in (
-            re.fullmatch(r"(\w+?)(?:\[(\d+)\])?", part) for part in key.split(".")
-        )
-        if found is not None
-    ]
-    if len(steps) != len(key.split(".")) or len(steps) < 2 or steps[-1][1] is not None:
-        raise DiagnosisError(f"no quantity {key!r} in the device {device.name}")
-    return steps
-
-
-def _changed(part: Any, steps: list[tuple[str, int | None]], by: float) -> Any:
-    """Copy of a part of a device with the quantity at the end of a path changed."""
-    (name, n), *rest = steps
-    # Files name one implant, Python the tuple of them.
-    field = name if n is None else f"{name}s"
-    old = getattr(part, field)
-    if n is not None:
-        members = list(old)
-        members[n] = _changed(members[n], rest, by)
-        return dataclasses.replace(part, **{field: tuple(members)})
-    new = _changed(old, rest, by) if rest else old + by
-    return dataclasses.replace(part, **{field: new})
 
 
 def baseline_of_device(

@@ -19,7 +19,6 @@ from bfsensor.device import Device
 from bfsensor.device_parts import Edge, EdgeStrip
 from bfsensor.diagnose.baseline import Baseline, Edges, Key
 from bfsensor.diagnose.device_baseline import FINE, WARMER, change_parameter
-from bfsensor.diagnose.table_baseline import conversion_weights
 from bfsensor.diagnose.walk import LEVEL, SPAN, Walk, walk
 from bfsensor.effects.effect import Effect
 from bfsensor.effects.lateral_diffusion import ZERO_CELSIUS
@@ -38,6 +37,7 @@ from bfsensor.effects.left_out import (
     ring_parameters,
 )
 from bfsensor.errors import DeviceError
+from bfsensor.response import conversion_weights
 from bfsensor.simulate.edge_field import front_plane, solve_edge
 from bfsensor.simulate.edge_shift import trace_edge
 from bfsensor.units import VACUUM_PERMITTIVITY

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor import silicon
 from bfsensor.device import Device
 from bfsensor.diagnose.baseline import Baseline, Edges
 from bfsensor.errors import BFSensorError, DiagnosisError
 from bfsensor.galsim_format import read_galsim
 from bfsensor.resources import tables_dir
+from bfsensor.response import conversion_weights
 from bfsensor.table import DistortionTable, vertex_fractions
 
 WAVELENGTHS = (400.0, 480.0, 550.0, 620.0, 700.0, 750.0, 870.0, 950.0)
@@ -249,17 +249,3 @@ def _along(
     values = np.concatenate([ends[:-1, :, None], inner, ends[1:, :, None]], axis=-1)
     mean = np.trapezoid(values, at, axis=-1)
     return np.asarray(np.moveaxis(mean, 0, axis))
-
-
-def conversion_weights(
-    depths: NDArray[np.float64], thickness: float, wavelength: float, temperature: float
-) -> NDArray[np.float64]:
-    """Share of the light that the response at each depth stands for, linear between them."""
-    length = float(silicon.absorption_length(wavelength, temperature))
-    z = np.linspace(0.0, thickness, 4001)
-    light = np.exp(-(thickness - z) / length)
-    light /= light.sum()
-    weights = np.array([
-        np.interp(z, depths, np.eye(len(depths))[n]) @ light for n in range(len(depths))
-    ])  # fmt: skip
-    return weights / weights.sum()

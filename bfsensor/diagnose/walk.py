@@ -15,24 +15,17 @@ import bfsensor
 from bfsensor.build import build_table
 from bfsensor.device import Device
 from bfsensor.diagnose.baseline import Edges
-from bfsensor.diagnose.table_baseline import CHARGE, conversion_weights, edges_by_depth
+from bfsensor.diagnose.table_baseline import CHARGE, edges_by_depth
 from bfsensor.errors import DiagnosisError
 from bfsensor.files import written_whole
+from bfsensor.response import LEVEL, REACH, VERTICES, mixed, response_depths
 from bfsensor.table_plan import Plan
-
-LEVEL = 40_000.0
-"""Background about which the response is taken [e-]: the middle of a flat of 80,000 e-."""
 
 SPAN = 25_000.0
 """To either side of it, of the backgrounds that tell how the response changes [e-]."""
 
 BEYOND = 50 * CHARGE
 """Largest charge above the background [e-]: the response is differential, so a small one."""
-
-REACH = 4
-"""Of the shifts [pixel]; a ring more holds edges that do not move."""
-
-VERTICES = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,15 +78,7 @@ class Walk:
 
     def _mixed(self, wavelength: float | None, temperature: float) -> Edges:
         """By background, weighted by where light converts."""
-        if wavelength is None:
-            return self.kx[:, -1], self.ky[:, -1]
-        weights = conversion_weights(
-            self.depths, float(self.depths[-1]), wavelength, temperature
-        )
-        return (
-            np.tensordot(self.kx, weights, (1, 0)),
-            np.tensordot(self.ky, weights, (1, 0)),
-        )
+        return mixed(self.kx, self.ky, self.depths, wavelength, temperature)
 
 
 def walk(
@@ -116,8 +101,7 @@ def walk(
     keep : Path, optional
         Folder in which the result is kept, and found by a later walk.
     """
-    thickness = device.silicon.thickness
-    depths = (5.0, 20.0, 0.5 * thickness, thickness)
+    depths = response_depths(device)
     both = [_at(device, cells, float(b), depths, keep) for b in backgrounds]
     kx, ky = (np.array([b[n] for b in both]) for n in range(2))
     return Walk(tuple(map(float, backgrounds)), np.array(depths), kx, ky)

@@ -16,7 +16,7 @@ from bfsensor.diagnose.device_baseline import (
 )
 from bfsensor.diagnose.sources import find_baseline, simulate_baseline
 from bfsensor.diagnose.walk import Walk
-from bfsensor.errors import DeviceError, DiagnosisError
+from bfsensor.errors import DeviceError, DiagnosisError, FitError
 from validation.concealed.card import NOMINAL, SPREAD, shifts_at
 from validation.virtual_source import virtual_baseline
 
@@ -88,7 +88,7 @@ def test_every_uncertain_quantity_can_be_changed(name):
      "channel.implant[0]", "channel.implants", "gates.gate_oxide.more"],
 )  # fmt: skip
 def test_what_a_device_does_not_have(key):
-    with pytest.raises(DiagnosisError, match="no quantity"):
+    with pytest.raises(FitError, match="no quantity"):
         change_parameter(Device.load("itl_sta3800c"), key, 1.0)
 
 

@@ -1,0 +1,161 @@
+"""Derivatives of the response by every uncertain quantity of a device, and the emulator.
+
+``python -m validation.device_derivatives derivatives`` holds derivatives of edge shifts from the
+linearised solve against differences of solutions 0.1 spreads to either side on a mesh that moves
+with the device, and 0.5 spreads to either side on meshes of their own, with what they cost.
+``python -m validation.device_derivatives emulator`` builds the emulator and holds it against
+solutions at random points of the prior volume.  Both add to files in ``validation/results``.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import click
+import numpy as np
+from astropy.table import Table, vstack
+
+from bfsensor import Device
+from bfsensor.errors import DeviceError
+from bfsensor.fit.emulator import DeviceEmulator
+from bfsensor.fit.emulator_nodes import STEP
+from bfsensor.fit.parameters import change_parameter, device_parameters
+from bfsensor.response import EdgeResponse, area_matrix, solve_response
+from validation.write_results import write_results
+
+RESULTS = Path(__file__).parent / "results" / "device_derivatives.ecsv"
+COMMAND = "python -m validation.device_derivatives"
+NEAR, FAR = 0.1, 0.5
+"""To either side, on the moved mesh and on others [spread]."""
+
+LAGS = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
+
+
+def differences(device: Device, name: str, step: float, cells: int, remeshed: bool):
+    """Change of the shifts for a unit, from solutions to either side or to the one there is."""
+    sides: list[tuple[float, EdgeResponse]] = []
+    for by in (step, -step):
+        try:
+            there = change_parameter(device, name, by)
+        except DeviceError:
+            continue
+        sides.append((by, solve_response(
+            there, cells=cells, laid_for=None if remeshed else device,
+        )))  # fmt: skip
+    if len(sides) == 1:
+        sides.append((0.0, solve_response(device, cells=cells)))
+    (a, one), (b, other) = sides
+    return np.stack([one.kx - other.kx, one.ky - other.ky])[:, -1] / (a - b)
+
+
+def compare_derivatives(device: Device, cells: int) -> Table:
+    """One row a parameter: errors of the derivatives, and what they are at the nearest lags."""
+    known = device_parameters(device)
+    changed = []
+    for name, spread in known.items():
+        step = STEP * spread
+        try:
+            changed.append((change_parameter(device, name, step), step))
+        except DeviceError:
+            changed.append((change_parameter(device, name, -step), -step))
+    solve_response(device, cells=8, changed=changed[:1])  # kernels are compiled
+    found = solve_response(device, cells=cells, changed=changed)
+    a = area_matrix(found.kx[-1], found.ky[-1])
+    rows = []
+    for n, (name, spread) in enumerate(known.items()):
+        own = np.stack([found.dkx[n, -1], found.dky[n, -1]])
+
+        def error(by: float, remeshed: bool, name=name, spread=spread, own=own) -> float:
+            wanted = differences(device, name, by * spread, cells, remeshed)
+            return float(np.sqrt(np.sum((own - wanted) ** 2) / np.sum(wanted**2)))
+
+        change = area_matrix(*own) * spread / a
+        row = {
+            "device": device.name, "cells": cells, "parameter": name, "spread": spread,
+            "error_moved": round(error(NEAR, False), 5),
+            "error_remeshed": round(error(FAR, True), 5),
+            **{f"change_{i}{j}": round(float(change[5 + j, 5 + i]), 5) for i, j in LAGS},
+            "solve_s": round(found.seconds[0], 2), "derivatives_s": round(found.seconds[1], 2),
+        }  # fmt: skip
+        rows.append(row)
+        click.echo(
+            f"{name:38s} {100 * row['error_moved']:6.2f} %, own mesh {100 * row['error_remeshed']:6.2f} %"
+            f"  a_00 {100 * row['change_00']:+.2f} % a spread"
+        )
+    ratio = found.seconds[1] / found.seconds[0]
+    click.echo(
+        f"all {len(rows)} derivatives: {ratio:.1f} solves of {found.seconds[0]:.2f} CPU s"
+    )
+    return Table(rows)
+
+
+def check_emulator(
+    device: Device, cells: int, points: int, keep: Path | None, remeshed: bool
+) -> Table:
+    """One row a lag: error of the emulator at random points, and what the prior leaves open."""
+    began = time.process_time()
+    emulator = DeviceEmulator.build(device, cells=cells, keep=keep)
+    built = time.process_time() - began
+    check = emulator.check(points, 20_260, remeshed=remeshed)
+    median, most = check.quantile(0.5), check.quantile(0.95)
+    spread = check.solved.std(axis=0, ddof=1) / np.abs(check.solved.mean(axis=0))
+    nominal = emulator.predict(emulator.nominal).areas
+    rows = [
+        {
+            "device": device.name, "cells": cells, "parameters": len(emulator.parameters),
+            "points": points, "remeshed": remeshed, "i": i, "j": j, "a": float(nominal[j, i]),
+            "prior_spread": round(float(spread[j, i]), 5),
+            "error_median": round(float(median[j, i]), 5),
+            "error_95": round(float(most[j, i]), 5), "build_cpu_s": round(built, 1),
+        }
+        for j in range(nominal.shape[0]) for i in range(nominal.shape[1])
+    ]  # fmt: skip
+    for row in rows:
+        click.echo("({i},{j}) a {a:+.3e}  prior {prior_spread:.4f}  median {error_median:.4f}  "
+                   "95 % {error_95:.4f}".format(**row))  # fmt: skip
+    click.echo(f"built in {built:.0f} CPU s (what was kept took none)")
+    return Table(rows)
+
+
+def add_results(table: Table, path: Path) -> None:
+    """Add rows to a file of results."""
+    if path.exists():
+        there = Table.read(path, format="ascii.ecsv")
+        table = vstack([there, table], metadata_conflicts="silent")
+    write_results(table, str(path), COMMAND)
+
+
+@click.group(help=__doc__)
+def main() -> None:
+    """Choose what to run."""
+
+
+@main.command()
+@click.option("--device", "names", multiple=True, default=("itl_sta3800c", "e2v_ccd250"))
+@click.option("--cells", default=16, show_default=True)
+def derivatives(names: tuple[str, ...], cells: int) -> None:
+    """Hold derivatives against differences."""
+    for name in names:
+        add_results(compare_derivatives(Device.load(name), cells), RESULTS)
+
+
+@main.command()
+@click.option("--device", "names", multiple=True, default=("itl_sta3800c", "e2v_ccd250"))
+@click.option("--cells", default=16, show_default=True)
+@click.option("--points", default=20, show_default=True)
+@click.option(
+    "--keep", type=click.Path(path_type=Path), help="Folder of finished solutions."
+)
+@click.option("--remeshed", is_flag=True, help="Solve every point on a mesh of its own.")
+def emulator(
+    names: tuple[str, ...], cells: int, points: int, keep: Path | None, remeshed: bool
+) -> None:
+    """Hold the emulator against solutions."""
+    path = RESULTS.with_name("device_emulator.ecsv")
+    for name in names:
+        add_results(check_emulator(Device.load(name), cells, points, keep, remeshed), path)
+
+
+if __name__ == "__main__":
+    main()
