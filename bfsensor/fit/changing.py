@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,18 +11,9 @@ from numpy.typing import NDArray
 from bfsensor.device import Device
 from bfsensor.device_parts import Provenance
 from bfsensor.errors import BFSensorError, FitError
+from bfsensor.fit.parameters import change_parameter
 from bfsensor.fit.quantities import DIFFUSION, Prior, quantities
 from bfsensor.recording.exposures import Condition
-
-
-def _change_parameter() -> Any:
-    # Moves to fit.parameters; until then it is found where it was.
-    for name in ("bfsensor.fit.parameters", "bfsensor.diagnose.device_baseline"):
-        try:
-            return importlib.import_module(name).change_parameter
-        except ModuleNotFoundError:
-            continue
-    raise FitError("change_parameter is nowhere")
 
 
 def device_at(
@@ -49,7 +38,6 @@ def device_at(
     FitError
         There is no such device.
     """
-    change = _change_parameter()
     known = quantities(device)
     wanted = {}
     if values is not None:
@@ -69,7 +57,7 @@ def device_at(
         later, refused = {}, None
         for name, value in left.items():
             try:
-                out = change(out, name, value - known[name].value)
+                out = change_parameter(out, name, value - known[name].value)
             except BFSensorError as error:
                 later[name], refused = value, error
         if len(later) == len(left):
