@@ -69,8 +69,8 @@ def parse_conditions(
               help="Profile likelihood of a free quantity; repeatable.")  # fmt: skip
 @click.option("--cells", default=16, show_default=True, help="Mesh cells a pixel.")
 @click.option("--fine", default=32, show_default=True, type=click.IntRange(min=0),
-              help="Cells of the mesh on which the device itself is solved; derivatives are those of "
-              "--cells. 0: --cells for both.")  # fmt: skip
+              help="Cells of the mesh on which the device is solved where the fit ends, until that is "
+              "right; derivatives are those of --cells. 0: --cells for both.")  # fmt: skip
 @click.option("-o", "--output", type=click.Path(path_type=Path),
               help="Folder for fit.json, device.toml and fit.png [DEVICE_fit].")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print fit.json instead of a table.")
@@ -106,6 +106,7 @@ def fit(
       bfsensor fit itl_sta3800c itl.csv slopes.csv --free all --at itl.csv:back_bias=-60V
       bfsensor fit itl_sta3800c slopes.csv --hold itl.csv --free silicon.background_doping
     """
+    from bfsensor.fit.finer import Refiner
     from bfsensor.fit.fit import fit_device
     from bfsensor.fit.quantities import DIFFUSION, choose_priors, with_priors
     from bfsensor.fit.tangents import SPILL, make_tangents
@@ -124,18 +125,16 @@ def fit(
     chosen = [_resolve(name, names) for name in profiles]
     folder = output or Path(f"{loaded.name}_fit")
     known = with_priors(loaded, priors)
-    emulator = None
+    emulator = refine = None
     if {"areas", "slopes"} & {data.kind for data in sets}:
-        emulator = build_emulator(
-            known,
-            [n for n in names if n not in (SPILL, DIFFUSION)],
-            sets,
-            cells,
-            fine,
-            folder,
-        )
+        asked = [n for n in names if n not in (SPILL, DIFFUSION)]
+        emulator = build_emulator(known, asked, sets, cells, folder)
+        if fine and fine != cells:
+            refine = Refiner(
+                emulator, known, priors, responding(sets), fine, Bar("fine mesh")
+            )
     result = fit_device(
-        known, sets, priors, emulator,
+        known, sets, priors, emulator, refine=refine,
         tangents=make_tangents(known, cells=min(cells, 8), progress=Bar("settings")),
         profiles=chosen,
         source=f"bfsensor fit of {', '.join(data.name for data in sets if data.fitted)}; "
@@ -154,19 +153,9 @@ def fit(
     click.echo(lines[-1])
 
 
-def build_emulator(
-    device: Any,
-    parameters: list[str],
-    sets: Sequence[DataSet],
-    cells: int,
-    fine: int,
-    folder: Path,
-) -> Any:
-    """Build the emulator of a device at the conditions of all areas and slopes."""
-    from bfsensor.fit.emulator import DeviceEmulator
-    from bfsensor.fit.finer import refine
-
-    wanted = tuple(
+def responding(sets: Sequence[DataSet]) -> tuple[Any, ...]:
+    """Conditions of all areas and slopes, which the response of flats predicts."""
+    return tuple(
         dict.fromkeys(
             condition
             for data in sets
@@ -174,15 +163,18 @@ def build_emulator(
             for condition in data.conditions
         )
     )
-    emulator = DeviceEmulator.build(
-        device, parameters, conditions=wanted, cells=cells, keep=folder / "emulator",
-        progress=Bar("emulator"),
+
+
+def build_emulator(
+    device: Any, parameters: list[str], sets: Sequence[DataSet], cells: int, folder: Path
+) -> Any:
+    """Build the emulator of a device at the conditions of all areas and slopes."""
+    from bfsensor.fit.emulator import DeviceEmulator
+
+    return DeviceEmulator.build(
+        device, parameters, conditions=responding(sets), cells=cells,
+        keep=folder / "emulator", progress=Bar("emulator"),
     )  # fmt: skip
-    if not fine or fine == cells:
-        return emulator
-    return refine(
-        emulator, device, emulator.nominal, wanted, cells=fine, progress=Bar("fine mesh")
-    )
 
 
 def _data_sets(

@@ -43,6 +43,9 @@ VOLTAGES = ("back_bias:5 V", "gate_high:0.5 V", "gate_low:0.5 V")
 MEASURED = 0.7
 """Posterior over prior width below which a combination has a row of its own."""
 
+PREDICTED = ((0, 0), (1, 0), (0, 1), (1, 1))
+"""Lags whose predicted a_ij are held against the true ones; (0, 0) was not fitted."""
+
 Areas = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
@@ -91,7 +94,8 @@ def recover(
     -------
     rows : list of dict
         ``pull`` and ``pull_rms`` of (fitted - true) / error with the error of the mean,
-        ``within_68`` and ``within_95``, ``remains`` (posterior over prior error), ``scale``.
+        ``within_68`` and ``within_95``, ``remains`` (posterior over prior error; of predictions
+        relative to themselves), ``scale``.
     told : mapping
         Ties and silent parameters of the first mock, seconds a fit.
     """
@@ -130,14 +134,18 @@ def recover(
         along = directions @ (off / spreads)
         scaled = found.covariance / np.outer(spreads, spreads)
         width = np.sqrt(np.einsum("cp,pq,cq->c", directions, scaled, directions))
-        pulls.append(np.concatenate([off / error, along / width]))
-        remains.append(np.concatenate([error / spreads, width]))
+        told_areas, told_errors = _predicted(emulator, found.values, found.covariance)
+        missed = (told_areas - np.array([true[j, i] for i, j in PREDICTED])) / told_errors
+        pulls.append(np.concatenate([off / error, along / width, missed]))
+        remains.append(np.concatenate([error / spreads, width, told_errors / told_areas]))
         scales.append(float(found.scales[0]))
         chi2.append(float(found.chi2[0]) / len(data.values))
     every, count = np.array(pulls), len(priors)
     rows = []
-    for n, name in enumerate([*map(describe, names), *labels]):
-        rows.append(_row(name, "parameter" if n < count else "combination", every[:, n]))
+    kinds = ["parameter"] * count + ["combination"] * len(labels) + ["prediction"] * 4
+    called = [*map(describe, names), *labels, *(f"a at {lag}" for lag in PREDICTED)]
+    for n, (name, kind) in enumerate(zip(called, kinds, strict=True)):
+        rows.append(_row(name, kind, every[:, n]))
         rows[-1]["remains"] = round(float(np.mean(np.array(remains)[:, n])), 3)
     # Parameters of one mock share its noise: the mocks count, not the pulls.
     rows.append(_row("all parameters", "all", every[:, :count]))
@@ -149,6 +157,17 @@ def recover(
             "chi2_per_n": round(float(np.mean(chi2)), 3),
         }  # fmt: skip
     return rows, told | {"cpu_s_a_fit": round(seconds / mocks, 3)}
+
+
+def _predicted(
+    emulator: Emulator, values: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Areas at the fitted values, and the errors that the posterior leaves them."""
+    response = emulator.predict(values, Condition())
+    i, j = np.array(PREDICTED).T
+    slope = np.asarray(response.jacobian)[:, j, i]
+    errors = np.sqrt(np.einsum("pn,pq,qn->n", slope, covariance, slope))
+    return np.asarray(response.areas)[j, i], errors
 
 
 def _problem(data: DataSet, emulator: Emulator, priors: Sequence[Prior]) -> Problem:
@@ -186,6 +205,7 @@ def main() -> None:
     parser.add_argument("--misstated", type=float, default=1.0)
     parser.add_argument("--mocks", type=int, default=50)
     parser.add_argument("--truth", choices=("emulator", "solved"), default="emulator")
+    parser.add_argument("--free", nargs="+", default=["all", *VOLTAGES])
     parser.add_argument("--cells", type=int, default=8)
     parser.add_argument("--seed", type=int, default=7301)
     parser.add_argument("--keep", type=Path, help="folder of the emulator's solves")
@@ -193,7 +213,7 @@ def main() -> None:
     from bfsensor.fit.emulator import DeviceEmulator
 
     device = Device.load(options.device)
-    priors = choose_priors(device, ("all", *VOLTAGES))
+    priors = choose_priors(device, tuple(options.free))
     device = with_priors(device, priors)
     begin = time.process_time()
     emulator = DeviceEmulator.build(
@@ -214,8 +234,8 @@ def main() -> None:
     )  # fmt: skip
     run = {
         "device": options.device, "errors": options.errors.stem, "times": options.times,
-        "misstated": options.misstated, "truth": options.truth, "cells": options.cells,
-        "seed": options.seed,
+        "misstated": options.misstated, "free": " ".join(options.free),
+        "truth": options.truth, "cells": options.cells, "seed": options.seed,
     }  # fmt: skip
     cost = {
         "cpu_s_build": round(built, 1),

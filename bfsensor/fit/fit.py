@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bfsensor.device import Device
 from bfsensor.errors import FitError
 from bfsensor.fit.changing import fitted_device
 from bfsensor.fit.data import UNITS, DataSet
-from bfsensor.fit.predictors import Emulator, Tangents, make_predictors
+from bfsensor.fit.predictors import Emulator, Prediction, Tangents, make_predictors
 from bfsensor.fit.quantities import DIFFUSION, Prior
 from bfsensor.fit.result import FitResult, FittedSet
 from bfsensor.fit.solve import FEWEST, Problem, Solution, profile, solve
@@ -20,12 +21,20 @@ FAR = 3.0
 """Spreads of its prior from which a fitted parameter is remarked upon."""
 
 
+ROUNDS = 10
+SETTLED = 0.1
+"""Largest change of a prediction by another fine solution where the fit ended [scaled error]."""
+
+Values = NDArray[np.float64]
+
+
 def fit_device(
     device: Device,
     sets: Sequence[DataSet],
     priors: Sequence[Prior],
     emulator: Emulator | None,
     *,
+    refine: Callable[[Values], Emulator] | None = None,
     tangents: Mapping[str, Tangents] | None = None,
     profiles: Sequence[str] = (),
     source: str = "fitted by bfsensor",
@@ -43,6 +52,10 @@ def fit_device(
         Of the free parameters.
     emulator : Emulator or None
         Response of the device by its parameters; they must be among the priors.
+    refine : callable, optional
+        What gives an emulator that is right at values of the parameters
+        (:class:`~bfsensor.fit.finer.Refiner`): the fit is repeated until it is right where it
+        ends, with the derivatives of ``emulator``.
     tangents : mapping, optional
         What predicts saturation and diffusion
         (:func:`~bfsensor.fit.tangents.make_tangents`).
@@ -73,7 +86,11 @@ def fit_device(
     problem = Problem(
         tuple(priors), tuple(sets), make_predictors(sets, emulator, priors, tangents)
     )
-    found = solve(problem)
+    settling: list[str] = []
+    if refine is None:
+        before, found = problem.predict(problem.means), solve(problem)
+    else:
+        problem, found, before, settling = _settle(problem, refine)
     names = tuple(prior.name for prior in priors)
     ties, silent = find_ties(names, found.sensitivity)
     known = combinations(found.sensitivity)
@@ -83,7 +100,7 @@ def fit_device(
             device, priors, found.values, np.sqrt(np.diag(found.covariance)), source
         ).to_toml(),
         parameters=names, prior=problem.means, spread=problem.spreads, value=found.values,
-        covariance=found.covariance, sets=_sets(problem, found),
+        covariance=found.covariance, sets=_sets(problem, found, before),
         remains=np.array([one.remains for one in known]),
         weights=np.array([one.weights for one in known]),
         ties=ties, silent=silent,
@@ -92,15 +109,56 @@ def fit_device(
     told = [
         *(note for data in sets for note in data.notes),
         *_remarks(result, priors),
+        *settling,
         *notes,
     ]
     fields = {f: getattr(result, f) for f in result.__dataclass_fields__}
     return FitResult(**(fields | {"notes": tuple(dict.fromkeys(told))}))
 
 
-def _sets(problem: Problem, found: Solution) -> tuple[FittedSet, ...]:
+def _settle(
+    problem: Problem, refine: Callable[[Values], Emulator]
+) -> tuple[Problem, Solution, list[Prediction], list[str]]:
+    """Fit with an emulator that is right where the last fit ended, until that does not matter.
+
+    Gives the problem and its solution, predictions at the priors' means, and a remark.
+    """
+    now = _with_emulator(problem, refine(problem.means))
+    before = now.predict(now.means)
+    found = solve(now)
+    history: list[float] = []
+    for _ in range(ROUNDS):
+        there = _with_emulator(problem, refine(found.values))
+        moved = 0.0
+        for k, data in enumerate(problem.sets):
+            if data.fitted:
+                one, other = (p.predictors[k](found.values)[0] for p in (now, there))
+                error = found.scales[k] * data.errors
+                moved = max(moved, float(np.max(np.abs(other - one) / error)))
+        history.append(moved)
+        now, found = there, solve(there, start=found.values)
+        if moved < SETTLED:
+            return now, found, before, [f"settled in {len(history)} fine solutions"]
+    return now, found, before, [
+        f"not settled: the last fine solution moved predictions by {history[-1]:.1f} scaled errors"
+    ]  # fmt: skip
+
+
+def _with_emulator(problem: Problem, emulator: Emulator) -> Problem:
+    """Give the problem with areas and slopes of another emulator."""
+    predictors = tuple(
+        make_predictors((data,), emulator, problem.priors)[0]
+        if data.kind in ("areas", "slopes")
+        else old
+        for data, old in zip(problem.sets, problem.predictors, strict=True)
+    )
+    return Problem(problem.priors, problem.sets, predictors)
+
+
+def _sets(
+    problem: Problem, found: Solution, before: Sequence[Prediction]
+) -> tuple[FittedSet, ...]:
     """Data beside what is predicted before and after."""
-    before = problem.predict(problem.means)
     after = problem.predict(found.values)
     out = []
     for k, data in enumerate(problem.sets):

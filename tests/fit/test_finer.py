@@ -3,7 +3,7 @@
 import numpy as np
 
 from bfsensor import Device
-from bfsensor.fit.finer import refine
+from bfsensor.fit.finer import Refiner
 from bfsensor.fit.quantities import choose_priors
 from bfsensor.recording.exposures import Condition
 from bfsensor.response import solve_response
@@ -16,7 +16,7 @@ def test_at_the_device_itself_the_fine_mesh_counts_and_elsewhere_the_coarse_slop
     at = Condition(gate_high=3.4)
     coarse = emulator_of_tangents(device, priors, condition=at)
     nominal = np.array([priors[0].mean])
-    finer = refine(coarse, device, nominal, [at], cells=16)
+    finer = Refiner(coarse, device, priors, (at,), cells=16)(nominal)
     there = device.with_value("gate_high", "3.4 V")
     wanted = quadrant(*solve_response(there, cells=16).edges(None, 173.0))
     found = finer.predict(nominal, at)

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from bfsensor import Device
 from bfsensor.errors import FitError
+from bfsensor.fit.finer import FinerEmulator
 from bfsensor.fit.fit import fit_device
 from bfsensor.fit.quantities import choose_priors, quantities, with_priors
 from bfsensor.fit.result import FitResult
 from bfsensor.fit.ties import combinations, find_ties
+from bfsensor.recording.exposures import Condition
 from tests.fit.test_solve import TRUTH
 from tests.fit.toys import MEANS, PRIORS, SPREADS, toy_data, toy_emulator
 
@@ -141,3 +144,34 @@ def test_a_tie_of_two_is_found_where_it_is():
 def test_a_profile_of_what_is_held_is_refused():
     with pytest.raises(FitError, match="gate_oxide is not free, and has no profile"):
         run(profiles=["gates.gate_oxide"])
+
+
+def test_a_wrong_emulator_is_put_right_where_the_fit_ends():
+    """Its shifts are a tenth off and its slopes a quarter; the fit is as if they were not."""
+    right, asked = toy_emulator(), []
+    wrong = replace(
+        right,
+        edges=tuple(1.1 * e for e in right.edges),
+        slopes=tuple(0.75 * s for s in right.slopes),
+    )
+
+    def refine(values):
+        asked.append(values)
+        true = right.predict(values, None)
+        own = wrong.predict(values, None)
+        added = true.kx - own.kx, true.ky - own.ky
+        return FinerEmulator(wrong, dict.fromkeys([Condition()], added))
+
+    data = toy_data(right, TRUTH, 12, scaled=False)
+    wanted = fit_device(DEVICE, [data], PRIORS, right)
+    found = fit_device(DEVICE, [data], PRIORS, wrong, refine=refine)
+    left = fit_device(DEVICE, [data], PRIORS, wrong)
+    # Slopes a quarter small pull less on the prior: values are not quite the same.
+    np.testing.assert_allclose(found.value, wanted.value, atol=0.35 * wanted.error.max())
+    assert found.chi2 < wanted.chi2 + 1 < left.chi2
+    assert found.notes[-1] == f"settled in {len(asked) - 1} fine solutions"
+    i, j = data.places.T
+    np.testing.assert_allclose(
+        found.sets[0].after, right.predict(found.value, None).areas[j, i],
+        atol=0.05 * data.errors[0],
+    )  # fmt: skip
