@@ -68,9 +68,11 @@ def parse_conditions(
 @click.option("--profile", "profiles", multiple=True, metavar="NAME",
               help="Profile likelihood of a free quantity; repeatable.")  # fmt: skip
 @click.option("--cells", default=16, show_default=True, help="Mesh cells a pixel.")
-@click.option("--fine", default=32, show_default=True, type=click.IntRange(min=0),
-              help="Cells of the mesh on which the device is solved where the fit ends, until that is "
-              "right; derivatives are those of --cells. 0: --cells for both.")  # fmt: skip
+@click.option(
+    "--curved", is_flag=True,
+    help="Fit with an emulator to second order about the device (2 solutions for each free "
+    "quantity, kept in the folder) instead of solving it anew where each round ends.",
+)  # fmt: skip
 @click.option("-o", "--output", type=click.Path(path_type=Path),
               help="Folder for fit.json, device.toml and fit.png [DEVICE_fit].")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print fit.json instead of a table.")
@@ -85,7 +87,7 @@ def fit(
     errors: str,
     profiles: tuple[str, ...],
     cells: int,
-    fine: int,
+    curved: bool,
     output: Path | None,
     as_json: bool,
 ) -> None:
@@ -106,7 +108,6 @@ def fit(
       bfsensor fit itl_sta3800c itl.csv slopes.csv --free all --at itl.csv:back_bias=-60V
       bfsensor fit itl_sta3800c slopes.csv --hold itl.csv --free silicon.background_doping
     """
-    from bfsensor.fit.finer import Refiner
     from bfsensor.fit.fit import fit_device
     from bfsensor.fit.quantities import DIFFUSION, choose_priors, with_priors
     from bfsensor.fit.tangents import SPILL, make_tangents
@@ -125,16 +126,16 @@ def fit(
     chosen = [_resolve(name, names) for name in profiles]
     folder = output or Path(f"{loaded.name}_fit")
     known = with_priors(loaded, priors)
-    emulator = refine = None
+    emulator = linearise = None
     if {"areas", "slopes"} & {data.kind for data in sets}:
-        asked = [n for n in names if n not in (SPILL, DIFFUSION)]
-        emulator = build_emulator(known, asked, sets, cells, folder)
-        if fine and fine != cells:
-            refine = Refiner(
-                emulator, known, priors, responding(sets), fine, Bar("fine mesh")
-            )
+        moving = tuple(prior for prior in priors if prior.name not in (SPILL, DIFFUSION))
+        if curved:
+            names = [prior.name for prior in moving]
+            emulator = build_emulator(known, names, sets, cells, folder)
+        else:
+            linearise = make_linearise(known, moving, priors, sets, cells)
     result = fit_device(
-        known, sets, priors, emulator, refine=refine,
+        known, sets, priors, emulator, linearise=linearise,
         tangents=make_tangents(known, cells=min(cells, 8), progress=Bar("settings")),
         profiles=chosen,
         source=f"bfsensor fit of {', '.join(data.name for data in sets if data.fitted)}; "
@@ -175,6 +176,21 @@ def build_emulator(
         device, parameters, conditions=responding(sets), cells=cells,
         keep=folder / "emulator", progress=Bar("emulator"),
     )  # fmt: skip
+
+
+def make_linearise(
+    device: Any,
+    moving: Sequence[Any],
+    priors: Sequence[Any],
+    sets: Sequence[DataSet],
+    cells: int,
+) -> Any:
+    """Make what solves the device with derivatives, by the values of all free parameters."""
+    from bfsensor.fit.linearised import Linearise
+
+    solve = Linearise(device, tuple(moving), responding(sets), cells, Bar("solutions"))
+    at = [k for k, prior in enumerate(priors) if prior in moving]
+    return lambda values: solve(values[at])
 
 
 def _data_sets(

@@ -18,8 +18,7 @@ FREE = ("--free", "thickness", "--free", "background_doping", "--free", "back_bi
 
 
 def fit(*arguments):
-    """Without the fine mesh: the toy is no device's."""
-    return CliRunner().invoke(main, ["fit", "--fine", "0", *map(str, arguments)])
+    return CliRunner().invoke(main, ["fit", *map(str, arguments)])
 
 
 @pytest.fixture
@@ -39,10 +38,16 @@ def asked(monkeypatch):
     """The toy in place of the emulator, and what the command asked of it."""
     out = {}
 
+    def linearise(device, moving, priors, sets, cells):
+        names = [prior.name for prior in moving]
+        out.update(device=device, parameters=names, sets=sets, cells=cells)
+        return lambda values: toy_emulator()
+
     def build(device, parameters, sets, cells, folder):
-        out.update(device=device, parameters=parameters, sets=sets, cells=cells)
+        out["curved"] = True
         return toy_emulator()
 
+    monkeypatch.setattr(cli_fit, "make_linearise", linearise)
     monkeypatch.setattr(cli_fit, "build_emulator", build)
     return out
 

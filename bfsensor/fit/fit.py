@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.device import Device
-from bfsensor.errors import FitError
+from bfsensor.errors import BFSensorError, FitError
 from bfsensor.fit.changing import fitted_device
 from bfsensor.fit.data import UNITS, DataSet
 from bfsensor.fit.predictors import Emulator, Prediction, Tangents, make_predictors
@@ -21,9 +21,12 @@ FAR = 3.0
 """Spreads of its prior from which a fitted parameter is remarked upon."""
 
 
-ROUNDS = 10
+ROUNDS = 12
 SETTLED = 0.1
-"""Largest change of a prediction by another fine solution where the fit ended [scaled error]."""
+"""Largest miss of a prediction by the tangent of the round before [scaled error]."""
+
+SHORTEST = 0.1
+"""Of steps, relative to that of the tangent."""
 
 Values = NDArray[np.float64]
 
@@ -34,7 +37,7 @@ def fit_device(
     priors: Sequence[Prior],
     emulator: Emulator | None,
     *,
-    refine: Callable[[Values], Emulator] | None = None,
+    linearise: Callable[[Values], Emulator] | None = None,
     tangents: Mapping[str, Tangents] | None = None,
     profiles: Sequence[str] = (),
     source: str = "fitted by bfsensor",
@@ -52,10 +55,9 @@ def fit_device(
         Of the free parameters.
     emulator : Emulator or None
         Response of the device by its parameters; they must be among the priors.
-    refine : callable, optional
-        What gives an emulator that is right at values of the parameters
-        (:class:`~bfsensor.fit.finer.Refiner`): the fit is repeated until it is right where it
-        ends, with the derivatives of ``emulator``.
+    linearise : callable, optional
+        What solves the device at values of its parameters with all derivatives
+        (:class:`~bfsensor.fit.linearised.Linearise`), in place of ``emulator``.
     tangents : mapping, optional
         What predicts saturation and diffusion
         (:func:`~bfsensor.fit.tangents.make_tangents`).
@@ -84,13 +86,15 @@ def fit_device(
             f"{', '.join(prior.name for prior in priors)}"
         )
     problem = Problem(
-        tuple(priors), tuple(sets), make_predictors(sets, emulator, priors, tangents)
+        tuple(priors),
+        tuple(sets),
+        make_predictors(sets, emulator, priors, tangents, late=linearise is not None),
     )
     settling: list[str] = []
-    if refine is None:
+    if linearise is None:
         before, found = problem.predict(problem.means), solve(problem)
     else:
-        problem, found, before, settling = _settle(problem, refine)
+        problem, found, before, settling = _settle(problem, linearise)
     names = tuple(prior.name for prior in priors)
     ties, silent = find_ties(names, found.sensitivity)
     known = combinations(found.sensitivity)
@@ -117,31 +121,60 @@ def fit_device(
 
 
 def _settle(
-    problem: Problem, refine: Callable[[Values], Emulator]
+    problem: Problem, linearise: Callable[[Values], Emulator]
 ) -> tuple[Problem, Solution, list[Prediction], list[str]]:
-    """Fit with an emulator that is right where the last fit ended, until that does not matter.
+    """Gauss and Newton: fit, solve the device where the fit ends, fit again.
 
-    Gives the problem and its solution, predictions at the priors' means, and a remark.
+    Steps that raise what is minimised, or lead to no device, are halved.  Gives the problem and its
+    solution, predictions at the priors' means, and a remark.
     """
-    now = _with_emulator(problem, refine(problem.means))
-    before = now.predict(now.means)
-    found = solve(now)
-    history: list[float] = []
-    for _ in range(ROUNDS):
-        there = _with_emulator(problem, refine(found.values))
-        moved = 0.0
-        for k, data in enumerate(problem.sets):
-            if data.fitted:
-                one, other = (p.predictors[k](found.values)[0] for p in (now, there))
-                error = found.scales[k] * data.errors
-                moved = max(moved, float(np.max(np.abs(other - one) / error)))
-        history.append(moved)
-        now, found = there, solve(there, start=found.values)
-        if moved < SETTLED:
-            return now, found, before, [f"settled in {len(history)} fine solutions"]
-    return now, found, before, [
-        f"not settled: the last fine solution moved predictions by {history[-1]:.1f} scaled errors"
-    ]  # fmt: skip
+    values = problem.means
+    now = _with_emulator(problem, linearise(values))
+    before = now.predict(values)
+    moved = np.inf
+    for number in range(1, ROUNDS + 1):
+        found = solve(now, start=values)
+        step, part, there = found.values, 1.0, None
+        highest = _objective(now, values, found.scales) + SETTLED
+        while there is None:
+            try:
+                there = _with_emulator(problem, linearise(step))
+                worse = _objective(there, step, found.scales) > highest
+            except (BFSensorError, ValueError):
+                worse = True
+            if worse and part > SHORTEST:
+                there, part = None, 0.5 * part
+                step = values + part * (found.values - values)
+            elif there is None:
+                raise FitError("the fit leads to where the device has no solution")
+        moved = max(
+            float(np.max(np.abs(other[0] - one[0]) / (scale * data.errors)))
+            for data, one, other, scale in zip(
+                problem.sets,
+                now.predict(step),
+                there.predict(step),
+                found.scales,
+                strict=True,
+            )
+            if data.fitted
+        )
+        values, now = step, there
+        if part == 1.0 and moved < SETTLED:
+            told = f"settled in {number} rounds of Gauss and Newton"
+            return now, solve(now, start=values), before, [told]
+    told = f"not settled: the last solution moved predictions by {moved:.1f} scaled errors"
+    return now, solve(now, start=values), before, [told]
+
+
+def _objective(problem: Problem, values: Values, scales: Values) -> float:
+    """What is minimised, at given scales of the errors."""
+    total = float(np.sum(((values - problem.means) / problem.spreads) ** 2))
+    for data, scale, (found, _) in zip(
+        problem.sets, scales, problem.predict(values), strict=True
+    ):
+        if data.fitted:
+            total += float(np.sum(((found - data.values) / (scale * data.errors)) ** 2))
+    return total
 
 
 def _with_emulator(problem: Problem, emulator: Emulator) -> Problem:

@@ -1,4 +1,4 @@
-"""Emulators that are straight in the parameters: of given arrays, and of our device's tangents."""
+"""An emulator that is straight in the parameters, of given arrays."""
 
 from __future__ import annotations
 
@@ -7,11 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor import Device
-from bfsensor.fit.changing import device_at
-from bfsensor.fit.quantities import Prior
-from bfsensor.recording.exposures import Condition
-from bfsensor.response import area_matrix, solve_response
+from bfsensor.response import area_matrix
 
 
 @dataclass(frozen=True)
@@ -48,21 +44,3 @@ def quadrant(kx, ky):
     a = area_matrix(kx, ky)
     n = len(a) // 2
     return a[n:-1, n:-1]
-
-
-def emulator_of_tangents(
-    device: Device, priors: tuple[Prior, ...], *, condition: Condition, cells: int = 8
-) -> LinearEmulator:
-    """Tangent of the device's own response at one condition."""
-    middle = np.array([prior.mean for prior in priors])
-    here = device_at(device, condition)
-    changed = []
-    for n, prior in enumerate(priors):
-        # To the one side where the other is no device: oxides of equal thickness.
-        step = 1e-3 * prior.spread * (-1 if prior.name == "gates.gate_oxide" else 1)
-        changed.append((device_at(here, Condition(), (prior,), middle[[n]] + step), step))
-    found = solve_response(here, cells=cells, changed=changed)
-    return LinearEmulator(
-        tuple(prior.name for prior in priors), middle, (found.kx[-1], found.ky[-1]),
-        (found.dkx[:, -1], found.dky[:, -1]),
-    )  # fmt: skip

@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
 from bfsensor import Device
 from bfsensor.errors import FitError
-from bfsensor.fit.finer import FinerEmulator
 from bfsensor.fit.fit import fit_device
 from bfsensor.fit.quantities import choose_priors, quantities, with_priors
 from bfsensor.fit.result import FitResult
 from bfsensor.fit.ties import combinations, find_ties
-from bfsensor.recording.exposures import Condition
+from tests.fit.linear_emulator import quadrant
 from tests.fit.test_solve import TRUTH
 from tests.fit.toys import MEANS, PRIORS, SPREADS, toy_data, toy_emulator
 
@@ -146,32 +146,61 @@ def test_a_profile_of_what_is_held_is_refused():
         run(profiles=["gates.gate_oxide"])
 
 
-def test_a_wrong_emulator_is_put_right_where_the_fit_ends():
-    """Its shifts are a tenth off and its slopes a quarter; the fit is as if they were not."""
-    right, asked = toy_emulator(), []
-    wrong = replace(
-        right,
-        edges=tuple(1.1 * e for e in right.edges),
-        slopes=tuple(0.75 * s for s in right.slopes),
-    )
+def bent(emulator, values):
+    """A truth that is not straight: shifts grow with the square of the first parameter besides."""
+    by = (values[0] - MEANS[0]) / SPREADS[0]
+    return tuple((1 + 0.15 * by + 0.08 * by**2) * e for e in emulator.edges)
 
-    def refine(values):
+
+def test_gauss_and_newton_find_the_minimum_of_what_is_not_straight():
+    emulator, asked = toy_emulator(count=1), []
+    truth = np.array([MEANS[0] + 1.5 * SPREADS[0]])
+
+    def linearise(values):
         asked.append(values)
-        true = right.predict(values, None)
-        own = wrong.predict(values, None)
-        added = true.kx - own.kx, true.ky - own.ky
-        return FinerEmulator(wrong, dict.fromkeys([Condition()], added))
+        step = 1e-5 * SPREADS[0]
+        low, here, high = (bent(emulator, values + s * step) for s in (-1, 0, 1))
+        slopes = tuple((b - a)[None] / (2 * step) for a, b in zip(low, high, strict=True))
+        return replace(emulator, nominal=values, edges=here, slopes=slopes)
 
-    data = toy_data(right, TRUTH, 12, scaled=False)
-    wanted = fit_device(DEVICE, [data], PRIORS, right)
-    found = fit_device(DEVICE, [data], PRIORS, wrong, refine=refine)
-    left = fit_device(DEVICE, [data], PRIORS, wrong)
-    # Slopes a quarter small pull less on the prior: values are not quite the same.
-    np.testing.assert_allclose(found.value, wanted.value, atol=0.35 * wanted.error.max())
-    assert found.chi2 < wanted.chi2 + 1 < left.chi2
-    assert found.notes[-1] == f"settled in {len(asked) - 1} fine solutions"
+    data = toy_data(linearise(truth), truth, 12, part=0.01, scaled=False)
+    found = fit_device(DEVICE, [data], PRIORS[:1], None, linearise=linearise)
     i, j = data.places.T
-    np.testing.assert_allclose(
-        found.sets[0].after, right.predict(found.value, None).areas[j, i],
-        atol=0.05 * data.errors[0],
-    )  # fmt: skip
+
+    def minimised(value):
+        a = quadrant(*bent(emulator, np.array([value])))[j, i]
+        return (
+            np.sum(((a - data.values) / data.errors) ** 2)
+            + ((value - MEANS[0]) / SPREADS[0]) ** 2
+        )
+
+    best = minimize_scalar(minimised, (MEANS[0], truth[0]), method="brent")
+    assert found.value[0] == pytest.approx(best.x, abs=0.02 * found.error[0])
+    assert found.notes[-1].startswith("settled in ") and 3 <= len(asked) <= 8
+    # One tangent alone ends elsewhere.
+    once = fit_device(DEVICE, [data], PRIORS[:1], linearise(np.array(MEANS[:1])))
+    assert abs(once.value[0] - best.x) > 2 * found.error[0]
+
+
+def test_a_step_to_where_there_is_no_device_is_halved():
+    emulator, asked = toy_emulator(), []
+
+    def linearise(values):
+        asked.append(values)
+        if len(asked) == 2:
+            raise FitError("no such device")
+        return emulator
+
+    data = toy_data(emulator, TRUTH, 12)
+    found = fit_device(DEVICE, [data], PRIORS, None, linearise=linearise)
+    np.testing.assert_allclose(asked[2] - MEANS, 0.5 * (asked[1] - MEANS))
+    wanted = fit_device(DEVICE, [data], PRIORS, emulator)
+    np.testing.assert_allclose(found.value, wanted.value, rtol=1e-6)
+
+    def nowhere(values):
+        if np.any(values != np.array(MEANS)):
+            raise FitError("no such device")
+        return emulator
+
+    with pytest.raises(FitError, match="leads to where the device has no solution"):
+        fit_device(DEVICE, [data], PRIORS, None, linearise=nowhere)
