@@ -82,8 +82,9 @@ def sweep(
     """
     from tqdm import tqdm
 
-    from bfsensor.device_sweep import CELLS, sweep_device
+    from bfsensor.device_sweep import sweep_device
     from bfsensor.sweep import open_executor
+    from bfsensor.sweep_points import CELLS
     from bfsensor.swept import combine, parse_swept
 
     if cells is not None and accuracy is not None:

@@ -8,15 +8,15 @@ import pytest
 from bfsensor import silicon
 from bfsensor.build import build_table
 from bfsensor.device import Device
-from bfsensor.device_sweep import (
+from bfsensor.device_sweep import sweep_device
+from bfsensor.errors import SweepError
+from bfsensor.sweep_points import (
     LEVEL,
     STEP,
     PointResponse,
     SweepPoint,
     light_weights,
-    sweep_device,
 )
-from bfsensor.errors import SweepError
 from bfsensor.sweep_rows import DeviceSweep
 from bfsensor.swept import parse_swept
 from bfsensor.table_plan import Plan
@@ -121,7 +121,7 @@ def test_written_and_read_back_equal(swept, tmp_path):
 
 def test_what_numpy_refuses_is_a_reason(monkeypatch):
     """As at -1 V, where lines between pixels are missing where their ends are asked for."""
-    import bfsensor.device_sweep as library
+    import bfsensor.sweep_points as library
 
     def fail(plan):
         raise ValueError("array of sample points is empty")
