@@ -90,7 +90,11 @@ class ImageChargeFit:
 
     @property
     def parameter_errors(self) -> dict[str, float]:
-        """Their errors, from the errors of the a_ij as given."""
+        """Their errors, from the errors of the a_ij as given; nan at a bound.
+
+        Where something ended at a bound, those of the height and the strength are too small:
+        the profile says what is known of them.
+        """
         return dict(
             zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True)
         )
