@@ -15,6 +15,7 @@ from bfsensor.cli_diagnose import diagnose
 from bfsensor.cli_fit import fit
 from bfsensor.cli_measure import measure
 from bfsensor.cli_spots import spots
+from bfsensor.cli_sweep import sweep
 from bfsensor.cli_table import table
 from bfsensor.errors import BFSensorError
 
@@ -165,6 +166,7 @@ def show(source: str, settings: list[tuple[str, str]], output: Path | None) -> N
 
 
 main.add_command(table)
+main.add_command(sweep)
 main.add_command(spots)
 main.add_command(measure)
 main.add_command(check)
