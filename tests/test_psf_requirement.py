@@ -18,6 +18,7 @@ from validation.psf_requirement import (
     mean_change,
     over_peaks,
     run,
+    share_light,
     star_light,
 )
 from validation.shear_bias import (
@@ -154,6 +155,12 @@ def test_light_of_a_star():
         expected, abs=5 * np.sqrt(expected) + 0.002 * electrons
     )
     assert len(photons) > 1.1 * expected
+    # GalSim's silicon would collect 1.7 times as many.
+    other = Model({**NULL, "absorption": "galsim"})
+    image = collect(other.sensor(7, 1.0), share_light(other, photons, "y"))
+    assert image.sum() == pytest.approx(
+        expected, abs=5 * np.sqrt(expected) + 0.005 * expected
+    )
     assert 900 < photons.wavelength.min() < photons.wavelength.max() < 1150
 
 

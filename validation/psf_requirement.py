@@ -40,6 +40,7 @@ from bfsensor import BrighterFatterSensor, DistortionTable, SiliconSensor
 from bfsensor.errors import MeasurementError
 from bfsensor.resources import tables_dir
 from bfsensor.sensor.drift import solve_drift
+from bfsensor.silicon import absorption_length
 from validation.shear_bias import Bias, adaptive_shape, open_shape, regaussianised_bias
 from validation.write_results import write_results
 
@@ -49,7 +50,7 @@ FWHM, SCALE = 0.7, 0.2  # arcsec
 SIDE, RADIUS = 33, 8.0  # pixel
 IN_PEAK = 0.05568  # part of the star in its central pixel
 DARK = 800.0  # e-; 30 s in r, 21.2 mag/arcsec^2
-PEAKS = {10e3: 16, 30e3: 10, 60e3: 8, 100e3: 8, 130e3: 6}
+PEAKS = {10e3: 16, 30e3: 14, 60e3: 8, 100e3: 8, 130e3: 6}
 """Stars for each peak [e-]."""
 SKIES = {0.0: 5, 3e3: 5, 10e3: 4}
 BANDS = dict.fromkeys("ugizy", 6)
@@ -157,14 +158,37 @@ MODELS = {
 }  # fmt: skip
 
 
-def passing_part(waves: NDArray[np.float64]) -> float:
-    """Part of the light that converts, by wavelength [nm]."""
-    from bfsensor.silicon import absorption_length
-
+@lru_cache(maxsize=16)
+def converting_part(band: str, law: str = "law") -> float:
+    """Part of a band's light that converts, by our absorption lengths or GalSim's."""
+    waves = np.empty(20000)
+    probe = galsim.PhotonArray(len(waves))
+    make_sampler(band).applyTo(probe, rng=galsim.BaseDeviate(911))
+    waves[:] = probe.wavelength
     table = DistortionTable.read(tables_dir() / DEVICE / "table.fits")
-    temperature = BrighterFatterSensor(table=table).temperature
-    lengths = np.asarray(absorption_length(waves, temperature))
-    return float(np.mean(-np.expm1(-table.thickness / lengths)))
+    if law == "galsim":
+        lengths = galsim.SiliconSensor().abs_length_table(waves)
+    else:
+        lengths = absorption_length(waves, BrighterFatterSensor(table=table).temperature)
+    return float(np.mean(-np.expm1(-table.thickness / np.asarray(lengths))))
+
+
+def make_sampler(band: str) -> galsim.WavelengthSampler:
+    """Photons spread evenly in wavelength over a band of LSST."""
+    bandpass = galsim.Bandpass(f"LSST_{band}.dat", "nm")
+    return galsim.WavelengthSampler(galsim.SED("1", "nm", "fphotons"), bandpass)
+
+
+def share_light(model: Model, photons: galsim.PhotonArray, band: str) -> galsim.PhotonArray:
+    """Leave photons out for models that absorb more, so that all collect the same charge."""
+    if model.engine is BrighterFatterSensor and model.options.get("absorption") != "galsim":
+        return photons
+    share = converting_part(band) / converting_part(band, "galsim")
+    if share > 0.999:
+        return photons
+    n = round(share * len(photons))
+    x, y, flux = photons.x[:n], photons.y[:n], photons.flux[:n]
+    return galsim.PhotonArray(n, x, y, flux, wavelength=photons.wavelength[:n])
 
 
 @lru_cache(maxsize=1)
@@ -204,11 +228,7 @@ def star_light(
     """
     rng = np.random.default_rng([seed, int(peak), int(sky), ord(band)])
     deviate = galsim.BaseDeviate(int(rng.integers(1, 2**31)))
-    bandpass = galsim.Bandpass(f"LSST_{band}.dat", "nm")
-    sampler = galsim.WavelengthSampler(galsim.SED("1", "nm", "fphotons"), bandpass)
-    probe = galsim.PhotonArray(20000)
-    sampler.applyTo(probe, rng=galsim.BaseDeviate(911))
-    kept = passing_part(probe.wavelength)
+    kept = converting_part(band)
     stars, skies = round(peak / IN_PEAK / kept), round(sky * SIDE**2 / kept)
     centre = tuple(rng.random(2) - 0.5)
     shot = galsim.Kolmogorov(fwhm=FWHM / SCALE).shoot(stars, deviate)
@@ -216,7 +236,7 @@ def star_light(
     y = np.concatenate([shot.y + centre[1], (rng.random(skies) - 0.5) * SIDE])
     order = rng.permutation(len(x))
     photons = galsim.PhotonArray(len(x), x[order], y[order], np.ones(len(x)))
-    sampler.applyTo(photons, rng=deviate)
+    make_sampler(band).applyTo(photons, rng=deviate)
     return photons, centre, peak / IN_PEAK
 
 
@@ -240,10 +260,11 @@ def draw_models(
     rows = []
     for name, model in models.items():
         began = time.process_time()
+        light = share_light(model, photons, band)
         if model.light not in plain:
-            plain[model.light] = collect(model.sensor(key, 0.0), photons)
+            plain[model.light] = collect(model.sensor(key, 0.0), light)
         off = plain[model.light]
-        on = collect(model.sensor(key, 1.0), photons, 0.5 * off if model.half else None)
+        on = collect(model.sensor(key, 1.0), light, 0.5 * off if model.half else None)
         (t0, p0, q0), (t1, p1, q1) = (adaptive_shape(a - sky) for a in (off, on))
         (u0, v0, _), (u1, v1, _) = (open_shape(a - sky, centre, RADIUS) for a in (off, on))
         bias = Bias(np.nan, np.nan)
