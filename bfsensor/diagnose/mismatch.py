@@ -164,7 +164,16 @@ def fit_baseline(
     if like is not None:
         slopes[:, :plain] = like.slopes[:, :plain]
     for turn in range(ROUNDS):
-        predicted = [predictor.predict(c, point) for c in channels]
+        try:
+            predicted = [predictor.predict(c, point) for c in channels]
+        except ConvergenceError:
+            # So far off that spots have no shape any more: a step that does harm.
+            if not (effect.any() and turn and halved < HALVINGS):
+                raise
+            halved += 1
+            point = 0.5 * (point + before) if halved < HALVINGS else before
+            history.append(np.nan)
+            continue
         residuals = np.concatenate([
             c.whiten(c.values - p) for c, p in zip(channels, predicted, strict=True)
         ])  # fmt: skip
