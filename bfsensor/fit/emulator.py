@@ -16,7 +16,6 @@ import os
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,8 @@ import bfsensor
 from bfsensor.device import Device
 from bfsensor.errors import ConvergenceError, DeviceError, FitError
 from bfsensor.files import written_whole
-from bfsensor.fit.emulator_nodes import Node, Solved, make_node, solve_nodes
+from bfsensor.fit.emulator_nodes import Node, make_node, solve_nodes
+from bfsensor.fit.expansion import EmulatorCheck, Expansion, Response, expand
 from bfsensor.fit.parameters import change_parameter, device_parameters, parameter_value
 from bfsensor.recording.exposures import Condition
 from bfsensor.response import (
@@ -43,81 +43,6 @@ VOLTAGES = ("back_bias", "gate_high", "gate_low", "temperature")
 """Of the operating point, which conditions may state."""
 
 _BY_DEPTH = ("silicon.thickness", "operating_point.temperature")
-
-
-@dataclass(frozen=True, eq=False)
-class Response:
-    """Response of a flat at one condition.
-
-    Attributes
-    ----------
-    kx, ky : ndarray, shape (2 n + 3, 2 n + 3)
-        Mean shifts of right and upper edges [pixel/e-], [row, column], (0, 0) in the middle.
-    areas : ndarray, shape (n + 1, n + 1)
-        a_ij [1/e-], [j, i] from (0, 0): the change of a pixel's area, relative, per electron.
-    jacobian : ndarray, shape (p, n + 1, n + 1)
-        Derivatives of the areas by the parameters [1/e- a unit]; 0 by what the condition states.
-    dkx, dky : ndarray, shape (p, 2 n + 3, 2 n + 3)
-        Derivatives of the shifts.
-    """
-
-    kx: NDArray[np.float64]
-    ky: NDArray[np.float64]
-    areas: NDArray[np.float64]
-    jacobian: NDArray[np.float64]
-    dkx: NDArray[np.float64]
-    dky: NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class EmulatorCheck:
-    """An emulator against full solutions at random points of the prior volume.
-
-    Attributes
-    ----------
-    values : ndarray, shape (points, p)
-        Parameters [internal units].
-    solved, emulated : ndarray, shape (points, n + 1, n + 1)
-        a_ij [1/e-], [j, i].
-    unsolved : int
-        Points drawn besides at which the device has no solution, such as silicon that is not
-        depleted.
-    """
-
-    values: NDArray[np.float64]
-    solved: NDArray[np.float64]
-    emulated: NDArray[np.float64]
-    unsolved: int
-
-    @property
-    def relative(self) -> NDArray[np.float64]:
-        """Errors relative to the solved a_ij, shape (points, n + 1, n + 1)."""
-        return self.emulated / self.solved - 1.0
-
-    def quantile(self, share: float) -> NDArray[np.float64]:
-        """Size of the relative error below which a share of the points lies, by lag."""
-        return np.asarray(np.quantile(np.abs(self.relative), share, axis=0))
-
-
-@dataclass(frozen=True, eq=False)
-class _Expansion:
-    """Shifts about one operating point: value, first and second derivatives in spreads.
-
-    ``free`` are the numbers of the parameters that the operating point leaves free.
-    """
-
-    free: NDArray[np.int64]
-    value: NDArray[np.float64]
-    first: NDArray[np.float64]
-    second: NDArray[np.float64]
-
-    def at(self, t: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Shifts (2, nd, ny, nx) and derivatives (p, ...) at offsets of the free parameters."""
-        bent = np.tensordot(t, self.second, (0, 0))
-        slopes = self.first + bent
-        return (
-            self.value + np.tensordot(t, self.first, 1) + 0.5 * np.tensordot(t, bent, 1), slopes,
-        )  # fmt: skip
 
 
 class DeviceEmulator:
@@ -146,7 +71,7 @@ class DeviceEmulator:
         level: float,
         cells: int,
         refine_z: int,
-        expansions: Mapping[tuple[float | None, ...], _Expansion],
+        expansions: Mapping[tuple[float | None, ...], Expansion],
     ) -> None:
         self.device = device
         self.parameters = tuple(spreads)
@@ -234,7 +159,7 @@ class DeviceEmulator:
             names = [list(spreads)[n] for n in free]
             units = np.array([spreads[n] for n in names])
             of_point = {at[1:]: s for at, s in solved.items() if at[0] == number}
-            expansions[point] = _expand(of_point, np.array(free, int), names, units)
+            expansions[point] = expand(of_point, np.array(free, int), names, units)
         return cls(device, spreads, level, cells, refine_z, expansions)
 
     @property
@@ -431,7 +356,7 @@ class DeviceEmulator:
                         f"of {bfsensor.__version__}: build it anew"
                     )
                 expansions = {
-                    tuple(point): _Expansion(
+                    tuple(point): Expansion(
                         *(
                             data[f"{name}_{n}"]
                             for name in ("free", "value", "first", "second")
@@ -505,33 +430,3 @@ def _lags(areas: NDArray[np.float64]) -> NDArray[np.float64]:
     """Areas by lag [j, i] from (0, 0), as far as they are complete."""
     middle = areas.shape[-1] // 2
     return areas[..., middle:-1, middle:-1]
-
-
-def _expand(
-    solved: Mapping[tuple[int, int], Solved],
-    free: NDArray[np.int64],
-    names: Sequence[str],
-    spreads: NDArray[np.float64],
-) -> _Expansion:
-    """Second derivatives from solutions to either side, or to one, and their derivatives."""
-
-    def scaled(slopes: NDArray[np.float64]) -> NDArray[np.float64]:
-        return slopes * spreads[:, None, None, None, None]
-
-    value, slopes = solved[-1, 0]
-    first = scaled(slopes)
-    second = np.zeros((len(names), *first.shape))
-    for n, name in enumerate(names):
-        sides = [side for side in (1, -1) if (n, side) in solved]
-        if not sides:
-            raise FitError(
-                f"{name}: no solution one spread to either side; give a smaller one"
-            )
-        bends, turns = [], []
-        for side in sides:
-            there, steeper = solved[n, side]
-            bends.append(2 * (there - value - side * first[n]))
-            turns.append(side * (scaled(steeper) - first))
-        second[n] = np.mean(turns, axis=0)
-        second[n, n] = np.mean(bends, axis=0)
-    return _Expansion(free, value, first, 0.5 * (second + np.swapaxes(second, 0, 1)))
