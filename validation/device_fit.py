@@ -12,8 +12,8 @@ are free with priors.
 fitted to: -30 V, +6/-6 V.  ``--slope`` takes the covariances over the level squared as a_ij, as the
 paper does; otherwise as those of a flat of 80,000 e-, which by higher orders of the a_ij are less.
 
-``wells`` predicts saturation levels with the device that ``seed`` has fitted.  ``lag2`` asks of one
-device how a_ij two pixels away depend on mesh, level and depth of conversion.
+``wells`` predicts saturation levels with the device that ``seed`` has fitted.  ``lag2`` asks how a_ij
+of the unfitted devices depend on mesh, level and depth of conversion.
 
 Rows of a run replace those of the same run in ``validation/results/device_fit.ecsv``; fit.json
 and device.toml go to ``--keep``.  Kinds of rows: 'areas' [1/e-], 'slopes' [% for 50,000 e-], 'wells'
@@ -336,27 +336,25 @@ def wells(reference: Path, keep: Path, cells: int) -> None:
 
 
 @main.command()
-@click.pass_obj
-def lag2(reference: Path) -> None:
-    """How a_ij two pixels away depend on mesh, level and depth of conversion."""
-    del reference
-    device = Device.load(DEVICES["itl"])
+def lag2() -> None:
+    """How a_ij, also two pixels away, depend on mesh, level, source and depth of conversion."""
     begin = time.process_time()
-    asked = {
-        "16 cells, 40,000 e-": (16, 40e3, None), "24 cells": (24, 40e3, None),
-        "level 10,000 e-": (16, 10e3, None), "level 80,000 e-": (16, 80e3, None),
-        "light of 950 nm": (16, 40e3, 950.0),
-    }  # fmt: skip
+    asked = [
+        ("itl, 16 cells", 16, 40e3, None), ("e2v, 16 cells", 16, 40e3, None),
+        ("e2v, 24 cells", 24, 40e3, None), ("itl, 24 cells", 24, 40e3, None),
+        ("itl, level 10,000 e-", 16, 10e3, None), ("itl, level 80,000 e-", 16, 80e3, None),
+        ("itl, light of 950 nm", 16, 40e3, 950.0),
+    ]  # fmt: skip
     rows = []
-    for name, (cells, level, wavelength) in asked.items():
-        a = area_matrix(
-            *solve_response(device, cells=cells, level=level).edges(wavelength, 173.0)
-        )
+    for name, cells, level, wavelength in asked:
+        device = Device.load(DEVICES[name[:3]])
+        found = solve_response(device, cells=cells, level=level)
+        a = area_matrix(*found.edges(wavelength, 173.0))
         middle = len(a) // 2
-        for i, j in ((1, 0), (0, 1), (2, 0), (0, 2), (2, 2)):
+        for i, j in ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2), (2, 2)):
             rows.append(row("lag2", name, i, j, after=a[middle + j, middle + i]))
-        click.echo(f"{name}: " + " ".join(f"{one['after']:.3e}" for one in rows[-5:]))
-    append("lag2", rows, cpu_s=round(time.process_time() - begin, 1))
+        click.echo(f"{name}: " + " ".join(f"{one['after']:.3e}" for one in rows[-7:]))
+        append("lag2", rows, cpu_s=round(time.process_time() - begin, 1))
 
 
 def _write(result: FitResult, keep: Path, name: str) -> None:

@@ -11,7 +11,7 @@ from bfsensor.fit.quantities import quantities
 from bfsensor.fit.result import FitResult
 from bfsensor.resources import tables_dir
 
-FITTED = {"itl_sta3800c_2019": "itl_sta3800c_60"}
+FITTED = {"itl_sta3800c_2019": "itl_sta3800c_60", "e2v_ccd250_2019": "e2v_ccd250_70"}
 
 
 @pytest.mark.parametrize("name", FITTED)
