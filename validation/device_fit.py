@@ -49,6 +49,7 @@ from bfsensor.recording.exposures import Condition
 from bfsensor.recording.measured import read_measured
 from bfsensor.response import area_matrix, solve_response
 from bfsensor.simulate.well import full_well
+from validation.finer_mesh import Finer, coarse_areas, seed_finer, table_areas
 from validation.write_results import write_results
 
 RESULTS = Path(__file__).parent / "results" / "device_fit.ecsv"
@@ -180,15 +181,20 @@ def areas(reference: Path, vendor: str, cells: int, keep: Path) -> None:
     device = with_priors(device, priors)
     data = data_set(read_measured(reference / f"{vendor}_covariances_21oct19.csv"))
     begin = time.process_time()
+    ratio = table_areas(device.name) / coarse_areas(device, Condition(), cells)
+    linearise = Linearise(device, priors, (Condition(),), cells)
     result = fit_device(
-        device, [data], priors, None, linearise=Linearise(device, priors, (Condition(),), cells),
+        device, [data], priors, None, linearise=Finer(linearise, {Condition(): ratio}),
         source=f"bfsensor fit of {data.name}, 24 lags; errors are correlated: fit.json",
     )  # fmt: skip
     seconds = time.process_time() - begin
     _write(result, keep, FITTED[vendor])
     run, galsim = published_areas(reference, vendor)
     rows = rows_of(result, {data.name: run}, {data.name: galsim})
-    append(vendor, rows, **_told(result, cells, seconds))
+    append(
+        vendor, rows, **_told(result, cells, seconds),
+        finer={f"({i},{j})": round(float(ratio[j, i]), 4) for i, j in data.places[:5].tolist()},
+    )  # fmt: skip
     click.echo(result.said())
 
 
@@ -207,9 +213,13 @@ def seed(reference: Path, cells: int, keep: Path, slope: bool) -> None:
     less = np.ones((5, 5)) if slope else lost_to_higher_orders(a, SEED_LEVEL)
     sets = {key: seed_data(reference, key, less) for key in SETTINGS}
     begin = time.process_time()
+    at = {key: both[0].conditions[0] for key, both in sets.items()}
+    ratios = {
+        at[key]: seed_finer(key, coarse_areas(device, at[key], cells)) for key in SETTINGS
+    }
     result = fit_device(
         device, sets["A"], priors, None,
-        linearise=Linearise(device, priors, sets["A"][0].conditions[:1], cells),
+        linearise=Finer(Linearise(device, priors, (at["A"],), cells), ratios),
         source="bfsensor fit of figure 9 of Lage, Bradshaw and Tyson (2017)",
     )  # fmt: skip
     run = "seed as slopes" if slope else "seed"
@@ -219,9 +229,8 @@ def seed(reference: Path, cells: int, keep: Path, slope: bool) -> None:
     }
     rows = rows_of(result, published)
     for key in ("B", "C"):
-        found = Linearise(device, priors, sets[key][0].conditions[:1], cells)
-        before = Linearise(device, (), found.conditions, cells)(np.empty(0))
-        after = found(result.value)
+        before = Finer(Linearise(device, (), (at[key],), cells), ratios)(np.empty(0))
+        after = Finer(Linearise(device, priors, (at[key],), cells), ratios)(result.value)
         for data in sets[key]:
             rows += predicted_rows(
                 data, before, after, priors, result, published[data.name]
