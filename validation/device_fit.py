@@ -11,6 +11,7 @@ are free with priors.
 (Lage, Bradshaw and Tyson 2017, figure 9; voltages stated and held) and predicts what it was not
 fitted to: -30 V, +6/-6 V.  ``--slope`` takes the covariances over the level squared as a_ij, as the
 paper does; otherwise as those of a flat of 80,000 e-, which by higher orders of the a_ij are less.
+Its mesh is that of the fit, nothing multiplied.
 
 ``wells`` predicts saturation levels with the device that ``seed`` has fitted.  ``lag2`` asks how a_ij
 of the unfitted devices depend on mesh, level and depth of conversion.
@@ -49,7 +50,7 @@ from bfsensor.recording.exposures import Condition
 from bfsensor.recording.measured import read_measured
 from bfsensor.response import area_matrix, solve_response
 from bfsensor.simulate.well import full_well
-from validation.finer_mesh import Finer, coarse_areas, seed_finer, table_areas
+from validation.finer_mesh import Finer, coarse_areas, table_areas
 from validation.write_results import write_results
 
 RESULTS = Path(__file__).parent / "results" / "device_fit.ecsv"
@@ -214,12 +215,9 @@ def seed(reference: Path, cells: int, keep: Path, slope: bool) -> None:
     sets = {key: seed_data(reference, key, less) for key in SETTINGS}
     begin = time.process_time()
     at = {key: both[0].conditions[0] for key, both in sets.items()}
-    ratios = {
-        at[key]: seed_finer(key, coarse_areas(device, at[key], cells)) for key in SETTINGS
-    }
     result = fit_device(
         device, sets["A"], priors, None,
-        linearise=Finer(Linearise(device, priors, (at["A"],), cells), ratios),
+        linearise=Linearise(device, priors, (at["A"],), cells),
         source="bfsensor fit of figure 9 of Lage, Bradshaw and Tyson (2017)",
     )  # fmt: skip
     run = "seed as slopes" if slope else "seed"
@@ -229,8 +227,8 @@ def seed(reference: Path, cells: int, keep: Path, slope: bool) -> None:
     }
     rows = rows_of(result, published)
     for key in ("B", "C"):
-        before = Finer(Linearise(device, (), (at[key],), cells), ratios)(np.empty(0))
-        after = Finer(Linearise(device, priors, (at[key],), cells), ratios)(result.value)
+        before = Linearise(device, (), (at[key],), cells)(np.empty(0))
+        after = Linearise(device, priors, (at[key],), cells)(result.value)
         for data in sets[key]:
             rows += predicted_rows(
                 data, before, after, priors, result, published[data.name]

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from astropy.table import Table
 from numpy.typing import NDArray
 
 from bfsensor.device import Device
@@ -17,8 +15,6 @@ from bfsensor.recording.exposures import Condition
 from bfsensor.resources import tables_dir
 from bfsensor.response import CHARGE, LEVEL
 from bfsensor.table import DistortionTable
-
-COVARIANCES = Path(__file__).parent / "results" / "covariances.ecsv"
 
 
 @dataclass(frozen=True)
@@ -90,12 +86,3 @@ def table_areas(name: str) -> NDArray[np.float64]:
         charge=LEVEL + CHARGE, background=LEVEL, depth=table.thickness
     )
     return change[table.reach :, table.reach :] / (CHARGE * table.pitch[0] * table.pitch[1])
-
-
-def seed_finer(key: str, coarse: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Ratio of tables at the seed's settings (``covariances.ecsv``) to a coarser mesh."""
-    kept = Table.read(COVARIANCES, format="ascii.ecsv")
-    ratio = np.ones_like(coarse)
-    for one in kept[kept["setting"] == f"seed {key}"]:
-        ratio[one["y"], one["x"]] = one["middle"] / coarse[one["y"], one["x"]]
-    return ratio
