@@ -161,6 +161,7 @@ class Diagnosis:
         if told is not None and (told.found or told.free_form is not None):
             out["chi2dof_after"] = _finite(told.chi2dof()[1])
         if self.attribution is not None:
+            out["fails_in"] = list(self.attribution.fails_in)
             out["channels"] = {
                 word: {"before": b / n, "after": a / n, "values": n}
                 for word, (b, a, n) in self.attribution.heldout.items()

@@ -69,7 +69,7 @@ def fit_widths(
     x, y = (np.tile(centres[:, axis], (count, 1)) for axis in (0, 1))
     flux = stamps.sum((2, 3))
     background = np.zeros((count, n))
-    history = []
+    history: list[float] = []
     for _ in range(ROUNDS):
         in_x = _profiles(x, shape[:, 0], nx)
         in_y = _profiles(y, shape[:, 1], ny)
