@@ -150,10 +150,13 @@ class BiasChannels:
         mean = excess.mean(0)
         least = STANDS_OUT * np.array([e for _, e, _ in self._rows[0]]) / len(excess) ** 0.5
         more = np.where(mean > least, 1 + mean, 1.0)
+        # Of a wave each frame has another phase, the same in all its rows.
+        apart = excess.std(0, ddof=1) if len(excess) > 2 else np.abs(mean)
+        apart = np.where(np.abs(mean) > least, apart, 0.0)
         for n, one in enumerate(self._rows):
             value, error, white = np.array(one).T
             values.append(value)
-            blocks.append(np.diag((more * error) ** 2))
+            blocks.append(np.diag(np.maximum(more * error, apart) ** 2))
             axes.add(len(one), self._condition, amp=np.arange(len(one)), exposure=2 * n,
                      what="rows", white=white)  # fmt: skip
         for exposure, levels in self._levels:
