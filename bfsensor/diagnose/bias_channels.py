@@ -151,7 +151,8 @@ class BiasChannels:
         least = STANDS_OUT * np.array([e for _, e, _ in self._rows[0]]) / len(excess) ** 0.5
         more = np.where(mean > least, 1 + mean, 1.0)
         # Of a wave each frame has another phase, the same in all its rows.
-        apart = excess.std(0, ddof=1) if len(excess) > 2 else np.abs(mean)
+        # One pair alone cannot tell that scatter: its excess is held against noise.
+        apart = excess.std(0, ddof=1) if len(excess) > 1 else np.zeros(len(mean))
         apart = np.where(np.abs(mean) > least, apart, 0.0)
         for n, one in enumerate(self._rows):
             value, error, white = np.array(one).T
