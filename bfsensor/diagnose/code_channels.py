@@ -34,6 +34,20 @@ HALO_ERROR = 5e-6
 """Crosstalk for which unlike sides of spots' halos may be taken (assumed): 0.2 ADU of 40,000."""
 
 
+PILE = 16
+"""Codes that full pixels lie within: read noise, some ADU wide."""
+
+
+def _piled(counts: NDArray[np.int64], width: float) -> bool:
+    """Whether pixels pile up at one level, as where part of them are full.
+
+    Twice what a Gaussian of that width has at its middle, and no chance.
+    """
+    most = float(np.convolve(counts, np.ones(PILE), "valid").max(initial=0.0))
+    expected = float(counts.sum()) * PILE / (np.sqrt(2 * np.pi) * width)
+    return most > 2 * expected + 6 * np.sqrt(expected)
+
+
 class CodeChannels:
     """Counts codes of flats wide enough that every remainder is as likely as any other.
 
@@ -56,6 +70,8 @@ class CodeChannels:
             # Of struck pixels the distribution is another; below 0 no converter counts.
             inside = codes[np.abs(codes - middle) < 6 * width].astype(np.int64)
             counts = np.bincount(inside[inside >= 0])
+            if _piled(counts, width):
+                continue
             kept = self._counts.get(amp, np.zeros(0, np.int64))
             size = -(-max(len(kept), len(counts)) // PERIOD) * PERIOD
             total = np.zeros(size, np.int64)

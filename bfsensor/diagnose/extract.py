@@ -421,9 +421,11 @@ def _rough_gains(channel: Channel, gains: list[list[float]]) -> None:
         if not rows.any():
             continue
         level, value = a["level"][rows], channel.values[rows]
-        # The slope of the variance at low levels: read noise is in the lowest of them.
-        low = level <= max(0.5 * level.max(), np.sort(level)[:3].max())
-        slope = (
-            np.polyfit(level[low], value[low], 1)[0] if len(set(level[low])) > 1 else 0.0
-        )
-        found.append(1.0 / slope if slope > 0 else float(level[low][0] / value[low][0]))
+        # Full pixels have next to no variance.
+        rising = value >= 0.5 * np.median(value / level) * level
+        level, value = level[rising], value[rising]
+        # The slope where light begins: read noise is in the lowest of them, and pixels that
+        # repel bend the line, by a sixth of its slope at half of a full well.
+        degree = min(2, len(set(level)) - 1)
+        slope = np.polyfit(level, value, degree, w=1 / value)[-2] if degree > 0 else 0.0
+        found.append(1.0 / slope if slope > 0 else float(level[0] / value[0]))

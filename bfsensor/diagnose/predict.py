@@ -362,15 +362,41 @@ class Predictor:
     def _effect_count(self) -> int:
         return sum(len(fitted(e)) for e in self.effects)
 
-    def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lowest and highest values of the parameters: effects' ranges, widened."""
-        low, high = (np.full(len(self.names), v) for v in (-np.inf, np.inf))
+    def shapes(self) -> NDArray[np.bool_]:
+        """Which parameters are of the shape of an effect, not its amplitude."""
+        out = np.zeros(len(self.names), bool)
         n = len(self.names) - self._effect_count
         for effect in self.effects:
             for p in fitted(effect):
-                low[n], high[n] = widened(p)
+                out[n] = not p.amplitude
                 n += 1
-        return low, high
+        return out
+
+    def reach(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Smallest and largest steps of a fit from a point, shape (2, parameters).
+
+        Effects stay in their ranges, widened; parameters of a shape go no farther than a
+        derivative can tell: to half or twice, or a quarter of a range.
+        """
+        ends = np.full((2, len(self.names)), np.inf)
+        ends[0] = -np.inf
+        n = len(self.names) - self._effect_count
+        for effect in self.effects:
+            for p in fitted(effect):
+                away = point[n] - p.neutral
+                range_ = np.array(widened(p)) - point[n]
+                far = 0.25 * (p.high - p.low)
+                step = (
+                    np.array([-0.5, 1.0]) * away
+                    if p.law == "log"
+                    else far * np.array([-1, 1])
+                )
+                held = p.amplitude or (p.law == "log" and p.signed)
+                ends[:, n] = range_ if held else np.clip(step, *range_)
+                # From beyond its range no farther.
+                ends[0, n], ends[1, n] = min(ends[0, n], 0.0), max(ends[1, n], 0.0)
+                n += 1
+        return ends
 
     def _with_light(
         self, channel: Channel, gains: NDArray[np.float64]
@@ -424,6 +450,10 @@ class Predictor:
             return device if channel.unit == PER_ELECTRON else gain | noise | device
         if channel.word == "spot":
             return gain | device | sigma
+        if channel.word == "flat_mean" and any(
+            "flat_mean" in e.touches for e in self.effects
+        ):
+            return gain
         return noise if channel.word == "bias_cov" else np.zeros(len(names), bool)
 
     def slope(
@@ -446,6 +476,12 @@ class Predictor:
                 if _width_of(key) == only:
                     out[rows] = (moved[rows] - here[rows]) / self.steps[n]
             return out
+        if channel.word == "flat_mean" and self.names[n].startswith("gain"):
+            # Full pixels tell the ratio of full well and gain to one part in 1e5: both sides.
+            back = parameters.copy()
+            back[n] -= self.steps[n]
+            both = self.predict(channel, step) - self.predict(channel, back)
+            return both / (2 * self.steps[n])
         return (self.predict(channel, step) - here) / self.steps[n]
 
     def linear(self, channel: Channel) -> dict[str, NDArray[np.float64]]:

@@ -92,7 +92,10 @@ def periodic_covariances(
     else:
         x = 2 * a_k * m
         small = np.abs(x) < 1e-9
-        power = m * np.where(small, 1 + x / 2, np.expm1(x) / np.where(small, 1.0, x))
+        # Beyond any sensor's areas, which a search may try, infinite.
+        with np.errstate(over="ignore"):
+            grown = np.expm1(x)
+        power = m * np.where(small, 1 + x / 2, grown / np.where(small, 1.0, x))
     return np.asarray(irfft2(power, s=(side, side)))
 
 

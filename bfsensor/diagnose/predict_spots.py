@@ -15,6 +15,7 @@ from scipy.special import ndtr
 from bfsensor.diagnose.spot_channels import STAMP, WING, stamp_moments
 from bfsensor.diagnose.spot_widths import fit_widths
 from bfsensor.effects.effect import Law
+from bfsensor.errors import ConvergenceError
 
 STEPS = 12
 """Of equal light: widths of spots of one pixel and 1e6 e- are 5e-5 pixel off; 1.4e-4 with 8."""
@@ -246,6 +247,7 @@ def representative_phases(phases: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(np.isfinite(out), out, np.mean(phases, axis=0))
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def predict_spots(
     kx: NDArray[np.float64],
     ky: NDArray[np.float64],
@@ -281,6 +283,8 @@ def predict_spots(
     """
     wanted = np.asarray(fluxes, float)
     top = float(wanted.max())
+    if not (np.isfinite(wanted).all() and wanted.min() > 0):
+        raise ConvergenceError(f"spots of {wanted.min():.3g} to {top:.3g} e- have no shape")
     centres = np.asarray(phases, float)
     grow = partial(
         grow_spots, kx, ky, sigma=sigma, flux=top, halo=halo, neighbours=neighbours, law=law,
@@ -297,6 +301,10 @@ def predict_spots(
         images = grow(phases=centres, steps=SPILLING)
     measure = partial(_measure, sigma=sigma, centres=centres)
     light = top * np.arange(every, len(images) + 1, every) / len(images)
+    if not np.isfinite(images).all():
+        raise ConvergenceError(
+            f"spots of {top:.3g} e- have no shape: shifts reach over pixels"
+        )
     plain = measure(images[every - 1 :: every])
     lines = _interpolate(plain[:, -1], np.column_stack([plain[:, :-1], plain[:, -1] - light]),
                          turning=spilling)  # fmt: skip

@@ -49,6 +49,9 @@ def counts(
         How many effects are found; their inaccuracies add up.
     """
     own = DEVICE_SEEN if finding.word == DEVICE else (finding.word,)
+    if finding.word == "bias_cov" and finding.where.get("k") == (0, 0):
+        # The read noise is that of flats as well: what is amiss there may show here.
+        own = ("bias_cov", "flat_cov")
     reach = ACCURACY**2 * sum(explained.get(w, 0.0) for w in own) * max(fits, 1)
     if finding.family != "chi-square":
         return finding.z**2 > reach

@@ -15,7 +15,7 @@ from bfsensor.diagnose.mismatch import BaselineFit
 from bfsensor.diagnose.predict import Predictor, fitted, widened
 from bfsensor.diagnose.predict_maps import lines_of_map
 from bfsensor.effects.effect import Effect, Layout, Parameter
-from bfsensor.errors import BFSensorError
+from bfsensor.errors import BFSensorError, ConvergenceError
 
 REFINED = 2
 """Best starts of a candidate that are refined."""
@@ -150,7 +150,10 @@ class Screen:
             here = self._here[n]
             if here is None:
                 here = self._here[n] = self.predictor.predict(channel, self.point)
-            moved = both.predict(channel, point) - here
+            with np.errstate(over="ignore", invalid="ignore"):
+                moved = both.predict(channel, point) - here
+            if not np.isfinite(moved).all():
+                raise ConvergenceError(f"predictions of {channel.word} overflow")
             out[start : start + len(channel)] = channel.whiten(moved)
         return out
 

@@ -52,7 +52,10 @@ class Saturation(Effect):
             full = [
                 s.level for s, r in zip(flats, rates, strict=True) if r < 0.97 * rates.max()
             ]
-            places = [float(np.median(full))] if full else places
+            # Levels are known as well as the gain.
+            places = (
+                [f * float(np.median(full)) for f in (0.93, 1.0, 1.07)] if full else places
+            )
         return [{"full_well": float(v)} for v in places]
 
     def law(self) -> Law:
@@ -66,7 +69,7 @@ class Saturation(Effect):
         sigma = np.sqrt(np.maximum(light, 1.0))
         distance = (self["full_well"] - light) / sigma
         for n in np.nonzero(np.abs(distance) <= FAR)[0]:
-            short, _ = _near(round(float(distance[n]), 1), _unevenness(light[n], sigma[n]))
+            short, _ = _between(float(distance[n]), _unevenness(light[n], sigma[n]))
             out[n] -= short * sigma[n]
         return out
 
@@ -80,7 +83,7 @@ class Saturation(Effect):
         out = c.copy()
         out[distance < -FAR] = 0.0
         for n in np.nonzero((distance >= -FAR) & (distance < reach))[0]:
-            _, left = _near(round(float(distance[n]), 1), _unevenness(light[n], sigma[n]))
+            _, left = _between(float(distance[n]), _unevenness(light[n], sigma[n]))
             # Each pixel keeps what it keeps of its variance; what was spilled, and room that
             # was filled, correlate the column.
             out[n] *= left[0]
@@ -94,7 +97,15 @@ def _unevenness(light: float, sigma: float) -> float:
     return round(UNEVEN * float(light) / float(sigma), 1)
 
 
-@lru_cache(maxsize=64)
+def _between(distance: float, uneven: float) -> tuple[float, Values]:
+    """As :func:`_near`, straight between tenths: a fit needs a slope."""
+    tenths = int(np.floor(10 * distance))
+    part = 10 * distance - tenths
+    low, high = _near(tenths / 10, uneven), _near((tenths + 1) / 10, uneven)
+    return (1 - part) * low[0] + part * high[0], (1 - part) * low[1] + part * high[1]
+
+
+@lru_cache(maxsize=256)
 def _near(distance: float, uneven: float) -> tuple[float, Values]:
     """Flats near the full well: what their mean lacks, and covariances along the column.
 

@@ -301,7 +301,10 @@ def test_saturation_starts_at_the_level_that_flats_do_not_pass():
         for n, level in enumerate(levels)
     )
     starts = Saturation.starts(Layout((64, 64), (), shots))
-    assert [s["full_well"] for s in starts] == [8.7e4]
+    places = [s["full_well"] for s in starts]
+    # As far off as the gain may be.
+    assert 8.7e4 in places and len(places) == 3
+    np.testing.assert_allclose(places, 8.7e4, rtol=0.08)
 
 
 # -- device parameters

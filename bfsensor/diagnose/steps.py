@@ -1,0 +1,330 @@
+"""Steps of the joint fit: what is left at a point, derivatives there, and how far to go."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from bfsensor.diagnose.bounded import Solved, solve_within
+from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.predict import Predictor
+from bfsensor.errors import ConvergenceError
+
+ROUNDS = 20
+"""Of steps that were taken, before a fit is given up."""
+
+HALVINGS = 5
+"""Of a step that does harm, before it is given up and the fit taken for arrived."""
+
+MISLED = 2
+"""Halvings of a step by another fit's derivatives after which a fit finds its own."""
+
+STALLED = 4
+"""Rounds without gain after which a fit with effects has arrived, whatever their steps."""
+
+REFRESHED = 2, 4
+"""Rounds in which what is left to chance is taken as strong as the effects then are."""
+
+SMALL = 0.05
+"""Largest step of a parameter [of its error] at which the fit has arrived."""
+
+NO_HARM = 0.01
+"""Rise of the chi-square that is none."""
+
+Seen = tuple[list[NDArray[np.float64]], NDArray[np.float64]]
+
+
+class Steps:
+    """Least squares around a point, which :meth:`go` and :meth:`go_carefully` move.
+
+    Parameters
+    ----------
+    predictor : Predictor
+        Predicts the channels.
+    channels : sequence of Channel
+        What to fit.
+    slopes : ndarray, shape (values, plain parameters), optional
+        Derivatives of another fit, of all parameters that are no effect's.
+
+    Attributes
+    ----------
+    point : ndarray
+        Non-linear parameters.
+    solved : Solved
+        The last solution: non-linear parameters, linear ones, strengths of what is left to
+        chance.
+    slopes : ndarray, shape (values, non-linear parameters)
+        Whitened derivatives.
+    """
+
+    def __init__(
+        self,
+        predictor: Predictor,
+        channels: Sequence[Channel],
+        slopes: NDArray[np.float64] | None = None,
+    ) -> None:
+        self.predictor, self.channels = predictor, channels
+        self.starts = np.concatenate([[0], np.cumsum([len(c) for c in channels])])
+        self.total = int(self.starts[-1])
+        self._find_columns()
+        self.count, self._priors = len(predictor.names), len(predictor.prior_rows)
+        self.effect = np.char.startswith(np.array(predictor.names, str), "effect ")
+        self._shape = predictor.shapes()
+        # With effects on flats means depend on gains, as they do not without.
+        flats = any("flat_mean" in e.touches for e in predictor.effects)
+        gains = np.char.startswith(np.array(predictor.names, str), "gain ")
+        self._anew = self.effect | (gains & flats)
+        self.point = predictor.start.astype(float).copy()
+        self.slopes = np.zeros((self.total, self.count))
+        self._borrowed = slopes is not None
+        if slopes is not None:
+            plain = int((~self.effect).sum())
+            self.slopes[:, :plain] = slopes[:, :plain]
+        self.history: list[float] = []
+        self.solved: Solved
+        self._last: tuple[NDArray[np.float64], Seen] | None = None
+        self.update_chance()
+
+    def _find_columns(self) -> None:
+        columns: dict[str, NDArray[np.float64]] = {}
+        for channel, start in zip(self.channels, self.starts, strict=False):
+            for name, column in self.predictor.linear(channel).items():
+                whole = columns.setdefault(name, np.zeros(self.total))
+                whole[start : start + len(channel)] += channel.whiten(column)
+        # A parameter that no value depends on is none.
+        columns = {k: v for k, v in columns.items() if np.abs(v).max() > 0}
+        self.columns = tuple(columns)
+        linear = np.array(list(columns.values())).T.reshape(self.total, len(columns))
+        self.scales = np.sqrt((linear**2).sum(0))
+        self._linear = linear / self.scales
+
+    def update_chance(self) -> None:
+        """Take what effects leave to chance as strong as they are at the point."""
+        found = [self.predictor.modes(c, self.point) for c in self.channels]
+        found = [
+            c.whiten(m) if m.shape[1] else m
+            for c, m in zip(self.channels, found, strict=True)
+        ]
+        some = any(m.shape[1] for m in found)
+        self.modes = block_diag(*found) if some else np.zeros((self.total, 0))
+        # Orthonormal columns of linear parameters and of chance, whose priors' rows are the last.
+        chance = self.modes.shape[1]
+        both = np.zeros((self.total + chance, self._linear.shape[1] + chance))
+        both[: self.total] = np.concatenate([self._linear, self.modes], axis=1)
+        both[self.total :, self._linear.shape[1] :] = np.eye(chance)
+        self._span = np.linalg.qr(both)[0][: self.total]
+
+    def residuals(self, point: NDArray[np.float64]) -> Seen:
+        """Predictions, and what they leave of the values, whitened; the last ones are kept."""
+        if self._last is not None and np.array_equal(self._last[0], point):
+            return self._last[1]
+        # Far from what pixels can do numbers overflow: such points are none.
+        with np.errstate(over="ignore", invalid="ignore"):
+            predicted = [self.predictor.predict(c, point) for c in self.channels]
+        if not all(np.isfinite(p).all() for p in predicted):
+            raise ConvergenceError(
+                "predictions overflow: parameters are far from any sensor's"
+            )
+        left = [
+            c.whiten(c.values - p) for c, p in zip(self.channels, predicted, strict=True)
+        ]
+        self._last = point.copy(), (predicted, np.concatenate(left))
+        return self._last[1]
+
+    def square(self, residuals: NDArray[np.float64], point: NDArray[np.float64]) -> float:
+        """Chi-square with the linear parameters at their best, priors included."""
+        given = self._span.T @ residuals
+        held = point[self.predictor.prior_rows]
+        return float(residuals @ residuals) - float(given @ given) + float(held @ held)
+
+    def differentiate(
+        self,
+        which: NDArray[np.bool_],
+        point: NDArray[np.float64],
+        predicted: Sequence[NDArray[np.float64]],
+        *,
+        forgiving: bool = False,
+    ) -> None:
+        """Find derivatives by some parameters; forgiving keeps old ones where there are no new."""
+        for n in map(int, np.flatnonzero(which)):
+            for channel, start, here in zip(
+                self.channels, self.starts, predicted, strict=False
+            ):
+                if not self.predictor.depends(channel)[n]:
+                    continue
+                try:
+                    with np.errstate(over="ignore", invalid="ignore"):
+                        change = self.predictor.slope(channel, point, n, here)
+                    if not np.isfinite(change).all():
+                        raise ConvergenceError(
+                            f"the derivative by {self.predictor.names[n]}"
+                        )
+                except ConvergenceError:
+                    # At the end of where spots have a shape.
+                    if not forgiving:
+                        raise
+                    continue
+                self.slopes[start : start + len(channel), n] = channel.whiten(change)
+
+    def solve(
+        self,
+        residuals: NDArray[np.float64],
+        point: NDArray[np.float64],
+        held: NDArray[np.bool_] | None = None,
+    ) -> Solved:
+        """Best step of all parameters, some of the non-linear ones held."""
+        plainly, chance = self.count + self._linear.shape[1], self.modes.shape[1]
+        rows = self.predictor.prior_rows
+        design = np.zeros((self.total + self._priors + chance, plainly + chance))
+        design[: self.total, : self.count] = self.slopes
+        design[: self.total, self.count : plainly] = self._linear
+        design[: self.total, plainly:] = self.modes
+        design[self.total + np.arange(self._priors), rows] = 1.0
+        last = self.total + self._priors + np.arange(chance)
+        design[last, plainly + np.arange(chance)] = 1.0
+        target = np.concatenate([residuals, -point[rows], np.zeros(chance)])
+        ends = np.repeat([[-np.inf], [np.inf]], design.shape[1], axis=1)
+        ends[:, : self.count] = self.predictor.reach(point)
+        if held is not None:
+            ends[:, : self.count][:, held] = 0.0
+        return solve_within(design, target, *ends)
+
+    def _step(self, solved: Solved) -> float:
+        """Move the point; gives the largest move over errors."""
+        self.solved = solved
+        step, errors = solved.solution[: self.count], solved.errors[: self.count]
+        self.point = self.point + step
+        moved = np.abs(step) / np.maximum(errors, 1e-300)
+        self.history.append(float(np.max(moved, where=errors > 0, initial=0.0)))
+        return self.history[-1]
+
+    def go(self) -> None:
+        """Full steps, with the derivatives of the second round for all later ones.
+
+        Raises
+        ------
+        ConvergenceError
+            The parameters still move after :data:`ROUNDS` rounds.
+        """
+        for turn in range(ROUNDS):
+            predicted, residuals = self.residuals(self.point)
+            if turn in REFRESHED and self.modes.shape[1]:
+                self.update_chance()
+            fresh = turn < 2 and not self._borrowed
+            self.differentiate(self.effect | fresh, self.point, predicted)
+            if self._step(self.solve(residuals, self.point)) < SMALL:
+                return
+        raise self._unsettled()
+
+    def go_carefully(self) -> None:
+        """Take steps that do no harm, those of effects with derivatives of each round.
+
+        A step that does harm is first mended: where it put all else, effects' amplitudes are
+        brought to their best, for they follow along curved valleys.  Then it is halved, at last
+        given up.  Without effects a fit that does not settle ends where it is.
+
+        Raises
+        ------
+        ConvergenceError
+            The effects' parameters still move after :data:`ROUNDS` rounds.
+        """
+        own = not self.effect.any()
+        squares: list[float] = []
+        for turn in range(ROUNDS):
+            predicted, residuals = self.residuals(self.point)
+            if turn in REFRESHED and self.modes.shape[1]:
+                self.update_chance()
+                squares.clear()
+            here = self.square(residuals, self.point)
+            squares.append(here)
+            fresh = own or (turn < 2 and not self._borrowed)
+            self.differentiate(self._anew | fresh, self.point, predicted, forgiving=True)
+            stalled = len(squares) > STALLED and np.ptp(squares[-STALLED:]) < 2 * NO_HARM
+            solved = self.solve(residuals, self.point)
+            if stalled or not self._gainful(solved, here):
+                if self._borrowed:
+                    # Derivatives of a fit without these effects lead nowhere: their own are found.
+                    self._borrowed = False
+                    self.differentiate(~self.effect, self.point, predicted, forgiving=True)
+                    solved = self.solve(residuals, self.point)
+                    if self._gainful(solved, here):
+                        continue
+                break
+            if self.history[-1] < SMALL:
+                return
+        else:
+            if not own:
+                raise self._unsettled()
+        # No step is told that was not seen to gain.
+        residuals = self.residuals(self.point)[1]
+        self.solved = self.solve(residuals, self.point, np.ones(self.count, bool))
+
+    def stay(self, point: NDArray[np.float64]) -> None:
+        """End at a point that other values told, whatever is left here.
+
+        Derivatives count in the errors only: what is left is none of these parameters'.
+        """
+        self.point = point.copy()
+        predicted, residuals = self.residuals(self.point)
+        held = np.ones(self.count, bool)
+        self.differentiate(held, self.point, predicted)
+        with_all = self.solve(residuals, self.point, held)
+        slopes = self.slopes
+        self.slopes = np.zeros_like(slopes)
+        self.solved = self.solve(residuals, self.point, held)._replace(
+            errors=with_all.errors, covariance=with_all.covariance
+        )
+        self.slopes = slopes
+
+    def _gainful(self, solved: Solved, least: float) -> bool:
+        """Go as far as a step does no harm; False: nowhere."""
+        start, step = self.point, solved.solution[: self.count]
+        errors = solved.errors[: self.count]
+        moved = np.abs(step) / np.maximum(errors, 1e-300)
+        far = float(np.max(moved, where=errors > 0, initial=0.0))
+        self.history.append(far)
+        self.solved = solved
+        if far < SMALL:
+            self.point = start + step
+            return True
+        for halved in range(HALVINGS):
+            there = start + 0.5**halved * step
+            try:
+                for tried in self._tries(there):
+                    if self.square(self.residuals(tried)[1], tried) <= least + NO_HARM:
+                        self.point = tried
+                        return True
+            except ConvergenceError:
+                # So far off that spots have no shape any more: a step that does harm.
+                continue
+            if self._borrowed and halved + 1 == MISLED:
+                return False
+        return False
+
+    def _tries(self, there: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
+        """Give a point, and after it the best ones near it.
+
+        First all but amplitudes held: a full well has to follow the gain to one part in 1e5.
+        Then the shapes of effects held.
+        """
+        yield there
+        amplitudes = self.effect & ~self._shape
+        for held in (~amplitudes, self._shape):
+            if not held.any() or not amplitudes.any():
+                continue
+            predicted, residuals = self.residuals(there)
+            kept = self.slopes.copy()
+            self.differentiate(amplitudes, there, predicted)
+            solved = self.solve(residuals, there, held)
+            self.slopes = kept
+            yield there + solved.solution[: self.count]
+
+    def _unsettled(self) -> ConvergenceError:
+        steps = ", ".join(f"{h:.2g}" for h in self.history)
+        return ConvergenceError(
+            f"the baseline's parameters still move by {self.history[-1]:.2g} of their errors after "
+            f"{ROUNDS} rounds (steps {steps})"
+        )
