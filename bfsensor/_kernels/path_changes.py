@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from bfsensor._kernels.drift import _SHORTEST, _cell, _weights, gradient, turns
+from bfsensor._kernels.drift import SHORTEST, _cell, _weights, gradient, turns
 
 
 class Changes(NamedTuple):
@@ -200,6 +200,7 @@ def boundary_changes(
                 if abs(ox) < zone[2] and abs(oy) < zone[3]:
                     break
             h = coarseness * (0.3 + 0.12 * max(p[2] - 1.0, 0.0))
+            shortest = SHORTEST * h
             stage = 0
             while stage < 4:
                 part = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
@@ -217,7 +218,7 @@ def boundary_changes(
                 if (
                     stage == 4
                     and turns(kp[0], kp[1], kp[2], kp[3]) >= turn * turn
-                    and h >= _SHORTEST
+                    and h >= shortest
                 ):
                     h *= 0.5
                     stage = 1
