@@ -12,8 +12,10 @@ import click
 from bfsensor.cli_check import check
 from bfsensor.cli_common import load_device, parse_settings
 from bfsensor.cli_diagnose import diagnose
+from bfsensor.cli_fit import fit
 from bfsensor.cli_measure import measure
 from bfsensor.cli_spots import spots
+from bfsensor.cli_sweep import sweep
 from bfsensor.cli_table import table
 from bfsensor.errors import BFSensorError
 
@@ -164,10 +166,12 @@ def show(source: str, settings: list[tuple[str, str]], output: Path | None) -> N
 
 
 main.add_command(table)
+main.add_command(sweep)
 main.add_command(spots)
 main.add_command(measure)
 main.add_command(check)
 main.add_command(diagnose)
+main.add_command(fit)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,11 @@ from bfsensor.cli_common import Bar
     help="Let a quantity of a DEVICE baseline float within its stated uncertainty, such as "
     "silicon.thickness; 'all' for every one. The device is simulated anew, 5 s for each.",
 )
+@click.option(
+    "--towards", metavar="TABLE|DEVICE",
+    help="The same device at another back bias: the operating point of the baseline may be off "
+    "its card on the line to that one.",
+)  # fmt: skip
 @click.option("-o", "--output", type=click.Path(path_type=Path),
               help="Folder for report.json, report.html and figures [CAMPAIGN_diagnosis].")  # fmt: skip
 @click.option(
@@ -46,6 +51,7 @@ def diagnose(
     campaign: Path,
     baseline: str | None,
     floating: tuple[str, ...],
+    towards: str | None,
     output: Path | None,
     seed: int,
     explain: bool,
@@ -67,6 +73,7 @@ def diagnose(
       bfsensor diagnose recordings/run_12 --baseline itl_sta3800c --float all
       bfsensor diagnose other_camera --baseline none
       bfsensor diagnose itl_covariances.csv --baseline itl_sta3800c_60
+      bfsensor diagnose e2v_covariances.csv --baseline e2v_ccd250 --towards e2v_ccd250_70
       bfsensor diagnose recordings/run_12 --predict level=40000,back_bias=-40 --predict flux=5e5
     """
     from bfsensor.diagnose import diagnosis
@@ -84,6 +91,7 @@ def diagnose(
         simulate_baseline,
         with_physics,
     )
+    from bfsensor.diagnose.table_baseline import with_operating_point
     from bfsensor.recording.campaign import read_campaign
 
     conditions = read_conditions(asked)
@@ -93,7 +101,11 @@ def diagnose(
         None if reduced is not None else read_campaign(campaign, progress=Bar("headers"))
     )
     named = baseline or (None if found is None else found.baseline)
-    if floating:
+    if towards is not None and (floating or named is None):
+        raise click.UsageError("--towards needs a --baseline, and none of --float")
+    if towards is not None:
+        predicted = with_operating_point(str(named), towards)
+    elif floating:
         exposures = () if found is None else found.exposures
         biases = sorted({e.back_bias for e in exposures if e.back_bias is not None})
         warm = {round(e.temperature) for e in exposures if e.temperature is not None}

@@ -218,15 +218,49 @@ class Device:
             device = device.with_value(f"operating_point.{key}", value)
         return device
 
-    def _resolve(self, key: str) -> str:
-        """Dotted name of a scalar quantity."""
-        known = [
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """Dotted names of all that :meth:`with_value` can change."""
+        return tuple(
             f"{section}.{f.name}"
             for section, kind in _SECTIONS.items()
             if getattr(self, section) is not None
             for f in dataclasses.fields(kind)
             if f.metadata or f.type == "int"
-        ]
+        )
+
+    def unit_of(self, key: str) -> tuple[str, str, str]:
+        """Full name of a quantity, its kind and the unit it is written in.
+
+        Parameters
+        ----------
+        key : str
+            As in :meth:`with_value`.
+
+        Returns
+        -------
+        name, kind, unit : str
+            Dotted name; a key of :data:`bfsensor.units.INTERNAL` and its written unit, both
+            empty for whole numbers.
+
+        Raises
+        ------
+        DeviceError
+            No such quantity.
+
+        Examples
+        --------
+        >>> Device.load("itl_sta3800c").unit_of("back_bias")
+        ('operating_point.back_bias', 'potential', 'V')
+        """
+        name = self._resolve(key)
+        section, _, last = name.partition(".")
+        spec = {f.name: f for f in dataclasses.fields(_SECTIONS[section])}[last]
+        return name, spec.metadata.get("kind", ""), spec.metadata.get("unit", "")
+
+    def _resolve(self, key: str) -> str:
+        """Dotted name of a scalar quantity."""
+        known = self.quantities
         if key in known:
             return key
         short = [k for k in known if k.split(".")[1] == key]

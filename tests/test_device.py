@@ -30,7 +30,12 @@ from tests.device_cases import E2V, ITL, refusal
 def test_builtin_devices_survive_writing(name, tmp_path):
     device = Device.load(name)
     assert device.name == name
-    assert device.provenance["silicon.thickness"] == Provenance(5.0, "published", None)
+    known = device.provenance["silicon.thickness"]
+    if name.endswith("_2019"):
+        # A fit narrows what its prior was.
+        assert known.origin == "fitted" and 0 < known.uncertainty <= 5.0 and known.source
+    else:
+        assert known == Provenance(5.0, "published", None)
     again = Device.from_toml(device.to_toml())
     assert again == device
     assert dict(again.provenance) == dict(device.provenance)

@@ -17,6 +17,7 @@ CLASSES = {
     errors.SensorError: ValueError,
     errors.SimulationError: ValueError,
     errors.DiagnosisError: ValueError,
+    errors.FitError: ValueError,
     errors.EffectError: ValueError,
     errors.SweepError: ValueError,
     errors.ConvergenceError: RuntimeError,

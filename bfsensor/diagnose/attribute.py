@@ -33,6 +33,7 @@ from bfsensor.diagnose.ranking import (
     rank,
     refine,
     seen_of,
+    tellable,
     threshold,
     with_hypotheses,
 )
@@ -43,7 +44,7 @@ from bfsensor.diagnose.remainder import (
     stands_out,
 )
 from bfsensor.diagnose.screen import Rival, Screen
-from bfsensor.diagnose.suspects import suspect_effects
+from bfsensor.diagnose.suspects import locate_effects
 from bfsensor.effects.effect import Effect
 from bfsensor.errors import ConvergenceError
 
@@ -105,8 +106,7 @@ def attribute(
         Of the noise that thresholds come from.
     """
     kinds = candidates_of(predictor.baseline) if kinds is None else kinds
-    if not predictor.layout.segments:
-        kinds = [k for k in kinds if not k.of_pixels]
+    kinds = tellable(kinds, predictor, fit.channels)
     base = Model(predictor, fit)
     candidates = (*kinds, *NAMED)
     first = mismatch
@@ -199,9 +199,8 @@ def _step(
         except ConvergenceError as error:
             notes.append(f"{rival.effect.name}: {error}")
             continue
-        left = locate_mismatch(further.fit, seed=seed)
-        if sure or not left.detected:
-            return further, suspect_effects(further.predictor, further.fit, left, kinds)
+        if sure or not locate_mismatch(further.fit, seed=seed).detected:
+            return further, locate_effects(further.predictor, further.fit, kinds, seed=seed)
     return None
 
 

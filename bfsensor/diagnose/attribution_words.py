@@ -77,6 +77,12 @@ def said_of(attribution: Attribution) -> list[str]:
             f"On recordings that were not fitted chi-square per value goes from {before:.2f} to "
             f"{after:.2f}."
         )
+        for word in attribution.fails_in:
+            worse, better, n = (attribution.heldout[word][k] for k in (1, 0, 2))
+            out.append(
+                f"There it fails in the channel {word!r} (from {better / n:.2f} to {worse / n:.4g}): "
+                "parameters of effects that act on it are not to be relied on."
+            )
     return out
 
 

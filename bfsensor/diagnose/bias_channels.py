@@ -10,9 +10,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Axes, Condition, Exposure, Frame
-
-READOUT_LAGS = 32
-"""Largest lag of the noise in readout order [pixel times]."""
+from bfsensor.effects.noise import READOUT_LAGS, near_lags
 
 OUTLIER = 6.0
 """Deviation [sigma] from which a pixel of a dark or bias counts as struck: one in 5e8 by noise."""
@@ -152,10 +150,14 @@ class BiasChannels:
         mean = excess.mean(0)
         least = STANDS_OUT * np.array([e for _, e, _ in self._rows[0]]) / len(excess) ** 0.5
         more = np.where(mean > least, 1 + mean, 1.0)
+        # Of a wave each frame has another phase, the same in all its rows.
+        # One pair alone cannot tell that scatter: its excess is held against noise.
+        apart = excess.std(0, ddof=1) if len(excess) > 1 else np.zeros(len(mean))
+        apart = np.where(np.abs(mean) > least, apart, 0.0)
         for n, one in enumerate(self._rows):
             value, error, white = np.array(one).T
             values.append(value)
-            blocks.append(np.diag((more * error) ** 2))
+            blocks.append(np.diag(np.maximum(more * error, apart) ** 2))
             axes.add(len(one), self._condition, amp=np.arange(len(one)), exposure=2 * n,
                      what="rows", white=white)  # fmt: skip
         for exposure, levels in self._levels:
@@ -352,8 +354,18 @@ def _errors_in_order(c: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _row_excess(noise: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Variance of the rows' means over what white noise gives, less one; its error; and that."""
+    """Variance of the rows' means over what white noise gives, less one; its error; and that.
+
+    Without the share of pixels that are few lags apart: those covariances are told by themselves,
+    and what is told twice would count twice.
+    """
     rows, columns = noise.shape
     share = noise.var() / columns
     excess = float(noise.mean(1).var(ddof=1) / share - 1.0)
-    return excess, float(np.sqrt(2.0 / (rows - 1))), float(share)
+    noise = noise - noise.mean()
+    lags = near_lags(columns)
+    near = sum((noise[:, k:] * noise[:, :-k]).sum() / rows / columns for k in lags.tolist())
+    excess -= 2 * float(near) / float(noise.var())
+    # All products of two pixels of a row have the same variance, and no covariance.
+    far = 2.0 / (rows - 1) - 4.0 / rows / columns * float((1 - lags / columns).sum())
+    return excess, float(np.sqrt(far)), float(share)

@@ -21,7 +21,7 @@ from bfsensor.diagnose.placed import place_effects
 from bfsensor.diagnose.plan import Plan, plan
 from bfsensor.diagnose.predict import Predictor, used_channels
 from bfsensor.diagnose.scans import DEVICE, DEVICE_SEEN
-from bfsensor.diagnose.suspects import suspect_effects
+from bfsensor.diagnose.suspects import locate_effects
 from bfsensor.diagnose.untested import find_untested
 
 SCHEMA = "bfsensor-diagnosis-1"
@@ -161,6 +161,7 @@ class Diagnosis:
         if told is not None and (told.found or told.free_form is not None):
             out["chi2dof_after"] = _finite(told.chi2dof()[1])
         if self.attribution is not None:
+            out["fails_in"] = list(self.attribution.fails_in)
             out["channels"] = {
                 word: {"before": b / n, "after": a / n, "values": n}
                 for word, (b, a, n) in self.attribution.heldout.items()
@@ -314,9 +315,10 @@ def diagnose_measured(
     """Hold channels that are measured already against a baseline; see :func:`diagnose`."""
     predictor, fit = fit_bounded(measured, baseline)
     more = _of_free(measured, baseline, fit)
-    mismatch = locate_mismatch(fit, seed=seed)
     if explain:
-        mismatch = suspect_effects(predictor, fit, mismatch)
+        mismatch = locate_effects(predictor, fit, seed=seed)
+    else:
+        mismatch = locate_mismatch(fit, seed=seed)
     attribution, advised = None, Plan()
     if mismatch.detected and explain:
         attribution = attribute(predictor, fit, mismatch, seed=seed)

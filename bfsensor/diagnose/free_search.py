@@ -11,6 +11,7 @@ from scipy.stats import chi2
 from bfsensor.diagnose.free_terms import Family, Term, Values
 from bfsensor.diagnose.locate import ALARM
 from bfsensor.diagnose.mismatch import BaselineFit
+from bfsensor.errors import ConvergenceError
 
 MOST_TERMS = 6
 """Terms of one family."""
@@ -77,13 +78,18 @@ class Dictionary:
     def __init__(self, family: Family, fit: BaselineFit) -> None:
         self.family, self.fit = family, fit
         blocks: list[Values] = []
+        usable = np.ones(len(family.terms), bool)
         rows: list[NDArray[np.int64]] = []
         for channel, start in zip(fit.channels, fit.starts, strict=False):
             if channel.word not in family.words:
                 continue
             columns = np.zeros((len(channel), len(family.terms)))
             for n, term in enumerate(family.terms):
-                found = (term.rough or term.column)(channel)
+                try:
+                    found = (term.rough or term.column)(channel)
+                except ConvergenceError:
+                    # Where so much changes that spots have no shape it is no explanation.
+                    found, usable[n] = None, False
                 if found is not None:
                     columns[:, n] = found
             white = channel.whiten(columns)
@@ -91,7 +97,7 @@ class Dictionary:
             blocks.append(white[used])
             rows.append(int(start) + used)
         empty = np.zeros((0, len(family.terms)))
-        self.x = np.concatenate([empty, *blocks])
+        self.x = np.concatenate([empty, *blocks]) * usable
         self.rows = np.concatenate([np.zeros(0, int), *rows])
         self.u = fit.basis[self.rows].T @ self.x
         raw = (self.x**2).sum(0)

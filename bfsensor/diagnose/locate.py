@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import copy
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -61,6 +62,26 @@ class Finding:
     z: float
     p_value: float
     where: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """A shape that an effect of the library makes.
+
+    Attributes
+    ----------
+    effect, word : str
+        Its name, and the channel that it shows in most.
+    weights : ndarray of float32, shape (n + priors,)
+        Whitened, priors' rows last, what the fit's parameters span taken off; of unit length.
+    signed : bool
+        Whether its opposite may be as well.
+    """
+
+    effect: str
+    word: str
+    weights: NDArray[np.float32]
+    signed: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,12 +216,13 @@ class Locator:
     """Judges residuals against noise that is drawn once.
 
     The noise is drawn through the fit's own linear model.  Statistics are the chi-squares
-    (one-sided) and the templates (two-sided).  So that thousands of templates of one channel do
-    not hide another's few, deviates are put on the scale of the largest that noise gives in
-    the same family, the chi-squares or one channel's templates: the logarithm of its tail's
-    probability.  The largest of all then gives family-wise p-values, step-down (Westfall & Young
-    1993): what has been found no longer hides what is next.  Beyond the draws an exponential
-    tail of the largest deviates is taken.
+    (one-sided), the templates (two-sided) and, with :meth:`with_library`, the shapes of known
+    effects.  So that thousands of templates of one channel do not hide another's few, deviates
+    are put on the scale of the largest that noise gives in the same family, the chi-squares, one
+    channel's templates or one effect's shapes: the logarithm of its tail's probability.  The
+    largest of all then gives family-wise p-values, step-down (Westfall & Young 1993): what has
+    been found no longer hides what is next.  Beyond the draws an exponential tail of the largest
+    deviates is taken.
 
     Parameters
     ----------
@@ -214,7 +236,9 @@ class Locator:
 
     def __init__(self, fit: BaselineFit, *, seed: int = 1, draws: int = DRAWS) -> None:
         self.scanner = Scanner(fit)
+        self.library: tuple[Known, ...] = ()
         self._chi = len(self.scanner.words)
+        self._seed, self._count = seed, draws
         rng = np.random.default_rng(seed)
         # One row a statistic, chi-squares first.
         self._drawn = np.empty((self._chi + len(self.scanner.templates), draws), np.float32)
@@ -227,32 +251,58 @@ class Locator:
         families = [np.arange(self._chi)] + [
             self._chi + np.nonzero(words == w)[0] for w in dict.fromkeys(words)
         ]
-        self._zero, self._scale = np.zeros(len(self._drawn)), np.ones(len(self._drawn))
-        for rows in families:
-            largest = self._drawn[rows].max(0)
-            self._zero[rows] = threshold = np.quantile(largest, 0.8)
-            self._scale[rows] = (largest[largest > threshold] - threshold).mean()
-        self._drawn -= self._zero[:, None].astype(np.float32)
-        self._drawn /= self._scale[:, None].astype(np.float32)
+        self._zero, self._scale = _ranked(self._drawn, families)
         parts = self._drawn[: self._chi], self._drawn[self._chi :]
         self._maxima = [p.max(0).astype(float) for p in parts]
+
+    def with_library(self, library: Sequence[Known]) -> Locator:
+        """Copy that judges shapes of known effects as well, by the same draws."""
+        out = copy.copy(self)
+        if not library:
+            return out
+        out.library = tuple(library)
+        fit, shapes = self.scanner.fit, np.array([k.weights for k in library])
+        rng = np.random.default_rng(self._seed)
+        drawn = np.empty((len(library), self._count), np.float32)
+        for start in range(0, self._count, 50):
+            noise = fit.draw_all(rng, min(50, self._count - start)).astype(np.float32)
+            drawn[:, start : start + len(noise)] = shapes @ noise.T
+        signed = np.array([k.signed for k in library])
+        drawn[signed] = np.abs(drawn[signed])
+        names = np.array([k.effect for k in library])
+        zero, scale = _ranked(
+            drawn, [np.nonzero(names == n)[0] for n in dict.fromkeys(names)]
+        )
+        out._drawn = np.concatenate([self._drawn, drawn])
+        out._zero = np.concatenate([self._zero, zero])
+        out._scale = np.concatenate([self._scale, scale])
+        out._maxima = [*self._maxima, drawn.max(0).astype(float)]
+        return out
 
     def locate(self, residuals: NDArray[np.float64] | None = None) -> Mismatch:
         """Find what of residuals noise does not explain.
 
         Parameters
         ----------
-        residuals : ndarray, shape (n,), optional
-            Whitened, what was fitted taken off; by default the fit's.
+        residuals : ndarray, shape (n + priors,), optional
+            Whitened, what was fitted taken off, by default the fit's; priors' rows are needed
+            for shapes of effects only.
         """
         fit = self.scanner.fit
-        residuals = fit.residuals if residuals is None else residuals
+        given = residuals
+        residuals = fit.residuals if given is None else given[: len(fit.residuals)]
         signed = self.scanner.templates_z(residuals)
         chi2, scans = self.scanner.chi2_z(residuals), np.abs(signed)
-        maxima = np.maximum(*self._maxima)
-        observed = np.concatenate([chi2, scans])
+        maxima = np.max(self._maxima, axis=0)
+        left = fit.left if given is None else given
+        known = np.array([float(k.weights @ left) for k in self.library])
+        shown = [
+            abs(z) if k.signed else z for k, z in zip(self.library, known, strict=True)
+        ]
+        observed = np.concatenate([chi2, scans, shown])
         ranks = (observed - self._zero) / self._scale
-        best = float(ranks[: self._chi].max()), float(ranks[self._chi :].max())
+        parts = np.split(ranks, [self._chi, self._chi + len(scans)])
+        best = [float(p.max(initial=-np.inf)) for p in parts]
         squares = [
             float(residuals[fit.of(w)] @ residuals[fit.of(w)]) for w in self.scanner.words
         ]
@@ -261,7 +311,7 @@ class Locator:
             p_value=tail_probability(max(best), maxima),
             p_chi2=tail_probability(best[0], self._maxima[0]),
             p_scans=tail_probability(best[1], self._maxima[1]),
-            findings=tuple(self._step_down(observed, ranks, signed)),
+            findings=tuple(self._step_down(observed, ranks, np.append(signed, known))),
             chi2=dict(
                 zip(self.scanner.words, zip(squares, dofs, strict=True), strict=True)
             ),
@@ -271,6 +321,7 @@ class Locator:
     def _pursue(self, signed: NDArray[np.float64]) -> list[Finding]:
         """Take the farthest template, take off what it explains, and so on (matching pursuit)."""
         z = signed.copy()
+        scans = slice(self._chi, self._chi + len(z))
         critical = float(np.quantile(self._maxima[1], 1 - 2 * ALARM))
         # What is left of each template's variance, and directions taken so far.
         free = np.ones(len(z))
@@ -279,7 +330,7 @@ class Locator:
         while len(parts) < PARTS:
             open_ = free > 0.02
             normed = np.where(open_, z / np.sqrt(np.maximum(free, 0.02)), 0.0)
-            ranks = (np.abs(normed) - self._zero[self._chi :]) / self._scale[self._chi :]
+            ranks = (np.abs(normed) - self._zero[scans]) / self._scale[scans]
             n = int(np.argmax(np.where(ranks > critical, np.abs(normed), 0.0)))
             p = tail_probability(float(ranks[n]), self._maxima[1])
             if p >= ALARM or (parts and abs(normed[n]) < FAINT * abs(parts[0].z)):
@@ -330,13 +381,31 @@ class Locator:
             if n < self._chi:
                 word = self.scanner.words[n]
                 findings.append(Finding("chi-square", word, float(observed[n]), p))
-            else:
+                continue
+            z = float(signed[n - self._chi])
+            if n < self._chi + len(self.scanner.templates):
                 template = self.scanner.templates[n - self._chi]
-                z = float(signed[n - self._chi])
                 findings.append(
                     Finding(template.family, template.word, z, p, dict(template.where))
                 )
+            else:
+                known = self.library[n - self._chi - len(self.scanner.templates)]
+                findings.append(Finding(FAMILY, known.word, z, p, {"effect": known.effect}))
         return findings
+
+
+def _ranked(
+    drawn: NDArray[np.float32], families: Iterable[NDArray[np.int64]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Put drawn deviates, in place, on the scale of their family's largest; zero and scale."""
+    zero, scale = np.zeros(len(drawn)), np.ones(len(drawn))
+    for rows in families:
+        largest = drawn[rows].max(0)
+        zero[rows] = threshold = np.quantile(largest, 0.8)
+        scale[rows] = (largest[largest > threshold] - threshold).mean()
+    drawn -= zero[:, None].astype(np.float32)
+    drawn /= scale[:, None].astype(np.float32)
+    return zero, scale
 
 
 def locate_mismatch(fit: BaselineFit, *, seed: int = 1, draws: int = DRAWS) -> Mismatch:

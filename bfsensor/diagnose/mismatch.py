@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,12 @@ STALLED = 4
 
 REFRESHED = 2, 4
 """Rounds in which what is left to chance is taken as strong as the effects then are."""
+
+UNSETTLED = (
+    "the recordings are so unlike the baseline that its parameters did not settle: what is left is "
+    "of the best that was found"
+)
+"""Note of fits whose free steps led away."""
 
 SMALL = 0.05
 """Largest step of a parameter [of its error] at which the fit has arrived."""
@@ -109,16 +115,23 @@ class BaselineFit:
 
     def draw(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Residuals that noise alone leaves, shape (count, n), the fit linear about its end."""
-        total, n = len(self.basis), len(self.residuals)
-        noise = rng.standard_normal((count, total))
+        return self.draw_all(rng, count)[:, : len(self.residuals)]
+
+    def draw_all(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+        """As :meth:`draw`, those of the priors after them."""
+        noise = rng.standard_normal((count, len(self.basis)))
         noise -= (noise @ self.basis) @ self.basis.T
-        return np.asarray(noise[:, :n])
+        return noise
 
 
 def fit_baseline(
     predictor: Predictor, channels: Sequence[Channel], *, like: BaselineFit | None = None
 ) -> BaselineFit:
     """Fit the baseline to channels: Gauss-Newton, device parameters held by their spread.
+
+    Recordings that are nothing like the baseline may lead such steps ever farther away.  Without
+    effects the fit is then made again by steps that may do no harm, and ends where they end:
+    what is left is large, and told; ``notes`` say so.
 
     Parameters
     ----------
@@ -135,6 +148,23 @@ def fit_baseline(
     ConvergenceError
         The parameters still move after :data:`ROUNDS` rounds.
     """
+    try:
+        return _fit(predictor, channels, like=like, careful=bool(predictor.effects))
+    except ConvergenceError:
+        if predictor.effects:
+            raise
+        found = _fit(predictor, channels, like=like, careful=True)
+        return replace(found, notes=(*found.notes, UNSETTLED))
+
+
+def _fit(
+    predictor: Predictor,
+    channels: Sequence[Channel],
+    *,
+    like: BaselineFit | None,
+    careful: bool,
+) -> BaselineFit:
+    """As :func:`fit_baseline`; careful steps do no harm, and need derivatives of each round."""
     starts = np.concatenate([[0], np.cumsum([len(c) for c in channels])])
     total = int(starts[-1])
     columns: dict[str, NDArray[np.float64]] = {}
@@ -151,7 +181,7 @@ def fit_baseline(
     low, high = predictor.bounds()
     effect = np.char.startswith(np.array(predictor.names, str), "effect ")
     modes = _modes(predictor, channels, point)
-    span = _span(linear / scales, modes) if effect.any() else linear[:, :0]
+    span = _span(linear / scales, modes) if careful else linear[:, :0]
     before, least, halved, arrived = point.copy(), np.inf, 0, False
     moved = np.inf
     history: list[float] = []
@@ -161,14 +191,23 @@ def fit_baseline(
     if like is not None:
         slopes[:, :plain] = like.slopes[:, :plain]
     for turn in range(ROUNDS):
-        predicted = [predictor.predict(c, point) for c in channels]
+        try:
+            predicted = [predictor.predict(c, point) for c in channels]
+        except ConvergenceError:
+            # So far off that spots have no shape any more: a step that does harm.
+            if not (careful and turn and halved < HALVINGS):
+                raise
+            halved += 1
+            point = 0.5 * (point + before) if halved < HALVINGS else before
+            history.append(np.nan)
+            continue
         residuals = np.concatenate([
             c.whiten(c.values - p) for c, p in zip(channels, predicted, strict=True)
         ])  # fmt: skip
         if turn in REFRESHED and modes.shape[1] and not halved:
             modes, least = _modes(predictor, channels, point), np.inf
             span = _span(linear / scales, modes)
-        if effect.any():
+        if careful:
             # Of what is left with the linear parameters at their best.
             given = span[:total].T @ residuals
             square = float(residuals @ residuals) - float(given @ given)
@@ -186,12 +225,18 @@ def fit_baseline(
             least, halved = square, 0
         # Derivatives hardly change: those of the second round serve all later ones; effects
         # with a shape are not as straight.
-        fresh = turn < 2 and like is None
+        fresh = (turn < 2 or (careful and not effect.any())) and like is None
         if fresh or effect.any():
             for n in map(int, np.flatnonzero(fresh | effect)):
                 for channel, start, here in zip(channels, starts, predicted, strict=False):
                     if predictor.depends(channel)[n]:
-                        change = predictor.slope(channel, point, n, here)
+                        try:
+                            change = predictor.slope(channel, point, n, here)
+                        except ConvergenceError:
+                            # At the end of where spots have a shape: that of the last round.
+                            if not (careful and turn):
+                                raise
+                            continue
                         slopes[start : start + len(channel), n] = channel.whiten(change)
         plainly, chance = count + linear.shape[1], modes.shape[1]
         design = np.zeros((total + priors + chance, plainly + chance))
@@ -236,10 +281,13 @@ def fit_baseline(
             point = before if arrived else point
             break
     else:
-        raise ConvergenceError(
-            f"the baseline's parameters still move by {moved:.2g} of their errors after {ROUNDS} "
-            f"rounds (steps {', '.join(f'{h:.2g}' for h in history)})"
-        )
+        if careful and not effect.any():
+            point = before
+        else:
+            raise ConvergenceError(
+                f"the baseline's parameters still move by {moved:.2g} of their errors after {ROUNDS} "
+                f"rounds (steps {', '.join(f'{h:.2g}' for h in history)})"
+            )
     left = target - q @ (q.T @ target)
     unit = np.concatenate([np.ones(count), scales, np.ones(chance)])
     values = np.concatenate([point, solution[count:] / unit[count:]])

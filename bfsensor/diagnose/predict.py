@@ -15,7 +15,8 @@ from bfsensor.diagnose.baseline import Baseline, Edges, area_matrix
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
-from bfsensor.diagnose.map_channels import MapShare, block_side
+from bfsensor.diagnose.linear_columns import linear_columns
+from bfsensor.diagnose.map_channels import MapShare
 from bfsensor.diagnose.predict_effects import ADDED, EffectChain, layout_of, pad_areas
 from bfsensor.diagnose.predict_flats import (
     flat_covariances_of,
@@ -25,9 +26,6 @@ from bfsensor.diagnose.predict_flats import (
 from bfsensor.diagnose.predict_spots import predict_spots, representative_phases
 from bfsensor.effects.effect import Effect, Layout, Parameter
 from bfsensor.errors import DiagnosisError
-
-MAP_ORDER = 4
-"""Order of the polynomial in x and y that the light on the sensor may have."""
 
 REDUCED_LEVEL = 40_000.0
 """Background [e-] at which a_ij without a level are predicted: halfway to a flat of 80,000 e-, at
@@ -452,11 +450,7 @@ class Predictor:
 
     def linear(self, channel: Channel) -> dict[str, NDArray[np.float64]]:
         """Columns of the linear parameters, by name; the same name is the same parameter."""
-        make = {
-            "flat_mean": self._mean_columns, "flat_map": self._map_columns,
-            "dark_map": self._dark_columns, "spot": self._spot_columns,
-        }.get(channel.word)  # fmt: skip
-        out = {} if make is None else make(channel)
+        out = linear_columns(channel, self._rows(channel), self.measured)
         for more in self.columns:
             out |= more(channel)
         return out
@@ -604,108 +598,10 @@ class Predictor:
             kept = self._grown[key] = state, found
         return kept[1]
 
-    def _mean_columns(self, channel: Channel) -> dict[str, NDArray[np.float64]]:
-        x = channel.axes
-        out = {}
-        light = x["time"] * x["lamp"]
-        for key, rows in self._rows(channel).items():
-            for amp in np.unique(x["amp"][rows]):
-                here = rows[x["amp"][rows] == amp]
-                column = np.zeros(len(channel))
-                column[here] = light[here]
-                out[f"light {int(amp)} {'/'.join(key)}"] = column
-        for amp in np.unique(x["amp"]):
-            out[f"dark {int(amp)}"] = np.where(x["amp"] == amp, x["time"], 0.0)
-        return out
-
-    def _dark_columns(self, channel: Channel) -> dict[str, NDArray[np.float64]]:
-        x = channel.axes
-        out = {}
-        level, column = x["what"] == "level", x["what"] == "column"
-        for amp in np.unique(x["amp"]):
-            here = x["amp"] == amp
-            out[f"dark {int(amp)}"] = np.where(here & level, x["time"], 0.0)
-            out[f"dark level {int(amp)}"] = np.where(here & level, 1.0, 0.0)
-            out[f"dark column {int(amp)}"] = np.where(here & column, 1.0, 0.0)
-        return out
-
-    def _map_columns(self, channel: Channel) -> dict[str, NDArray[np.float64]]:
-        x = channel.axes
-        ny, nx = self.measured.shape
-        out: dict[str, NDArray[np.float64]] = {}
-        u, v = 2 * (x["x"] + 0.5) / nx - 1, 2 * (x["y"] + 0.5) / ny - 1
-        for name in dict.fromkeys(x["map"]):
-            here = x["map"] == name
-            for what in ("column", "row", "block"):
-                rows = here & (x["what"] == what)
-                for p in range(MAP_ORDER + 1):
-                    for q in range(MAP_ORDER + 1 - p):
-                        # The mean of a power of what is summed over is part of other columns.
-                        if (what == "column" and q) or (what == "row" and p):
-                            continue
-                        basis = np.zeros(len(channel))
-                        basis[rows] = u[rows] ** p * v[rows] ** q
-                        out[f"map {name} {what} {p}{q}"] = basis
-            ring = here & (x["what"] == "ring")
-            if ring.any():
-                # Sizes of pixels, and the effect, which evens the pixels' response out: more at
-                # some levels and conditions than at others, so that ratios keep of it.
-                for power in (2, 4):
-                    out[f"map {name} rings k{power}"] = np.where(ring, x["k"] ** power, 0.0)
-            if name == "all" and ring.any():
-                out["map rings white"] = np.where(ring, 1.0, 0.0)
-            for step, column in self._amplifier_steps(channel, here).items():
-                out[f"map {name} {step}"] = column
-        return out
-
-    def _amplifier_steps(
-        self, channel: Channel, here: NDArray[np.bool_]
-    ) -> dict[str, NDArray[np.float64]]:
-        """Steps between amplifiers, which were divided by their means: free, along x and y."""
-        x, out = channel.axes, {}
-        for what, axis, n in (("column", "x", 0), ("row", "y", 1)):
-            rows = here & (x["what"] == what)
-            for start in sorted({o[n] for o in self.measured.origins} - {0}):
-                beyond = rows & (x[axis] >= start)
-                if beyond.any() and not beyond[rows].all():
-                    out[f"{what} from {start}"] = np.where(beyond, 1.0, 0.0)
-        rows = here & (x["what"] == "block")
-        # Blocks may lie on several amplifiers.
-        half = 0.5 * block_side(self.measured.shape)
-        shares = [
-            np.where(rows, _overlap(x["x"], half, s.x, s.columns), 0.0)
-            * _overlap(x["y"], half, s.y, s.rows)
-            for s in self.measured.segments
-        ]
-        covered = np.maximum(np.sum(shares, axis=0), 1e-9)
-        for amp, share in enumerate(shares[1:], 1):
-            if share.any():
-                out[f"block amp {amp}"] = share / covered
-        return out
-
-    def _spot_columns(self, channel: Channel) -> dict[str, NDArray[np.float64]]:
-        x = channel.axes
-        out = {}
-        for key, rows in self._rows(channel).items():
-            for what in ("flux", "skew_x", "skew_y"):
-                here = rows[x["what"][rows] == what]
-                column = np.zeros(len(channel))
-                column[here] = x["light"][here] if what == "flux" else 1.0
-                out[f"spot {what} {'/'.join(key)}"] = column
-        return out
-
 
 def _width_of(key: tuple[str, ...]) -> str:
     """Wavelength and temperature of a condition: what spots have one width at."""
     return f"{key[0]}/{key[2]}"
-
-
-def _overlap(
-    centre: NDArray[np.float64], half: float, start: int, count: int
-) -> NDArray[np.float64]:
-    """Pixels of intervals about centres that lie in another interval."""
-    low, high = centre + 0.5 - half, centre + 0.5 + half
-    return np.maximum(np.minimum(high, start + count) - np.maximum(low, start), 0.0)
 
 
 def fitted(effect: Effect) -> list[Parameter]:

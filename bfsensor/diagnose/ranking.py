@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from bfsensor.diagnose.baseline import Baseline
+from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.locate import ALARM, Mismatch
 from bfsensor.diagnose.model import Model
 from bfsensor.diagnose.named import NAMED
-from bfsensor.diagnose.predict import fitted
+from bfsensor.diagnose.predict import Predictor, fitted
 from bfsensor.diagnose.scans import DEVICE, DEVICE_SEEN
 from bfsensor.diagnose.screen import OCCAM, Rival, Screen
 from bfsensor.effects.device_parameter import device_parameters
@@ -39,6 +40,15 @@ def candidates_of(baseline: Baseline) -> tuple[type[Effect], ...]:
         baseline.derivatives_by_condition(), baseline.spread, baseline.nominal
     )
     return (*LIBRARY, *own, *baseline.pieces)
+
+
+def tellable(
+    kinds: Sequence[type[Effect]], predictor: Predictor, channels: Sequence[Channel]
+) -> list[type[Effect]]:
+    """Candidates that the recordings can tell: reduced ones lack pixels, a_ij alone the level."""
+    pixels = bool(predictor.layout.segments)
+    levels = any(c.unit != PER_ELECTRON for c in channels)
+    return [k for k in kinds if (pixels or not k.of_pixels) and (levels or not k.of_levels)]
 
 
 def name_of(kind: type[Effect]) -> str:

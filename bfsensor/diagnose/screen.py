@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.mismatch import BaselineFit
 from bfsensor.diagnose.predict import Predictor, fitted, widened
 from bfsensor.diagnose.predict_maps import lines_of_map
-from bfsensor.effects.effect import Effect, Parameter
+from bfsensor.effects.effect import Effect, Layout, Parameter
 from bfsensor.errors import BFSensorError
 
 REFINED = 2
@@ -169,6 +170,56 @@ class Screen:
                 self.passed_over[effect.name] = str(error)
         return sorted((t for t in tried if t is not None), key=lambda t: -t[0])
 
+    def shapes(self, kind: type[Effect], layout: Layout) -> list[NDArray[np.float64]]:
+        """What an effect changes, of unit length, at each place where a fit of it may begin.
+
+        Of many places (:data:`MANY`) only what one channel shows (:data:`TELLING`).
+
+        Parameters
+        ----------
+        kind : type
+            Of effect.
+        layout : Layout
+            Which the places are those of.
+        """
+        starts = [_inside(kind(v)) for v in kind.starts(layout)]
+        telling = self._telling(kind) if len(starts) > MANY else None
+        out = []
+        for effect in starts:
+            try:
+                if telling is None:
+                    template = self._change_of_start(effect)
+                else:
+                    channel, first = telling
+                    change = np.zeros(len(self.fit.residuals))
+                    change[first : first + len(channel)] = self._told(effect, channel)
+                    template = self._projected(change)
+            except BFSensorError as error:
+                self.passed_over[effect.name] = str(error)
+                continue
+            length = float(np.sqrt(template @ template))
+            if length > 0:
+                out.append(template / length)
+        return out
+
+    def _telling(self, kind: type[Effect]) -> tuple[Channel, int] | None:
+        """First channel that tells places of an effect apart, and where it begins."""
+        word = next((w for w in TELLING if w in kind.touches), "")
+        return next((
+            (c, int(start)) for c, start in zip(self.fit.channels, self.fit.starts, strict=False)
+            if c.word == word and c.fold == "fit"
+        ), None)  # fmt: skip
+
+    def _told(self, effect: Effect, channel: Channel) -> NDArray[np.float64]:
+        """What an effect changes in a telling channel, whitened."""
+        if channel.word == "flat_map":
+            return channel.whiten(lines_of_map(effect, channel, self.predictor.layout))
+        plain = self.predictor.with_effects((), self.point)
+        chain = self.predictor.with_effects((effect,), self.point)
+        more = chain.start[len(chain.start) - len(fitted(effect)) :]
+        change = chain.predict(channel, np.append(plain.start, more))
+        return channel.whiten(change - plain.predict(channel, plain.start))
+
     def _scaled(self, effect: Effect) -> tuple[float, Effect] | None:
         """Gain of an effect of the best amplitude; None of what cannot be seen."""
         template = self._change_of_start(effect)
@@ -196,26 +247,14 @@ class Screen:
 
     def _likely(self, kind: type[Effect], starts: list[Effect]) -> list[Effect]:
         """Those of many starts that one channel finds likeliest."""
-        word = next((w for w in TELLING if w in kind.touches), "")
-        channels = [
-            (c, start) for c, start in zip(self.fit.channels, self.fit.starts, strict=False)
-            if c.word == word and c.fold == "fit"
-        ]  # fmt: skip
-        if len(starts) <= MANY or not channels:
+        telling = self._telling(kind)
+        if len(starts) <= MANY or telling is None:
             return starts
-        (channel, first), gains = channels[0], []
+        (channel, first), gains = telling, []
         own = slice(first, first + len(channel))
         basis, left = self.fit.basis[own], self.fit.left[own]
         for effect in starts:
-            if word == "flat_map":
-                change = lines_of_map(effect, channel, self.predictor.layout)
-            else:
-                chain = self.predictor.with_effects((effect,), self.point)
-                more = chain.start[len(chain.start) - len(fitted(effect)) :]
-                plain = self.predictor.with_effects((), self.point)
-                change = chain.predict(channel, np.append(plain.start, more))
-                change = change - plain.predict(channel, plain.start)
-            template = channel.whiten(change)
+            template = self._told(effect, channel)
             along = basis.T @ template
             length = float(template @ template) - float(along @ along)
             gains.append(float(template @ left) ** 2 / length if length > 0 else 0.0)

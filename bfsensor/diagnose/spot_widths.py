@@ -54,7 +54,7 @@ def fit_widths(
     Raises
     ------
     ConvergenceError
-        Widths or centres still move after :data:`ROUNDS` rounds.
+        Widths or centres still move after :data:`ROUNDS` rounds, or there are no spots left.
 
     Examples
     --------
@@ -69,7 +69,7 @@ def fit_widths(
     x, y = (np.tile(centres[:, axis], (count, 1)) for axis in (0, 1))
     flux = stamps.sum((2, 3))
     background = np.zeros((count, n))
-    history = []
+    history: list[float] = []
     for _ in range(ROUNDS):
         in_x = _profiles(x, shape[:, 0], nx)
         in_y = _profiles(y, shape[:, 1], ny)
@@ -86,10 +86,19 @@ def fit_widths(
         score *= scale
         own, cross = normal[..., :_OWN, :_OWN], normal[..., :_OWN, _OWN:]
         both = np.concatenate([cross, score[..., :_OWN, None]], axis=-1)
-        eliminated = np.linalg.solve(own, both)
-        turned = cross.swapaxes(-1, -2) @ eliminated
-        rest = (normal[..., _OWN:, _OWN:] - turned[..., :2]).sum(1)
-        step = np.linalg.solve(rest, (score[..., _OWN:] - turned[..., 2]).sum(1)[..., None])
+        try:
+            eliminated = np.linalg.solve(own, both)
+            turned = cross.swapaxes(-1, -2) @ eliminated
+            rest = (normal[..., _OWN:, _OWN:] - turned[..., :2]).sum(1)
+            wanted = (score[..., _OWN:] - turned[..., 2]).sum(1)
+            step = np.linalg.solve(rest, wanted[..., None])
+        except np.linalg.LinAlgError:
+            raise ConvergenceError(
+                f"predicted spots have no shape after {len(history)} rounds: widths from "
+                f"{shape.min():.3g} to {shape.max():.3g} pixel, fluxes from {flux.min():.3g} to "
+                f"{flux.max():.3g} e-",
+                history,
+            ) from None
         step = np.clip(step[..., 0], -0.2 * shape, 0.2 * shape)
         moved = eliminated[..., 2] - np.einsum("knab,kb->kna", eliminated[..., :2], step)
         shape += step

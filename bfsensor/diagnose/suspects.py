@@ -1,9 +1,8 @@
 """Whether an effect of the library stands out where the scans, made for no effect, see nothing.
 
-Thousands of shapes are scanned; a hundred are the library's own, and an effect that shows in many
-places at once is found by its own shape long before any scan sees a part of it.  What is found is
-charged with all that was tried: with each start, with the parameters that were fitted, with every
-kind.
+Thousands of shapes are scanned; a few hundred are the library's own, and an effect that shows in
+many places at once is found by its own shape long before any scan sees a part of it.  Both are
+held against the same draws of noise, each effect's shapes a family.
 """
 
 from __future__ import annotations
@@ -12,104 +11,107 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from bfsensor.diagnose.locate import ALARM, FAMILY, Finding, Mismatch
+from bfsensor.diagnose.locate import ALARM, FAMILY, Finding, Known, Locator, Mismatch
 from bfsensor.diagnose.mismatch import BaselineFit
 from bfsensor.diagnose.predict import Predictor, fitted
-from bfsensor.diagnose.ranking import candidates_of, further, seen_of
-from bfsensor.diagnose.screen import Rival, Screen
+from bfsensor.diagnose.ranking import candidates_of, further, name_of, seen_of, tellable
+from bfsensor.diagnose.screen import Screen
 from bfsensor.effects.effect import Effect
 
 LOOKED = 1e4
 """Waves that maps are searched for; starts that such sightings give are charged with all."""
 
-CLOSEST = 3
-"""Kinds whose parameters are fitted."""
+SURE = 1e-4
+"""Probability by the scans alone below which no other shape is asked."""
 
 
-def suspect_effects(
+def locate_effects(
     predictor: Predictor,
     fit: BaselineFit,
-    mismatch: Mismatch,
     kinds: Sequence[type[Effect]] | None = None,
+    *,
+    seed: int = 1,
 ) -> Mismatch:
-    """Hold the library's own shapes against what a fit leaves, beside the scans.
+    """Find what noise does not explain, by scans and by the library's own shapes together.
 
-    The smaller of both family-wise probabilities counts, for two families of tests
-    (Sidak: 1 - (1 - p)^2).
+    Shapes are those at the places where fits of the effects begin, whatever the data.  Effects
+    that begin at waves that were seen in maps are fitted, and charged for all waves that might
+    have been (:data:`LOOKED`): noise hardly ever makes one of them the smallest probability.
 
     Parameters
     ----------
     predictor, fit : Predictor, BaselineFit
         The baseline, fitted.
-    mismatch : Mismatch
-        What the scans found.
     kinds : sequence of type, optional
         Candidates; by default all of the baseline.  Effects that are there are none.
-
-    Returns
-    -------
-    Mismatch
-        With the probability of both, and a finding of that family where that is what stands out.
+    seed : int
+        Of the draws of noise.
     """
-    both = 1 - (1 - mismatch.p_value) ** 2
-    if mismatch.p_value < ALARM / 2:
-        return replace(mismatch, p_value=max(both, mismatch.p_value))
+    locator = Locator(fit, seed=seed)
+    mismatch = locator.locate()
+    if mismatch.p_value < SURE:
+        # Of two families; which of them is the closer one is known here.
+        return replace(mismatch, p_value=2 * mismatch.p_value)
     if kinds is None:
         kinds = candidates_of(predictor.baseline)
-    if not predictor.layout.segments:
-        kinds = [k for k in kinds if not k.of_pixels]
-    there = predictor.effects_at(fit.values[: len(predictor.names)])
-    found = _likeliest(Screen(predictor, fit, seen_of(mismatch)), further(kinds, there))
-    if found is None or found[0] >= mismatch.p_value:
-        return replace(mismatch, p_value=both)
-    p, rival = found
-    both = 1 - (1 - p) ** 2 if p > 1e-6 else 2 * p
-    findings = mismatch.findings
-    if both < ALARM:
-        z = float(np.sqrt(rival.gain))
-        told = Finding(
-            FAMILY, _channel_of(fit, rival), z, both, {"effect": rival.effect.name}
-        )
-        findings = (told, *findings)
-    return replace(mismatch, p_value=both, findings=findings)
+    kinds = tellable(kinds, predictor, fit.channels)
+    kinds = further(kinds, predictor.effects_at(fit.values[: len(predictor.names)]))
+    screen = Screen(predictor, fit, seen_of(mismatch))
+    mismatch = locator.with_library(known_shapes(screen, kinds)).locate()
+    return _with_sighted(screen, kinds, mismatch)
 
 
-def _likeliest(screen: Screen, kinds: Sequence[type[Effect]]) -> tuple[float, Rival] | None:
-    """Kind that noise is least likely to give, and how likely that any kind is so unlikely."""
-    starts = []
+def known_shapes(screen: Screen, kinds: Sequence[type[Effect]]) -> list[Known]:
+    """Shapes of effects at all places where their fits begin, whatever the data show."""
+    unseen = replace(screen.predictor.layout, sightings=())
+    out = []
     for kind in kinds:
-        tried = screen.tried(kind)
-        if tried:
-            starts.append((kind, tried))
-    judged = []
-    for kind, tried in sorted(starts, key=lambda s: -s[1][0][0])[:CLOSEST]:
-        rival = screen.best(tried[:1])
+        signed = any(p.signed for p in kind.parameters if p.amplitude)
+        for shape in screen.shapes(kind, unseen):
+            word = _channel_of(screen.fit, shape)
+            out.append(Known(name_of(kind), word, shape.astype(np.float32), signed))
+    return out
+
+
+def _with_sighted(
+    screen: Screen, kinds: Sequence[type[Effect]], mismatch: Mismatch
+) -> Mismatch:
+    """What effects say that begin at waves that were seen in maps."""
+    if not screen.predictor.layout.sightings:
+        return mismatch
+    for kind in (k for k in kinds if k.from_sightings):
+        rival = screen.best(screen.tried(kind)[:1])
         # Beyond plausible ranges a shape may follow anything.
         if rival is None or rival.refuted or rival.evidence < 0:
             continue
-        charged = trials_of(kind, screen)
-        p = float(chi2.sf(rival.gain, max(len(fitted(rival.effect)), 1))) * charged
-        judged.append((min(p, 1.0), rival))
-    if not judged:
-        return None
-    p, rival = min(judged, key=lambda j: j[0])
-    many = len(starts)
-    return (1 - (1 - p) ** many if p > 1e-9 else p * many), rival
+        p = float(chi2.sf(rival.gain, max(len(fitted(rival.effect)), 1)))
+        p = min(p * trials_of(kind, screen), 1.0)
+        if p < mismatch.p_value:
+            findings = mismatch.findings
+            if p < ALARM:
+                z, word = (
+                    float(np.sqrt(rival.gain)),
+                    _channel_of(screen.fit, rival.template),
+                )
+                findings = (
+                    Finding(FAMILY, word, z, p, {"effect": name_of(kind)}),
+                    *findings,
+                )
+            mismatch = replace(mismatch, p_value=p, findings=findings)
+    return mismatch
 
 
 def trials_of(kind: type[Effect], screen: Screen) -> float:
-    """Places at which a kind is tried."""
-    layout = screen.predictor.layout
-    count = float(max(len(kind.starts(layout, screen.seen)), 1))
-    return count * (LOOKED if kind.from_sightings and layout.sightings else 1.0)
+    """Places at which a kind that begins at sighted waves is tried."""
+    return max(len(kind.starts(screen.predictor.layout, screen.seen)), 1) * LOOKED
 
 
-def _channel_of(fit: BaselineFit, rival: Rival) -> str:
-    """Channel in which a candidate shows most."""
-    n = len(fit.residuals)
-    squares = rival.template[:n] ** 2
+def _channel_of(fit: BaselineFit, shape: NDArray[np.floating]) -> str:
+    """Channel in which a shape shows most."""
+    squares = shape[: len(fit.residuals)] ** 2
     return max(
         dict.fromkeys(c.word for c in fit.channels),
         key=lambda w: float(squares[fit.of(w)].sum()),

@@ -16,6 +16,7 @@ class BrighterFatterNonlinear(Effect):
     stage = "collect"
     parameters = (Parameter("b", "1/e-", 3e-7, 3e-6, signed=True, amplitude=True),)
     touches = ("flat_cov", "spot")
+    of_levels = True
     source = (
         "Astier et al. 2019, A&A 629, A36, question shifts proportional to charge and fit a term "
         "a b; law of one b and range assumed"

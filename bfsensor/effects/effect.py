@@ -254,6 +254,8 @@ class Effect:
         Whether :meth:`starts` are taken from waves that were sought in maps.
     of_pixels : bool
         Whether its predictions need the amplifiers' pixels, which reduced recordings do not tell.
+    of_levels : bool
+        Whether only the level tells it: a_ij without one are as well those of another device.
     bends : bool
         Whether what it changes goes with the square of its amplitude as well.
     """
@@ -269,6 +271,7 @@ class Effect:
     by_time: ClassVar[bool] = False
     standing: ClassVar[bool] = False
     of_pixels: ClassVar[bool] = False
+    of_levels: ClassVar[bool] = False
     from_sightings: ClassVar[bool] = False
     bends: ClassVar[bool] = False
 

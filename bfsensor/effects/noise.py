@@ -7,6 +7,14 @@ from numpy.typing import NDArray
 
 from bfsensor.effects.effect import Axes, Effect, Image, Layout, Values
 
+READOUT_LAGS = 32
+"""Largest lag at which the noise of biases is measured in readout order [pixel times]."""
+
+
+def near_lags(width: int) -> NDArray:
+    """Lags within a row whose covariances are measured by themselves: no part of its mean's."""
+    return np.arange(1, min(READOUT_LAGS, width // 2) + 1)
+
 
 class ReadNoise(Effect):
     """Noise added to the frames, beside the white one; subclasses give it and its covariance.
@@ -39,8 +47,9 @@ class ReadNoise(Effect):
         out = np.zeros(len(axes["amp"]))
         widths = layout.frame_width(axes["amp"])
         for width in np.unique(widths):
-            # Variance of a mean of so many pixels, less what uncorrelated ones would have.
-            lag = np.arange(1.0, width)
+            # Variance of a mean of so many pixels, less what uncorrelated ones would have, and
+            # those that are so near that their covariance is told by itself.
+            lag = np.arange(len(near_lags(int(width))) + 1.0, width)
             tied = self.on_frame(lag, np.zeros(len(lag)), float(width))
             rows = (widths == width) & (axes["what"] == "rows")
             out[rows] = 2.0 / width * float((1 - lag / width) @ tied)

@@ -9,7 +9,7 @@ from scipy.stats import binom
 
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Axes, Condition
-from bfsensor.diagnose.locate import Locator
+from bfsensor.diagnose.locate import FAMILY, Known, Locator
 from bfsensor.diagnose.mismatch import BaselineFit
 
 HERE = Condition(620.0, -60.0, -100.0)
@@ -155,3 +155,42 @@ def test_own_shape_is_the_prediction_with_its_sum_rule(judge: Locator) -> None:
         assert (weight * shape)[rows].sum() == pytest.approx(
             0.0, abs=1e-6 * np.abs(shape).max()
         )
+
+
+def known(fit: BaselineFit, n: int, *, signed: bool) -> list[Known]:
+    """Two effects, one with a single shape, one with many that are alike."""
+    rng = np.random.default_rng(n)
+    out = []
+    base = rng.standard_normal(len(fit.basis))
+    for k in range(n):
+        shape = base + 0.5 * rng.standard_normal(len(fit.basis)) * (k > 0)
+        shape -= fit.basis @ (fit.basis.T @ shape)
+        shape = (shape / np.sqrt(shape @ shape)).astype(np.float32)
+        out.append(Known("one" if k == 0 else "many", "flat_cov", shape, signed))
+    return out
+
+
+@pytest.mark.parametrize("signed", [True, False])
+def test_shapes_of_effects_alarm_as_seldom_as_is_said(judge: Locator, signed: bool) -> None:
+    fit = judge.scanner.fit
+    both = judge.with_library(known(fit, 30, signed=signed))
+    drawn = fit.draw_all(np.random.default_rng(5), 400)
+    p = np.array([both.locate(r).p_value for r in drawn])
+    for level in (0.05, 0.2, 0.5):
+        low, high = binom.interval(0.999, 400, level)
+        assert low - 6 <= (p < level).sum() <= high + 6
+    # A shape that is there is found, and its opposite only where that may be.
+    shape = both.library[0].weights.astype(float)
+    found = both.locate(drawn[0] + (7.0 - shape @ drawn[0]) * shape)
+    assert found.p_value < 1e-3
+    first = found.findings[0]
+    assert (first.family, first.where) == (FAMILY, {"effect": "one"})
+    assert first.z == pytest.approx(7.0, abs=1e-4)
+    against = both.locate(drawn[0] - (7.0 + shape @ drawn[0]) * shape)
+    assert any(f.family == FAMILY for f in against.findings) == signed
+
+
+def test_without_shapes_nothing_changes(judge: Locator) -> None:
+    residuals = judge.scanner.fit.draw(np.random.default_rng(6), 1)[0]
+    with_none, plain = judge.with_library([]).locate(residuals), judge.locate(residuals)
+    assert with_none.p_value == plain.p_value and with_none.findings == plain.findings

@@ -1,10 +1,14 @@
 """Another operating point of the same device as a candidate, and plans for reduced recordings."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.table import Table
+from click.testing import CliRunner
 
+from bfsensor.cli import main
 from bfsensor.diagnose.baseline import area_matrix
 from bfsensor.diagnose.diagnosis import diagnose_measured, fit_bounded
 from bfsensor.diagnose.forecast import Forecaster
@@ -110,3 +114,30 @@ def test_reduced_recordings_tell_no_clouds_and_no_darks():
     fe55 = Recording("fe55", "Fe55", (Planned("dark", 50, seconds=60.0),), RULES["fe55"])
     assert ruled(fe55, here, found, Rival(loss, 8.0, 3.0, template)) == 0.0
     assert here.forecasts((Planned("dark", 10, seconds=15.0, after=1e5),)) == []
+
+
+def test_areas_without_a_level_tell_no_response_to_it():
+    baseline = baseline_of_table("e2v_ccd250")
+    table = recorded("e2v_ccd250_70", seed=5109)
+    found = diagnose_measured(measure_reduced(table, reach=4), baseline)
+    assert found.mismatch.detected
+    assert "bf_nonlinear" not in json.dumps(found.to_report()["effects"])
+
+
+def test_the_command_line_lets_the_operating_point_move(tmp_path):
+    table = recorded("e2v_ccd250_70", seed=5107)
+    j, i = np.indices(table.a.shape)
+    path = tmp_path / "areas.csv"
+    Table(
+        {"i_serial": i.ravel(), "j_parallel": j.ravel(), "cov_per_e": table.a.ravel(),
+         "err_per_e": table.errors.ravel()}
+    ).write(path, format="ascii.csv")  # fmt: skip
+    given = ["diagnose", str(path), "--baseline", "e2v_ccd250", "-o", str(tmp_path / "out")]
+    done = CliRunner().invoke(main, [*given, "--towards", "e2v_ccd250_70"])
+    assert done.exit_code == 0
+    assert "operating_point.back_bias = -7" in done.stdout
+    other = CliRunner().invoke(main, [*given, "--towards", "itl_sta3800c"])
+    assert other.exit_code == 1
+    assert "are not of one device at two operating points" in other.stderr
+    wrong = CliRunner().invoke(main, ["diagnose", str(path), "--towards", "e2v_ccd250_70"])
+    assert wrong.exit_code == 2 and "--towards needs a --baseline" in wrong.stderr

@@ -13,6 +13,7 @@ from bfsensor.diagnose.attribute import attribute
 from bfsensor.diagnose.class_words import CLASS_WORDS
 from bfsensor.diagnose.diagnosis import Diagnosis, fit_bounded, held_out
 from bfsensor.diagnose.extract import measure_channels
+from bfsensor.diagnose.found import FAILS
 from bfsensor.diagnose.locate import locate_mismatch
 from bfsensor.diagnose.plan import plan
 from bfsensor.diagnose.report import write_report
@@ -86,8 +87,19 @@ def test_report_json_has_plan_advice_and_what_was_not_tested(explained, written)
     assert held["chi2dof_after"] < 1.2 < held["chi2dof_before"]
     assert held["channels"]["flat_mean"]["before"] > 10
     assert held["channels"]["flat_mean"]["after"] < 2
+    assert held["fails_in"] == [] and "fails" not in report["said"]
     # A channel without values is none of them.
     assert all(row["values"] > 0 for row in held["channels"].values())
+
+
+def test_what_fails_on_other_recordings_says_so(explained):
+    told = explained.attribution
+    before, _, n = told.heldout["flat_mean"]
+    worse = {**told.heldout, "flat_mean": (before, before + 2 * FAILS, n)}
+    astray = replace(explained, attribution=replace(told, heldout=worse))
+    assert astray.to_report()["heldout"]["fails_in"] == ["flat_mean"]
+    assert "fails in the channel 'flat_mean'" in astray.said()
+    assert "not to be relied on" in astray.said()
 
 
 def test_the_page_is_whole_and_says_it_all(written):

@@ -10,6 +10,8 @@ from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.conditions import Axes, Condition
 from bfsensor.diagnose.extract import Measured
 from bfsensor.diagnose.predict import Predictor
+from bfsensor.diagnose.spot_widths import fit_widths
+from bfsensor.errors import ConvergenceError
 from validation.virtual_source import virtual_baseline
 
 CONDITIONS = (
@@ -68,3 +70,8 @@ def test_one_width_moves_all_voltages() -> None:
 
     assert left(x["back_bias"] == -40.0) == pytest.approx(400 * 1 / 2, rel=0.1)
     assert left(x["temperature"] == -80.0) < 1.0
+
+
+def test_images_without_spots_are_no_singular_matrix():
+    with pytest.raises(ConvergenceError, match="no shape after 0 rounds"):
+        fit_widths(np.zeros((1, 2, 9, 9)), (1.0, 1.0), np.zeros((2, 2)))

@@ -219,6 +219,8 @@ def test_noise_has_the_covariance_that_is_said(variant, values):
         total += [np.mean(series[: series.size - k] * series[k:]) for k in range(6)]
         cross += np.mean(a * b)
         rows += a.mean(1).var()
+        for k in range(1, width // 2 + 1):
+            rows -= 2 / width**2 * (a[:, k:] * a[:, :-k]).sum() / len(a)
     lag = np.arange(6)
     said = effect.bias_cov({"amp": np.zeros(6, int), "lag": lag}, LAYOUT)
     # Of 168,000 pixels, tied to ten neighbours each, the covariance is known to 3 %.
@@ -232,8 +234,8 @@ def test_noise_has_the_covariance_that_is_said(variant, values):
     assert cross / frames_of == pytest.approx(shared, abs=0.35)
     more = effect.bias_level(x, LAYOUT)[1]
     assert rows / frames_of - 9.0 / width == pytest.approx(more, abs=0.08)
-    if variant != "common":
-        assert abs(more) > 0.1
+    if variant == "pickup":
+        assert abs(more) > 0.05
 
 
 def test_rows_have_the_covariance_that_is_said():

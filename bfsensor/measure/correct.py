@@ -1,0 +1,232 @@
+r"""Take the brighter-fatter effect out of images: a scalar kernel, or shifts of edges.
+
+While a pixel fills, the charge around it moves its boundaries in proportion to what is
+there, so on average over an exposure by half of what they have moved at its end.  A boundary
+moved by s sweeps s times the light that falls on it from one pixel to the other.  Both
+corrections take the light on a boundary to be the mean of the two pixels that share it and
+move it back.  They differ in what they know of the shifts: the scalar kernel K knows them as
+the gradient of a potential, :math:`s = -\nabla (K \otimes F)`, the edge model has them
+for every edge.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.signal import fftconvolve
+
+from bfsensor.errors import ConvergenceError, MeasurementError
+from bfsensor.measure.arrays import to_floats
+
+
+def correct_kernel(
+    image: ArrayLike,
+    kernel: ArrayLike,
+    *,
+    conserving: bool = True,
+    threshold: float = 10.0,
+    iterations: int = 20,
+) -> NDArray[np.float64]:
+    r"""Correct an image with a scalar kernel.
+
+    .. math::
+        \hat F = F + \tfrac12 \nabla \cdot [\hat F\, \nabla (K \otimes \hat F)],
+
+    iterated from :math:`\hat F = F`.
+
+    Parameters
+    ----------
+    image : array_like, shape (ny, nx)
+        Charge without bias [e-], of one exposure, every pixel finite.
+    kernel : array_like, shape (odd, odd)
+        K [1/e-] by lag [j, i], the centre in the middle; minus its Laplacian is a_ij.
+    conserving : bool
+        Take the divergence of what crosses the edges, each with the mean of its two pixels:
+        the sum of all charge stays.  Otherwise :math:`\tfrac12 (\nabla F \cdot \nabla
+        \phi + F \nabla^2 \phi)` by central differences, as first published, which keeps it
+        only where gradients are small.
+    threshold : float
+        The iteration ends when a step changes the pixels by less, in sum [e-]; inf: after
+        the first.
+    iterations : int
+        Steps at most.
+
+    Returns
+    -------
+    corrected : ndarray, shape (ny, nx)
+
+    Raises
+    ------
+    MeasurementError
+        An image or kernel that is not finite, or of another shape.
+    ConvergenceError
+        The threshold was not reached; ``history`` has the sum of changes by step.
+
+    Notes
+    -----
+    Charge outside the image is taken to be that of its nearest pixel: within the reach of
+    the kernel from the border this is a guess.  No charge crosses the border if conserving.
+
+    References
+    ----------
+    Coulton et al. 2018, AJ 155, 258, sections 2 and 3.
+
+    Examples
+    --------
+    >>> kernel = np.zeros((3, 3))
+    >>> kernel[1, 1] = -3e-7
+    >>> flat = np.full((9, 9), 5e4)
+    >>> bool(np.allclose(correct_kernel(flat, kernel), flat))
+    True
+    """
+    given = _image(image)
+    k = to_floats(kernel, "kernel")
+    if k.ndim != 2 or not all(side % 2 for side in k.shape):
+        raise MeasurementError(f"kernel of shape {k.shape} must have two odd sides")
+    if not np.all(np.isfinite(k)):
+        raise MeasurementError("kernel holds values that are not finite")
+    if not threshold > 0:
+        raise MeasurementError(f"threshold = {threshold} e- must be above 0 e-")
+    if not iterations >= 1:
+        raise MeasurementError(f"iterations = {iterations} must be 1 or more")
+    move = _move_conserving if conserving else _move_expanded
+    history: list[float] = []
+    found = given
+    while len(history) < iterations:
+        # One pixel more all around: gradients at the border.
+        pad = tuple((side // 2 + 1,) * 2 for side in k.shape)
+        potential = fftconvolve(np.pad(found, pad, mode="edge"), k, mode="valid")
+        new = given + move(found, potential)
+        history.append(float(np.abs(new - found).sum()))
+        found = new
+        if history[-1] < threshold:
+            return found
+    raise ConvergenceError(
+        f"after {iterations} steps the correction still changes by {history[-1]:.3g} e-, not "
+        f"below {threshold:g} e-",
+        history,
+    )
+
+
+def correct_edges(
+    image: ArrayLike, north: ArrayLike, east: ArrayLike
+) -> NDArray[np.float64]:
+    r"""Correct an image with the shifts of pixel edges.
+
+    With :math:`s` the shift that the charge at the end gives the edge between pixels 1 and 2,
+    :math:`\tfrac12 s` on average, the charge
+
+    .. math:: \delta = \tfrac12 s\, \tfrac12 (F_1 + F_2)
+
+    came to the wrong side of it.  Two convolutions, not iterated: shifts follow the charge
+    that was stored, and that is what the image shows.
+
+    Parameters
+    ----------
+    image : array_like, shape (ny, nx)
+        Charge without bias [e-], of one exposure, every pixel finite.
+    north, east : array_like, shape (n, n)
+        Shift [pixel/e-], outward positive, of the upper and of the right edge of the pixel
+        at lag i in x and j in y, ``[j, i]`` from (0, 0), by charge at (0, 0).  All other
+        edges by mirror symmetry; beyond the last nothing moves.
+
+    Returns
+    -------
+    corrected : ndarray, shape (ny, nx)
+        Its sum is that of the image, to round-off.
+
+    Raises
+    ------
+    MeasurementError
+        An image or shifts that are not finite, or of another shape.
+
+    Notes
+    -----
+    Shifts are antisymmetric about the charge, edge by edge, so that uniform charge moves
+    none.  Charge outside the image is taken to be that of its nearest pixel.
+
+    References
+    ----------
+    Astier & Regnault 2023, A&A 670, A118; normalisation of Guyonnet et al. 2015, A&A 575,
+    A41.
+
+    Examples
+    --------
+    >>> north = np.array([[-5e-7, -1e-7], [-1e-7, -5e-8]])
+    >>> image = np.zeros((9, 9))
+    >>> image[4, 4] = 1e5
+    >>> corrected = correct_edges(image, north, north.T)
+    >>> bool(corrected[4, 4] > 1e5), bool(abs(corrected.sum() - 1e5) < 1e-6)
+    (True, True)
+    """
+    given = _image(image)
+    n, e = to_floats(north, "north"), to_floats(east, "east")
+    if n.ndim != 2 or n.shape != e.shape or n.shape[0] != n.shape[1]:
+        raise MeasurementError(
+            f"north and east have the shapes {n.shape} and {e.shape}, not (n, n) both"
+        )
+    if not (np.all(np.isfinite(n)) and np.all(np.isfinite(e))):
+        raise MeasurementError("north or east holds values that are not finite")
+    moved_y = 0.25 * (given[1:] + given[:-1]) * _shifts(given, n)
+    moved_x = 0.25 * (given[:, 1:] + given[:, :-1]) * _shifts(given.T, e.T).T
+    return given - _gains(moved_y, moved_x, given.shape)
+
+
+def _image(image: ArrayLike) -> NDArray[np.float64]:
+    """Check an image."""
+    array = to_floats(image, "image")
+    if array.ndim != 2 or min(array.shape) < 2:
+        raise MeasurementError(
+            f"image of shape {array.shape} must have two sides of 2 pixels or more"
+        )
+    bad = np.count_nonzero(~np.isfinite(array))
+    if bad:
+        # A convolution would spread them over all pixels.
+        raise MeasurementError(
+            f"image holds {bad} values that are not finite: fill them before a correction"
+        )
+    return array
+
+
+def _shifts(image: NDArray[np.float64], upper: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shifts [pixel] of the edges between the rows of an image, (ny - 1, nx)."""
+    n = len(upper)
+    half = np.concatenate([upper[:, :0:-1], upper], axis=1)
+    # Rows of edges -n .. n - 1 about the charge: those below it are shifted the other way.
+    whole = np.concatenate([-half[::-1], half])
+    padded = np.pad(image, ((n, n), (n - 1, n - 1)), mode="edge")
+    return np.asarray(fftconvolve(padded, whole, mode="valid")[1:-1])
+
+
+def _gains(
+    up: NDArray[np.float64], right: NDArray[np.float64], shape: tuple[int, ...]
+) -> NDArray[np.float64]:
+    """What pixels gain where the lower, left one of two gains what the other loses."""
+    gain = np.zeros(shape)
+    gain[:-1] += up
+    gain[1:] -= up
+    gain[:, :-1] += right
+    gain[:, 1:] -= right
+    return gain
+
+
+def _move_conserving(
+    charge: NDArray[np.float64], potential: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Half the divergence of F grad(potential), by what crosses the edges."""
+    inner = potential[1:-1, 1:-1]
+    up = 0.25 * (charge[1:] + charge[:-1]) * (inner[1:] - inner[:-1])
+    right = 0.25 * (charge[:, 1:] + charge[:, :-1]) * (inner[:, 1:] - inner[:, :-1])
+    return _gains(up, right, charge.shape)
+
+
+def _move_expanded(
+    charge: NDArray[np.float64], potential: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Half of grad F grad(potential) + F Laplacian(potential), by central differences."""
+    f, p = np.pad(charge, 1, mode="edge"), potential
+    along_y = (f[2:, 1:-1] - f[:-2, 1:-1]) * (p[2:, 1:-1] - p[:-2, 1:-1])
+    along_x = (f[1:-1, 2:] - f[1:-1, :-2]) * (p[1:-1, 2:] - p[1:-1, :-2])
+    around = p[2:, 1:-1] + p[:-2, 1:-1] + p[1:-1, 2:] + p[1:-1, :-2]
+    laplacian = around - 4 * p[1:-1, 1:-1]
+    return np.asarray(0.5 * (0.25 * (along_y + along_x) + charge * laplacian))

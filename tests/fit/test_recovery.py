@@ -1,0 +1,55 @@
+"""Coverage of the fit's intervals for devices drawn from their priors."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tests.fit.toys import MEANS, PRIORS, SPREADS, toy_emulator
+from validation.fit_recovery import recover
+
+MOCKS = 150
+EMULATOR = toy_emulator()
+ERRORS = np.full((5, 5), 0.02 * np.abs(EMULATOR.predict(np.array(MEANS), None).areas[0, 1]))
+
+
+def all_of(rows):
+    return next(row for row in rows if row["kind"] == "all")
+
+
+def test_intervals_cover_as_they_say_whatever_the_errors_are_told_to_be():
+    for misstated in (1.0, 3.0):
+        rows, told = recover(
+            EMULATOR, PRIORS, ERRORS, mocks=MOCKS, seed=88, misstated=misstated
+        )
+        whole = all_of(rows)
+        assert abs(whole["within_68"] - 0.683) < 3.5 * whole["within_68_error"]
+        assert abs(whole["within_95"] - 0.95) < 3.5 * whole["within_95_error"]
+        assert abs(whole["pull"]) < 3.5 * whole["pull_error"]
+        # One scale has an error of 15 %; 1 / misstated on average.
+        assert abs(whole["scale"] * misstated - 1) < 3 * 0.15 / np.sqrt(MOCKS) + 0.02
+        assert len(rows) >= len(PRIORS) + 2 and told["silent"] == []
+
+
+def test_a_truth_that_the_emulator_does_not_know_is_not_covered():
+    """Of another toy: the same machinery sees that intervals are wrong."""
+    other = toy_emulator(seed=99)
+
+    def areas(values):
+        step = 4 * (values - np.array(MEANS))
+        return other.predict(np.array(MEANS) + step / np.array(SPREADS), None).areas
+
+    rows, _ = recover(EMULATOR, PRIORS, ERRORS, mocks=30, seed=88, areas=areas)
+    assert all_of(rows)["within_68"] < 0.5
+
+
+def test_a_device_that_cannot_be_is_drawn_again():
+    refused = []
+
+    def areas(values):
+        if values[0] > MEANS[0]:
+            refused.append(values[0])
+            raise ValueError("no such device")
+        return EMULATOR.predict(values, None).areas
+
+    rows, _ = recover(EMULATOR, PRIORS, ERRORS, mocks=10, seed=3, areas=areas)
+    assert refused and all_of(rows)["mocks"] == 10

@@ -1,0 +1,47 @@
+"""The fitted devices that are shipped: their files agree with the fit beside them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bfsensor.device import Device
+from bfsensor.fit.parameters import parameter_value
+from bfsensor.fit.quantities import quantities
+from bfsensor.fit.result import FitResult
+from bfsensor.resources import tables_dir
+
+FITTED = {"itl_sta3800c_2019": "itl_sta3800c_60", "e2v_ccd250_2019": "e2v_ccd250_70"}
+
+
+@pytest.mark.parametrize("name", FITTED)
+def test_device_is_that_of_its_fit(name):
+    device = Device.load(name)
+    fit = FitResult.read(tables_dir() / name / "fit.json")
+    for parameter, value, error in zip(fit.parameters, fit.value, fit.error, strict=True):
+        assert parameter_value(device, parameter) == pytest.approx(value, rel=1e-6)
+        known = device.provenance[parameter]
+        assert known.origin == "fitted"
+        assert known.uncertainty == pytest.approx(error, rel=1e-3)
+        assert "fit.json" in known.source
+    # What was held is that of the device from which the fit began.
+    began = quantities(Device.load(FITTED[name]))
+    for parameter, quantity in quantities(device).items():
+        if parameter not in fit.parameters:
+            assert quantity.value == pytest.approx(began[parameter].value, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", FITTED)
+def test_fit_beside_a_device(name):
+    fit = FitResult.read(tables_dir() / name / "fit.json")
+    (data,) = fit.sets
+    assert len(data.values) == 24 and not np.any(np.all(data.places == 0, axis=1))
+    assert data.chi2 < data.chi2_before
+    assert np.max(np.abs(data.after[:3] / data.values[:3] - 1)) < 0.05
+    assert np.all(np.abs(fit.pulls) < 3)
+    # What the device's file cannot hold: errors that parameters share.  As independent ones they
+    # would leave the best known combination several times as open as the fit does.
+    weights = fit.weights[0] / fit.spread
+    alone = float(np.sqrt(weights**2 @ np.diag(fit.covariance)))
+    together = float(np.sqrt(weights @ fit.covariance @ weights))
+    assert together < 0.5 * alone
