@@ -175,13 +175,18 @@ class Device:
                 lines += ["", *_lines(part, section, section, self.provenance)]
         return "\n".join(lines) + "\n"
 
+    @property
+    def physics(self) -> str:
+        """Text of all values without name and provenance: what solutions, and caches, depend on."""
+        return dataclasses.replace(self, name="device", provenance={}).to_toml()
+
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write a device file (beside, then renamed)."""
         with written_whole(path, DeviceError) as beside:
             beside.write_text(self.to_toml(), encoding="utf-8")
 
     def with_value(self, key: str, value: str) -> Device:
-        """Give a copy with one quantity changed.
+        """Give a copy with one quantity changed; provenance stays only with an equal value.
 
         Parameters
         ----------
@@ -207,6 +212,8 @@ class Device:
             except DeviceError as error:
                 raise DeviceError(f"{section}: {name}: {error}") from None
             _check_range(converted, spec.metadata, section, name, value)
+        if converted == getattr(part, name):
+            return self
         changed = dataclasses.replace(part, **{name: converted})
         kept = {k: v for k, v in self.provenance.items() if k != f"{section}.{name}"}
         return dataclasses.replace(self, **{section: changed}, provenance=kept)
