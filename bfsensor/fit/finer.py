@@ -1,6 +1,6 @@
 """What is predicted on the mesh of a fit, carried to a finer one wherever the device is solved.
 
-On 16 cells a pixel a_01 is 4 % (ITL) and 8 % (E2V) above that on 64, more than the errors of a fit,
+On 16 cells a pixel a_01 is 4 % (ITL) and 9 % (E2V) above that on 64, more than the errors of a fit,
 whose parameters would follow the mesh; by how much changes with the parameters (E2V: from 9 % to
 2 % within the priors).  Derivatives on the finer mesh would cost ten times as much, the solution
 alone no more than the derivatives on the fit's own mesh.
@@ -28,8 +28,8 @@ from bfsensor.recording.exposures import Condition
 from bfsensor.response import LEVEL, mixed, response_depths
 
 FINER = 48
-"""Cells a pixel of the finer mesh: at the nearest lags within 0.7 % (ITL) of 64, where 32 are
-within 2 %, in 8 CPU s and 1 GB a condition."""
+"""Cells a pixel of the finer mesh: at the nearest lags within 0.6 % (ITL) and 1.1 % (E2V) of 64,
+where 32 are within 2.2 %, in 8 CPU s and 1 GB a condition."""
 
 REFINE_Z = 0
 """Halvings in z of the finer mesh: one changes the lags by 0.1 % on 48 cells, for twice the time;
