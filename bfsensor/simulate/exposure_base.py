@@ -57,7 +57,7 @@ class ExposurePlan:
     def key(self) -> str:
         """What tells the results of one plan from those of another."""
         fields = [f"{name}={getattr(self, name)!r}" for name in self.KEYED]
-        text = "\n".join([self.SCHEMA, self.device.physics, *fields])
+        text = "\n".join([self.SCHEMA, self.device.to_toml(), *fields])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def check_full_well(self) -> None:
