@@ -1,8 +1,8 @@
 """What is predicted on the mesh of a fit, carried to a finer one wherever the device is solved.
 
 On 16 cells a pixel a_01 is 4 % (ITL) and 9 % (E2V) above that on 64, more than the errors of a fit,
-whose parameters would follow the mesh; by how much changes with the parameters (E2V: from 9 % to
-2 % within the priors).  Derivatives on the finer mesh would cost ten times as much, the solution
+whose parameters would follow the mesh; by how much changes with the parameters (E2V, above that on
+32: 7 % at the priors, 6 % where the fit ends, 2 % at a random draw).  Derivatives on the finer mesh would cost ten times as much, the solution
 alone no more than the derivatives on the fit's own mesh.
 """
 
