@@ -2,8 +2,8 @@
 
 On 16 cells a pixel a_01 is 4 % (ITL) and 9 % (E2V) above that on 64, more than the errors of a fit,
 whose parameters would follow the mesh; by how much changes with the parameters (E2V, above that on
-32: 7 % at the priors, 6 % where the fit ends, 2 % at a random draw).  Derivatives on the finer mesh would cost ten times as much, the solution
-alone no more than the derivatives on the fit's own mesh.
+32: 7 % at the priors, 6 % where the fit ends, 2 % at a random draw).  Derivatives on the finer mesh
+would cost some ten times as much as on the fit's own, the solution alone less than those.
 """
 
 from __future__ import annotations
