@@ -186,7 +186,9 @@ class Device:
             beside.write_text(self.to_toml(), encoding="utf-8")
 
     def with_value(self, key: str, value: str) -> Device:
-        """Give a copy with one quantity changed; provenance stays only with an equal value.
+        """Give a copy with one quantity changed, without what was known about its old value.
+
+        Caches go by :attr:`physics`, which that does not touch.
 
         Parameters
         ----------
@@ -212,8 +214,6 @@ class Device:
             except DeviceError as error:
                 raise DeviceError(f"{section}: {name}: {error}") from None
             _check_range(converted, spec.metadata, section, name, value)
-        if converted == getattr(part, name):
-            return self
         changed = dataclasses.replace(part, **{name: converted})
         kept = {k: v for k, v in self.provenance.items() if k != f"{section}.{name}"}
         return dataclasses.replace(self, **{section: changed}, provenance=kept)
