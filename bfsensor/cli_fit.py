@@ -69,6 +69,11 @@ def parse_conditions(
               help="Profile likelihood of a free quantity; repeatable.")  # fmt: skip
 @click.option("--cells", default=16, show_default=True, help="Mesh cells a pixel.")
 @click.option(
+    "--finer", type=click.IntRange(min=0),
+    help="Cells a pixel of a finer mesh, on which a_ij and slopes are solved besides, 8 CPU s a "
+    "condition and round on 48; derivatives stay on --cells. 0: none. [48 where --cells is below]",
+)  # fmt: skip
+@click.option(
     "--curved", is_flag=True,
     help="Fit with an emulator to second order about the device (2 solutions for each free "
     "quantity, kept in the folder) instead of solving it anew where each round ends.",
@@ -87,6 +92,7 @@ def fit(
     errors: str,
     profiles: tuple[str, ...],
     cells: int,
+    finer: int | None,
     curved: bool,
     output: Path | None,
     as_json: bool,
@@ -108,6 +114,7 @@ def fit(
       bfsensor fit itl_sta3800c itl.csv slopes.csv --free all --at itl.csv:back_bias=-60V
       bfsensor fit itl_sta3800c slopes.csv --hold itl.csv --free silicon.background_doping
     """
+    from bfsensor.fit.finer import FINER
     from bfsensor.fit.fit import fit_device
     from bfsensor.fit.quantities import DIFFUSION, choose_priors, with_priors
     from bfsensor.fit.tangents import SPILL, make_tangents
@@ -128,12 +135,18 @@ def fit(
     known = with_priors(loaded, priors)
     emulator = linearise = None
     if {"areas", "slopes"} & {data.kind for data in sets}:
+        if finer is None:
+            finer = FINER if cells < FINER else 0
         moving = tuple(prior for prior in priors if prior.name not in (SPILL, DIFFUSION))
         if curved:
             names = [prior.name for prior in moving]
             emulator = build_emulator(known, names, sets, cells, folder)
         else:
             linearise = make_linearise(known, moving, priors, sets, cells)
+        if finer:
+            solve = linearise or (lambda values, fixed=emulator: fixed)
+            linearise = make_finer(solve, known, priors, sets, finer, cells, folder)
+            emulator = None
     result = fit_device(
         known, sets, priors, emulator, linearise=linearise,
         tangents=make_tangents(known, cells=min(cells, 8), progress=Bar("settings")),
@@ -191,6 +204,24 @@ def make_linearise(
     solve = Linearise(device, tuple(moving), responding(sets), cells, Bar("solutions"))
     at = [k for k, prior in enumerate(priors) if prior in moving]
     return lambda values: solve(values[at])
+
+
+def make_finer(
+    linearise: Any,
+    device: Any,
+    priors: Sequence[Any],
+    sets: Sequence[DataSet],
+    finer: int,
+    cells: int,
+    folder: Path,
+) -> Any:
+    """Carry what solves the device to a finer mesh."""
+    from bfsensor.fit.finer import Finer
+
+    return Finer(
+        linearise, device, tuple(priors), responding(sets), finer, cells,
+        keep=folder / "finer", progress=Bar("finer mesh"),
+    )  # fmt: skip
 
 
 def _data_sets(

@@ -175,13 +175,20 @@ class Device:
                 lines += ["", *_lines(part, section, section, self.provenance)]
         return "\n".join(lines) + "\n"
 
+    @property
+    def physics(self) -> str:
+        """Text of all values without name and provenance: what solutions, and caches, depend on."""
+        return dataclasses.replace(self, name="device", provenance={}).to_toml()
+
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write a device file (beside, then renamed)."""
         with written_whole(path, DeviceError) as beside:
             beside.write_text(self.to_toml(), encoding="utf-8")
 
     def with_value(self, key: str, value: str) -> Device:
-        """Give a copy with one quantity changed.
+        """Give a copy with one quantity changed, without what was known about its old value.
+
+        Caches go by :attr:`physics`, which that does not touch.
 
         Parameters
         ----------

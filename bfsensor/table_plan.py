@@ -64,7 +64,7 @@ class Plan:
         text = json.dumps(
             [
                 bfsensor.__version__,
-                self.device.to_toml(),
+                self.device.physics,
                 self.charges,
                 self.backgrounds,
                 self.depths,

@@ -46,6 +46,14 @@ def table(plan):
     return build_table(plan)
 
 
+def test_finished_levels_are_found_whatever_is_known_of_the_device(plan, device):
+    again = device.with_value("back_bias", "-61 V").with_value("back_bias", "-50 V")
+    assert again.to_toml() != device.to_toml()  # its source is gone
+    assert dataclasses.replace(plan, device=again).key == plan.key
+    other = dataclasses.replace(plan, device=device.with_value("back_bias", "-61 V"))
+    assert other.key != plan.key
+
+
 def test_full_well_is_where_the_barrier_falls_to_the_spill_barrier(device):
     well = full_well(device)
     # 182,364 e- were measured at these gate voltages (another back bias); the spill barrier was

@@ -10,6 +10,7 @@ from click.testing import CliRunner
 
 from bfsensor import Device, cli_fit
 from bfsensor.cli import main
+from bfsensor.fit.finer import Finer
 from bfsensor.fit.result import FitResult
 from tests.fit.test_solve import TRUTH
 from tests.fit.toys import toy_data, toy_emulator
@@ -47,7 +48,13 @@ def asked(monkeypatch):
         out["curved"] = True
         return toy_emulator()
 
+    def finer(linearise, device, priors, sets, finer, cells, folder):
+        Finer(linearise, device, priors, (), finer, cells)  # checks
+        out["finer"] = finer, cells, folder
+        return linearise
+
     monkeypatch.setattr(cli_fit, "make_linearise", linearise)
+    monkeypatch.setattr(cli_fit, "make_finer", finer)
     monkeypatch.setattr(cli_fit, "build_emulator", build)
     return out
 
@@ -71,6 +78,20 @@ def test_fit_prints_a_table_and_writes_result_device_and_figure(tmp_path, record
     assert asked["device"].provenance["operating_point.back_bias"].uncertainty == 2.0
     # All but (0, 0) would be 24; this table's a_00 is measured.
     assert written.n == 25
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted"),
+    [((), (48, 16)), (("--finer", 0), None), (("--cells", 48), None),
+     (("--finer", 32, "--curved"), (32, 16))],
+)  # fmt: skip
+def test_values_are_carried_to_a_finer_mesh_by_default(
+    tmp_path, recording, asked, given, wanted
+):
+    result = fit("itl_sta3800c", recording, *FREE, *given, "-o", tmp_path / "o")
+    assert result.exit_code == 0, result.output
+    assert asked.get("finer") == (wanted and (*wanted, tmp_path / "o"))
+    assert asked.get("curved", False) == ("--curved" in given)
 
 
 def test_json_conditions_and_what_is_held_out(tmp_path, recording, asked):
@@ -112,6 +133,7 @@ def test_saturation_alone_needs_no_emulator(tmp_path):
         (("itl_sta3800c", "F", "--free", "thicknes"), "no quantity 'thicknes'"),
         (("itl_sta3800c", "F", "--profile", "thickness"), "not one of the free"),
         (("itl_sta3800c", "F", "--at", "g.csv:back_bias=-50V"), "no such recording; given are"),
+        (("itl_sta3800c", "F", "--finer", "17"), "finer = 17 cells a pixel must be even"),
         (("itl_sta3800c", "F", "--at", "back_bias=50nm"), "'50nm' is not a potential"),
     ],
 )  # fmt: skip

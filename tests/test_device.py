@@ -200,6 +200,20 @@ def test_with_value_takes_dotted_and_short_names(key):
     assert ITL.with_operating_point(back_bias="-61 V") == changed
 
 
+def test_physics_has_neither_name_nor_provenance():
+    there_and_back = ITL.with_value("back_bias", "-61 V").with_value("back_bias", "-50 V")
+    assert there_and_back != ITL and there_and_back.physics == ITL.physics
+    renamed = dataclasses.replace(ITL, name="another")
+    assert renamed.physics == ITL.physics
+    assert ITL.with_value("back_bias", "-61 V").physics != ITL.physics
+    assert (
+        dataclasses.replace(
+            Device.from_toml(ITL.physics), name=ITL.name, provenance=ITL.provenance
+        )
+        == ITL
+    )  # nothing else is left out
+
+
 def test_with_value_takes_whole_numbers():
     assert E2V.with_value("collecting_phases", "3").gates.collecting_phases == 3
 

@@ -113,7 +113,9 @@ def _slope_along(phi, xs, ys, zs, p, sign, cell, weights, g, out):
 ANY_TURN = 3.0
 """More than the difference of two unit vectors: steps are not shortened."""
 
-_SHORTEST = 1e-3  # um; shorter steps change nothing that is told apart
+SHORTEST = 0.1
+"""Part of its usual length to which a step is shortened: where the field is weak and turns
+everywhere a path would else take minutes."""
 
 
 @numba.njit(cache=True, inline="always")
@@ -158,6 +160,7 @@ def find_well(
             if abs(ox) < zone[2] and abs(oy) < zone[3]:
                 break
         h = coarseness * (0.3 + 0.12 * max(p[2] - 1.0, 0.0))
+        shortest = SHORTEST * h
         _slope_along(phi, xs, ys, zs, p, 1.0, cell, weights, g, a)
         while True:
             for m in range(3):
@@ -169,7 +172,7 @@ def find_well(
             for m in range(3):
                 q[m] = p[m] + h * c[m]
             _slope_along(phi, xs, ys, zs, q, 1.0, cell, weights, g, d)
-            if turns(a, b, c, d) < turn * turn or h < _SHORTEST:
+            if turns(a, b, c, d) < turn * turn or h < shortest:
                 break
             h *= 0.5
         for m in range(3):

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from bfsensor._kernels.drift import _SHORTEST, _cell, _weights, gradient, turns
+from bfsensor._kernels.drift import SHORTEST, _cell, _weights, gradient, turns
 
 
 class Changes(NamedTuple):
@@ -149,15 +149,30 @@ def _descent(phi, changes, xs, ys, zs, p, delta, cell, weights, g, hess, push, o
 
 @numba.njit(cache=True)
 def boundary_changes(
-    phi, changes, xs, ys, zs, seeds, axis, zone, coarseness, turn, max_steps, growth, out
+    phi,
+    changes,
+    xs,
+    ys,
+    zs,
+    seeds,
+    axis,
+    zone,
+    coarseness,
+    turn,
+    max_steps,
+    early,
+    growth,
+    out_early,
+    out,
 ):
     """Shift along ``axis`` of points ``seeds`` (n, 3) of a boundary, to ``out`` (n, changes).
 
     An electron that starts on the boundary must stay on it: of its deviation some way down,
     the part that a shift of the start makes cancels that which the change of the potential
     makes.  The first grows on the way; what is further down counts with its inverse, and
-    beyond a ``growth`` of 1e3 for next to nothing.  Steps are those with which the seeds were found, for
-    on the boundary of another step the deviation would leave before it has grown.
+    beyond a ``growth`` of 1e3 for next to nothing; ``out_early`` gets what was found when it
+    had grown by ``early``.  Steps are those with which the seeds were found, for on the boundary
+    of another step the deviation would leave before it has grown.
     """
     n = out.shape[1]
     p = np.zeros(3)
@@ -177,6 +192,7 @@ def boundary_changes(
         delta[:] = 0.0
         delta[0, axis] = 1.0
         best = 0.0
+        grown = False
         for _ in range(max_steps):
             if p[2] < zone[4]:
                 ox = p[0] - zone[0] * np.round(p[0] / zone[0])
@@ -184,6 +200,7 @@ def boundary_changes(
                 if abs(ox) < zone[2] and abs(oy) < zone[3]:
                     break
             h = coarseness * (0.3 + 0.12 * max(p[2] - 1.0, 0.0))
+            shortest = SHORTEST * h
             stage = 0
             while stage < 4:
                 part = 0.0 if stage == 0 else (1.0 if stage == 3 else 0.5)
@@ -201,7 +218,7 @@ def boundary_changes(
                 if (
                     stage == 4
                     and turns(kp[0], kp[1], kp[2], kp[3]) >= turn * turn
-                    and h >= _SHORTEST
+                    and h >= shortest
                 ):
                     h *= 0.5
                     stage = 1
@@ -218,6 +235,9 @@ def boundary_changes(
                 best = size
                 for r in range(n):
                     out[s, r] = -delta[r + 1, axis] / delta[0, axis]
+                    if not grown:
+                        out_early[s, r] = out[s, r]
+                grown = grown or size > early
             if size > growth:
                 break
 

@@ -116,7 +116,7 @@ def _at(
 ) -> Edges:
     """Shifts by depth about one background, walked or read."""
     text = "\n".join([
-        "walk 1", bfsensor.__version__, device.to_toml(), f"{cells} {VERTICES} {REACH}",
+        "walk 1", bfsensor.__version__, device.physics, f"{cells} {VERTICES} {REACH}",
         " ".join(f"{v:.9g}" for v in (background, *depths)),
     ])  # fmt: skip
     name = f"walk_{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"

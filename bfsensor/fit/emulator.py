@@ -368,7 +368,10 @@ class DeviceEmulator:
             raise
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise FitError(f"{path}: not an emulator ({error})") from None
-        if device is not None and device.to_toml() != header["device"]:
+        if (
+            device is not None
+            and device.physics != Device.from_toml(header["device"]).physics
+        ):
             raise FitError(
                 f"{path}: of another device than {device.name}, or of other values"
             )

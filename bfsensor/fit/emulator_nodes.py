@@ -72,8 +72,8 @@ def make_node(
             step = -step
         steps.append(step)
     return Node(
-        device.to_toml(),
-        laid_for.to_toml(),
+        device.physics,
+        laid_for.physics,
         level,
         cells,
         refine_z,

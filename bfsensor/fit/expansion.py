@@ -113,5 +113,16 @@ def expand(
             bends.append(2 * (there - value - side * first[n]))
             turns.append(side * (scaled(steeper) - first))
         second[n] = np.mean(turns, axis=0)
-        second[n, n] = np.mean(bends, axis=0)
-    return Expansion(free, value, first, 0.5 * (second + np.swapaxes(second, 0, 1)))
+        second[n, n] = _agreed(second[n, n], np.mean(bends, axis=0))
+    return Expansion(free, value, first, _agreed(second, np.swapaxes(second, 0, 1)))
+
+
+def _agreed(one: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of two estimates of one thing the smaller, 0 where they differ in sign.
+
+    Every second derivative is found twice, from the neighbours of either parameter, and on the
+    diagonal from their values and from their derivatives.  A point of a boundary that was not
+    differentiated well spoils one of them only.
+    """
+    smaller = np.where(np.abs(one) < np.abs(other), one, other)
+    return np.asarray(np.where(one * other > 0, smaller, 0.0))

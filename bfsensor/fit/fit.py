@@ -11,6 +11,7 @@ from bfsensor.device import Device
 from bfsensor.errors import BFSensorError, FitError
 from bfsensor.fit.changing import fitted_device
 from bfsensor.fit.data import UNITS, DataSet
+from bfsensor.fit.finer import Finer, say
 from bfsensor.fit.predictors import Emulator, Prediction, Tangents, make_predictors
 from bfsensor.fit.quantities import DIFFUSION, Prior
 from bfsensor.fit.result import FitResult, FittedSet
@@ -57,7 +58,8 @@ def fit_device(
         Response of the device by its parameters; they must be among the priors.
     linearise : callable, optional
         What solves the device at values of its parameters with all derivatives
-        (:class:`~bfsensor.fit.linearised.Linearise`), in place of ``emulator``.
+        (:class:`~bfsensor.fit.linearised.Linearise`), in place of ``emulator``; a
+        :class:`~bfsensor.fit.finer.Finer` for the values of a finer mesh, which the result tells.
     tangents : mapping, optional
         What predicts saturation and diffusion
         (:func:`~bfsensor.fit.tangents.make_tangents`).
@@ -98,6 +100,7 @@ def fit_device(
     names = tuple(prior.name for prior in priors)
     ties, silent = find_ties(names, found.sensitivity)
     known = combinations(found.sensitivity)
+    mesh = linearise.record(found.values) if isinstance(linearise, Finer) else {}
     result = FitResult(
         device=device.to_toml(),
         fitted_device=fitted_device(
@@ -108,12 +111,13 @@ def fit_device(
         remains=np.array([one.remains for one in known]),
         weights=np.array([one.weights for one in known]),
         ties=ties, silent=silent,
-        profiles={name: profile(problem, found, name) for name in profiles},
+        profiles={name: profile(problem, found, name) for name in profiles}, mesh=mesh,
     )  # fmt: skip
     told = [
         *(note for data in sets for note in data.notes),
         *_remarks(result, priors),
         *settling,
+        *([say(mesh)] if mesh else []),
         *notes,
     ]
     fields = {f: getattr(result, f) for f in result.__dataclass_fields__}

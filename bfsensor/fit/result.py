@@ -112,6 +112,9 @@ class FitResult:
         Values and rise of the minimum, for those asked for.
     notes : tuple of str
         Assumptions and limits.
+    mesh : mapping
+        Of a fit carried to a finer mesh: cells a pixel of both, ratios of their a_ij by condition
+        ([j, i]) where the fit ends and at the priors, solutions made, version; else empty.
     """
 
     device: str
@@ -128,6 +131,7 @@ class FitResult:
     silent: tuple[str, ...] = ()
     profiles: Mapping[str, tuple[Values, Values]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    mesh: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def error(self) -> Values:
@@ -188,6 +192,7 @@ class FitResult:
         if found != SCHEMA:
             raise FitError(f"{path}: its schema is {found!r}, not {SCHEMA!r}")
         try:
+            data.setdefault("mesh", {})  # before fits were carried to finer meshes
             fields = {spec.name: data[spec.name] for spec in dataclasses.fields(cls)}
             fields["sets"] = tuple(FittedSet(**_arrays(one)) for one in fields["sets"])
             fields["profiles"] = {

@@ -75,7 +75,8 @@ class BrighterFatterSensor(EffectSensor):
     shift_map : ShiftMap or str, optional
         Fixed shifts of any shape, or the file that holds them.
     charge_response : bool
-        The response depends on the charge; otherwise that of a small charge holds.
+        The response depends on the charge; otherwise that of a small charge among empty
+        pixels holds for every charge on every background, and ``background`` has no say.
     background : bool
         The response depends on the charge of the neighbours.
     depth : bool

@@ -107,6 +107,11 @@ class PixelBoundaries:
             Of the vertices on edges between rows.
         vertical : ndarray, shape (nd, 2 reach + 1, 2 reach + 2, vertices, 2)
             Of the vertices on edges between columns.
+
+        Raises
+        ------
+        ConvergenceError
+            A line has no point on the side of some pixel.
         """
         n_pixels = 2 * self.reach + 1
         fit = _line_fit(n_pixels, vertices, tuple(fractions))
@@ -114,6 +119,7 @@ class PixelBoundaries:
         grid_y = (np.arange(n_pixels + 1) - self.reach - 0.5) * self.pitch[1]
         nd, n_lines = self.rows.shape[:2]
         corners = np.zeros((nd, n_lines, n_lines, 2))
+        z = self.depths
         horizontal = np.zeros((nd, n_lines, n_pixels, vertices, 2))
         vertical = np.zeros((nd, n_pixels, n_lines, vertices, 2))
         for d in range(nd):
@@ -122,11 +128,11 @@ class PixelBoundaries:
                 new = np.zeros((n_lines, n_lines, 2))
                 for m in range(n_lines):
                     ends = grid_x + corners[d, m, :, 0]
-                    fitted = fit.apply(self.rows[d, m], 0, ends) - grid_y[m]
+                    fitted = fit.apply(self.rows[d, m], 0, ends, z[d]) - grid_y[m]
                     new[m, :, 1] = fitted[:: vertices + 1]
                     horizontal[d, m, :, :, 1] = _between(fitted, vertices)
                     ends = grid_y + corners[d, :, m, 1]
-                    fitted = fit.apply(self.columns[d, m], 1, ends) - grid_x[m]
+                    fitted = fit.apply(self.columns[d, m], 1, ends, z[d]) - grid_x[m]
                     new[:, m, 0] = fitted[:: vertices + 1]
                     vertical[d, :, m, :, 0] = _between(fitted, vertices)
                 moved = np.abs(new - corners[d]).max()
@@ -190,14 +196,21 @@ class _LineFit:
     matrix: NDArray[np.float64]
 
     def apply(
-        self, line: NDArray[np.float64], along: int, ends: NDArray[np.float64]
+        self, line: NDArray[np.float64], along: int, ends: NDArray[np.float64], z: float
     ) -> NDArray[np.float64]:
-        """Vertices of ``line`` (points (x, y)) whose corners lie at ``ends`` along it."""
+        """Vertices of ``line`` (points (x, y)) at height ``z``; corners at ``ends`` along it."""
         values = np.empty((len(ends) - 1, len(self.points)))
         for p in range(len(ends) - 1):
             # A line between rows jumps where it crosses a boundary between columns: only
             # points of this pixel count, the outermost one up to the corner.
             a, b = np.searchsorted(line[:, along], ends[p : p + 2])
+            if a >= b:
+                raise ConvergenceError(
+                    f"a boundary between {('rows', 'columns')[along]} at z = {z:g} um has no point "
+                    f"on the side of a pixel, {'xy'[along]} from {ends[p]:.4g} to "
+                    f"{ends[p + 1]:.4g} um: boundaries fold (is the silicon hardly depleted, or a "
+                    "pixel near its full well?)"
+                )
             where = ends[p] + (ends[p + 1] - ends[p]) * self.points
             values[p] = np.interp(where, line[a:b, along], line[a:b, 1 - along])
         return self.matrix @ values.ravel()

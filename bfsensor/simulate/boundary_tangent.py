@@ -28,6 +28,13 @@ from bfsensor.simulate.tangent import PotentialChange
 GROWTH = 1e3
 """Of a deviation from a boundary, beyond which the way down is no longer followed."""
 
+EARLY = 30.0
+"""Growth at which the shift of a point is known to some per cent, before saddles are near."""
+
+JUMP = 0.5
+"""Of a shift after that, relative to itself or the median of its line, which is none of the
+boundary's: a step past a saddle makes deviations of any size.  The earlier value is taken then."""
+
 _MAX_STEPS = 3000
 
 
@@ -67,11 +74,16 @@ def boundary_changes(
         moved = np.zeros((*shape, nd, n, 2))
         for seeds, reached in foot.below:
             flat = np.ascontiguousarray(seeds.reshape(-1, 3))
-            first = np.zeros((len(flat), n))
+            first, early = np.zeros((2, len(flat), n))
             path_changes.boundary_changes(
                 field.phi, made, field.x, field.y, field.z, flat, foot.axis, field.zone,
-                COARSENESS, TURN, _MAX_STEPS, GROWTH, first,
+                COARSENESS, TURN, _MAX_STEPS, EARLY, GROWTH,
+                early, first,
             )  # fmt: skip
+            median = np.median(np.abs(early.reshape(*shape, n)), axis=1, keepdims=True)
+            usual = np.broadcast_to(median, (*shape, n)).reshape(-1, n)
+            jumps = np.abs(first - early) > JUMP * np.maximum(np.abs(early), usual)
+            first = np.where(jumps, early, first)
             depths = lines.depths[reached]
             up = np.zeros((len(flat), len(depths), n, 2))
             slopes = np.zeros((len(flat), len(depths), 2))

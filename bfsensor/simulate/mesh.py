@@ -303,7 +303,8 @@ class Surfaces:
         """Rise from 0 in the channel stop to 1 in the channel, against distance from the edge."""
         beyond = distance - self.stop_half_width
         if width <= 0:
-            return np.where(beyond > 0, 1.0, 0.0)
+            # A node on the edge is in the stop whatever its last digit.
+            return np.where(beyond > 1e-9, 1.0, 0.0)
         return np.clip(beyond / width, 0.0, 1.0)
 
     def gate(self, distance: NDArray[np.float64]) -> NDArray[np.float64]:

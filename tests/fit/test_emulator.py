@@ -8,7 +8,7 @@ import pytest
 from bfsensor import Device
 from bfsensor.errors import FitError
 from bfsensor.fit.emulator import DeviceEmulator
-from bfsensor.fit.emulator_nodes import solve_nodes
+from bfsensor.fit.emulator_nodes import make_node, solve_nodes
 from bfsensor.fit.parameters import change_parameter
 from bfsensor.recording.exposures import Condition
 from bfsensor.response import area_matrix, solve_response
@@ -30,6 +30,18 @@ def kept(tmp_path_factory):
 def emulator(kept):
     device = Device.load("itl_sta3800c")
     return DeviceEmulator.build(device, NAMES, **MESH, keep=kept)
+
+
+def test_kept_solutions_are_found_whatever_is_known_of_the_device():
+    device, bare = (
+        Device.load("itl_sta3800c"),
+        Device.from_toml(Device.load("itl_sta3800c").physics),
+    )
+    one, same, other = (
+        make_node(d, d, 4e4, 8, 0, {NAMES[0]: 5.0}, (0, -1, 0)).key
+        for d in (device, bare, change_parameter(device, NAMES[0], 1.0))
+    )
+    assert one == same and one != other
 
 
 def solved_areas(device, laid_for, condition=None):

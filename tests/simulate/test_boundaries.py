@@ -1,10 +1,12 @@
 """Pixel boundaries: tiling, symmetry, tracing error, periodic images, physics."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from bfsensor.device import Device
-from bfsensor.errors import TableError
+from bfsensor.errors import ConvergenceError, TableError
 from bfsensor.simulate import boundaries
 from bfsensor.simulate.boundaries import find_boundaries, lowest_depth
 from bfsensor.simulate.far_field import FarField, image_shifts
@@ -56,6 +58,18 @@ def test_empty_pixels_are_squares(device):
     for displacement in lines.vertices(8, vertex_fractions(8)):
         # Bisection to 1e-5 um, and boundaries on mirror planes of the mesh.
         assert np.abs(displacement).max() < 1.1e-5
+
+
+def test_a_line_without_points_on_a_side_is_told(lines):
+    # As where the silicon is hardly depleted and boundaries fold over their neighbours.
+    folded = lines.rows.copy()
+    beside = (folded[1, 2, :, 0] > 5.0) & (folded[1, 2, :, 0] < 15.0)
+    folded[1, 2, beside, 0] = 4.0
+    with pytest.raises(
+        ConvergenceError,
+        match=r"between rows at z = 10 um has no point on the side of a pixel, x from ",
+    ):
+        table_of(dataclasses.replace(lines, rows=folded))
 
 
 def test_polygons_tile_and_charge_of_area_is_conserved(lines):
