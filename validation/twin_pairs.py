@@ -1,12 +1,13 @@
 """Twins: effects that the usual recordings cannot tell apart, the recording that is advised, taken.
 
-``python -m validation.twin_pairs`` takes campaigns of size S of the virtual sensor with either
+``python -m validation.twin_pairs`` takes campaigns of the virtual sensor with either
 member of a pair on its pixels, and diagnoses them with the whole library: which class is reported,
 which recording is advised.  Where the pair is tied, the recording is then taken (pixels of the same
 chip, read as it says) and both explanations are held against it with parameters as they were fitted,
 the light free.  The tie is broken if the wrong one is far worse and the true one fits.
 
-    cti, memory       serial CTI and amplifier memory, of a campaign without overscans
+    cti, memory       serial CTI and amplifier memory, of a campaign without overscans: of size M,
+                      for in flats of size S CTI is not seen; all others are of size S
     loss, curve       charge loss and a curved response
     variance, gain    noise of the light beyond Poisson's, which a gain absorbs: nothing is seen
                       until Fe55 tells the gain
@@ -146,13 +147,14 @@ class Twin:
     lacks: tuple[str, ...] = ()
     taken: str = ""
     channel: str = "flat_mean"
+    size: str = "S"
 
 
 def take(twin: Twin, truth: Any) -> dict[str, Any]:
     """Diagnose one campaign of a pair, take the advised recording, hold both against it."""
     begin = time.process_time()
     baseline = virtual_baseline()
-    source = VirtualSource(seed=SEED, effects=[truth])
+    source = VirtualSource(seed=SEED, size=twin.size, effects=[truth])
     found = diagnose_measured(without(measure_channels(source), *twin.lacks), baseline)
     told = found.attribution
     advised = [a for a in found.plan.advised if set(a.separates) == set(twin.pair)]
@@ -241,7 +243,7 @@ TWINS = (
     Twin(
         ("cti_serial", "electronic_memory"),
         (make_effect("cti_serial", {"cti": 2e-5}), make_effect("electronic_memory", {"alpha": 4e-3})),
-        ("serial_overscan",), "overscan", "serial_overscan",
+        ("serial_overscan",), "overscan", "serial_overscan", "M",
     ),
     Twin(
         ("charge_loss", "gain_nonlinearity"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -142,4 +142,4 @@ def virtual_baseline() -> Baseline:
         edges, card = Path(folder) / "edges.json", Path(folder) / "card.json"
         edges.write_text(json.dumps(baseline_edges()))
         card.write_text(json.dumps(device_card("virtual", Geometry(256), 30.0)))
-        return read_edges(edges, card=card)
+        return replace(read_edges(edges, card=card), name="edges of the nominal virtual device")
