@@ -142,4 +142,6 @@ def virtual_baseline() -> Baseline:
         edges, card = Path(folder) / "edges.json", Path(folder) / "card.json"
         edges.write_text(json.dumps(baseline_edges()))
         card.write_text(json.dumps(device_card("virtual", Geometry(256), 30.0)))
-        return replace(read_edges(edges, card=card), name="edges of the nominal virtual device")
+        return replace(
+            read_edges(edges, card=card), name="edges of the nominal virtual device"
+        )
