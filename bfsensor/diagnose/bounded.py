@@ -24,7 +24,8 @@ class Solved(NamedTuple):
     covariance : ndarray, shape (p, p)
         Without a box.
     basis : ndarray, shape (n, rank)
-        Orthonormal columns that the design spans.
+        Orthonormal columns that those of the design span which no end stops: what is left is
+        orthogonal to them.
     left : ndarray, shape (n,)
         Target less what the solution makes.
     """
@@ -81,8 +82,7 @@ def solve_within(
     else:
         inverse = np.linalg.pinv(unit, rcond=SINGULAR)
         x = inverse @ target
-        rank = np.linalg.matrix_rank(r)
-        q = np.linalg.svd(unit, full_matrices=False)[0][:, :rank]
+        q = _span(unit)
         told = q.T @ target
     if ((x < lowest) | (x > highest)).any():
         if regular:
@@ -94,6 +94,9 @@ def solve_within(
         else:
             x = _inside(q.T @ unit, told, lowest, highest)
         left = target - unit @ x
+        # What an end stops is not fitted: what is left is orthogonal to the others.
+        stopped = np.isclose(x, lowest, rtol=1e-9) | np.isclose(x, highest, rtol=1e-9)
+        q = _span(unit[:, ~stopped])
     else:
         left = target - q @ told
     solution, errors = np.zeros(design.shape[1]), np.zeros(design.shape[1])
@@ -102,6 +105,15 @@ def solve_within(
     covariance = np.zeros((design.shape[1], design.shape[1]))
     covariance[np.ix_(used, used)] = (inverse @ inverse.T) / np.outer(scale, scale)
     return Solved(solution, errors, covariance, q, left)
+
+
+def _span(unit: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Orthonormal columns that those of unit length span."""
+    q, r = np.linalg.qr(unit)
+    if (np.abs(np.diag(r)) > SINGULAR).all():
+        return q
+    shapes, sizes, _ = np.linalg.svd(unit, full_matrices=False)
+    return np.asarray(shapes[:, sizes > SINGULAR * sizes.max(initial=0.0)])
 
 
 def _inside(

@@ -34,6 +34,10 @@ SMALL = 0.05
 NO_HARM = 0.01
 """Rise of the chi-square that is none."""
 
+IDLE = 1.0
+"""Gain of a chi-square by derivatives alone that is not worth a step: the parameters count as
+fitted, and what is left is orthogonal to their columns."""
+
 Seen = tuple[list[NDArray[np.float64]], NDArray[np.float64]]
 
 
@@ -252,15 +256,34 @@ class Steps:
                     solved = self.solve(residuals, self.point)
                     if self._gainful(solved, here):
                         continue
-                break
+                # What effects stop, all others may still do.
+                if own or not self._gainful(
+                    self.solve(residuals, self.point, self.effect), here
+                ):
+                    break
+                here = self.square(self.residuals(self.point)[1], self.point)
+                if squares[-1] - here < 2 * NO_HARM:
+                    break
+                continue
             if self.history[-1] < SMALL:
                 return
         else:
             if not own:
                 raise self._unsettled()
-        # No step is told that was not seen to gain.
+        self._end()
+
+    def _end(self) -> None:
+        """End here: of what steps would still gain, told is none but what counts for nothing."""
         residuals = self.residuals(self.point)[1]
-        self.solved = self.solve(residuals, self.point, np.ones(self.count, bool))
+        nothing, everything = np.zeros(self.count, bool), np.ones(self.count, bool)
+        told = self.solve(residuals, self.point, everything)
+        square = float(told.left @ told.left)
+        for held in (nothing, self.effect):
+            free = self.solve(residuals, self.point, held)
+            if square - float(free.left @ free.left) < IDLE:
+                told = free
+                break
+        self.solved = told
 
     def stay(self, point: NDArray[np.float64]) -> None:
         """End at a point that other values told, whatever is left here.
@@ -269,15 +292,9 @@ class Steps:
         """
         self.point = point.copy()
         predicted, residuals = self.residuals(self.point)
-        held = np.ones(self.count, bool)
-        self.differentiate(held, self.point, predicted)
-        with_all = self.solve(residuals, self.point, held)
-        slopes = self.slopes
-        self.slopes = np.zeros_like(slopes)
-        self.solved = self.solve(residuals, self.point, held)._replace(
-            errors=with_all.errors, covariance=with_all.covariance
-        )
-        self.slopes = slopes
+        everything = np.ones(self.count, bool)
+        self.differentiate(everything, self.point, predicted)
+        self.solved = self.solve(residuals, self.point, everything)
 
     def _gainful(self, solved: Solved, least: float) -> bool:
         """Go as far as a step does no harm; False: nowhere."""

@@ -32,6 +32,8 @@ def test_the_best_inside_the_box(seed, parallel):
     assert (found.solution <= high * (1 + 1e-12)).all()
     np.testing.assert_allclose(found.left @ found.left, 2 * other.cost, rtol=1e-9)
     np.testing.assert_allclose(found.left, target - design @ found.solution, atol=1e-9)
+    # What the tests of what is left rely on.
+    np.testing.assert_allclose(found.basis.T @ found.left, 0.0, atol=1e-8)
     # Clipping the free solution, which is what this is for, is worse.
     clipped = np.clip(np.linalg.lstsq(design, target, rcond=None)[0], low, high)
     assert np.sum((target - design @ clipped) ** 2) > found.left @ found.left * (1 + 1e-6)
@@ -59,4 +61,5 @@ def test_held_zero_and_tied_columns():
     design[:, 6] = design[:, 0]
     tied = solve_within(design, target, low, high)
     np.testing.assert_allclose(tied.left @ tied.left, found.left @ found.left, rtol=1e-9)
-    assert tied.basis.shape[1] == 6
+    stopped = np.sum(np.isclose(tied.solution, low) | np.isclose(tied.solution, high))
+    assert tied.basis.shape[1] == 6 - stopped
