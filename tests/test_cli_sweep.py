@@ -55,7 +55,12 @@ def test_rows_figure_and_summary_are_written(finished):
     assert (folder / "a.png").stat().st_size > 20_000
 
 
-@pytest.mark.parametrize("kind", ["process", "dask", "parsl"])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "kind", ["process", pytest.param("dask", marks=SLOW), pytest.param("parsl", marks=SLOW)]
+)
 def test_every_executor_gives_the_same_bits(finished, tmp_path, kind):
     if kind != "process":
         pytest.importorskip({"dask": "distributed", "parsl": "parsl"}[kind])
