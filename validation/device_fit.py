@@ -230,11 +230,13 @@ def seed(reference: Path, cells: int, finer: int, keep: Path, slope: bool) -> No
     priors = choose_priors(device, ("all",))
     at = {key: condition_at(key) for key in SETTINGS}
     begin = time.process_time()
-    unfitted = make_finer(device, (), at["A"], cells, finer, keep)(np.empty(0))
-    response = unfitted.predict(np.empty(0), at["A"])
-    a = area_matrix(response.kx, response.ky)[1:-1, 1:-1]
-    less = np.ones((5, 5)) if slope else lost_to_higher_orders(a, SEED_LEVEL)
-    sets = {key: seed_data(reference, key, less) for key in SETTINGS}
+    sets, unfitted, less = {}, {}, {}
+    for key in SETTINGS:
+        unfitted[key] = make_finer(device, (), at[key], cells, finer, keep)(np.empty(0))
+        response = unfitted[key].predict(np.empty(0), at[key])
+        a = area_matrix(response.kx, response.ky)[1:-1, 1:-1]
+        less[key] = np.ones((5, 5)) if slope else lost_to_higher_orders(a, SEED_LEVEL)
+        sets[key] = seed_data(reference, key, less[key])
     result = fit_device(
         device, sets["A"], priors, None,
         linearise=make_finer(device, priors, at["A"], cells, finer, keep),
@@ -247,14 +249,17 @@ def seed(reference: Path, cells: int, finer: int, keep: Path, slope: bool) -> No
     }
     rows = rows_of(result, published)
     for key in ("B", "C"):
-        before = make_finer(device, (), at[key], cells, finer, keep)(np.empty(0))
         after = make_finer(device, priors, at[key], cells, finer, keep)(result.value)
         for data in sets[key]:
             rows += predicted_rows(
-                data, before, after, priors, result, published[data.name]
+                data, unfitted[key], after, priors, result, published[data.name]
             )
     seconds = time.process_time() - begin
-    append(run, rows, **_told(result, seconds), less_at_01=float(less[1, 0]))
+    lost = {
+        key: [round(float(one[j, i]), 4) for i, j in ((1, 0), (0, 1))]
+        for key, one in less.items()
+    }
+    append(run, rows, **_told(result, seconds), less_at_10_and_01=lost)
     click.echo(result.said())
 
 
