@@ -11,6 +11,7 @@ are free with priors.
 (Lage, Bradshaw and Tyson 2017, figure 9; voltages stated and held) and predicts what it was not
 fitted to: -30 V, +6/-6 V.  ``--slope`` takes the covariances over the level squared as a_ij, as the
 paper does; otherwise as those of a flat of 80,000 e-, which by higher orders of the a_ij are less.
+``--every`` fits all three settings: whether any device within the priors shows them.
 
 Wherever a device is solved, fitted or predicted, a_ij and slopes are those of ``--finer`` cells a
 pixel, derivatives those of ``--cells``.
@@ -73,14 +74,8 @@ that the fit begins at a kink and at the end of what can be for both."""
 SEED_LEVEL = 80_000.0
 SETTINGS = {"A": (-60.0, 4.0, -8.0), "B": (-30.0, 4.0, -8.0), "C": (-60.0, 6.0, -6.0)}
 WELLS = (
-    (-8.0, 0.0),
-    (-8.0, 1.0),
-    (-8.0, 2.0),
-    (-8.0, 3.0),
-    (-6.0, 2.0),
-    (-6.0, 4.0),
-    (-4.0, 3.0),
-)
+    (-8.0, 0.0), (-8.0, 1.0), (-8.0, 2.0), (-8.0, 3.0), (-6.0, 2.0), (-6.0, 4.0), (-4.0, 3.0),
+)  # fmt: skip
 """Low and high gates whose measured saturation is predicted."""
 
 WAVELENGTH = 621.0
@@ -194,7 +189,7 @@ def areas(reference: Path, vendor: str, cells: int, finer: int, keep: Path) -> N
     begin = time.process_time()
     result = fit_device(
         device, [data], priors, None,
-        linearise=make_finer(device, priors, Condition(), cells, finer, keep),
+        linearise=make_finer(device, priors, (Condition(),), cells, finer, keep),
         source=f"bfsensor fit of {data.name}, 24 lags; errors are correlated: fit.json",
     )  # fmt: skip
     seconds = time.process_time() - begin
@@ -208,14 +203,14 @@ def areas(reference: Path, vendor: str, cells: int, finer: int, keep: Path) -> N
 def make_finer(
     device: Device,
     priors: tuple[Prior, ...],
-    at: Condition,
+    at: tuple[Condition, ...],
     cells: int,
     finer: int,
     keep: Path,
 ) -> Finer:
-    """What solves a device at a condition, on both meshes."""
-    solve = Linearise(device, priors, (at,), cells)
-    return Finer(solve, device, priors, (at,), finer, cells, keep=keep / "finer")
+    """What solves a device at conditions, on both meshes."""
+    solve = Linearise(device, priors, at, cells)
+    return Finer(solve, device, priors, at, finer, cells, keep=keep / "finer")
 
 
 @main.command()
@@ -223,8 +218,11 @@ def make_finer(
 @_FINER
 @_KEEP
 @click.option("--slope", is_flag=True, help="Covariance over the level squared is a_ij.")
+@click.option("--every", is_flag=True, help="Fit all settings, predict none.")
 @click.pass_obj
-def seed(reference: Path, cells: int, finer: int, keep: Path, slope: bool) -> None:
+def seed(
+    reference: Path, cells: int, finer: int, keep: Path, slope: bool, every: bool
+) -> None:
     """Fit one ITL device at -60 V, +4/-8 V, and predict the other settings."""
     device = Device.load("itl_sta3800c_60").with_operating_point(gate_high="4 V")
     priors = choose_priors(device, ("all",))
@@ -232,24 +230,28 @@ def seed(reference: Path, cells: int, finer: int, keep: Path, slope: bool) -> No
     begin = time.process_time()
     sets, unfitted, less = {}, {}, {}
     for key in SETTINGS:
-        unfitted[key] = make_finer(device, (), at[key], cells, finer, keep)(np.empty(0))
+        unfitted[key] = make_finer(device, (), (at[key],), cells, finer, keep)(np.empty(0))
         response = unfitted[key].predict(np.empty(0), at[key])
         a = area_matrix(response.kx, response.ky)[1:-1, 1:-1]
         less[key] = np.ones((5, 5)) if slope else lost_to_higher_orders(a, SEED_LEVEL)
         sets[key] = seed_data(reference, key, less[key])
+    fitted = tuple(SETTINGS) if every else ("A",)
+    conditions = tuple(at[key] for key in fitted)
     result = fit_device(
-        device, sets["A"], priors, None,
-        linearise=make_finer(device, priors, at["A"], cells, finer, keep),
+        device, [one for key in fitted for one in sets[key]], priors, None,
+        linearise=make_finer(device, priors, conditions, cells, finer, keep),
         source="bfsensor fit of figure 9 of Lage, Bradshaw and Tyson (2017)",
     )  # fmt: skip
-    run = "seed as slopes" if slope else "seed"
+    run = "seed" + " as slopes" * slope + " every" * every
     _write(result, keep, run.replace(" ", "_"))
     published = {
         one.name: seed_published(reference, one) for s in sets.values() for one in s
     }
     rows = rows_of(result, published)
-    for key in ("B", "C"):
-        after = make_finer(device, priors, at[key], cells, finer, keep)(result.value)
+    for key in SETTINGS:
+        if key in fitted:
+            continue
+        after = make_finer(device, priors, (at[key],), cells, finer, keep)(result.value)
         for data in sets[key]:
             rows += predicted_rows(
                 data, unfitted[key], after, priors, result, published[data.name]
@@ -380,7 +382,7 @@ def _write(result: FitResult, keep: Path, name: str) -> None:
 
 def _told(result: FitResult, seconds: float) -> dict[str, Any]:
     mesh = result.mesh
-    (one,) = mesh["ratios"]
+    one = mesh["ratios"][0]
     ratios = {
         f"({i},{j})": [round(one[k][j][i], 4) for k in ("finer_over_own", "at_the_priors")]
         for i, j in ((1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
