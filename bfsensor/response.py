@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from bfsensor import silicon
 from bfsensor.device import Device
+from bfsensor.errors import TableError
 from bfsensor.levels import SAMPLES, Images
 from bfsensor.simulate.boundaries import TURN, Feet, PixelBoundaries, find_boundaries
 from bfsensor.simulate.boundary_tangent import boundary_changes
@@ -143,6 +144,7 @@ def solve_response(
     level: float = LEVEL,
     cells: int = 16,
     refine_z: int = REFINE_Z,
+    period: int = PERIOD,
     laid_for: Device | None = None,
     changed: Sequence[tuple[Device, float]] = (),
     tolerance: float = TOLERANCE,
@@ -159,6 +161,9 @@ def solve_response(
         Of the mesh, a pixel.
     refine_z : int
         Halvings of its steps in z (:data:`REFINE_Z`).
+    period : int
+        Pixels from a charge to its periodic image, even, above 2 REACH + 2; half of them are
+        solved, between mirrors.
     laid_for : Device, optional
         A device near to it for which the mesh is laid before it is moved
         (:func:`~bfsensor.simulate.moved_mesh.move_mesh`), so that the two compare without the
@@ -177,14 +182,18 @@ def solve_response(
     ------
     DeviceError, ConvergenceError
         The device has no mirror planes, or no such solution.
+    TableError
+        The period is odd, or the images are among the edges.
     """
+    if period % 2 or period <= 2 * REACH + 2:
+        raise TableError(f"period = {period} pixels must be even and above {2 * REACH + 2}")
     began = time.process_time()
     model = device if laid_for is None else laid_for
     fine, small = (
         move_mesh(
             make_mesh(model, pixels=(n, n), cells=cells, refine_z=refine_z), model, device
         )
-        for n in (PERIOD, 1)
+        for n in (period, 1)
     )
     unit_solver, solver = Electrostatics(device, small), Electrostatics(device, fine)
     unit = unit_solver.solve(level, start=unit_solver.solve(0.0).phi)
@@ -202,7 +211,7 @@ def solve_response(
         turn=TURN,
         feet=feet,
     )
-    edges = _Edges.of(unit, depths)
+    edges = _Edges.of(unit, depths, period)
     moved = edges.moved(lines)
     kx, ky = edges.mean(moved)
     middle = time.process_time()
@@ -240,19 +249,14 @@ class _Edges:
     images: Images
     coarse: Images
     pitch: tuple[float, float]
-    period: tuple[float, float]
+    period: int
 
     @classmethod
-    def of(cls, unit: Potential, depths: NDArray[np.float64]) -> _Edges:
+    def of(cls, unit: Potential, depths: NDArray[np.float64], period: int) -> _Edges:
         """Prepare for a device and its depths."""
-        pitch = unit.mesh.pitch
-        period = PERIOD * pitch[0], PERIOD * pitch[1]
-        far = _far_field(unit, depths)
-        images, coarse = (
-            Images.of(far, REACH, pitch, period, vertex_fractions(n))
-            for n in (VERTICES, _COARSE)
-        )
-        return cls(far, images, coarse, pitch, period)
+        far = _far_field(unit, depths, period)
+        images, coarse = (_images(far, unit, period, n) for n in (VERTICES, _COARSE))
+        return cls(far, images, coarse, unit.mesh.pitch, period)
 
     @staticmethod
     def moved(lines: PixelBoundaries) -> tuple[NDArray[np.float64], ...]:
@@ -279,8 +283,8 @@ class _Edges:
             unit, device=device, phi=unit.phi + step * change.unit.at_nodes,
             mesh=replace(mesh, x=mesh.x + step * vx, y=mesh.y + step * vy, z=mesh.z + step * vz),
         )  # fmt: skip
-        far = _far_field(there, np.array(response_depths(device)))
-        other = Images.of(far, REACH, self.pitch, self.period, vertex_fractions(_COARSE))
+        far = _far_field(there, np.array(response_depths(device)), self.period)
+        other = _images(far, unit, self.period, _COARSE)
         at = np.linspace(0, VERTICES - 1, _COARSE).round().astype(int)
         few = moved[0], moved[1][..., at, :], moved[2][..., at, :]
         here, gone = (self._mean(i.taken_off(few)[0]) for i in (self.coarse, other))
@@ -304,7 +308,13 @@ class _Edges:
         return kx, ky
 
 
-def _far_field(unit: Potential, depths: NDArray[np.float64]) -> FarField:
+def _far_field(unit: Potential, depths: NDArray[np.float64], period: int) -> FarField:
     pitch = unit.mesh.pitch
     ground = Surfaces.of(unit.device).silicon_stop
-    return FarField.of(unit, depths, ground, 5 * PERIOD * max(pitch))
+    return FarField.of(unit, depths, ground, 5 * period * max(pitch))
+
+
+def _images(far: FarField, unit: Potential, period: int, vertices: int) -> Images:
+    pitch = unit.mesh.pitch
+    apart = period * pitch[0], period * pitch[1]
+    return Images.of(far, REACH, pitch, apart, vertex_fractions(vertices))

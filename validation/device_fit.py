@@ -11,14 +11,16 @@ are free with priors.
 (Lage, Bradshaw and Tyson 2017, figure 9; voltages stated and held) and predicts what it was not
 fitted to: -30 V, +6/-6 V.  ``--slope`` takes the covariances over the level squared as a_ij, as the
 paper does; otherwise as those of a flat of 80,000 e-, which by higher orders of the a_ij are less.
-Its mesh is that of the fit, nothing multiplied.
+``--every`` fits all three settings: whether any device within the priors shows them.
 
-``wells`` predicts saturation levels with the device that ``seed`` has fitted.  ``lag2`` asks how a_ij
-of the unfitted devices depend on mesh, level and depth of conversion.
+Wherever a device is solved, fitted or predicted, a_ij and slopes are those of ``--finer`` cells a
+pixel, derivatives those of ``--cells``.
+
+``wells`` predicts saturation levels with the device that ``seed`` has fitted.
 
 Rows of a run replace those of the same run in ``validation/results/device_fit.ecsv``; fit.json
 and device.toml go to ``--keep``.  Kinds of rows: 'areas' [1/e-], 'slopes' [% for 50,000 e-], 'wells'
-[e-], 'lag2' [1/e-]; 'parameter': measured and error are the prior's, in units of device files;
+[e-]; 'parameter': measured and error are the prior's, in units of device files;
 'chi2' over the number of values (measured), errors as stated; 'scale' of the errors;
 'combination': after is posterior over prior width.
 """
@@ -39,18 +41,24 @@ from numpy.typing import NDArray
 
 from bfsensor.device import Device
 from bfsensor.fit.data import DataSet, area_data, data_set, select
+from bfsensor.fit.finer import FINER, Finer
 from bfsensor.fit.fit import fit_device
 from bfsensor.fit.linearised import Linearise
 from bfsensor.fit.predictors import make_predictors
-from bfsensor.fit.quantities import choose_priors, describe, quantities, with_priors
+from bfsensor.fit.quantities import (
+    Prior,
+    choose_priors,
+    describe,
+    quantities,
+    with_priors,
+)
 from bfsensor.fit.result import FitResult
 from bfsensor.fit.ties import name_combination
 from bfsensor.measure.toy_array import close_sum, predict_array
 from bfsensor.recording.exposures import Condition
 from bfsensor.recording.measured import read_measured
-from bfsensor.response import area_matrix, solve_response
+from bfsensor.response import area_matrix
 from bfsensor.simulate.well import full_well
-from validation.finer_mesh import Finer, coarse_areas, table_areas
 from validation.write_results import write_results
 
 RESULTS = Path(__file__).parent / "results" / "device_fit.ecsv"
@@ -66,14 +74,8 @@ that the fit begins at a kink and at the end of what can be for both."""
 SEED_LEVEL = 80_000.0
 SETTINGS = {"A": (-60.0, 4.0, -8.0), "B": (-30.0, 4.0, -8.0), "C": (-60.0, 6.0, -6.0)}
 WELLS = (
-    (-8.0, 0.0),
-    (-8.0, 1.0),
-    (-8.0, 2.0),
-    (-8.0, 3.0),
-    (-6.0, 2.0),
-    (-6.0, 4.0),
-    (-4.0, 3.0),
-)
+    (-8.0, 0.0), (-8.0, 1.0), (-8.0, 2.0), (-8.0, 3.0), (-6.0, 2.0), (-6.0, 4.0), (-4.0, 3.0),
+)  # fmt: skip
 """Low and high gates whose measured saturation is predicted."""
 
 WAVELENGTH = 621.0
@@ -163,6 +165,8 @@ def main(ctx: click.Context, reference: Path) -> None:
 
 
 _CELLS = click.option("--cells", default=16, show_default=True, help="Mesh cells a pixel.")
+_FINER = click.option("--finer", default=FINER, show_default=True,
+                      help="Cells a pixel of a_ij and slopes.")  # fmt: skip
 _KEEP = click.option("--keep", type=click.Path(path_type=Path), required=True,
                      help="Folder of fit.json and device.toml.")  # fmt: skip
 
@@ -170,9 +174,10 @@ _KEEP = click.option("--keep", type=click.Path(path_type=Path), required=True,
 @main.command()
 @click.argument("vendor", type=click.Choice(list(DEVICES)))
 @_CELLS
+@_FINER
 @_KEEP
 @click.pass_obj
-def areas(reference: Path, vendor: str, cells: int, keep: Path) -> None:
+def areas(reference: Path, vendor: str, cells: int, finer: int, keep: Path) -> None:
     """Fit the a_ij of 2019."""
     device = Device.load(DEVICES[vendor])
     out = HELD if vendor == "e2v" else ()
@@ -182,59 +187,81 @@ def areas(reference: Path, vendor: str, cells: int, keep: Path) -> None:
     device = with_priors(device, priors)
     data = data_set(read_measured(reference / f"{vendor}_covariances_21oct19.csv"))
     begin = time.process_time()
-    ratio = table_areas(device.name) / coarse_areas(device, Condition(), cells)
-    linearise = Linearise(device, priors, (Condition(),), cells)
     result = fit_device(
-        device, [data], priors, None, linearise=Finer(linearise, {Condition(): ratio}),
+        device, [data], priors, None,
+        linearise=make_finer(device, priors, (Condition(),), cells, finer, keep),
         source=f"bfsensor fit of {data.name}, 24 lags; errors are correlated: fit.json",
     )  # fmt: skip
     seconds = time.process_time() - begin
     _write(result, keep, FITTED[vendor])
     run, galsim = published_areas(reference, vendor)
     rows = rows_of(result, {data.name: run}, {data.name: galsim})
-    append(
-        vendor, rows, **_told(result, cells, seconds),
-        finer={f"({i},{j})": round(float(ratio[j, i]), 4) for i, j in data.places[:5].tolist()},
-    )  # fmt: skip
+    append(vendor, rows, **_told(result, seconds))
     click.echo(result.said())
+
+
+def make_finer(
+    device: Device,
+    priors: tuple[Prior, ...],
+    at: tuple[Condition, ...],
+    cells: int,
+    finer: int,
+    keep: Path,
+) -> Finer:
+    """What solves a device at conditions, on both meshes."""
+    solve = Linearise(device, priors, at, cells)
+    return Finer(solve, device, priors, at, finer, cells, keep=keep / "finer")
 
 
 @main.command()
 @_CELLS
+@_FINER
 @_KEEP
 @click.option("--slope", is_flag=True, help="Covariance over the level squared is a_ij.")
+@click.option("--every", is_flag=True, help="Fit all settings, predict none.")
 @click.pass_obj
-def seed(reference: Path, cells: int, keep: Path, slope: bool) -> None:
+def seed(
+    reference: Path, cells: int, finer: int, keep: Path, slope: bool, every: bool
+) -> None:
     """Fit one ITL device at -60 V, +4/-8 V, and predict the other settings."""
     device = Device.load("itl_sta3800c_60").with_operating_point(gate_high="4 V")
     priors = choose_priors(device, ("all",))
-    a = area_matrix(*solve_response(device, cells=cells).edges(WAVELENGTH, 173.0))[
-        1:-1, 1:-1
-    ]
-    less = np.ones((5, 5)) if slope else lost_to_higher_orders(a, SEED_LEVEL)
-    sets = {key: seed_data(reference, key, less) for key in SETTINGS}
+    at = {key: condition_at(key) for key in SETTINGS}
     begin = time.process_time()
-    at = {key: both[0].conditions[0] for key, both in sets.items()}
+    sets, unfitted, less = {}, {}, {}
+    for key in SETTINGS:
+        unfitted[key] = make_finer(device, (), (at[key],), cells, finer, keep)(np.empty(0))
+        response = unfitted[key].predict(np.empty(0), at[key])
+        a = area_matrix(response.kx, response.ky)[1:-1, 1:-1]
+        less[key] = np.ones((5, 5)) if slope else lost_to_higher_orders(a, SEED_LEVEL)
+        sets[key] = seed_data(reference, key, less[key])
+    fitted = tuple(SETTINGS) if every else ("A",)
+    conditions = tuple(at[key] for key in fitted)
     result = fit_device(
-        device, sets["A"], priors, None,
-        linearise=Linearise(device, priors, (at["A"],), cells),
+        device, [one for key in fitted for one in sets[key]], priors, None,
+        linearise=make_finer(device, priors, conditions, cells, finer, keep),
         source="bfsensor fit of figure 9 of Lage, Bradshaw and Tyson (2017)",
     )  # fmt: skip
-    run = "seed as slopes" if slope else "seed"
+    run = "seed" + " as slopes" * slope + " every" * every
     _write(result, keep, run.replace(" ", "_"))
     published = {
         one.name: seed_published(reference, one) for s in sets.values() for one in s
     }
     rows = rows_of(result, published)
-    for key in ("B", "C"):
-        before = Linearise(device, (), (at[key],), cells)(np.empty(0))
-        after = Linearise(device, priors, (at[key],), cells)(result.value)
+    for key in SETTINGS:
+        if key in fitted:
+            continue
+        after = make_finer(device, priors, (at[key],), cells, finer, keep)(result.value)
         for data in sets[key]:
             rows += predicted_rows(
-                data, before, after, priors, result, published[data.name]
+                data, unfitted[key], after, priors, result, published[data.name]
             )
     seconds = time.process_time() - begin
-    append(run, rows, **_told(result, cells, seconds), less_at_01=float(less[1, 0]))
+    lost = {
+        key: [round(float(one[j, i]), 4) for i, j in ((1, 0), (0, 1))]
+        for key, one in less.items()
+    }
+    append(run, rows, **_told(result, seconds), less_at_10_and_01=lost)
     click.echo(result.said())
 
 
@@ -253,10 +280,15 @@ def lost_to_higher_orders(a: NDArray[np.float64], level: float) -> NDArray[np.fl
     return out
 
 
+def condition_at(key: str) -> Condition:
+    """Light and voltages of a setting."""
+    back, high, low = SETTINGS[key]
+    return Condition(wavelength=WAVELENGTH, back_bias=back, gate_high=high, gate_low=low)
+
+
 def seed_data(reference: Path, key: str, less: NDArray[np.float64]) -> list[DataSet]:
     """Covariances, over level squared and what higher orders take, and slopes at a setting."""
-    back, high, low = SETTINGS[key]
-    at = Condition(wavelength=WAVELENGTH, back_bias=back, gate_high=high, gate_low=low)
+    at = condition_at(key)
     table = text_tables.read(reference / "seed_fig9_covariance_80ke.csv", comment="#")
     table = table[table["condition"] == key]
     a, errors = np.full((2, 5, 5), np.nan)
@@ -342,37 +374,22 @@ def wells(reference: Path, keep: Path, cells: int) -> None:
     append("wells", rows, cells=cells, cpu_s=round(time.process_time() - begin, 1))
 
 
-@main.command()
-def lag2() -> None:
-    """How a_ij, also two pixels away, depend on mesh, level, source and depth of conversion."""
-    begin = time.process_time()
-    asked = [
-        ("itl, 16 cells", 16, 40e3, None), ("e2v, 16 cells", 16, 40e3, None),
-        ("e2v, 24 cells", 24, 40e3, None), ("itl, 24 cells", 24, 40e3, None),
-        ("itl, level 10,000 e-", 16, 10e3, None), ("itl, level 80,000 e-", 16, 80e3, None),
-        ("itl, light of 950 nm", 16, 40e3, 950.0),
-    ]  # fmt: skip
-    rows = []
-    for name, cells, level, wavelength in asked:
-        device = Device.load(DEVICES[name[:3]])
-        found = solve_response(device, cells=cells, level=level)
-        a = area_matrix(*found.edges(wavelength, 173.0))
-        middle = len(a) // 2
-        for i, j in ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2), (2, 2)):
-            rows.append(row("lag2", name, i, j, after=a[middle + j, middle + i]))
-        click.echo(f"{name}: " + " ".join(f"{one['after']:.3e}" for one in rows[-7:]))
-        append("lag2", rows, cpu_s=round(time.process_time() - begin, 1))
-
-
 def _write(result: FitResult, keep: Path, name: str) -> None:
     keep.mkdir(parents=True, exist_ok=True)
     result.write(keep / "fit.json")
     replace(Device.from_toml(result.fitted_device), name=name).write(keep / "device.toml")
 
 
-def _told(result: FitResult, cells: int, seconds: float) -> dict[str, Any]:
+def _told(result: FitResult, seconds: float) -> dict[str, Any]:
+    mesh = result.mesh
+    one = mesh["ratios"][0]
+    ratios = {
+        f"({i},{j})": [round(one[k][j][i], 4) for k in ("finer_over_own", "at_the_priors")]
+        for i, j in ((1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
+    }
     return {
-        "cells": cells, "cpu_s": round(seconds, 1), "notes": list(result.notes),
+        "cells": mesh["cells"], "finer": mesh["finer"], "finer_over_own": ratios,
+        "cpu_s": round(seconds, 1), "notes": list(result.notes),
         "ties": list(result.ties), "silent": list(result.silent),
     }  # fmt: skip
 

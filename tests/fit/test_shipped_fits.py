@@ -46,8 +46,11 @@ def test_sensor_by_name_shows_what_was_measured(name):
     )
     a = change[table.reach :, table.reach :] / (CHARGE * table.pitch[0] * table.pitch[1])
     i, j = data.places.T
-    # Meshes, and the table between its charges: 1.4 % at most at the nearest lags.
-    assert np.max(np.abs((a[j, i] / data.after)[:3] - 1)) < 0.02
+    # The nearest four lags without (0, 0): 0.5 % (ITL), 0.8 % (E2V), from the meshes and from the
+    # table between its levels; fits whose areas were multiplied by one ratio had 1.4 %.
+    near = np.isin([f"{i},{j}" for i, j in data.places], ("1,0", "0,1", "1,1", "2,0"))
+    assert near.sum() == 4
+    assert np.max(np.abs((a[j, i] / data.after)[near] - 1)) < 0.01
     assert np.max(np.abs((a[j, i] / data.values)[:3] - 1)) < 0.05
     before = DistortionTable.read(tables_dir() / FITTED[name] / "table.fits")
     assert before.device_text != table.device_text
