@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 
 class Condition(NamedTuple):
-    """Light and operating point of an exposure; nan where not known."""
+    """Light [nm] and operating point [V, deg C] of an exposure; nan where not known."""
 
     wavelength: float
     back_bias: float
@@ -48,7 +48,7 @@ class Axes:
 
 
 class Exposure(Protocol):
-    """What the channels ask of an exposure; None where not known."""
+    """What the channels ask of an exposure, temperature in deg C; None where not known."""
 
     @property
     def number(self) -> int: ...

@@ -14,6 +14,7 @@ from bfsensor.diagnose.device_baseline import TABLES, baseline_of_device, write_
 from bfsensor.diagnose.free_baseline import free_baseline
 from bfsensor.diagnose.left_out import physics_left_out
 from bfsensor.diagnose.table_baseline import baseline_of_table
+from bfsensor.effects.lateral_diffusion import ZERO_CELSIUS
 from bfsensor.errors import DeviceError, DiagnosisError
 from bfsensor.recording.amplifiers import AmplifierFrame, read_exposure
 from bfsensor.recording.area_changes import AreaChangeTable
@@ -64,6 +65,10 @@ class CampaignSource:
         return read_exposure(self.campaign, exposure)
 
 
+def _celsius(kelvin: float | None) -> float | None:
+    return None if kelvin is None else kelvin - ZERO_CELSIUS
+
+
 def _settled(campaign: Campaign) -> list[Exposure]:
     """Exposures with the settings of their group: readings that jitter are one condition.
 
@@ -75,7 +80,8 @@ def _settled(campaign: Campaign) -> list[Exposure]:
             for one in members:
                 settled[one.number] = replace(
                     one, wavelength=condition.wavelength, back_bias=condition.back_bias,
-                    temperature=condition.temperature,
+                    # Recordings tell kelvin, conditions and effects degrees Celsius.
+                    temperature=_celsius(condition.temperature),
                     pair=one.pair if campaign.has_manifest else None,
                 )  # fmt: skip
     return [settled[one.number] for one in campaign.exposures]

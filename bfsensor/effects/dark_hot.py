@@ -145,7 +145,8 @@ class HotColumns(_Dark):
                 ]
                 column = int(segment.sensor_column(np.array(int(s["x"][0]))))
                 places.setdefault(column, float(s.get("z", SURE)))
-        sure = [x for x, z in places.items() if abs(z) >= SURE][:MOST] or list(places)[:1]
+        # Beside a hot column, which the mean of all takes in, the others seem cold.
+        sure = [x for x, z in places.items() if z >= SURE][:MOST] or list(places)[:1]
         return [
             {"rate": rate, "columns": float(count)}
             | {f"x{n + 1}": float(sure[n]) if n < count else 0.0 for n in range(MOST)}

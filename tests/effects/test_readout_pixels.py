@@ -5,6 +5,7 @@ import pytest
 from scipy.optimize import brentq, least_squares
 
 from bfsensor.effects.adc_bits import AdcBits
+from bfsensor.effects.dark_hot import HotColumns
 from bfsensor.effects.effect import Effect, Layout, Segment, Shot
 from bfsensor.effects.library import LIBRARY, make_effect
 from bfsensor.effects.transfer import behind_flat, late_shares
@@ -352,3 +353,15 @@ def test_a_trap_meets_spots_as_the_background_leaves_it(level, reach):
     if reach:
         none = effect.spot_image(spot * reach / spot.max(), {"background": 0.0}, alone)
         np.testing.assert_allclose(none, spot * reach / spot.max(), atol=1e-9)
+
+
+def test_beside_a_hot_column_others_are_not_hot():
+    """What a hot column adds to the mean makes all others look cold, far beyond noise."""
+    seen = [
+        {"word": "dark_map", "what": "column", "x": (x, x + 1), "amp": 0, "z": z}
+        for x, z in ((3, 900.0), (1, -40.0), (5, -39.0))
+    ]
+    starts = HotColumns.starts(LAYOUT, seen)
+    assert {s["columns"] for s in starts} == {1.0}
+    place = float(LAYOUT.segments[0].sensor_column(np.array(3)))
+    assert {s["x1"] for s in starts} == {place}
