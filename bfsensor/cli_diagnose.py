@@ -41,8 +41,9 @@ from bfsensor.cli_common import Bar
 @click.option(
     "--predict", "asked", metavar="CONDITIONS", multiple=True,
     help="Write predicted.ecsv: what the accepted model expects of exposures that were not taken. "
-    "Flats by level [e-] or seconds, spots by flux [e-]; wavelength, back_bias, temperature and lamp "
-    "where they differ from the campaign's; several times, or an ECSV file with these columns.",
+    "Flats by level [e-] or seconds, spots by flux [e-]; wavelength [nm], back_bias [V], "
+    "temperature [C] and lamp where they differ from the campaign's; several times, or an ECSV "
+    "file with these columns.",
 )  # fmt: skip
 @click.option(
     "--json", "as_json", is_flag=True, help="Print report.json instead of a summary."
