@@ -60,7 +60,12 @@ def test_spots_that_are_there_are_kept(finished):
         np.testing.assert_array_equal(again[name], image)
 
 
-@pytest.mark.parametrize("kind", ["process", "dask", "parsl"])
+SLOW = pytest.mark.slow  # tests/test_sweep.py has these executors in every run
+
+
+@pytest.mark.parametrize(
+    "kind", ["process", pytest.param("dask", marks=SLOW), pytest.param("parsl", marks=SLOW)]
+)
 def test_every_executor_gives_the_same_bits(finished, tmp_path, kind):
     if kind != "process":
         pytest.importorskip({"dask": "distributed", "parsl": "parsl"}[kind])

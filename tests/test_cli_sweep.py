@@ -55,7 +55,7 @@ def test_rows_figure_and_summary_are_written(finished):
     assert (folder / "a.png").stat().st_size > 20_000
 
 
-SLOW = pytest.mark.slow
+SLOW = pytest.mark.slow  # tests/test_sweep.py has these executors in every run
 
 
 @pytest.mark.parametrize(
