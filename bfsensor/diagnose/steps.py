@@ -198,12 +198,16 @@ class Steps:
 
     def _step(self, solved: Solved) -> float:
         """Move the point; gives the largest move over errors."""
+        self._note(solved)
+        self.point = self.point + solved.solution[: self.count]
+        return self.history[-1]
+
+    def _note(self, solved: Solved) -> None:
+        """Keep a solution, and how far it wants to go."""
         self.solved = solved
         step, errors = solved.solution[: self.count], solved.errors[: self.count]
-        self.point = self.point + step
         moved = np.abs(step) / np.maximum(errors, 1e-300)
         self.history.append(float(np.max(moved, where=errors > 0, initial=0.0)))
-        return self.history[-1]
 
     def go(self) -> None:
         """Full steps, with the derivatives of the second round for all later ones.
@@ -299,12 +303,8 @@ class Steps:
     def _gainful(self, solved: Solved, least: float) -> bool:
         """Go as far as a step does no harm; False: nowhere."""
         start, step = self.point, solved.solution[: self.count]
-        errors = solved.errors[: self.count]
-        moved = np.abs(step) / np.maximum(errors, 1e-300)
-        far = float(np.max(moved, where=errors > 0, initial=0.0))
-        self.history.append(far)
-        self.solved = solved
-        if far < SMALL:
+        self._note(solved)
+        if self.history[-1] < SMALL:
             self.point = start + step
             return True
         for halved in range(HALVINGS):
