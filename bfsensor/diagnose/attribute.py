@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from bfsensor.diagnose.fitted_effects import fitted
 from bfsensor.diagnose.found import (
     OUTSIDE_WORD,
     Attribution,
@@ -25,7 +26,7 @@ from bfsensor.diagnose.open_world import (
     explain_outside,
     fit_free_form,
 )
-from bfsensor.diagnose.predict import Predictor, fitted
+from bfsensor.diagnose.predict import Predictor
 from bfsensor.diagnose.ranking import (
     candidates_of,
     concerned,

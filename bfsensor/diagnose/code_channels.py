@@ -58,6 +58,20 @@ class CodeChannels:
     def __init__(self, fold: str = "fit") -> None:
         self._fold = fold
         self._counts: dict[int, NDArray[np.int64]] = {}
+        self._piled: dict[int, int] = {}
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Which flats were left out, in words."""
+        if not self._piled:
+            return ()
+        told = ", ".join(
+            f"{n} of amplifier {amp}" for amp, n in sorted(self._piled.items())
+        )
+        return (
+            f"{self._fold} fold: flats in which pixels pile up at one code, as full ones do, are "
+            f"left out of the histogram of codes: {told}",
+        )
 
     def add(self, frames: Sequence[Frame]) -> None:
         """Add a flat's raw codes."""
@@ -71,6 +85,7 @@ class CodeChannels:
             inside = codes[np.abs(codes - middle) < 6 * width].astype(np.int64)
             counts = np.bincount(inside[inside >= 0])
             if _piled(counts, width):
+                self._piled[amp] = self._piled.get(amp, 0) + 1
                 continue
             kept = self._counts.get(amp, np.zeros(0, np.int64))
             size = -(-max(len(kept), len(counts)) // PERIOD) * PERIOD

@@ -213,7 +213,7 @@ def measure_channels(
         sorted([*finder.single, *(g[0] for g in groups if len(g) == 1)], key=lambda f: f.number),
         lambda flat: [_good(flats, f) for f in read(flat)], lags=lags,
     )  # fmt: skip
-    notes += [*finder.notes, *describe_unlike(unlike)]
+    notes += [*finder.notes, *describe_unlike(unlike), *codes.notes, *late_codes.notes]
     # Sums of maps are the largest that is held: they go before the spots come.
     found_maps, late_found_maps = maps.channels(), late_maps.channels()
     shares = {(e.fold, k): v for e in (maps, late_maps) for k, v in e.shares().items()}

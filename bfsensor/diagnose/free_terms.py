@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.conditions import Condition
+from bfsensor.diagnose.fitted_effects import fitted
 from bfsensor.diagnose.model import Model
-from bfsensor.diagnose.predict import fitted
 from bfsensor.diagnose.predict_flats import flat_response, periodic_covariances
 from bfsensor.effects.effect import Effect
 

@@ -9,10 +9,11 @@ import numpy as np
 
 from bfsensor.diagnose.baseline import Baseline
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
+from bfsensor.diagnose.fitted_effects import fitted
 from bfsensor.diagnose.locate import ALARM, Mismatch
 from bfsensor.diagnose.model import Model
 from bfsensor.diagnose.named import NAMED
-from bfsensor.diagnose.predict import Predictor, fitted
+from bfsensor.diagnose.predict import Predictor
 from bfsensor.diagnose.scans import DEVICE, DEVICE_SEEN
 from bfsensor.diagnose.screen import OCCAM, Rival, Screen
 from bfsensor.effects.device_parameter import device_parameters

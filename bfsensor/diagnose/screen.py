@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.fitted_effects import fitted, widened
 from bfsensor.diagnose.mismatch import BaselineFit
-from bfsensor.diagnose.predict import Predictor, fitted, widened
+from bfsensor.diagnose.predict import Predictor
 from bfsensor.diagnose.predict_maps import lines_of_map
 from bfsensor.effects.effect import Effect, Layout, Parameter
 from bfsensor.errors import BFSensorError, ConvergenceError

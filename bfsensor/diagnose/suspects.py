@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from bfsensor.diagnose.fitted_effects import fitted
 from bfsensor.diagnose.locate import ALARM, FAMILY, Finding, Known, Locator, Mismatch
 from bfsensor.diagnose.mismatch import BaselineFit
-from bfsensor.diagnose.predict import Predictor, fitted
+from bfsensor.diagnose.predict import Predictor
 from bfsensor.diagnose.ranking import candidates_of, further, name_of, seen_of, tellable
 from bfsensor.diagnose.screen import Screen
 from bfsensor.effects.effect import Effect
