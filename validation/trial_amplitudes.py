@@ -11,7 +11,8 @@ For each class and variant, with amplitudes at the top of their ranges and all o
 the middle of theirs, the amplitude is lowered until the SNR is about 40, and once more to about 10:
 a power law between the two.  ``--check`` takes one campaign of a third chip at SNR 10 and asks how
 far the baseline's residuals go along the signature: 10 with an error of 1.  Rows go to
-``validation/results/challenge_amplitudes.ecsv``; what is there is not taken again.
+``validation/results/challenge_amplitudes.ecsv``; what is there is not taken again but with
+``--again CLASS ...``: what a campaign tells changes with the channels and with what floats.
 """
 
 from __future__ import annotations
@@ -326,10 +327,20 @@ def main() -> None:
         "--check", action="store_true", help="A third chip's campaign each."
     )
     parser.add_argument("-o", "--output", type=Path, default=RESULTS)
+    parser.add_argument(
+        "--again",
+        nargs="+",
+        default=[],
+        metavar="CLASS",
+        help="Take these, and only these.",
+    )
     options = parser.parse_args()
+    if unknown := set(options.again) - set(EFFECTS):
+        parser.error(f"--again {' '.join(sorted(unknown))}: not among {', '.join(EFFECTS)}")
     for word, kind in EFFECTS.items():
         for variant in sorted(kind.variants):
-            if (word, variant) in read_amplitudes(options.output):
+            there = (word, variant) in read_amplitudes(options.output)
+            if word not in options.again if options.again else there:
                 continue
             begin = time.process_time()
             told, best = calibrate(word, variant)
@@ -347,7 +358,9 @@ def main() -> None:
                 effect = strongest(word, variant).scaled(factor)
                 row["seen"] = round(seen_along(effect, best.direction, CHECKED), 2)
             row["cpu_s"] = round(time.process_time() - begin, 1)
-            append_rows(options.output, [row], COMMAND, key=("effect", "variant"))
+            append_rows(
+                options.output, [row], COMMAND, key=("effect", "variant"), replace=True
+            )
             print(*row.values(), flush=True)
 
 

@@ -203,3 +203,11 @@ def test_a_signal_grows_in_proportion_and_no_effect_has_none(monkeypatch):
     assert two.snr / one.snr == pytest.approx(2.0, rel=0.02)
     assert not amplitudes.change(effect.neutral(), amplitudes.SEEDS[0]).any()
     amplitudes._fitted.cache_clear()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("word", ["voltage_dependence", "cti_serial", "bf_chromatic"])
+def test_amplitudes_on_record_are_those_of_the_channels_as_they_are(word):
+    told = amplitudes.read_amplitudes()[word, ""]
+    now = amplitudes.take_signal(strongest(word, "").scaled(told.high))
+    assert now.snr == pytest.approx(told.snr_high, rel=0.1)

@@ -45,10 +45,7 @@ def write_rows(path: str | Path, rows: Sequence[Row], command: str) -> None:
     [{'name': 'a', 'p': 0.5}, {'name': '', 'p': 0.1}]
     """
     table = Table({name: [row[name] for row in rows] for name in (rows[0] if rows else {})})
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
-    )
-    table.meta = {"command": command, "commit": commit.stdout.strip()}
+    table.meta = {"command": command, "commit": _commit()}
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(f"{path.name}.{os.getpid()}.part")
@@ -59,22 +56,67 @@ def write_rows(path: str | Path, rows: Sequence[Row], command: str) -> None:
         beside.unlink(missing_ok=True)
 
 
+def _commit() -> str:
+    told = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
+    )
+    return told.stdout.strip()
+
+
 def append_rows(
-    path: str | Path, rows: Iterable[Row], command: str, *, key: Sequence[str]
+    path: str | Path,
+    rows: Iterable[Row],
+    command: str,
+    *,
+    key: Sequence[str],
+    replace: bool = False,
 ) -> int:
     """Add rows whose ``key`` columns no row has yet; return how many were added.
 
-    Several processes may add to one file: each waits for the other.
+    Each row tells the commit that it was made at.  Several processes may add to one file: each
+    waits for the other.
+
+    Parameters
+    ----------
+    path : path
+        Of the file, made if it is not there.
+    rows : iterable of mapping
+        To add.
+    command : str
+        That made them.
+    key : sequence of str
+        Columns that tell rows apart.
+    replace : bool
+        Whether rows take the place of those with their key.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> target = Path(tempfile.mkdtemp()) / "two.ecsv"
+    >>> for p in 0.5, 0.1:
+    ...     append_rows(target, [{"name": "a", "p": p}], "python -m this", key=["name"])
+    1
+    0
+    >>> append_rows(target, [{"name": "a", "p": 0.1}], "", key=["name"], replace=True)
+    1
+    >>> [row["p"] for row in read_rows(target)]
+    [0.1]
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with locked(path.parent):
         old = read_rows(path)
-        known = {tuple(r[k] for k in key) for r in old}
-        new = [r for r in rows if tuple(r[k] for k in key) not in known]
-        if new:
-            write_rows(path, [*old, *new], command)
-    return len(new)
+        # Rows of before commits were told one by one are of the header's.
+        made = Table.read(path, format="ascii.ecsv").meta.get("commit", "") if old else ""
+        old = [{**r, "commit": r.get("commit", made)} for r in old]
+        new = [{**r, "commit": _commit()} for r in rows]
+        taken = {tuple(r[k] for k in key) for r in (new if replace else old)}
+        kept, others = (new, old) if replace else (old, new)
+        others = [r for r in others if tuple(r[k] for k in key) not in taken]
+        added = new if replace else others
+        if added:
+            write_rows(path, [*others, *kept] if replace else [*kept, *others], command)
+    return len(added)
 
 
 @contextlib.contextmanager
