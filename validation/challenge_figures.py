@@ -12,7 +12,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize_scalar
+from scipy.stats import norm
 
 from validation.concealed.score import Score
 from validation.concealed.tally import wilson
@@ -22,6 +24,34 @@ EDGES = (3.0, 4.0, 5.0, 6.25, 8.0, 10.0, 14.0, 30.5)
 
 CHANCES = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 0.97, 1.0)
 """Probabilities between which classes are counted."""
+
+
+FAMILIES = 53
+"""Families that share the false alarms in a campaign of size S: the chi-squares, twelve channels'
+scans, forty effects of the library."""
+
+
+def informed(snr: ArrayLike, shapes: int, alarm: float = 0.01) -> NDArray[np.float64]:
+    """Share that an observer detects who knows the true effect's shape to be one of several.
+
+    Deviates along the shapes, of Gaussian noise, two-sided, Bonferroni's charge: what is lost
+    against it, an effect's unknown shape has cost, or one that nobody has drawn.
+
+    Parameters
+    ----------
+    snr : array_like
+        Projected SNR.
+    shapes : int
+        How many shapes are asked.
+    alarm : float
+        Share of nulls that are allowed to look like one of them.
+
+    Examples
+    --------
+    >>> informed([3.0, 5.0, 8.0], 1).round(3), informed(5.0, 48).round(3)
+    (array([0.664, 0.992, 1.   ]), np.float64(0.902))
+    """
+    return np.asarray(norm.sf(norm.isf(0.5 * alarm / shapes) - np.asarray(snr)))
 
 
 def reliability(
@@ -109,6 +139,13 @@ def draw_detection(scores: Sequence[Score], ax: Any) -> None:
             color="C1" if share in (0.85, 0.97) else "C2",
             label=word,
         )
+    fine = np.geomspace(EDGES[0], 30.0, 200)
+    ax.plot(
+        fine,
+        informed(fine, FAMILIES),
+        color="0.6",
+        label=f"knows {FAMILIES} shapes exactly",
+    )
     ax.set(xscale="log", xlabel="projected SNR", ylabel="detected", ylim=(0, 1.05))
     ax.set_xticks([3, 5, 8, 12, 20, 30], labels=["3", "5", "8", "12", "20", "30"])
     ax.minorticks_off()
