@@ -7,7 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from bfsensor.diagnose.found import (
+    LEVELS,
     OUTSIDE_WORD,
+    WIDENED,
     Attribution,
     Found,
     class_probabilities,
@@ -26,6 +28,7 @@ from bfsensor.diagnose.open_world import (
     fit_free_form,
 )
 from bfsensor.diagnose.predict import Predictor, fitted
+from bfsensor.diagnose.profile import find_profiles
 from bfsensor.diagnose.ranking import (
     candidates_of,
     concerned,
@@ -319,6 +322,7 @@ def _found(model: Model, n: int, ranking: Sequence[Rival]) -> Found:
     return Found(
         effect, gain, model.errors(n), class_probabilities(ranking),
         tied_classes(effect, ranking), tuple(ranking),
+        find_profiles(model, n, [WIDENED * w for w in LEVELS.values()]),
     )  # fmt: skip
 
 

@@ -383,18 +383,7 @@ class Predictor:
         n = len(self.names) - self._effect_count
         for effect in self.effects:
             for p in fitted(effect):
-                away = point[n] - p.neutral
-                range_ = np.array(widened(p)) - point[n]
-                far = 0.25 * (p.high - p.low)
-                step = (
-                    np.array([-0.5, 1.0]) * away
-                    if p.law == "log"
-                    else far * np.array([-1, 1])
-                )
-                held = p.amplitude or (p.law == "log" and p.signed)
-                ends[:, n] = range_ if held else np.clip(step, *range_)
-                # From beyond its range no farther.
-                ends[0, n], ends[1, n] = min(ends[0, n], 0.0), max(ends[1, n], 0.0)
+                ends[:, n] = reach_of(p, float(point[n]))
                 n += 1
         return ends
 
@@ -652,6 +641,17 @@ def widened(p: Parameter) -> tuple[float, float]:
         return p.neutral + low, p.neutral + (10 * p.high if p.amplitude else 3 * p.high)
     reach = 0.5 * (p.high - p.low)
     return p.low - reach, p.high + reach
+
+
+def reach_of(p: Parameter, value: float) -> tuple[float, float]:
+    """Smallest and largest step of an effect's parameter from a value: see :meth:`Predictor.reach`."""
+    away, far = value - p.neutral, 0.25 * (p.high - p.low)
+    range_ = np.array(widened(p)) - value
+    step = np.array([-0.5, 1.0]) * away if p.law == "log" else far * np.array([-1, 1])
+    held = p.amplitude or (p.law == "log" and p.signed)
+    low, high = range_ if held else np.clip(step, *range_)
+    # From beyond its range no farther.
+    return min(float(low), 0.0), max(float(high), 0.0)
 
 
 def _effect_step(effect: Effect, p: Parameter) -> float:
