@@ -8,7 +8,9 @@ import numpy as np
 
 from bfsensor.diagnose.fitted_effects import fitted
 from bfsensor.diagnose.found import (
+    LEVELS,
     OUTSIDE_WORD,
+    WIDENED,
     Attribution,
     Found,
     class_probabilities,
@@ -27,6 +29,7 @@ from bfsensor.diagnose.open_world import (
     fit_free_form,
 )
 from bfsensor.diagnose.predict import Predictor
+from bfsensor.diagnose.profile import find_profiles
 from bfsensor.diagnose.ranking import (
     candidates_of,
     concerned,
@@ -320,6 +323,7 @@ def _found(model: Model, n: int, ranking: Sequence[Rival]) -> Found:
     return Found(
         effect, gain, model.errors(n), class_probabilities(ranking),
         tied_classes(effect, ranking), tuple(ranking),
+        find_profiles(model, n, [WIDENED * w for w in LEVELS.values()]),
     )  # fmt: skip
 
 

@@ -86,7 +86,14 @@ def said_of(attribution: Attribution) -> list[str]:
     return out
 
 
-def _value(told: dict[str, float]) -> str:
+def _value(told: dict[str, Any]) -> str:
     if "lo68" not in told:
         return f"{told['value']:g}"
-    return f"{told['value']:.3g} ({told['lo68']:.3g} to {told['hi68']:.3g})"
+    low, high = f"{told['lo68']:.3g}", f"{told['hi68']:.3g}"
+    open_ = told.get("open68", ())
+    text = f"{low} to {high}"
+    if len(open_) == 2:
+        text = "any"
+    elif open_:
+        text = f"above {low}" if "hi" in open_ else f"below {high}"
+    return f"{told['value']:.3g} ({text})"

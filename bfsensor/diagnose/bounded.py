@@ -82,7 +82,7 @@ def solve_within(
     else:
         inverse = np.linalg.pinv(unit, rcond=SINGULAR)
         x = inverse @ target
-        q = _span(unit)
+        q = span(unit)
         told = q.T @ target
     if ((x < lowest) | (x > highest)).any():
         if regular:
@@ -96,7 +96,7 @@ def solve_within(
         left = target - unit @ x
         # What an end stops is not fitted: what is left is orthogonal to the others.
         stopped = np.isclose(x, lowest, rtol=1e-9) | np.isclose(x, highest, rtol=1e-9)
-        q = _span(unit[:, ~stopped])
+        q = span(unit[:, ~stopped])
     else:
         left = target - q @ told
     solution, errors = np.zeros(design.shape[1]), np.zeros(design.shape[1])
@@ -107,7 +107,7 @@ def solve_within(
     return Solved(solution, errors, covariance, q, left)
 
 
-def _span(unit: NDArray[np.float64]) -> NDArray[np.float64]:
+def span(unit: NDArray[np.float64]) -> NDArray[np.float64]:
     """Orthonormal columns that those of unit length span."""
     q, r = np.linalg.qr(unit)
     if (np.abs(np.diag(r)) > SINGULAR).all():

@@ -54,23 +54,11 @@ class FittedEffects:
         return np.array([word in e.touches for _, e, _ in self._each], bool)
 
     def reach(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Smallest and largest steps of a fit from values, shape (2, n).
-
-        Effects stay in their ranges, widened; parameters of a shape go no farther than a
-        derivative can tell: to half or twice, or a quarter of a range.
-        """
-        ends = np.empty((2, len(self)))
-        for n, (_, _, p) in enumerate(self._each):
-            away = values[n] - p.neutral
-            range_ = np.array(widened(p)) - values[n]
-            far = 0.25 * (p.high - p.low)
-            step = (
-                np.array([-0.5, 1.0]) * away if p.law == "log" else far * np.array([-1, 1])
-            )
-            held = p.amplitude or (p.law == "log" and p.signed)
-            ends[:, n] = range_ if held else np.clip(step, *range_)
-        # From beyond its range no farther.
-        return np.array([np.minimum(ends[0], 0.0), np.maximum(ends[1], 0.0)])
+        """Smallest and largest steps of a fit from values, shape (2, n)."""
+        ends = [
+            reach_of(p, float(v)) for (_, _, p), v in zip(self._each, values, strict=True)
+        ]
+        return np.array(ends, float).reshape(-1, 2).T
 
 
 def fitted(effect: Effect) -> list[Parameter]:
@@ -85,6 +73,21 @@ def widened(p: Parameter) -> tuple[float, float]:
         return p.neutral + low, p.neutral + (10 * p.high if p.amplitude else 3 * p.high)
     reach = 0.5 * (p.high - p.low)
     return p.low - reach, p.high + reach
+
+
+def reach_of(p: Parameter, value: float) -> tuple[float, float]:
+    """Smallest and largest step of a fit from a parameter's value.
+
+    Effects stay in their ranges, widened; parameters of a shape go no farther than a
+    derivative can tell: to half or twice, or a quarter of a range.
+    """
+    away, far = value - p.neutral, 0.25 * (p.high - p.low)
+    range_ = np.array(widened(p)) - value
+    step = np.array([-0.5, 1.0]) * away if p.law == "log" else far * np.array([-1, 1])
+    held = p.amplitude or (p.law == "log" and p.signed)
+    low, high = range_ if held else np.clip(step, *range_)
+    # From beyond its range no farther.
+    return min(float(low), 0.0), max(float(high), 0.0)
 
 
 def _step(effect: Effect, p: Parameter) -> float:

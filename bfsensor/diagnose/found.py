@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from bfsensor.diagnose.locate import Mismatch
 from bfsensor.diagnose.mismatch import BaselineFit
 from bfsensor.diagnose.open_world import OpenWorld
 from bfsensor.diagnose.predict import Predictor
+from bfsensor.diagnose.profile import Profile, linear_interval
 from bfsensor.diagnose.screen import Rival
 from bfsensor.effects.effect import Effect, Parameter
 
@@ -36,6 +38,10 @@ WIDENED = 1.12
 linear fits 63 % were (closed forms, shapes that bend and tails are left out of these)."""
 
 
+LEVELS = {"68": 1.0, "95": 1.96}
+"""Half widths of intervals, in standard errors of a Gaussian."""
+
+
 @dataclass(frozen=True, eq=False)
 class Found:
     """One effect of an attribution.
@@ -54,6 +60,8 @@ class Found:
         Classes that cannot be told from it, its own first.
     rivals : tuple of Rival
         Best of each kind in its place, best first.
+    profiles : mapping of str to Profile
+        Of parameters whose chi-square is no parabola.
     """
 
     effect: Effect
@@ -62,12 +70,14 @@ class Found:
     probability: dict[str, float]
     tied: tuple[str, ...]
     rivals: tuple[Rival, ...] = ()
+    profiles: Mapping[str, Profile] = field(default_factory=dict)
 
-    def intervals(self, scale: float = WIDENED) -> dict[str, dict[str, float]]:
+    def intervals(self, scale: float = WIDENED) -> dict[str, dict[str, Any]]:
         """Values with intervals of 68 and 95 %, as report.json has them.
 
-        Of positive shape parameters and amplitudes that are badly known the logarithm is taken
-        for Gaussian, of all others the parameter.
+        Of parameters with a profile they end where the chi-square has risen by as much as
+        errors, widened, say; 'open68' and 'open95' list ends, 'lo' or 'hi', that it does not
+        reach within the range of fits.  Of all others see :func:`linear_interval`.
 
         Parameters
         ----------
@@ -79,12 +89,23 @@ class Found:
             value = self.effect[p.name]
             told = {"value": value}
             if p.name in self.errors:
-                for level, width in (("68", 1.0), ("95", 1.96)):
-                    told[f"lo{level}"], told[f"hi{level}"] = _interval(
-                        value, scale * width * self.errors[p.name], p
-                    )
+                for level, width in LEVELS.items():
+                    told |= self._interval(p, level, scale * width)
             out[p.name] = told
         return out
+
+    def _interval(self, p: Parameter, level: str, width: float) -> dict[str, Any]:
+        """Ends of one interval; 'open95' and the like name those that lie beyond the range."""
+        keys = f"lo{level}", f"hi{level}"
+        if p.name not in self.profiles:
+            ends = linear_interval(self.effect[p.name], width * self.errors[p.name], p)
+            return dict(zip(keys, ends, strict=True))
+        low, high, *closed = self.profiles[p.name].interval(width)
+        # The fit may have ended a little off the lowest place.
+        low, high = min(low, self.effect[p.name]), max(high, self.effect[p.name])
+        told: dict[str, Any] = dict(zip(keys, (low, high), strict=True))
+        open_ = [k for k, c in zip(("lo", "hi"), closed, strict=True) if not c]
+        return told | ({f"open{level}": open_} if open_ else {})
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,12 +218,3 @@ def _cosine(one: Rival, other: Rival) -> float:
     a, b = one.template, other.template
     norm = np.sqrt((a @ a) * (b @ b))
     return float(abs(a @ b) / norm) if norm else 0.0
-
-
-def _interval(value: float, width: float, p: Parameter) -> tuple[float, float]:
-    """Ends of an interval."""
-    away = value - p.neutral if p.law == "log" else value
-    if p.law == "log" and not p.signed and away > 0 and width > 0.15 * away:
-        factor = float(np.exp(min(width / away, 50.0)))
-        return p.neutral + away / factor, p.neutral + away * factor
-    return value - width, value + width

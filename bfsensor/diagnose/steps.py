@@ -173,13 +173,10 @@ class Steps:
                     continue
                 self.slopes[start : start + len(channel), n] = channel.whiten(change)
 
-    def solve(
-        self,
-        residuals: NDArray[np.float64],
-        point: NDArray[np.float64],
-        held: NDArray[np.bool_] | None = None,
-    ) -> Solved:
-        """Best step of all parameters, some of the non-linear ones held."""
+    def problem(
+        self, residuals: NDArray[np.float64], point: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Columns of all parameters and what they should make, rows of priors last."""
         plainly, chance = self.count + self._linear.shape[1], self.modes.shape[1]
         rows = self.predictor.prior_rows
         design = np.zeros((self.total + self._priors + chance, plainly + chance))
@@ -189,7 +186,16 @@ class Steps:
         design[self.total + np.arange(self._priors), rows] = 1.0
         last = self.total + self._priors + np.arange(chance)
         design[last, plainly + np.arange(chance)] = 1.0
-        target = np.concatenate([residuals, -point[rows], np.zeros(chance)])
+        return design, np.concatenate([residuals, -point[rows], np.zeros(chance)])
+
+    def solve(
+        self,
+        residuals: NDArray[np.float64],
+        point: NDArray[np.float64],
+        held: NDArray[np.bool_] | None = None,
+    ) -> Solved:
+        """Best step of all parameters, some of the non-linear ones held."""
+        design, target = self.problem(residuals, point)
         ends = np.repeat([[-np.inf], [np.inf]], design.shape[1], axis=1)
         ends[:, : self.count] = self.predictor.reach(point)
         if held is not None:

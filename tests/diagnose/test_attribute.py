@@ -15,7 +15,9 @@ from bfsensor.diagnose.attribute import (
 from bfsensor.diagnose.diagnosis import fit_bounded
 from bfsensor.diagnose.extract import measure_channels
 from bfsensor.diagnose.locate import locate_mismatch
+from bfsensor.diagnose.model import Model
 from bfsensor.diagnose.placed import place_effects
+from bfsensor.diagnose.profile import valley_of
 from bfsensor.diagnose.screen import Rival, Screen, evidence
 from bfsensor.effects.charge_loss import ChargeLoss
 from bfsensor.effects.gain_nonlinearity import GainNonlinearity
@@ -56,6 +58,18 @@ def test_an_effect_is_named_with_its_parameters(torn):
         width = 1.5 * (told[name]["hi68"] - told[name]["lo68"]) + more
         assert abs(told[name]["value"] - truth) < width, name
     assert abs(told["column"]["value"] * 128 - 0.3 * 128) < 1.0
+
+
+def test_the_valley_about_a_fit_is_that_of_the_fit(torn):
+    """Its lowest place, and errors by what all else takes of one effect's derivatives."""
+    model = Model(torn.predictor, torn.fit)
+    valley = valley_of(model, 0)
+    errors = np.array(list(model.errors(0).values()))
+    np.testing.assert_allclose(valley.errors, errors, rtol=0.05)
+    # Steps end where they gain a hundredth; errors that chance widens have their logarithm apart.
+    assert abs(valley.square + model.fit.chance - model.fit.total) < 0.5
+    aside = valley.best + 0.5 * errors * [1.0, 0.0, 0.0, 0.0]
+    assert (valley.left(aside) ** 2).sum() > valley.square
 
 
 def test_recordings_that_were_not_fitted_agree_better(torn):
