@@ -7,6 +7,7 @@ from bfsensor import Device
 from bfsensor.build import build_table
 from bfsensor.errors import FitError
 from bfsensor.fit import finer
+from bfsensor.fit import solved as solving
 from bfsensor.fit.data import area_data
 from bfsensor.fit.finer import Finer
 from bfsensor.fit.fit import fit_device
@@ -81,8 +82,8 @@ def test_values_are_the_finer_mesh_s_and_solved_once(kept, monkeypatch):
         solved.append(len(nodes))
         return nodes_solver(nodes, **more)
 
-    nodes_solver = finer.solve_nodes
-    monkeypatch.setattr(finer, "solve_nodes", solve_nodes)
+    nodes_solver = solving.solve_nodes
+    monkeypatch.setattr(solving, "solve_nodes", solve_nodes)
     both = make_finer(kept, (HERE, RED), FREE[:1])
     carried = both(means)
     coarse = carried.emulator
