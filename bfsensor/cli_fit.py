@@ -46,10 +46,10 @@ def parse_conditions(
 @click.option("--set", "settings", multiple=True, callback=parse_settings, metavar="KEY=VALUE",
               help="Change a value of the device, such as gate_high=4V; repeatable.")  # fmt: skip
 @click.option(
-    "--free", multiple=True, metavar="NAME[:SPREAD]",
-    help="Let a quantity be free within the uncertainty that its file states, or within SPREAD: "
-    "silicon.thickness, back_bias:5V; 'all' for all with an uncertainty; repeatable. By default "
-    "those whose origin is 'guessed'.",
+    "--free", multiple=True, metavar="NAME[:[MEAN+-]SPREAD]",
+    help="Let a quantity be free within the uncertainty that its file states, or within SPREAD, "
+    "of the file's value or of MEAN: silicon.thickness, back_bias:5V, 'thickness:98 um+-2 um'; "
+    "'all' for all with an uncertainty; repeatable. By default those whose origin is 'guessed'.",
 )  # fmt: skip
 @click.option(
     "--at", "conditions", multiple=True, callback=parse_conditions,

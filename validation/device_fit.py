@@ -16,6 +16,9 @@ paper does; otherwise as those of a flat of 80,000 e-, which by higher orders of
 Wherever a device is solved, fitted or predicted, a_ij and slopes are those of ``--finer`` cells a
 pixel, derivatives those of ``--cells``.
 
+``--resistivity`` takes the prior of the doping from what the wafers were specified to be
+(``RESISTIVITY``), not from the value of the published simulation.
+
 ``wells`` predicts saturation levels with the device that ``seed`` has fitted.
 
 Rows of a run replace those of the same run in ``validation/results/device_fit.ecsv``; fit.json
@@ -41,9 +44,10 @@ from numpy.typing import NDArray
 
 from bfsensor.device import Device
 from bfsensor.fit.data import DataSet, area_data, data_set, select
-from bfsensor.fit.finer import FINER, Finer
+from bfsensor.fit.finer import FINER, REFINE_Z, Finer
 from bfsensor.fit.fit import fit_device
 from bfsensor.fit.linearised import Linearise
+from bfsensor.fit.missed import DRAWS
 from bfsensor.fit.predictors import make_predictors
 from bfsensor.fit.quantities import (
     Prior,
@@ -53,6 +57,7 @@ from bfsensor.fit.quantities import (
     with_priors,
 )
 from bfsensor.fit.result import FitResult
+from bfsensor.fit.solved import Solved
 from bfsensor.fit.ties import name_combination
 from bfsensor.measure.toy_array import close_sum, predict_array
 from bfsensor.recording.exposures import Condition
@@ -70,6 +75,14 @@ GALSIM = {"itl": "lsst_itl_50_32", "e2v": "lsst_e2v_50_32"}
 HELD = ("gates.gate_oxide", "gates.field_oxide")
 """In the E2V device: its oxides are equally thick, and a field oxide cannot be the thinner one, so
 that the fit begins at a kink and at the end of what can be for both."""
+
+RESISTIVITY = "background_doping:-1.7e12 cm-3 +- 0.7e12 cm-3"
+"""Of LSST's sensors: above 5 kOhm cm (Radeka, Sensor Development Program, LSST directors' review,
+SLAC, March 2006), at 470 cm2/V/s fewer than 2.7e12 acceptors a cm3; high-resistivity wafers of
+CCDs reach 10 kOhm cm and above (10,000 Ohm cm: Holland et al., LBNL; 10 to 12 kOhm cm: Stover et al.
+1998), and 20 kOhm cm are 0.66e12: mean and standard deviation of an even distribution between them.
+Published simulations of the ITL device have 1.0e12 (Poisson_CCD22 of 2015, data/run1/bf.cfg at -60 V,
++4/-8 V) and 2.4e12 (its successors of 2017 and 2019); neither says from what measurement."""
 
 SEED_LEVEL = 80_000.0
 SETTINGS = {"A": (-60.0, 4.0, -8.0), "B": (-30.0, 4.0, -8.0), "C": (-60.0, 6.0, -6.0)}
@@ -167,6 +180,10 @@ def main(ctx: click.Context, reference: Path) -> None:
 _CELLS = click.option("--cells", default=16, show_default=True, help="Mesh cells a pixel.")
 _FINER = click.option("--finer", default=FINER, show_default=True,
                       help="Cells a pixel of a_ij and slopes.")  # fmt: skip
+_RESISTIVITY = click.option("--resistivity", is_flag=True,
+                            help="Prior of the doping by the wafers' specification.")  # fmt: skip
+_DRAWS = click.option("--draws", default=DRAWS, show_default=True,
+                      help="Devices drawn from the posterior that are solved.")  # fmt: skip
 _KEEP = click.option("--keep", type=click.Path(path_type=Path), required=True,
                      help="Folder of fit.json and device.toml.")  # fmt: skip
 
@@ -175,14 +192,26 @@ _KEEP = click.option("--keep", type=click.Path(path_type=Path), required=True,
 @click.argument("vendor", type=click.Choice(list(DEVICES)))
 @_CELLS
 @_FINER
+@_DRAWS
+@_RESISTIVITY
 @_KEEP
 @click.pass_obj
-def areas(reference: Path, vendor: str, cells: int, finer: int, keep: Path) -> None:
+def areas(
+    reference: Path,
+    vendor: str,
+    cells: int,
+    finer: int,
+    draws: int,
+    resistivity: bool,
+    keep: Path,
+) -> None:
     """Fit the a_ij of 2019."""
     device = Device.load(DEVICES[vendor])
     out = HELD if vendor == "e2v" else ()
     priors = tuple(
-        p for p in choose_priors(device, ("all", *VOLTAGES)) if p.name not in out
+        p
+        for p in choose_priors(device, ("all", *VOLTAGES, *_doping(resistivity)))
+        if p.name not in out
     )
     device = with_priors(device, priors)
     data = data_set(read_measured(reference / f"{vendor}_covariances_21oct19.csv"))
@@ -190,14 +219,31 @@ def areas(reference: Path, vendor: str, cells: int, finer: int, keep: Path) -> N
     result = fit_device(
         device, [data], priors, None,
         linearise=make_finer(device, priors, (Condition(),), cells, finer, keep),
+        solved=make_solved(device, priors, (Condition(),), finer, keep), draws=draws,
         source=f"bfsensor fit of {data.name}, 24 lags; errors are correlated: fit.json",
     )  # fmt: skip
     seconds = time.process_time() - begin
     _write(result, keep, FITTED[vendor])
     run, galsim = published_areas(reference, vendor)
     rows = rows_of(result, {data.name: run}, {data.name: galsim})
-    append(vendor, rows, **_told(result, seconds))
+    append(vendor + " by resistivity" * resistivity, rows, **_told(result, seconds))
     click.echo(result.said())
+
+
+def _doping(resistivity: bool) -> tuple[str, ...]:
+    """Give what is asked of the doping besides."""
+    return (RESISTIVITY,) if resistivity else ()
+
+
+def make_solved(
+    device: Device,
+    priors: tuple[Prior, ...],
+    at: tuple[Condition, ...],
+    finer: int,
+    keep: Path,
+) -> Solved:
+    """What solves a device on the finer mesh alone."""
+    return Solved(device, priors, at, finer, REFINE_Z, keep / "finer")
 
 
 def make_finer(
@@ -216,16 +262,25 @@ def make_finer(
 @main.command()
 @_CELLS
 @_FINER
+@_DRAWS
+@_RESISTIVITY
 @_KEEP
 @click.option("--slope", is_flag=True, help="Covariance over the level squared is a_ij.")
 @click.option("--every", is_flag=True, help="Fit all settings, predict none.")
 @click.pass_obj
 def seed(
-    reference: Path, cells: int, finer: int, keep: Path, slope: bool, every: bool
+    reference: Path,
+    cells: int,
+    finer: int,
+    draws: int,
+    resistivity: bool,
+    keep: Path,
+    slope: bool,
+    every: bool,
 ) -> None:
     """Fit one ITL device at -60 V, +4/-8 V, and predict the other settings."""
     device = Device.load("itl_sta3800c_60").with_operating_point(gate_high="4 V")
-    priors = choose_priors(device, ("all",))
+    priors = choose_priors(device, ("all", *_doping(resistivity)))
     at = {key: condition_at(key) for key in SETTINGS}
     begin = time.process_time()
     sets, unfitted, less = {}, {}, {}
@@ -240,9 +295,11 @@ def seed(
     result = fit_device(
         device, [one for key in fitted for one in sets[key]], priors, None,
         linearise=make_finer(device, priors, conditions, cells, finer, keep),
+        solved=make_solved(device, priors, conditions, finer, keep), draws=draws,
         source="bfsensor fit of figure 9 of Lage, Bradshaw and Tyson (2017)",
     )  # fmt: skip
     run = "seed" + " as slopes" * slope + " every" * every
+    run += " by resistivity" * resistivity
     _write(result, keep, run.replace(" ", "_"))
     published = {
         one.name: seed_published(reference, one) for s in sets.values() for one in s
@@ -390,6 +447,7 @@ def _told(result: FitResult, seconds: float) -> dict[str, Any]:
     return {
         "cells": mesh["cells"], "finer": mesh["finer"], "finer_over_own": ratios,
         "cpu_s": round(seconds, 1), "notes": list(result.notes),
+        "posterior": {k: v for k, v in result.posterior.items() if k in ("curved", "solved")},
         "ties": list(result.ties), "silent": list(result.silent),
     }  # fmt: skip
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bfsensor.fit.missed import (
     DRAWS,
     Exact,
+    Missed,
     fitted_numbers,
     measure_missed,
     relative_errors,
@@ -56,6 +57,7 @@ def find_posterior(
     found: Solution,
     exact: Exact | None,
     *,
+    missed: Missed | None = None,
     draws: int = DRAWS,
     progress: Callable[[int, int], None] | None = None,
 ) -> Posterior:
@@ -68,6 +70,8 @@ def find_posterior(
     exact : callable, optional
         Predictions of all sets from a solution at values; without it nothing is said of what
         predictions miss.
+    missed : Missed, optional
+        What predictions miss, measured before, in place of ``exact``.
     draws : int
         At which it is asked.
     progress : callable, optional
@@ -78,10 +82,11 @@ def find_posterior(
     record: dict[str, Any] = {
         "tangent_error": np.sqrt(np.diag(found.covariance)).tolist(), "curved": curved
     }  # fmt: skip
-    missed, words = None, "errors do not hold what predictions miss over them"
-    if exact is not None and draws:
+    words = "errors do not hold what predictions miss over them"
+    if missed is None and exact is not None and draws:
         missed = measure_missed(problem, found, exact, draws=draws, progress=progress)
-        record |= {"solved": draws, "rms": {
+    if missed is not None:
+        record |= {"solved": len(missed.at), "rms": {
             data.name: rms.tolist()
             for data, rms in zip(problem.sets, missed.rms, strict=True)
         }}  # fmt: skip
@@ -90,8 +95,8 @@ def find_posterior(
             for data, rms, scale in zip(problem.sets, missed.rms, found.scales, strict=True)
         ]
         words = (
-            f"errors hold what predictions miss at {draws} devices drawn from the posterior: at most "
-            f"{', '.join(f'{one:.2g}' for one in most)} scaled errors of the sets"
+            f"errors hold what predictions miss at {len(missed.at)} devices drawn from the posterior: "
+            f"at most {', '.join(f'{one:.2g}' for one in most)} scaled errors of the sets"
         )
     if curved:
         unknown = None

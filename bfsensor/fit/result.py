@@ -45,7 +45,8 @@ class FittedSet:
     values, errors : ndarray, shape (n,)
         As measured, errors as stated.
     before, after : ndarray, shape (n,)
-        Of the device as its file says, and as fitted.
+        At the means of the priors, which are the values of the device file unless others were
+        stated, and as fitted.
     after_error : ndarray, shape (n,)
         What the parameters' posterior leaves open of the prediction.
     chi2, chi2_before : float
