@@ -285,6 +285,7 @@ def main() -> None:
     parser.add_argument("--cells", type=int, default=8)
     parser.add_argument("--seed", type=int, default=7301)
     parser.add_argument("--keep", type=Path, help="folder of the emulator's solves")
+    parser.add_argument("--emulator", type=Path, help="file of one, in place of solves")
     options = parser.parse_args()
     from bfsensor.fit.emulator import DeviceEmulator
     from bfsensor.fit.linearised import LinearEmulator, LinearResponse
@@ -295,10 +296,14 @@ def main() -> None:
     )
     device = with_priors(device, priors)
     begin = time.process_time()
-    emulator: Emulator = DeviceEmulator.build(
-        device, [prior.name for prior in priors], conditions=(Condition(),),
-        cells=options.cells, keep=options.keep,
-    )  # fmt: skip
+    emulator: Emulator
+    if options.emulator is not None:
+        emulator = DeviceEmulator.read(options.emulator, device=device)
+    else:
+        emulator = DeviceEmulator.build(
+            device, [prior.name for prior in priors], conditions=(Condition(),),
+            cells=options.cells, keep=options.keep,
+        )  # fmt: skip
     built = time.process_time() - begin
     errors = (
         options.times * read_area_changes(options.errors).errors[: LAGS + 1, : LAGS + 1]

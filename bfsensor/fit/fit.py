@@ -138,6 +138,13 @@ def fit_device(
         *(note for data in sets for note in data.notes),
         *_remarks(result, priors),
         posterior.words,
+        *(
+            [
+                "profiles are those of predictions straight in the parameters: parabolas within bounds"
+            ]
+            if profiles and not posterior.record["curved"]
+            else []
+        ),
         *settling,
         *([say(mesh)] if mesh else []),
         *notes,
