@@ -17,7 +17,8 @@ Wherever a device is solved, fitted or predicted, a_ij and slopes are those of `
 pixel, derivatives those of ``--cells``.
 
 ``--resistivity`` takes the prior of the doping from what the wafers were specified to be
-(``RESISTIVITY``), not from the value of the published simulation.
+(``RESISTIVITY``), not from the value of the published simulation.  ``doping FIT...`` gives what
+other priors of the doping would make of finished fits, by the tangent where each ended.
 
 ``wells`` predicts saturation levels with the device that ``seed`` has fitted.
 
@@ -25,7 +26,8 @@ Rows of a run replace those of the same run in ``validation/results/device_fit.e
 and device.toml go to ``--keep``.  Kinds of rows: 'areas' [1/e-], 'slopes' [% for 50,000 e-], 'wells'
 [e-]; 'parameter': measured and error are the prior's, in units of device files;
 'chi2' over the number of values (measured), errors as stated; 'scale' of the errors;
-'combination': after is posterior over prior width.
+'combination': after is posterior over prior width; 'doping' [1e12 cm-3]: measured and error are
+the prior's.
 """
 
 from __future__ import annotations
@@ -79,10 +81,13 @@ that the fit begins at a kink and at the end of what can be for both."""
 RESISTIVITY = "background_doping:-1.7e12 cm-3 +- 0.7e12 cm-3"
 """Of LSST's sensors: above 5 kOhm cm (Radeka, Sensor Development Program, LSST directors' review,
 SLAC, March 2006), at 470 cm2/V/s fewer than 2.7e12 acceptors a cm3; high-resistivity wafers of
-CCDs reach 10 kOhm cm and above (10,000 Ohm cm: Holland et al., LBNL; 10 to 12 kOhm cm: Stover et al.
-1998), and 20 kOhm cm are 0.66e12: mean and standard deviation of an even distribution between them.
+CCDs reach 10 to 12 kOhm cm (LBNL's, n-type; notes of E. Hoeg, SAG_CUO_57, 1999) and are sold above.
+20 kOhm cm, taken as the end, are 0.66e12: mean and standard deviation of an even distribution
+between the two, 1.68 +- 0.59, and somewhat wider.
 Published simulations of the ITL device have 1.0e12 (Poisson_CCD22 of 2015, data/run1/bf.cfg at -60 V,
 +4/-8 V) and 2.4e12 (its successors of 2017 and 2019); neither says from what measurement."""
+
+DOPING = "silicon.background_doping"
 
 SEED_LEVEL = 80_000.0
 SETTINGS = {"A": (-60.0, 4.0, -8.0), "B": (-30.0, 4.0, -8.0), "C": (-60.0, 6.0, -6.0)}
@@ -401,6 +406,38 @@ def predicted_rows(
     ]
     return [*rows, row("chi2", data.name, measured=len(rows), before=chi2[0], after=chi2[1],
                        published=chi2[2])]  # fmt: skip
+
+
+@main.command()
+@click.argument("fits", nargs=-1, required=True, type=click.Path(path_type=Path))
+def doping(fits: tuple[Path, ...]) -> None:
+    """Give finished fits other priors of the doping: as fitted, by resistivity, wider, none."""
+    rows = []
+    for path in fits:
+        result = FitResult.read(path)
+        k = result.parameters.index(DOPING)
+        own = float(result.prior[k]), float(result.spread[k])
+        (asked,) = choose_priors(Device.from_toml(result.device), (RESISTIVITY,))
+        for mean, spread in (own, (asked.mean, asked.spread), (own[0], 1.0), (own[0], 1e3)):
+            value, error = with_prior(result, k, mean, spread)
+            rows.append(row(
+                "doping", path.parent.name, measured=mean, error=spread, before=result.value[k],
+                after=value, after_error=error, pull=(value - mean) / spread,
+            ))  # fmt: skip
+            click.echo(rows[-1])
+    append("doping", rows)
+
+
+def with_prior(
+    result: FitResult, k: int, mean: float, spread: float
+) -> tuple[float, float]:
+    """Give one parameter and its error with another prior of its own, by the tangent."""
+    precision = np.linalg.inv(result.covariance)
+    pulled = precision @ result.value
+    precision[k, k] += 1 / spread**2 - 1 / result.spread[k] ** 2
+    pulled[k] += mean / spread**2 - result.prior[k] / result.spread[k] ** 2
+    covariance = np.linalg.inv(precision)
+    return float((covariance @ pulled)[k]), float(np.sqrt(covariance[k, k]))
 
 
 @main.command()

@@ -13,7 +13,8 @@ Rows 'tangent': errors of a Gaussian of the tangent where the fit ends; 'posteri
 fit states, of draws.  A row for each parameter, for the combinations that the first mock measures
 best, for the best of each mock's own ('own 1' to 'own 3') and for all parameters together replaces
 those of the same run in ``validation/results/fit_recovery.ecsv``, with Wilson bounds (95 %) of the
-coverage; the parameters that are not told apart are in the header.
+coverage; the parameters that are not told apart are in the header, with the number of mocks whose
+posterior was drawn from.
 """
 
 from __future__ import annotations
@@ -124,7 +125,7 @@ def recover(
     remains: dict[str, list[NDArray[np.float64]]] = {way: [] for way in ways}
     scales, chi2, told = [], [], {}
     directions = None
-    seconds = 0.0
+    seconds, drawn = 0.0, 0
     while len(scales) < mocks:
         truth = draw_truth(priors, rng)
         try:
@@ -136,8 +137,8 @@ def recover(
         except ValueError:
             continue
         ny, nx = errors.shape
-        drawn = true[:ny, :nx] + errors * rng.standard_normal(errors.shape)
-        data = area_data("mock", drawn, misstated * errors, independent=independent)
+        noisy = true[:ny, :nx] + errors * rng.standard_normal(errors.shape)
+        data = area_data("mock", noisy, misstated * errors, independent=independent)
         begin = time.process_time()
         problem = _problem(data, emulator, priors)
         tangent = solve(problem)
@@ -147,7 +148,8 @@ def recover(
             missed = Missed(
                 np.zeros((len(emulator_misses), len(priors))), (emulator_misses[:, j, i],)
             )
-        found = find_posterior(problem, tangent, None, missed=missed).solution
+        posterior = find_posterior(problem, tangent, None, missed=missed)
+        found, drawn = posterior.solution, drawn + ("draws" in posterior.record)
         seconds += time.process_time() - begin
         if directions is None:
             ties, silent = find_ties(names, tangent.sensitivity)
@@ -199,7 +201,7 @@ def recover(
             "scale_scatter": round(float(np.std(scales)), 3),
             "chi2_per_n": round(float(np.mean(chi2)), 3),
         }  # fmt: skip
-    return rows, told | {"cpu_s_a_fit": round(seconds / mocks, 3)}
+    return rows, told | {"cpu_s_a_fit": round(seconds / mocks, 3), "drawn": drawn}
 
 
 def _predicted(

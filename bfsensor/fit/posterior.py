@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor.errors import ConvergenceError
 from bfsensor.fit.missed import (
     DRAWS,
     Exact,
@@ -103,7 +104,15 @@ def find_posterior(
         if missed is not None:
             f = fitted_numbers(problem)
             unknown = relative_errors(problem, found, missed)[np.ix_(f, f)]
-        drawn = sample_posterior(problem, found, bent=bent, unknown=unknown)
+        try:
+            drawn = sample_posterior(problem, found, bent=bent, unknown=unknown)
+        except ConvergenceError as error:
+            curved, words = (
+                False,
+                f"{words}; predictions bend, but {error}: errors are too small",
+            )
+            record["not_drawn"] = str(error)
+    if curved:
         record |= _told(drawn)
         left = _left(problem, found, drawn)
         if missed is not None:

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bfsensor.errors import FitError
+from bfsensor.errors import ConvergenceError, FitError
+from bfsensor.fit import posterior
 from bfsensor.fit.data import DataSet
 from bfsensor.fit.missed import Missed, measure_missed, widen
 from bfsensor.fit.posterior import find_posterior
@@ -175,3 +176,23 @@ def test_a_profile_that_ends_at_a_bound_is_one_sided():
     assert bounds.low == -np.inf
     error = np.sqrt(found.covariance[1, 1])
     assert bounds.high == pytest.approx(found.values[1] + np.sqrt(3.84) * error, abs=1e-3)
+
+
+def test_draws_that_do_not_agree_are_said_so(monkeypatch):
+    whole = problem()
+    found = solve(whole)
+
+    def refuse(*args, **more):
+        raise ConvergenceError("draws differ between chains", [2.0])
+
+    monkeypatch.setattr(posterior, "sample_posterior", refuse)
+    left = find_posterior(whole, found, None)
+    assert "differ between chains: errors are too small" in left.words
+    assert left.record["not_drawn"] and "draws" not in left.record
+    np.testing.assert_array_equal(left.solution.covariance, found.covariance)
+
+
+def test_chains_that_are_too_short_do_not_agree():
+    whole = problem(turn=40 * TURN)
+    with pytest.raises(ConvergenceError, match=r"draws of p\.\w differ between chains"):
+        sample_posterior(whole, solve(whole), steps=3)
