@@ -27,8 +27,8 @@ Values = NDArray[np.float64]
 STRAIGHT = 1e-3
 """Largest second derivative of predictions that count as straight [errors a squared spread]."""
 
-PREDICTED = 200
-"""Draws at which predictions are made, for what the posterior leaves open of them."""
+PREDICTED = 100
+"""Draws at which predictions are made: what the posterior leaves open of them, to 7 %."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.errors import ConvergenceError
-from bfsensor.fit.solve import Problem, Solution, out_of_order
+from bfsensor.fit.solve import Problem, Solution, ordered_pairs
 
 Values = NDArray[np.float64]
 
@@ -136,12 +136,16 @@ def sample_posterior(
         for end in ("low", "high")
     )
 
+    pairs = ordered_pairs(problem)
+
     def height(t: Values) -> tuple[Values, Values]:
         """Minus the logarithm of the posterior, and its slopes; infinite out of bounds."""
         half, slopes = bent.at(t)
         half += 0.5 * np.sum((off + t) ** 2, axis=1)
         out = np.any((t < low) | (t > high), axis=1)
-        out |= [out_of_order(problem, best + one * spreads) for one in t]
+        there = best + t * spreads
+        for lower, upper in pairs:
+            out |= there[:, lower] > there[:, upper]
         return np.where(out, np.inf, half), slopes + off + t
 
     rng = np.random.default_rng(seed)

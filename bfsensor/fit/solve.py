@@ -231,19 +231,20 @@ def _minimise(
     )  # fmt: skip
 
 
-def _pairs(problem: Problem) -> list[tuple[int, int]]:
+def ordered_pairs(problem: Problem) -> list[tuple[int, int]]:
+    """Numbers of parameters of which the first is not above the second in any device."""
     names = [prior.name for prior in problem.priors]
     return [(names.index(a), names.index(b)) for a, b in ORDERED if {a, b} <= set(names)]
 
 
 def out_of_order(problem: Problem, values: Values) -> bool:
     """Whether a pair is the wrong way round, such as a gate oxide above the field oxide."""
-    return any(values[low] > values[high] for low, high in _pairs(problem))
+    return any(values[low] > values[high] for low, high in ordered_pairs(problem))
 
 
 def _disorder(problem: Problem, values: Values) -> tuple[Values, Values]:
     """Residuals of pairs that are the wrong way round, and their slopes in spreads."""
-    pairs, spreads = _pairs(problem), problem.spreads
+    pairs, spreads = ordered_pairs(problem), problem.spreads
     out, slopes = np.zeros(len(pairs)), np.zeros((len(pairs), len(values)))
     for row, (low, high) in enumerate(pairs):
         unit = spreads[low] / STEEP
@@ -256,7 +257,7 @@ def _disorder(problem: Problem, values: Values) -> tuple[Values, Values]:
 def _ordered(problem: Problem, values: Values) -> Values:
     """Copy in which pairs that are a hair the wrong way round are equal."""
     out = np.array(values)
-    for low, high in _pairs(problem):
+    for low, high in ordered_pairs(problem):
         out[low] = min(out[low], out[high])
     return out
 
