@@ -46,10 +46,10 @@ def parse_conditions(
 @click.option("--set", "settings", multiple=True, callback=parse_settings, metavar="KEY=VALUE",
               help="Change a value of the device, such as gate_high=4V; repeatable.")  # fmt: skip
 @click.option(
-    "--free", multiple=True, metavar="NAME[:SPREAD]",
-    help="Let a quantity be free within the uncertainty that its file states, or within SPREAD: "
-    "silicon.thickness, back_bias:5V; 'all' for all with an uncertainty; repeatable. By default "
-    "those whose origin is 'guessed'.",
+    "--free", multiple=True, metavar="NAME[:[MEAN+-]SPREAD]",
+    help="Let a quantity be free within the uncertainty that its file states, or within SPREAD, "
+    "of the file's value or of MEAN: silicon.thickness, back_bias:5V, 'thickness:98 um+-2 um'; "
+    "'all' for all with an uncertainty; repeatable. By default those whose origin is 'guessed'.",
 )  # fmt: skip
 @click.option(
     "--at", "conditions", multiple=True, callback=parse_conditions,
@@ -76,7 +76,13 @@ def parse_conditions(
 @click.option(
     "--curved", is_flag=True,
     help="Fit with an emulator to second order about the device (2 solutions for each free "
-    "quantity, kept in the folder) instead of solving it anew where each round ends.",
+    "quantity, kept in the folder) instead of solving it anew where each round ends. Errors are then "
+    "those of draws, and profiles bend: without it both are those of the tangent.",
+)  # fmt: skip
+@click.option(
+    "--draws", default=12, show_default=True, type=click.IntRange(min=0),
+    help="Devices drawn from the posterior that are solved on the finer mesh: what predictions miss "
+    "there counts in the errors.",
 )  # fmt: skip
 @click.option("-o", "--output", type=click.Path(path_type=Path),
               help="Folder for fit.json, device.toml and fit.png [DEVICE_fit].")  # fmt: skip
@@ -94,6 +100,7 @@ def fit(
     cells: int,
     finer: int | None,
     curved: bool,
+    draws: int,
     output: Path | None,
     as_json: bool,
 ) -> None:
@@ -133,7 +140,7 @@ def fit(
     chosen = [_resolve(name, names) for name in profiles]
     folder = output or Path(f"{loaded.name}_fit")
     known = with_priors(loaded, priors)
-    emulator = linearise = None
+    emulator = linearise = solved = None
     if {"areas", "slopes"} & {data.kind for data in sets}:
         if finer is None:
             finer = FINER if cells < FINER else 0
@@ -147,10 +154,12 @@ def fit(
             solve = linearise or (lambda values, fixed=emulator: fixed)
             linearise = make_finer(solve, known, priors, sets, finer, cells, folder)
             emulator = None
+        if draws:
+            solved = make_solved(known, priors, sets, cells, finer, folder)
     result = fit_device(
         known, sets, priors, emulator, linearise=linearise,
         tangents=make_tangents(known, cells=min(cells, 8), progress=Bar("settings")),
-        profiles=chosen,
+        solved=solved, draws=draws, progress=Bar("devices drawn"), profiles=chosen,
         source=f"bfsensor fit of {', '.join(data.name for data in sets if data.fitted)}; "
         "errors are correlated: fit.json",
         notes=[
@@ -222,6 +231,23 @@ def make_finer(
         linearise, device, tuple(priors), responding(sets), finer, cells,
         keep=folder / "finer", progress=Bar("finer mesh"),
     )  # fmt: skip
+
+
+def make_solved(
+    device: Any,
+    priors: Sequence[Any],
+    sets: Sequence[DataSet],
+    cells: int,
+    finer: int,
+    folder: Path,
+) -> Any:
+    """Make what solves the device without derivatives, on the finer mesh if there is one."""
+    from bfsensor.fit.finer import REFINE_Z
+    from bfsensor.fit.solved import Solved
+    from bfsensor.response import REFINE_Z as OWN
+
+    mesh = (finer, REFINE_Z) if finer else (cells, OWN)
+    return Solved(device, tuple(priors), responding(sets), *mesh, keep=folder / "finer")
 
 
 def _data_sets(

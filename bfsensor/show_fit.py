@@ -79,12 +79,21 @@ def draw_profile(
     error: float,
     name: str,
     ax: Axes,
+    *,
+    bounds: Sequence[tuple[float, float]] = (),
 ) -> None:
-    """Rise of the minimum against one parameter, and the parabola of its error."""
+    """Rise of the minimum against one parameter, the parabola of its error, and intervals.
+
+    Infinite ends of intervals lie at the last point of the profile.
+    """
+    for low, high in bounds:
+        ax.axvspan(
+            max(low, values.min()), min(high, values.max()), color=BLUE, alpha=0.1, lw=0
+        )
     fine = np.linspace(values.min(), values.max(), 100)
-    ax.plot(fine, ((fine - value) / error) ** 2, color=GREY, label="from the tangent")
+    ax.plot(fine, ((fine - value) / error) ** 2, color=GREY, label="of the error")
     ax.plot(values, rise, "o-", ms=3, color=BLUE, label="profile")
-    for level in (1, 4):
+    for level in (1, 3.84):
         ax.axhline(level, color="0.85", lw=0.8, zorder=0)
     ax.set(xlabel=name, ylabel="rise of chi-square and prior", ylim=(-0.2, 9.5))
     ax.legend(frameon=False, fontsize=8)

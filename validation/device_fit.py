@@ -16,13 +16,18 @@ paper does; otherwise as those of a flat of 80,000 e-, which by higher orders of
 Wherever a device is solved, fitted or predicted, a_ij and slopes are those of ``--finer`` cells a
 pixel, derivatives those of ``--cells``.
 
+``--resistivity`` takes the prior of the doping from what the wafers were specified to be
+(``RESISTIVITY``), not from the value of the published simulation.  ``doping FIT...`` gives what
+other priors of the doping would make of finished fits, by the tangent where each ended.
+
 ``wells`` predicts saturation levels with the device that ``seed`` has fitted.
 
 Rows of a run replace those of the same run in ``validation/results/device_fit.ecsv``; fit.json
 and device.toml go to ``--keep``.  Kinds of rows: 'areas' [1/e-], 'slopes' [% for 50,000 e-], 'wells'
 [e-]; 'parameter': measured and error are the prior's, in units of device files;
 'chi2' over the number of values (measured), errors as stated; 'scale' of the errors;
-'combination': after is posterior over prior width.
+'combination': after is posterior over prior width; 'doping' [1e12 cm-3]: measured and error are
+the prior's.
 """
 
 from __future__ import annotations
@@ -41,9 +46,10 @@ from numpy.typing import NDArray
 
 from bfsensor.device import Device
 from bfsensor.fit.data import DataSet, area_data, data_set, select
-from bfsensor.fit.finer import FINER, Finer
+from bfsensor.fit.finer import FINER, REFINE_Z, Finer
 from bfsensor.fit.fit import fit_device
 from bfsensor.fit.linearised import Linearise
+from bfsensor.fit.missed import DRAWS
 from bfsensor.fit.predictors import make_predictors
 from bfsensor.fit.quantities import (
     Prior,
@@ -53,6 +59,7 @@ from bfsensor.fit.quantities import (
     with_priors,
 )
 from bfsensor.fit.result import FitResult
+from bfsensor.fit.solved import Solved
 from bfsensor.fit.ties import name_combination
 from bfsensor.measure.toy_array import close_sum, predict_array
 from bfsensor.recording.exposures import Condition
@@ -70,6 +77,17 @@ GALSIM = {"itl": "lsst_itl_50_32", "e2v": "lsst_e2v_50_32"}
 HELD = ("gates.gate_oxide", "gates.field_oxide")
 """In the E2V device: its oxides are equally thick, and a field oxide cannot be the thinner one, so
 that the fit begins at a kink and at the end of what can be for both."""
+
+RESISTIVITY = "background_doping:-1.7e12 cm-3 +- 0.7e12 cm-3"
+"""Of LSST's sensors: above 5 kOhm cm (Radeka, Sensor Development Program, LSST directors' review,
+SLAC, March 2006), at 470 cm2/V/s fewer than 2.7e12 acceptors a cm3; high-resistivity wafers of
+CCDs reach 10 to 12 kOhm cm (LBNL's, n-type; notes of E. Hoeg, SAG_CUO_57, 1999) and are sold above.
+20 kOhm cm, taken as the end, are 0.66e12: mean and standard deviation of an even distribution
+between the two, 1.68 +- 0.59, and somewhat wider.
+Published simulations of the ITL device have 1.0e12 (Poisson_CCD22 of 2015, data/run1/bf.cfg at -60 V,
++4/-8 V) and 2.4e12 (its successors of 2017 and 2019); neither says from what measurement."""
+
+DOPING = "silicon.background_doping"
 
 SEED_LEVEL = 80_000.0
 SETTINGS = {"A": (-60.0, 4.0, -8.0), "B": (-30.0, 4.0, -8.0), "C": (-60.0, 6.0, -6.0)}
@@ -167,6 +185,10 @@ def main(ctx: click.Context, reference: Path) -> None:
 _CELLS = click.option("--cells", default=16, show_default=True, help="Mesh cells a pixel.")
 _FINER = click.option("--finer", default=FINER, show_default=True,
                       help="Cells a pixel of a_ij and slopes.")  # fmt: skip
+_RESISTIVITY = click.option("--resistivity", is_flag=True,
+                            help="Prior of the doping by the wafers' specification.")  # fmt: skip
+_DRAWS = click.option("--draws", default=DRAWS, show_default=True,
+                      help="Devices drawn from the posterior that are solved.")  # fmt: skip
 _KEEP = click.option("--keep", type=click.Path(path_type=Path), required=True,
                      help="Folder of fit.json and device.toml.")  # fmt: skip
 
@@ -175,14 +197,26 @@ _KEEP = click.option("--keep", type=click.Path(path_type=Path), required=True,
 @click.argument("vendor", type=click.Choice(list(DEVICES)))
 @_CELLS
 @_FINER
+@_DRAWS
+@_RESISTIVITY
 @_KEEP
 @click.pass_obj
-def areas(reference: Path, vendor: str, cells: int, finer: int, keep: Path) -> None:
+def areas(
+    reference: Path,
+    vendor: str,
+    cells: int,
+    finer: int,
+    draws: int,
+    resistivity: bool,
+    keep: Path,
+) -> None:
     """Fit the a_ij of 2019."""
     device = Device.load(DEVICES[vendor])
     out = HELD if vendor == "e2v" else ()
     priors = tuple(
-        p for p in choose_priors(device, ("all", *VOLTAGES)) if p.name not in out
+        p
+        for p in choose_priors(device, ("all", *VOLTAGES, *_doping(resistivity)))
+        if p.name not in out
     )
     device = with_priors(device, priors)
     data = data_set(read_measured(reference / f"{vendor}_covariances_21oct19.csv"))
@@ -190,14 +224,31 @@ def areas(reference: Path, vendor: str, cells: int, finer: int, keep: Path) -> N
     result = fit_device(
         device, [data], priors, None,
         linearise=make_finer(device, priors, (Condition(),), cells, finer, keep),
+        solved=make_solved(device, priors, (Condition(),), finer, keep), draws=draws,
         source=f"bfsensor fit of {data.name}, 24 lags; errors are correlated: fit.json",
     )  # fmt: skip
     seconds = time.process_time() - begin
     _write(result, keep, FITTED[vendor])
     run, galsim = published_areas(reference, vendor)
     rows = rows_of(result, {data.name: run}, {data.name: galsim})
-    append(vendor, rows, **_told(result, seconds))
+    append(vendor + " by resistivity" * resistivity, rows, **_told(result, seconds))
     click.echo(result.said())
+
+
+def _doping(resistivity: bool) -> tuple[str, ...]:
+    """Give what is asked of the doping besides."""
+    return (RESISTIVITY,) if resistivity else ()
+
+
+def make_solved(
+    device: Device,
+    priors: tuple[Prior, ...],
+    at: tuple[Condition, ...],
+    finer: int,
+    keep: Path,
+) -> Solved:
+    """What solves a device on the finer mesh alone."""
+    return Solved(device, priors, at, finer, REFINE_Z, keep / "finer")
 
 
 def make_finer(
@@ -216,16 +267,25 @@ def make_finer(
 @main.command()
 @_CELLS
 @_FINER
+@_DRAWS
+@_RESISTIVITY
 @_KEEP
 @click.option("--slope", is_flag=True, help="Covariance over the level squared is a_ij.")
 @click.option("--every", is_flag=True, help="Fit all settings, predict none.")
 @click.pass_obj
 def seed(
-    reference: Path, cells: int, finer: int, keep: Path, slope: bool, every: bool
+    reference: Path,
+    cells: int,
+    finer: int,
+    draws: int,
+    resistivity: bool,
+    keep: Path,
+    slope: bool,
+    every: bool,
 ) -> None:
     """Fit one ITL device at -60 V, +4/-8 V, and predict the other settings."""
     device = Device.load("itl_sta3800c_60").with_operating_point(gate_high="4 V")
-    priors = choose_priors(device, ("all",))
+    priors = choose_priors(device, ("all", *_doping(resistivity)))
     at = {key: condition_at(key) for key in SETTINGS}
     begin = time.process_time()
     sets, unfitted, less = {}, {}, {}
@@ -240,9 +300,11 @@ def seed(
     result = fit_device(
         device, [one for key in fitted for one in sets[key]], priors, None,
         linearise=make_finer(device, priors, conditions, cells, finer, keep),
+        solved=make_solved(device, priors, conditions, finer, keep), draws=draws,
         source="bfsensor fit of figure 9 of Lage, Bradshaw and Tyson (2017)",
     )  # fmt: skip
     run = "seed" + " as slopes" * slope + " every" * every
+    run += " by resistivity" * resistivity
     _write(result, keep, run.replace(" ", "_"))
     published = {
         one.name: seed_published(reference, one) for s in sets.values() for one in s
@@ -347,6 +409,38 @@ def predicted_rows(
 
 
 @main.command()
+@click.argument("fits", nargs=-1, required=True, type=click.Path(path_type=Path))
+def doping(fits: tuple[Path, ...]) -> None:
+    """Give finished fits other priors of the doping: as fitted, by resistivity, wider, none."""
+    rows = []
+    for path in fits:
+        result = FitResult.read(path)
+        k = result.parameters.index(DOPING)
+        own = float(result.prior[k]), float(result.spread[k])
+        (asked,) = choose_priors(Device.from_toml(result.device), (RESISTIVITY,))
+        for mean, spread in (own, (asked.mean, asked.spread), (own[0], 1.0), (own[0], 1e3)):
+            value, error = with_prior(result, k, mean, spread)
+            rows.append(row(
+                "doping", path.parent.name, measured=mean, error=spread, before=result.value[k],
+                after=value, after_error=error, pull=(value - mean) / spread,
+            ))  # fmt: skip
+            click.echo(rows[-1])
+    append("doping", rows)
+
+
+def with_prior(
+    result: FitResult, k: int, mean: float, spread: float
+) -> tuple[float, float]:
+    """Give one parameter and its error with another prior of its own, by the tangent."""
+    precision = np.linalg.inv(result.covariance)
+    pulled = precision @ result.value
+    precision[k, k] += 1 / spread**2 - 1 / result.spread[k] ** 2
+    pulled[k] += mean / spread**2 - result.prior[k] / result.spread[k] ** 2
+    covariance = np.linalg.inv(precision)
+    return float((covariance @ pulled)[k]), float(np.sqrt(covariance[k, k]))
+
+
+@main.command()
 @_KEEP
 @click.option("--cells", default=8, show_default=True, help="Mesh cells a pixel.")
 @click.pass_obj
@@ -390,6 +484,7 @@ def _told(result: FitResult, seconds: float) -> dict[str, Any]:
     return {
         "cells": mesh["cells"], "finer": mesh["finer"], "finer_over_own": ratios,
         "cpu_s": round(seconds, 1), "notes": list(result.notes),
+        "posterior": {k: v for k, v in result.posterior.items() if k in ("curved", "solved")},
         "ties": list(result.ties), "silent": list(result.silent),
     }  # fmt: skip
 

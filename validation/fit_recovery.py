@@ -4,12 +4,17 @@
 draws true parameters from the priors of a device, gives its a_ij errors like those of a measured
 table (times ``--times``), fits them, and counts how often the truth lies within 1 and 1.96 posterior
 errors.  ``solved``: true a_ij come from full solutions of each drawn device, so that the
-emulator's own error counts; ``emulator``: from the emulator, so that it does not.  ``--misstated 3``
-tells the fit errors wrong by that factor, which the estimated scale has to find.
+emulator's own error counts: what it misses at ``CHECKED`` devices drawn from the priors is then told
+to the fit as an error of its predictions; ``emulator``: from the emulator, so that it does not.
+``--misstated 3`` tells the fit errors wrong by that factor, which the estimated scale has to find.
+``--straight`` takes the tangent of the emulator at the priors for truth and fit: nothing bends.
 
-A row for each parameter, for the combinations that the data measure best and for all together
-replaces those of the same run in ``validation/results/fit_recovery.ecsv``; the parameters that
-are not told apart are in the header.
+Rows 'tangent': errors of a Gaussian of the tangent where the fit ends; 'posterior': those that the
+fit states, of draws.  A row for each parameter, for the combinations that the first mock measures
+best, for the best of each mock's own ('own 1' to 'own 3') and for all parameters together replaces
+those of the same run in ``validation/results/fit_recovery.ecsv``, with Wilson bounds (95 %) of the
+coverage; the parameters that are not told apart are in the header, with the number of mocks whose
+posterior was drawn from.
 """
 
 from __future__ import annotations
@@ -26,10 +31,12 @@ from numpy.typing import NDArray
 
 from bfsensor import Device
 from bfsensor.fit.data import DataSet, area_data
+from bfsensor.fit.missed import Missed
+from bfsensor.fit.posterior import find_posterior
 from bfsensor.fit.predictors import Emulator, make_predictors
 from bfsensor.fit.quantities import Prior, choose_priors, describe, with_priors
 from bfsensor.fit.solve import Problem, solve
-from bfsensor.fit.ties import combinations, find_ties, name_combination
+from bfsensor.fit.ties import find_ties, name_combination, principal
 from bfsensor.recording.area_changes import read_area_changes
 from bfsensor.recording.exposures import Condition
 from validation.write_results import write_results
@@ -42,6 +49,12 @@ VOLTAGES = ("back_bias:5 V", "gate_high:0.5 V", "gate_low:0.5 V")
 
 MEASURED = 0.7
 """Posterior over prior width below which a combination has a row of its own."""
+
+OWN = 3
+"""Best combinations of each mock's own that have rows."""
+
+CHECKED = 12
+"""Devices drawn from the priors at which what the emulator misses is measured."""
 
 PREDICTED = ((0, 0), (1, 0), (0, 1), (1, 1))
 """Lags whose predicted a_ij are held against the true ones; (0, 0) was not fitted."""
@@ -69,6 +82,7 @@ def recover(
     seed: int,
     areas: Areas | None = None,
     misstated: float = 1.0,
+    emulator_misses: NDArray[np.float64] | None = None,
 ) -> tuple[list[dict[str, Any]], Mapping[str, Any]]:
     """Fit mocks of known devices.
 
@@ -89,6 +103,8 @@ def recover(
         and another is drawn.
     misstated : float
         Errors told to the fit over true ones.
+    emulator_misses : ndarray, shape (k, ny, nx), optional
+        What the emulator misses of a_ij [1/e-] over the priors.
 
     Returns
     -------
@@ -104,10 +120,13 @@ def recover(
     spreads = np.array([prior.spread for prior in priors])
     independent = np.ones(errors.shape, bool)
     independent[0, 0] = False
-    pulls, remains, scales, chi2, told = [], [], [], [], {}
+    ways = ("tangent", "posterior")
+    pulls: dict[str, list[NDArray[np.float64]]] = {way: [] for way in ways}
+    remains: dict[str, list[NDArray[np.float64]]] = {way: [] for way in ways}
+    scales, chi2, told = [], [], {}
     directions = None
-    seconds = 0.0
-    while len(pulls) < mocks:
+    seconds, drawn = 0.0, 0
+    while len(scales) < mocks:
         truth = draw_truth(priors, rng)
         try:
             true = (
@@ -118,45 +137,71 @@ def recover(
         except ValueError:
             continue
         ny, nx = errors.shape
-        drawn = true[:ny, :nx] + errors * rng.standard_normal(errors.shape)
-        data = area_data("mock", drawn, misstated * errors, independent=independent)
+        noisy = true[:ny, :nx] + errors * rng.standard_normal(errors.shape)
+        data = area_data("mock", noisy, misstated * errors, independent=independent)
         begin = time.process_time()
-        found = solve(_problem(data, emulator, priors))
+        problem = _problem(data, emulator, priors)
+        tangent = solve(problem)
+        missed = None
+        if emulator_misses is not None:
+            i, j = data.places.T
+            missed = Missed(
+                np.zeros((len(emulator_misses), len(priors))), (emulator_misses[:, j, i],)
+            )
+        posterior = find_posterior(problem, tangent, None, missed=missed)
+        found, drawn = posterior.solution, drawn + ("draws" in posterior.record)
         seconds += time.process_time() - begin
-        off, error = found.values - truth, np.sqrt(np.diag(found.covariance))
         if directions is None:
-            ties, silent = find_ties(names, found.sensitivity)
+            ties, silent = find_ties(names, tangent.sensitivity)
             told = {"ties": list(ties), "silent": [describe(n) for n in silent]}
-            known = combinations(found.sensitivity)
-            directions = np.array([one.weights for one in known if one.remains < MEASURED])
+            scaled = tangent.covariance / np.outer(spreads, spreads)
+            directions = np.array(
+                [one.weights for one in principal(scaled) if one.remains < MEASURED]
+            )
             labels = [name_combination(names, weights) for weights in directions]
-        # Combinations of the first mock's tangent, of parameters in units of their priors.
-        along = directions @ (off / spreads)
-        scaled = found.covariance / np.outer(spreads, spreads)
-        width = np.sqrt(np.einsum("cp,pq,cq->c", directions, scaled, directions))
-        told_areas, told_errors = _predicted(emulator, found.values, found.covariance)
-        missed = (told_areas - np.array([true[j, i] for i, j in PREDICTED])) / told_errors
-        pulls.append(np.concatenate([off / error, along / width, missed]))
-        remains.append(np.concatenate([error / spreads, width, told_errors / told_areas]))
-        scales.append(float(found.scales[0]))
-        chi2.append(float(found.chi2[0]) / len(data.values))
-    every, count = np.array(pulls), len(priors)
-    rows = []
-    kinds = ["parameter"] * count + ["combination"] * len(labels) + ["prediction"] * 4
-    called = [*map(describe, names), *labels, *(f"a at {lag}" for lag in PREDICTED)]
-    for n, (name, kind) in enumerate(zip(called, kinds, strict=True)):
-        rows.append(_row(name, kind, every[:, n]))
-        rows[-1]["remains"] = round(float(np.mean(np.array(remains)[:, n])), 3)
-    # Parameters of one mock share its noise: the mocks count, not the pulls.
-    rows.append(_row("all parameters", "all", every[:, :count]))
-    rows[-1]["remains"] = round(float(np.mean(np.array(remains)[:, :count])), 3)
+        off = (tangent.values - truth) / spreads
+        for way, solution in zip(ways, (tangent, found), strict=True):
+            scaled = solution.covariance / np.outer(spreads, spreads)
+            error = np.sqrt(np.diag(scaled))
+            own = np.array([one.weights for one in principal(scaled)[:OWN]])
+            # Combinations of parameters in units of their priors.
+            along = np.concatenate([directions, own])
+            width = np.sqrt(np.einsum("cp,pq,cq->c", along, scaled, along))
+            pulls[way].append(np.concatenate([off / error, along @ off / width]))
+            remains[way].append(np.concatenate([error, width]))
+        # What the fit predicts is as the tangent has it: held against the true ones there.
+        told_areas, told_errors = _predicted(emulator, tangent.values, tangent.covariance)
+        missed_areas = (
+            told_areas - np.array([true[j, i] for i, j in PREDICTED])
+        ) / told_errors
+        pulls["tangent"][-1] = np.append(pulls["tangent"][-1], missed_areas)
+        remains["tangent"][-1] = np.append(
+            remains["tangent"][-1], np.abs(told_errors / told_areas)
+        )
+        scales.append(float(tangent.scales[0]))
+        chi2.append(float(tangent.chi2[0]) / len(data.values))
+    count, rows = len(priors), []
+    kinds = ["parameter"] * count + ["combination"] * len(labels) + ["own"] * OWN
+    called = [*map(describe, names), *labels, *(f"own {n + 1}" for n in range(OWN))]
+    for way in ways:
+        every, left = np.array(pulls[way]), np.array(remains[way])
+        more = len(every[0]) - len(called)
+        predicted = [f"a at {lag}" for lag in PREDICTED][:more]
+        for n, (name, kind) in enumerate(
+            zip([*called, *predicted], [*kinds, *["prediction"] * more], strict=True)
+        ):
+            rows.append({"way": way} | _row(name, kind, every[:, n]))
+            rows[-1]["remains"] = round(float(np.mean(left[:, n])), 3)
+        # Parameters of one mock share its noise: the mocks count, not the pulls.
+        rows.append({"way": way} | _row("all parameters", "all", every[:, :count]))
+        rows[-1]["remains"] = round(float(np.mean(left[:, :count])), 3)
     for row in rows:
         row |= {
             "mocks": mocks, "scale": round(float(np.mean(scales)), 3),
             "scale_scatter": round(float(np.std(scales)), 3),
             "chi2_per_n": round(float(np.mean(chi2)), 3),
         }  # fmt: skip
-    return rows, told | {"cpu_s_a_fit": round(seconds / mocks, 3)}
+    return rows, told | {"cpu_s_a_fit": round(seconds / mocks, 3), "drawn": drawn}
 
 
 def _predicted(
@@ -192,7 +237,36 @@ def _row(name: str, kind: str, pulls: NDArray[np.float64]) -> dict[str, Any]:
         "pull_rms": round(float(np.sqrt(np.mean(by_mock**2))), 3),
         "within_68": one[0], "within_68_error": one[1],
         "within_95": two[0], "within_95_error": two[1],
+    } | {
+        f"within_{share}_{end}": bound
+        for share, part in (("68", one[0]), ("95", two[0]))
+        for end, bound in zip(("low", "high"), wilson(part, len(by_mock)), strict=True)
     }  # fmt: skip
+
+
+def wilson(part: float, count: int, z: float = 1.96) -> tuple[float, float]:
+    """Bounds of a share that was counted among independent trials (Wilson 1927)."""
+    middle = (part + z**2 / (2 * count)) / (1 + z**2 / count)
+    half = (
+        z / (1 + z**2 / count) * np.sqrt(part * (1 - part) / count + (z / (2 * count)) ** 2)
+    )
+    return round(float(middle - half), 3), round(float(middle + half), 3)
+
+
+def measure_misses(
+    emulator: Emulator, priors: Sequence[Prior], areas: Areas, seed: int
+) -> NDArray[np.float64]:
+    """What an emulator misses of a_ij [1/e-] at devices drawn from the priors, (k, ny, nx)."""
+    rng, out = np.random.default_rng(seed), []
+    while len(out) < CHECKED:
+        values = draw_truth(priors, rng)
+        try:
+            solved = areas(values)
+        except ValueError:
+            continue
+        found = np.asarray(emulator.predict(values, Condition()).areas)
+        out.append(solved[: len(found), : len(found)] - found)
+    return np.array(out)
 
 
 def main() -> None:
@@ -205,21 +279,33 @@ def main() -> None:
     parser.add_argument("--misstated", type=float, default=1.0)
     parser.add_argument("--mocks", type=int, default=50)
     parser.add_argument("--truth", choices=("emulator", "solved"), default="emulator")
+    parser.add_argument("--straight", action="store_true")
+    parser.add_argument(
+        "--held", nargs="*", default=[], help="names that are not free after all"
+    )
     parser.add_argument("--free", nargs="+", default=["all", *VOLTAGES])
     parser.add_argument("--cells", type=int, default=8)
     parser.add_argument("--seed", type=int, default=7301)
     parser.add_argument("--keep", type=Path, help="folder of the emulator's solves")
+    parser.add_argument("--emulator", type=Path, help="file of one, in place of solves")
     options = parser.parse_args()
     from bfsensor.fit.emulator import DeviceEmulator
+    from bfsensor.fit.linearised import LinearEmulator, LinearResponse
 
     device = Device.load(options.device)
-    priors = choose_priors(device, tuple(options.free))
+    priors = tuple(
+        p for p in choose_priors(device, tuple(options.free)) if p.name not in options.held
+    )
     device = with_priors(device, priors)
     begin = time.process_time()
-    emulator = DeviceEmulator.build(
-        device, [prior.name for prior in priors], conditions=(Condition(),),
-        cells=options.cells, keep=options.keep,
-    )  # fmt: skip
+    emulator: Emulator
+    if options.emulator is not None:
+        emulator = DeviceEmulator.read(options.emulator, device=device)
+    else:
+        emulator = DeviceEmulator.build(
+            device, [prior.name for prior in priors], conditions=(Condition(),),
+            cells=options.cells, keep=options.keep,
+        )  # fmt: skip
     built = time.process_time() - begin
     errors = (
         options.times * read_area_changes(options.errors).errors[: LAGS + 1, : LAGS + 1]
@@ -228,14 +314,23 @@ def main() -> None:
         None if options.truth == "emulator" else solved_areas(device, priors, options.cells)
     )
     begin = time.process_time()
+    misses = (
+        None if areas is None else measure_misses(emulator, priors, areas, options.seed + 1)
+    )
+    if options.straight:
+        means = np.array([prior.mean for prior in priors])
+        at = emulator.predict(means, Condition())
+        here = LinearResponse(at.kx, at.ky, at.dkx, at.dky)
+        emulator = LinearEmulator(emulator.parameters, means, {Condition(): here})
     rows, told = recover(
         emulator, priors, errors, mocks=options.mocks, seed=options.seed, areas=areas,
-        misstated=options.misstated,
+        misstated=options.misstated, emulator_misses=misses,
     )  # fmt: skip
     run = {
         "device": options.device, "errors": options.errors.stem, "times": options.times,
         "misstated": options.misstated, "free": " ".join(options.free),
-        "truth": options.truth, "cells": options.cells, "seed": options.seed,
+        "truth": "straight" if options.straight else options.truth,
+        "cells": options.cells, "seed": options.seed,
     }  # fmt: skip
     cost = {
         "cpu_s_build": round(built, 1),

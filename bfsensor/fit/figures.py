@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from bfsensor import show_fit
 from bfsensor.device import Device
+from bfsensor.fit.profiles import LEVELS, profile_bounds
 from bfsensor.fit.quantities import Quantity, describe, quantities
 from bfsensor.fit.result import FitResult
 from bfsensor.show_style import new_figure
@@ -59,5 +60,6 @@ def figure_for_fit(result: FitResult) -> Figure:
             show_fit.draw_profile(
                 values, rise, float(result.value[k]), float(result.error[k]), label,
                 figure.add_subplot(bottom[n]),
+                bounds=[profile_bounds(values, rise, one) for one in LEVELS.values()],
             )  # fmt: skip
     return figure

@@ -19,13 +19,12 @@ from numpy.typing import NDArray
 import bfsensor
 from bfsensor.device import Device
 from bfsensor.errors import FitError
-from bfsensor.fit.changing import device_at
-from bfsensor.fit.emulator_nodes import Node, solve_nodes
 from bfsensor.fit.linearised import LinearResponse
 from bfsensor.fit.predictors import Emulator
 from bfsensor.fit.quantities import Prior
+from bfsensor.fit.solved import Shifts, solve_shifts
 from bfsensor.recording.exposures import Condition
-from bfsensor.response import LEVEL, mixed, response_depths
+from bfsensor.response import LEVEL
 
 FINER = 48
 """Cells a pixel of the finer mesh: at the nearest lags within 0.6 % (ITL) and 1.1 % (E2V) of 64,
@@ -36,8 +35,6 @@ REFINE_Z = 0
 what it does to derivatives does not matter here."""
 
 Values = NDArray[np.float64]
-Shifts = tuple[Values, Values]
-"""Of right and of upper edges [pixel/e-]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,28 +120,11 @@ class Finer:
         return FinerEmulator(emulator, added)
 
     def _solved(self, values: Values) -> dict[Condition, Shifts]:
-        """Shifts on the finer mesh; conditions that differ in wavelength share a solution."""
-        devices: dict[Condition, tuple[Device, str]] = {}
-        nodes: dict[str, Node] = {}
-        for condition in dict.fromkeys(self.conditions):
-            here = device_at(self.device, condition, self.priors, values)
-            node = Node(
-                here.physics, device_at(self.device, condition).physics, LEVEL, self.cells,
-                REFINE_Z, (), (), (len(nodes), -1, 0),
-            )  # fmt: skip
-            devices[condition] = here, node.key
-            nodes.setdefault(node.key, node)
-        found = solve_nodes(
-            list(nodes.values()), keep=self.keep, progress=self.progress, executor=None
-        )
-        out = {}
-        for condition, (here, key) in devices.items():
-            kx, ky = found[nodes[key].at][0]
-            out[condition] = mixed(
-                kx, ky, np.array(response_depths(here)), condition.wavelength,
-                here.operating_point.temperature,
-            )  # fmt: skip
-        return out
+        """Shifts on the finer mesh."""
+        return solve_shifts(
+            self.device, self.priors, values, self.conditions, cells=self.cells,
+            refine_z=REFINE_Z, keep=self.keep, progress=self.progress,
+        )  # fmt: skip
 
     def record(self, values: Values) -> dict[str, Any]:
         """Give what is to be kept with a fit that ended at these values: meshes and ratios.

@@ -12,11 +12,13 @@ from bfsensor.errors import BFSensorError, FitError
 from bfsensor.fit.changing import fitted_device
 from bfsensor.fit.data import UNITS, DataSet
 from bfsensor.fit.finer import Finer, say
+from bfsensor.fit.missed import DRAWS
+from bfsensor.fit.posterior import find_posterior
 from bfsensor.fit.predictors import Emulator, Prediction, Tangents, make_predictors
 from bfsensor.fit.quantities import DIFFUSION, Prior
 from bfsensor.fit.result import FitResult, FittedSet
 from bfsensor.fit.solve import FEWEST, Problem, Solution, profile, solve
-from bfsensor.fit.ties import combinations, find_ties
+from bfsensor.fit.ties import find_ties, principal
 
 FAR = 3.0
 """Spreads of its prior from which a fitted parameter is remarked upon."""
@@ -40,6 +42,9 @@ def fit_device(
     *,
     linearise: Callable[[Values], Emulator] | None = None,
     tangents: Mapping[str, Tangents] | None = None,
+    solved: Callable[[Values], Emulator] | None = None,
+    draws: int = DRAWS,
+    progress: Callable[[int, int], None] | None = None,
     profiles: Sequence[str] = (),
     source: str = "fitted by bfsensor",
     notes: Sequence[str] = (),
@@ -63,6 +68,14 @@ def fit_device(
     tangents : mapping, optional
         What predicts saturation and diffusion
         (:func:`~bfsensor.fit.tangents.make_tangents`).
+    solved : callable, optional
+        What solves the device at values of all free parameters without derivatives
+        (:class:`~bfsensor.fit.solved.Solved`): what predictions miss over the posterior then counts
+        in its errors (:mod:`bfsensor.fit.missed`); by default a note says that it does not.
+    draws : int
+        From the posterior, at which the device is solved.
+    progress : callable, optional
+        Called with (solved, draws).
     profiles : sequence of str
         Parameters whose profile likelihood is wanted.
     source : str
@@ -97,9 +110,16 @@ def fit_device(
         before, found = problem.predict(problem.means), solve(problem)
     else:
         problem, found, before, settling = _settle(problem, linearise)
+    tangent = found
+    asked = solved is not None and {"areas", "slopes"} & {data.kind for data in sets}
+    posterior = find_posterior(
+        problem, found, _exact(problem, solved) if solved is not None and asked else None,
+        draws=draws, progress=progress,
+    )  # fmt: skip
+    found = posterior.solution
     names = tuple(prior.name for prior in priors)
     ties, silent = find_ties(names, found.sensitivity)
-    known = combinations(found.sensitivity)
+    known = principal(found.covariance / np.outer(problem.spreads, problem.spreads))
     mesh = linearise.record(found.values) if isinstance(linearise, Finer) else {}
     result = FitResult(
         device=device.to_toml(),
@@ -107,15 +127,24 @@ def fit_device(
             device, priors, found.values, np.sqrt(np.diag(found.covariance)), source
         ).to_toml(),
         parameters=names, prior=problem.means, spread=problem.spreads, value=found.values,
-        covariance=found.covariance, sets=_sets(problem, found, before),
+        covariance=found.covariance, sets=_sets(problem, found, before, posterior.left),
         remains=np.array([one.remains for one in known]),
         weights=np.array([one.weights for one in known]),
         ties=ties, silent=silent,
-        profiles={name: profile(problem, found, name) for name in profiles}, mesh=mesh,
+        profiles={name: profile(problem, tangent, name) for name in profiles}, mesh=mesh,
+        posterior=posterior.record,
     )  # fmt: skip
     told = [
         *(note for data in sets for note in data.notes),
         *_remarks(result, priors),
+        posterior.words,
+        *(
+            [
+                "profiles are those of predictions straight in the parameters: parabolas within bounds"
+            ]
+            if profiles and not posterior.record["curved"]
+            else []
+        ),
         *settling,
         *([say(mesh)] if mesh else []),
         *notes,
@@ -181,6 +210,15 @@ def _objective(problem: Problem, values: Values, scales: Values) -> float:
     return total
 
 
+def _exact(
+    problem: Problem, solved: Callable[[Values], Emulator]
+) -> Callable[[Values], list[Values]]:
+    """Predictions of all sets from a solution at the values."""
+    return lambda values: [
+        value for value, _ in _with_emulator(problem, solved(values)).predict(values)
+    ]
+
+
 def _with_emulator(problem: Problem, emulator: Emulator) -> Problem:
     """Give the problem with areas and slopes of another emulator."""
     predictors = tuple(
@@ -193,21 +231,23 @@ def _with_emulator(problem: Problem, emulator: Emulator) -> Problem:
 
 
 def _sets(
-    problem: Problem, found: Solution, before: Sequence[Prediction]
+    problem: Problem,
+    found: Solution,
+    before: Sequence[Prediction],
+    left: Sequence[Values],
 ) -> tuple[FittedSet, ...]:
     """Data beside what is predicted before and after."""
     after = problem.predict(found.values)
     out = []
     for k, data in enumerate(problem.sets):
-        value, slope = after[k]
-        open_ = np.einsum("np,pq,nq->n", slope, found.covariance, slope)
+        value = after[k][0]
         dof = len(data.values) - found.determined[k]
         estimated = data.fitted and data.scaled and dof >= FEWEST
         scale = float(found.scales[k])
         first = before[k][0]
         out.append(FittedSet(
             data.name, data.kind, UNITS[data.kind], data.fitted, data.labels, data.places,
-            data.values, data.errors, first, value, np.sqrt(np.maximum(open_, 0.0)),
+            data.values, data.errors, first, value, left[k],
             float(found.chi2[k]), float(np.sum(((first - data.values) / data.errors) ** 2)),
             scale, scale / np.sqrt(2 * dof) if estimated else np.nan,
             float(found.determined[k]),

@@ -142,7 +142,8 @@ def choose_priors(
         Values are means, uncertainties spreads.
     asked : tuple of str
         Names, dotted or the end of one where that is unique, each with a spread of its own after
-        a colon, such as ``'back_bias:5 V'``; 'all' for all with an uncertainty, except
+        a colon, such as ``'back_bias:5 V'``, or mean and spread, such as
+        ``'background_doping:-1.7e12 cm-3 +- 0.7e12 cm-3'``; 'all' for all with an uncertainty, except
         ``well.spill_barrier``, which only saturation sees.  None: those whose origin is 'guessed'.
     more : tuple of str
         Free besides, if the device states an uncertainty.
@@ -159,6 +160,8 @@ def choose_priors(
     ['operating_point.hole_quasi_fermi_level']
     >>> choose_priors(device, ("back_bias:5 V",))[0].spread
     5.0
+    >>> choose_priors(device, ("thickness:98 um +- 2 um",))[0].mean
+    98.0
     """
     known = quantities(device)
     spreads = {
@@ -167,6 +170,7 @@ def choose_priors(
         if known_of.uncertainty
     }
     chosen: dict[str, float] = {}
+    means: dict[str, float] = {}
     for text in asked:
         name, _, spread = text.partition(":")
         if name == "all":
@@ -175,7 +179,10 @@ def choose_priors(
         key = name if name == DIFFUSION else _resolve(name, known)
         if spread:
             kind = "number" if key == DIFFUSION else known[key].kind
+            mean, sign, width = spread.partition("+-")
             try:
+                if sign:
+                    means[key], spread = to_internal(mean.strip(), kind), width.strip()
                 chosen[key] = abs(to_internal(spread, kind))
             except DeviceError as error:
                 raise FitError(f"--free {text}: {error}") from None
@@ -203,9 +210,11 @@ def choose_priors(
             f"all, or {', '.join(spreads)}"
         )
     return tuple(
-        Prior(DIFFUSION, 1.0, spread, 0.0)
+        Prior(DIFFUSION, means.get(key, 1.0), spread, 0.0)
         if key == DIFFUSION
-        else Prior(key, known[key].value, spread, known[key].low, known[key].high)
+        else Prior(
+            key, means.get(key, known[key].value), spread, known[key].low, known[key].high
+        )
         for key, spread in chosen.items()
     )
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from bfsensor.device import Device
 from bfsensor.errors import FitError
 from bfsensor.files import written_whole
+from bfsensor.fit.profiles import LEVELS, profile_bounds
 from bfsensor.fit.quantities import DIFFUSION, Quantity, describe, quantities
 from bfsensor.fit.ties import name_combination
 
@@ -44,7 +45,8 @@ class FittedSet:
     values, errors : ndarray, shape (n,)
         As measured, errors as stated.
     before, after : ndarray, shape (n,)
-        Of the device as its file says, and as fitted.
+        At the means of the priors, which are the values of the device file unless others were
+        stated, and as fitted.
     after_error : ndarray, shape (n,)
         What the parameters' posterior leaves open of the prediction.
     chi2, chi2_before : float
@@ -99,7 +101,7 @@ class FitResult:
     value : ndarray, shape (p,)
         Where the posterior is largest [internal units].
     covariance : ndarray, shape (p, p)
-        Posterior, of the tangent there.
+        Posterior, second moments about the values.
     sets : tuple of FittedSet
         The data.
     remains : ndarray, shape (p,)
@@ -115,6 +117,10 @@ class FitResult:
     mesh : mapping
         Of a fit carried to a finer mesh: cells a pixel of both, ratios of their a_ij by condition
         ([j, i]) where the fit ends and at the priors, solutions made, version; else empty.
+    posterior : mapping
+        How the errors were found: errors of the tangent alone; devices drawn and solved, and rms of
+        what predictions of each set miss there; where predictions bend, number, mean and central
+        intervals of the draws.
     """
 
     device: str
@@ -132,6 +138,7 @@ class FitResult:
     profiles: Mapping[str, tuple[Values, Values]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     mesh: Mapping[str, Any] = field(default_factory=dict)
+    posterior: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def error(self) -> Values:
@@ -153,6 +160,17 @@ class FitResult:
         """How many numbers were fitted."""
         return sum(len(one.values) for one in self.sets if one.fitted)
 
+    def bounds(self) -> dict[str, dict[str, list[float | None]]]:
+        """68 and 95 % bounds of the profiles [internal units]; None where they do not rise."""
+        return {
+            name: {
+                share: [end if np.isfinite(end) else None for end in found]
+                for share, level in LEVELS.items()
+                for found in [profile_bounds(values, rise, level)]
+            }
+            for name, (values, rise) in self.profiles.items()
+        }
+
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, FitResult):
             return NotImplemented
@@ -171,6 +189,7 @@ class FitResult:
                     for one in value
                 ]
             elif spec.name == "profiles":
+                out["profile_bounds"] = _plain(self.bounds())
                 value = {k: [_plain(a) for a in both] for k, both in value.items()}
             out[spec.name] = _plain(value)
         return out
@@ -192,7 +211,9 @@ class FitResult:
         if found != SCHEMA:
             raise FitError(f"{path}: its schema is {found!r}, not {SCHEMA!r}")
         try:
-            data.setdefault("mesh", {})  # before fits were carried to finer meshes
+            # Fits written before they were carried to finer meshes, and drawn from.
+            for later in ("mesh", "posterior"):
+                data.setdefault(later, {})
             fields = {spec.name: data[spec.name] for spec in dataclasses.fields(cls)}
             fields["sets"] = tuple(FittedSet(**_arrays(one)) for one in fields["sets"])
             fields["profiles"] = {
@@ -230,12 +251,31 @@ class FitResult:
             for row in rows
         ]
 
+    def _profile_lines(self) -> list[str]:
+        """Bounds of each profile beside those of its error."""
+        known, out = quantities(Device.from_toml(self.device)), []
+        for name, both in self.bounds().items():
+            k = self.parameters.index(name)
+            unit = known.get(name, Quantity(1.0, "number", "", 0.0, np.inf))
+            parts = []
+            for share, ends in both.items():
+                reach = np.sqrt(LEVELS[share]) * self.error[k]
+                plain = [self.value[k] - reach, self.value[k] + reach]
+                words = ["open" if end is None else unit.text(end) for end in ends]
+                parts.append(
+                    f"{share} {words[0]} to {words[1]} "
+                    f"(+-: {unit.text(plain[0])} to {unit.text(plain[1])})"
+                )
+            out.append(f"profile of {describe(name)}: {'; '.join(parts)}")
+        return out
+
     def _told(self) -> list[str]:
         out = [
             f"measured to {part:.2f} of its prior: {name_combination(self.parameters, weights)}"
             for part, weights in zip(self.remains, self.weights, strict=True)
             if part < WELL_KNOWN and len(self.parameters) > 1
         ]
+        out += self._profile_lines()
         out += [f"not told apart: {tie}" for tie in self.ties]
         if self.silent:
             out.append(

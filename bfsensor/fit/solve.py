@@ -231,14 +231,20 @@ def _minimise(
     )  # fmt: skip
 
 
-def _pairs(problem: Problem) -> list[tuple[int, int]]:
+def ordered_pairs(problem: Problem) -> list[tuple[int, int]]:
+    """Numbers of parameters of which the first is not above the second in any device."""
     names = [prior.name for prior in problem.priors]
     return [(names.index(a), names.index(b)) for a, b in ORDERED if {a, b} <= set(names)]
 
 
+def out_of_order(problem: Problem, values: Values) -> bool:
+    """Whether a pair is the wrong way round, such as a gate oxide above the field oxide."""
+    return any(values[low] > values[high] for low, high in ordered_pairs(problem))
+
+
 def _disorder(problem: Problem, values: Values) -> tuple[Values, Values]:
     """Residuals of pairs that are the wrong way round, and their slopes in spreads."""
-    pairs, spreads = _pairs(problem), problem.spreads
+    pairs, spreads = ordered_pairs(problem), problem.spreads
     out, slopes = np.zeros(len(pairs)), np.zeros((len(pairs), len(values)))
     for row, (low, high) in enumerate(pairs):
         unit = spreads[low] / STEEP
@@ -251,7 +257,7 @@ def _disorder(problem: Problem, values: Values) -> tuple[Values, Values]:
 def _ordered(problem: Problem, values: Values) -> Values:
     """Copy in which pairs that are a hair the wrong way round are equal."""
     out = np.array(values)
-    for low, high in _pairs(problem):
+    for low, high in ordered_pairs(problem):
         out[low] = min(out[low], out[high])
     return out
 
@@ -278,9 +284,10 @@ def profile(
     name : str
         Of the parameter.
     points : int
-        Odd; the middle one is the solution.
+        Odd; the middle one is the solution.  More where the minimum rises less than a parabola.
     reach : float
-        To either side [posterior error], as far as bounds allow.
+        To either side [posterior error]: until the minimum lies its square higher, as far as bounds
+        allow, which are the last points then, but at most three times as far.
 
     Returns
     -------
@@ -296,18 +303,21 @@ def profile(
     if name not in names:
         raise FitError(f"{name} is not free; free are {', '.join(names)}")
     k = names.index(name)
-    error = float(np.sqrt(solution.covariance[k, k]))
-    grid = solution.values[k] + reach * error * np.linspace(-1, 1, points)
-    prior = problem.priors[k]
-    grid = grid[(grid >= prior.low) & (grid <= prior.high)]
-    totals = np.zeros(len(grid))
+    step = reach * float(np.sqrt(solution.covariance[k, k])) / (points // 2)
+    prior, best = problem.priors[k], float(solution.values[k])
+    found = {best: 0.0}
     # Outwards from the solution, each from where the last one ended.
-    for side in (np.flatnonzero(grid >= solution.values[k]),
-                 np.flatnonzero(grid < solution.values[k])[::-1]):  # fmt: skip
+    for side, end in ((1, prior.high), (-1, prior.low)):
         start = solution.values
-        for n in side:
-            found = solve(
-                problem, fixed=(k, float(grid[n])), scales=solution.scales, start=start
-            )
-            totals[n], start = found.total, found.values
-    return grid, totals - solution.total
+        for n in range(1, 3 * (points // 2) + 1):
+            value = best + side * n * step
+            last = side * (value - end) >= 0
+            value = end if last else value
+            if value in found:
+                break
+            there = solve(problem, fixed=(k, value), scales=solution.scales, start=start)
+            found[value], start = there.total - solution.total, there.values
+            if last or (n >= points // 2 and found[value] >= reach**2 - 1e-3):
+                break
+    values = np.array(sorted(found))
+    return values, np.array([found[value] for value in values])

@@ -54,6 +54,27 @@ def combinations(sensitivity: NDArray[np.float64]) -> tuple[Combination, ...]:
     return tuple(out)
 
 
+def principal(covariance: NDArray[np.float64]) -> tuple[Combination, ...]:
+    """Combinations whose errors are independent, the best known first.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (p, p)
+        Of the posterior, in units of the priors.
+
+    Examples
+    --------
+    >>> [round(one.remains, 3) for one in principal(np.diag([1.0, 0.04]))]
+    [0.2, 1.0]
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    out = []
+    for value, vector in zip(values, vectors.T, strict=True):
+        sign = np.sign(vector[np.argmax(np.abs(vector))])
+        out.append(Combination(float(np.sqrt(max(value, 0.0))), sign * vector))
+    return tuple(out)
+
+
 def name_combination(names: Sequence[str], weights: NDArray[np.float64]) -> str:
     """Name a combination by its larger parts.
 

@@ -7,6 +7,7 @@ from bfsensor import Device
 from bfsensor.build import build_table
 from bfsensor.errors import FitError
 from bfsensor.fit import finer
+from bfsensor.fit import solved as solving
 from bfsensor.fit.data import area_data
 from bfsensor.fit.finer import Finer
 from bfsensor.fit.fit import fit_device
@@ -50,11 +51,19 @@ def test_a_fit_ends_at_the_device_and_the_table_of_the_finer_mesh(tmp_path, kept
     x, y = make_finer(kept)._solved(truth)[HERE]
     areas = area_matrix(x, y)[5:-1, 5:-1]
     data = area_data("mock", areas, np.full(areas.shape, 0.002 * areas[0, 1]), scaled=False)
-    found = fit_device(DEVICE, [data], FREE, None, linearise=make_finer(kept))
+    exact = solving.Solved(DEVICE, FREE, (HERE,), 16, finer.REFINE_Z, kept)
+    there = exact(truth).predict(np.zeros(0), HERE)
+    np.testing.assert_array_equal(there.areas, areas)
+    found = fit_device(
+        DEVICE, [data], FREE, None, linearise=make_finer(kept), solved=exact, draws=2
+    )
     # Noiseless and measured far better than the priors: with the coarse mesh's own a_ij the first
     # pull is -1.6, and chi2 2700.
     np.testing.assert_allclose(found.pulls, 0.7, atol=0.01)
     assert found.chi2 < 0.1
+    # Derivatives of 8 cells hardly miss over what 0.2 % of a_01 leave open.
+    assert found.posterior["solved"] == 2 and not found.posterior["curved"]
+    assert 0 < np.max(found.posterior["rms"]["mock"]) < 0.002 * areas[0, 1]
     table = table_areas(Device.from_toml(found.fitted_device))
     ratio = np.array(found.mesh["ratios"][0]["finer_over_own"])
     for (i, j), value in zip(data.places, found.sets[0].after, strict=True):
@@ -81,8 +90,8 @@ def test_values_are_the_finer_mesh_s_and_solved_once(kept, monkeypatch):
         solved.append(len(nodes))
         return nodes_solver(nodes, **more)
 
-    nodes_solver = finer.solve_nodes
-    monkeypatch.setattr(finer, "solve_nodes", solve_nodes)
+    nodes_solver = solving.solve_nodes
+    monkeypatch.setattr(solving, "solve_nodes", solve_nodes)
     both = make_finer(kept, (HERE, RED), FREE[:1])
     carried = both(means)
     coarse = carried.emulator

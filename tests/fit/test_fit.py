@@ -102,12 +102,19 @@ def test_priors_by_name():
     (doping,) = choose_priors(DEVICE, ("background_doping:1e11 cm-3",))
     assert doping.spread == pytest.approx(0.1)
     assert (doping.low, doping.high) == (-1e6, 0.0)
+    (other,) = choose_priors(DEVICE, ("background_doping:-1.7e12 cm-3+-7e11 cm-3",))
+    assert (other.mean, other.spread) == pytest.approx((-1.7, 0.7))
     known = with_priors(DEVICE, (doping,)).provenance["silicon.background_doping"]
     assert known.uncertainty == pytest.approx(0.1) and known.origin == "published"
     for asked, message in (
         (("dose",), "no quantity 'dose' in the device; did you mean channel"),
         (("thicknes",), "did you mean silicon.thickness"),
         (("gate_high",), "states no uncertainty of operating_point.gate_high: give one"),
+        (("thickness:5 V +- 1 um",), "--free thickness:5 V .. 1 um: '5 V' is not a length"),
+        (
+            ("background_doping:1e12 cm-3+-1e11 cm-3",),
+            "background_doping: 1 lies outside -1e",
+        ),
         (("thickness:5 V",), "--free thickness:5 V: '5 V' is not a length"),
         (("thickness:0 um",), "spread of the prior 0.0 must be above 0"),
     ):
@@ -204,3 +211,39 @@ def test_a_step_to_where_there_is_no_device_is_halved():
 
     with pytest.raises(FitError, match="leads to where the device has no solution"):
         fit_device(DEVICE, [data], PRIORS, None, linearise=nowhere)
+
+
+def test_profiles_are_told_with_their_bounds_beside_those_of_the_error():
+    result = run(profiles=["silicon.thickness"])
+    found = result.bounds()["silicon.thickness"]
+    for share, reach in (("68 %", 1.0), ("95 %", np.sqrt(3.84))):
+        wanted = result.value[0] + reach * result.error[0] * np.array([-1, 1])
+        np.testing.assert_allclose(found[share], wanted, rtol=1e-4)
+    assert result.to_dict()["profile_bounds"] == {"silicon.thickness": found}
+    (line,) = [one for one in result.said().splitlines() if one.startswith("profile of")]
+    assert line.startswith("profile of thickness: 68 % ") and "open" not in line
+
+
+def test_devices_drawn_from_the_posterior_widen_it():
+    emulator, asked = toy_emulator(), []
+
+    def solved(values):
+        """The toy with a_ij that bend with the thickness, which its tangent does not know."""
+        asked.append(values)
+        bend = 0.02 * ((values[0] - MEANS[0]) / SPREADS[0]) ** 2
+        return replace(emulator, edges=tuple((1 + bend) * e for e in emulator.edges))
+
+    plain = run()
+    assert plain.posterior["curved"] is False and "solved" not in plain.posterior
+    assert any("do not hold what predictions miss" in note for note in plain.notes)
+    wide = run(solved=solved, draws=9)
+    assert len(asked) == 9 and wide.posterior["solved"] == 9
+    np.testing.assert_array_equal(wide.value, plain.value)
+    assert np.all(wide.error >= plain.error) and wide.error[1] > 1.02 * plain.error[1]
+    np.testing.assert_allclose(wide.posterior["tangent_error"], plain.error)
+    assert wide.remains[0] > 1.02 * plain.remains[0]
+    same = run(solved=lambda values: emulator)
+    np.testing.assert_allclose(same.covariance, plain.covariance, rtol=1e-8)
+    np.testing.assert_allclose(
+        same.sets[1].after_error, plain.sets[1].after_error, rtol=1e-6
+    )
