@@ -48,6 +48,21 @@ def _piled(counts: NDArray[np.int64], width: float) -> bool:
     return most > 2 * expected + 6 * np.sqrt(expected)
 
 
+TAIL = 2.75
+"""Widths from the middle beyond which flats' codes are few, and full ones are none."""
+
+
+def _cut_off(codes: NDArray[np.float32], middle: float, width: float) -> bool:
+    """Whether the upper tail is missing beside the lower one, as where its pixels are full.
+
+    So few pile up in a flat whose mean is two or three widths below the full well that no pile
+    shows, but the codes below powers of two have lost what is piled.  Half, and no chance.
+    """
+    away = (codes - middle) / width
+    low, high = int((away < -TAIL).sum()), int((away > TAIL).sum())
+    return high < 0.5 * low and low - high > 6 * np.sqrt(low + high)
+
+
 class CodeChannels:
     """Counts codes of flats wide enough that every remainder is as likely as any other.
 
@@ -69,8 +84,8 @@ class CodeChannels:
             f"{n} of amplifier {amp}" for amp, n in sorted(self._piled.items())
         )
         return (
-            f"{self._fold} fold: flats in which pixels pile up at one code, as full ones do, are "
-            f"left out of the histogram of codes: {told}",
+            f"{self._fold} fold: flats whose brightest codes pile up or are missing, as of full "
+            f"pixels, are left out of the histogram of codes: {told}",
         )
 
     def add(self, frames: Sequence[Frame]) -> None:
@@ -84,7 +99,7 @@ class CodeChannels:
             # Of struck pixels the distribution is another; below 0 no converter counts.
             inside = codes[np.abs(codes - middle) < 6 * width].astype(np.int64)
             counts = np.bincount(inside[inside >= 0])
-            if _piled(counts, width):
+            if _piled(counts, width) or _cut_off(codes, float(middle), width):
                 self._piled[amp] = self._piled.get(amp, 0) + 1
                 continue
             kept = self._counts.get(amp, np.zeros(0, np.int64))

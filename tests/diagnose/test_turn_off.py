@@ -41,7 +41,7 @@ def test_flats_of_part_full_pixels_are_in_no_histogram(full, counted):
     channels.add([SimpleNamespace(image=codes)])
     assert bool(channels.channels()) == counted
     told = [
-        "fit fold: flats in which pixels pile up at one code, as full ones do, are left out of "
-        "the histogram of codes: 1 of amplifier 0"
+        "fit fold: flats whose brightest codes pile up or are missing, as of full pixels, are left "
+        "out of the histogram of codes: 1 of amplifier 0"
     ]
     assert list(channels.notes) == ([] if counted else told)
