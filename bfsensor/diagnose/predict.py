@@ -390,7 +390,8 @@ class Predictor:
                 if width_of(key) == only:
                     out[rows] = (moved[rows] - here[rows]) / self.steps[n]
             return out
-        if channel.word == "flat_mean" and self.names[n].startswith("gain"):
+        ratio = self.names[n].startswith("gain") or self.names[n].endswith(" full_well")
+        if channel.word == "flat_mean" and ratio:
             # Full pixels tell the ratio of full well and gain to one part in 1e5: both sides.
             back = parameters.copy()
             back[n] -= self.steps[n]

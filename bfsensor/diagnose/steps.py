@@ -11,6 +11,7 @@ from scipy.linalg import block_diag
 from bfsensor.diagnose.bounded import Solved, solve_within
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.predict import Predictor
+from bfsensor.effects.effect import Effect
 from bfsensor.errors import ConvergenceError
 
 ROUNDS = 20
@@ -37,6 +38,9 @@ NO_HARM = 0.01
 IDLE = 1.0
 """Gain of a chi-square by derivatives alone that is not worth a step: the parameters count as
 fitted, and what is left is orthogonal to their columns."""
+
+POOR = 0.5
+"""Part of the gain that derivatives promised below which they are another point's: found anew."""
 
 Seen = tuple[list[NDArray[np.float64]], NDArray[np.float64]]
 
@@ -83,8 +87,11 @@ class Steps:
         self._anew = self.effect | (gains & flats)
         self.point = predictor.start.astype(float).copy()
         self.slopes = np.zeros((self.total, self.count))
-        self._borrowed = slopes is not None
-        if slopes is not None:
+        # Where flats fill up, what the device did to their covariances is gone.
+        full = any(np.isfinite(e.law().full_well) for e in predictor.effects)
+        self._borrowed = slopes is not None and not full
+        self._chance = any(type(e).modes is not Effect.modes for e in predictor.effects)
+        if slopes is not None and not full:
             plain = int((~self.effect).sum())
             self.slopes[:, :plain] = slopes[:, :plain]
         self.history: list[float] = []
@@ -225,7 +232,7 @@ class Steps:
         """
         for turn in range(ROUNDS):
             predicted, residuals = self.residuals(self.point)
-            if turn in REFRESHED and self.modes.shape[1]:
+            if turn in REFRESHED and self._chance:
                 self.update_chance()
             fresh = turn < 2 and not self._borrowed
             self.differentiate(self.effect | fresh, self.point, predicted)
@@ -247,17 +254,20 @@ class Steps:
         """
         own = not self.effect.any()
         squares: list[float] = []
+        promised = 0.0
         for turn in range(ROUNDS):
             predicted, residuals = self.residuals(self.point)
-            if turn in REFRESHED and self.modes.shape[1]:
+            if turn in REFRESHED and self._chance:
                 self.update_chance()
                 squares.clear()
             here = self.square(residuals, self.point)
             squares.append(here)
-            fresh = own or (turn < 2 and not self._borrowed)
+            poor = promised > IDLE and -np.diff(squares[-2:]).sum() < POOR * promised
+            fresh = own or (turn < 2 and not self._borrowed) or poor
             self.differentiate(self._anew | fresh, self.point, predicted, forgiving=True)
             stalled = len(squares) > STALLED and np.ptp(squares[-STALLED:]) < 2 * NO_HARM
             solved = self.solve(residuals, self.point)
+            promised = here - float(solved.left @ solved.left)
             if stalled or not self._gainful(solved, here):
                 if self._borrowed:
                     # Derivatives of a fit without these effects lead nowhere: their own are found.

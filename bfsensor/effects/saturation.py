@@ -18,6 +18,10 @@ FAR = 5.0
 LAGS = 4
 """Lags along the column at which spilled charge correlates pixels, as far as it is followed."""
 
+UNSURE = 0.1
+"""Part of what the mean of a flat near the full well lacks, of the lesser of what its variance
+keeps and loses, and of its covariances, that the assumed unevenness leaves open (assumed)."""
+
 ROUNDS = 200
 """Of spilling: charge that finds no room within so many is lost."""
 
@@ -33,7 +37,16 @@ class Saturation(Effect):
     word = "saturation"
     stage = "collect"
     parameters = (
-        Parameter("full_well", "e-", 7e4, 1.15e5, neutral=2e5, law="flat", amplitude=True),
+        Parameter(
+            "full_well",
+            "e-",
+            7e4,
+            1.15e5,
+            neutral=2e5,
+            law="flat",
+            amplitude=True,
+            step=30.0,
+        ),  # a tenth of a flat's noise, over which its mean bends
     )
     touches = ("flat_mean", "flat_cov", "spot")
     source = (
@@ -73,6 +86,28 @@ class Saturation(Effect):
             out[n] -= short * sigma[n]
         return out
 
+    def modes(self, word: str, axes: Axes, layout: Layout) -> Values | None:
+        """What the closed forms near the full well leave open, of each flat and lag on its own."""
+        if word not in ("flat_mean", "flat_cov") or self.is_neutral():
+            return None
+        light = np.asarray(axes.get("light", axes["level"]), float)
+        sigma = np.sqrt(np.maximum(light, 1.0))
+        distance = (self["full_well"] - light) / sigma
+        reach = FAR * np.hypot(1.0, UNEVEN * light / sigma)
+        lag = np.zeros(len(light), int)
+        near = (distance >= -FAR) & (distance <= (FAR if word == "flat_mean" else reach))
+        if word == "flat_cov":
+            lag = np.asarray(axes["j"]).astype(int)
+            near &= (np.asarray(axes["i"]) == 0) & (lag <= LAGS)
+        rows = np.flatnonzero(near)
+        out = np.zeros((len(light), len(rows)))
+        for mode, n in enumerate(rows):
+            short, left = _between(float(distance[n]), _unevenness(light[n], sigma[n]))
+            left[0] = min(left[0], 1 - left[0])
+            own = short * sigma[n] if word == "flat_mean" else left[lag[n]] * light[n]
+            out[n, mode] = UNSURE * own
+        return out
+
     def covariances(self, c: Values, axes: Axes, layout: Layout) -> Values:
         if self.is_neutral():
             return c
@@ -94,18 +129,22 @@ class Saturation(Effect):
 
 def _unevenness(light: float, sigma: float) -> float:
     """Of the light from pixel to pixel, in standard deviations of its noise."""
-    return round(UNEVEN * float(light) / float(sigma), 1)
+    return UNEVEN * float(light) / float(sigma)
 
 
 def _between(distance: float, uneven: float) -> tuple[float, Values]:
-    """As :func:`_near`, straight between tenths: a fit needs a slope."""
-    tenths = int(np.floor(10 * distance))
-    part = 10 * distance - tenths
-    low, high = _near(tenths / 10, uneven), _near((tenths + 1) / 10, uneven)
-    return (1 - part) * low[0] + part * high[0], (1 - part) * low[1] + part * high[1]
+    """As :func:`_near`, straight between tenths of both: a fit needs slopes and no steps."""
+    tenths = int(np.floor(10 * distance)), int(np.floor(10 * uneven))
+    parts = 10 * distance - tenths[0], 10 * uneven - tenths[1]
+    short, left = 0.0, np.zeros(LAGS + 1)
+    for n, m in np.ndindex(2, 2):
+        found = _near((tenths[0] + n) / 10, (tenths[1] + m) / 10)
+        weight = (parts[0] if n else 1 - parts[0]) * (parts[1] if m else 1 - parts[1])
+        short, left = short + weight * found[0], left + weight * found[1]
+    return short, left
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=1024)
 def _near(distance: float, uneven: float) -> tuple[float, Values]:
     """Flats near the full well: what their mean lacks, and covariances along the column.
 

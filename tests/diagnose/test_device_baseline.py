@@ -24,6 +24,7 @@ LIMITS = {"silicon.background_doping": (0.03, 0.06), "silicon.thickness": (0.3, 
 HERE = Condition(620.0, -50.0, np.nan)
 
 
+@pytest.mark.slow
 def test_a_changed_parameter_is_predicted(tmp_path):
     device = Device.load("itl_sta3800c")
     kept = simulate_baseline("itl_sta3800c", ["silicon.thickness"], [-60.0], keep=tmp_path)

@@ -119,6 +119,7 @@ def test_finished_solutions_are_not_made_again(emulator, kept, tmp_path):
     paths[0].unlink()
 
 
+@pytest.mark.slow
 def test_conditions_hold_what_they_state():
     device = Device.load("e2v_ccd250")
     warm, biased = Condition(wavelength=700.0), Condition(back_bias=-60.0)

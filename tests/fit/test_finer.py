@@ -46,6 +46,7 @@ def kept(tmp_path_factory):
     return tmp_path_factory.mktemp("finer")
 
 
+@pytest.mark.slow
 def test_a_fit_ends_at_the_device_and_the_table_of_the_finer_mesh(tmp_path, kept):
     truth = np.array([prior.mean + 0.7 * prior.spread for prior in FREE])
     x, y = make_finer(kept)._solved(truth)[HERE]
