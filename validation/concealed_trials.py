@@ -24,6 +24,7 @@ import json
 import secrets
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,6 +47,7 @@ from validation.concealed.opening import (
     write_summary,
 )
 from validation.concealed.rows import locked, read_rows
+from validation.concealed.score import Score
 from validation.concealed.submit import digest, read_json, write_json
 from validation.concealed.tally import print_lines, tally
 from validation.trial_amplitudes import (
@@ -152,6 +154,21 @@ def snr_of(effect: Effect, calibration: Calibration, size: str = "S") -> float:
     elif not _one_amplitude(effect):
         factor, at, _ = _twin(effect.scaled(room), told)
     return float(at * (1 / room / factor) ** told.power)
+
+
+def score_now(row: Mapping[str, Any], calibration: Calibration) -> Score:
+    """Score a row by the SNRs that effects with nothing but an amplitude have in today's channels.
+
+    Truths tell those of when they were drawn, by the calibration of then; effects with more
+    parameters had twins of their own.
+    """
+    score = from_row(row)
+    effects = [effect_of(e) for e in json.loads(row["truth_json"])["effects"]]
+    told = [
+        snr_of(e, calibration) if _one_amplitude(e) and not isinstance(e, Saturation) else s
+        for e, s in zip(effects, score.snr, strict=True)
+    ]
+    return replace(score, snr=tuple(told))
 
 
 def draw_truth(number: int, seed: int, calibration: Calibration) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from tests.concealed.reports import report
 from validation import concealed_trials as trials
 from validation import trial_amplitudes as amplitudes
 from validation.concealed.library import EFFECTS, make_effect
-from validation.concealed.opening import from_row
+from validation.concealed.opening import Opened, from_row, to_row
 from validation.concealed.plan import Size
 from validation.concealed.rows import read_rows
 from validation.concealed.submit import digest
@@ -85,6 +85,24 @@ def test_the_snr_of_a_told_effect(calibration):
     assert trials.snr_of(told, calibration) == pytest.approx(40 * 0.2 / 0.1)
     with pytest.raises(ValueError, match=r"no calibration of cti_serial: run python -m"):
         trials.snr_of(told, {})
+
+
+def test_rows_are_scored_by_the_snrs_of_now(calibration):
+    """Of effects that are nothing but an amplitude; of others their own twins told it."""
+    told = [
+        ("cti_serial", {"cti": 1e-6}),
+        ("psf_wings", {"frac": 0.01, "sigma": 4.0}),
+    ]
+    for word, parameters in told:
+        effect = {"class": word, "parameters": parameters, "snr": 33.0, "capped": False}
+        truth = {"campaign": "c", "effects": [effect], "size": "S", "seed": 1}
+        row = to_row(Opened(truth, report(), {}, "0"), "channel", "set")
+        one = len(make_effect(word, parameters).parameters) == 1
+        wanted = trials.snr_of(make_effect(word, parameters), calibration) if one else 33.0
+        score = trials.score_now(row, calibration)
+        assert score.snr == (pytest.approx(wanted),)
+        assert from_row(row).snr == (33.0,)
+    assert trials.snr_of(make_effect(*told[0]), calibration) != 33.0 and not one
 
 
 def test_truths_are_drawn_again_the_same_and_even_in_the_logarithm(
