@@ -27,6 +27,65 @@ FOLDS = ("fit", "select", "held-out")
 
 
 @dataclass(frozen=True, eq=False)
+class Common:
+    """What the errors of some values tell of those of others: ``spread @ gather`` times them.
+
+    Attributes
+    ----------
+    spread : csr_array, shape (n, m)
+        To the values that are told of.
+    gather : csr_array, shape (m, n)
+        From those that tell, which are others: of them nothing is told.
+
+    Examples
+    --------
+    The last of three values is the mean of the first two, and noise of its own:
+
+    >>> both = Common(csr_array([[0.0], [0.0], [1.0]]), csr_array([[0.5, 0.5, 0.0]]))
+    >>> c = Channel("flat_map", np.zeros(3), (np.eye(1),) * 3, {"x": np.arange(3)}, "", common=both)
+    >>> c.whiten(np.array([2.0, 4.0, 3.0]))
+    array([2., 4., 0.])
+    """
+
+    spread: csr_array
+    gather: csr_array
+
+    def __post_init__(self) -> None:
+        if self.spread.shape != self.gather.shape[::-1]:
+            raise DiagnosisError(
+                f"noise in common: {self.spread.shape} and {self.gather.shape} do not match"
+            )
+        if (self.gather @ self.spread).count_nonzero():
+            raise DiagnosisError("noise in common: what values tell of is told to others")
+
+    @classmethod
+    def none(cls, n: int) -> Common:
+        """Nothing, of ``n`` values."""
+        return cls(csr_array((n, 0)), csr_array((0, n)))
+
+    @property
+    def size(self) -> int:
+        """Number of values."""
+        return int(self.spread.shape[0])
+
+    @property
+    def tells(self) -> NDArray[np.bool_]:
+        """Which values tell of others."""
+        out = np.zeros(self.size, bool)
+        out[self.gather.indices] = True
+        return out
+
+    def told(self, errors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Parts of errors, shape (n, ...), that the others tell."""
+        return np.asarray(self.spread @ (self.gather @ errors))
+
+    def variance(self, own: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Variance that is told, from what values have themselves."""
+        middle = (self.gather * own) @ self.gather.T
+        return np.asarray((self.spread @ middle).multiply(self.spread).sum(1)).ravel()
+
+
+@dataclass(frozen=True, eq=False)
 class Channel:
     """Numbers of one kind, the covariance of their errors, and where each belongs.
 
@@ -38,13 +97,15 @@ class Channel:
         What was measured, in ``unit``.
     blocks : tuple of ndarray
         Covariance matrices of consecutive values [unit^2]; values of different blocks are
-        independent.
+        independent, but for what ``common`` tells.
     axes : mapping of str to ndarray, shape (n,)
         Coordinates of each value: 'amp', 'level' [e- or ADU], 'i', 'j', 'wavelength' [nm], ...
     unit : str
         Of the values.
     fold : str
         Which exposures they come from: 'fit', 'select' or 'held-out'.
+    common : Common, optional
+        Noise that values share with others before them; ``blocks`` are of what is left.
 
     Examples
     --------
@@ -59,6 +120,7 @@ class Channel:
     axes: Mapping[str, NDArray]
     unit: str
     fold: str = "fit"
+    common: Common | None = None
     _whitener: csr_array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -81,6 +143,10 @@ class Channel:
         if not np.all(np.isfinite(values)):
             raise DiagnosisError(
                 f"{self.word}: {int((~np.isfinite(values)).sum())} values are not finite"
+            )
+        if self.common is not None and self.common.size != len(values):
+            raise DiagnosisError(
+                f"{self.word}: noise in common of {self.common.size} values, not {len(values)}"
             )
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "axes", MappingProxyType(axes))
@@ -107,7 +173,7 @@ class Channel:
 
     def __reduce__(self) -> tuple[Any, ...]:
         given = (self.word, self.values, self.blocks, dict(self.axes), self.unit, self.fold)
-        return Channel, given
+        return Channel, (*given, self.common)
 
     def __len__(self) -> int:
         return len(self.values)
@@ -117,7 +183,10 @@ class Channel:
         """Standard error of each value [unit]."""
         if not self.blocks:
             return np.zeros(0)
-        return np.sqrt(np.concatenate([np.diag(b) for b in self.blocks]))
+        variance = np.concatenate([np.diag(b) for b in self.blocks])
+        if self.common is not None:
+            variance += self.common.variance(variance)
+        return np.sqrt(variance)
 
     def whiten(self, residuals: ArrayLike) -> NDArray[np.float64]:
         """Divide by the errors: independent numbers of variance 1 where the errors are right.
@@ -127,7 +196,10 @@ class Channel:
         residuals : array_like, shape (n, ...)
             Differences, or derivatives, in ``unit``.
         """
-        return np.asarray(self._whitener @ np.asarray(residuals, float))
+        given = np.asarray(residuals, float)
+        if self.common is not None:
+            given = given - self.common.told(given)
+        return np.asarray(self._whitener @ given)
 
     def unwhiten(self, white: ArrayLike) -> NDArray[np.float64]:
         """Undo :meth:`whiten`: residuals in ``unit``, shape (n,)."""
@@ -137,7 +209,7 @@ class Channel:
             part = slice(start, start + len(block))
             out[part] = np.linalg.cholesky(block) @ given[part]
             start += len(block)
-        return out
+        return out if self.common is None else out + self.common.told(out)
 
 
 def join_channels(channels: Sequence[Channel]) -> Channel:
@@ -151,4 +223,15 @@ def join_channels(channels: Sequence[Channel]) -> Channel:
         {n: np.concatenate([c.axes[n] for c in channels]) for n in names},
         first.unit,
         first.fold,
+        join_common([c.common or Common.none(len(c)) for c in channels])
+        if any(c.common for c in channels)
+        else None,
+    )
+
+
+def join_common(parts: Sequence[Common]) -> Common:
+    """Noise in common of values one after another, of which these parts share none."""
+    return Common(
+        csr_array(block_diag([p.spread for p in parts], format="csr")),
+        csr_array(block_diag([p.gather for p in parts], format="csr")),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.conditions import Axes, Condition
 from bfsensor.diagnose.flat_channels import TAIL
 from bfsensor.diagnose.map_channels import MapShare, block_side
+from bfsensor.diagnose.map_noise import block_noise
 from bfsensor.diagnose.mismatch import BaselineFit
 from bfsensor.diagnose.planned import Forecast, Planned
 from bfsensor.diagnose.predict import Predictor
@@ -168,8 +170,7 @@ class Forecaster:
             if known != name or (known not in places and np.any(column)):
                 free[name] = column
         values = here + slopes[:, count:] @ self.fit.values[count:]
-        moved = Channel(channel.word, values, channel.blocks, channel.axes, channel.unit)
-        return Forecast(moved, slopes, free)
+        return Forecast(replace(channel, values=values), slopes, free)
 
     def _flats(self, planned: Planned) -> list[Forecast]:
         condition, segments = self.condition(planned), self.measured.segments
@@ -281,26 +282,31 @@ class Forecaster:
         seconds: float,
     ) -> list[Forecast]:
         """Flats of another condition over those of the usual one, where both are predicted."""
-        like = next((c for c in self.fit.channels if c.word == "flat_map"), None)
-        if like is None:
+        if not any(c.word == "flat_map" for c in self.fit.channels):
             return []
-        linear = np.isin(like.axes["what"], ("column", "row", "block"))
-        rows = (like.axes["map"] == "all") & linear
         shares = tuple(
             MapShare(sign, where, seconds, float(levels.mean()))
             for sign, where in ((1.0, condition), (-1.0, self.usual))
         )
         ny, nx = self.measured.shape
-        side = block_side((ny, nx))
-        pixels = {"column": ny, "row": nx, "block": side**2}
         # Photon noise of both: the usual condition's flats are at least as many.
         noise = 2 / (float((levels * self.gains).mean()) * planned.count)
-        axes = {name: column[rows] for name, column in like.axes.items()}
         name = f"{MAP} {len(self._maps_more)}"
-        axes["map"] = np.full(rows.sum(), name)
-        axes |= {n: np.full(rows.sum(), v) for n, v in condition._asdict().items()}
-        blocks = tuple(np.array([[noise / pixels[str(w)]]]) for w in axes["what"])
-        channel = Channel("flat_map", np.zeros(int(rows.sum())), blocks, axes, "")
+        side = block_side((ny, nx))
+        shared = block_noise(np.ones((ny, nx), bool), side)
+        y, x = ((v + 0.5) * side - 0.5 for v in np.divmod(shared.kept, nx // side))
+        axes = Axes()
+        for what, at in (
+            ("column", {"x": np.arange(nx), "y": -1.0}), ("row", {"x": -1.0, "y": np.arange(ny)}),
+            ("block", {"x": x, "y": y}),
+        ):  # fmt: skip
+            count = {"column": nx, "row": ny, "block": len(x)}[what]
+            axes.add(count, condition, map=name, what=what, k=-1.0, **at)
+        blocks = (*np.full((nx, 1, 1), noise / ny), *np.full((ny, 1, 1), noise / nx),
+                  noise * shared.covariance)  # fmt: skip
+        size = nx + ny + len(x)
+        channel = Channel("flat_map", np.zeros(size), blocks, axes.columns(), "",
+                          common=shared.common())  # fmt: skip
         self._extend([], {(channel.fold, name): shares})
         return [self.forecast(channel)]
 
@@ -363,9 +369,7 @@ class Forecaster:
         for channel in self.fit.channels:
             if channel.word in ("bias_cov", "bias_level", "amp_cross") and len(channel):
                 blocks = tuple(b * taken / planned.count for b in channel.blocks)
-                like = Channel(channel.word, channel.values, blocks, channel.axes,
-                               channel.unit)  # fmt: skip
-                out.append(self.forecast(like))
+                out.append(self.forecast(replace(channel, blocks=blocks, fold="fit")))
         return out
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.free_search import Dictionary
 from bfsensor.diagnose.free_terms import SCALE, Family, Scene, Term, Values
-from bfsensor.diagnose.map_channels import RINGS, block_side, ring_modes
+from bfsensor.diagnose.map_channels import RINGS, ring_modes
+from bfsensor.diagnose.map_shapes import Places
 from bfsensor.diagnose.predict_maps import reduce_map
 
 POWERS = (0, 1)
@@ -239,36 +240,15 @@ def _shapes(
                 yield f"box {x}, {y}", {"x": x, "y": y}, (v, w), "box"
 
 
-class _MapAxes(NamedTuple):
-    """Rows of a channel of maps by what they are, and where on the sensor they belong."""
-
-    column: NDArray[np.int64]
-    row: NDArray[np.int64]
-    block: NDArray[np.int64]
-    x: NDArray[np.int64]
-    y: NDArray[np.int64]
-    block_x: NDArray[np.int64]
-    block_y: NDArray[np.int64]
-    maps: NDArray[np.int64]
-    names: tuple[str, ...]
-    side: int
-
-
-def _map_axes(scene: Scene, channel: Channel) -> _MapAxes:
+def _places(
+    scene: Scene, channel: Channel
+) -> tuple[Places, NDArray[np.str_], NDArray[np.int64]]:
+    """Where a channel's values belong, names of its maps and which of them each is of; kept."""
     kept = scene.kept.get(("maps", id(channel)))
     if kept is None or kept[0] is not channel:
-        a = channel.axes
-        column, row, block = (
-            np.nonzero(a["what"] == k)[0] for k in ("column", "row", "block")
-        )
-        side = block_side(scene.model.predictor.layout.shape)
-        names, maps = np.unique(a["map"], return_inverse=True)
-        bx, by = (((a[k][block] + 0.5) / side).astype(int) for k in "xy")
-        axes = _MapAxes(
-            column, row, block, a["x"][column].astype(int), a["y"][row].astype(int), bx, by, maps,
-            tuple(str(n) for n in names), side,
-        )  # fmt: skip
-        kept = scene.kept["maps", id(channel)] = channel, axes
+        places = Places.of(channel.axes, scene.model.predictor.layout.shape)
+        found = places, *np.unique(channel.axes["map"], return_inverse=True)
+        kept = scene.kept["maps", id(channel)] = channel, found
     return kept[1]
 
 
@@ -281,17 +261,10 @@ def _separable(
     """Column of a product of a function of x and one of y, without making the image."""
     if channel.word != "flat_map":
         return None
-    a = _map_axes(scene, channel)
-    v, w = along
-    across, down = (
-        u[: len(u) // a.side * a.side].reshape(-1, a.side).mean(1) for u in along
-    )
-    out = np.zeros(len(channel))
-    out[a.column] = v[a.x] * w.mean()
-    out[a.row] = w[a.y] * v.mean()
-    out[a.block] = across[a.block_x] * down[a.block_y]
-    factor = np.array([shares.get((channel.fold, name), 0.0) for name in a.names])
-    return np.asarray(out * factor[a.maps])
+    places, names, maps = _places(scene, channel)
+    out = places.product(*along, len(channel))
+    factor = np.array([shares.get((channel.fold, str(n)), 0.0) for n in names])
+    return np.asarray(out * factor[maps])
 
 
 def _ripple(scene: Scene, frequency: float) -> Term:

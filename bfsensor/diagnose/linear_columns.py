@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.extract import Measured
-from bfsensor.diagnose.map_channels import block_side
+from bfsensor.diagnose.map_shapes import Places
 
 MAP_ORDER = 4
 """Order of the polynomial in x and y that the light on the sensor may have."""
@@ -74,22 +74,25 @@ def _dark_columns(channel: Channel) -> dict[str, NDArray[np.float64]]:
 
 
 def _map_columns(channel: Channel, measured: Measured) -> dict[str, NDArray[np.float64]]:
-    x = channel.axes
+    x, size = channel.axes, len(channel)
     ny, nx = measured.shape
     out: dict[str, NDArray[np.float64]] = {}
-    u, v = 2 * (x["x"] + 0.5) / nx - 1, 2 * (x["y"] + 0.5) / ny - 1
+    places = Places.of(x, measured.shape)
+    u, v = (2 * (np.arange(n) + 0.5) / n - 1 for n in (nx, ny))
+    smooth = {
+        f"light {p}{q}": places.product(u**p, v**q, size)
+        for p in range(MAP_ORDER + 1) for q in range(MAP_ORDER + 1 - p)
+    }  # fmt: skip
+    # Amplifiers were divided by their means: steps between them are free.
+    for amp, s in enumerate(measured.segments[1:], 1):
+        inside = np.zeros(nx), np.zeros(ny)
+        inside[0][s.x : s.x + s.columns] = 1.0
+        inside[1][s.y : s.y + s.rows] = 1.0
+        smooth[f"amp {amp}"] = places.product(*inside, size)
     for name in dict.fromkeys(x["map"]):
         here = x["map"] == name
-        for what in ("column", "row", "block"):
-            rows = here & (x["what"] == what)
-            for p in range(MAP_ORDER + 1):
-                for q in range(MAP_ORDER + 1 - p):
-                    # The mean of a power of what is summed over is part of other columns.
-                    if (what == "column" and q) or (what == "row" and p):
-                        continue
-                    basis = np.zeros(len(channel))
-                    basis[rows] = u[rows] ** p * v[rows] ** q
-                    out[f"map {name} {what} {p}{q}"] = basis
+        for what, column in smooth.items():
+            out[f"map {name} {what}"] = np.where(here, column, 0.0)
         ring = here & (x["what"] == "ring")
         if ring.any():
             # Sizes of pixels, and the effect, which evens the pixels' response out: more at
@@ -98,34 +101,6 @@ def _map_columns(channel: Channel, measured: Measured) -> dict[str, NDArray[np.f
                 out[f"map {name} rings k{power}"] = np.where(ring, x["k"] ** power, 0.0)
         if name == "all" and ring.any():
             out["map rings white"] = np.where(ring, 1.0, 0.0)
-        for step, column in _amplifier_steps(channel, here, measured).items():
-            out[f"map {name} {step}"] = column
-    return out
-
-
-def _amplifier_steps(
-    channel: Channel, here: NDArray[np.bool_], measured: Measured
-) -> dict[str, NDArray[np.float64]]:
-    """Steps between amplifiers, which were divided by their means: free, along x and y."""
-    x, out = channel.axes, {}
-    for what, axis, n in (("column", "x", 0), ("row", "y", 1)):
-        rows = here & (x["what"] == what)
-        for start in sorted({o[n] for o in measured.origins} - {0}):
-            beyond = rows & (x[axis] >= start)
-            if beyond.any() and not beyond[rows].all():
-                out[f"{what} from {start}"] = np.where(beyond, 1.0, 0.0)
-    rows = here & (x["what"] == "block")
-    # Blocks may lie on several amplifiers.
-    half = 0.5 * block_side(measured.shape)
-    shares = [
-        np.where(rows, _overlap(x["x"], half, s.x, s.columns), 0.0)
-        * _overlap(x["y"], half, s.y, s.rows)
-        for s in measured.segments
-    ]
-    covered = np.maximum(np.sum(shares, axis=0), 1e-9)
-    for amp, share in enumerate(shares[1:], 1):
-        if share.any():
-            out[f"block amp {amp}"] = share / covered
     return out
 
 
@@ -139,11 +114,3 @@ def _spot_columns(channel: Channel, rows_of: Rows) -> dict[str, NDArray[np.float
             column[here] = x["light"][here] if what == "flux" else 1.0
             out[f"spot {what} {'/'.join(key)}"] = column
     return out
-
-
-def _overlap(
-    centre: NDArray[np.float64], half: float, start: int, count: int
-) -> NDArray[np.float64]:
-    """Pixels of intervals about centres that lie in another interval."""
-    low, high = centre + 0.5 - half, centre + 0.5 + half
-    return np.maximum(np.minimum(high, start + count) - np.maximum(low, start), 0.0)

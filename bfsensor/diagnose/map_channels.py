@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft, rfft2
 
-from bfsensor.diagnose.channels import Channel
+from bfsensor.diagnose.channels import Channel, Common, join_common
 from bfsensor.diagnose.conditions import Axes, Condition
+from bfsensor.diagnose.map_noise import BlockNoise, block_noise
 from bfsensor.diagnose.map_waves import find_patterns, without_shape
 
 BLOCKS = 16
@@ -176,7 +177,9 @@ class MapChannels:
         self._close()
         if not self._groups:
             return []
-        values, blocks, axes = [], [], Axes()
+        values, axes = [], Axes()
+        blocks: list[NDArray[np.float64]] = []
+        common: list[Common] = []
         # One map is held, and one that others are divided by: that of the commonest condition.
         kept: tuple[list[_Group], _Map] | None = None
         for name, (groups, below) in self._plan().items():
@@ -190,12 +193,15 @@ class MapChannels:
                 image = image.over(kept[1])
             if self.fold == "fit" and name != "short":
                 self.sightings += tuple(find_patterns(image.values, name, self._amplifiers))
-            for v, e, columns in self._parts(image, own=name == "all"):
+            parts, noise = self._parts(image, own=name == "all")
+            for v, e, columns in parts:
                 values.append(v)
-                blocks.extend(np.square(e)[:, None, None])
+                blocks.extend([e] if e.ndim == 2 else np.square(e)[:, None, None])
                 axes.add(len(v), groups[0].condition, map=name, **columns)
+            others = sum(len(v) for v, _, _ in parts[3:])
+            common += [noise.common(), Common.none(others)]
         return [Channel("flat_map", np.concatenate(values), tuple(blocks), axes.columns(), "",
-                        self.fold)]  # fmt: skip
+                        self.fold, join_common(common))]  # fmt: skip
 
     def _plan(self) -> dict[str, tuple[list[_Group], list[_Group]]]:
         """Flats of each map, and of what it is divided by."""
@@ -264,8 +270,8 @@ class MapChannels:
 
     def _parts(
         self, image: _Map, *, own: bool
-    ) -> list[tuple[NDArray, NDArray, Mapping[str, object]]]:
-        """Columns, rows, blocks and rings of a map with errors.
+    ) -> tuple[list[tuple[NDArray, NDArray, Mapping[str, object]]], BlockNoise]:
+        """Columns, rows, blocks, and rings and others of a map, with errors or their covariance.
 
         ``own``: the map holds the pixels' own response, of which its neighbours tell.
         """
@@ -300,14 +306,10 @@ class MapChannels:
         count = _blocks(good, side).sum((1, 3))
         mean = _blocks(filled, side).sum((1, 3), dtype=np.float64) / np.maximum(count, 1)
         y, x = ((index + 0.5) * side - 0.5 for index in np.indices((rows, columns)))
-        full = count.ravel() > side * side // 2
-        out.append(
-            (
-                mean.ravel()[full],
-                (sigma / np.sqrt(np.maximum(count, 1))).ravel()[full],
-                {"what": "block", "k": -1.0, "x": x.ravel()[full], "y": y.ravel()[full]},
-            )
-        )
+        noise = block_noise(good, side)
+        mean, x, y = (v.ravel()[noise.kept] for v in (mean, x, y))
+        told = {"what": "block", "k": -1.0, "x": x, "y": y}
+        out.append((mean, sigma**2 * noise.covariance, told))
         free = without_shape(filled)
         power = ring_power(free)
         keep = self._modes > 50
@@ -333,7 +335,7 @@ class MapChannels:
         out.append(
             (chess, np.full(len(chess), error), {"what": "chess", "k": -1.0, "x": centres, "y": -1.0})
         )  # fmt: skip
-        return out
+        return out, noise
 
     @property
     def _modes(self) -> NDArray[np.int64]:

@@ -252,7 +252,7 @@ class MapChange:
             rows = np.nonzero(channel.axes["map"] == name)[0]
             axes = {k: channel.axes[k][rows] for k in ("what", "x", "y", "k")}
             parts = parts_of(axes)
-            errors = [channel.blocks[n][0, 0] ** 0.5 for n in rows[parts["texture"]]]
+            errors = channel.errors[rows[parts["texture"]]]
             parts["faint"] = np.array(1e-6 * FAINT * min(errors, default=0.0))
             kept = self._kept[key] = channel, rows, parts
         return kept[1], kept[2]
@@ -267,7 +267,7 @@ def area_change(effect: Effect, shot: Shot, layout: Layout) -> NDArray[np.float6
 
 
 def lines_of_map(effect: Effect, channel: Channel, layout: Layout) -> NDArray[np.float64]:
-    """Change of the columns and rows of the map of all light alone, nothing evened out."""
+    """Change of columns, rows and blocks of the map of all light alone, nothing evened out."""
     x, out = channel.axes, np.zeros(len(channel))
     own = np.nonzero(x["map"] == "all")[0]
     if not len(own):
@@ -286,7 +286,26 @@ def lines_of_map(effect: Effect, channel: Channel, layout: Layout) -> NDArray[np
     for what, axis, name in (("column", 0, "x"), ("row", 1, "y")):
         rows = own[x["what"][own] == what]
         out[rows] = total.mean(axis)[x[name][rows].astype(int)]
+    rows = own[x["what"][own] == "block"]
+    out[rows] = block_means(total)[block_places(x, rows, layout.shape)]
     return out
+
+
+def block_means(change: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Means of a map's blocks."""
+    ny, nx = change.shape
+    side = block_side((ny, nx))
+    whole = change[: ny // side * side, : nx // side * side]
+    return np.asarray(whole.reshape(ny // side, side, nx // side, side).mean((1, 3)))
+
+
+def block_places(
+    axes: Axes, rows: NDArray[np.int64], shape: tuple[int, int]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Which row and column of blocks values belong to."""
+    side = block_side(shape)
+    y, x = (((axes[n][rows] + 0.5) / side).astype(int) for n in "yx")
+    return y, x
 
 
 PARTS = ("column", "row", "block", "ring", "texture", "chess")
@@ -336,11 +355,7 @@ def reduce_spectrum(
         return out
     change = irfft2(delta, s=shape)
     if len(block):
-        side = block_side(shape)
-        mean = change[: ny // side * side, : nx // side * side]
-        mean = mean.reshape(ny // side, side, nx // side, side).mean((1, 3))
-        y, x = (((axes[n][block] + 0.5) / side).astype(int) for n in "yx")
-        out[block] = mean[y, x]
+        out[block] = block_means(change)[block_places(axes, block, shape)]
     if len(chess):
         out[chess] = map_chess(change)[0]
     if len(ring) or len(texture):

@@ -8,8 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor.diagnose.map_shapes import Places
+
 if TYPE_CHECKING:
     from bfsensor.diagnose.scans import Group, Pattern
+
+OCTAVES = 4
+"""Sizes of boxes, from half a side on."""
 
 LENGTHS = 1.5, 4.0
 """Reaches of a distortion by a boundary [pixel]."""
@@ -128,3 +133,31 @@ def frames(
             before, behind = (inside & (place % period == k) for k in (period - 1, 0))
             pattern = np.where(columns, before * 1.0 - behind, 0.0)
             yield "combs", pattern, {"what": "comb", "period": float(period)}
+
+
+def boxes(
+    x: Mapping[str, NDArray], here: NDArray[np.bool_], name: str
+) -> Iterator[tuple[str, NDArray[np.float64], dict[str, object]]]:
+    """Halves, quarters and so on of a map, with what columns and rows have of them."""
+    sides = [
+        int(x[axis][here & (x["what"] == what)].max(initial=-1)) + 1
+        for what, axis in (("row", "y"), ("column", "x"))
+    ]
+    if not min(sides) or not (here & (x["what"] == "block")).any():
+        return
+    places = Places.of(x, (sides[0], sides[1]))
+    down, across = (np.arange(n) + 0.5 for n in sides)
+    for octave in range(1, OCTAVES + 1):
+        tall, wide = (n / 2**octave for n in sides)
+        for a in range(2**octave):
+            for b in range(2**octave):
+                low = a * wide, b * tall
+                in_x, in_y = (
+                    1.0 * ((place >= start) & (place < start + size))
+                    for place, start, size in zip((across, down), low, (wide, tall), strict=True)
+                )  # fmt: skip
+                box = places.product(in_x, in_y, len(here))
+                yield "boxes", np.where(here, box, 0.0), {
+                    "map": name, "what": "block", "x": (int(low[0]), int(low[0] + wide)),
+                    "y": (int(low[1]), int(low[1] + tall)),
+                }  # fmt: skip

@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from bfsensor.diagnose.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.mismatch import BaselineFit
-from bfsensor.diagnose.scan_shapes import boundaries, frames, middle, own_shapes
+from bfsensor.diagnose.scan_shapes import boundaries, boxes, frames, middle, own_shapes
 
 POWERS = (0, 1, 2, 3)
 """Powers of the level that covariances and means may go with."""
 
 OCTAVES = 4
-"""Sizes of strips and boxes, from the whole side on."""
-
+"""Sizes of strips, from the whole side on."""
 
 DEVICE, DEVICE_SCAN = "device", "device parameter off its card"
 """Word and family of the scan of the device's parameters, which have no channel of their own."""
@@ -100,6 +99,11 @@ class Group:
         self.axes = {n: np.concatenate([c.axes[n] for c, _ in members]) for n in names}
         self.size = sum(len(c) for c, _ in members)
         self.rows = np.concatenate([s + np.arange(len(c)) for c, s in members])
+        # Inverse errors of values that tell of others, and 0.
+        self._alone = np.concatenate([
+            np.where(c.common.tells, 1 / c.errors, 0.0) if c.common else np.zeros(len(c))
+            for c, _ in members
+        ])  # fmt: skip
         columns = [self.axes[n] for n in ("wavelength", "back_bias", "temperature")]
         self.condition = np.array([
             "/".join(f"{float(v):g}" for v in row) for row in zip(*columns, strict=True)
@@ -115,12 +119,18 @@ class Group:
     def template(
         self, family: str, pattern: NDArray[np.float64], where: Mapping[str, object]
     ) -> Template | None:
-        """Whiten a pattern; None if it is nothing."""
-        parts, start = [], 0
-        for channel, _ in self.members:
-            parts.append(channel.whiten(pattern[start : start + len(channel)]))
-            start += len(channel)
-        whole = np.concatenate(parts)
+        """Whiten a pattern; None if it is nothing.
+
+        Of values that tell of others, others have of it what these tell: nothing of their own.
+        """
+        if not pattern[self._alone == 0].any():
+            whole = pattern * self._alone
+        else:
+            parts, start = [], 0
+            for channel, _ in self.members:
+                parts.append(channel.whiten(pattern[start : start + len(channel)]))
+                start += len(channel)
+            whole = np.concatenate(parts)
         used = np.nonzero(np.abs(whole) > 1e-12 * max(np.abs(whole).max(), 1e-300))[0]
         if len(used) == 0 or not np.isfinite(whole).all():
             return None
@@ -231,7 +241,24 @@ def _means(g: Group) -> Iterator[Pattern]:
 
 
 def _maps(g: Group) -> Iterator[Pattern]:
-    """Strips, steps, edges and waves in columns and rows, boxes in blocks, rings."""
+    """Patterns of columns and rows, which blocks follow; boxes; rings and finer ones."""
+    yield from _lines(g)
+    x = g.axes
+    for name in dict.fromkeys(x["map"]):
+        here = x["map"] == name
+        yield from boxes(x, here, str(name))
+        rows = here & (x["what"] == "ring")
+        for k in np.unique(x["k"][rows]):
+            yield "rings", np.where(rows & (x["k"] == k), 1.0, 0.0), {
+                "map": str(name), "what": "ring", "period": 1 / float(k),
+            }  # fmt: skip
+        if rows.any():
+            yield "rings", np.where(rows, 1.0, 0.0), {"map": str(name), "what": "ring"}
+        yield from _fine_patterns(x, here, str(name))
+
+
+def _lines(g: Group) -> Iterator[Pattern]:
+    """Strips, steps, edges and waves in columns and rows."""
     x = g.axes
     for name in dict.fromkeys(x["map"]):
         here = x["map"] == name
@@ -267,36 +294,9 @@ def _maps(g: Group) -> Iterator[Pattern]:
                     yield f"{what} waves", np.where(rows, wave(phase), 0.0), {
                         **common, "period": n / cycles,
                     }  # fmt: skip
-        rows = here & (x["what"] == "block")
-        if rows.any():
-            u, v = x["x"].astype(float), x["y"].astype(float)
-            nx, ny = u[rows].max() + u[rows].min(), v[rows].max() + v[rows].min()
-            for octave in range(1, OCTAVES + 1):
-                wide, tall = nx / 2**octave, ny / 2**octave
-                for a in range(2**octave):
-                    for b in range(2**octave):
-                        lo = (a * wide, b * tall)
-                        own = (
-                            (u >= lo[0])
-                            & (u < lo[0] + wide)
-                            & (v >= lo[1])
-                            & (v < lo[1] + tall)
-                        )
-                        yield "boxes", np.where(rows & own, 1.0, 0.0), {
-                            "map": str(name), "what": "block", "x": (int(lo[0]), int(lo[0] + wide)),
-                            "y": (int(lo[1]), int(lo[1] + tall)),
-                        }  # fmt: skip
-        rows = here & (x["what"] == "ring")
-        for k in np.unique(x["k"][rows]):
-            yield "rings", np.where(rows & (x["k"] == k), 1.0, 0.0), {
-                "map": str(name), "what": "ring", "period": 1 / float(k),
-            }  # fmt: skip
-        if rows.any():
-            yield "rings", np.where(rows, 1.0, 0.0), {"map": str(name), "what": "ring"}
         if name == "all":
             for family, pattern, where in frames(x, here):
                 yield family, pattern, {"map": str(name), **where}
-        yield from _fine_patterns(x, here, str(name))
 
 
 def _fine_patterns(

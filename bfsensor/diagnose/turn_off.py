@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -103,6 +104,4 @@ def _keep(channel: Channel, keep: NDArray[np.bool_]) -> Channel:
             blocks.append(block[np.ix_(part, part)])
         start += len(block)
     axes = {k: v[keep] for k, v in channel.axes.items()}
-    return Channel(
-        channel.word, channel.values[keep], tuple(blocks), axes, channel.unit, channel.fold
-    )
+    return replace(channel, values=channel.values[keep], blocks=tuple(blocks), axes=axes)

@@ -9,7 +9,6 @@ from astropy.table import Table
 from click.testing import CliRunner
 
 from bfsensor.cli import main
-from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.diagnosis import SCHEMA, diagnose, diagnose_measured, fit_bounded
 from bfsensor.diagnose.extract import measure_channels
 from bfsensor.diagnose.locate import Scanner, locate_mismatch, tail_probability
@@ -145,8 +144,7 @@ def test_a_device_off_its_card_is_told_and_not_absorbed(tmp_path):
     moved = point.copy()
     moved[predictor.names.index("device h")] += 8.0
     channels = tuple(
-        Channel(c.word, c.values + predictor.predict(c, moved) - predictor.predict(c, point),
-                c.blocks, c.axes, c.unit, c.fold)
+        replace(c, values=c.values + predictor.predict(c, moved) - predictor.predict(c, point))
         for c in measured.channels
     )  # fmt: skip
     found = diagnose_measured(replace(measured, channels=channels), virtual_baseline())

@@ -9,7 +9,6 @@ import pytest
 
 from bfsensor.diagnose.attribute import attribute
 from bfsensor.diagnose.attribution_words import reported, said_of
-from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.diagnosis import fit_bounded
 from bfsensor.diagnose.extract import measure_channels
 from bfsensor.diagnose.free_kernel import edge_names, shifts_of
@@ -45,7 +44,7 @@ def _changed(word, change):
     measured = _null()
     channels = tuple(
         c if c.word != word
-        else Channel(c.word, c.values + change(c.axes, c.values), c.blocks, c.axes, c.unit, c.fold)
+        else replace(c, values=c.values + change(c.axes, c.values))
         for c in measured.channels
     )  # fmt: skip
     return replace(measured, channels=channels)
@@ -294,9 +293,8 @@ def test_the_process_leaves_to_parameters_what_is_theirs():
         point[row] += 5 * null.fit.errors[row]
     measured = _null()
     channels = tuple(
-        Channel(c.word, c.values + null.predictor.predict(c, point)
-                - null.predictor.predict(c, null.fit.values[: len(point)]),
-                c.blocks, c.axes, c.unit, c.fold)
+        replace(c, values=c.values + null.predictor.predict(c, point)
+                - null.predictor.predict(c, null.fit.values[: len(point)]))
         for c in measured.channels
     )  # fmt: skip
     model, _ = _located(replace(measured, channels=channels))

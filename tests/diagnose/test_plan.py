@@ -250,8 +250,7 @@ def test_what_cannot_be_seen_is_told(tied):
     assert told["charge_loss"].because == "no lamp monitor"
     red = [c for c in measured.channels if c.word == "flat_cov"]
     one = tuple(
-        Channel(c.word, c.values, c.blocks,
-                {**c.axes, "wavelength": np.full(len(c), 620.0)}, c.unit, c.fold)
+        replace(c, axes={**c.axes, "wavelength": np.full(len(c), 620.0)})
         for c in red
     )  # fmt: skip
     (told_,) = (

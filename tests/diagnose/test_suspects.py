@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.diagnosis import fit_bounded
 from bfsensor.diagnose.extract import measure_channels
 from bfsensor.diagnose.locate import ALARM, FAMILY, locate_mismatch
@@ -39,7 +38,7 @@ def with_change(null, effect, length):
         for c, s in zip(fit.channels, fit.starts, strict=False)
     }
     channels = tuple(
-        Channel(c.word, c.values + c.unwhiten(parts[id(c)]), c.blocks, c.axes, c.unit, c.fold)
+        replace(c, values=c.values + c.unwhiten(parts[id(c)]))
         if id(c) in parts else c
         for c in measured.channels
     )  # fmt: skip
