@@ -30,10 +30,12 @@ from typing import Any, NamedTuple
 
 import click
 import numpy as np
+from astropy.table import Table
 from tqdm import tqdm
 
-from bfsensor.diagnose.diagnosis import diagnose_measured
+from bfsensor.diagnose.diagnosis import diagnose_measured, fit_bounded
 from bfsensor.diagnose.extract import measure_channels
+from bfsensor.diagnose.suspects import alarms_of
 from validation.concealed.campaign import seal
 from validation.concealed.effect import Effect
 from validation.concealed.effects_silicon import DeviceParameter, Saturation
@@ -59,9 +61,11 @@ from validation.trial_amplitudes import (
     take_signal,
 )
 from validation.virtual_source import VirtualSource, virtual_baseline
+from validation.write_results import write_results
 
 RESULTS = Path(__file__).parent / "results" / "challenge_trials.ecsv"
-COMMAND = "python -m validation.concealed_trials take"
+ALARMS = RESULTS.with_name("challenge_alarms.ecsv")
+COMMAND = "python -m validation.concealed_trials"
 MIX = {"null": 150, "outside": 60, "several": 80, "single": 210}
 FAINTEST, STRONGEST = 3.0, 30.0
 """Projected SNRs between which effects are drawn."""
@@ -330,7 +334,7 @@ def take(
             if sealed.exists() and (name, digest(sealed)) in there:
                 continue
             opened = take_trial(number, seed, work, calibration)
-            add_results(output, [to_row(opened, "channel", name)], COMMAND)
+            add_results(output, [to_row(opened, "channel", name)], f"{COMMAND} take")
     except ValueError as error:
         raise click.ClickException(str(error)) from None
 
@@ -352,12 +356,36 @@ def show(output: Path, name: str, misses: bool) -> None:
     scores = [from_row(r) for r in rows]
     lines = tally(scores)
     write_summary(
-        output.with_name(f"{output.stem}_summary.ecsv"), lines, name, "channel", COMMAND
+        output.with_name(f"{output.stem}_summary.ecsv"), lines, name, "channel", f"{COMMAND} take"
     )
     print_lines(lines, click.echo)
     if misses:
         click.echo("\nMisses:")
         print_misses(scores, click.echo)
+
+
+@main.command()
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), default=ALARMS, show_default=True
+)
+@click.option("--seed", default=1, show_default=True, help="Of the campaign.")
+def alarms(output: Path, seed: int) -> None:
+    """Find from which deviate on each family of statistics alarms, in a campaign without effects.
+
+    What scans, chi-squares and shapes of effects have of the false alarms, by their number.
+
+    \b
+    Example:
+      python -m validation.concealed_trials alarms
+    """
+    measured = measure_channels(VirtualSource(seed=seed, size="S", effects=[]))
+    found = alarms_of(*fit_bounded(measured, virtual_baseline()))
+    table = Table({"family": list(found), "alarm": list(found.values())})
+    table["alarm"].format = ".3f"
+    write_results(table, output, f"{COMMAND} alarms --seed {seed}")
+    click.echo(
+        f"{output}: {len(found)} families, {min(found.values()):.2f} to {max(found.values()):.2f}"
+    )
 
 
 @main.command()

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 from scipy.sparse import csr_array
 
 from bfsensor.diagnose.mismatch import BaselineFit
@@ -278,6 +279,21 @@ class Locator:
         out._scale = np.concatenate([self._scale, scale])
         out._maxima = [*self._maxima, drawn.max(0).astype(float)]
         return out
+
+    def alarms(self) -> dict[str, float]:
+        """Deviate from which a statistic alone is an alarm, by family.
+
+        Families are the chi-squares, the templates of each channel, by its word, and the shapes
+        of each effect.
+        """
+        maxima = np.max(self._maxima, axis=0)
+        rank = float(brentq(
+            lambda r: tail_probability(r, maxima) - ALARM, maxima.min(), 9 * maxima.max(), xtol=1e-3
+        ))  # fmt: skip
+        names = ["chi-square"] * self._chi
+        names += [t.word for t in self.scanner.templates] + [k.effect for k in self.library]
+        first = {name: n for n, name in reversed(list(enumerate(names)))}
+        return {n: float(self._zero[k] + rank * self._scale[k]) for n, k in first.items()}
 
     def locate(self, residuals: NDArray[np.float64] | None = None) -> Mismatch:
         """Find what of residuals noise does not explain.

@@ -56,13 +56,27 @@ def locate_effects(
     if mismatch.p_value < SURE:
         # Of two families; which of them is the closer one is known here.
         return replace(mismatch, p_value=2 * mismatch.p_value)
-    if kinds is None:
-        kinds = candidates_of(predictor.baseline)
-    kinds = tellable(kinds, predictor, fit.channels)
-    kinds = further(kinds, predictor.effects_at(fit.values[: len(predictor.names)]))
+    kinds = _candidates(predictor, fit, kinds)
     screen = Screen(predictor, fit, seen_of(mismatch))
     mismatch = locator.with_library(known_shapes(screen, kinds)).locate()
     return _with_sighted(screen, kinds, mismatch)
+
+
+def alarms_of(predictor: Predictor, fit: BaselineFit, *, seed: int = 1) -> dict[str, float]:
+    """Deviates from which :func:`locate_effects` alarms, by family: :meth:`Locator.alarms`."""
+    screen = Screen(predictor, fit)
+    shapes = known_shapes(screen, _candidates(predictor, fit))
+    return Locator(fit, seed=seed).with_library(shapes).alarms()
+
+
+def _candidates(
+    predictor: Predictor, fit: BaselineFit, kinds: Sequence[type[Effect]] | None = None
+) -> Sequence[type[Effect]]:
+    """Effects that are sought: those that these channels can tell, and are not there yet."""
+    if kinds is None:
+        kinds = candidates_of(predictor.baseline)
+    kinds = tellable(kinds, predictor, fit.channels)
+    return further(kinds, predictor.effects_at(fit.values[: len(predictor.names)]))
 
 
 def known_shapes(screen: Screen, kinds: Sequence[type[Effect]]) -> list[Known]:

@@ -105,6 +105,21 @@ def test_a_lone_number_is_not_hidden_by_many_templates(judge: Locator) -> None:
     assert [part.word for part in found.parts] == ["amp_cross"]
 
 
+def test_a_deviate_at_a_familys_alarm_is_one(judge: Locator) -> None:
+    """A lone number a little beyond its family's deviate alarms, a little below it does not."""
+    fit = judge.scanner.fit
+    alarms = judge.alarms()
+    assert set(alarms) == {"chi-square", "flat_cov", "flat_map", "amp_cross"}
+    # Of more templates noise gives farther ones.
+    assert 2.5 < alarms["amp_cross"] < alarms["flat_map"] < 6
+    (row,) = (k for k, t in enumerate(judge.scanner.templates) if t.word == "amp_cross")
+    unit = pattern(fit, "amp_cross", np.ones(1), 1.0)
+    unit -= fit.basis @ (fit.basis.T @ unit)
+    unit /= judge.scanner.templates_z(unit)[row]
+    for part, alarmed in ((0.98, False), (1.02, True)):
+        assert (judge.locate(part * alarms["amp_cross"] * unit).p_value < 0.01) == alarmed
+
+
 def test_parts_are_what_was_put_in_and_no_shadow(judge: Locator) -> None:
     fit = judge.scanner.fit
     x = fit.channels[0].axes
