@@ -96,4 +96,6 @@ def _value(told: dict[str, Any]) -> str:
         text = "any"
     elif open_:
         text = f"above {low}" if "hi" in open_ else f"below {high}"
+    if told.get("stopped68"):
+        text += f", followed from {low} to {high} only"
     return f"{told['value']:.3g} ({text})"

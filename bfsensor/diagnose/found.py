@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from bfsensor.diagnose.fitted_effects import widened
 from bfsensor.diagnose.locate import Mismatch
 from bfsensor.diagnose.mismatch import BaselineFit
 from bfsensor.diagnose.open_world import OpenWorld
 from bfsensor.diagnose.predict import Predictor
-from bfsensor.diagnose.profile import Profile, linear_interval
+from bfsensor.diagnose.profile import Profile
 from bfsensor.diagnose.screen import Rival
+from bfsensor.diagnose.valley import linear_interval
 from bfsensor.effects.effect import Effect, Parameter
 
 TIED = 3.0
@@ -77,7 +79,9 @@ class Found:
 
         Of parameters with a profile they end where the chi-square has risen by as much as
         errors, widened, say; 'open68' and 'open95' list ends, 'lo' or 'hi', that it does not
-        reach within the range of fits.  Of all others see :func:`linear_interval`.
+        reach within the range of fits, 'stopped68' and 'stopped95' those of them that lie inside
+        it: beyond nothing could be predicted, or the chi-square hardly rose.  Of all others see
+        :func:`linear_interval`.
 
         Parameters
         ----------
@@ -95,7 +99,7 @@ class Found:
         return out
 
     def _interval(self, p: Parameter, level: str, width: float) -> dict[str, Any]:
-        """Ends of one interval; 'open95' and the like name those that lie beyond the range."""
+        """Ends of one interval; 'open95' and the like name those that were not reached."""
         keys = f"lo{level}", f"hi{level}"
         if p.name not in self.profiles:
             ends = linear_interval(self.effect[p.name], width * self.errors[p.name], p)
@@ -105,7 +109,14 @@ class Found:
         low, high = min(low, self.effect[p.name]), max(high, self.effect[p.name])
         told: dict[str, Any] = dict(zip(keys, (low, high), strict=True))
         open_ = [k for k, c in zip(("lo", "hi"), closed, strict=True) if not c]
-        return told | ({f"open{level}": open_} if open_ else {})
+        limits = dict(zip(("lo", "hi"), widened(p), strict=True))
+        near = 1e-6 * (limits["hi"] - limits["lo"])
+        stopped = [k for k in open_ if abs(told[f"{k}{level}"] - limits[k]) > near]
+        return (
+            told
+            | ({f"open{level}": open_} if open_ else {})
+            | ({f"stopped{level}": stopped} if stopped else {})
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,8 @@ from bfsensor.diagnose.extract import measure_channels
 from bfsensor.diagnose.locate import locate_mismatch
 from bfsensor.diagnose.model import Model
 from bfsensor.diagnose.placed import place_effects
-from bfsensor.diagnose.profile import valley_of
 from bfsensor.diagnose.screen import Rival, Screen, evidence
+from bfsensor.diagnose.valley import valley_of
 from bfsensor.effects.charge_loss import ChargeLoss
 from bfsensor.effects.gain_nonlinearity import GainNonlinearity
 from bfsensor.effects.interpixel_coupling import InterpixelCoupling

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bfsensor.diagnose.fitted_effects import widened
 from bfsensor.diagnose.found import WIDENED, Found
-from bfsensor.diagnose.profile import Profile, Valley, linear_interval, profiles_in
+from bfsensor.diagnose.profile import Profile, profiles_in
+from bfsensor.diagnose.valley import Valley, linear_interval
 from bfsensor.effects.effect import Parameter
 from bfsensor.effects.psf_wings import PsfWings
 from bfsensor.errors import ConvergenceError
@@ -129,3 +131,9 @@ def test_found_tells_profiles_and_open_ends():
     low, high = linear_interval(0.01, WIDENED * 0.001, PsfWings.parameters[0])
     assert (told["frac"]["lo68"], told["frac"]["hi68"]) == (low, high)
     assert "open68" not in told["frac"]
+    assert "stopped68" not in told["sigma"] and widened(effect.parameters[1])[1] == 24.0
+    x = np.linspace(3.0, 20.0, 43)
+    profile = Profile(x, np.where(x < 5.0, 4.0 * (x - 5.0) ** 2, 0.0))
+    told = Found(effect, 20.0, errors, {}, (), (), {"sigma": profile}).intervals()
+    # Inside the range of fits: there was nothing to follow it by.
+    assert told["sigma"]["open68"] == told["sigma"]["stopped68"] == ["hi"]
