@@ -46,12 +46,8 @@ def combinations(sensitivity: NDArray[np.float64]) -> tuple[Combination, ...]:
     >>> [round(one.remains, 3) for one in both]
     [0.229, 1.0]
     """
-    values, vectors = np.linalg.eigh(sensitivity.T @ sensitivity)
-    out = []
-    for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
-        sign = np.sign(vector[np.argmax(np.abs(vector))])
-        out.append(Combination(float(1 / np.sqrt(1 + max(value, 0.0))), sign * vector))
-    return tuple(out)
+    information = np.eye(sensitivity.shape[1]) + sensitivity.T @ sensitivity
+    return principal(np.linalg.inv(information))
 
 
 def principal(covariance: NDArray[np.float64]) -> tuple[Combination, ...]:
