@@ -39,6 +39,7 @@ from bfsensor.diagnose.ranking import (
     seen_of,
     tellable,
     threshold,
+    with_fitted,
     with_hypotheses,
 )
 from bfsensor.diagnose.remainder import (
@@ -343,12 +344,13 @@ def _judge(
         for n in range(len(model.effects)):
             others = tuple(e for k, e in enumerate(model.effects) if k != n)
             without = model.with_effects(others)
-            if without.fit.total - model.fit.total < WEAK:
+            gain = without.fit.total - model.fit.total
+            if gain < WEAK:
                 model, places, swapped = without, {}, True
                 break
             screen = Screen(without.predictor, without.fit, seen_of(mismatch))
             ranking = refine(without, rank(screen, further(kinds, others)))
-            places[n] = ranking
+            ranking = places[n] = with_fitted(ranking, model.effects[n], gain)
             here = next(
                 (r for r in ranking if r.effect.name == model.effects[n].name), None
             )

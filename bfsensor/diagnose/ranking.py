@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -123,6 +124,27 @@ def refine(model: Model, ranking: Sequence[Rival]) -> list[Rival]:
             )  # fmt: skip
         else:
             out.append(rival)
+    return sorted(out, key=lambda r: -r.evidence)
+
+
+def with_fitted(ranking: Sequence[Rival], effect: Effect, gain: float) -> list[Rival]:
+    """Give an effect that was fitted the gain of its fit, where the search for it ended lower.
+
+    Parameters
+    ----------
+    ranking : sequence of Rival
+        Candidates in its place.
+    effect : Effect
+        As fitted.
+    gain : float
+        Decrease of the chi-square by it.
+    """
+    out = [
+        replace(r, effect=effect, gain=gain, evidence=r.evidence + 0.5 * (gain - r.gain))
+        if r.effect.name == effect.name and r.gain < gain
+        else r
+        for r in ranking
+    ]
     return sorted(out, key=lambda r: -r.evidence)
 
 

@@ -47,7 +47,7 @@ def combinations(sensitivity: NDArray[np.float64]) -> tuple[Combination, ...]:
     [0.229, 1.0]
     """
     information = np.eye(sensitivity.shape[1]) + sensitivity.T @ sensitivity
-    return principal(np.linalg.inv(information))
+    return principal(np.asarray(np.linalg.inv(information), float))
 
 
 def principal(covariance: NDArray[np.float64]) -> tuple[Combination, ...]:

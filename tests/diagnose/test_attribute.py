@@ -17,6 +17,7 @@ from bfsensor.diagnose.extract import measure_channels
 from bfsensor.diagnose.locate import locate_mismatch
 from bfsensor.diagnose.model import Model
 from bfsensor.diagnose.placed import place_effects
+from bfsensor.diagnose.ranking import with_fitted
 from bfsensor.diagnose.screen import Rival, Screen, evidence
 from bfsensor.diagnose.valley import valley_of
 from bfsensor.effects.charge_loss import ChargeLoss
@@ -127,6 +128,18 @@ def test_probabilities_and_ties_follow_evidence_and_gain():
         "charge_loss",
         "gain_nonlinearity",
     )
+
+
+def test_an_effect_that_was_fitted_has_the_gain_of_its_fit():
+    """A search that ended short of it must not make another one more probable."""
+    loss = rival(ChargeLoss, {"q": 1e-7}, 400.0, 195.0, [1, 0])
+    short = rival(GainNonlinearity, {"c2": -5e-3, "c3": -8e-4}, 350.0, 170.0, [1, 0])
+    bent = GainNonlinearity({"c2": -8e-3, "c3": 6e-4})
+    assert class_probabilities([loss, short])["charge_loss"] > 0.999
+    out = with_fitted([loss, short], bent, 410.0)
+    assert [r.effect for r in out] == [bent, loss.effect]
+    assert class_probabilities(out)["gain_nonlinearity"] > 0.99
+    assert with_fitted([loss, short], bent, 300.0) == [loss, short]
 
 
 def test_evidence_falls_with_the_room_a_parameter_has():
