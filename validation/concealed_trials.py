@@ -356,7 +356,11 @@ def show(output: Path, name: str, misses: bool) -> None:
     scores = [from_row(r) for r in rows]
     lines = tally(scores)
     write_summary(
-        output.with_name(f"{output.stem}_summary.ecsv"), lines, name, "channel", f"{COMMAND} take"
+        output.with_name(f"{output.stem}_summary.ecsv"),
+        lines,
+        name,
+        "channel",
+        f"{COMMAND} take",
     )
     print_lines(lines, click.echo)
     if misses:
