@@ -19,7 +19,8 @@ class BlockNoise(NamedTuple):
     ----------
     kept : ndarray of int
         Blocks, counted by rows, that tell more than columns, rows and each other do: of R x C
-        blocks (R - 1) (C - 1).  Both numbers below count what is beyond the last whole block.
+        blocks (R - 1) (C - 1).  Below, R and C also count rows and columns of blocks that the
+        rim cuts off.
     covariance : ndarray, shape (kept, kept)
         Of what columns and rows do not tell of them, for pixels of variance 1.
     spread : ndarray, shape (kept, R + C)
