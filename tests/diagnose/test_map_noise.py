@@ -78,6 +78,7 @@ def test_whitened_noise_of_pixels_is_white(good):
     lines = sum(good.shape)
     apart = white[lines:] @ white.T / DRAWS
     expected = np.eye(len(white))[lines:]
+    # 6 sigma of a covariance of so many draws, 4 of a variance.
     np.testing.assert_allclose(apart, expected, atol=6 / np.sqrt(DRAWS))
     np.testing.assert_allclose(channel.unwhiten(white[:, 0]), drawn[:, 0], atol=1e-12)
     read = drawn.std(1) > 0
@@ -103,6 +104,7 @@ def test_a_pattern_along_an_axis_counts_once():
         white = whiten(shape)
         return white @ whiten(drawn) / np.sqrt(white @ white)
 
+    # Of 400 draws a standard deviation scatters by 0.035.
     assert deviates(channel.whiten).std() == pytest.approx(1.0, abs=0.12)
 
     def apart(values):
