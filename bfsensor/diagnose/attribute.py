@@ -29,7 +29,7 @@ from bfsensor.diagnose.open_world import (
     fit_free_form,
 )
 from bfsensor.diagnose.predict import Predictor
-from bfsensor.diagnose.profile import find_profiles
+from bfsensor.diagnose.profile import Profile, find_profiles, settle
 from bfsensor.diagnose.ranking import (
     candidates_of,
     concerned,
@@ -77,6 +77,10 @@ TAKEN = 9.0
 """Chi-square that a parameter of an effect takes by chance, as the best of a library."""
 
 FOLDS = ("fit", "select")
+
+
+WIDTHS = [WIDENED * w for w in LEVELS.values()]
+"""Roots of the rises of the chi-square that intervals end at."""
 
 
 def attribute(
@@ -250,7 +254,8 @@ def _outside(
         free, last = told
         left = chosen.mismatch
     found = [
-        _found(last, n, _place(last, n, kinds, left)) for n in range(len(last.effects))
+        _found(last, n, _place(last, n, kinds, left), find_profiles(last, n, WIDTHS))
+        for n in range(len(last.effects))
     ]
     return found, last, left, free
 
@@ -317,15 +322,30 @@ def _needed(model: Model, base: Model) -> list[Effect]:
     return out
 
 
-def _found(model: Model, n: int, ranking: Sequence[Rival]) -> Found:
+def _found(
+    model: Model, n: int, ranking: Sequence[Rival], profiles: Mapping[str, Profile]
+) -> Found:
     """One effect of a model with those that may stand in its place."""
     effect = model.effects[n]
     gain = next((r.gain for r in ranking if r.effect.name == effect.name), np.nan)
     return Found(
         effect, gain, model.errors(n), class_probabilities(ranking),
-        tied_classes(effect, ranking), tuple(ranking),
-        find_profiles(model, n, [WIDENED * w for w in LEVELS.values()]),
+        tied_classes(effect, ranking), tuple(ranking), profiles,
     )  # fmt: skip
+
+
+def _settled(model: Model) -> tuple[Model, list[dict[str, Profile]]]:
+    """Profiles of all effects' parameters, and the fit gone on where one of them is lower."""
+    profiles: dict[int, dict[str, Profile]] = {}
+    for n in range(len(model.effects)):
+        lower, own = settle(model, n, WIDTHS)
+        if lower is not model:
+            profiles.clear()
+        model, profiles[n] = lower, own
+    return model, [
+        profiles[n] if n in profiles else find_profiles(model, n, WIDTHS)
+        for n in range(len(model.effects))
+    ]
 
 
 def _judge(
@@ -362,7 +382,9 @@ def _judge(
                 if other.fit.total < model.fit.total:
                     model, places, swapped = other, {}, True
                     break
-    if rounds and model.effects:
+    last = model
+    model, profiles = _settled(model)
+    if model.effects and (rounds or model is not last):
         mismatch = locate_mismatch(model.fit, seed=seed)
-    out = [_found(model, n, places.get(n, [])) for n in range(len(model.effects))]
+    out = [_found(model, n, places.get(n, []), own) for n, own in enumerate(profiles)]
     return out, model, mismatch

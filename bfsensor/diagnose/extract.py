@@ -216,6 +216,7 @@ def measure_channels(
     notes += [*finder.notes, *describe_unlike(unlike), *codes.notes, *late_codes.notes]
     # Sums of maps are the largest that is held: they go before the spots come.
     found_maps, late_found_maps = maps.channels(), late_maps.channels()
+    notes += [*maps.notes, *(f"held out: {n}" for n in late_maps.notes)]
     shares = {(e.fold, k): v for e in (maps, late_maps) for k, v in e.shares().items()}
     sightings = maps.sightings
     del maps, late_maps, by_fold

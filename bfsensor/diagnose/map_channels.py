@@ -9,11 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft, next_fast_len, rfft, rfft2
+from scipy.fft import rfft2
 
 from bfsensor.diagnose.channels import Channel, Common, join_common
 from bfsensor.diagnose.conditions import Axes, Condition
+from bfsensor.diagnose.map_borders import Border, find_borders
 from bfsensor.diagnose.map_noise import BlockNoise, block_noise
+from bfsensor.diagnose.map_texture import map_texture, texture_noise
 from bfsensor.diagnose.map_waves import find_patterns, without_shape
 
 BLOCKS = 16
@@ -21,12 +23,6 @@ BLOCKS = 16
 
 RINGS = 24
 """Bins of the spatial frequency, from 0 to half a cycle a pixel."""
-
-NEAREST, FARTHEST = 4, 40
-"""Distances in x [pixel] at which a map is held against itself: nearer ones share boundaries."""
-
-STRIPE = 256
-"""Rows of a map that are transformed at a time."""
 
 FULL = 0.5
 """Part of the light's noise below which a flat's wells are full."""
@@ -88,6 +84,7 @@ class MapChannels:
         self._shape, self._longest, self.fold = shape, longest, fold
         self._amplifiers = tuple(amplifiers)
         self.sightings: tuple[Mapping[str, Any], ...] = ()
+        self._borders: dict[tuple[int, int], Border] = {}
         self._groups: list[_Group] = []
         self._sums: dict[tuple[tuple[str, ...], bool], _Sum] = {}
         self._closed = True
@@ -164,6 +161,18 @@ class MapChannels:
         else:
             self._sums[name] = _Sum(self._total, weight)
         self._total = np.zeros((0, 0), np.float32)
+
+    def _keep(self, border: Border) -> None:
+        """Remember a border that was cut, as the map shows it that does so most."""
+        name = border.axis, border.line
+        self._borders[name] = max(
+            border, self._borders.get(name, border), key=lambda b: b.ratio
+        )
+
+    @property
+    def notes(self) -> list[str]:
+        """What there is to say of the maps."""
+        return [str(border) for border in self._borders.values()]
 
     def _is_short(self, group: _Group) -> bool:
         return group.time < SHORT * self._longest[group.condition.key]
@@ -262,6 +271,9 @@ class MapChannels:
         power = sum(
             w**2 * g.power / (2 * g.pairs**2) for w, g in zip(weights, groups, strict=True)
         )
+        for border in find_borders(image):
+            border.cut(image)
+            self._keep(border)
         pairs = sum(g.pairs for g in groups)
         ratio = sum(g.low / max(g.high, 1e-30) * g.pairs for g in groups) / pairs
         return _Map(
@@ -325,10 +337,10 @@ class MapChannels:
                 {"what": "ring", "k": frequency[keep], "x": -1.0, "y": -1.0},
             )
         )
-        texture, dx, dy = map_texture(free)
-        products = good.sum() * (1 - np.abs(dx) / nx) * (1 - dy / ny)
-        spread = 1e6 * float(free.var(dtype=np.float64)) / np.sqrt(np.maximum(products, 1))
-        out.append((texture, spread, {"what": "texture", "k": -1.0, "x": dx, "y": dy}))
+        texture = map_texture(free)
+        spread = texture_noise(free, texture, int(good.sum()))
+        told = {"what": "texture", "k": -1.0, "x": texture.dx, "y": texture.dy}
+        out.append((texture.values, spread, told))
         chess, centres = map_chess(filled)
         # Single pixels' noise is not evened out as that over many is.
         error = np.sqrt(sigma**2 / image.ratio * len(chess) / max(good.sum(), 1))
@@ -437,46 +449,6 @@ def spectrum_rings(modes: NDArray, shape: tuple[int, int]) -> NDArray[np.float64
     count = np.bincount(bins, minlength=RINGS + 1)[:RINGS]
     total = np.bincount(bins, power.ravel(), minlength=RINGS + 1)[:RINGS]
     return np.asarray(total / (shape[0] * shape[1]) / np.maximum(count, 1))
-
-
-def map_texture(
-    image: NDArray,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Hold a map against itself: mean products [1e-6] of pixels (dx, dy) apart, with dx and dy.
-
-    In the same row and from one row to the next: patterns that go with the time of readout
-    keep step along a row and start the next one with another phase.  Means of columns and of
-    rows are taken off: they are told by themselves.
-
-    Examples
-    --------
-    >>> wave = np.sin(2 * np.pi * np.arange(64 * 100) / 8.1).reshape(64, 100)
-    >>> values, dx, dy = map_texture(wave)
-    >>> [float(values[(dx == n) & (dy == 0)][0].round(-5)) for n in (4, 8)]
-    [-500000.0, 500000.0]
-    """
-    ny, nx = image.shape
-    columns = image.mean(0, dtype=np.float64)
-    reach = min(FARTHEST, nx // 2)
-    side = next_fast_len(nx + reach + 1, real=True)
-    same, following = np.zeros(side), np.zeros(side)
-    # Some rows at a time: transforms of large sensors need not be held.
-    for start in range(0, ny, STRIPE):
-        rows = image[start : start + STRIPE + 1]
-        rows = rows - columns - rows.mean(1, dtype=np.float64)[:, None] + columns.mean()
-        modes = rfft(rows, side, axis=1)
-        own = modes[:STRIPE]
-        same += irfft((own.real**2 + own.imag**2).sum(0), side)
-        following += irfft((modes[:-1].conj() * modes[1:]).sum(0), side)
-    near, all_ = np.arange(NEAREST, reach + 1), np.arange(-reach, reach + 1)
-    all_ = all_[np.abs(all_) >= NEAREST]
-    # A row's mean, taken off, leaves white noise anticorrelated by 1/nx.
-    values = [
-        same[near] / (ny * (nx - near)) + same[0] / (ny * nx**2),
-        following[all_] / ((ny - 1) * (nx - np.abs(all_))),
-    ]
-    dy = np.repeat([0.0, 1.0], [len(near), len(all_)])
-    return 1e6 * np.concatenate(values), np.concatenate([near, all_]).astype(float), dy
 
 
 def map_chess(image: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

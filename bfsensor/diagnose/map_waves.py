@@ -100,9 +100,10 @@ def find_patterns(
     Returns
     -------
     list of dict
-        At most two, the clearest first: 'map', 'z', 'shape' ('wave': 'fx', 'fy', 'xx', 'xy',
-        'yy' of :class:`Wave` about the middle, pixel n / 2, 'phase' [cycles], 'amp'; 'rings':
-        those of :func:`bfsensor.diagnose.map_rings.find_rings`).
+        At most two waves, the clearest first: 'map', 'z', 'shape' ('wave': 'fx', 'fy', 'xx',
+        'xy', 'yy' of :class:`Wave` about the middle, pixel n / 2, 'phase' [cycles], 'amp'). Of
+        the map of all light before them the clearest 'rings' of
+        :func:`bfsensor.diagnose.map_rings.find_rings`.
 
     Examples
     --------
@@ -134,8 +135,9 @@ def find_patterns(
             out.append((gain, wave))
     out.sort(key=lambda found: -found[0])
     told: list[dict[str, Any]] = []
+    found: list[tuple[float, list[dict[str, Any]]]] = []
     ny_all, nx_all = image.shape
-    for gain, wave in out[:2]:
+    for gain, wave in out:
         # Centre of a binned pixel on the sensor.
         first = 0.5 * (side - 1)
         whole = Wave(
@@ -143,24 +145,27 @@ def find_patterns(
             wave.fx / side, wave.fy / side, wave.xx / side**2, wave.xy / side**2,
             wave.yy / side**2, wave.sine * spread, wave.cosine * spread,
         ).about(nx_all / 2, ny_all / 2)  # fmt: skip
-        if name == "all" and not told:
+        if name == "all":
             y, x = (
                 side * g + first + c
                 for g, c in zip(np.indices(values.shape), corner, strict=True)
             )
             near = _circles(whole, 20.0 * side * max(values.shape))
-            told += [
-                {"map": name, "shape": "rings", "z": float(np.sqrt(own)), **rings}
-                for own, rings in find_rings(values, x, y, near)
-            ]
-            for rings in told:
-                rings["amp"] *= spread
+            rings = find_rings(values, x, y, near)
+            if rings:
+                found.append((rings[0][0], [
+                    {"map": name, "shape": "rings", "z": float(np.sqrt(own)), **r}
+                    | {"amp": spread * r["amp"]}
+                    for own, r in rings
+                ]))  # fmt: skip
         told.append({
             "map": name, "shape": "wave", "z": float(np.sqrt(gain)), "amp": whole.amp,
             "phase": float(np.arctan2(whole.cosine, whole.sine) / (2 * np.pi)),
             **{k: getattr(whole, k) for k in ("fx", "fy", "xx", "xy", "yy")},
         })  # fmt: skip
-    return told
+    # Waves of other parts of the same rings lead to other circles: the clearest count.
+    clearest = max(found, key=lambda f: f[0], default=(0.0, []))[1]
+    return [*clearest, *told[:2]]
 
 
 def _middle(

@@ -19,9 +19,9 @@ from bfsensor.diagnose.map_channels import (
     MapShare,
     block_side,
     map_chess,
-    map_texture,
     spectrum_rings,
 )
+from bfsensor.diagnose.map_texture import map_texture
 from bfsensor.diagnose.map_waves import smooth_shapes
 from bfsensor.effects.effect import Axes, Effect, Layout, Shot
 

@@ -31,6 +31,13 @@ SEEN = 0.05
 """Rise of the chi-square's root along a step below which nothing tells how far to go next."""
 
 
+LOWER = 0.2
+"""Chi-square by which a profile must be lower than the fit for the fit to go on there."""
+
+RESTARTS = 4
+"""Of a fit that profiles found lower places of."""
+
+
 @dataclass(frozen=True)
 class Profile:
     """How the chi-square rises with one parameter, all others at their best.
@@ -201,6 +208,35 @@ class _Side:
             one, two = self.places[at - 1 : at + 1]
             if not self._add(one + float(np.clip(part, 0.2, 0.8)) * (two - one), at):
                 return
+
+
+def settle(
+    model: Model, n: int, widths: Sequence[float]
+) -> tuple[Model, dict[str, Profile]]:
+    """Profiles as of :func:`find_profiles`, and the fit gone on from where they are lower.
+
+    Along a bent valley a fit goes by steps that gain ever less and may end before its lowest
+    place; profiles, which follow the valley, come by it.
+    """
+    for _ in range(RESTARTS):
+        if type(model.effects[n]).modes is not Effect.modes:
+            return model, {}
+        valley = valley_of(model, n)
+        profiles = profiles_in(valley, widths)
+        if valley.square - valley.lowest.square < LOWER:
+            return model, profiles
+        effects, values = list(model.effects), valley.lowest.values.tolist()
+        effects[n] = effects[n].with_values(
+            **{p.name: v for p, v in zip(valley.parameters, values, strict=True)}
+        )
+        try:
+            lower = model.with_effects(effects)
+        except ConvergenceError:
+            return model, profiles
+        if lower.fit.total > model.fit.total - 0.5 * LOWER:
+            return model, profiles
+        model = lower
+    return model, find_profiles(model, n, widths)
 
 
 def find_profiles(model: Model, n: int, widths: Sequence[float]) -> dict[str, Profile]:

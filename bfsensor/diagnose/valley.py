@@ -52,6 +52,11 @@ class Valley:
         Derivatives of the prediction at the best, what everything else takes of them taken off.
     steps : ndarray, shape (p,)
         Of derivatives.
+
+    Attributes
+    ----------
+    lowest : Held
+        Of all points that were come to; the best, where the fit found it.
     """
 
     def __init__(
@@ -69,6 +74,7 @@ class Valley:
         self.covariance = np.linalg.pinv(slopes.T @ slopes, rcond=1e-12)
         self.errors = np.sqrt(np.diag(self.covariance))
         self._unit = np.where(self.errors > 0, self.errors, steps)
+        self.lowest = Held(self.square, best, slopes)
 
     def along(self, k: int, value: float) -> Values:
         """All parameters with one at a value, the others moved linearly with it."""
@@ -124,7 +130,7 @@ class Valley:
         values[k] = value
         left = self.left(values)
         if not len(own):
-            return Held(float(left @ left), values, near.slopes)
+            return self._kept(Held(float(left @ left), values, near.slopes))
         slopes, fresh = near.slopes.copy(), False
         for _ in range(TURNS):
             ends = [reach_of(self.parameters[n], float(values[n])) for n in own]
@@ -144,7 +150,11 @@ class Valley:
             if fresh:
                 break
             slopes[:, own], fresh = self._slopes_at(values, left, own), True
-        return Held(float(left @ left), values, slopes)
+        return self._kept(Held(float(left @ left), values, slopes))
+
+    def _kept(self, held: Held) -> Held:
+        self.lowest = min(self.lowest, held, key=lambda h: h.square)
+        return held
 
     def _tried(self, values: Values, own: NDArray[np.int64], step: Values) -> Values | None:
         there = values.copy()

@@ -40,3 +40,21 @@ def test_even_rings_are_not_told_as_uneven_ones():
 
 def test_noise_has_no_rings():
     assert not sightings(None)
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_rings_are_followed_from_whichever_wave_leads_to_them(seed):
+    """Of rings whose spacing sways, the clearest wave may lie where they are straight."""
+    rng = np.random.default_rng(seed)
+    effect = UnevenTreeRings(
+        PLACE | {"sway": 0.15, "length": 467.5, "sway_phase": 0.0, "phase": 0.25}
+    )
+    layout = Layout((256, 256), (Segment(0, 0, 256, 256),))
+    true = area_change(effect, SHOT, layout)
+    found = find_patterns(true + 2.7e-3 * rng.standard_normal(layout.shape), "all")
+    start = next(s for s in found if s["shape"] == "rings")
+    assert "sway" in start
+    said = area_change(
+        UnevenTreeRings({p.name: start[p.name] for p in effect.parameters}), SHOT, layout
+    )
+    assert ((true - said) ** 2).sum() < 0.05 * (true**2).sum()

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bfsensor.diagnose import profile
 from bfsensor.diagnose.fitted_effects import widened
 from bfsensor.diagnose.found import WIDENED, Found
-from bfsensor.diagnose.profile import Profile, profiles_in
+from bfsensor.diagnose.profile import LOWER, Profile, profiles_in, settle
 from bfsensor.diagnose.valley import Valley, linear_interval
 from bfsensor.effects.effect import Parameter
 from bfsensor.effects.psf_wings import PsfWings
@@ -137,3 +138,64 @@ def test_found_tells_profiles_and_open_ends():
     told = Found(effect, 20.0, errors, {}, (), (), {"sigma": profile}).intervals()
     # Inside the range of fits: there was nothing to follow it by.
     assert told["sigma"]["open68"] == told["sigma"]["stopped68"] == ["hi"]
+
+
+class Fitted:
+    """A fit of :func:`bent` in closed form, that steps do not move: it stays where it is put."""
+
+    def __init__(self, values, refused=()):
+        self.values, self.refused = np.array(values, float), refused
+        self.effects = (self,)
+        self.total = float(bent(self.values) @ bent(self.values))
+        self.fit = self
+
+    modes = PsfWings.modes
+
+    def with_values(self, amp, shape):
+        return Fitted([amp, shape], self.refused)
+
+    def with_effects(self, effects):
+        if "all" in self.refused:
+            raise ConvergenceError("nothing converges")
+        return effects[0]
+
+
+@pytest.fixture
+def valleys(monkeypatch):
+    monkeypatch.setattr(
+        profile, "valley_of", lambda model, n: valley(bent, model.values, (AMP, SHAPE))
+    )
+
+
+@pytest.mark.parametrize("start", [[2.6, 1.5], [1.2, 3.2]])
+def test_a_fit_that_ended_early_goes_on_where_profiles_are_lower(valleys, start):
+    began = Fitted(start)
+    assert began.total > 2 * LOWER
+    settled, found = settle(began, 0, WIDTHS)
+    assert settled.total < 2 * LOWER
+    low, high, *closed = found["shape"].interval(1.0)
+    assert low < 2.0 < high
+    assert all(closed)
+
+
+def test_a_fit_at_its_lowest_stays(valleys):
+    began = Fitted([2.0, 2.0])
+    settled, found = settle(began, 0, WIDTHS)
+    assert settled is began
+    assert found
+
+
+def test_a_fit_that_cannot_go_on_stays(valleys):
+    began = Fitted([2.6, 1.5], refused=("all",))
+    settled, found = settle(began, 0, WIDTHS)
+    assert settled is began
+    assert found
+
+
+def test_the_lowest_point_is_kept():
+    here = valley(bent, [2.6, 1.5])
+    assert here.lowest.square == here.square
+    profiles_in(here, WIDTHS)
+    assert here.lowest.square < here.square
+    left = bent(here.lowest.values)
+    assert here.lowest.square == pytest.approx(float(left @ left))
