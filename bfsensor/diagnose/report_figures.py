@@ -60,6 +60,14 @@ class Drawn(NamedTuple):
         return [p for p in (self.before, self.after) if p is not None]
 
 
+SAME_PIXELS = (
+    " Maps of all light are of the same pixels, whose own response is the same in all flats "
+    "(noise that is alike to 0.9): that a pattern comes again is no more evidence that it is what "
+    "it is taken for."
+)
+"""What recordings of one sensor do not tell."""
+
+
 def draw_figures(diagnosis: Diagnosis, folder: Path) -> list[Drawn]:
     """Draw what the channels allow.  Nothing without matplotlib."""
     try:
@@ -125,7 +133,8 @@ def _summary(diagnosis: Diagnosis) -> dict[str, Picture]:
     if attribution.found and held:
         out["heldout"] = Picture(
             "Recordings that no fit has seen: chi-square per value by the baseline and with the "
-            "effects. The grey bars are where noise alone leaves it in 95 of 100 cases.",
+            "effects. The grey bars are where noise alone leaves it in 95 of 100 cases."
+            + (SAME_PIXELS if NAMES["flat_map"] in held else ""),
             (6.2, 0.9 + 0.36 * len(held)), (lambda ax: show.draw_held_out(held, ax),),
         )  # fmt: skip
     return out

@@ -116,6 +116,8 @@ def test_the_page_is_whole_and_says_it_all(written):
     assert "or gain nonlinearity" in text or "or charge loss" in text
     assert "binned by two along the row" in text and "Astier" in text
     assert re.search(r"1\.\d+e-07 to 1\.\d+e-07", text)
+    # What maps of the same pixels that were not fitted are worth.
+    assert "whose own response is the same in all flats" in text
 
 
 def test_figures_come_in_pairs_of_one_scale(written):
