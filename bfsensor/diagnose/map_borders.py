@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 UNLIKE = 8.0
 """Standard errors by which a line at the rim must scatter more than others to be left out."""
 
-
 INNER = 64
 """Inner lines, at most, that are looked at."""
 

@@ -18,7 +18,7 @@ CLEAR = 18.0
 """Power over the noise's above which a mode is a pattern's: of 1e6 modes of noise none."""
 
 STRONGEST = 4096
-"""Modes that count as a pattern's, at most."""
+"""Modes that count as a pattern's, at most; weaker ones count as noise, which errs to the safe side."""
 
 Values = NDArray[np.float64]
 
@@ -135,7 +135,8 @@ def texture_noise(image: NDArray, texture: Texture, pixels: int) -> Values:
     turns = np.outer(texture.dx, column / nx) + np.outer(
         texture.dy, np.fft.fftfreq(ny)[row]
     )
-    own = max(variance - float(strength.sum()), 0.1 * variance)
+    # Round-off of strong patterns aside, noise is no less than that of the usual mode.
+    own = max(variance - float(strength.sum()), noise)
     spread = 2 * np.sqrt(own * strength) * np.cos(2 * np.pi * turns)
     spread *= (1e6 / np.sqrt(products))[:, None]
     return np.asarray(spread @ spread.T + np.diag((1e6 * own) ** 2 / products))

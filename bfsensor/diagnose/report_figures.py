@@ -61,9 +61,8 @@ class Drawn(NamedTuple):
 
 
 SAME_PIXELS = (
-    " Maps of all light are of the same pixels, whose own response is the same in all flats "
-    "(noise that is alike to 0.9): that a pattern comes again is no more evidence that it is what "
-    "it is taken for."
+    " Maps of all light are of the same pixels, whose own response is the same in all flats: "
+    "that a pattern comes again is no more evidence that it is what it is taken for."
 )
 """What recordings of one sensor do not tell."""
 

@@ -18,16 +18,21 @@ def draw(rng, shape):
     return shape + rng.normal(0, SIGMA, (SIDE, SIDE))
 
 
+def drawn(seed):
+    """Textures of maps with the pattern, their values, and the covariance by one more map."""
+    rng, shape = np.random.default_rng(seed), pattern()
+    textures = [map_texture(draw(rng, shape)) for _ in range(DRAWS)]
+    one = draw(rng, shape)
+    covariance = texture_noise(one, map_texture(one), one.size)
+    return textures, np.array([t.values for t in textures]), covariance
+
+
 def white(covariance, residuals):
     return np.linalg.solve(np.linalg.cholesky(covariance), residuals)
 
 
 def test_errors_of_a_pattern_are_as_measured():
-    rng, shape = np.random.default_rng(3), pattern()
-    textures = [map_texture(draw(rng, shape)) for _ in range(DRAWS)]
-    values = np.array([t.values for t in textures])
-    one = draw(rng, shape)
-    covariance = texture_noise(one, map_texture(one), one.size)
+    _, values, covariance = drawn(3)
     left = white(covariance, (values - values.mean(0)).T)
     # Modes of the pattern that do not stand out count as noise: errors are up to a tenth too large.
     square = float((left**2).sum(0).mean()) / len(left)
@@ -41,12 +46,8 @@ def test_errors_of_a_pattern_are_as_measured():
 
 def test_an_amplitude_scatters_as_its_error_says():
     """Fitted with products taken as independent, by more than twice as much."""
-    rng, shape = np.random.default_rng(4), pattern()
-    textures = [map_texture(draw(rng, shape)) for _ in range(DRAWS)]
-    values = np.array([t.values for t in textures])
-    one = draw(rng, shape)
-    covariance = texture_noise(one, map_texture(one), one.size)
-    template = map_texture(shape).values
+    textures, values, covariance = drawn(4)
+    template = map_texture(pattern()).values
 
     def deviates(matrix):
         weights = np.linalg.solve(matrix, template)
