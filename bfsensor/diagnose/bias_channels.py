@@ -57,24 +57,11 @@ class BiasChannels:
         """Add a bias frame."""
         self._condition = Condition.of(exposure)
         self._names = [f.name for f in frames]
-        zeros, levels = [], []
-        for frame in frames:
-            over = frame.serial_overscan.astype(np.float64)
-            # Without an overscan the mean bias is the zero of flats: its level stays in it.
-            zeros.append(float(over.mean()) if over.size else 0.0)
+        zeros = self.add_level(exposure, frames)
+        for frame, zero in zip(frames, zeros, strict=True):
             if frame.name not in self._sum:
                 self._sum[frame.name] = np.zeros(frame.pixels.shape)
-            self._sum[frame.name] += frame.pixels.astype(np.float64) - zeros[-1]
-            image = frame.image.astype(np.float64)
-            if over.size:
-                # Tracks of particles would tell their own number, not the level.
-                image = image[~_struck(image, TRACK)]
-                share = image.var() / image.size + over.var() / over.size
-                levels.append((float(image.mean()) - zeros[-1], share + LEVEL_ERROR**2))
-        if len(levels) == len(frames):
-            self._levels.append((exposure, levels))
-            overs = [f.serial_overscan.astype(np.float64) for f in frames]
-            self._zeros.append([(o.mean(), o.var() / o.size) for o in overs])
+            self._sum[frame.name] += frame.pixels.astype(np.float64) - zero
         self.frames += 1
         here = [(f.pixels, zero) for f, zero in zip(frames, zeros, strict=True)]
         if not self._last:
@@ -97,6 +84,25 @@ class BiasChannels:
         self._rows.append(rows)
         flat -= flat.mean(1, keepdims=True)
         self._cross.append(flat @ flat.T / (self._size - (len(flat) > 1)))
+
+    def add_level(self, exposure: Exposure, frames: Sequence[Frame]) -> list[float]:
+        """Add a bias frame to the levels alone; gives its zeros [ADU]."""
+        zeros, levels = [], []
+        for frame in frames:
+            over = frame.serial_overscan.astype(np.float64)
+            # Without an overscan the mean bias is the zero of flats: its level stays in it.
+            zeros.append(float(over.mean()) if over.size else 0.0)
+            image = frame.image.astype(np.float64)
+            if over.size:
+                # Tracks of particles would tell their own number, not the level.
+                image = image[~_struck(image, TRACK)]
+                share = image.var() / image.size + over.var() / over.size
+                levels.append((float(image.mean()) - zeros[-1], share + LEVEL_ERROR**2))
+        if len(levels) == len(frames):
+            self._levels.append((exposure, levels))
+            overs = [f.serial_overscan.astype(np.float64) for f in frames]
+            self._zeros.append([(o.mean(), o.var() / o.size) for o in overs])
+        return zeros
 
     def mean(self, name: str) -> NDArray[np.float64] | None:
         """Mean bias of an amplifier's whole frame, any overscan's level taken off [ADU]."""

@@ -36,6 +36,7 @@ from bfsensor.diagnose.pairs import (
     scan_unlike,
 )
 from bfsensor.diagnose.spot_channels import SpotChannels
+from bfsensor.diagnose.spot_ghosts import describe_ghosts, find_ghosts
 from bfsensor.effects.effect import Segment, Shot
 from bfsensor.errors import MeasurementError
 
@@ -160,11 +161,18 @@ def measure_channels(
             progress(done, len(exposures))
         return frames
 
+    ghosts = find_ghosts(exposures, source.read)
+    if ghosts:
+        notes.append(describe_ghosts(ghosts, exposures))
     biases, late_biases = BiasChannels(), BiasChannels("held-out")
     in_mean: list[int] = []
-    for n, exposure in enumerate(kinds.get("bias", [])):
+    for exposure in kinds.get("bias", []):
+        if exposure.number in ghosts:
+            biases.add_level(exposure, read(exposure))
+    quiet = [e for e in kinds.get("bias", []) if e.number not in ghosts]
+    for n, exposure in enumerate(quiet):
         # Noise is measured in differences of two frames: they go together.
-        held = is_held_out(n // 2, len(kinds["bias"]) // 2)
+        held = is_held_out(n // 2, len(quiet) // 2)
         (late_biases if held else biases).add(exposure, read(exposure))
         if not held:
             in_mean.append(exposure.number)
@@ -234,8 +242,9 @@ def measure_channels(
         before[exposure.number] = last
         last = levels.get(exposure.number, 0.0)
     seen: dict[float | None, int] = {}
-    times = [e.exposure_time for e in kinds.get("dark", [])]
-    for exposure in kinds.get("dark", []):
+    dark = [e for e in kinds.get("dark", []) if e.number not in ghosts]
+    times = [e.exposure_time for e in dark]
+    for exposure in dark:
         turn = seen.get(exposure.exposure_time, 0)
         seen[exposure.exposure_time] = turn + 1
         # The third of at least four of an exposure time.
