@@ -1,6 +1,6 @@
 """Show: physics that a device's simulation leaves out, concealed and found again.
 
-``python -m validation.concealed_physics [--keep FOLDER] [--again]``
+``python -m validation.concealed_physics [--keep FOLDER] [--again] [--only LABEL ...]``
 
 The truth is a chip: the ITL device with doping, channel dose and back bias scattered about its card
 (1.5 %, 1 %, 0.1 V), from tables at 32 cells a pixel with all physics.  The baseline is the card's
@@ -54,7 +54,7 @@ from bfsensor.diagnose.predict_maps import shot_at
 from bfsensor.diagnose.ranking import name_of
 from bfsensor.effects.effect import Effect, Segment, Shot
 from bfsensor.measure.bartlett import bartlett_matrix
-from validation.write_results import write_results
+from validation.write_results import commit_here, write_results
 
 RESULTS = "validation/results/concealed_physics.ecsv"
 FIGURE = "validation/figures/concealed_physics.png"
@@ -456,32 +456,41 @@ def main() -> None:
     """Run what is not there yet and write the rows."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--keep", type=Path, default=Path(gettempdir()) / "bfsensor_walks")
-    parser.add_argument("--again", action="store_true", help="take all rows again")
-    parser.add_argument("--only", nargs="*", default=[], help="labels")
+    parser.add_argument(
+        "--again", action="store_true", help="take rows again that are there"
+    )
+    parser.add_argument(
+        "--only", nargs="*", default=[], help="labels; rows of others stay as they are"
+    )
     given = parser.parse_args()
+    labels = [case.label for case in CASES]
+    if unknown := sorted(set(given.only) - set(labels)):
+        parser.error(f"--only {', '.join(unknown)}: not among {', '.join(labels)}")
     path = Path(RESULTS)
-    rows: list[dict[str, Any]] = []
-    if path.exists() and not given.again:
+    rows: dict[str, dict[str, Any]] = {}
+    if path.exists():
         there = Table.read(path, format="ascii.ecsv", fill_values=[])
-        rows = [dict(zip(there.colnames, r, strict=True)) for r in there]
+        for row in there:
+            # Rows of one file may be of several commits.
+            found = dict(zip(there.colnames, row, strict=True))
+            rows[found["case"]] = {"commit": there.meta["commit"], **found}
     for case in CASES:
-        if any(r["case"] == case.label for r in rows):
+        wanted = not given.only or case.label in given.only
+        if not wanted or (case.label in rows and not given.again):
             continue
-        if given.only and case.label not in given.only:
-            continue
-        rows.append(run(case, given.keep))
+        rows[case.label] = {"commit": commit_here(), **run(case, given.keep)}
         print(
             {
                 k: float(f"{v:.4g}") if isinstance(v, float) else v
-                for k, v in rows[-1].items()
+                for k, v in rows[case.label].items()
             },
             flush=True,
         )
-        table = Table(rows)
+        table = Table([rows[label] for label in labels if label in rows])
         for column in table.columns.values():
             if column.dtype.kind == "f":
                 column.info.format = ".4g"
-        total = round(float(sum(r["cpu_s"] for r in rows)), 1)
+        total = round(float(np.sum(table["cpu_s"])), 1)
         write_results(table, RESULTS, COMMAND, cpu_s=total, pairs=PAIRS)
         draw(table, FIGURE)
 
