@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -107,27 +109,30 @@ class Exposure:
             *(np.empty(batch, np.int32) for _ in range(4)),
         )
         _charge.take_image(
-            image, self.charges, self.ledger, physics.response, physics.edges, np.float32(0)
-        )
+            np.ascontiguousarray(image), self.charges, self.ledger, physics.response,
+            physics.edges, np.float32(0),
+        )  # fmt: skip
 
     def add(self, image: NDArray[np.floating], light: Light) -> float:
         """Collect photons; returns the flux that stays in the image."""
         p = self.physics
-        arguments: Any = (
-            image, light, p.medium, self.pattern, self.plan, p.edges, self.charges,
-            self.hot, self.ledger, p.response,
-        )  # fmt: skip
-        if self.threads == 1:
-            return float(_shoot.shoot(*arguments, 1, *self._buffers))
-        with threads_to_use(self.threads) as threads:
-            return float(_shoot.shoot_on_threads(*arguments, threads, *self._buffers))
+        with _in_rows(image) as pixels:
+            arguments: Any = (
+                pixels, light, p.medium, self.pattern, self.plan, p.edges, self.charges,
+                self.hot, self.ledger, p.response,
+            )  # fmt: skip
+            if self.threads == 1:
+                return float(_shoot.shoot(*arguments, 1, *self._buffers))
+            with threads_to_use(self.threads) as threads:
+                return float(_shoot.shoot_on_threads(*arguments, threads, *self._buffers))
 
     def renew(self, image: NDArray[np.floating]) -> None:
         """Renew the boundaries now."""
         p = self.physics
-        _shoot.renew(
-            image, self.plan, p.edges, self.charges, self.hot, self.ledger, p.response
-        )
+        with _in_rows(image) as pixels:
+            _shoot.renew(
+                pixels, self.plan, p.edges, self.charges, self.hot, self.ledger, p.response
+            )
 
     def copy(self) -> Exposure:
         """Give an independent copy."""
@@ -152,6 +157,20 @@ class Exposure:
             "lost": float(sums[_charge.LOST]),
             "beyond_table": int(counters[_charge.BEYOND]),
         }
+
+
+@contextmanager
+def _in_rows(image: NDArray[np.floating]) -> Iterator[NDArray[np.floating]]:
+    """Give the image with its pixels one after another, itself or a copy that is written back.
+
+    Kernels are compiled for each layout of memory, which takes longer than any copy.
+    """
+    if image.flags.c_contiguous:
+        yield image
+        return
+    pixels = np.ascontiguousarray(image)
+    yield pixels
+    image[...] = pixels
 
 
 def _no_hot_edges(edges: Edges, tiles: int) -> Hot:
