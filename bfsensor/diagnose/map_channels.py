@@ -30,6 +30,12 @@ FULL = 0.5
 LOW = 8
 """Side of the boxes [pixel] that tell noise over many pixels."""
 
+LONG = 4
+"""Blocks in the shortest wave that tells noise over still more: light of its own in each flat."""
+
+CERTAIN = 5.0
+"""Standard deviations by which that must be above the boxes' to count."""
+
 SHORT = 0.25
 """Part of the longest exposure time below which flats count as short."""
 
@@ -136,7 +142,9 @@ class MapChannels:
         boxes = noise[:ny, :nx].reshape(ny // side, side, nx // side, side)
         group.low += float((boxes.mean((1, 3), dtype=np.float64) * side).var())
         group.high += float(np.diff(noise, axis=1).var(dtype=np.float64)) / 2
-        group.power += ring_power(noise)
+        modes = rfft2(noise)
+        group.power += spectrum_rings(modes, self._shape)
+        group.long += long_power(modes, self._shape)
         group.pairs += 1
         group.shared += shared
         group.level += level
@@ -276,9 +284,25 @@ class MapChannels:
             self._keep(border)
         pairs = sum(g.pairs for g in groups)
         ratio = sum(g.low / max(g.high, 1e-30) * g.pairs for g in groups) / pairs
+        long = self._long(groups, weights)
         return _Map(
-            image, float(low) + common, np.asarray(power) + common, float(ratio), pairs
+            image, float(low) + common, np.asarray(power) + common, float(ratio), pairs,
+            max(long - float(low), 0.0),
+        )  # fmt: skip
+
+    def _long(self, groups: list[_Group], weights: NDArray[np.float64]) -> float:
+        """Noise of a mean over long waves as a pixel's variance; 0 unless certainly the larger."""
+        modes = int(_is_long(self._shape).sum())
+        parts = np.array(
+            [w**2 / (2 * g.pairs**2) for w, g in zip(weights, groups, strict=True)]
         )
+        low, long = (np.array([getattr(g, k) for g in groups]) for k in ("low", "long"))
+        pairs = np.array([g.pairs for g in groups])
+        if not modes:
+            return 0.0
+        error = np.sqrt(float(((parts * low) ** 2 / (modes * pairs)).sum()))
+        found = float(parts @ long)
+        return found if found > float(parts @ low) + CERTAIN * error else 0.0
 
     def _parts(
         self, image: _Map, *, own: bool
@@ -288,14 +312,15 @@ class MapChannels:
         ``own``: the map holds the pixels' own response, of which its neighbours tell.
         """
         ny, nx = self._shape
-        sigma = np.sqrt(image.low)
+        single = np.sqrt(image.low)
         if own:
             steps = np.diff(image.values, axis=1).ravel()
             steps = steps[np.isfinite(steps)]
             steps -= np.median(steps)
             seen = 1.4826 * float(np.median(np.abs(steps, out=steps))) / np.sqrt(2.0)
             del steps
-            sigma = max(sigma, seen * np.sqrt(image.ratio))
+            single = max(single, seen * np.sqrt(image.ratio))
+        sigma = np.sqrt(single**2 + image.long)
         good = np.isfinite(image.values)
         filled = np.where(good, image.values, np.float32(0.0))
         out: list[tuple[NDArray, NDArray, Mapping[str, object]]] = []
@@ -343,7 +368,7 @@ class MapChannels:
         out.append((texture.values, spread, told))
         chess, centres = map_chess(filled)
         # Single pixels' noise is not evened out as that over many is.
-        error = np.sqrt(sigma**2 / image.ratio * len(chess) / max(good.sum(), 1))
+        error = np.sqrt(single**2 / image.ratio * len(chess) / max(good.sum(), 1))
         out.append(
             (chess, np.full(len(chess), error), {"what": "chess", "k": -1.0, "x": centres, "y": -1.0})
         )  # fmt: skip
@@ -363,6 +388,7 @@ class _Group:
     time: float
     low: float = 0.0
     high: float = 0.0
+    long: float = 0.0
     power: NDArray[np.float64] = field(default_factory=lambda: np.zeros(RINGS))
     pairs: int = 0
     shared: float = 0.0
@@ -387,7 +413,8 @@ class _Map:
     """A map less one, its noise over many pixels as a pixel's variance, and by ring.
 
     ``ratio``: of that variance to the one between neighbours; the effect evens the response of
-    single pixels out as it does their noise, to first order.
+    single pixels out as it does their noise, to first order.  ``long``: what noise over
+    blocks has more.
     """
 
     values: NDArray[np.float32]
@@ -395,12 +422,14 @@ class _Map:
     power: NDArray[np.float64]
     ratio: float
     pairs: int
+    long: float = 0.0
 
     def over(self, other: _Map) -> _Map:
         """Ratio of two maps, less one."""
         return _Map(
             (self.values - other.values) / (1 + other.values), self.low + other.low,
             self.power + other.power, self.ratio, min(self.pairs, other.pairs),
+            self.long + other.long,
         )  # fmt: skip
 
 
@@ -428,6 +457,33 @@ def _ring_bins(shape: tuple[int, int]) -> NDArray[np.uint8]:
     bins[0], bins[:, 0] = RINGS, RINGS
     bins.setflags(write=False)
     return bins
+
+
+@lru_cache(maxsize=1)
+def _is_long(shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Modes longer than so many blocks; rows' and columns' own are not."""
+    fy, fx = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None]
+    out = np.hypot(fy, fx) * LONG * block_side(shape) < 1
+    out[0], out[:, 0] = False, False
+    out.setflags(write=False)
+    return out
+
+
+def long_power(modes: NDArray, shape: tuple[int, int]) -> float:
+    """Mean power of a mode longer than :data:`LONG` blocks, of a map's transform.
+
+    Examples
+    --------
+    >>> noise = np.random.default_rng(1).standard_normal((128, 128))
+    >>> 0.5 < long_power(rfft2(noise), noise.shape) < 2.0
+    True
+    """
+    own = modes[_is_long(shape)]
+    return (
+        float((own.real**2 + own.imag**2).mean()) / (shape[0] * shape[1])
+        if own.size
+        else 0.0
+    )
 
 
 def ring_modes(shape: tuple[int, int]) -> NDArray[np.int64]:

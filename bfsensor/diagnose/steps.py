@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from bfsensor.diagnose.bounded import Solved, solve_within
+from bfsensor.diagnose.bounded import SINGULAR, Solved, solve_within
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.predict import Predictor
 from bfsensor.effects.effect import Effect
@@ -126,7 +126,10 @@ class Steps:
         both = np.zeros((self.total + chance, self._linear.shape[1] + chance))
         both[: self.total] = np.concatenate([self._linear, self.modes], axis=1)
         both[self.total :, self._linear.shape[1] :] = np.eye(chance)
-        self._span = np.linalg.qr(both)[0][: self.total]
+        self._whole, triangle = np.linalg.qr(both)
+        self._span = self._whole[: self.total]
+        size = np.abs(np.diag(triangle))
+        self._apart = chance > 0 and bool((size > SINGULAR * size.max(initial=0.0)).all())
 
     def residuals(self, point: NDArray[np.float64]) -> Seen:
         """Predictions, and what they leave of the values, whitened; the last ones are kept."""
@@ -209,6 +212,37 @@ class Steps:
             ends[:, : self.count][:, held] = 0.0
         return solve_within(design, target, *ends)
 
+    def _solve(
+        self,
+        residuals: NDArray[np.float64],
+        point: NDArray[np.float64],
+        held: NDArray[np.bool_] | None = None,
+    ) -> Solved:
+        """Solve for the non-linear parameters alone, what the others take projected out.
+
+        With hundreds of columns of chance that is a small problem in place of a large one; of the
+        solution only that part is told, and no basis.
+        """
+        if not self._apart:
+            return self.solve(residuals, point, held)
+        rows = self.predictor.prior_rows
+        # Rows of chance come before those of priors.
+        first = len(self._whole)
+        design = np.zeros((first + self._priors, self.count + 1))
+        design[: self.total, :-1], design[: self.total, -1] = self.slopes, residuals
+        design[first + np.arange(self._priors), rows] = 1.0
+        design[first:, -1] = -point[rows]
+        design[:first] -= self._whole @ (self._span.T @ design[: self.total])
+        ends = np.array(self.predictor.reach(point), float)
+        if held is not None:
+            ends[:, held] = 0.0
+        # A column that is projected out but for rounding is none.
+        norms = np.sqrt((self.slopes**2).sum(0))
+        norms[rows] = np.hypot(norms[rows], 1.0)
+        gone = np.sqrt((design[:, :-1] ** 2).sum(0)) < SINGULAR * norms
+        design[:, :-1][:, gone] = 0.0
+        return solve_within(design[:, :-1], design[:, -1], *ends)
+
     def _step(self, solved: Solved) -> float:
         """Move the point; gives the largest move over errors."""
         self._note(solved)
@@ -266,19 +300,20 @@ class Steps:
             fresh = own or (turn < 2 and not self._borrowed) or poor
             self.differentiate(self._anew | fresh, self.point, predicted, forgiving=True)
             stalled = len(squares) > STALLED and np.ptp(squares[-STALLED:]) < 2 * NO_HARM
-            solved = self.solve(residuals, self.point)
+            start = self.point
+            solved = self._solve(residuals, start)
             promised = here - float(solved.left @ solved.left)
             if stalled or not self._gainful(solved, here):
                 if self._borrowed:
                     # Derivatives of a fit without these effects lead nowhere: their own are found.
                     self._borrowed = False
                     self.differentiate(~self.effect, self.point, predicted, forgiving=True)
-                    solved = self.solve(residuals, self.point)
+                    solved = self._solve(residuals, self.point)
                     if self._gainful(solved, here):
                         continue
                 # What effects stop, all others may still do.
                 if own or not self._gainful(
-                    self.solve(residuals, self.point, self.effect), here
+                    self._solve(residuals, self.point, self.effect), here
                 ):
                     break
                 here = self.square(self.residuals(self.point)[1], self.point)
@@ -286,6 +321,8 @@ class Steps:
                     break
                 continue
             if self.history[-1] < SMALL:
+                if self._apart:
+                    self.solved = self.solve(residuals, start)
                 return
         else:
             if not own:
@@ -351,7 +388,7 @@ class Steps:
             predicted, residuals = self.residuals(there)
             kept = self.slopes.copy()
             self.differentiate(amplitudes, there, predicted)
-            solved = self.solve(residuals, there, held)
+            solved = self._solve(residuals, there, held)
             self.slopes = kept
             yield there + solved.solution[: self.count]
 

@@ -7,6 +7,7 @@ import pytest
 
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.steps import Steps
+from bfsensor.effects.illumination_turbulence import IlluminationTurbulence
 from bfsensor.effects.psf_wings import PsfWings
 
 PLACES = np.linspace(0.0, 6.0, 40)
@@ -96,3 +97,39 @@ def test_harm_is_not_told_as_gain():
         float(steps.solved.left @ steps.solved.left), abs=1e-6
     )
     np.testing.assert_allclose(steps.point, (0.01, 3.0))
+
+
+class Chance(Halo):
+    """Of an effect that leaves much to chance, and a width that is held by a prior."""
+
+    prior_rows = np.array([1])
+    effects = (IlluminationTurbulence({"rms": 1e-3, "corr": 20.0}),)
+
+    def modes(self, channel, point):
+        del point
+        # Fewer and more columns than values, one of them along the level.
+        count = 3 * len(channel)
+        out = np.random.default_rng(8).normal(0, 0.4, (len(channel), count))
+        out[:, 0] = 2.0
+        return out
+
+
+@pytest.mark.parametrize("held", [None, np.array([False, True]), np.array([True, True])])
+@pytest.mark.parametrize("start", [(0.02, 3.0), (0.0, 2.0), (0.4, 3.0)])
+def test_what_is_left_to_chance_is_projected_out(start, held):
+    """Steps, errors and chi-squares of the small problem are those of the whole one."""
+    steps = Steps(Chance(start), [channel((0.02, 3.0))])
+    predicted, residuals = steps.residuals(steps.point)
+    steps.differentiate(np.ones(2, bool), steps.point, predicted)
+    whole, small = (f(residuals, steps.point, held) for f in (steps.solve, steps._solve))
+    assert len(whole.solution) > 100 and len(small.solution) == 2
+    np.testing.assert_allclose(small.solution, whole.solution[:2], rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(small.errors, whole.errors[:2], rtol=1e-8)
+    assert small.left @ small.left == pytest.approx(whole.left @ whole.left, rel=1e-10)
+
+
+def test_it_is_told_whole_at_the_end():
+    steps = Steps(Chance((0.02, 3.0)), [channel((0.02, 3.0))])
+    steps.go_carefully()
+    assert len(steps.solved.solution) == 2 + 1 + 3 * len(PLACES)
+    assert steps.solved.basis.shape[1] > 100
