@@ -8,6 +8,7 @@ Rows of kind 'lag2' [1/e-] replace those in ``validation/results/device_fit.ecsv
 
 from __future__ import annotations
 
+import argparse
 import time
 from typing import Any
 from unittest.mock import patch
@@ -48,6 +49,9 @@ def leave(self: Images, moved: Any) -> tuple[Any, float]:
 
 def main() -> None:
     """Solve each and write the rows."""
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     begin = time.process_time()
     rows = []
     for name, changed in ASKED.items():

@@ -18,6 +18,7 @@ Rows go to ``validation/results/twin_pairs.ecsv``.
 
 from __future__ import annotations
 
+import argparse
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -277,6 +278,9 @@ TWINS = (
 
 def main() -> None:
     """Take all pairs."""
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     rows = []
     for twin in TWINS:
         for truth in twin.truths:

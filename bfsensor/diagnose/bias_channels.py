@@ -85,17 +85,26 @@ class BiasChannels:
         flat -= flat.mean(1, keepdims=True)
         self._cross.append(flat @ flat.T / (self._size - (len(flat) > 1)))
 
-    def add_level(self, exposure: Exposure, frames: Sequence[Frame]) -> list[float]:
-        """Add a bias frame to the levels alone; gives its zeros [ADU]."""
+    def add_level(
+        self,
+        exposure: Exposure,
+        frames: Sequence[Frame],
+        lit: Sequence[NDArray[np.bool_]] = (),
+    ) -> list[float]:
+        """Add a bias frame to the levels alone; gives its zeros [ADU].
+
+        What stands in pixels that were ``lit`` before is no particle's.
+        """
         zeros, levels = [], []
-        for frame in frames:
+        for n, frame in enumerate(frames):
             over = frame.serial_overscan.astype(np.float64)
             # Without an overscan the mean bias is the zero of flats: its level stays in it.
             zeros.append(float(over.mean()) if over.size else 0.0)
             image = frame.image.astype(np.float64)
             if over.size:
                 # Tracks of particles would tell their own number, not the level.
-                image = image[~_struck(image, TRACK)]
+                struck = _struck(image, TRACK)
+                image = image[~(struck & ~lit[n]) if lit else ~struck]
                 share = image.var() / image.size + over.var() / over.size
                 levels.append((float(image.mean()) - zeros[-1], share + LEVEL_ERROR**2))
         if len(levels) == len(frames):

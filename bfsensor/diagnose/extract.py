@@ -168,7 +168,7 @@ def measure_channels(
     in_mean: list[int] = []
     for exposure in kinds.get("bias", []):
         if exposure.number in ghosts:
-            biases.add_level(exposure, read(exposure))
+            biases.add_level(exposure, read(exposure), ghosts[exposure.number])
     quiet = [e for e in kinds.get("bias", []) if e.number not in ghosts]
     for n, exposure in enumerate(quiet):
         # Noise is measured in differences of two frames: they go together.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,10 @@ LEAST = 4
 Read = Callable[[Exposure], Sequence[Frame]]
 
 
-def find_ghosts(exposures: Sequence[Exposure], read: Read) -> set[int]:
-    """Numbers of biases and darks in which pixels that spots lit before stand above the others.
+def find_ghosts(
+    exposures: Sequence[Exposure], read: Read
+) -> dict[int, list[NDArray[np.bool_]]]:
+    """Biases and darks in which pixels that spots lit before stand above the others.
 
     They are held against the last frame of their kind and exposure time before any spots, line
     by line: neither a pattern that stands nor the level of a row counts.  Where there is none
@@ -37,8 +39,9 @@ def find_ghosts(exposures: Sequence[Exposure], read: Read) -> set[int]:
 
     Returns
     -------
-    set of int
-        Each amplifier's lit pixels together deviate by more than :data:`CERTAIN` of their error.
+    dict of int to list of ndarray of bool
+        By the exposure's number the lit pixels of each amplifier, which together deviate by more
+        than :data:`CERTAIN` of their error.
     """
     spots: list[Exposure] = []
     before: dict[tuple[str, float], list[Exposure]] = {}
@@ -53,7 +56,7 @@ def find_ghosts(exposures: Sequence[Exposure], read: Read) -> set[int]:
             # The brightest shows best where light falls; of equal ones the last left most.
             brightest = max(spots, key=lambda s: (s.exposure_time or 0.0, s.number))
             after.setdefault(key, []).append((one, brightest))
-    found: set[int] = set()
+    found: dict[int, list[NDArray[np.bool_]]] = {}
     lit: dict[int, list[NDArray[np.bool_]]] = {}
     for key, late in after.items():
         early = before.get(key, [])
@@ -65,11 +68,11 @@ def find_ghosts(exposures: Sequence[Exposure], read: Read) -> set[int]:
             if brightest.number not in lit:
                 lit[brightest.number] = [_lit(f.image) for f in read(brightest)]
             if _excess(read(one), reference, lit[brightest.number]) > CERTAIN:
-                found.add(one.number)
+                found[one.number] = lit[brightest.number]
     return found
 
 
-def describe_ghosts(ghosts: set[int], exposures: Sequence[Exposure]) -> str:
+def describe_ghosts(ghosts: Container[int], exposures: Sequence[Exposure]) -> str:
     """One line on which exposures are used how."""
     parts = []
     for kind, words in (

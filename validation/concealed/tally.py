@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from astropy.stats import binom_conf_interval
-from scipy.stats import binom, kstest
+from scipy.stats import binom, fisher_exact, kstest
 
 from validation.concealed.score import NAN, Held, Score
 
@@ -292,6 +292,38 @@ def print_lines(lines: Sequence[Line], echo: Callable[[str], Any] = print) -> No
         asked = (_goal(line.passed, line.percent), _goal(line.moonshot, line.percent))
         echo(f"{line.quantity:48s}{value:>8s}  {bounds:>16s}{trials:>9s}  {asked[0]:13s}"
              f"{asked[1]:13s}{line.reached()}")  # fmt: skip
+
+
+def print_beside(
+    lines: Sequence[Line],
+    others: Sequence[Line],
+    names: tuple[str, str],
+    echo: Callable[[str], Any] = print,
+) -> dict[str, float]:
+    """Print two sets' lines beside one another; return, of shares, the p that they are one.
+
+    Fisher's exact test, two-sided; lines without trials in either are left out.
+    """
+    found: dict[str, float] = {}
+    by = {line.quantity: line for line in others}
+    echo(f"{'quantity':48s}{names[0]:>28s}{names[1]:>28s}  p of one share")
+    for one in lines:
+        other = by.get(one.quantity)
+        if other is None or not one.trials or not other.trials:
+            continue
+        told = [
+            f"{line.hits}/{line.trials} {_written(line.value, line.percent)}"
+            if line.hits >= 0
+            else f"{_written(line.value, line.percent)} ({line.trials})"
+            for line in (one, other)
+        ]
+        end = ""
+        if one.hits >= 0 and other.hits >= 0:
+            table = [[line.hits, line.trials - line.hits] for line in (one, other)]
+            found[one.quantity] = float(fisher_exact(table).pvalue)
+            end = f"{found[one.quantity]:.2f}"
+        echo(f"{one.quantity:48s}{told[0]:>28s}{told[1]:>28s}  {end}")
+    return found
 
 
 def _written(value: float, percent: bool) -> str:
