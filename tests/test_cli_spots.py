@@ -77,6 +77,7 @@ def test_every_executor_gives_the_same_bits(finished, tmp_path, kind):
         np.testing.assert_array_equal(here[name], there[name])
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on(finished, tmp_path):
     """``kill -9`` after the first spot, the same command again: the same bits."""
     command = [

@@ -26,6 +26,7 @@ def test_as_the_table_has_it():
         np.testing.assert_allclose(one, other, atol=6e-9)
 
 
+@pytest.mark.slow
 def test_the_patch_is_large_enough():
     """Its images, taken off by their far field, are nearer than the other's, 12 pixels against 20.
 
@@ -50,8 +51,10 @@ def test_periods_are_refused_whose_images_are_among_the_edges(period):
         solve_response(Device.load("itl_sta3800c"), period=period)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "step"), [("silicon.thickness", 0.5), ("channel_stop.width", 0.02)]
+    ("name", "step"),
+    [("silicon.thickness", 0.5), ("channel_stop.width", 0.02)],
 )
 def test_derivatives(name, step):
     """Depths, images and nodes move as well; asked for: 2 % of the change, at every depth."""
@@ -71,6 +74,7 @@ def test_derivatives(name, step):
         assert np.abs(one - other)[far].max() < 0.05 * np.abs(other)[far].max()
 
 
+@pytest.mark.slow
 def test_points_that_jump_past_a_saddle_keep_their_earlier_derivative(monkeypatch):
     """On this mesh single points of a line jump: without the guard all of it is lost."""
     device, name, spread = Device.load("itl_sta3800c"), "gates.field_oxide_taper", 0.2

@@ -165,7 +165,9 @@ def take_signature(case: Case) -> Signature:
         for seed in SEEDS:
             null, fit = fitted_null(seed)
             source = VirtualSource(seed=seed, effects=[scaled(case, factor)])
-            change = residuals_at(fit, measure_channels(source)) - residuals_at(fit, null)
+            change = residuals_at(
+                fit, measure_channels(source, ghosts=False)
+            ) - residuals_at(fit, null)
             both.append(without_parameters(fit, change))
         fit = fitted_null(SEEDS[0])[1]
         parts = {w: np.append(fit.of(w), np.zeros(len(fit.basis) - len(fit.residuals), bool))

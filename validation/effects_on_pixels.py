@@ -161,7 +161,7 @@ def compare(
     """
     null, fit = null_campaign(seed, size)
     source = VirtualSource(seed=seed, size=size, effects=[own or OnPixels(effect)])
-    other = measure_channels(source)
+    other = measure_channels(source, ghosts=False)
     by = used_channels(other.channels, FOLDS)
     before, bare, after = (
         residuals(fit, m, e, by, (effect,))

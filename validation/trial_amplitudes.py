@@ -157,7 +157,7 @@ def change(effect: Effect, seed: int, size: str = "S") -> NDArray[np.float64]:
     """
     null, fit = twin_of(effect, seed, size)
     source = VirtualSource(seed=seed, size=size, effects=[at_seed(effect, seed)])
-    measured = measure_channels(source)
+    measured = measure_channels(source, ghosts=False)
     return without_parameters(fit, residuals_at(fit, measured) - residuals_at(fit, null))
 
 

@@ -122,7 +122,11 @@ class Measured:
 
 
 def measure_channels(
-    source: Source, *, lags: int = 4, progress: Callable[[int, int], None] | None = None
+    source: Source,
+    *,
+    lags: int = 4,
+    progress: Callable[[int, int], None] | None = None,
+    ghosts: bool = True,
 ) -> Measured:
     """Measure all channels that a campaign's exposures allow.
 
@@ -134,6 +138,9 @@ def measure_channels(
         Largest lag of the flats' covariances [pixel].
     progress : callable, optional
         Called with (exposures done, exposures in all).
+    ghosts : bool
+        Whether biases and darks that hold what spots left are sought, and set apart; if not,
+        campaigns with and without an effect have the same values.
 
     Returns
     -------
@@ -161,15 +168,15 @@ def measure_channels(
             progress(done, len(exposures))
         return frames
 
-    ghosts = find_ghosts(exposures, source.read)
-    if ghosts:
-        notes.append(describe_ghosts(ghosts, exposures))
+    haunted = find_ghosts(exposures, source.read) if ghosts else {}
+    if haunted:
+        notes.append(describe_ghosts(haunted, exposures))
     biases, late_biases = BiasChannels(), BiasChannels("held-out")
     in_mean: list[int] = []
     for exposure in kinds.get("bias", []):
-        if exposure.number in ghosts:
-            biases.add_level(exposure, read(exposure), ghosts[exposure.number])
-    quiet = [e for e in kinds.get("bias", []) if e.number not in ghosts]
+        if exposure.number in haunted:
+            biases.add_level(exposure, read(exposure), haunted[exposure.number])
+    quiet = [e for e in kinds.get("bias", []) if e.number not in haunted]
     for n, exposure in enumerate(quiet):
         # Noise is measured in differences of two frames: they go together.
         held = is_held_out(n // 2, len(quiet) // 2)
@@ -242,7 +249,7 @@ def measure_channels(
         before[exposure.number] = last
         last = levels.get(exposure.number, 0.0)
     seen: dict[float | None, int] = {}
-    dark = [e for e in kinds.get("dark", []) if e.number not in ghosts]
+    dark = [e for e in kinds.get("dark", []) if e.number not in haunted]
     times = [e.exposure_time for e in dark]
     for exposure in dark:
         turn = seen.get(exposure.exposure_time, 0)

@@ -276,6 +276,7 @@ def test_rows_hold_all_that_scores_are_made_from(place):
     assert (alarms["hits"], alarms["trials"], alarms["pass"]) == (0, 1, "<= 0.03")
 
 
+@pytest.mark.slow
 def test_end_to_end_with_the_installed_command(tmp_path, monkeypatch):
     """A null and a torn campaign of 64 x 64 pixels, written, run and opened: about 15 CPU s."""
     small = Size(64, 3, 0, dithers=1, spot_seconds=(5.0, 30.0))

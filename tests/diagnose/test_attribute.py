@@ -84,6 +84,7 @@ def test_recordings_that_were_not_fitted_agree_better(torn):
     assert after < before
 
 
+@pytest.mark.slow
 def test_a_twin_is_in_the_class():
     """Lost charge bends the mean as a curved response does; eight levels hardly tell them."""
     found = explained(7102, make_effect("charge_loss", {"q": 5e-8})).found

@@ -48,6 +48,7 @@ def test_a_changed_parameter_is_predicted(tmp_path):
     assert kept.nominal == {"silicon.thickness": 100.0} and kept.card["pixel"] == 10.0
 
 
+@pytest.mark.slow
 def test_as_accurate_as_the_shipped_table():
     """Within 3 % at the nearest lags: half as many cells a pixel are 10 % off at (1, 0)."""
     made = baseline_of_device(Device.load("e2v_ccd250_70")).areas_on(HERE, None, 40_000.0)
@@ -120,6 +121,7 @@ def test_what_cannot_float_is_named(tmp_path):
         simulate_baseline("nowhere", ["all"], [], keep=tmp_path)
 
 
+@pytest.mark.slow
 def test_derivatives_at_every_back_bias_against_full_solutions():
     """At -40 V doping to 1 %, 4 % scaled by the square, 12 % by the plain ratio.
 

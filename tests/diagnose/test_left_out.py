@@ -37,6 +37,8 @@ SHOTS = [
 ]
 LAYOUT = Layout((64, 48), ())
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):

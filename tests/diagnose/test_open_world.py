@@ -175,6 +175,7 @@ def test_a_kernel_that_is_odd_in_y():
     assert found.chi2dof()[1] < found.chi2dof()[0]
 
 
+@pytest.mark.slow
 def test_an_echo_names_no_trap():
     # What a trap explains of an echo is much; that does not make it the cause.
     echo = make_effect("outside_library", {"amp": 3e-4}, "echo")
@@ -193,6 +194,7 @@ def test_an_echo_names_no_trap():
     assert after < 1.2 < before
 
 
+@pytest.mark.slow
 def test_pixels_of_two_parities_and_a_ripple_are_told_apart():
     chess = make_effect("outside_library", {"amp": 2e-3}, "checkerboard")
     ripple = make_effect("outside_library", {"amp": 2e-3, "period": 11.3}, "ripple")
@@ -339,6 +341,7 @@ def test_a_gain_that_bends_is_no_open_world():
     assert [f.effect.word for f in told.found] == ["gain_nonlinearity"]
 
 
+@pytest.mark.slow
 def test_exchanged_axes_are_seen_behind_device_parameters_that_imitate_them():
     exchanged = make_effect("outside_library", {"amp": 1.0}, "axes_exchanged")
     model, mismatch = _located(_campaign(exchanged))

@@ -124,6 +124,7 @@ def test_areas_without_a_level_tell_no_response_to_it():
     assert "bf_nonlinear" not in json.dumps(found.to_report()["effects"])
 
 
+@pytest.mark.slow
 def test_the_command_line_lets_the_operating_point_move(tmp_path):
     table = recorded("e2v_ccd250_70", seed=5107)
     j, i = np.indices(table.a.shape)

@@ -56,6 +56,7 @@ def test_nothing_is_suspected_of_a_null(null):
     assert after.p_value >= min(before.p_value, 1 - ALARM) * 0.5
 
 
+@pytest.mark.slow
 def test_what_scans_hardly_see_is_found_by_its_own_shape(null):
     effect = Persistence({"frac": 1e-4, "tau": 2.0})
     predictor, fit = with_change(null, effect, 8.0)

@@ -22,6 +22,7 @@ def saturated():
     return measure_channels(VirtualSource(seed=5177, size=SMALL, effects=[effect]))
 
 
+@pytest.mark.slow
 def test_flats_beyond_the_full_well_are_saturated(saturated):
     """Fainter flats tell the baseline; full ones then tell the full well, and nothing else."""
     found = diagnose_measured(saturated, virtual_baseline())

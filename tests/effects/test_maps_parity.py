@@ -30,7 +30,9 @@ def test_all_words_have_their_variants():
     assert len(NAMES) == 12 and {k.word for k in KINDS} == set(WORDS)
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=NAMES)
+@pytest.mark.parametrize("kind", [
+    pytest.param(k, id=k.word, marks=[pytest.mark.slow] * (k.word == "fringing")) for k in KINDS
+])  # fmt: skip
 def test_predictions_agree_with_pixels_of_a_small_campaign(kind):
     engine = ENGINES[known_to_the_sensor(kind)]
     # Of fringes small campaigns, which have no red light, know nothing.

@@ -143,6 +143,7 @@ def test_conditions_hold_what_they_state():
         found.predict(moved, Condition(back_bias=-70.0))
 
 
+@pytest.mark.slow
 def test_a_side_without_such_a_device():
     """E2V's oxides are equal: the gate's can only be thinner."""
     device = Device.load("e2v_ccd250")

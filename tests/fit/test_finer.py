@@ -83,6 +83,7 @@ def test_a_fit_ends_at_the_device_and_the_table_of_the_finer_mesh(tmp_path, kept
     assert len(told) == 1 and f"(0,1) {ratio[1, 0]:.3f}" in told[0]
 
 
+@pytest.mark.slow
 def test_values_are_the_finer_mesh_s_and_solved_once(kept, monkeypatch):
     means = np.array([FREE[0].mean])
     solved = []

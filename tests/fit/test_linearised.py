@@ -10,6 +10,7 @@ from bfsensor.fit.quantities import choose_priors
 from bfsensor.recording.exposures import Condition
 
 
+@pytest.mark.slow
 def test_tangents_lead_to_neighbours_except_by_what_is_stated():
     device = Device.load("itl_sta3800c_60")
     priors = choose_priors(device, ("gate_oxide", "gate_high:0.5 V", "back_bias:5 V"))

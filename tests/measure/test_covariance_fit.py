@@ -85,6 +85,7 @@ def test_off_diagonal_weights_matter():
     assert tie.max() > 0.15
 
 
+@pytest.mark.slow
 def test_images_to_parameters_with_coverage():
     """24 campaigns of Gaussian flats, 15 levels twice, 96 x 96 pixels (200 in validation/)."""
     fits = [measure_mock("fields", TRUTH, 96, 5200 + k) for k in range(24)]

@@ -45,6 +45,7 @@ def test_no_growth_is_none():
     assert not found.growth.any() and not found.slope.any()
 
 
+@pytest.mark.slow
 def test_errors_are_those_of_the_scatter():
     """Pulls of 60 slopes: mean 0, width 1."""
     runs = [measure_growth(*draw(8, seed)) for seed in range(3000, 3060)]

@@ -35,6 +35,7 @@ def python(code):
 # -- the example files ---------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_star_field_is_the_same_on_one_process_and_on_two(tmp_path):
     images = {}
     for nproc in (1, 2):

@@ -69,6 +69,7 @@ def test_without_feedback_both_images_are_equal(monkeypatch):
     assert np.array_equal(without.off, with_effect.off)
 
 
+@pytest.mark.slow
 def test_the_field_is_that_of_the_middle_of_the_step():
     """One step with the charge of its middle does what many steps do."""
 

@@ -22,6 +22,7 @@ def flat():
     return simulate_flat(plan(), 0)
 
 
+@pytest.mark.slow
 def test_electrons_are_conserved_and_poisson(flat):
     assert flat.on[-1].sum() == flat.off[-1].sum()
     assert abs(flat.off[-1].sum() - 500_000) < 5 * np.sqrt(500_000)
@@ -29,6 +30,7 @@ def test_electrons_are_conserved_and_poisson(flat):
     assert (np.diff(flat.on, axis=0, prepend=0) >= 0).all()
 
 
+@pytest.mark.slow
 def test_pixels_that_are_ahead_fall_behind(flat):
     """What a pixel loses is half the level times a_ij times the charges ahead, summed.
 
