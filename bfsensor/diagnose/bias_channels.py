@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -222,7 +223,7 @@ class DarkChannels:
         self._bias, self._noise, self._fold = bias, read_noise, fold
         self._biases = biases
         self._rows: list[tuple[Exposure, float, list[tuple[float, float, int, int]]]] = []
-        self._columns: list[tuple[float, list[NDArray[np.float64]], list[float]]] = []
+        self._columns: list[_Columns] = []
         self._names: list[str] = []
         self._condition = Condition(np.nan, np.nan, np.nan)
 
@@ -231,7 +232,8 @@ class DarkChannels:
     ) -> None:
         """Add a dark; ``after`` is the mean level [ADU] of the exposure before it."""
         self._condition = Condition.of(exposure)
-        found, columns, noises = [], [], []
+        found = []
+        lines = _Columns(exposure.exposure_time or 0.0, [], [], [])
         self._names = [f.name for f in frames]
         for frame in frames:
             over = frame.serial_overscan
@@ -252,10 +254,11 @@ class DarkChannels:
             # What strikes most of a column is no particle: a hot column is told as it is.
             hot = struck.mean(0) > 0.5
             kept = np.where(struck & ~hot, np.nan, image)
-            columns.append(np.nanmean(kept, 0))
-            noises.append(float(good.var()) / image.shape[0])
+            lines.means.append(np.nanmean(kept, 0))
+            lines.own.append(np.nanvar(kept, 0) / image.shape[0])
+            lines.noise.append(float(good.var()) / image.shape[0])
         self._rows.append((exposure, after, found))
-        self._columns.append((exposure.exposure_time or 0.0, columns, noises))
+        self._columns.append(lines)
 
     def channels(self) -> list[Channel]:
         """Levels and struck pixels by dark; columns of the longest darks."""
@@ -276,14 +279,18 @@ class DarkChannels:
             values.append(struck)
             blocks.append(np.diag(struck + 1.0))
             axes.add(len(level), self._condition, what="struck", x=-1, **common)
-        longest = max(t for t, *_ in self._columns)
-        chosen = [c for t, c, _ in self._columns if t == longest]
-        noises = np.mean([n for t, _, n in self._columns if t == longest], axis=0)
-        for amp, lines in enumerate(zip(*chosen, strict=True)):
-            mean = np.mean(lines, axis=0)
-            noise = self._column_error(mean, amp, float(noises[amp]), len(chosen))
+        longest = max(c.seconds for c in self._columns)
+        chosen = [c for c in self._columns if c.seconds == longest]
+        for amp in range(len(self._names)):
+            mean = np.mean([c.means[amp] for c in chosen], axis=0)
+            noise = float(np.mean([c.noise[amp] for c in chosen]))
+            own = np.mean([c.own[amp] for c in chosen], axis=0)
+            usual = self._column_error(mean, amp, noise, len(chosen)) ** 2
+            # Charge of a hot column has a shot noise of its own.
+            sure = STANDS_OUT * np.sqrt(2.0 / self._rows_of(amp, mean) / len(chosen))
+            more = np.where(own > noise * (1 + sure), own - noise, 0.0) / len(chosen)
             values.append(mean - np.median(mean))
-            blocks.extend([np.array([[noise**2]])] * len(mean))
+            blocks.extend((usual + more)[:, None, None])
             axes.add(len(mean), self._condition, what="column", x=np.arange(len(mean)), amp=amp,
                      time=longest, exposure=-1, after=0.0)  # fmt: skip
         return [Channel("dark_map", np.concatenate(values), tuple(blocks), axes.columns(), "adu",
@@ -310,14 +317,26 @@ class DarkChannels:
         """
         scatter = max(1.4826 * float(np.median(np.abs(mean - np.median(mean)))), 1e-6)
         read = self._noise.get(self._names[amp], 0.0)
-        pixels = self._pixels(amp) / len(mean)
+        pixels = self._rows_of(amp, mean)
         # The mean bias is the same in all darks.
         shared = read**2 / self._biases / pixels if self._biases else 0.0
         expected = float(np.sqrt(max(noise - shared, 0.0) / darks + shared))
         return expected if scatter < UNEVEN * expected else scatter
 
-    def _pixels(self, amp: int) -> int:
-        return self._rows[0][2][amp][3]
+    def _rows_of(self, amp: int, mean: NDArray[np.float64]) -> float:
+        """Pixels of a column."""
+        return self._rows[0][2][amp][3] / len(mean)
+
+
+class _Columns(NamedTuple):
+    """Columns of one dark, by amplifier."""
+
+    seconds: float
+    means: list[NDArray[np.float64]]
+    own: list[NDArray[np.float64]]
+    """Variance of each column's mean, of its own pixels [ADU^2]."""
+    noise: list[float]
+    """Of all pixels [ADU^2]."""
 
 
 def without_hot_columns(image: NDArray[np.float64], noise: float) -> NDArray[np.float64]:

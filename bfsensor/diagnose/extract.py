@@ -37,6 +37,7 @@ from bfsensor.diagnose.pairs import (
 )
 from bfsensor.diagnose.spot_channels import SpotChannels
 from bfsensor.diagnose.spot_ghosts import describe_ghosts, find_ghosts
+from bfsensor.diagnose.spot_places import PlacedSpots
 from bfsensor.effects.effect import Segment, Shot
 from bfsensor.errors import MeasurementError
 
@@ -97,6 +98,8 @@ class Measured:
         Numbers of the frames that the mean bias is made of.
     sightings : tuple of mapping
         Waves in the maps: where fits of such patterns may begin.
+    placed : tuple of PlacedSpots
+        Spots of all folds, in the order of time.
     """
 
     channels: tuple[Channel, ...]
@@ -119,6 +122,7 @@ class Measured:
     offsets: tuple[float, ...] = ()
     biases: tuple[int, ...] = ()
     sightings: tuple[Mapping[str, Any], ...] = ()
+    placed: tuple[PlacedSpots, ...] = ()
 
 
 def measure_channels(
@@ -315,6 +319,7 @@ def measure_channels(
         shots=_shots(exposures, levels, float(np.mean(rough))),
         maps=shares,
         neighbours=spots.neighbours,
+        placed=tuple(spots.placed),
         offsets=tuple(
             float(f.serial_overscan.mean()) if f.serial_overscan.size else np.nan
             for f in layout

@@ -51,6 +51,8 @@ class BaselineFit:
     chance : float
         Logarithm by which what effects leave to chance widens the errors of all values together
         (of the determinant of their covariance).
+    scores : int
+        Rows at the end of ``left`` and of ``basis`` that stand for what scatter tells.
     notes : tuple of str
         What the prediction had to assume.
     """
@@ -71,6 +73,7 @@ class BaselineFit:
         repr=False, default_factory=lambda: np.zeros((0, 0))
     )
     chance: float = 0.0
+    scores: int = 0
     notes: tuple[str, ...] = ()
 
     def of(self, word: str) -> NDArray[np.bool_]:
@@ -99,7 +102,8 @@ class BaselineFit:
     @property
     def total(self) -> float:
         """Chi-square of the residuals and of the priors; wider errors cost their logarithm."""
-        return float(self.left @ self.left) + self.chance
+        left = self.left[: len(self.left) - self.scores]
+        return float(left @ left) + self.chance
 
     def draw(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
         """Residuals that noise alone leaves, shape (count, n), the fit linear about its end."""
@@ -192,6 +196,7 @@ def _as_fit(steps: Steps, *notes: str) -> BaselineFit:
         covariance=solved.covariance / np.outer(unit, unit),
         left=solved.left,
         slopes=steps.slopes,
+        scores=len(steps.score.target),
         chance=float(np.linalg.slogdet(np.eye(chance) + steps.modes.T @ steps.modes)[1]),
         notes=(*predictor.notes, *notes),
     )

@@ -278,6 +278,14 @@ class EffectChain:
                 out += effect.spot_flux(axes, self.layout)
         return out
 
+    def spot_ghosts(
+        self, shown: NDArray[np.float64], lit: NDArray[np.float64]
+    ) -> NDArray[np.float64] | None:
+        """Parts of the charge of spots that others show, shape (n, m); None of none."""
+        parts = [e.spot_ghosts(shown, lit, self.layout) for e in self.effects]
+        some = [p for p in parts if p is not None]
+        return np.sum(some, axis=0) if some else None
+
     def modes(
         self, channel: Channel, gains: NDArray[np.float64], axes: dict[str, NDArray]
     ) -> NDArray[np.float64]:

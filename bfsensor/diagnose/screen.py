@@ -15,6 +15,7 @@ from bfsensor.diagnose.fitted_effects import fitted, widened
 from bfsensor.diagnose.mismatch import BaselineFit
 from bfsensor.diagnose.predict import Predictor
 from bfsensor.diagnose.predict_maps import lines_of_map
+from bfsensor.diagnose.scatter import likeliest, scatter_of
 from bfsensor.effects.effect import Effect, Layout, Parameter
 from bfsensor.errors import BFSensorError, ConvergenceError
 
@@ -33,6 +34,10 @@ ASTRAY = 0.1
 OCCAM = 5.0
 """Logarithm of the evidence that a parameter costs a candidate that is not fitted on, for it is
 far from the best (a third of a per cent of its range is about what data allow)."""
+
+SCATTERED = 6.0
+"""Gain of the likelihood by scatter from which a candidate that is told by it is not fitted on by
+what it changes in the mean."""
 
 STEP = 0.02
 """Of derivatives, as a part of a parameter."""
@@ -120,6 +125,7 @@ class Screen:
         self.passed_over: dict[str, str] = {}
         """Candidates of which a start or a fit could not be worked out, and why."""
         self._scaled_templates: dict[Effect, NDArray[np.float64]] = {}
+        self._scattered: set[Effect] = set()
 
     def change(self, effect: Effect) -> NDArray[np.float64]:
         """What an effect changes: whitened, priors' rows after it, parameters projected out."""
@@ -231,6 +237,10 @@ class Screen:
         if length <= 0:
             return None
         factor = float(template @ self.fit.left) / length
+        if effect.told_by_scatter:
+            found = self._by_scatter(effect, template)
+            if found is not None:
+                return found
         signed = any(p.signed for p in effect.parameters if p.amplitude)
         if factor <= 0 and not signed:
             self._scaled_templates[effect] = template
@@ -248,6 +258,25 @@ class Screen:
         self._scaled_templates[best] = template
         # As it is: far from the start what it changes is another thing.
         return max(float(template @ (2 * self.fit.left - template)), 0.0), best
+
+    def _by_scatter(
+        self, effect: Effect, template: NDArray[np.float64]
+    ) -> tuple[float, Effect] | None:
+        """Gain of an effect as strong as scatter tells; None where it tells hardly anything."""
+        fit = self.fit
+        own = scatter_of(self.predictor, fit.channels, fit.starts, effect, self.point)
+        modes = np.concatenate([own, np.zeros((len(fit.left) - len(own), own.shape[1]))])
+        modes -= fit.basis @ (fit.basis.T @ modes)
+        nothing = np.zeros(len(fit.left))
+        if likeliest(modes, fit.left, nothing, nothing)[0] < SCATTERED:
+            return None
+        other = self._change_of_start(effect.scaled(0.5))
+        one, two = 4 * other - template, 2 * template - 4 * other
+        gain, factor = likeliest(modes, fit.left, one, two)
+        best = _inside(effect.scaled(factor))
+        self._scaled_templates[best] = factor * one + factor**2 * two
+        self._scattered.add(best)
+        return max(gain, 0.0), best
 
     def _likely(self, kind: type[Effect], starts: list[Effect]) -> list[Effect]:
         """Those of many starts that one channel finds likeliest."""
@@ -279,8 +308,8 @@ class Screen:
         """
         if not tried:
             return None
-        if tried[0][0] < least:
-            gain, effect = tried[0]
+        gain, effect = tried[0]
+        if gain < least or effect in self._scattered:
             template = self._scaled_templates.get(effect)
             if template is None:
                 template = self.change(effect)

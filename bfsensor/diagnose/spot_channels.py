@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from bfsensor.diagnose.channels import FOLDS, Channel
 from bfsensor.diagnose.conditions import Axes, Condition, Exposure
+from bfsensor.diagnose.spot_places import PlacedSpots
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.spot_fit import fit_spots
 from bfsensor.measure.spots import SpotList, cut_stamps, find_spots
@@ -38,6 +39,7 @@ class SpotChannels:
         self._backgrounds: dict[int, float] = {}
         self.dropped: dict[str, int] = {}
         self._grids: list[tuple[float, float]] = []
+        self.placed: list[PlacedSpots] = []
 
     def add(
         self, exposure: Exposure, image: NDArray[np.float64], *, fold: str = "fit"
@@ -83,6 +85,12 @@ class SpotChannels:
         phases = np.stack([fit.centre_x[used], fit.centre_y[used]], axis=1)
         self._rows.append((exposure, out, phases, fold))
         self._grids.append(_grid(inside))
+        corners = np.column_stack([stamps.x, stamps.y])[used]
+        self.placed.append(
+            PlacedSpots(
+                exposure.number, total, (fit.sigma_x, fit.sigma_y), corners + phases
+            )
+        )
         return None
 
     def channels(self) -> list[Channel]:

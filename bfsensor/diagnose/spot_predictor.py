@@ -16,6 +16,7 @@ from bfsensor.diagnose.conditions import Condition
 from bfsensor.diagnose.extract import Measured
 from bfsensor.diagnose.predict_effects import EffectChain
 from bfsensor.diagnose.predict_spots import predict_spots, representative_phases
+from bfsensor.diagnose.spot_places import widening
 from bfsensor.errors import DiagnosisError
 
 Found = dict[str, NDArray[np.float64]]
@@ -47,6 +48,7 @@ class SpotPredictor:
         self.widths: list[str] = []
         self.start: list[float] = []
         self._slopes: Edges | None = None
+        self._gained: NDArray[np.float64] | None = None
         self._conditions: dict[tuple[str, ...], Condition] = {}
         self._kept: dict[tuple[str, ...], tuple[tuple[NDArray, ...], Found]] = {}
         phases: dict[tuple[str, ...], list[NDArray[np.float64]]] = {}
@@ -156,7 +158,34 @@ class SpotPredictor:
             here = x["what"] == "flux"
             axes = {k: v[here] for k, v in x.items()} | {"flux": scale * x["flux"][here]}
             out[here] += chain.spot_flux(axes) / scale
+            self._add_ghosts(out, x, chain)
         return out
+
+    def _add_ghosts(
+        self, out: NDArray[np.float64], x: Mapping[str, NDArray], chain: EffectChain
+    ) -> None:
+        """Add to fluxes and widths what spots of all folds left behind."""
+        placed = self.measured.placed
+        lit = np.array([s.number for s in placed], float)
+        fluxes = np.array([s.flux for s in placed])
+        place_of = {s.number: n for n, s in enumerate(placed)}
+        for what in ("flux", "sigma_x", "sigma_y"):
+            rows = np.flatnonzero(x["what"] == what)
+            numbers = x["exposure"][rows].astype(int)
+            parts = chain.spot_ghosts(numbers.astype(float), lit)
+            if parts is None or not len(placed):
+                return
+            if what == "flux":
+                out[rows] += parts @ fluxes
+                continue
+            # Exposures that are only planned lie nowhere yet.
+            known = np.isin(numbers, list(place_of))
+            rows, own = rows[known], [place_of[n] for n in numbers[known].tolist()]
+            if self._gained is None:
+                self._gained = widening(placed, placed)
+            shares = parts[known] * fluxes / fluxes[own, None]
+            gained = (shares * self._gained["xy".index(what[-1]), own]).sum(1)
+            out[rows] += gained / (2 * out[rows])
 
     def _shifts(
         self, condition: Condition, device: Mapping[str, float]

@@ -11,6 +11,7 @@ from scipy.linalg import block_diag
 from bfsensor.diagnose.bounded import SINGULAR, Solved, solve_within
 from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.predict import Predictor
+from bfsensor.diagnose.scatter import no_score, score_of, scored
 from bfsensor.effects.effect import Effect
 from bfsensor.errors import ConvergenceError
 
@@ -28,6 +29,10 @@ STALLED = 4
 
 REFRESHED = 2, 4
 """Rounds in which what is left to chance is taken as strong as the effects then are."""
+
+ANEW, AWAY = 8, 0.1
+"""Times that what is left to chance is taken anew where scatter tells its strength, and distance
+[errors] of such parameters from where it was taken last from which on it is."""
 
 SMALL = 0.05
 """Largest step of a parameter [of its error] at which the fit has arrived."""
@@ -97,6 +102,7 @@ class Steps:
         self.history: list[float] = []
         self.solved: Solved
         self._last: tuple[NDArray[np.float64], Seen] | None = None
+        self._scored = np.array(sorted(scored(predictor)), int)
         self.update_chance()
 
     def _find_columns(self) -> None:
@@ -130,6 +136,34 @@ class Steps:
         self._span = self._whole[: self.total]
         size = np.abs(np.diag(triangle))
         self._apart = chance > 0 and bool((size > SINGULAR * size.max(initial=0.0)).all())
+        self._update_score()
+
+    def _update_score(self) -> None:
+        """Take what scatter tells about parameters as it does at the point."""
+        self.score = no_score(self.point)
+        if len(self._scored):
+            self.score = score_of(
+                self.predictor, self.channels, self.point, self.modes, self._span,
+                self.residuals(self.point)[1],
+            )  # fmt: skip
+
+    def _reach(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Smallest and largest steps; where scatter tells, half or twice what it was taken at."""
+        ends = np.array(self.predictor.reach(point), float)
+        own = self._scored[(self.score.rows[:, self._scored] != 0).any(0)]
+        there = self.predictor.reach(self.score.origin)[:, own]
+        size = np.abs(self.score.origin[own])
+        there = np.clip(there, -0.5 * size, size) + self.score.origin[own] - point[own]
+        ends[:, own] = np.clip(
+            ends[:, own], np.minimum(there[0], 0), np.maximum(there[1], 0)
+        )
+        return ends
+
+    def _behind(self) -> bool:
+        """Whether what scatter tells was found far from here."""
+        errors = self.solved.errors[self._scored]
+        away = np.abs(self.point - self.score.origin)[self._scored]
+        return bool((away > AWAY * errors).any())
 
     def residuals(self, point: NDArray[np.float64]) -> Seen:
         """Predictions, and what they leave of the values, whitened; the last ones are kept."""
@@ -152,7 +186,9 @@ class Steps:
         """Chi-square with the linear parameters at their best, priors included."""
         given = self._span.T @ residuals
         held = point[self.predictor.prior_rows]
-        return float(residuals @ residuals) - float(given @ given) + float(held @ held)
+        told = self.score.left(point)
+        square = float(residuals @ residuals) - float(given @ given)
+        return square + float(held @ held) + float(told @ told)
 
     def differentiate(
         self,
@@ -186,17 +222,23 @@ class Steps:
     def problem(
         self, residuals: NDArray[np.float64], point: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Columns of all parameters and what they should make, rows of priors last."""
+        """Columns of all parameters and what they should make.
+
+        Rows of values, of priors, of chance and of what scatter tells.
+        """
         plainly, chance = self.count + self._linear.shape[1], self.modes.shape[1]
         rows = self.predictor.prior_rows
-        design = np.zeros((self.total + self._priors + chance, plainly + chance))
+        count = self.total + self._priors + chance + len(self.score.target)
+        design = np.zeros((count, plainly + chance))
         design[: self.total, : self.count] = self.slopes
         design[: self.total, self.count : plainly] = self._linear
         design[: self.total, plainly:] = self.modes
         design[self.total + np.arange(self._priors), rows] = 1.0
         last = self.total + self._priors + np.arange(chance)
         design[last, plainly + np.arange(chance)] = 1.0
-        return design, np.concatenate([residuals, -point[rows], np.zeros(chance)])
+        design[count - len(self.score.target) :, : self.count] = self.score.rows
+        told = self.score.left(point)
+        return design, np.concatenate([residuals, -point[rows], np.zeros(chance), told])
 
     def solve(
         self,
@@ -207,7 +249,7 @@ class Steps:
         """Best step of all parameters, some of the non-linear ones held."""
         design, target = self.problem(residuals, point)
         ends = np.repeat([[-np.inf], [np.inf]], design.shape[1], axis=1)
-        ends[:, : self.count] = self.predictor.reach(point)
+        ends[:, : self.count] = self._reach(point)
         if held is not None:
             ends[:, : self.count][:, held] = 0.0
         return solve_within(design, target, *ends)
@@ -228,16 +270,18 @@ class Steps:
         rows = self.predictor.prior_rows
         # Rows of chance come before those of priors.
         first = len(self._whole)
-        design = np.zeros((first + self._priors, self.count + 1))
+        last = first + self._priors
+        design = np.zeros((last + len(self.score.target), self.count + 1))
         design[: self.total, :-1], design[: self.total, -1] = self.slopes, residuals
         design[first + np.arange(self._priors), rows] = 1.0
-        design[first:, -1] = -point[rows]
+        design[first:last, -1] = -point[rows]
+        design[last:, :-1], design[last:, -1] = self.score.rows, self.score.left(point)
         design[:first] -= self._whole @ (self._span.T @ design[: self.total])
-        ends = np.array(self.predictor.reach(point), float)
+        ends = self._reach(point)
         if held is not None:
             ends[:, held] = 0.0
         # A column that is projected out but for rounding is none.
-        norms = np.sqrt((self.slopes**2).sum(0))
+        norms = np.sqrt((self.slopes**2).sum(0) + (self.score.rows**2).sum(0))
         norms[rows] = np.hypot(norms[rows], 1.0)
         gone = np.sqrt((design[:, :-1] ** 2).sum(0)) < SINGULAR * norms
         design[:, :-1][:, gone] = 0.0
@@ -288,7 +332,7 @@ class Steps:
         """
         own = not self.effect.any()
         squares: list[float] = []
-        promised = 0.0
+        promised, anew = 0.0, 0
         for turn in range(ROUNDS):
             predicted, residuals = self.residuals(self.point)
             if turn in REFRESHED and self._chance:
@@ -321,6 +365,11 @@ class Steps:
                     break
                 continue
             if self.history[-1] < SMALL:
+                if anew < ANEW and self._behind():
+                    anew += 1
+                    self.update_chance()
+                    squares.clear()
+                    continue
                 if self._apart:
                     self.solved = self.solve(residuals, start)
                 return

@@ -218,10 +218,10 @@ class Effect:
     :meth:`light_map`, :meth:`displacements`, :meth:`spot_light` (they serve predictions too),
     :meth:`turbulence`, :meth:`store`, :meth:`shift`, :meth:`amplify`, :meth:`noise`,
     :meth:`convert`.  *On channels*, in closed form: :meth:`signal`, :meth:`covariances`,
-    :meth:`spot_image`, :meth:`spot_flux`, :meth:`pattern` and the methods named after channel
-    words, which give the change that is to be added, in electrons (or e-^2), and are given the
-    axes of the channel with 'level' in electrons; :meth:`modes` says what is left to chance.  A
-    subclass overrides what it touches and nothing else.
+    :meth:`spot_image`, :meth:`spot_flux`, :meth:`spot_ghosts`, :meth:`pattern` and the methods
+    named after channel words, which give the change that is to be added, in electrons (or e-^2),
+    and are given the axes of the channel with 'level' in electrons; :meth:`modes` says what is
+    left to chance.  A subclass overrides what it touches and nothing else.
 
     Parameters
     ----------
@@ -258,6 +258,8 @@ class Effect:
         Whether only the level tells it: a_ij without one are as well those of another device.
     bends : bool
         Whether what it changes goes with the square of its amplitude as well.
+    told_by_scatter : tuple of str
+        Channels in which :meth:`modes`, in proportion to the amplitude, tell how strong it is.
     """
 
     values: Mapping[str, float]
@@ -274,6 +276,7 @@ class Effect:
     of_levels: ClassVar[bool] = False
     from_sightings: ClassVar[bool] = False
     bends: ClassVar[bool] = False
+    told_by_scatter: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         needed = {p.name for p in self.parameters}
@@ -490,6 +493,24 @@ class Effect:
     def spot_flux(self, axes: Axes, layout: Layout) -> Values:
         """Added to electrons of whole spots [e-], besides :meth:`spot_image`; by exposure."""
         return _nothing(axes)
+
+    def spot_ghosts(self, shown: Values, lit: Values, layout: Layout) -> Values | None:
+        """Parts of the charge of spots that others show where they were.
+
+        Parameters
+        ----------
+        shown, lit : ndarray, shapes (n,) and (m,)
+            Numbers of the exposures that show ghosts, and of those that leave them.
+        layout : Layout
+            Sensor and campaign.
+
+        Returns
+        -------
+        parts : ndarray, shape (n, m), or None
+            None: nothing is left.
+        """
+        del shown, lit, layout
+        return None
 
     def modes(self, word: str, axes: Axes, layout: Layout) -> Values | None:
         """What chance adds to a channel: shapes whose strengths are independent, of variance 1.

@@ -33,6 +33,7 @@ class IlluminationTurbulence(Effect):
     touches = ("flat_cov", "flat_mean")
     of_pixels = True
     bends = True
+    told_by_scatter = ("flat_mean",)
     source = (
         "Banovetz et al. 2024, arXiv 2411.13386 (1e-3 from peak to peak in differenced flats); a "
         "Gaussian correlation and the range are assumed"

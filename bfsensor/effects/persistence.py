@@ -79,16 +79,13 @@ class Persistence(Effect):
             out[row] = part * segment.rows * segment.columns if struck else others
         return out
 
-    def spot_flux(self, axes: Axes, layout: Layout) -> Values:
-        # Dithers are within a pixel: the ghost of the last spot is in the stamp of the next.
-        later = np.subtract.outer(axes["exposure"], axes["exposure"]).astype(float)
-        ghosts = self._after(later) @ axes["flux"]
+    def spot_ghosts(self, shown: Values, lit: Values, layout: Layout) -> Values | None:
+        parts = self._after(np.subtract.outer(shown, lit))
         biases = np.array(layout.biases, float)
-        if not len(biases):
-            return np.asarray(ghosts)
-        # Biases hold ghosts too, and their mean is taken off all exposures.
-        later = np.subtract.outer(biases, np.asarray(axes["exposure"], float))
-        return np.asarray(ghosts - (self._after(later) @ axes["flux"]).sum() / len(biases))
+        if len(biases):
+            # Biases hold ghosts too, and their mean is taken off all exposures.
+            parts = parts - self._after(np.subtract.outer(biases, lit)).mean(0)
+        return np.asarray(parts)
 
     def modes(self, word: str, axes: Axes, layout: Layout) -> Values | None:
         if word not in ("flat_mean", "dark_map") or not layout.shots:

@@ -103,6 +103,7 @@ class Chance(Halo):
     """Of an effect that leaves much to chance, and a width that is held by a prior."""
 
     prior_rows = np.array([1])
+    steps = np.array([1e-3, 1e-3])
     effects = (IlluminationTurbulence({"rms": 1e-3, "corr": 20.0}),)
 
     def modes(self, channel, point):
