@@ -202,25 +202,31 @@ def test_refusals(tmp_path):
     assert part.exit_code == 2 and "K/N" in part.output
 
 
+@pytest.fixture
+def other_twins():
+    """Twins of another size are not those of other tests."""
+    amplitudes._fitted.cache_clear()
+    yield
+    amplitudes._fitted.cache_clear()
+
+
 @pytest.mark.slow
-def test_a_signal_grows_in_proportion_and_no_effect_has_none(monkeypatch):
-    """Twins of 128 x 128 pixels: about a minute.
+def test_a_signal_grows_in_proportion_and_no_effect_has_none(monkeypatch, other_twins):
+    """Twins of 192 x 192 pixels, four spots on each amplifier: about a minute.
 
     Twice the crosstalk is twice the projected SNR (measured power 1.001, here to 2 %), and
     a campaign with a neutral effect is its twin, bit for bit.
     """
-    small = Size(128, 4, 1, dithers=1)
+    small = Size(192, 4, 1, dithers=1)
     source = amplitudes.VirtualSource
     monkeypatch.setattr(
         amplitudes, "VirtualSource", lambda **k: source(**(k | {"size": small}))
     )  # fmt: skip
-    amplitudes._fitted.cache_clear()
-    effect = make_effect("amp_crosstalk", {"c": 5e-4})
+    effect = make_effect("amp_crosstalk", {"c": 2e-3})
     one, two = (amplitudes.take_signal(effect.scaled(f)) for f in (0.5, 1.0))
     assert two.snr > 10 and "amp_cross" in two.shown
     assert two.snr / one.snr == pytest.approx(2.0, rel=0.02)
     assert not amplitudes.change(effect.neutral(), amplitudes.SEEDS[0]).any()
-    amplitudes._fitted.cache_clear()
 
 
 @pytest.mark.slow
