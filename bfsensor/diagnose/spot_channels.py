@@ -23,6 +23,9 @@ REPEATS = 8
 CLIP = 8.0
 """Median deviations from which on a pixel of the rim is struck: 5.4 sigma of noise."""
 
+QUIET = 2.0
+"""Least median deviation of a pixel [e-]: that of a read noise of 3 e-."""
+
 WING_ERROR = 2e-4
 """Error of the share of a spot's flux outside its stamp: backgrounds are known to about 0.1 e- a
 pixel of 320 (assumed)."""
@@ -187,7 +190,9 @@ def _clipped_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     middle = np.median(values, axis=-1, keepdims=True)
     away = np.abs(values - middle)
-    near = away <= CLIP * np.median(away, axis=-1, keepdims=True)
+    # Of predictions, which have no noise, as much counts as in recordings.
+    usual = np.maximum(np.median(away, axis=-1, keepdims=True), QUIET)
+    near = away <= CLIP * usual
     return np.asarray((values * near).sum(-1) / near.sum(-1))
 
 
