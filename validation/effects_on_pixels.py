@@ -7,7 +7,7 @@ same conventions and none of this code: the same comparison with them checks the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,6 +18,7 @@ from bfsensor.diagnose.channels import Channel
 from bfsensor.diagnose.extract import Measured, measure_channels
 from bfsensor.diagnose.mismatch import BaselineFit, fit_baseline
 from bfsensor.diagnose.predict import Predictor, used_channels
+from bfsensor.diagnose.spot_ghosts import find_ghosts
 from bfsensor.effects.effect import Effect, Layout, Segment, Shot
 from validation.concealed.electrostatics import EdgeShifts
 from validation.concealed.plan import SIZES, Geometry
@@ -162,9 +163,11 @@ def compare(
         two campaigns do not share.  Where nothing is predicted: 0, 0 and the length seen.
         Errors are those that the channels of the campaign with the effect have.
     """
-    null, fit = null_campaign(seed, size)
     source = VirtualSource(seed=seed, size=size, effects=[own or OnPixels(effect)])
-    other = measure_channels(source, ghosts=False)
+    # Both campaigns use the same frames.
+    haunted = find_ghosts(source.exposures, source.read)
+    null, fit = null_campaign(seed, size, haunted)
+    other = measure_channels(source, ghosts=haunted)
     by = used_channels(other.channels, FOLDS)
     before, bare, after = (
         residuals(fit, m, e, by, (effect,))
@@ -233,16 +236,21 @@ def _without_parameters(
 _NULLS: dict[Any, tuple[Measured, BaselineFit]] = {}
 
 
-def null_campaign(seed: int, size: Any) -> tuple[Measured, BaselineFit]:
+def null_campaign(
+    seed: int, size: Any, ghosts: Mapping[int, list[NDArray[np.bool_]]] | None = None
+) -> tuple[Measured, BaselineFit]:
     """A campaign without effects, and its fit, at the sensor's own gains; kept.
 
     Gains are known from flats to 2e-3, and an effect of more than 500 errors is predicted better.
+    ``ghosts``: frames to set apart, for comparisons with a campaign in which spots left some.
     """
-    key = seed, repr(size)
+    key = seed, repr(size), tuple(ghosts or ())
     if key not in _NULLS:
         pixels = (SIZES[size] if isinstance(size, str) else size).pixels
         sensor = VirtualSensor(Geometry(pixels), seed=seed)
-        measured = measure_channels(VirtualSource(seed=seed, size=size))
+        measured = measure_channels(
+            VirtualSource(seed=seed, size=size), ghosts=ghosts or True
+        )
         predictor = Predictor(measured, virtual_baseline())
         fit = fit_baseline(predictor, used_channels(measured.channels, FOLDS))
         values = fit.values.copy()

@@ -130,7 +130,7 @@ def measure_channels(
     *,
     lags: int = 4,
     progress: Callable[[int, int], None] | None = None,
-    ghosts: bool = True,
+    ghosts: bool | Mapping[int, list[NDArray[np.bool_]]] = True,
 ) -> Measured:
     """Measure all channels that a campaign's exposures allow.
 
@@ -142,9 +142,10 @@ def measure_channels(
         Largest lag of the flats' covariances [pixel].
     progress : callable, optional
         Called with (exposures done, exposures in all).
-    ghosts : bool
+    ghosts : bool, or mapping of int to list of ndarray of bool
         Whether biases and darks that hold what spots left are sought, and set apart; if not,
-        campaigns with and without an effect have the same values.
+        campaigns with and without an effect have the same values.  Or those that are set apart,
+        as :func:`~bfsensor.diagnose.spot_ghosts.find_ghosts` gives them.
 
     Returns
     -------
@@ -172,7 +173,10 @@ def measure_channels(
             progress(done, len(exposures))
         return frames
 
-    haunted = find_ghosts(exposures, source.read) if ghosts else {}
+    if isinstance(ghosts, bool):
+        haunted = find_ghosts(exposures, source.read) if ghosts else {}
+    else:
+        haunted = dict(ghosts)
     if haunted:
         notes.append(describe_ghosts(haunted, exposures))
     biases, late_biases = BiasChannels(), BiasChannels("held-out")

@@ -20,9 +20,10 @@ RANDOM = (
 )  # fmt: skip
 """Effects that are told by their scatter: predicted is what is expected of many."""
 
-SCATTER = {"correlated_noise:pickup": 3 / 14**0.5}
+SCATTER = {"correlated_noise:pickup": 3 / 14**0.5, "tearing": 3 * 0.71 / 12**0.5}
 """Relative scatter of a prediction, three of its standard deviations: a wave's power in the
-differences of 2 x 7 biases, whose phases are free, is between 0 and 2 of its mean in each."""
+differences of 2 x 7 biases, whose phases are free, is between 0 and 2 of its mean in each; how far
+the edge of a tear moves between two flats scatters by .71 of its mean, and a dozen pairs are bright."""
 
 FEW = 0.05
 """Relative error of a prediction: closed forms are of first order in amplitudes of per cents."""
