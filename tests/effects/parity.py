@@ -20,10 +20,14 @@ RANDOM = (
 )  # fmt: skip
 """Effects that are told by their scatter: predicted is what is expected of many."""
 
-SCATTER = {"correlated_noise:pickup": 3 / 14**0.5, "tearing": 3 * 0.71 / 12**0.5}
+SCATTER = {
+    ("correlated_noise:pickup", ""): 3 / 14**0.5,
+    ("tearing", "flat_cov"): 3 * 0.71 / 12**0.5,
+}
 """Relative scatter of a prediction, three of its standard deviations: a wave's power in the
 differences of 2 x 7 biases, whose phases are free, is between 0 and 2 of its mean in each; how far
-the edge of a tear moves between two flats scatters by .71 of its mean, and a dozen pairs are bright."""
+the edge of a tear moves between two flats scatters by .71 of its mean, and a dozen pairs are bright
+(assumed).  Of one channel, or of all."""
 
 FEW = 0.05
 """Relative error of a prediction: closed forms are of first order in amplitudes of per cents."""
@@ -49,7 +53,8 @@ def disagreements(effect, engine, size="S", few=FEW):
         gap = abs(r.factor - 1) * r.said
         # Of random effects the sums over two campaigns differ by as many of their errors.
         allowed = max(few * r.said, 4 * 2**0.5 if effect.word in RANDOM else UNSEEN)
-        allowed = max(allowed, SCATTER.get(effect.name, 0.0) * r.said)
+        scatter = max(SCATTER.get((effect.name, word), 0.0) for word in ("", r.channel))
+        allowed = max(allowed, scatter * r.said)
         if gap > max(allowed, 3 * r.error * r.said):
             out.append(
                 f"{r.channel}: factor {r.factor:.3f} +- {r.error:.3f} on {r.said:.1f} sigma"
