@@ -118,6 +118,10 @@ SHORTEST = 0.1
 everywhere a path would else take minutes."""
 
 
+LEAVE = 0.5
+"""Off an edge [um] a path does not come back to it: boundaries shift by less."""
+
+
 @numba.njit(cache=True, inline="always")
 def turns(a, b, c, d):
     """Largest difference of the directions within a step from that at its start, squared."""
@@ -133,7 +137,21 @@ def turns(a, b, c, d):
 
 @numba.njit(cache=True)
 def find_well(
-    phi, xs, ys, zs, start, zone, coarseness, max_steps, scratch, cell, out, turn=ANY_TURN
+    phi,
+    xs,
+    ys,
+    zs,
+    start,
+    zone,
+    coarseness,
+    max_steps,
+    scratch,
+    cell,
+    out,
+    turn=ANY_TURN,
+    axis=0,
+    edge=0.0,
+    leave=np.inf,
 ):
     """Follow an electron from ``start`` to its well; write where it ended to ``out``.
 
@@ -141,7 +159,8 @@ def find_well(
     when it is below ``top`` and within the half width and height of a pixel centre.  Steps
     are Runge-Kutta of fourth order in arc length; within one the direction changes by less than
     ``turn`` (of a unit vector), or it is halved: by default any length will do, and a step may
-    lead over a saddle of the potential.
+    lead over a saddle of the potential.  Farther than ``leave`` from ``edge`` along ``axis`` it is
+    not followed.
     """
     p = scratch[0]
     q = scratch[1]
@@ -159,6 +178,8 @@ def find_well(
             oy = p[1] - zone[1] * np.round(p[1] / zone[1])
             if abs(ox) < zone[2] and abs(oy) < zone[3]:
                 break
+        if abs(p[axis] - edge) > leave:
+            break
         h = coarseness * (0.3 + 0.12 * max(p[2] - 1.0, 0.0))
         shortest = SHORTEST * h
         _slope_along(phi, xs, ys, zs, p, 1.0, cell, weights, g, a)
@@ -182,6 +203,64 @@ def find_well(
 
 
 @numba.njit(cache=True)
+def _sides(
+    phi, xs, ys, zs, point, axis, edge, a, b, zone, coarseness, max_steps, scratch, cell, turn,
+    leave,
+):  # fmt: skip
+    """Whether electrons from ``a`` and ``b`` off the edge go below and above it."""
+    end = np.zeros(3)
+    point[axis] = edge + a
+    find_well(
+        phi, xs, ys, zs, point, zone, coarseness, max_steps, scratch, cell, end, turn, axis, edge,
+        leave,
+    )  # fmt: skip
+    below = end[axis] < edge
+    point[axis] = edge + b
+    find_well(
+        phi, xs, ys, zs, point, zone, coarseness, max_steps, scratch, cell, end, turn, axis, edge,
+        leave,
+    )  # fmt: skip
+    return below, end[axis] > edge
+
+
+@numba.njit(cache=True)
+def _bisect(
+    phi, xs, ys, zs, point, axis, edge, a, b, tolerance, zone, coarseness, max_steps, scratch,
+    cell, turn, leave,
+):  # fmt: skip
+    """Ends of the interval that is left, nan where there is no watershed."""
+    end = np.zeros(3)
+    found = False
+    for _ in range(8):
+        below, above = _sides(
+            phi, xs, ys, zs, point, axis, edge, a, b, zone, coarseness, max_steps, scratch, cell,
+            turn, leave,
+        )  # fmt: skip
+        if below and above:
+            found = True
+            break
+        width = b - a
+        if not below:
+            a -= 2.0 * width
+        if not above:
+            b += 2.0 * width
+    if not found:
+        return np.nan, np.nan
+    while b - a > tolerance:
+        middle = 0.5 * (a + b)
+        point[axis] = edge + middle
+        find_well(
+            phi, xs, ys, zs, point, zone, coarseness, max_steps, scratch, cell, end, turn, axis,
+            edge, leave,
+        )  # fmt: skip
+        if end[axis] < edge:
+            a = middle
+        else:
+            b = middle
+    return a, b
+
+
+@numba.njit(cache=True)
 def bisect_edge(
     phi,
     xs,
@@ -198,93 +277,41 @@ def bisect_edge(
     max_steps,
     out,
     turn=ANY_TURN,
+    leave=LEAVE,
 ):
     """Find, for every seed, where the well that an electron reaches changes across an edge.
 
     ``seeds`` (n, 3) are points on the nominal edge; the coordinate ``axis`` (0: x, 1: y) is
     searched from ``edge + low`` to ``edge + high``, which are widened while both ends reach
     the same side.  ``out`` (n,) gets the position; returns the number of seeds that failed
-    (nan in ``out``).  ``turn`` as in :func:`find_well`.
+    (nan in ``out``).  ``turn`` as in :func:`find_well`.  Paths are followed until they are
+    ``leave`` [um] off the edge; those of the last two points all the way, and where these do not
+    end on the sides that they had left to, all of that seed's are, from the beginning.
     """
     scratch = np.zeros((13, 4))
     cell = np.ones(3, np.int64)
     point = np.zeros(3)
-    end = np.zeros(3)
     failed = 0
     for n in range(seeds.shape[0]):
         for m in range(3):
             point[m] = seeds[n, m]
-        nominal = edge[n]
-        a = low[n]
-        b = high[n]
-        found = False
-        for _ in range(8):
-            point[axis] = nominal + a
-            find_well(
-                phi,
-                xs,
-                ys,
-                zs,
-                point,
-                zone,
-                coarseness,
-                max_steps,
-                scratch,
-                cell,
-                end,
-                turn,
-            )
-            below = end[axis] < nominal
-            point[axis] = nominal + b
-            find_well(
-                phi,
-                xs,
-                ys,
-                zs,
-                point,
-                zone,
-                coarseness,
-                max_steps,
-                scratch,
-                cell,
-                end,
-                turn,
-            )
-            above = end[axis] > nominal
+        out[n] = np.nan
+        for far in (leave, np.inf):
+            a, b = _bisect(
+                phi, xs, ys, zs, point, axis, edge[n], low[n], high[n], tolerance, zone,
+                coarseness, max_steps, scratch, cell, turn, far,
+            )  # fmt: skip
+            below, above = True, not np.isnan(a)
+            if above and far < np.inf:
+                below, above = _sides(
+                    phi, xs, ys, zs, point, axis, edge[n], a, b, zone, coarseness, max_steps,
+                    scratch, cell, turn, np.inf,
+                )  # fmt: skip
             if below and above:
-                found = True
+                out[n] = edge[n] + 0.5 * (a + b)
                 break
-            width = b - a
-            if not below:
-                a -= 2.0 * width
-            if not above:
-                b += 2.0 * width
-        if not found:
-            out[n] = np.nan
+        if np.isnan(out[n]):
             failed += 1
-            continue
-        while b - a > tolerance:
-            middle = 0.5 * (a + b)
-            point[axis] = nominal + middle
-            find_well(
-                phi,
-                xs,
-                ys,
-                zs,
-                point,
-                zone,
-                coarseness,
-                max_steps,
-                scratch,
-                cell,
-                end,
-                turn,
-            )
-            if end[axis] < nominal:
-                a = middle
-            else:
-                b = middle
-        out[n] = nominal + 0.5 * (a + b)
     return failed
 
 

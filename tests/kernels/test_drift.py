@@ -124,3 +124,31 @@ def test_bisection_reports_seeds_without_a_watershed():
     )  # fmt: skip
     assert failed == 1
     assert np.isnan(out[0])
+
+
+def test_paths_that_are_left_early_end_where_they_were_going():
+    """Winding boundary: what leaves the edge on one side may yet end on the other."""
+    nodes, z = np.linspace(-3.0, 13.0, 65), np.linspace(-1.0, 9.0, 41)
+    x, height = nodes[None, None, :], z[None, :, None]
+    bent = 5.0 + 0.8 * np.sin(1.5 * height)
+    phi = (
+        -np.cos(2 * np.pi * (x - bent) / 10.0)
+        - 0.3 * height
+        - 0.05 * nodes[:, None, None] ** 2
+    )
+    phi = np.ascontiguousarray(phi)
+    zone = np.array([10.0, 10.0, 4.0, 9.0, 1.0])
+    seeds = np.array([[5.0, 0.0, 6.0], [5.0, 0.5, 6.0], [5.0, 1.0, 5.0]])
+
+    def bisected(leave):
+        out = np.zeros(3)
+        assert not drift.bisect_edge(
+            phi, nodes, nodes, z, seeds, 0, np.full(3, 5.0), np.full(3, -0.01),
+            np.full(3, 0.01), 1e-6, zone, 0.25, 4000, out, drift.ANY_TURN, leave,
+        )  # fmt: skip
+        return out
+
+    whole = bisected(np.inf)
+    assert np.all(np.abs(whole - 5.0) > 0.3)
+    for leave in (0.1, 0.5, 2.0):
+        assert np.array_equal(bisected(leave), whole)
