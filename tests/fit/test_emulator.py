@@ -178,7 +178,12 @@ def test_values_that_it_refuses(emulator):
 
 @pytest.mark.slow
 def test_the_prior_volume():
-    """All parameters at once, on a mesh whose error does not count."""
-    found = DeviceEmulator.build(Device.load("e2v_ccd250"), cells=8)
+    """All parameters at once, on the mesh that fits use: on 8 cells E2V's stops are not resolved.
+
+    There a_10 changes by up to three times itself within the prior, here by 18 %; it is what is
+    left where much larger shifts cancel.
+    """
+    found = DeviceEmulator.build(Device.load("e2v_ccd250"))
     errors = found.check(8, 90211).quantile(0.5)
-    assert errors[:2, :2].max() < 0.01
+    assert errors[1, 0] < 0.01 and errors[1, 1] < 0.01 and errors[0, 0] < 0.01
+    assert errors[0, 1] < 0.04  # [j, i]
