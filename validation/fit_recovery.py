@@ -10,11 +10,12 @@ to the fit as an error of its predictions; ``emulator``: from the emulator, so t
 ``--straight`` takes the tangent of the emulator at the priors for truth and fit: nothing bends.
 
 Rows 'tangent': errors of a Gaussian of the tangent where the fit ends; 'posterior': those that the
-fit states, of draws.  A row for each parameter, for the combinations that the first mock measures
-best, for the best of each mock's own ('own 1' to 'own 3') and for all parameters together replaces
-those of the same run in ``validation/results/fit_recovery.ecsv``, with Wilson bounds (95 %) of the
-coverage; the parameters that are not told apart are in the header, with the number of mocks whose
-posterior was drawn from.
+fit states, of draws about its values; 'draws': central intervals of the draws, pulls being the
+normal ones of the truth's rank among them (where nothing bends, those of 'posterior').  A row for
+each parameter, for the combinations that the first mock measures best, for the best of each mock's
+own ('own 1' to 'own 3') and for all parameters together replaces those of the same run in
+``validation/results/fit_recovery.ecsv``, with Wilson bounds (95 %) of the coverage; the parameters
+that are not told apart are in the header, with the number of mocks whose posterior was drawn from.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table, vstack
 from numpy.typing import NDArray
+from scipy.stats import norm
 
 from bfsensor import Device
 from bfsensor.fit.data import DataSet, area_data
@@ -120,7 +122,7 @@ def recover(
     spreads = np.array([prior.spread for prior in priors])
     independent = np.ones(errors.shape, bool)
     independent[0, 0] = False
-    ways = ("tangent", "posterior")
+    ways = ("tangent", "posterior", "draws")
     pulls: dict[str, list[NDArray[np.float64]]] = {way: [] for way in ways}
     remains: dict[str, list[NDArray[np.float64]]] = {way: [] for way in ways}
     scales, chi2, told = [], [], {}
@@ -160,7 +162,7 @@ def recover(
             )
             labels = [name_combination(names, weights) for weights in directions]
         off = (tangent.values - truth) / spreads
-        for way, solution in zip(ways, (tangent, found), strict=True):
+        for way, solution in zip(ways[:2], (tangent, found), strict=True):
             scaled = solution.covariance / np.outer(spreads, spreads)
             error = np.sqrt(np.diag(scaled))
             own = np.array([one.weights for one in principal(scaled)[:OWN]])
@@ -169,6 +171,13 @@ def recover(
             width = np.sqrt(np.einsum("cp,pq,cq->c", along, scaled, along))
             pulls[way].append(np.concatenate([off / error, along @ off / width]))
             remains[way].append(np.concatenate([error, width]))
+        if posterior.draws is None:
+            pulls["draws"].append(pulls["posterior"][-1])
+        else:
+            ranks = np.vstack([np.eye(len(priors)), along])
+            away = (posterior.draws - truth) / spreads @ ranks.T
+            pulls["draws"].append(pulls_of_ranks(away))
+        remains["draws"].append(remains["posterior"][-1])
         # What the fit predicts is as the tangent has it: held against the true ones there.
         told_areas, told_errors = _predicted(emulator, tangent.values, tangent.covariance)
         missed_areas = (
@@ -242,6 +251,18 @@ def _row(name: str, kind: str, pulls: NDArray[np.float64]) -> dict[str, Any]:
         for share, part in (("68", one[0]), ("95", two[0]))
         for end, bound in zip(("low", "high"), wilson(part, len(by_mock)), strict=True)
     }  # fmt: skip
+
+
+def pulls_of_ranks(away: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pulls of the truth as many draws as lie above it would have of a normal distribution.
+
+    Parameters
+    ----------
+    away : ndarray, shape (m, k)
+        Draws less the truth.
+    """
+    above = (np.sum(away > 0, axis=0) + 0.5) / (len(away) + 1)
+    return np.asarray(norm.ppf(above))
 
 
 def wilson(part: float, count: int, z: float = 1.96) -> tuple[float, float]:

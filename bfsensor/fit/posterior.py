@@ -21,11 +21,15 @@ from bfsensor.fit.missed import (
 )
 from bfsensor.fit.sampled import bent_about, sample_posterior, with_draws
 from bfsensor.fit.solve import Problem, Solution
+from bfsensor.fit.ties import principal
 
 Values = NDArray[np.float64]
 
 STRAIGHT = 1e-3
 """Largest second derivative of predictions that count as straight [errors a squared spread]."""
+
+SHARES = {"68": 0.6827, "95": 0.95}
+"""Of the draws in central intervals."""
 
 PREDICTED = 100
 """Draws at which predictions are made: what the posterior leaves open of them, to 7 %."""
@@ -45,12 +49,15 @@ class Posterior:
         What is kept with the result: how the errors were found, and what predictions miss.
     words : str
         A sentence of it.
+    draws : ndarray, shape (m, p), optional
+        Of the parameters [internal units], where predictions bend.
     """
 
     solution: Solution
     left: tuple[Values, ...]
     record: dict[str, Any] = field(default_factory=dict)
     words: str = ""
+    draws: Values | None = None
 
 
 def find_posterior(
@@ -113,13 +120,13 @@ def find_posterior(
             )
             record["not_drawn"] = str(error)
     if curved:
-        record |= _told(drawn)
+        own = with_draws(found, drawn)
+        record |= _told(drawn) | {"combinations": _combined(problem, own, drawn)}
         left = _left(problem, found, drawn)
         if missed is not None:
             left = tuple(np.hypot(a, b) for a, b in zip(left, missed.rms, strict=True))
         return Posterior(
-            with_draws(found, drawn), left, record,
-            f"{words}; predictions bend: the posterior was drawn from",
+            own, left, record, f"{words}; predictions bend: the posterior was drawn from", drawn,
         )  # fmt: skip
     if missed is not None:
         wider, left = widen(problem, found, missed)
@@ -133,12 +140,30 @@ def find_posterior(
 
 def _told(draws: Values) -> dict[str, Any]:
     """Means and central intervals."""
-    low, high = (1 - 0.6827) / 2, (1 - 0.95) / 2
-    return {
-        "draws": len(draws), "mean": np.mean(draws, axis=0).tolist(),
-        "central_68": np.quantile(draws, [low, 1 - low], axis=0).T.tolist(),
-        "central_95": np.quantile(draws, [high, 1 - high], axis=0).T.tolist(),
-    }  # fmt: skip
+    return {"draws": len(draws), "mean": np.mean(draws, axis=0).tolist()} | _intervals(
+        draws
+    )
+
+
+def _combined(problem: Problem, found: Solution, draws: Values) -> dict[str, Any]:
+    """Means and intervals of independent combinations, as far from where the fit ends.
+
+    In units of the priors, the best known first.  Where the best known direction turns from place to
+    place, its draws lie to one side of the fitted values and are not normal: an error about those
+    tells less well than an interval.
+    """
+    scaled = found.covariance / np.outer(problem.spreads, problem.spreads)
+    weights = np.array([one.weights for one in principal(scaled)])
+    off = (draws - found.values) / problem.spreads @ weights.T
+    return {"mean": np.mean(off, axis=0).tolist()} | _intervals(off)
+
+
+def _intervals(draws: Values) -> dict[str, Any]:
+    out = {}
+    for name, share in SHARES.items():
+        ends = np.quantile(draws, [(1 - share) / 2, (1 + share) / 2], axis=0)
+        out[f"central_{name}"] = ends.T.tolist()
+    return out
 
 
 def _left(problem: Problem, found: Solution, draws: Values) -> tuple[Values, ...]:

@@ -120,7 +120,8 @@ class FitResult:
     posterior : mapping
         How the errors were found: errors of the tangent alone; devices drawn and solved, and rms of
         what predictions of each set miss there; where predictions bend, number, mean and central
-        intervals of the draws.
+        intervals of the draws, of the parameters and ('combinations') of the combinations above, these
+        as far from ``value`` in units of their priors.
     """
 
     device: str
@@ -270,11 +271,19 @@ class FitResult:
         return out
 
     def _told(self) -> list[str]:
-        out = [
-            f"measured to {part:.2f} of its prior: {name_combination(self.parameters, weights)}"
-            for part, weights in zip(self.remains, self.weights, strict=True)
-            if part < WELL_KNOWN and len(self.parameters) > 1
-        ]
+        drawn = self.posterior.get("combinations", {}).get("central_95")
+        out = []
+        for number, (part, weights) in enumerate(
+            zip(self.remains, self.weights, strict=True)
+        ):
+            if part < WELL_KNOWN and len(self.parameters) > 1:
+                name = name_combination(self.parameters, weights)
+                ends = (
+                    ""
+                    if drawn is None
+                    else "; 95 % of draws from {:+.2f} to {:+.2f}".format(*drawn[number])
+                )
+                out.append(f"measured to {part:.2f} of its prior: {name}{ends}")
         out += self._profile_lines()
         out += [f"not told apart: {tie}" for tie in self.ties]
         if self.silent:

@@ -13,7 +13,7 @@ from bfsensor import Device
 from bfsensor.errors import FitError
 from bfsensor.fit.fit import fit_device
 from bfsensor.fit.quantities import choose_priors, quantities, with_priors
-from bfsensor.fit.result import FitResult
+from bfsensor.fit.result import WELL_KNOWN, FitResult
 from bfsensor.fit.ties import combinations, find_ties
 from tests.fit.linear_emulator import quadrant
 from tests.fit.test_solve import TRUTH
@@ -222,6 +222,16 @@ def test_profiles_are_told_with_their_bounds_beside_those_of_the_error():
     assert result.to_dict()["profile_bounds"] == {"silicon.thickness": found}
     (line,) = [one for one in result.said().splitlines() if one.startswith("profile of")]
     assert line.startswith("profile of thickness: 68 % ") and "open" not in line
+
+
+def test_what_draws_leave_of_combinations_is_told():
+    result = run()
+    known = np.sum(result.remains < WELL_KNOWN)
+    assert known >= 1 and "of draws" not in result.said()
+    ends = [[-0.31 - n, 0.12 + n] for n in range(len(result.parameters))]
+    drawn = replace(result, posterior={"combinations": {"central_95": ends}})
+    lines = [one for one in drawn.said().splitlines() if one.startswith("measured to")]
+    assert len(lines) == known and lines[0].endswith("; 95 % of draws from -0.31 to +0.12")
 
 
 def test_devices_drawn_from_the_posterior_widen_it():

@@ -16,6 +16,7 @@ from bfsensor.fit.profiles import LEVELS, profile_bounds
 from bfsensor.fit.quantities import Prior
 from bfsensor.fit.sampled import bent_about, sample_posterior, with_draws
 from bfsensor.fit.solve import Problem, profile, solve
+from bfsensor.fit.ties import principal
 from bfsensor.recording.exposures import Condition
 
 TURN = 0.4
@@ -99,6 +100,14 @@ def test_where_predictions_bend_the_posterior_is_drawn_from_and_intervals_are_ke
     assert "was drawn from" in bending.words
     low, high = np.array(bending.record["central_95"]).T
     assert np.all(low < bending.record["mean"]) and np.all(high > bending.record["mean"])
+    # A valley whose direction turns: the draws of its best combination lie to one side of the fit.
+    ends, mean = (bending.record["combinations"][k] for k in ("central_95", "mean"))
+    scaled = bending.solution.covariance / np.outer(whole.spreads, whole.spreads)
+    best = principal(scaled)[0]
+    along = (bending.draws - found.values) / whole.spreads @ best.weights
+    assert mean[0] == pytest.approx(along.mean(), abs=1e-9)
+    inside = (along > ends[0][0]) & (along < ends[0][1])
+    assert inside.mean() == pytest.approx(0.95, abs=1e-3)
     # x + 0.4 y^2 is measured to 0.2, and so it is predicted however wide x and y are.
     assert bending.left[0][0] == pytest.approx(0.2, rel=0.2)
     straight = find_posterior(problem(0.0), solve(problem(0.0)), None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tests.fit.toys import MEANS, PRIORS, SPREADS, toy_emulator
-from validation.fit_recovery import recover
+from validation.fit_recovery import pulls_of_ranks, recover
 
 MOCKS = 150
 EMULATOR = toy_emulator()
@@ -53,3 +53,10 @@ def test_a_device_that_cannot_be_is_drawn_again():
 
     rows, _ = recover(EMULATOR, PRIORS, ERRORS, mocks=10, seed=3, areas=areas)
     assert refused and all_of(rows)["mocks"] == 10
+
+
+def test_the_truth_s_rank_among_normal_draws_is_its_pull():
+    draws = 3.0 + 2.0 * np.random.default_rng(5).standard_normal((40_000, 1))
+    for truth in (1.0, 3.0, 6.0):
+        assert abs(pulls_of_ranks(draws - truth)[0] - (3.0 - truth) / 2.0) < 0.03
+    assert np.isfinite(pulls_of_ranks(draws - 99.0)).all()
