@@ -37,7 +37,7 @@ from bfsensor.fit.missed import Missed
 from bfsensor.fit.posterior import find_posterior
 from bfsensor.fit.predictors import Emulator, make_predictors
 from bfsensor.fit.quantities import Prior, choose_priors, describe, with_priors
-from bfsensor.fit.solve import Problem, solve
+from bfsensor.fit.solve import ORDERED, Problem, solve
 from bfsensor.fit.ties import find_ties, name_combination, principal
 from bfsensor.recording.area_changes import read_area_changes
 from bfsensor.recording.exposures import Condition
@@ -65,14 +65,25 @@ Areas = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 def draw_truth(priors: Sequence[Prior], rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw each parameter from its prior, anew where it lies outside its bounds."""
+    """Draw each parameter from its prior, anew where it lies outside its bounds.
+
+    All of them anew where there is no such device, as with a gate oxide above the field oxide: half
+    of the E2V device's neighbours.
+    """
+    names = [prior.name for prior in priors]
     out = np.empty(len(priors))
-    for n, prior in enumerate(priors):
-        while True:
-            out[n] = rng.normal(prior.mean, prior.spread)
-            if prior.low < out[n] < prior.high:
-                break
-    return out
+    while True:
+        for n, prior in enumerate(priors):
+            while True:
+                out[n] = rng.normal(prior.mean, prior.spread)
+                if prior.low < out[n] < prior.high:
+                    break
+        if not any(
+            out[names.index(low)] > out[names.index(high)]
+            for low, high in ORDERED
+            if {low, high} <= set(names)
+        ):
+            return out
 
 
 def recover(

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from bfsensor import Device
+from bfsensor.fit.quantities import choose_priors
 from tests.fit.toys import MEANS, PRIORS, SPREADS, toy_emulator
-from validation.fit_recovery import pulls_of_ranks, recover
+from validation.fit_recovery import draw_truth, pulls_of_ranks, recover
 
 MOCKS = 150
 EMULATOR = toy_emulator()
@@ -60,3 +62,12 @@ def test_the_truth_s_rank_among_normal_draws_is_its_pull():
     for truth in (1.0, 3.0, 6.0):
         assert abs(pulls_of_ranks(draws - truth)[0] - (3.0 - truth) / 2.0) < 0.03
     assert np.isfinite(pulls_of_ranks(draws - 99.0)).all()
+
+
+def test_truths_are_devices_that_can_be():
+    """E2V's oxides are equally thick: drawn apart, half of the pairs would be out of order."""
+    priors = choose_priors(Device.load("e2v_ccd250"), ("gate_oxide", "field_oxide"))
+    rng = np.random.default_rng(7)
+    gate, field = np.array([draw_truth(priors, rng) for _ in range(200)]).T
+    assert [p.name for p in priors] == ["gates.gate_oxide", "gates.field_oxide"]
+    assert np.all(gate <= field) and gate.std() > 0.3 * priors[0].spread
