@@ -6,6 +6,8 @@ K, densities in electron/um^3 and doses in electron/um^2.
 
 from __future__ import annotations
 
+from functools import cache
+
 import astropy.units as u
 import numpy as np
 
@@ -78,6 +80,7 @@ def to_internal(text: str, kind: str) -> float:
         raise DeviceError(f"{text!r} is not a {kind}; expected {expected}") from None
 
 
+@cache
 def _ratio(given: u.UnitBase, wanted: u.UnitBase) -> tuple[float, float]:
     """Give the size of a unit in another as a fraction, so that powers of ten are exact.
 
@@ -127,7 +130,7 @@ def from_internal(value: float, kind: str, unit: str) -> str:
         mantissa, exponent = f"{number:.{digits - 1}e}".split("e")
         plain = f"{number:.{max(digits - 1 - int(exponent), 0)}f}"
         text = plain if -5 <= int(exponent) < 6 else f"{mantissa}e{exponent}"
-        quantity = f"{text} {unit}".strip()
-        if to_internal(quantity, kind) == value:
-            return quantity
+        # As to_internal reads it, without parsing the unit for each number of digits.
+        if float(text) * times / over == value:
+            return f"{text} {unit}".strip()
     return f"{float(value)!r} {_name(kind)}".strip()
