@@ -110,8 +110,9 @@ def collect(edges, charges, hot, x, y, z, lo, hi, near_x, near_y, out_i, out_j):
     margins = charges.margins
     share_x, share_y = edges.shares[0], edges.shares[1]
     tiles_x = (nx + 15) // 16
-    count_x = 0
-    count_y = 0
+    # Not 0, of which numba would make a type and compile all below for it as well.
+    count_x = np.int64(0)
+    count_y = np.int64(0)
     # Where they land; who is near an edge is listed without a branch.
     for n in range(np.uint64(lo), np.uint64(hi)):
         ax = x[n]

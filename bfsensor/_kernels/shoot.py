@@ -124,7 +124,7 @@ def _shoot(
         now = start // BATCH % 2
         count = min(BATCH, total - start)
         after = min(BATCH, total - start - count)
-        done = 0
+        done = np.int64(0)  # as a literal 0 would have its own code below
         while done < count:
             size = np.inf
             if plan.block > 0:
