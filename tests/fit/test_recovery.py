@@ -7,7 +7,7 @@ import numpy as np
 from bfsensor import Device
 from bfsensor.fit.quantities import choose_priors
 from tests.fit.toys import MEANS, PRIORS, SPREADS, toy_emulator
-from validation.fit_recovery import draw_truth, pulls_of_ranks, recover
+from validation.mock_fits import draw_truth, pulls_of_ranks, recover
 
 MOCKS = 150
 EMULATOR = toy_emulator()
@@ -71,3 +71,15 @@ def test_truths_are_devices_that_can_be():
     gate, field = np.array([draw_truth(priors, rng) for _ in range(200)]).T
     assert [p.name for p in priors] == ["gates.gate_oxide", "gates.field_oxide"]
     assert np.all(gate <= field) and gate.std() > 0.3 * priors[0].spread
+
+
+def test_mocks_that_were_stopped_go_on(tmp_path):
+    """As in one go: truths, noise, combinations and rows."""
+    kept = tmp_path / "mocks.pickle"
+    whole, told = recover(EMULATOR, PRIORS, ERRORS, mocks=6, seed=3)
+    recover(EMULATOR, PRIORS, ERRORS, mocks=2, seed=3, kept=kept)
+    rows, again = recover(EMULATOR, PRIORS, ERRORS, mocks=6, seed=3, kept=kept)
+    assert rows == whole
+    assert again | {"cpu_s_a_fit": 0} == told | {"cpu_s_a_fit": 0}
+    other, _ = recover(EMULATOR, PRIORS, ERRORS, mocks=6, seed=4)
+    assert rows != other
