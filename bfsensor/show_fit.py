@@ -24,7 +24,8 @@ def draw_ratios(
 ) -> None:
     """Simulated over measured, before and after, with the measured errors about one.
 
-    Numbers whose error is as large as they are stand at the end of the axis in grey.
+    Numbers with errors of 0.7 of them or more are drawn faint and do not set the axis; a triangle
+    stands where a point lies beyond it.
     """
     at = np.arange(len(labels))
     part = np.abs(errors / values)
@@ -38,15 +39,21 @@ def draw_ratios(
     for ratio, colour, word, size, move in (
         (before / values, RED, "before", 5, -0.15), (after / values, BLUE, "after", 5, 0.15)
     ):  # fmt: skip
-        ax.plot(at[told] + move, ratio[told], "o", ms=size, color=colour,
-                mfc="white" if word == "before" else colour, label=word)  # fmt: skip
+        fill = "white" if word == "before" else colour
+        for faint, these in ((1.0, told), (0.35, ~told)):
+            inside = these & (np.abs(ratio - 1) <= top)
+            ax.plot(at[inside] + move, ratio[inside], "o", ms=size, color=colour, mfc=fill,
+                    alpha=faint, label=word if faint == 1.0 else None)  # fmt: skip
+            for side, shape in ((1, "^"), (-1, "v")):
+                beyond = these & (side * (ratio - 1) > top)
+                end = np.full(np.count_nonzero(beyond), 1 + 0.96 * side * top)
+                ax.plot(at[beyond] + move, end, shape, ms=size, color=colour, mfc=fill,
+                        alpha=faint)  # fmt: skip
     ax.axhline(1, color="0.5", lw=0.8)
     ax.set(
         ylim=(1 - top, 1 + top), ylabel="simulated / measured", xlim=(-0.7, len(at) - 0.3)
     )
     ax.set_xticks(at, labels, rotation=90, fontsize=7)
-    for k in np.flatnonzero(~told):
-        ax.get_xticklabels()[k].set_color(GREY)
     ax.legend(
         frameon=False, fontsize=8, ncol=3, loc="lower center", bbox_to_anchor=(0.5, 1)
     )
