@@ -32,8 +32,11 @@ from typing import Any
 import numpy as np
 from astropy.table import Table, vstack
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from bfsensor import Device
+from bfsensor.errors import MeasurementError
+from bfsensor.files import written_whole
 from bfsensor.fit.predictors import Emulator
 from bfsensor.fit.quantities import Prior, choose_priors, with_priors
 from bfsensor.recording.area_changes import read_area_changes
@@ -52,10 +55,21 @@ CHECKED = 12
 
 
 def measure_misses(
-    emulator: Emulator, priors: Sequence[Prior], areas: Areas, seed: int
+    emulator: Emulator,
+    priors: Sequence[Prior],
+    areas: Areas,
+    seed: int,
+    *,
+    kept: Path | None = None,
 ) -> NDArray[np.float64]:
-    """What an emulator misses of a_ij [1/e-] at devices drawn from the priors, (k, ny, nx)."""
+    """What an emulator misses of a_ij [1/e-] at devices drawn from the priors, (k, ny, nx).
+
+    From the file ``kept`` if it is there, else kept in it.
+    """
+    if kept is not None and kept.exists():
+        return np.asarray(np.load(kept))
     rng, out = np.random.default_rng(seed), []
+    bar = tqdm(total=CHECKED, desc="devices solved")
     while len(out) < CHECKED:
         values = draw_truth(priors, rng)
         try:
@@ -64,6 +78,11 @@ def measure_misses(
             continue
         found = np.asarray(emulator.predict(values, Condition()).areas)
         out.append(solved[: len(found), : len(found)] - found)
+        bar.update()
+    bar.close()
+    if kept is not None:
+        with written_whole(kept, MeasurementError) as beside, beside.open("wb") as file:
+            np.save(file, np.array(out))
     return np.array(out)
 
 
@@ -91,6 +110,8 @@ def main() -> None:
     )
     parser.add_argument("--emulator", type=Path, help="file of one, in place of solves")
     options = parser.parse_args()
+    if options.straight and options.truth == "solved":
+        parser.error("--straight takes truths of the emulator: leave --truth solved out")
     from bfsensor.fit.emulator import DeviceEmulator
     from bfsensor.fit.linearised import LinearEmulator, LinearResponse
 
@@ -115,10 +136,6 @@ def main() -> None:
     areas = (
         None if options.truth == "emulator" else solved_areas(device, priors, options.cells)
     )
-    begin = time.process_time()
-    misses = (
-        None if areas is None else measure_misses(emulator, priors, areas, options.seed + 1)
-    )
     if options.straight:
         means = np.array([prior.mean for prior in priors])
         at = emulator.predict(means, Condition())
@@ -132,9 +149,15 @@ def main() -> None:
     }  # fmt: skip
     kept = None
     if options.keep is not None:
+        options.keep.mkdir(parents=True, exist_ok=True)
         called = " ".join(f"{v}" for v in (*run.values(), options.mocks, *options.held))
         hashed = hashlib.sha256(called.encode()).hexdigest()[:12]
         kept = options.keep / f"mocks_{commit_here()}_{hashed}.pickle"
+    begin = time.process_time()
+    misses = None
+    if areas is not None:
+        beside = kept and kept.with_suffix(".misses.npy")
+        misses = measure_misses(emulator, priors, areas, options.seed + 1, kept=beside)
     rows, told = recover(
         emulator, priors, errors, mocks=options.mocks, seed=options.seed, areas=areas,
         misstated=options.misstated, emulator_misses=misses, kept=kept,

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
+from tqdm import tqdm
 
 from bfsensor.errors import MeasurementError
 from bfsensor.files import written_whole
@@ -155,6 +156,7 @@ def recover(
     rng.bit_generator.state = mock.rng
     independent = np.ones(errors.shape, bool)
     independent[0, 0] = False
+    bar = tqdm(total=mocks, initial=len(mock.scales), desc="mocks", disable=None)
     while len(mock.scales) < mocks:
         truth = draw_truth(priors, rng)
         try:
@@ -173,6 +175,8 @@ def recover(
         mock.rng = dict(rng.bit_generator.state)
         if kept is not None:
             mock.save(kept)
+        bar.update()
+    bar.close()
     return _rows(mock, [describe(prior.name) for prior in priors]), mock.told | {
         "cpu_s_a_fit": round(mock.seconds / mocks, 3), "drawn": mock.drawn,
     }  # fmt: skip
