@@ -103,7 +103,8 @@ def _describe(name: str, source: str, kind: str, fit: ImageChargeFit) -> dict[st
 @click.command(help=__doc__)
 @click.option("--device", "names", multiple=True, default=tuple(MEASURED), show_default=True,
               type=click.Choice(tuple(MEASURED)))  # fmt: skip
-@click.option("--shared", type=click.Path(path_type=Path), default=Path("/work/shared"))
+@click.option("--shared", type=click.Path(path_type=Path, exists=True, file_okay=False),
+              default=Path("../shared"), show_default=True)  # fmt: skip
 @click.option("-o", "--output", type=click.Path(path_type=Path), default=RESULTS)
 def main(names: tuple[str, ...], shared: Path, output: Path) -> None:
     """Fit, print, write."""
