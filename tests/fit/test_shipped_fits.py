@@ -7,6 +7,7 @@ import pytest
 
 from bfsensor import BrighterFatterSensor
 from bfsensor.device import Device
+from bfsensor.fit.missed import DRAWS
 from bfsensor.fit.parameters import parameter_value
 from bfsensor.fit.quantities import quantities
 from bfsensor.fit.result import FitResult
@@ -64,6 +65,8 @@ def test_fit_beside_a_device(name):
     assert data.chi2 < data.chi2_before
     assert np.max(np.abs(data.after[:3] / data.values[:3] - 1)) < 0.05
     assert np.all(np.abs(fit.pulls) < 3)
+    # Errors hold what predictions miss, as every fit by the command now has it.
+    assert fit.posterior["solved"] == DRAWS
     # What the device's file cannot hold: errors that parameters share.  As independent ones they
     # would leave the best known combination several times as open as the fit does.
     weights = fit.weights[0] / fit.spread
