@@ -41,7 +41,7 @@ from typing import Any
 import click
 import numpy as np
 from astropy.io import ascii as text_tables
-from astropy.table import Table, vstack
+from astropy.table import Table
 from numpy.typing import NDArray
 
 from bfsensor.device import Device
@@ -66,7 +66,7 @@ from bfsensor.recording.exposures import Condition
 from bfsensor.recording.measured import read_measured
 from bfsensor.response import area_matrix
 from bfsensor.simulate.well import full_well
-from validation.write_results import write_results
+from validation.write_results import replace_run
 
 RESULTS = Path(__file__).parent / "results" / "device_fit.ecsv"
 COMMAND = "python -m validation.device_fit REFERENCE"
@@ -166,12 +166,7 @@ def rows_of(
 def append(run: str, rows: Sequence[Mapping[str, Any]], **told: Any) -> None:
     """Replace the rows of a run, and what the header says of it."""
     table = Table([{"run": run} | dict(one) for one in rows])
-    meta: dict[str, Any] = {}
-    if RESULTS.exists():
-        old = Table.read(RESULTS, format="ascii.ecsv")
-        meta = {k: v for k, v in old.meta.items() if k not in ("command", "commit")}
-        table = vstack([old[old["run"] != run], table], metadata_conflicts="silent")
-    write_results(table, str(RESULTS), COMMAND, **(meta | {run: told}))
+    replace_run(table, RESULTS, COMMAND, {"run": run}, told)
 
 
 @click.group()

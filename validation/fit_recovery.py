@@ -25,12 +25,11 @@ from __future__ import annotations
 import argparse
 import hashlib
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from astropy.table import Table, vstack
+from astropy.table import Table
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -42,7 +41,7 @@ from bfsensor.fit.quantities import Prior, choose_priors, with_priors
 from bfsensor.recording.area_changes import read_area_changes
 from bfsensor.recording.exposures import Condition
 from validation.mock_fits import Areas, draw_truth, recover
-from validation.write_results import commit_here, write_results
+from validation.write_results import commit_here, replace_run
 
 RESULTS = Path(__file__).parent / "results" / "fit_recovery.ecsv"
 COMMAND = "python -m validation.fit_recovery"
@@ -141,16 +140,17 @@ def main() -> None:
         at = emulator.predict(means, Condition())
         here = LinearResponse(at.kx, at.ky, at.dkx, at.dky)
         emulator = LinearEmulator(emulator.parameters, means, {Condition(): here})
+    free = " ".join([*options.free, *(f"-{name}" for name in options.held)])
     run = {
         "device": options.device, "errors": options.errors.stem, "times": options.times,
-        "misstated": options.misstated, "free": " ".join(options.free),
+        "misstated": options.misstated, "free": free,
         "truth": "straight" if options.straight else options.truth,
         "cells": options.cells, "seed": options.seed,
     }  # fmt: skip
     kept = None
     if options.keep is not None:
         options.keep.mkdir(parents=True, exist_ok=True)
-        called = " ".join(f"{v}" for v in (*run.values(), options.mocks, *options.held))
+        called = " ".join(f"{v}" for v in (*run.values(), options.mocks))
         hashed = hashlib.sha256(called.encode()).hexdigest()[:12]
         kept = options.keep / f"mocks_{commit_here()}_{hashed}.pickle"
     begin = time.process_time()
@@ -171,7 +171,7 @@ def main() -> None:
     print("\n".join(table[[*rows[0]]].pformat(max_lines=-1, max_width=-1)))
     for word, text in (told | cost).items():
         print(f"{word}: {text}")
-    append(table, run, told)
+    replace_run(table, RESULTS, COMMAND, run, told)
 
 
 def solved_areas(device: Device, priors: Sequence[Prior], cells: int) -> Areas:
@@ -186,20 +186,6 @@ def solved_areas(device: Device, priors: Sequence[Prior], cells: int) -> Areas:
         return np.asarray(a[len(a) // 2 :, len(a) // 2 :])
 
     return areas
-
-
-def append(table: Table, run: Mapping[str, Any], told: Mapping[str, Any]) -> None:
-    """Replace the rows of the same run, and what its header says."""
-    key = " ".join(f"{value}" for value in run.values())
-    meta: dict[str, Any] = {}
-    if RESULTS.exists():
-        old = Table.read(RESULTS, format="ascii.ecsv")
-        meta = {k: v for k, v in old.meta.items() if k not in ("command", "commit")}
-        other = np.zeros(len(old), bool)
-        for name, value in run.items():
-            other |= np.asarray(old[name] != value)
-        table = vstack([old[other], table], metadata_conflicts="silent")
-    write_results(table, str(RESULTS), COMMAND, **(meta | {key: dict(told)}))
 
 
 if __name__ == "__main__":
