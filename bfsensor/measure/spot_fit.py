@@ -18,6 +18,8 @@ from bfsensor.measure.spot_solve import approach, solve, start
 from bfsensor.measure.spots import Stamps
 
 _ROUNDS = 10
+# Of chi2 per pixel: a thousandth of the noise, which the tolerances of centres leave as well.
+_LEAST_MISFIT = 1e-6
 
 
 def fit_spots(
@@ -206,8 +208,8 @@ def _judge(
     deviation = 1.4826 * float(np.median(np.abs(reduced[used] - typical)))
     noise = typical * np.sqrt(2 / dof)
     uneven = np.abs(reduced - typical) > limit * np.maximum(deviation, noise)
-    # A good fit is no fault.
-    uneven &= reduced > typical
+    # A good fit is no fault, and what rounding leaves of noiseless spots is a good fit.
+    uneven &= reduced > typical + _LEAST_MISFIT
     # What the widths would be if this spot alone decided.
     inverse = invert(normal.rest)
     alone = np.einsum("nij,nj->ni", inverse, normal.score)

@@ -341,6 +341,18 @@ def test_peaks_are_of_a_centred_spot_and_central_signals_of_the_spot_as_it_fell(
     assert fit.central_signals.mean() / fit.peak == pytest.approx(ratio, abs=0.01)
 
 
+def test_what_rounding_leaves_drops_no_spot():
+    mean, _, _ = expect(400, 1e5, Shape(1.0, 1.0), background=0.0)
+    # Unlike noise, rounding differs from spot to spot by powers of two.
+    rng = np.random.default_rng(5)
+    rounding = rng.standard_normal(mean.shape) * np.exp(
+        2 * rng.standard_normal((400, 1, 1))
+    )
+    fit = fit_spots(Stamps(mean * (1 + 1e-13 * rounding)), background=0.0)
+    assert fit.used.all()
+    assert 0 < fit.chi2 / fit.dof < 1e-15
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_files_give_back_what_was_written(known, tmp_path):
     data, good = spoil()

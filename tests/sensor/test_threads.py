@@ -52,8 +52,12 @@ def test_threads_share_the_work(kind):
     image = galsim.ImageF(40, 40)
     image.setCenter(0, 0)
     sensor.accumulate(light, image)  # compiled
-    process, thread = time.process_time(), time.thread_time()
-    for _ in range(4):
-        sensor.accumulate(light, image)
-    process, thread = time.process_time() - process, time.thread_time() - thread
-    assert process > 1.15 * thread
+    ratios = []
+    # Threads take pieces as they are free: where others keep the second core busy, this one
+    # may do nearly all, but not every time.  Without threads every ratio is 1.
+    while len(ratios) < 20 and not (ratios and ratios[-1] > 1.15):
+        process, thread = time.process_time(), time.thread_time()
+        for _ in range(4):
+            sensor.accumulate(light, image)
+        ratios.append((time.process_time() - process) / (time.thread_time() - thread))
+    assert ratios[-1] > 1.15, ratios
