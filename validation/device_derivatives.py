@@ -4,7 +4,8 @@
 linearised solve against differences of solutions 0.1 spreads to either side on a mesh that moves
 with the device, and 0.5 spreads to either side on meshes of their own, with what they cost.
 ``python -m validation.device_derivatives emulator`` builds the emulator and holds it against
-solutions at random points of the prior volume.  Both add to files in ``validation/results``.
+solutions at random points of the prior volume.  Rows replace those of the same device, mesh and
+points in ``validation/results``.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pathlib import Path
 
 import click
 import numpy as np
-from astropy.table import Table, vstack
+from astropy.table import Table
 from numpy.typing import NDArray
 
 from bfsensor import Device
@@ -23,12 +24,14 @@ from bfsensor.fit.emulator import DeviceEmulator
 from bfsensor.fit.emulator_nodes import STEP
 from bfsensor.fit.parameters import change_parameter, device_parameters
 from bfsensor.response import REFINE_Z, EdgeResponse, area_matrix, solve_response
-from validation.write_results import write_results
+from validation.write_results import replace_run
 
 RESULTS = Path(__file__).parent / "results" / "device_derivatives.ecsv"
 COMMAND = "python -m validation.device_derivatives"
 NEAR, FAR = 0.1, 0.5
 """To either side, on the moved mesh and on others [spread]."""
+
+MADE_ALIKE = ("device", "cells", "refine_z")
 
 LAGS = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
 
@@ -132,12 +135,9 @@ def check_emulator(
     return Table(rows)
 
 
-def add_results(table: Table, path: Path) -> None:
-    """Add rows to a file of results."""
-    if path.exists():
-        there = Table.read(path, format="ascii.ecsv")
-        table = vstack([there, table], metadata_conflicts="silent")
-    write_results(table, str(path), COMMAND)
+def put_results(table: Table, path: Path, run: tuple[str, ...]) -> None:
+    """Write rows in place of those that were made alike: with equal columns ``run``."""
+    replace_run(table, path, COMMAND, {name: table[name][0] for name in run}, {})
 
 
 @click.group(help=__doc__)
@@ -149,14 +149,16 @@ def main() -> None:
 @click.option("--device", "names", multiple=True, default=("itl_sta3800c", "e2v_ccd250"))
 @click.option("--cells", default=16, show_default=True)
 @click.option("--refine-z", default=REFINE_Z, show_default=True)
-@click.option("--parameter", "parameters", multiple=True, help="By default all.")
+@click.option("--parameter", "parameters", multiple=True,
+              help="Printed only.  By default all, which are written.")  # fmt: skip
 def derivatives(
     names: tuple[str, ...], cells: int, refine_z: int, parameters: tuple[str, ...]
 ) -> None:
     """Hold derivatives against differences."""
     for name in names:
         rows = compare_derivatives(Device.load(name), cells, refine_z, parameters)
-        add_results(rows, RESULTS)
+        if not parameters:
+            put_results(rows, RESULTS, MADE_ALIKE)
 
 
 @main.command()
@@ -180,7 +182,7 @@ def emulator(
     path = RESULTS.with_name("device_emulator.ecsv")
     for name in names:
         rows = check_emulator(Device.load(name), cells, refine_z, points, keep, remeshed)
-        add_results(rows, path)
+        put_results(rows, path, (*MADE_ALIKE, "points", "remeshed"))
 
 
 if __name__ == "__main__":
