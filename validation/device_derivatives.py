@@ -24,7 +24,7 @@ from bfsensor.fit.emulator import DeviceEmulator
 from bfsensor.fit.emulator_nodes import STEP
 from bfsensor.fit.parameters import change_parameter, device_parameters
 from bfsensor.response import REFINE_Z, EdgeResponse, area_matrix, solve_response
-from validation.write_results import replace_run
+from validation.write_results import commit_here, replace_run
 
 RESULTS = Path(__file__).parent / "results" / "device_derivatives.ecsv"
 COMMAND = "python -m validation.device_derivatives"
@@ -110,7 +110,9 @@ def check_emulator(
 ) -> Table:
     """One row a lag: error of the emulator at random points, and what the prior leaves open."""
     began = time.process_time()
-    emulator = DeviceEmulator.build(device, cells=cells, refine_z=refine_z, keep=keep)
+    # The version alone does not tell solutions of one commit from those of another.
+    kept = keep and keep / commit_here()
+    emulator = DeviceEmulator.build(device, cells=cells, refine_z=refine_z, keep=kept)
     built = time.process_time() - began
     check = emulator.check(points, 20_260, remeshed=remeshed)
     median, most = check.quantile(0.5), check.quantile(0.95)
@@ -167,7 +169,9 @@ def derivatives(
 @click.option("--refine-z", default=REFINE_Z, show_default=True)
 @click.option("--points", default=20, show_default=True)
 @click.option(
-    "--keep", type=click.Path(path_type=Path), help="Folder of finished solutions."
+    "--keep",
+    type=click.Path(path_type=Path),
+    help="Folder of finished solutions, by commit.",
 )
 @click.option("--remeshed", is_flag=True, help="Solve every point on a mesh of its own.")
 def emulator(

@@ -17,7 +17,9 @@ own ('own 1' to 'own 3') and for all parameters together replaces those of the s
 ``validation/results/fit_recovery.ecsv``, with Wilson bounds (95 %) of the coverage; the parameters
 that are not told apart are in the header, with the number of mocks whose posterior was drawn from.
 
-With ``--keep`` a run that was stopped goes on after its last mock, on the same commit.
+With ``--keep`` a run that was stopped goes on after its last mock, on the same commit; solves of
+another commit are not used, for the package's version does not tell them apart.  A file given by
+``--emulator`` is named in the header.
 """
 
 from __future__ import annotations
@@ -126,7 +128,7 @@ def main() -> None:
     else:
         emulator = DeviceEmulator.build(
             device, [prior.name for prior in priors], conditions=(Condition(),),
-            cells=options.cells, keep=options.keep,
+            cells=options.cells, keep=options.keep and options.keep / f"solves_{commit_here()}",
         )  # fmt: skip
     built = time.process_time() - begin
     errors = (
@@ -169,6 +171,8 @@ def main() -> None:
     }
     table = Table([run | row | cost for row in rows])
     print("\n".join(table[[*rows[0]]].pformat(max_lines=-1, max_width=-1)))
+    if options.emulator is not None:
+        told = {**told, "emulator": options.emulator.name}
     for word, text in (told | cost).items():
         print(f"{word}: {text}")
     replace_run(table, RESULTS, COMMAND, run, told)
