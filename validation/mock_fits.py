@@ -202,13 +202,13 @@ def _fit_mock(
     mock.seconds += time.process_time() - begin
     mock.drawn += "draws" in posterior.record
     spreads = problem.spreads
-    if not mock.labels:
+    if not mock.told:
         ties, silent = find_ties(names, tangent.sensitivity)
         mock.told = {"ties": list(ties), "silent": [describe(n) for n in silent]}
         scaled = tangent.covariance / np.outer(spreads, spreads)
         mock.directions = np.array(
             [one.weights for one in principal(scaled) if one.remains < MEASURED]
-        )
+        ).reshape(-1, len(names))
         mock.labels = [name_combination(names, weights) for weights in mock.directions]
     off = (tangent.values - truth) / spreads
     for way, solution in zip(WAYS[:2], (tangent, posterior.solution), strict=True):
