@@ -51,8 +51,9 @@ LAGS = 4
 VOLTAGES = ("back_bias:5 V", "gate_high:0.5 V", "gate_low:0.5 V")
 """Not stated with the data of 2019: parameters with priors."""
 
-CHECKED = 12
-"""Devices drawn from the priors at which what the emulator misses is measured."""
+CHECKED = 48
+"""Devices drawn from the priors at which what the emulator misses is measured: at 12, with a_10
+missed by heavy tails (kurtosis 7), its rms came out 0.6 and 1.5 times that of 108."""
 
 
 def measure_misses(
@@ -60,6 +61,7 @@ def measure_misses(
     priors: Sequence[Prior],
     areas: Areas,
     seed: int,
+    count: int,
     *,
     kept: Path | None = None,
 ) -> NDArray[np.float64]:
@@ -70,8 +72,8 @@ def measure_misses(
     if kept is not None and kept.exists():
         return np.asarray(np.load(kept))
     rng, out = np.random.default_rng(seed), []
-    bar = tqdm(total=CHECKED, desc="devices solved")
-    while len(out) < CHECKED:
+    bar = tqdm(total=count, desc="devices solved")
+    while len(out) < count:
         values = draw_truth(priors, rng)
         try:
             solved = areas(values)
@@ -110,6 +112,8 @@ def main() -> None:
         help="folder of the emulator's solves and of mocks fitted so far",
     )
     parser.add_argument("--emulator", type=Path, help="file of one, in place of solves")
+    parser.add_argument("--checked", type=int, default=CHECKED,
+                        help="devices at which what the emulator misses is measured")  # fmt: skip
     options = parser.parse_args()
     if options.straight and options.truth == "solved":
         parser.error("--straight takes truths of the emulator: leave --truth solved out")
@@ -159,7 +163,9 @@ def main() -> None:
     misses = None
     if areas is not None:
         beside = kept and kept.with_suffix(".misses.npy")
-        misses = measure_misses(emulator, priors, areas, options.seed + 1, kept=beside)
+        misses = measure_misses(
+            emulator, priors, areas, options.seed + 1, options.checked, kept=beside
+        )
     rows, told = recover(
         emulator, priors, errors, mocks=options.mocks, seed=options.seed, areas=areas,
         misstated=options.misstated, emulator_misses=misses, kept=kept,
@@ -171,8 +177,11 @@ def main() -> None:
     }
     table = Table([run | row | cost for row in rows])
     print("\n".join(table[[*rows[0]]].pformat(max_lines=-1, max_width=-1)))
+    told = dict(told)
     if options.emulator is not None:
-        told = {**told, "emulator": options.emulator.name}
+        told["emulator"] = options.emulator.name
+    if misses is not None:
+        told["checked"] = len(misses)
     for word, text in (told | cost).items():
         print(f"{word}: {text}")
     replace_run(table, RESULTS, COMMAND, run, told)
