@@ -19,7 +19,8 @@ from bfsensor.simulate.boundaries import (
     find_boundaries,
 )
 from bfsensor.simulate.mesh import make_mesh
-from bfsensor.simulate.poisson import Electrostatics, Potential, solve_unit_cell, tile
+from bfsensor.simulate.poisson import Electrostatics, Potential
+from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 from bfsensor.table import DistortionTable, vertex_fractions
 from bfsensor.table_plan import Plan
 

@@ -22,7 +22,8 @@ from bfsensor.files import written_whole
 from bfsensor.simulate.boundaries import find_boundaries
 from bfsensor.simulate.far_field import FarField, image_shifts
 from bfsensor.simulate.mesh import Surfaces, make_mesh
-from bfsensor.simulate.poisson import Electrostatics, solve_unit_cell, tile
+from bfsensor.simulate.poisson import Electrostatics
+from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 from bfsensor.table import nominal_positions, vertex_fractions
 from bfsensor.table_plan import PERIOD, Plan, storage_height
 

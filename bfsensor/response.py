@@ -23,8 +23,9 @@ from bfsensor.simulate.boundary_tangent import boundary_changes
 from bfsensor.simulate.far_field import FarField
 from bfsensor.simulate.mesh import Surfaces, make_mesh
 from bfsensor.simulate.moved_mesh import move_mesh
-from bfsensor.simulate.poisson import Electrostatics, Potential, tile
+from bfsensor.simulate.poisson import Electrostatics, Potential
 from bfsensor.simulate.tangent import TOLERANCE, PotentialChange, Tangent
+from bfsensor.simulate.unit_cell import tile
 from bfsensor.table import vertex_fractions
 from bfsensor.table_plan import PERIOD
 

@@ -27,8 +27,9 @@ from bfsensor.show_style import (
     new_figure,
 )
 from bfsensor.simulate.mesh import Surfaces, make_mesh
-from bfsensor.simulate.poisson import Electrostatics, Potential, solve_unit_cell, tile
+from bfsensor.simulate.poisson import Electrostatics, Potential
 from bfsensor.simulate.transport import Transport
+from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

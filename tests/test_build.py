@@ -18,7 +18,7 @@ from bfsensor.build import (
 from bfsensor.device import Device, Ripple, builtin_devices
 from bfsensor.errors import DeviceError, TableError
 from bfsensor.simulate.boundaries import lowest_depth
-from bfsensor.simulate.poisson import solve_unit_cell
+from bfsensor.simulate.unit_cell import solve_unit_cell
 from bfsensor.simulate.well import barrier, full_well
 
 

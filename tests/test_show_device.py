@@ -10,8 +10,9 @@ from bfsensor.device import Device
 from bfsensor.errors import BFSensorError
 from bfsensor.show_style import BLUE, RED
 from bfsensor.simulate.mesh import make_mesh
-from bfsensor.simulate.poisson import Electrostatics, solve_unit_cell, tile
+from bfsensor.simulate.poisson import Electrostatics
 from bfsensor.simulate.transport import Transport
+from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 
 matplotlib = pytest.importorskip("matplotlib")
 matplotlib.use("Agg")

@@ -33,7 +33,7 @@ from bfsensor.device import Device
 from bfsensor.resources import tables_dir
 from bfsensor.simulate.charge_field import ImageCharge
 from bfsensor.simulate.image_charge import area_changes
-from bfsensor.simulate.poisson import solve_unit_cell
+from bfsensor.simulate.unit_cell import solve_unit_cell
 from bfsensor.table import DistortionTable
 from validation.write_results import write_results
 

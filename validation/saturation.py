@@ -20,7 +20,8 @@ from scipy.interpolate import PchipInterpolator
 
 from bfsensor import Device
 from bfsensor.simulate.mesh import make_mesh
-from bfsensor.simulate.poisson import Electrostatics, solve_unit_cell, tile
+from bfsensor.simulate.poisson import Electrostatics
+from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 from bfsensor.simulate.well import barrier
 from validation.write_results import write_results
 

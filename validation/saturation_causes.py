@@ -32,7 +32,8 @@ from astropy.table import Table
 from bfsensor import Device
 from bfsensor.errors import ConvergenceError, DeviceError
 from bfsensor.simulate.mesh import make_mesh
-from bfsensor.simulate.poisson import Electrostatics, solve_unit_cell, tile
+from bfsensor.simulate.poisson import Electrostatics
+from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 from bfsensor.simulate.well import barrier, surface_barrier
 from validation.saturation import PERIOD, charge_at
 from validation.write_results import write_results

@@ -25,8 +25,9 @@ from astropy.table import Table
 
 from bfsensor import Device
 from bfsensor.simulate.mesh import make_mesh
-from bfsensor.simulate.poisson import Electrostatics, Potential, solve_unit_cell, tile
+from bfsensor.simulate.poisson import Electrostatics, Potential
 from bfsensor.simulate.transport import PUBLISHED_DIFFUSION, Tracer, Transport
+from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 from validation.write_results import write_results
 
 START = (4.0, 1.0, 95.0)

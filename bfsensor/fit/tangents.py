@@ -21,7 +21,8 @@ from bfsensor.fit.quantities import DIFFUSION, Prior
 from bfsensor.recording.exposures import Condition
 from bfsensor.sensor.drift import solve_drift
 from bfsensor.simulate.mesh import make_mesh
-from bfsensor.simulate.poisson import Electrostatics, solve_unit_cell, tile
+from bfsensor.simulate.poisson import Electrostatics
+from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 from bfsensor.simulate.well import barrier, full_well
 
 STEP = 0.5

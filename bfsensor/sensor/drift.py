@@ -70,7 +70,7 @@ def solve_drift(device_text: str, temperature: float, start: float) -> Drift:
     -------
     Drift
     """
-    from bfsensor.simulate.poisson import solve_unit_cell
+    from bfsensor.simulate.unit_cell import solve_unit_cell
 
     device = Device.from_toml(device_text)
     unit = solve_unit_cell(device, 0.0, cells=8)

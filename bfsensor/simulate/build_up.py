@@ -23,8 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.simulate.mesh import make_mesh
-from bfsensor.simulate.poisson import Electrostatics, Potential, solve_unit_cell, tile
+from bfsensor.simulate.poisson import Electrostatics, Potential
 from bfsensor.simulate.transport import ABSORBED, Electrons, Tracer, Transport
+from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 
 if TYPE_CHECKING:
     from bfsensor.device import Device

@@ -35,7 +35,8 @@ from bfsensor.simulate.edge_system import (
     relax_holes,
 )
 from bfsensor.simulate.mesh import Surfaces
-from bfsensor.simulate.poisson import Potential, solve_unit_cell
+from bfsensor.simulate.poisson import Potential
+from bfsensor.simulate.unit_cell import solve_unit_cell
 from bfsensor.units import VACUUM_PERMITTIVITY
 
 if TYPE_CHECKING:

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from bfsensor.simulate.mesh import Mesh
 from bfsensor.simulate.moved_mesh import move_mesh
-from bfsensor.simulate.poisson import Electrostatics, Potential, tile
+from bfsensor.simulate.poisson import Electrostatics, Potential
+from bfsensor.simulate.unit_cell import tile
 
 if TYPE_CHECKING:
     from bfsensor.device import Device

@@ -133,7 +133,7 @@ class Tracer:
     Examples
     --------
     >>> from bfsensor import Device
-    >>> from bfsensor.simulate.poisson import solve_unit_cell
+    >>> from bfsensor.simulate.unit_cell import solve_unit_cell
     >>> empty = solve_unit_cell(Device.load("itl_sta3800c"), 0.0, cells=8)
     >>> starts = [[1.0, 2.0, 95.0], [4.0, -8.0, 95.0]]
     >>> Tracer(empty).trace(starts, seed=8231, transport=Transport(diffusion=0)).pixels

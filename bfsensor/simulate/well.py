@@ -9,7 +9,8 @@ from scipy.optimize import brentq
 
 from bfsensor.errors import ConvergenceError, DeviceError
 from bfsensor.simulate.mesh import make_mesh
-from bfsensor.simulate.poisson import Electrostatics, Potential, solve_unit_cell, tile
+from bfsensor.simulate.poisson import Electrostatics, Potential
+from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 
 if TYPE_CHECKING:
     from bfsensor.device import Device

@@ -20,7 +20,8 @@ from bfsensor.build import PERIOD, plan_table, solve_level
 from bfsensor.device import Device
 from bfsensor.simulate.boundaries import find_boundaries
 from bfsensor.simulate.mesh import make_mesh
-from bfsensor.simulate.poisson import Electrostatics, solve_unit_cell, tile
+from bfsensor.simulate.poisson import Electrostatics
+from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 
 PEER_CPU, PEER_MEMORY = 694.0, 1.78
 

@@ -11,7 +11,8 @@ from bfsensor.simulate import boundaries
 from bfsensor.simulate.boundaries import find_boundaries, lowest_depth
 from bfsensor.simulate.far_field import FarField, image_shifts
 from bfsensor.simulate.mesh import Surfaces, make_mesh
-from bfsensor.simulate.poisson import Electrostatics, solve_unit_cell, tile
+from bfsensor.simulate.poisson import Electrostatics
+from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 from bfsensor.table import DistortionTable, vertex_fractions
 
 CHARGE = 1e5

@@ -8,8 +8,8 @@ from bfsensor._kernels import cloud as kernels
 from bfsensor._kernels import transport as transport_kernels
 from bfsensor.errors import SimulationError
 from bfsensor.simulate.cloud import FE55_LENGTH, fe55_cloud, trace_cloud
-from bfsensor.simulate.poisson import solve_unit_cell
 from bfsensor.simulate.transport import Tracer, Transport
+from bfsensor.simulate.unit_cell import solve_unit_cell
 from tests.simulate.test_transport import FIELD, KT, TEMPERATURE, check_variance, synthetic
 
 STRENGTH = 1 / (4 * np.pi * 11.7 * 55.26349362)  # V um

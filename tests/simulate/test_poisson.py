@@ -12,7 +12,8 @@ from bfsensor.simulate import poisson
 from bfsensor.simulate.discretise import discretise
 from bfsensor.simulate.mesh import Surfaces, make_mesh
 from bfsensor.simulate.multigrid import Multigrid
-from bfsensor.simulate.poisson import Electrostatics, solve_unit_cell, tile
+from bfsensor.simulate.poisson import Electrostatics
+from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 from bfsensor.units import VACUUM_PERMITTIVITY
 
 from .cases import flat_device

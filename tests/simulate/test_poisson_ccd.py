@@ -14,7 +14,8 @@ import pytest
 
 from bfsensor.device import Device
 from bfsensor.simulate.mesh import make_mesh
-from bfsensor.simulate.poisson import Electrostatics, solve_unit_cell, tile
+from bfsensor.simulate.poisson import Electrostatics
+from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 from bfsensor.units import VACUUM_PERMITTIVITY
 
 ANCHOR = (

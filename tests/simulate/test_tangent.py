@@ -12,8 +12,9 @@ from bfsensor.simulate.boundaries import TURN, find_boundaries
 from bfsensor.simulate.boundary_tangent import boundary_changes
 from bfsensor.simulate.mesh import Surfaces, make_mesh
 from bfsensor.simulate.moved_mesh import move_mesh
-from bfsensor.simulate.poisson import Electrostatics, tile
+from bfsensor.simulate.poisson import Electrostatics
 from bfsensor.simulate.tangent import Tangent
+from bfsensor.simulate.unit_cell import tile
 from bfsensor.units import VACUUM_PERMITTIVITY
 from tests.simulate.cases import flat_device
 

@@ -8,8 +8,9 @@ from bfsensor._kernels import transport as kernels
 from bfsensor.errors import ConvergenceError, DeviceError
 from bfsensor.simulate.boundaries import find_boundaries
 from bfsensor.simulate.mesh import make_mesh
-from bfsensor.simulate.poisson import Electrostatics, solve_unit_cell, tile
+from bfsensor.simulate.poisson import Electrostatics
 from bfsensor.simulate.transport import PUBLISHED_DIFFUSION, Tracer, Transport
+from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 from bfsensor.units import ELECTRON_MASS
 
 KT = 0.0149

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bfsensor import Device
-from bfsensor.simulate.poisson import solve_unit_cell
+from bfsensor.simulate.unit_cell import solve_unit_cell
 from bfsensor.simulate.well import barrier, surface_barrier
 
 
