@@ -66,7 +66,7 @@ from bfsensor.recording.exposures import Condition
 from bfsensor.recording.measured import read_measured
 from bfsensor.response import area_matrix
 from bfsensor.simulate.well import full_well
-from validation.write_results import replace_run
+from validation.write_results import commit_here, replace_run
 
 RESULTS = Path(__file__).parent / "results" / "device_fit.ecsv"
 COMMAND = "python -m validation.device_fit REFERENCE"
@@ -235,6 +235,11 @@ def _doping(resistivity: bool) -> tuple[str, ...]:
     return (RESISTIVITY,) if resistivity else ()
 
 
+def kept_solutions(keep: Path) -> Path:
+    """Where finished solutions are: the version alone does not tell those of two commits apart."""
+    return keep / f"finer_{commit_here()}"
+
+
 def make_solved(
     device: Device,
     priors: tuple[Prior, ...],
@@ -243,7 +248,7 @@ def make_solved(
     keep: Path,
 ) -> Solved:
     """What solves a device on the finer mesh alone."""
-    return Solved(device, priors, at, finer, REFINE_Z, keep / "finer")
+    return Solved(device, priors, at, finer, REFINE_Z, kept_solutions(keep))
 
 
 def make_finer(
@@ -256,7 +261,7 @@ def make_finer(
 ) -> Finer:
     """What solves a device at conditions, on both meshes."""
     solve = Linearise(device, priors, at, cells)
-    return Finer(solve, device, priors, at, finer, cells, keep=keep / "finer")
+    return Finer(solve, device, priors, at, finer, cells, keep=kept_solutions(keep))
 
 
 @main.command()
