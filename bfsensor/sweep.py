@@ -162,17 +162,32 @@ def _parsl(workers: int) -> Iterator[Any]:
         from parsl.concurrent import ParslPoolExecutor
         from parsl.config import Config
         from parsl.executors import HighThroughputExecutor
+        from parsl.providers import LocalProvider
     except ImportError as error:
         raise SweepError(
             "executor = 'parsl' needs the extra: pip install 'bfsensor[parsl]'"
         ) from error
+    import shlex
+    import sys
     import tempfile
 
+    # Parsl starts its scripts by bare name: they are found where this Python is, whether or
+    # not its environment was activated.
+    scripts = Path(sys.executable).parent
     with tempfile.TemporaryDirectory(prefix="bfsensor_parsl_") as folder:
         config = Config(
             executors=[
                 HighThroughputExecutor(
-                    label="local", max_workers_per_node=workers, address="127.0.0.1"
+                    label="local",
+                    max_workers_per_node=workers,
+                    address="127.0.0.1",
+                    interchange_launch_cmd=[
+                        sys.executable,
+                        str(scripts / "interchange.py"),
+                    ],
+                    provider=LocalProvider(
+                        worker_init=f'export PATH={shlex.quote(str(scripts))}:"$PATH"'
+                    ),
                 )
             ],
             run_dir=folder,

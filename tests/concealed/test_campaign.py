@@ -121,7 +121,7 @@ def test_the_plan_is_that_of_practice_campaigns(monkeypatch):
     assert [e.back_bias for e in ours] == list(theirs["vbb"])
     assert [e.temperature for e in ours] == list(theirs["temp"])
     classes = json.loads((PRACTICE / "taxonomy.json").read_text())["classes"]
-    assert set(classes) == set(EFFECTS)
+    assert set(EFFECTS) <= set(classes)  # words may be added before a maker is
 
 
 def test_the_truth_is_sealed_and_elsewhere(tmp_path):

@@ -147,7 +147,7 @@ def test_sbig_unequal_flats_are_in_no_channel(sbig):
     assert low < min(p.level for p in ordered if p.level > quiet) < high
 
 
-REFERENCE = SBIG.parents[1] / "reference"
+DATA = Path(__file__).parents[1] / "data"
 
 
 @pytest.mark.parametrize(
@@ -162,9 +162,7 @@ REFERENCE = SBIG.parents[1] / "reference"
 )
 def test_measured_areas_beside_tables(kind, baseline, detected):
     """Ours at the measured voltage agree with both vendors' sensors; -50 V does not with E2V's."""
-    path = REFERENCE / f"{kind}_covariances_21oct19.csv"
-    if not path.exists():
-        pytest.skip(f"no {path}")
+    path = DATA / f"{kind}_covariances_21oct19.csv"
     predicted = find_baseline(baseline)
     recording = find_reduced_recording(path)
     found = diagnose_measured(

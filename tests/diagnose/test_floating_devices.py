@@ -22,7 +22,7 @@ from validation.concealed.card import NOMINAL, SPREAD, shifts_at
 from validation.floating_devices import LAGS, SHIFT, draw_table, prove, shifted_areas
 from validation.virtual_source import virtual_baseline
 
-REFERENCE = Path(__file__).parents[2].parent / "shared" / "reference"
+DATA = Path(__file__).parents[1] / "data"
 DRAWS = 24
 
 
@@ -59,10 +59,9 @@ def test_a_quantity_off_the_card_is_found(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not REFERENCE.exists(), reason="published a_ij are not in this place")
 def test_our_device_off_its_card_is_found(tmp_path: Path) -> None:
     name, device = "channel.implant[0].dose", "e2v_ccd250_70"
-    published = read_area_changes(REFERENCE / "e2v_covariances_21oct19.csv")
+    published = read_area_changes(DATA / "e2v_covariances_21oct19.csv")
     errors = published.errors[:LAGS, :LAGS]
     floating = simulate_baseline(device, (name,), (), keep=tmp_path)
     shifted = shifted_areas(Device.load(device), name, SHIFT, tmp_path)

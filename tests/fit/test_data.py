@@ -12,34 +12,29 @@ from bfsensor.fit.data import MODEL_ERROR, area_data, data_set, select
 from bfsensor.recording.exposures import Condition
 from bfsensor.recording.measured import read_measured
 
-REFERENCE = Path(__file__).parents[2].parent / "shared" / "reference"
-published = pytest.mark.skipif(
-    not REFERENCE.exists(), reason="published data are not in this place"
-)
+DATA = Path(__file__).parents[1] / "data"
 
 
-@published
 @pytest.mark.parametrize("name", ["itl", "e2v"])
 def test_published_areas_without_what_the_sum_rule_set(name):
-    data = data_set(read_measured(REFERENCE / f"{name}_covariances_21oct19.csv"))
+    data = data_set(read_measured(DATA / f"{name}_covariances_21oct19.csv"))
     assert len(data.values) == 24 and "(0,0)" not in data.labels
     # Neighbours first, in y the larger.
     assert data.labels[:3] == ("(1,0)", "(0,1)", "(1,1)")
     assert data.values[1] > 2 * data.values[0] > 0
     assert set(data.conditions) == {Condition()}
     assert data_set(
-        read_measured(REFERENCE / f"{name}_covariances_21oct19.csv"), lags=8
+        read_measured(DATA / f"{name}_covariances_21oct19.csv"), lags=8
     ).values.shape == (80,)
 
 
-@published
 def test_published_slopes_and_saturation():
-    slopes = data_set(read_measured(REFERENCE / "bf_slopes.csv"))
+    slopes = data_set(read_measured(DATA / "bf_slopes.csv"))
     assert slopes.kind == "slopes" and len(slopes.values) == 6
     assert slopes.labels[0] == "x back bias -60 V, gates -8/4 V"
     expected = np.hypot(0.09, MODEL_ERROR["slopes"] * 0.71)
     assert slopes.errors[0] == pytest.approx(expected)
-    wells = data_set(read_measured(REFERENCE / "sat_data_21oct19.csv"))
+    wells = data_set(read_measured(DATA / "sat_data_21oct19.csv"))
     assert wells.kind == "saturation" and wells.conditions[3].gate_high == 1.5
     assert "2 % assumed" in wells.notes[0]
     np.testing.assert_allclose(wells.errors, 0.02 * wells.values)

@@ -15,17 +15,16 @@ from bfsensor.fit.quantities import choose_priors, with_priors
 from bfsensor.recording.exposures import Condition
 from bfsensor.recording.measured import read_measured
 
-REFERENCE = Path(__file__).parents[2].parent / "shared" / "reference"
+DATA = Path(__file__).parents[1] / "data"
 FREE = ("all", "back_bias:5 V", "gate_high:0.5 V", "gate_low:0.5 V")
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not REFERENCE.exists(), reason="published a_ij are not in this place")
 def test_itl_of_2019():
     device = Device.load("itl_sta3800c_60")
     priors = choose_priors(device, FREE)
     device = with_priors(device, priors)
-    data = data_set(read_measured(REFERENCE / "itl_covariances_21oct19.csv"))
+    data = data_set(read_measured(DATA / "itl_covariances_21oct19.csv"))
     linearise = Linearise(device, priors, (Condition(),), cells=16)
     result = fit_device(device, [data], priors, None, linearise=linearise)
     (one,) = result.sets

@@ -15,6 +15,7 @@ from bfsensor.recording.covariance_tables import read_covariances
 from bfsensor.recording.lsst_datasets import PhotonTransferDataset
 from bfsensor.recording.reduced import find_reduced, read_profile, read_spots
 
+DATA = Path(__file__).parents[1] / "data"
 SHARED = Path(__file__).parents[2].parent / "shared"
 A = {(0, 0): -1.7e-6, (1, 0): 1.0e-7, (0, 1): 2.7e-7, (1, 1): 6e-8}
 
@@ -204,9 +205,7 @@ def test_the_sum_rule_makes_the_centre_dependent(tmp_path):
     ("name", "centre", "y"), [("itl", -1.044e-6, 1.761e-7), ("e2v", -1.68e-6, 2.747e-7)]
 )
 def test_published_area_changes(name, centre, y):
-    path = SHARED / "reference" / f"{name}_covariances_21oct19.csv"
-    if not path.is_file():
-        pytest.skip(f"no {path}")
+    path = DATA / f"{name}_covariances_21oct19.csv"
     found = read_area_changes(path)
     assert found.a.shape == (9, 9) and not found.independent[0, 0]
     assert (found.a[0, 0], found.a[1, 0]) == (centre, y)

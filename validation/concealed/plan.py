@@ -3,6 +3,7 @@
 Sizes (flat pairs at each of eight levels of the first condition, pairs at each of two levels of
 the others):
 
+    T    128 x 128, 4 pairs, 1 pair      tests: one dither of the spots
     S    256 x 256, 4 pairs, 2 pairs     CI, effects of transfer and amplifier
     M    512 x 512, 8 pairs, 4 pairs     nightly
     L    512 x 512, 24 pairs, 12 pairs   scored, brighter-fatter terms
@@ -68,7 +69,12 @@ class Size:
     spot_seconds: tuple[float, ...] = SPOT_SECONDS
 
 
-SIZES = {"S": Size(256, 4, 2), "M": Size(512, 8, 4), "L": Size(512, 24, 12)}
+SIZES = {
+    "T": Size(128, 4, 1, dithers=1),
+    "S": Size(256, 4, 2),
+    "M": Size(512, 8, 4),
+    "L": Size(512, 24, 12),
+}
 
 
 @dataclass(frozen=True)

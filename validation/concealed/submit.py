@@ -14,6 +14,7 @@ import os
 import shlex
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -122,8 +123,12 @@ def run_campaigns(
     folder, results = Path(folder).resolve(), Path(results).resolve()
     campaigns = find_campaigns(folder)
     words = shlex.split(command)
-    if not words or shutil.which(words[0]) is None:
+    # a script beside this Python is found though its environment was not activated
+    places = os.pathsep.join([os.environ.get("PATH", ""), str(Path(sys.executable).parent)])
+    program = shutil.which(words[0], path=places) if words else None
+    if program is None:
         raise ValueError(f"command {command!r}: not installed")
+    words[0] = program
     results.mkdir(parents=True, exist_ok=True)
     try:
         with locked(results, wait=False):
