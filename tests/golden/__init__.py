@@ -1,0 +1,5 @@
+"""Digests of what the package makes, so that code can move without its results moving.
+
+``python -m tests.golden make`` writes ``golden.json``; ``python -m tests.golden compare`` makes
+everything again and prints what differs.  With ``--quick`` only the part that every test run does.
+"""
