@@ -15,15 +15,15 @@ _PUBLIC = {
     "RecordingError": "errors",
     "SensorError": "errors",
     "TableError": "errors",
-    "Device": "device",
-    "builtin_devices": "device",
-    "import_poisson_ccd": "device_import",
-    "DistortionTable": "table",
-    "build_table": "build",
-    "plan_table": "build",
-    "BrighterFatterSensor": "sensor",
-    "SiliconSensor": "sensor",
-    "ShiftMap": "sensor",
+    "Device": "device.device",
+    "builtin_devices": "device.device",
+    "import_poisson_ccd": "device.poisson_ccd",
+    "DistortionTable": "table.table",
+    "build_table": "table.build",
+    "plan_table": "table.table_plan",
+    "BrighterFatterSensor": "sensor.brighter_fatter",
+    "SiliconSensor": "sensor.silicon_sensor",
+    "ShiftMap": "sensor.shift_maps",
 }
 
 __all__ = ["__version__", *sorted(_PUBLIC)]
@@ -41,7 +41,7 @@ def __dir__() -> list[str]:
 
 
 def _register() -> None:
-    from bfsensor._register import register_when_loaded
+    from bfsensor.galsim import register_when_loaded
 
     register_when_loaded()
 

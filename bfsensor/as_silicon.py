@@ -4,6 +4,6 @@ With ``modules: [bfsensor.as_silicon]`` a configuration that says ``type: Silico
 imSim's, needs no other change.
 """
 
-from bfsensor._register import register
+from bfsensor.galsim import register
 
 register(silicon=True)

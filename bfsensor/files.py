@@ -1,4 +1,4 @@
-"""Files written whole or not at all."""
+"""Files written whole or not at all, and where the files that come with the package lie."""
 
 from __future__ import annotations
 
@@ -64,3 +64,19 @@ def written_whole(
         raise error(f"{target}: cannot be written: {fault}") from None
     finally:
         beside.unlink(missing_ok=True)
+
+
+def tables_dir() -> Path:
+    """Find the built-in devices and tables: in a wheel, or beside it in a checkout.
+
+    Returns
+    -------
+    folder : Path
+    """
+    package = Path(__file__).resolve().parent
+    for folder in (package / "tables", package.parent / "tables"):
+        if folder.is_dir():
+            return folder
+    raise BFSensorError(
+        f"the tables of bfsensor are missing beside {package}: reinstall the package"
+    )

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 import bfsensor
-from bfsensor.device import builtin_devices
-from bfsensor.resources import tables_dir
+from bfsensor.device.device import builtin_devices
+from bfsensor.files import tables_dir
 
 ROOT = Path(__file__).resolve().parents[1]
 DEVICES = [
@@ -21,8 +21,8 @@ DEVICES = [
 ]  # fmt: skip
 REPORT = """
 import json, bfsensor
-from bfsensor.device import Device, builtin_devices
-from bfsensor.resources import tables_dir
+from bfsensor.device.device import Device, builtin_devices
+from bfsensor.files import tables_dir
 print(json.dumps({
     "package": bfsensor.__file__, "version": bfsensor.__version__,
     "tables": str(tables_dir()), "devices": builtin_devices(),

@@ -20,9 +20,9 @@ from astropy.io import fits
 from astropy.table import Table
 
 from bfsensor.errors import RecordingError
-from bfsensor.recording.campaign import Campaign, read_campaign
-from bfsensor.recording.inspection import inspect_campaign
-from bfsensor.recording.questions import open_questions
+from bfsensor.recording.campaign.campaign import Campaign, read_campaign
+from bfsensor.recording.campaign.inspection import inspect_campaign
+from bfsensor.recording.campaign.questions import open_questions
 from validation.write_results import write_results
 
 NY, NX, PRESCAN, OVERSCAN, ROWS = 96, 80, 8, 24, 16

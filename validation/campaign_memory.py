@@ -65,8 +65,8 @@ def make_large(folder: Path, exposures: int, compress: bool, seed: int = 8413) -
 
 def read_large(folder: Path) -> None:
     """Read headers, then pixels; print times and the peak of memory of this process."""
-    from bfsensor.recording.campaign import read_campaign
-    from bfsensor.recording.inspection import inspect_campaign
+    from bfsensor.recording.campaign.campaign import read_campaign
+    from bfsensor.recording.campaign.inspection import inspect_campaign
 
     def peak() -> float:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2

@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize_scalar
 from scipy.stats import norm
 
-from bfsensor.diagnose.channels import WORDS
-from bfsensor.diagnose.scans import DEVICE
+from bfsensor.diagnose.data.channels import WORDS
+from bfsensor.diagnose.detect.scans import DEVICE
 from validation.concealed.score import Score
 from validation.concealed.tally import wilson
 

@@ -26,13 +26,14 @@ from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_distribution
 
 from bfsensor import BrighterFatterSensor, DistortionTable
-from bfsensor.diagnose.baseline import Baseline, area_matrix
-from bfsensor.diagnose.conditions import Condition
-from bfsensor.diagnose.predict_flats import flat_covariances_of
-from bfsensor.diagnose.table_baseline import baseline_of_table
+from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.diagnose.model.baseline import Baseline
+from bfsensor.diagnose.model.flat_predictions import flat_covariances_of
+from bfsensor.diagnose.model.table_baseline import baseline_of_table
+from bfsensor.files import tables_dir
 from bfsensor.measure.bartlett import bartlett_matrix
-from bfsensor.measure.flats import flat_covariances
-from bfsensor.resources import tables_dir
+from bfsensor.measure.flat_pairs import flat_covariances
+from bfsensor.response.edge_response import area_matrix
 from bfsensor.sensor.flats import draw_flat
 from validation.sensor_flats import predict as integrate
 from validation.write_results import write_results

@@ -14,11 +14,12 @@ import galsim
 import numpy as np
 from astropy.table import Table
 
-from bfsensor.build import build_table, plan_table
-from bfsensor.device import Device
-from bfsensor.galsim_format import read_galsim
-from bfsensor.resources import tables_dir
-from bfsensor.table import DistortionTable
+from bfsensor.device.device import Device
+from bfsensor.files import tables_dir
+from bfsensor.table.build import build_table
+from bfsensor.table.galsim_format import read_galsim
+from bfsensor.table.table import DistortionTable
+from bfsensor.table.table_plan import plan_table
 from validation.write_results import write_results
 
 LAGS = (

@@ -32,28 +32,30 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bfsensor import Device
-from bfsensor.device_parts import Provenance
-from bfsensor.diagnose.attribute import attribute
-from bfsensor.diagnose.baseline import Baseline, area_matrix
-from bfsensor.diagnose.channels import Channel
-from bfsensor.diagnose.conditions import Axes, Condition
-from bfsensor.diagnose.device_baseline import baseline_of_device, change_parameter
-from bfsensor.diagnose.extract import Measured
-from bfsensor.diagnose.left_out import (
+from bfsensor.device.parameters import change_parameter
+from bfsensor.device.parts import Provenance
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.exposures import Axes, Condition
+from bfsensor.diagnose.data.map_channels import MapChannels
+from bfsensor.diagnose.data.measure_channels import MeasuredChannels
+from bfsensor.diagnose.detect.candidates import name_of
+from bfsensor.diagnose.detect.locate import locate_mismatch
+from bfsensor.diagnose.explain.stepwise import attribute
+from bfsensor.diagnose.fit.baseline_fit import fit_baseline
+from bfsensor.diagnose.fit.fitted_model import Model, compare_held_out
+from bfsensor.diagnose.model.baseline import Baseline
+from bfsensor.diagnose.model.device_baseline import baseline_of_device
+from bfsensor.diagnose.model.left_out_physics import (
     HOLES,
     LEVEL_OF_HOLES,
     SPREAD_OF_STOPS,
     physics_left_out,
 )
-from bfsensor.diagnose.locate import locate_mismatch
-from bfsensor.diagnose.map_channels import MapChannels
-from bfsensor.diagnose.mismatch import fit_baseline
-from bfsensor.diagnose.model import Model, compare_held_out
-from bfsensor.diagnose.predict import Predictor, used_channels
-from bfsensor.diagnose.predict_maps import shot_at
-from bfsensor.diagnose.ranking import name_of
+from bfsensor.diagnose.model.map_predictions import shot_at
+from bfsensor.diagnose.model.predictor import Predictor, used_channels
 from bfsensor.effects.effect import Effect, Segment, Shot
 from bfsensor.measure.bartlett import bartlett_matrix
+from bfsensor.response.edge_response import area_matrix
 from validation.write_results import commit_here, write_results
 
 RESULTS = "validation/results/concealed_physics.ecsv"
@@ -207,7 +209,7 @@ def _plain(truth: Baseline) -> Predictor:
 
 def _measured(
     channels: Sequence[Channel], sightings: Sequence[Any], maps: dict[Any, Any]
-) -> Measured:
+) -> MeasuredChannels:
     """A campaign of one amplifier, gain 1."""
     shots = tuple(
         Shot("flat", n, 1.0, *c, 0.0, LEVELS[1]) for n, c in enumerate((*FITTED, HELD))
@@ -216,7 +218,7 @@ def _measured(
     spots = sum(
         int((c.axes["what"] == "sigma_x").sum()) for c in channels if c.word == "spot"
     )
-    return Measured(
+    return MeasuredChannels(
         channels=tuple(channels), amplifiers=("all",), gains=(1.0,), read_noise=(NOISE,),
         phases=tuple(rng.uniform(-0.5, 0.5, (64, 2)) for _ in range(spots)), columns=(SIDE,),
         flips=((False, False),), origins=((0, 0),), shape=(SIDE, SIDE),
@@ -280,7 +282,7 @@ def _evened(
 
 def record(
     truth: Baseline, effects: Sequence[Effect], case: Case, *, noisy: bool
-) -> Measured:
+) -> MeasuredChannels:
     """Take all recordings of a chip."""
     rng = np.random.default_rng([6032, CASES.index(case)])
     found, sightings, maps = take_maps(truth, effects, rng)

@@ -33,9 +33,10 @@ import numpy as np
 from astropy.table import Table
 from tqdm import tqdm
 
-from bfsensor.diagnose.diagnosis import diagnose_measured, fit_bounded
-from bfsensor.diagnose.extract import measure_channels
-from bfsensor.diagnose.suspects import alarms_of
+from bfsensor.diagnose.data.measure_channels import measure_channels
+from bfsensor.diagnose.detect.matched_filters import alarms_of
+from bfsensor.diagnose.diagnosis import diagnose_measured
+from bfsensor.diagnose.fit.baseline_fit import fit_bounded
 from validation.concealed.campaign import seal
 from validation.concealed.effect import Effect
 from validation.concealed.effects_silicon import DeviceParameter, Saturation

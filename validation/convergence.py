@@ -15,13 +15,15 @@ from dataclasses import replace
 import numpy as np
 from astropy.table import Table
 
-from bfsensor.build import plan_table, solve_level
-from bfsensor.device import Device
+from bfsensor.device.device import Device
+from bfsensor.response.vertices import vertex_fractions
 from bfsensor.simulate.boundaries import find_boundaries
 from bfsensor.simulate.mesh import make_mesh
 from bfsensor.simulate.poisson import Electrostatics
 from bfsensor.simulate.unit_cell import solve_unit_cell, tile
-from bfsensor.table import DistortionTable, vertex_fractions
+from bfsensor.table.levels import solve_level
+from bfsensor.table.table import DistortionTable
+from bfsensor.table.table_plan import plan_table
 from validation.write_results import write_results
 
 CHARGE = 1e5

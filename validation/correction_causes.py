@@ -25,8 +25,9 @@ from scipy.signal import fftconvolve
 from scipy.special import ndtr
 
 from bfsensor.measure.correct import correct_edges
-from bfsensor.quadrant_shifts import QuadrantShifts, quadrant_shifts
-from bfsensor.simulate.image_charge import ImageCharge, edge_shifts
+from bfsensor.simulate.charge_field import ImageCharge
+from bfsensor.simulate.image_charge import edge_shifts
+from bfsensor.table.quadrant_shifts import QuadrantShifts, quadrant_shifts
 from validation.correction_round_trip import (
     PEAKS,
     SIDE,

@@ -31,12 +31,12 @@ from astropy.table import Table, vstack
 from numpy.typing import NDArray
 
 from bfsensor import BrighterFatterSensor, DistortionTable
-from bfsensor.lsst_format import make_distortion_matrix, make_kernel, solve_kernel
+from bfsensor.files import tables_dir
 from bfsensor.measure.correct import correct_edges, correct_kernel
-from bfsensor.quadrant_shifts import QuadrantShifts, quadrant_shifts
-from bfsensor.recording.lsst_datasets import BrighterFatterKernel, DistortionMatrix
-from bfsensor.resources import tables_dir
+from bfsensor.recording.tables.lsst_datasets import BrighterFatterKernel, DistortionMatrix
 from bfsensor.sensor.flats import draw_flat
+from bfsensor.table.lsst_format import make_distortion_matrix, make_kernel, solve_kernel
+from bfsensor.table.quadrant_shifts import QuadrantShifts, quadrant_shifts
 from validation.write_results import write_results
 
 RESULTS = Path(__file__).parent / "results"

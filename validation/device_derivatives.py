@@ -19,11 +19,16 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bfsensor import Device
+from bfsensor.device.parameters import change_parameter, device_parameters
 from bfsensor.errors import DeviceError
-from bfsensor.fit.emulator import DeviceEmulator
-from bfsensor.fit.emulator_nodes import STEP
-from bfsensor.fit.parameters import change_parameter, device_parameters
-from bfsensor.response import REFINE_Z, EdgeResponse, area_matrix, solve_response
+from bfsensor.response.edge_response import (
+    REFINE_Z,
+    EdgeResponse,
+    area_matrix,
+    solve_response,
+)
+from bfsensor.response.emulator import DeviceEmulator
+from bfsensor.response.emulator_nodes import STEP
 from validation.write_results import commit_here, replace_run
 
 RESULTS = Path(__file__).parent / "results" / "device_derivatives.ecsv"

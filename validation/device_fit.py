@@ -44,27 +44,27 @@ from astropy.io import ascii as text_tables
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bfsensor.device import Device
-from bfsensor.fit.data import DataSet, area_data, data_set, select
-from bfsensor.fit.finer import FINER, REFINE_Z, Finer
-from bfsensor.fit.fit import fit_device
-from bfsensor.fit.linearised import Linearise
-from bfsensor.fit.missed import DRAWS
-from bfsensor.fit.predictors import make_predictors
-from bfsensor.fit.quantities import (
+from bfsensor.device.device import Device
+from bfsensor.device.quantities import (
     Prior,
     choose_priors,
     describe,
     quantities,
     with_priors,
 )
+from bfsensor.fit.data import DataSet, area_data, data_set, select
+from bfsensor.fit.degeneracies import name_combination
+from bfsensor.fit.finer_mesh import FINER, REFINE_Z, Finer
+from bfsensor.fit.fit import fit_device
+from bfsensor.fit.full_solutions import FullSolutions
+from bfsensor.fit.linear_response import Linearise
+from bfsensor.fit.prediction_error import DRAWS
+from bfsensor.fit.predictors import make_predictors
 from bfsensor.fit.result import FitResult
-from bfsensor.fit.solved import Solved
-from bfsensor.fit.ties import name_combination
 from bfsensor.measure.toy_array import close_sum, predict_array
-from bfsensor.recording.exposures import Condition
-from bfsensor.recording.measured import read_measured
-from bfsensor.response import area_matrix
+from bfsensor.recording.campaign.exposures import Condition
+from bfsensor.recording.tables.measured import read_measured
+from bfsensor.response.edge_response import area_matrix
 from bfsensor.simulate.well import full_well
 from validation.write_results import commit_here, replace_run
 
@@ -246,9 +246,9 @@ def make_solved(
     at: tuple[Condition, ...],
     finer: int,
     keep: Path,
-) -> Solved:
+) -> FullSolutions:
     """What solves a device on the finer mesh alone."""
-    return Solved(device, priors, at, finer, REFINE_Z, kept_solutions(keep))
+    return FullSolutions(device, priors, at, finer, REFINE_Z, kept_solutions(keep))
 
 
 def make_finer(

@@ -64,9 +64,9 @@ class Clock:
 def diagnose_large(folder: Path | None, exposures: int) -> dict[str, Any]:
     """Diagnose files, or frames made on the way; seconds and memory [GB] by part."""
     from bfsensor.diagnose import diagnosis
-    from bfsensor.diagnose.report import write_report
-    from bfsensor.diagnose.sources import CampaignSource, find_baseline
-    from bfsensor.recording.campaign import read_campaign
+    from bfsensor.diagnose.model.open_baseline import CampaignSource, find_baseline
+    from bfsensor.diagnose.report.html_report import write_report
+    from bfsensor.recording.campaign.campaign import read_campaign
 
     clock = Clock()
     source: Any = LargeCampaign(exposures)

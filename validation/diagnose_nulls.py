@@ -17,10 +17,10 @@ from astropy.stats import binom_conf_interval
 from astropy.table import Table, vstack
 from scipy.stats import kstest
 
-from bfsensor.diagnose.extract import measure_channels
-from bfsensor.diagnose.locate import locate_mismatch
-from bfsensor.diagnose.mismatch import fit_baseline
-from bfsensor.diagnose.predict import Predictor, used_channels
+from bfsensor.diagnose.data.measure_channels import measure_channels
+from bfsensor.diagnose.detect.locate import locate_mismatch
+from bfsensor.diagnose.fit.baseline_fit import fit_baseline
+from bfsensor.diagnose.model.predictor import Predictor, used_channels
 from validation.virtual_source import VirtualSource, virtual_baseline
 from validation.write_results import write_results
 

@@ -36,11 +36,11 @@ from astropy.stats import binom_conf_interval
 from astropy.table import Table, vstack
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.diagnosis import Diagnosis
-from bfsensor.diagnose.extract import Measured, measure_channels
-from bfsensor.diagnose.locate import ALARM, Locator, Mismatch
-from bfsensor.diagnose.mismatch import BaselineFit, fit_baseline
-from bfsensor.diagnose.predict import Predictor, used_channels
+from bfsensor.diagnose.data.measure_channels import MeasuredChannels, measure_channels
+from bfsensor.diagnose.detect.locate import ALARM, Locator, Mismatch
+from bfsensor.diagnose.fit.baseline_fit import BaselineFit, fit_baseline
+from bfsensor.diagnose.model.predictor import Predictor, used_channels
+from bfsensor.diagnose.report.diagnosis_result import Diagnosis
 from validation.concealed.library import make_effect
 from validation.virtual_source import VirtualSource, virtual_baseline
 from validation.write_results import write_results
@@ -87,7 +87,7 @@ CASES = (
 
 
 @lru_cache(maxsize=64)
-def fitted_null(seed: int) -> tuple[Measured, BaselineFit]:
+def fitted_null(seed: int) -> tuple[MeasuredChannels, BaselineFit]:
     """A campaign without effects, and its fit."""
     measured = measure_channels(VirtualSource(seed=seed))
     predictor = Predictor(measured, virtual_baseline())
@@ -100,7 +100,7 @@ def locator(seed: int) -> Locator:
     return Locator(fitted_null(seed)[1], seed=seed)
 
 
-def residuals_at(fit: BaselineFit, measured: Measured) -> NDArray[np.float64]:
+def residuals_at(fit: BaselineFit, measured: MeasuredChannels) -> NDArray[np.float64]:
     """Residuals of a campaign, by the parameters and errors of another's fit."""
     predictor = Predictor(measured, virtual_baseline())
     values = dict(zip(fit.names, fit.values, strict=True))
@@ -218,7 +218,7 @@ def overlap(one: tuple[float, float], two: tuple[float, float]) -> float:
     return max(both, 0.0) / max(max(one[1], two[1]) - min(one[0], two[0]), 1e-9)
 
 
-def score(case: Case, signature: Signature, measured: Measured, fit: BaselineFit,
+def score(case: Case, signature: Signature, measured: MeasuredChannels, fit: BaselineFit,
           found: Mismatch) -> dict[str, float]:  # fmt: skip
     """Hold a location against the truth: 1 right, 0 wrong, nan where the effect has no such place."""
     told = Diagnosis("", "", measured, fit, found, np.nan)

@@ -22,14 +22,14 @@ import numpy as np
 from astropy.table import Table, vstack
 
 from bfsensor import Device, build_table, plan_table
-from bfsensor.measure.response import measure_response
-from bfsensor.simulate.flat_exposure import (
+from bfsensor.direct.flat_exposure import (
     Flat,
     FlatPlan,
     periodic_covariances,
     simulate_flat,
 )
-from bfsensor.sweep import open_executor
+from bfsensor.measure.pixel_response import measure_response
+from bfsensor.sweeps.executors import open_executor
 from validation.write_results import write_results
 
 RESULTS = Path(__file__).parent / "results" / "direct_flats.ecsv"

@@ -28,8 +28,8 @@ from astropy.table import Table
 from scipy.special import ndtr
 
 from bfsensor import BrighterFatterSensor, Device, ShiftMap
-from bfsensor.device_parts import Edge, EdgeStrip
-from bfsensor.sensor.drift import solve_drift
+from bfsensor.device.parts import Edge, EdgeStrip
+from bfsensor.sensor.drift_field import solve_drift
 from bfsensor.simulate.edge_field import front_plane, solve_edge
 from bfsensor.simulate.edge_shift import EdgeShift, trace_edge
 from validation.write_results import write_results

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.channels import Channel
-from bfsensor.diagnose.extract import Measured, measure_channels
-from bfsensor.diagnose.mismatch import BaselineFit, fit_baseline
-from bfsensor.diagnose.predict import Predictor, used_channels
-from bfsensor.diagnose.spot_ghosts import find_ghosts
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.measure_channels import MeasuredChannels, measure_channels
+from bfsensor.diagnose.data.spot_ghosts import find_ghosts
+from bfsensor.diagnose.fit.baseline_fit import BaselineFit, fit_baseline
+from bfsensor.diagnose.model.predictor import Predictor, used_channels
 from bfsensor.effects.effect import Effect, Layout, Segment, Shot
 from validation.concealed.electrostatics import EdgeShifts
 from validation.concealed.plan import SIZES, Geometry
@@ -116,7 +116,7 @@ class OnPixels:
 
 def residuals(
     fit: BaselineFit,
-    measured: Measured,
+    measured: MeasuredChannels,
     effects: Sequence[Effect],
     by: Sequence[Channel],
     chance: Sequence[Effect] = (),
@@ -233,12 +233,12 @@ def _without_parameters(
     return {w: left[: len(fit.residuals)][fit.of(w)] for w in changes}
 
 
-_NULLS: dict[Any, tuple[Measured, BaselineFit]] = {}
+_NULLS: dict[Any, tuple[MeasuredChannels, BaselineFit]] = {}
 
 
 def null_campaign(
     seed: int, size: Any, ghosts: Mapping[int, list[NDArray[np.bool_]]] | None = None
-) -> tuple[Measured, BaselineFit]:
+) -> tuple[MeasuredChannels, BaselineFit]:
     """A campaign without effects, and its fit, at the sensor's own gains; kept.
 
     Gains are known from flats to 2e-3, and an effect of more than 500 errors is predicted better.

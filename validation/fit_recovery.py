@@ -36,12 +36,12 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from bfsensor import Device
+from bfsensor.device.quantities import Prior, choose_priors, with_priors
 from bfsensor.errors import MeasurementError
 from bfsensor.files import written_whole
 from bfsensor.fit.predictors import Emulator
-from bfsensor.fit.quantities import Prior, choose_priors, with_priors
-from bfsensor.recording.area_changes import read_area_changes
-from bfsensor.recording.exposures import Condition
+from bfsensor.recording.campaign.exposures import Condition
+from bfsensor.recording.tables.area_changes import read_area_changes
 from validation.mock_fits import Areas, draw_truth, recover
 from validation.write_results import commit_here, replace_run
 
@@ -117,8 +117,8 @@ def main() -> None:
     options = parser.parse_args()
     if options.straight and options.truth == "solved":
         parser.error("--straight takes truths of the emulator: leave --truth solved out")
-    from bfsensor.fit.emulator import DeviceEmulator
-    from bfsensor.fit.linearised import LinearEmulator, LinearResponse
+    from bfsensor.fit.linear_response import LinearEmulator, LinearResponse
+    from bfsensor.response.emulator import DeviceEmulator
 
     device = Device.load(options.device)
     priors = tuple(
@@ -189,8 +189,8 @@ def main() -> None:
 
 def solved_areas(device: Device, priors: Sequence[Prior], cells: int) -> Areas:
     """a_ij of full solutions of a device with other parameters, on its mesh moved with it."""
-    from bfsensor.fit.changing import device_at
-    from bfsensor.response import area_matrix, solve_response
+    from bfsensor.fit.device_at import device_at
+    from bfsensor.response.edge_response import area_matrix, solve_response
 
     def areas(values: NDArray[np.float64]) -> NDArray[np.float64]:
         there = device_at(device, Condition(), priors, values)

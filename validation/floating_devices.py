@@ -27,18 +27,16 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bfsensor import Device
-from bfsensor.diagnose.baseline import Baseline
-from bfsensor.diagnose.conditions import Condition
-from bfsensor.diagnose.device_baseline import (
-    LEVEL,
-    change_parameter,
-    device_parameters,
-)
-from bfsensor.diagnose.diagnosis import Diagnosis, diagnose_measured
-from bfsensor.diagnose.predict import REDUCED_LEVEL
-from bfsensor.diagnose.reduced_channels import measure_reduced
-from bfsensor.diagnose.sources import simulate_baseline
-from bfsensor.recording.area_changes import AreaChangeTable, read_area_changes
+from bfsensor.device.parameters import change_parameter, device_parameters
+from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.diagnose.data.reduced_channels import measure_reduced
+from bfsensor.diagnose.diagnosis import diagnose_measured
+from bfsensor.diagnose.model.baseline import Baseline
+from bfsensor.diagnose.model.open_baseline import simulate_baseline
+from bfsensor.diagnose.model.predictor import REDUCED_LEVEL
+from bfsensor.diagnose.report.diagnosis_result import Diagnosis
+from bfsensor.recording.tables.area_changes import AreaChangeTable, read_area_changes
+from bfsensor.response.edge_response import LEVEL
 from validation.write_results import write_results
 
 RESULTS = "validation/results/floating_devices.ecsv"

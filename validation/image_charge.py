@@ -29,12 +29,12 @@ from astropy.table import Table
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from bfsensor.device import Device
-from bfsensor.resources import tables_dir
+from bfsensor.device.device import Device
+from bfsensor.files import tables_dir
 from bfsensor.simulate.charge_field import ImageCharge
 from bfsensor.simulate.image_charge import area_changes
 from bfsensor.simulate.unit_cell import solve_unit_cell
-from bfsensor.table import DistortionTable
+from bfsensor.table.table import DistortionTable
 from validation.write_results import write_results
 
 RESULTS = Path(__file__).parent / "results" / "image_charge.ecsv"

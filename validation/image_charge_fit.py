@@ -1,7 +1,7 @@
 r"""The image-charge engine fitted as LSST's pipeline does: to our tables, and to measured a_ij.
 
 ``python -m validation.image_charge_fit [--device NAME ...] [-o OUT.ecsv]`` fits heights, half sides,
-strength and offset (:mod:`bfsensor.fit.image_charge`; uniform drift field, light converting at the
+strength and offset (:mod:`bfsensor.fit.image_charge_fit`; uniform drift field, light converting at the
 back surface) to
 
 ``table``: the differential response of a shipped table about 40,000 e-, all lags up to 4, each with
@@ -27,12 +27,13 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bfsensor.device import Device
-from bfsensor.fit.image_charge import SCALES, ImageChargeFit, fit_image_charge
-from bfsensor.recording.area_changes import read_area_changes
-from bfsensor.resources import tables_dir
+from bfsensor.device.device import Device
+from bfsensor.files import tables_dir
+from bfsensor.fit.image_charge_fit import ImageChargeFit, fit_image_charge
+from bfsensor.fit.image_charge_problem import SCALES
+from bfsensor.recording.tables.area_changes import read_area_changes
 from bfsensor.simulate.charge_field import ImageCharge
-from bfsensor.table import DistortionTable
+from bfsensor.table.table import DistortionTable
 from validation.write_results import write_results
 
 RESULTS = Path(__file__).parent / "results" / "image_charge_fit.ecsv"

@@ -13,9 +13,9 @@ import time
 from typing import Any
 from unittest.mock import patch
 
-from bfsensor.device import Device
-from bfsensor.levels import Images
-from bfsensor.response import area_matrix, solve_response
+from bfsensor.device.device import Device
+from bfsensor.response.edge_response import area_matrix, solve_response
+from bfsensor.response.periodic_images import Images
 from validation.device_fit import DEVICES, append, row
 
 COMMAND = "python -m validation.lag_two"

@@ -16,9 +16,9 @@ from astropy.io import fits
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from bfsensor.recording.amplifiers import AmplifierFrame
-from bfsensor.recording.exposures import Exposure
-from bfsensor.recording.sections import AmplifierLayout
+from bfsensor.recording.campaign.amplifiers import AmplifierFrame
+from bfsensor.recording.campaign.exposures import Exposure
+from bfsensor.recording.raw.sections import AmplifierLayout
 
 NX, NY, PRESCAN, OVERSCAN, ROWS = 512, 2002, 10, 54, 46
 COLUMNS = 8
@@ -42,7 +42,7 @@ GAUSSIAN = 1000.0
 
 
 class LargeCampaign:
-    """Exposures and their frames, as :class:`bfsensor.diagnose.extract.Source` has them.
+    """Exposures and their frames, as :class:`bfsensor.diagnose.data.measure_channels.Source` has them.
 
     Parameters
     ----------

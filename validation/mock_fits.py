@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from tqdm import tqdm
 
+from bfsensor.device.quantities import Prior, describe
 from bfsensor.errors import MeasurementError
 from bfsensor.files import written_whole
 from bfsensor.fit.data import DataSet, area_data
-from bfsensor.fit.missed import Missed
+from bfsensor.fit.degeneracies import find_ties, name_combination, principal
+from bfsensor.fit.least_squares import ORDERED, FitSolution, LeastSquaresProblem, solve
 from bfsensor.fit.posterior import find_posterior
+from bfsensor.fit.prediction_error import Missed
 from bfsensor.fit.predictors import Emulator, make_predictors
-from bfsensor.fit.quantities import Prior, describe
-from bfsensor.fit.solve import ORDERED, Problem, Solution, solve
-from bfsensor.fit.ties import find_ties, name_combination, principal
-from bfsensor.recording.exposures import Condition
+from bfsensor.recording.campaign.exposures import Condition
 
 MEASURED = 0.7
 """Posterior over prior width below which a combination has a row of its own."""
@@ -184,10 +184,10 @@ def recover(
 
 def _fit_mock(
     mock: Mocks,
-    problem: Problem,
+    problem: LeastSquaresProblem,
     emulator_misses: NDArray[np.float64] | None,
     truth: NDArray[np.float64],
-) -> Solution:
+) -> FitSolution:
     """Fit one more and hold the truth against what the fit says; the tangent's solution."""
     (data,), names = problem.sets, tuple(prior.name for prior in problem.priors)
     begin = time.process_time()
@@ -233,7 +233,7 @@ def _fit_mock(
 
 
 def _hold_predictions(
-    mock: Mocks, emulator: Emulator, tangent: Solution, true: NDArray[np.float64]
+    mock: Mocks, emulator: Emulator, tangent: FitSolution, true: NDArray[np.float64]
 ) -> None:
     """Add what the fit predicts, as the tangent has it, against the true ones there."""
     told, errors = _predicted(emulator, tangent.values, tangent.covariance)
@@ -281,8 +281,12 @@ def _predicted(
     return np.asarray(response.areas)[j, i], errors
 
 
-def _problem(data: DataSet, emulator: Emulator, priors: Sequence[Prior]) -> Problem:
-    return Problem(tuple(priors), (data,), make_predictors((data,), emulator, priors))
+def _problem(
+    data: DataSet, emulator: Emulator, priors: Sequence[Prior]
+) -> LeastSquaresProblem:
+    return LeastSquaresProblem(
+        tuple(priors), (data,), make_predictors((data,), emulator, priors)
+    )
 
 
 def _row(name: str, kind: str, pulls: NDArray[np.float64]) -> dict[str, Any]:

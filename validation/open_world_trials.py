@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 
+from bfsensor.diagnose.data.measure_channels import MeasuredChannels, measure_channels
 from bfsensor.diagnose.diagnosis import diagnose_measured
-from bfsensor.diagnose.extract import Measured, measure_channels
 from validation.concealed.effect import Effect
 from validation.concealed.library import make_effect
 from validation.concealed.outside import OutsideLibrary
@@ -105,12 +105,14 @@ def trials(count: int, known: int) -> Iterator[tuple[str, Effect, float, int]]:
             yield f"{word} {variant}".strip(), top.scaled(factor), snr, seed
 
 
-def take(effect: Effect, seed: int) -> Measured:
+def take(effect: Effect, seed: int) -> MeasuredChannels:
     """Take the channels of one campaign."""
     return measure_channels(VirtualSource(seed=seed, effects=[at_seed(effect, seed)]))
 
 
-def diagnosed(effect: Effect, snr: float, measured: Measured, name: str) -> dict[str, Any]:
+def diagnosed(
+    effect: Effect, snr: float, measured: MeasuredChannels, name: str
+) -> dict[str, Any]:
     """Diagnose a campaign and hold the report against the truth."""
     begin = time.process_time()
     found = diagnose_measured(measured, virtual_baseline(), campaign=name)

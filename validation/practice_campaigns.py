@@ -26,7 +26,7 @@ COMMAND = "python -m validation.practice_campaigns FOLDER"
 def diagnose(folder: Path, out: Path) -> tuple[dict, float, float]:
     """Report, CPU seconds and peak memory [GB] of the command on one campaign."""
     begin = time.monotonic()
-    code = "from bfsensor.cli import main; main()"
+    code = "from bfsensor.cli.main import main; main()"
     line = [sys.executable, "-c", code, "diagnose", str(folder), "-o", str(out)]
     process = subprocess.Popen(line, stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)

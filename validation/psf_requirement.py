@@ -37,10 +37,10 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bfsensor import BrighterFatterSensor, DistortionTable, SiliconSensor
+from bfsensor.device.silicon import absorption_length
 from bfsensor.errors import MeasurementError
-from bfsensor.resources import tables_dir
-from bfsensor.sensor.drift import solve_drift
-from bfsensor.silicon import absorption_length
+from bfsensor.files import tables_dir
+from bfsensor.sensor.drift_field import solve_drift
 from validation.shear_bias import Bias, adaptive_shape, open_shape, regaussianised_bias
 from validation.write_results import write_results
 

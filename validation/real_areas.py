@@ -2,7 +2,7 @@
 
 ``SHARED/reference/{itl,e2v}_covariances_21oct19.csv`` (Poisson_CCD repository @ 876adb8), held
 against GalSim's shipped tables and ours.  A table of our devices knows one operating point;
-:func:`bfsensor.diagnose.table_baseline.with_operating_point` lets it move on the line to that of a
+:func:`bfsensor.diagnose.model.table_baseline.with_operating_point` lets it move on the line to that of a
 second table of the same device card, so that *another operating point* stands among the candidates
 as a parameter of the device.
 """
@@ -12,18 +12,20 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from bfsensor.device import Device
-from bfsensor.diagnose.attribute import candidates_of
-from bfsensor.diagnose.baseline import Baseline
-from bfsensor.diagnose.device_baseline import parameter_value
-from bfsensor.diagnose.diagnosis import Diagnosis, diagnose_measured, fit_bounded
-from bfsensor.diagnose.locate import locate_mismatch
-from bfsensor.diagnose.model import Model
-from bfsensor.diagnose.reduced_channels import measure_reduced
-from bfsensor.diagnose.sources import simulate_baseline
-from bfsensor.diagnose.table_baseline import baseline_of_table, with_operating_point
+from bfsensor.device.device import Device
+from bfsensor.device.parameters import parameter_value
+from bfsensor.diagnose.data.reduced_channels import measure_reduced
+from bfsensor.diagnose.detect.candidates import candidates_of
+from bfsensor.diagnose.detect.locate import locate_mismatch
+from bfsensor.diagnose.diagnosis import diagnose_measured
+from bfsensor.diagnose.fit.baseline_fit import fit_bounded
+from bfsensor.diagnose.fit.fitted_model import Model
+from bfsensor.diagnose.model.baseline import Baseline
+from bfsensor.diagnose.model.open_baseline import simulate_baseline
+from bfsensor.diagnose.model.table_baseline import baseline_of_table, with_operating_point
+from bfsensor.diagnose.report.diagnosis_result import Diagnosis
 from bfsensor.errors import ConvergenceError
-from bfsensor.recording.area_changes import AreaChangeTable
+from bfsensor.recording.tables.area_changes import AreaChangeTable
 
 PAIRS = {"itl": ("itl_sta3800c", "itl_sta3800c_60"), "e2v": ("e2v_ccd250", "e2v_ccd250_70")}
 """Two tables of one device card, at two operating points."""

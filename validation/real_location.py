@@ -21,16 +21,17 @@ from astropy.table import Table
 from scipy.linalg import block_diag
 from scipy.stats import chi2 as chi2_distribution
 
-from bfsensor.diagnose.baseline import Baseline
-from bfsensor.diagnose.diagnosis import Diagnosis, diagnose, diagnose_measured
-from bfsensor.diagnose.free_baseline import free_baseline
-from bfsensor.diagnose.reduced_channels import measure_reduced
-from bfsensor.diagnose.sources import CampaignSource, find_baseline
+from bfsensor.diagnose.data.reduced_channels import measure_reduced
+from bfsensor.diagnose.diagnosis import diagnose, diagnose_measured
+from bfsensor.diagnose.model.baseline import Baseline
+from bfsensor.diagnose.model.free_baseline import free_baseline
+from bfsensor.diagnose.model.open_baseline import CampaignSource, find_baseline
+from bfsensor.diagnose.report.diagnosis_result import Diagnosis
 from bfsensor.measure.bartlett import bartlett_matrix, image_weights
 from bfsensor.measure.covariance_model import model_covariances
-from bfsensor.recording.area_changes import AreaChangeTable, read_area_changes
-from bfsensor.recording.campaign import read_campaign
-from bfsensor.recording.covariance_tables import CovarianceTable
+from bfsensor.recording.campaign.campaign import read_campaign
+from bfsensor.recording.tables.area_changes import AreaChangeTable, read_area_changes
+from bfsensor.recording.tables.covariance_tables import CovarianceTable
 from validation.write_results import write_results
 
 RESULTS = Path(__file__).parent / "results"

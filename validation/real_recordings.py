@@ -26,10 +26,10 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bfsensor.device import Device
-from bfsensor.diagnose.diagnosis import Diagnosis
-from bfsensor.diagnose.table_baseline import BACK_BIAS, with_operating_point
-from bfsensor.recording.area_changes import read_area_changes
+from bfsensor.device.device import Device
+from bfsensor.diagnose.model.table_baseline import BACK_BIAS, with_operating_point
+from bfsensor.diagnose.report.diagnosis_result import Diagnosis
+from bfsensor.recording.tables.area_changes import read_area_changes
 from validation import real_areas, real_figures, real_rings, real_sbig, real_spots
 from validation.write_results import write_results
 

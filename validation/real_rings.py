@@ -12,7 +12,7 @@ sideways while it drifts in the field E of the device:
 .. math:: s_k(z) \propto \int_0^z \phi_k(z') / E(z')\, dz', \qquad
     A(\lambda) = \int p(z \mid f\, \ell(\lambda))\, s_k(z)\, dz,
 
-with the absorption length :math:`\ell` of :mod:`bfsensor.silicon` and a factor f on it: 1 is
+with the absorption length :math:`\ell` of :mod:`bfsensor.device.silicon` and a factor f on it: 1 is
 silicon at the card's temperature, 0 the baseline, all light converting at the back.  No ripple is
 fitted: amplitudes of one band of periods are ratios of products of profiles.
 """
@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize_scalar
 from scipy.signal import butter, sosfiltfilt
 
-from bfsensor import silicon
-from bfsensor.device import Device
-from bfsensor.sensor.drift import solve_drift
+from bfsensor.device import silicon
+from bfsensor.device.device import Device
+from bfsensor.sensor.drift_field import solve_drift
 
 WAVELENGTHS = (400, 500, 550, 650, 700, 770, 800, 950)
 PERIODS = 28.0, 90.0

@@ -2,7 +2,7 @@
 
 ``SHARED/recordings/sbig_flats`` (SBIG ST-7-type CCD, Astr480/CCDChar @ ccdc2a3): ramps of single
 flats.  Neighbours in exposure time are scaled to one another and
-measured block by block (:func:`bfsensor.measure.flats.flat_covariances`), for the light varies by
+measured block by block (:func:`bfsensor.measure.flat_pairs.flat_covariances`), for the light varies by
 37 % over the sensor; blocks of one run are averaged in bins of level.  Differences whose far lags
 rise (fixed pattern, above 17,000 to 25,000 ADU) are left out.  A run is then a table of
 covariances as anybody could have reduced it, and goes to
@@ -21,18 +21,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from bfsensor.diagnose.channels import Channel
-from bfsensor.diagnose.diagnosis import Diagnosis, diagnose_measured
-from bfsensor.diagnose.free_baseline import free_baseline
-from bfsensor.diagnose.model import Model
-from bfsensor.diagnose.pairs import RATIO
-from bfsensor.diagnose.reduced_channels import measure_reduced
-from bfsensor.diagnose.sources import CampaignSource
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.flat_pairing import RATIO
+from bfsensor.diagnose.data.reduced_channels import measure_reduced
+from bfsensor.diagnose.diagnosis import diagnose_measured
+from bfsensor.diagnose.fit.fitted_model import Model
+from bfsensor.diagnose.model.free_baseline import free_baseline
+from bfsensor.diagnose.model.open_baseline import CampaignSource
+from bfsensor.diagnose.report.diagnosis_result import Diagnosis
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.bartlett import bartlett_matrix
-from bfsensor.measure.flats import flat_covariances
-from bfsensor.recording.campaign import read_campaign
-from bfsensor.recording.covariance_tables import CovarianceTable
+from bfsensor.measure.flat_pairs import flat_covariances
+from bfsensor.recording.campaign.campaign import read_campaign
+from bfsensor.recording.tables.covariance_tables import CovarianceTable
 
 RUNS = ("langford", "bergeson")
 GAIN = 0.43

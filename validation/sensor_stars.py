@@ -29,10 +29,11 @@ import numpy as np
 from astropy.table import Table, vstack
 
 from bfsensor import BrighterFatterSensor, DistortionTable, SiliconSensor
-from bfsensor.build import build_table, plan_table
-from bfsensor.device import Device
-from bfsensor.galsim_format import write_galsim
-from bfsensor.resources import tables_dir
+from bfsensor.device.device import Device
+from bfsensor.files import tables_dir
+from bfsensor.table.build import build_table
+from bfsensor.table.galsim_format import write_galsim
+from bfsensor.table.table_plan import plan_table
 from validation.write_results import write_results
 
 RESULTS = Path(__file__).parent / "results"

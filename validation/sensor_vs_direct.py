@@ -18,8 +18,8 @@ import numpy as np
 from astropy.table import Table
 
 from bfsensor import BrighterFatterSensor, Device
+from bfsensor.direct.spot_exposure import Spot, SpotPlan, spot_electrons
 from bfsensor.measure.growth import measure_growth
-from bfsensor.simulate.exposure import Spot, SpotPlan, spot_electrons
 from validation.write_results import write_results
 
 LEVELS = (20e3, 80e3, 150e3)

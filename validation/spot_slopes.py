@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from bfsensor import Device
+from bfsensor.direct.spot_exposure import Spot, SpotPlan, simulate_spot
 from bfsensor.measure.growth import UNIT, Growth, measure_growth
-from bfsensor.simulate.exposure import Spot, SpotPlan, simulate_spot
-from bfsensor.sweep import open_executor, run_points
+from bfsensor.sweeps.executors import open_executor, run_points
 from validation.write_results import write_results
 
 SETTINGS = {

@@ -22,6 +22,7 @@ from astropy.table import Table, vstack
 from numpy.typing import NDArray
 
 from bfsensor import DistortionTable
+from bfsensor.files import tables_dir
 from bfsensor.measure.toy import (
     measure_pair,
     predict_pair,
@@ -34,7 +35,6 @@ from bfsensor.measure.toy_array import (
     predict_array,
     throw_at_array,
 )
-from bfsensor.resources import tables_dir
 from validation.write_results import write_results
 
 RESULTS = Path(__file__).parent / "results"

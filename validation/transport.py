@@ -24,9 +24,9 @@ import numpy as np
 from astropy.table import Table
 
 from bfsensor import Device
+from bfsensor.direct.transport import PUBLISHED_DIFFUSION, Tracer, Transport
 from bfsensor.simulate.mesh import make_mesh
 from bfsensor.simulate.poisson import Electrostatics, Potential
-from bfsensor.simulate.transport import PUBLISHED_DIFFUSION, Tracer, Transport
 from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 from validation.write_results import write_results
 

@@ -28,9 +28,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.extract import Measured, measure_channels
-from bfsensor.diagnose.mismatch import BaselineFit, fit_baseline
-from bfsensor.diagnose.predict import Predictor, used_channels
+from bfsensor.diagnose.data.measure_channels import MeasuredChannels, measure_channels
+from bfsensor.diagnose.fit.baseline_fit import BaselineFit, fit_baseline
+from bfsensor.diagnose.model.predictor import Predictor, used_channels
 from validation.concealed.card import NOMINAL
 from validation.concealed.effect import Effect, Range
 from validation.concealed.effects_silicon import DeviceParameter, Saturation
@@ -132,7 +132,7 @@ def _middle(given: Range) -> float:
 
 
 @lru_cache(maxsize=16)
-def _fitted(seed: int, word: str, size: str) -> tuple[Measured, BaselineFit]:
+def _fitted(seed: int, word: str, size: str) -> tuple[MeasuredChannels, BaselineFit]:
     """The twin without the effect, and the baseline's fit; ``word`` names a device parameter."""
     told = DeviceParameter({word: NOMINAL[word]}, word) if word else None
     effects = () if told is None else still(told)
@@ -141,7 +141,9 @@ def _fitted(seed: int, word: str, size: str) -> tuple[Measured, BaselineFit]:
     return measured, fit_baseline(predictor, used_channels(measured.channels, FOLDS))
 
 
-def twin_of(effect: Effect, seed: int, size: str = "S") -> tuple[Measured, BaselineFit]:
+def twin_of(
+    effect: Effect, seed: int, size: str = "S"
+) -> tuple[MeasuredChannels, BaselineFit]:
     """Return the twin without the effect: its channels and the baseline's fit of them."""
     word = effect.variant if isinstance(effect, DeviceParameter) else ""
     return _fitted(seed, word, size)

@@ -29,10 +29,11 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.diagnosis import Diagnosis, diagnose_measured
-from bfsensor.diagnose.extract import Measured, measure_channels
-from bfsensor.diagnose.predict import Predictor
-from bfsensor.diagnose.recordings import RULES
+from bfsensor.diagnose.data.measure_channels import MeasuredChannels, measure_channels
+from bfsensor.diagnose.diagnosis import diagnose_measured
+from bfsensor.diagnose.model.predictor import Predictor
+from bfsensor.diagnose.plan.catalogue import RULES
+from bfsensor.diagnose.report.diagnosis_result import Diagnosis
 from bfsensor.effects.effect import Effect
 from validation.concealed.effect import Range
 from validation.concealed.library import make_effect
@@ -115,14 +116,16 @@ def slowly(seed: int, effect: Any) -> VirtualSource:
 TAKEN = {"binned_serial": binned, "overscan": with_overscan, "pixel_time": slowly}
 
 
-def without(measured: Measured, *words: str) -> Measured:
+def without(measured: MeasuredChannels, *words: str) -> MeasuredChannels:
     """The same campaign without some channels."""
     return replace(
         measured, channels=tuple(c for c in measured.channels if c.word not in words)
     )
 
 
-def held_against(measured: Measured, effect: Effect, word: str) -> tuple[float, int]:
+def held_against(
+    measured: MeasuredChannels, effect: Effect, word: str
+) -> tuple[float, int]:
     """Chi-square of one channel with an effect as it is, what is linear fitted; and its dof."""
     predictor = Predictor(measured, virtual_baseline(), [effect])
     square, number = 0.0, 0

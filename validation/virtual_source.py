@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.baseline import Baseline, read_edges
+from bfsensor.diagnose.model.baseline import Baseline, read_edges
 from validation.concealed.arrays import iterate_exposures
 from validation.concealed.card import baseline_edges, device_card
 from validation.concealed.plan import SIZES, Geometry

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Seen, Values
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Seen
+from bfsensor.typing import FloatArray
 
 REMAINDERS = 64
 """Codes whose remainders the channel counts; beyond, powers of two are told apart."""
@@ -62,7 +63,7 @@ class AdcBits(Effect):
         rest = np.minimum(np.floor(above - on * (half + delta)), half - 1)
         return level - above + on * half + rest
 
-    def code_hist(self, axes: Axes, layout: Layout) -> Values:
+    def code_hist(self, axes: Axes, layout: Layout) -> FloatArray:
         code, bit, own = axes["code"].astype(int), axes["bit"].astype(int), int(self["bit"])
         out = np.zeros(len(code))
         high, half = bit >= 0, 2**own
@@ -93,7 +94,7 @@ class AdcBits(Effect):
             out[rows] += change[REMAINDERS - code[rows] - 1]
         return out
 
-    def bias_cov(self, axes: Axes, layout: Layout) -> Values:
+    def bias_cov(self, axes: Axes, layout: Layout) -> FloatArray:
         out = np.zeros(len(axes["amp"]))
         if self["delta"] == 0 or not _known(layout):
             return out
@@ -108,13 +109,13 @@ class AdcBits(Effect):
         change = np.array(layout.gains) ** 2 * (wrong - right)
         return np.where(axes["lag"] == 0, change[axes["amp"].astype(int)], out)
 
-    def signal(self, level: Values, axes: Axes, layout: Layout) -> Values:
+    def signal(self, level: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
         if self["delta"] == 0 or not _known(layout):
             return level
         start, noise = self._zeros(layout)
         error = self._error(start, noise)
 
-        def read(amp: NDArray[np.int64]) -> Values:
+        def read(amp: NDArray[np.int64]) -> FloatArray:
             return level + self._light_error(level, amp, layout) - gains[amp] * error[amp]
 
         gains = np.array(layout.gains)
@@ -124,7 +125,7 @@ class AdcBits(Effect):
         count = len(layout.segments)
         return np.asarray(np.mean([read(np.array(n)) for n in range(count)], axis=0))
 
-    def covariances(self, c: Values, axes: Axes, layout: Layout) -> Values:
+    def covariances(self, c: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
         if self["delta"] == 0 or not _known(layout):
             return c
         # Whether the bit is on is a noise of its own.
@@ -134,20 +135,22 @@ class AdcBits(Effect):
         out[:, 0, 0] -= mean * (self["delta"] * np.array(layout.gains)[amp] + mean)
         return out
 
-    def _light_error(self, level: Values, amp: NDArray[np.int64], layout: Layout) -> Values:
+    def _light_error(
+        self, level: FloatArray, amp: NDArray[np.int64], layout: Layout
+    ) -> FloatArray:
         """Mean error of codes of pixels with light and its noise [e-]."""
         gain, (start, noise) = np.array(layout.gains)[amp], self._zeros(layout)
         wide = np.sqrt(noise[amp] ** 2 + np.maximum(level, 0.0) / gain**2)
         return np.asarray(gain * self._error(start[amp] + level / gain, wide))
 
-    def _zeros(self, layout: Layout) -> tuple[Values, Values]:
+    def _zeros(self, layout: Layout) -> tuple[FloatArray, FloatArray]:
         """True levels without light, and read noise, of the amplifiers [ADU]."""
         zero = np.array(layout.offsets)
         noise = np.array(layout.read_noise or np.full(len(zero), READ_NOISE))
         noise = np.where(np.isfinite(noise) & (noise > 0), noise, READ_NOISE)
         return _levels(self, tuple(zero.tolist()), tuple(noise.tolist())), noise
 
-    def _error(self, level: Values, sigma: Values) -> Values:
+    def _error(self, level: FloatArray, sigma: FloatArray) -> FloatArray:
         """Mean error of the codes [ADU] of levels with noise."""
         delta, half = self["delta"], 2.0 ** int(self["bit"])
         period, s = 2 * half, abs(delta)
@@ -165,7 +168,7 @@ class AdcBits(Effect):
         even = (ends[1][0] - ends[0][0]) / period
         return np.asarray(-delta * np.where(sigma > 0.75 * period, even, on))
 
-    def _width(self, below: NDArray[np.int64], *, odd: bool) -> Values:
+    def _width(self, below: NDArray[np.int64], *, odd: bool) -> FloatArray:
         """Change of the width of the n-th code below odd or even multiples of the bit [codes]."""
         delta, half = self["delta"], 2 ** int(self["bit"])
         if (delta > 0) == odd:
@@ -181,7 +184,9 @@ def _known(layout: Layout) -> bool:
 
 
 @lru_cache(maxsize=64)
-def _levels(effect: AdcBits, zero: tuple[float, ...], noise: tuple[float, ...]) -> Values:
+def _levels(
+    effect: AdcBits, zero: tuple[float, ...], noise: tuple[float, ...]
+) -> FloatArray:
     """True levels [ADU] whose mean codes, wrong as they are, are given."""
     given, spread = np.array(zero), np.array(noise)
     reach = abs(effect["delta"])

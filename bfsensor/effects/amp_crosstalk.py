@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Shot, Values
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Shot
+from bfsensor.typing import FloatArray
 
 
 class AmpCrosstalk(Effect):
@@ -28,7 +29,7 @@ class AmpCrosstalk(Effect):
         c = np.asarray(self["c"], total.dtype)
         return [f + c * (total - f) for f in frames]
 
-    def amp_cross(self, axes: Axes, layout: Layout) -> Values:
+    def amp_cross(self, axes: Axes, layout: Layout) -> FloatArray:
         # Of ADU in ADU: the victim's gain counts, and the aggressor's.
         gains = np.asarray(layout.gains if layout.gains else np.ones(len(layout.segments)))
         ratio = gains[axes["amp"].astype(int)] / gains[axes["other"].astype(int)]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from bfsensor.effects.effect import Edges, Effect, Layout, Parameter, Shot, Values
+from bfsensor.effects.effect import Effect, Layout, Parameter, Shot
+from bfsensor.typing import Edges, FloatArray
 
 
 class BrighterFatterAnisotropy(Effect):
@@ -17,7 +18,7 @@ class BrighterFatterAnisotropy(Effect):
         "Astier & Regnault 2023, A&A 670, A118); law and range assumed"
     )
 
-    def edges(self, kx: Values, ky: Values, shot: Shot, layout: Layout) -> Edges:
+    def edges(self, kx: FloatArray, ky: FloatArray, shot: Shot, layout: Layout) -> Edges:
         del shot, layout
         half = 0.5 * self["eps"]
         return (kx, ky) if half == 0.0 else ((1 - half) * kx, (1 + half) * ky)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from bfsensor.effects.effect import Edges, Effect, Layout, Parameter, Shot, Values
+from bfsensor.effects.effect import Effect, Layout, Parameter, Shot
+from bfsensor.typing import Edges, FloatArray
 
 ZERO, STEP = 620.0, 330.0
 """Wavelength [nm] at which nothing changes, and that over which shifts change by kappa."""
@@ -20,7 +21,7 @@ class BrighterFatterChromatic(Effect):
         "670, A118, model the bands of one camera); law and range assumed"
     )
 
-    def edges(self, kx: Values, ky: Values, shot: Shot, layout: Layout) -> Edges:
+    def edges(self, kx: FloatArray, ky: FloatArray, shot: Shot, layout: Layout) -> Edges:
         del layout
         factor = 1 + self["kappa"] * (shot.wavelength - ZERO) / STEP
         return (kx, ky) if factor == 1.0 else (factor * kx, factor * ky)

@@ -6,7 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from bfsensor.effects.effect import Edges, Effect, Layout, Parameter, Shot, Values
+from bfsensor.effects.effect import Effect, Layout, Parameter, Shot
+from bfsensor.typing import Edges, FloatArray
 
 REACH = 30
 """Lag [pixel] up to which areas change."""
@@ -31,7 +32,7 @@ class BrighterFatterLongRange(Effect):
         "field of a charge between planes: Astier & Regnault 2023, A&A 670, A118"
     )
 
-    def edges(self, kx: Values, ky: Values, shot: Shot, layout: Layout) -> Edges:
+    def edges(self, kx: FloatArray, ky: FloatArray, shot: Shot, layout: Layout) -> Edges:
         del shot
         if self["amp"] == 0.0:
             return kx, ky

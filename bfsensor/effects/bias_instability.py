@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Values
-from bfsensor.effects.noise import ReadNoise, added
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter
+from bfsensor.effects.read_noise import ReadNoise, added
+from bfsensor.typing import FloatArray
 
 SOURCE = (
     "Bias jumps and shapes beyond the overscan's level, typically above 1 ADU, of LSST sensors: "
@@ -30,7 +31,7 @@ class BiasByFrame(Effect):
             return frames
         return added(frames, [self["rms"] * rng.standard_normal((1, 1)) for _ in frames])
 
-    def bias_level(self, axes: Axes, layout: Layout) -> Values:
+    def bias_level(self, axes: Axes, layout: Layout) -> FloatArray:
         return np.where(axes["what"] == "frames", self["rms"] ** 2, 0.0)
 
 
@@ -52,11 +53,11 @@ class BiasByRow(ReadNoise):
             frames, [self["rms"] * rng.standard_normal((len(f), 1)) for f in frames]
         )
 
-    def in_order(self, lag: NDArray, width: NDArray) -> Values:
+    def in_order(self, lag: NDArray, width: NDArray) -> FloatArray:
         # So many of a row's pixels have one of their own row so much later.
         return np.asarray(self["rms"] ** 2 * np.clip(1 - np.abs(lag) / width, 0, None))
 
-    def on_frame(self, i: NDArray, j: NDArray, width: float) -> Values:
+    def on_frame(self, i: NDArray, j: NDArray, width: float) -> FloatArray:
         return np.where(np.broadcast_arrays(i, j)[1] == 0, self["rms"] ** 2, 0.0)
 
 
@@ -79,24 +80,24 @@ class BiasRamp(Effect):
             return frames
         return added(frames, [self._at(np.arange(f.shape[1]))[None] for f in frames])
 
-    def bias_level(self, axes: Axes, layout: Layout) -> Values:
+    def bias_level(self, axes: Axes, layout: Layout) -> FloatArray:
         image = self._mean(axes, layout, "image") - self._mean(axes, layout, "overscan")
         return np.where(axes["what"] == "level", image, 0.0)
 
-    def serial_overscan(self, axes: Axes, layout: Layout) -> Values:
+    def serial_overscan(self, axes: Axes, layout: Layout) -> FloatArray:
         first = layout.of_amp("prescan", axes["amp"]) + layout.of_amp(
             "columns", axes["amp"]
         )
         return self._at(first + axes["k"] - 1)
 
-    def flat_mean(self, axes: Axes, layout: Layout) -> Values:
+    def flat_mean(self, axes: Axes, layout: Layout) -> FloatArray:
         # The mean bias has the ramp too, over the mean of its whole overscan.
         return self._mean(axes, layout, "overscan")
 
-    def _at(self, column: NDArray) -> Values:
+    def _at(self, column: NDArray) -> FloatArray:
         return np.asarray(self["amp"] * np.exp(-column / self["length"]))
 
-    def _mean(self, axes: Axes, layout: Layout, part: str) -> Values:
+    def _mean(self, axes: Axes, layout: Layout, part: str) -> FloatArray:
         """Mean of the ramp over a part of the rows, by value."""
         every = []
         for s in layout.segments:

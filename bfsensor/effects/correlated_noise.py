@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from bfsensor.effects.effect import Axes, Image, Layout, Parameter, Seen, Values
-from bfsensor.effects.noise import ReadNoise, added
+from bfsensor.effects.effect import Axes, Image, Layout, Parameter, Seen
+from bfsensor.effects.read_noise import ReadNoise, added
+from bfsensor.typing import FloatArray
 
 RMS = Parameter("rms", "e-", 0.5, 4.0, amplitude=True)
 
@@ -39,7 +40,7 @@ class NoiseInTime(ReadNoise):
             out.append(lfilter([1.0], [1.0, -keep], fresh).reshape(frame.shape))
         return added(frames, out)
 
-    def in_order(self, lag: NDArray, width: NDArray) -> Values:
+    def in_order(self, lag: NDArray, width: NDArray) -> FloatArray:
         # Fits may try values at which it would not die out.
         keep = float(np.clip(self["corr"], -0.999, 0.999))
         return np.asarray(self["rms"] ** 2 * keep ** np.abs(lag))
@@ -65,10 +66,10 @@ class CommonNoise(ReadNoise):
         shared = self["rms"] * rng.standard_normal(frames[0].shape)
         return added(frames, [shared] * len(frames))
 
-    def in_order(self, lag: NDArray, width: NDArray) -> Values:
+    def in_order(self, lag: NDArray, width: NDArray) -> FloatArray:
         return np.where(lag == 0, self["rms"] ** 2, 0.0)
 
-    def amp_cross(self, axes: Axes, layout: Layout) -> Values:
+    def amp_cross(self, axes: Axes, layout: Layout) -> FloatArray:
         return np.where(axes["what"] == "noise", self["rms"] ** 2, 0.0)
 
 
@@ -106,8 +107,8 @@ class Pickup(ReadNoise):
         wave = np.sqrt(2.0) * self["rms"] * np.cos(2 * np.pi * (turns - rng.random()))
         return added(frames, [wave] * len(frames))
 
-    def in_order(self, lag: NDArray, width: NDArray) -> Values:
+    def in_order(self, lag: NDArray, width: NDArray) -> FloatArray:
         return np.asarray(self["rms"] ** 2 * np.cos(2 * np.pi * lag / self["period"]))
 
-    def amp_cross(self, axes: Axes, layout: Layout) -> Values:
+    def amp_cross(self, axes: Axes, layout: Layout) -> FloatArray:
         return np.where(axes["what"] == "noise", self["rms"] ** 2, 0.0)

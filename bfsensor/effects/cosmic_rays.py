@@ -10,18 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from bfsensor.effects.chance import scatter_of_pairs
 from bfsensor.effects.dark_pixels import OUTLIER
-from bfsensor.effects.effect import (
-    Axes,
-    Effect,
-    Image,
-    Layout,
-    Parameter,
-    Seen,
-    Shot,
-    Values,
-)
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Seen, Shot
+from bfsensor.effects.random_covariances import scatter_of_pairs
+from bfsensor.typing import FloatArray
 
 AREA = 256 * 256
 """Pixels that the rate is for."""
@@ -85,7 +77,7 @@ class CosmicRays(Effect):
         np.add.at(struck, (y[inside], x[inside]), found.charge[inside].astype(charge.dtype))
         return struck
 
-    def covariances(self, c: Values, axes: Axes, layout: Layout) -> Values:
+    def covariances(self, c: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
         side = c.shape[-1]
         table, _ = _excess(
             layout.thickness, layout.pixel, layout.shape, layout.clip, layout.lags
@@ -104,13 +96,13 @@ class CosmicRays(Effect):
         added[:, (lags % side)[:, None], lags % side] = each * own
         return np.asarray(c + added)
 
-    def dark_map(self, axes: Axes, layout: Layout) -> Values:
+    def dark_map(self, axes: Axes, layout: Layout) -> FloatArray:
         out = np.zeros(len(axes["time"]))
         for rows, (mean, _), (always, _) in self._struck(axes, layout):
             out[rows] = mean + always
         return out
 
-    def modes(self, word: str, axes: Axes, layout: Layout) -> Values | None:
+    def modes(self, word: str, axes: Axes, layout: Layout) -> FloatArray | None:
         if word == "flat_cov":
             return scatter_of_pairs(self, axes, layout, partial(self._few, layout=layout))
         if word != "dark_map":
@@ -133,13 +125,13 @@ class CosmicRays(Effect):
         own = float(np.interp(np.log(max(level, LEVELS[0])), np.log(LEVELS), single))
         return own / np.sqrt(tracks) if tracks > 0 else 0.0
 
-    def _each(self, seconds: Values | float) -> Values:
+    def _each(self, seconds: FloatArray | float) -> FloatArray:
         """Tracks that begin in a pixel of an exposure."""
         return np.asarray(self["rate"] * (np.asarray(seconds) + READOUT) / 60.0 / AREA)
 
     def _struck(
         self, axes: Axes, layout: Layout
-    ) -> list[tuple[NDArray[np.int64], tuple[Values, Values], tuple[float, float]]]:
+    ) -> list[tuple[NDArray[np.int64], tuple[FloatArray, FloatArray], tuple[float, float]]]:
         """By amplifier: rows of struck pixels; their mean number and its scatter, by dark, and
         the same of those that the mean bias was struck in."""  # noqa: D205, D209
         found = _tracks(layout.thickness, layout.pixel, layout.shape)
@@ -175,10 +167,10 @@ class Tracks(NamedTuple):
     owner: NDArray[np.int64]
     y: NDArray[np.int64]
     x: NDArray[np.int64]
-    charge: Values
-    share: Values
+    charge: FloatArray
+    share: FloatArray
 
-    def above(self, limit: float) -> Values:
+    def above(self, limit: float) -> FloatArray:
         """Pixels of each track with more charge."""
         weight = np.where(self.charge > limit, self.share, 0.0)
         return np.asarray(np.bincount(self.owner, weight, self.number), float)
@@ -244,7 +236,7 @@ def _tracks(thickness: float, pixel: float, shape: tuple[int, int]) -> Tracks:
 @lru_cache(maxsize=4)
 def _excess(
     thickness: float, pixel: float, shape: tuple[int, int], clip: float, lags: int
-) -> tuple[Values, Values]:
+) -> tuple[FloatArray, FloatArray]:
     """What one track a pixel would add to covariances by level [e-^2], lag 0 in the middle.
 
     And the root of the mean square of what single tracks add to the variance, over its mean.  A

@@ -6,13 +6,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Values
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter
 from bfsensor.effects.transfer import (
     behind_flat,
     leave_behind,
     trail_covariances,
     trail_image,
 )
+from bfsensor.typing import FloatArray
 
 
 class CtiParallel(Effect):
@@ -30,16 +31,16 @@ class CtiParallel(Effect):
     def shift(self, frame: Image, amp: int, layout: Layout) -> Image:
         return leave_behind(frame, self["cti"], 0)
 
-    def parallel_overscan(self, axes: Axes, layout: Layout) -> Values:
+    def parallel_overscan(self, axes: Axes, layout: Layout) -> FloatArray:
         rows = layout.of_amp("rows", axes["amp"])
         return axes["level"] * behind_flat(axes["k"], rows, 0 * rows, self["cti"])
 
-    def covariances(self, c: Values, axes: Axes, layout: Layout) -> Values:
+    def covariances(self, c: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
         rows = layout.of_amp("rows", axes["amp"])
         return trail_covariances(c, self["cti"] * (rows + 1) / 2, -2)
 
     def spot_image(
-        self, images: Values, axes: Mapping[str, float], layout: Layout
-    ) -> Values:
+        self, images: FloatArray, axes: Mapping[str, float], layout: Layout
+    ) -> FloatArray:
         mean = np.mean([(s.rows + 1) / 2 for s in layout.segments])
         return trail_image(images, self["cti"] * float(mean), layout.backwards("y"), -2)

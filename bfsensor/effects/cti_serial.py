@@ -6,13 +6,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Values
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter
 from bfsensor.effects.transfer import (
     behind_flat,
     leave_behind,
     trail_covariances,
     trail_image,
 )
+from bfsensor.typing import FloatArray
 
 
 class CtiSerial(Effect):
@@ -34,16 +35,16 @@ class CtiSerial(Effect):
     def shift(self, frame: Image, amp: int, layout: Layout) -> Image:
         return leave_behind(frame, self["cti"], 1)
 
-    def serial_overscan(self, axes: Axes, layout: Layout) -> Values:
+    def serial_overscan(self, axes: Axes, layout: Layout) -> FloatArray:
         columns, before = (layout.of_amp(n, axes["amp"]) for n in ("columns", "prescan"))
         return axes["level"] * behind_flat(axes["k"], columns, before, self["cti"])
 
-    def covariances(self, c: Values, axes: Axes, layout: Layout) -> Values:
+    def covariances(self, c: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
         columns, before = (layout.of_amp(n, axes["amp"]) for n in ("columns", "prescan"))
         return trail_covariances(c, self["cti"] * (before + (columns + 1) / 2), -1)
 
     def spot_image(
-        self, images: Values, axes: Mapping[str, float], layout: Layout
-    ) -> Values:
+        self, images: FloatArray, axes: Mapping[str, float], layout: Layout
+    ) -> FloatArray:
         mean = np.mean([s.prescan + (s.columns + 1) / 2 for s in layout.segments])
         return trail_image(images, self["cti"] * float(mean), layout.backwards("x"), -1)

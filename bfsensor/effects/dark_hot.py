@@ -8,16 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.effects.dark_pixels import mean_bias, struck_pixels
-from bfsensor.effects.effect import (
-    Axes,
-    Effect,
-    Image,
-    Layout,
-    Parameter,
-    Seen,
-    Shot,
-    Values,
-)
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Seen, Shot
+from bfsensor.typing import FloatArray
 
 DOUBLING = 6.0
 """Rise of the temperature [K] that doubles the rate (assumed)."""
@@ -62,7 +54,7 @@ class _Dark(Effect):
             return charge
         return charge + rng.poisson(mean, charge.shape).astype(charge.dtype)
 
-    def dark_map(self, axes: Axes, layout: Layout) -> Values:
+    def dark_map(self, axes: Axes, layout: Layout) -> FloatArray:
         noise, more = layout.noise, mean_bias(layout)
         hot = self.hot(layout)
         out = np.zeros(len(axes["time"]))
@@ -91,7 +83,9 @@ class _Dark(Effect):
                 out[rows] = np.where(what == "struck", struck, np.where(at, column, mixed))
         return out
 
-    def _born(self, seconds: Values | float, temperature: Values | float) -> Values:
+    def _born(
+        self, seconds: FloatArray | float, temperature: FloatArray | float
+    ) -> FloatArray:
         """Electrons in a pixel of a hot column."""
         warm = np.nan_to_num(np.asarray(temperature, float), nan=REFERENCE) - REFERENCE
         return np.asarray(
@@ -159,7 +153,7 @@ class HotColumns(_Dark):
         out[[x for x in places if 0 <= x < len(out)]] = True
         return out
 
-    def pattern(self, shot: Shot, layout: Layout) -> Values | None:
+    def pattern(self, shot: Shot, layout: Layout) -> FloatArray | None:
         if not shot.level > 0:
             return None
         born = self._born(shot.seconds, shot.temperature) / shot.level

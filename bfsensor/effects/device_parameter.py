@@ -7,8 +7,9 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from bfsensor.effects.effect import Edges, Effect, Layout, Parameter, Seen, Shot, Values
+from bfsensor.effects.effect import Effect, Layout, Parameter, Seen, Shot
 from bfsensor.errors import EffectError
+from bfsensor.typing import Edges, FloatArray
 
 NEAREST, FARTHEST = 3.0, 16.0
 """How far off a parameter plausibly is [spreads]: nearer ones float in every fit."""
@@ -70,7 +71,7 @@ class DeviceParameter(Effect):
         middle = np.sqrt(NEAREST * FARTHEST) * own.spread
         return [{own.name: own.nominal + sign * float(middle)} for sign in (1.0, -1.0)]
 
-    def edges(self, kx: Values, ky: Values, shot: Shot, layout: Layout) -> Edges:
+    def edges(self, kx: FloatArray, ky: FloatArray, shot: Shot, layout: Layout) -> Edges:
         del layout
         own = self.floating
         change = self[own.name] - own.nominal

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bfsensor.effects.effect import Edges, Effect, Layout, Parameter, Seen, Shot
+from bfsensor.effects.effect import Effect, Layout, Parameter, Seen, Shot
+from bfsensor.typing import Edges
 
 
 class EdgeRolloff(Effect):

@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.errors import EffectError
+from bfsensor.typing import Edges, FloatArray
 
 STAGES = ("light", "collect", "store", "shift", "amplifier", "converter")
 """In the order in which light becomes codes."""
 
 Image = NDArray[Any]
-Values = NDArray[np.float64]
-Edges = tuple[Values, Values]
 Axes = Mapping[str, NDArray]
 Seen = Mapping[str, Any]
 
@@ -158,13 +157,13 @@ class Layout:
     clip: float = 5.0
 
     @property
-    def noise(self) -> Values:
+    def noise(self) -> FloatArray:
         """Read noise of the amplifiers [e-], 0 where not known."""
         if len(self.read_noise) != len(self.segments) or not self.gains:
             return np.zeros(len(self.segments))
         return np.nan_to_num(np.array(self.read_noise) * np.array(self.gains))
 
-    def of_amp(self, name: str, amp: NDArray) -> Values:
+    def of_amp(self, name: str, amp: NDArray) -> FloatArray:
         """Give an attribute of the segments, by name, of given amplifiers."""
         if not self.segments:
             # A reduced recording: nothing of it lies anywhere on a sensor.
@@ -172,7 +171,7 @@ class Layout:
         every = np.array([getattr(s, name) for s in self.segments], float)
         return np.asarray(every[np.asarray(amp).astype(int)])
 
-    def frame_width(self, amp: NDArray) -> Values:
+    def frame_width(self, amp: NDArray) -> FloatArray:
         """Columns of given amplifiers' frames, prescan and overscan among them."""
         names = "prescan", "columns", "serial_overscan"
         return np.asarray(np.sum([self.of_amp(n, amp) for n in names], axis=0))
@@ -357,7 +356,7 @@ class Effect:
 
     # -- light and collection: on pixels and in predictions alike
 
-    def edges(self, kx: Values, ky: Values, shot: Shot, layout: Layout) -> Edges:
+    def edges(self, kx: FloatArray, ky: FloatArray, shot: Shot, layout: Layout) -> Edges:
         """Shifts of right and upper edges per electron [pixel/e-], [row dy, column dx]."""
         del shot, layout
         return kx, ky
@@ -381,7 +380,7 @@ class Effect:
         """How collection departs from linear shifts."""
         return Law()
 
-    def light_map(self, shot: Shot, layout: Layout) -> Values | None:
+    def light_map(self, shot: Shot, layout: Layout) -> FloatArray | None:
         """Factor on the light of an exposure, shape of the sensor; None: one."""
         del shot, layout
         return None
@@ -403,7 +402,7 @@ class Effect:
 
     def turbulence(
         self, shot: Shot, layout: Layout, rng: np.random.Generator
-    ) -> Values | None:
+    ) -> FloatArray | None:
         """Factor on the light that differs from frame to frame; None: one."""
         del shot, layout, rng
         return None
@@ -446,7 +445,7 @@ class Effect:
 
     # -- on channels: what is to be added to the prediction
 
-    def pattern(self, shot: Shot, layout: Layout) -> Values | None:
+    def pattern(self, shot: Shot, layout: Layout) -> FloatArray | None:
         """Relative change of a flat's map that comes after collection; None: none.
 
         Shape of the sensor, on its axes (not in readout order); ``shot.level`` [e-] is the
@@ -455,7 +454,7 @@ class Effect:
         del shot, layout
         return None
 
-    def signal(self, level: Values, axes: Axes, layout: Layout) -> Values:
+    def signal(self, level: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
         """Signal of smooth light after the amplifier [e-] against the collected charge [e-].
 
         One to one and smooth; also of pixels of spots' mean images.
@@ -463,7 +462,7 @@ class Effect:
         del axes, layout
         return level
 
-    def covariances(self, c: Values, axes: Axes, layout: Layout) -> Values:
+    def covariances(self, c: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
         """Covariances of flats after this effect [e-^2].
 
         Parameters
@@ -480,8 +479,8 @@ class Effect:
         return c
 
     def spot_image(
-        self, images: Values, axes: Mapping[str, float], layout: Layout
-    ) -> Values:
+        self, images: FloatArray, axes: Mapping[str, float], layout: Layout
+    ) -> FloatArray:
         """Mean images of spots [e-] on the sensor's axes after this effect, shape (..., ny, nx).
 
         ``axes``: the condition, 'hours', and 'background', electrons of a pixel beside a spot over
@@ -490,11 +489,13 @@ class Effect:
         del axes, layout
         return images
 
-    def spot_flux(self, axes: Axes, layout: Layout) -> Values:
+    def spot_flux(self, axes: Axes, layout: Layout) -> FloatArray:
         """Added to electrons of whole spots [e-], besides :meth:`spot_image`; by exposure."""
         return _nothing(axes)
 
-    def spot_ghosts(self, shown: Values, lit: Values, layout: Layout) -> Values | None:
+    def spot_ghosts(
+        self, shown: FloatArray, lit: FloatArray, layout: Layout
+    ) -> FloatArray | None:
         """Parts of the charge of spots that others show where they were.
 
         Parameters
@@ -512,7 +513,7 @@ class Effect:
         del shown, lit, layout
         return None
 
-    def modes(self, word: str, axes: Axes, layout: Layout) -> Values | None:
+    def modes(self, word: str, axes: Axes, layout: Layout) -> FloatArray | None:
         """What chance adds to a channel: shapes whose strengths are independent, of variance 1.
 
         A random effect changes values in expectation, by the other methods, and by its own
@@ -535,11 +536,11 @@ class Effect:
         del word, axes, layout
         return None
 
-    def flat_mean(self, axes: Axes, layout: Layout) -> Values:
+    def flat_mean(self, axes: Axes, layout: Layout) -> FloatArray:
         """Added to means of flats [e-], besides :meth:`signal`."""
         return _nothing(axes)
 
-    def serial_overscan(self, axes: Axes, layout: Layout) -> Values:
+    def serial_overscan(self, axes: Axes, layout: Layout) -> FloatArray:
         """Added to the k-th pixel of the serial overscan behind flats [e-].
 
         The profile's zero, its last pixels, is taken off by the caller, and so is the zero of
@@ -547,15 +548,15 @@ class Effect:
         """
         return _nothing(axes)
 
-    def parallel_overscan(self, axes: Axes, layout: Layout) -> Values:
+    def parallel_overscan(self, axes: Axes, layout: Layout) -> FloatArray:
         """Added to the k-th row of the parallel overscan behind flats [e-]."""
         return _nothing(axes)
 
-    def bias_cov(self, axes: Axes, layout: Layout) -> Values:
+    def bias_cov(self, axes: Axes, layout: Layout) -> FloatArray:
         """Added to the noise's covariance at a lag in readout order [e-^2]."""
         return _nothing(axes)
 
-    def bias_level(self, axes: Axes, layout: Layout) -> Values:
+    def bias_level(self, axes: Axes, layout: Layout) -> FloatArray:
         """Added to bias levels [e-], or to variances [e-^2].
 
         Where 'what' is 'rows': to the variance of rows' means over that of white noise of the
@@ -563,15 +564,15 @@ class Effect:
         """
         return _nothing(axes)
 
-    def dark_map(self, axes: Axes, layout: Layout) -> Values:
+    def dark_map(self, axes: Axes, layout: Layout) -> FloatArray:
         """Added to levels and columns of darks [e-]; where 'what' is 'struck', to numbers."""
         return _nothing(axes)
 
-    def amp_cross(self, axes: Axes, layout: Layout) -> Values:
+    def amp_cross(self, axes: Axes, layout: Layout) -> FloatArray:
         """Added to shared noise [e-^2]; where 'what' is 'crosstalk', to fractions."""
         return _nothing(axes)
 
-    def code_hist(self, axes: Axes, layout: Layout) -> Values:
+    def code_hist(self, axes: Axes, layout: Layout) -> FloatArray:
         """Added to the relative frequencies of codes.
 
         By remainder; where 'bit' is n > 0, of the ``-code``-th code below those that 2^n is the
@@ -581,5 +582,5 @@ class Effect:
         return _nothing(axes)
 
 
-def _nothing(axes: Axes) -> Values:
+def _nothing(axes: Axes) -> FloatArray:
     return np.zeros(len(next(iter(axes.values()))))

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Shot, Values
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Shot
 from bfsensor.effects.transfer import trail_image
+from bfsensor.typing import FloatArray
 
 
 class ElectronicMemory(Effect):
@@ -34,7 +35,7 @@ class ElectronicMemory(Effect):
             out.append(frame + np.asarray(self["alpha"], frame.dtype) * before)
         return out
 
-    def pattern(self, shot: Shot, layout: Layout) -> Values | None:
+    def pattern(self, shot: Shot, layout: Layout) -> FloatArray | None:
         # Before the first column there was no light.
         out = np.zeros(layout.shape)
         for s in layout.segments:
@@ -42,21 +43,21 @@ class ElectronicMemory(Effect):
             out[s.y : s.y + s.rows, column] = -self._share
         return out
 
-    def signal(self, level: Values, axes: Axes, layout: Layout) -> Values:
+    def signal(self, level: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
         return level * (1.0 + self["alpha"])
 
-    def covariances(self, c: Values, axes: Axes, layout: Layout) -> Values:
+    def covariances(self, c: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
         # Each pixel is a mean of two, the gain being that of smooth light.
         both = np.roll(c, 1, -1) + np.roll(c, -1, -1)
         part = self._share
         return np.asarray(c + part * (1 - part) * (both - 2 * c))
 
     def spot_image(
-        self, images: Values, axes: Mapping[str, float], layout: Layout
-    ) -> Values:
+        self, images: FloatArray, axes: Mapping[str, float], layout: Layout
+    ) -> FloatArray:
         return trail_image(images, self._share, layout.backwards("x"), -1)
 
-    def serial_overscan(self, axes: Axes, layout: Layout) -> Values:
+    def serial_overscan(self, axes: Axes, layout: Layout) -> FloatArray:
         return np.where(axes["k"] == 1, self["alpha"] * axes["level"], 0.0)
 
     @property

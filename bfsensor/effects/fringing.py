@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bfsensor.effects.effect import Effect, Layout, Parameter, Seen, Shot, Values
+from bfsensor.effects.effect import Effect, Layout, Parameter, Seen, Shot
+from bfsensor.typing import FloatArray
 
 RED = 900.0
 """Wavelength [nm] from which on silicon of 100 um lets enough light through (assumed)."""
@@ -62,7 +63,7 @@ class Fringing(Effect):
             for tilt in (-1.0, 0.0, 1.0) for phase in (0.0, 0.25)
         ]  # fmt: skip
 
-    def light_map(self, shot: Shot, layout: Layout) -> Values | None:
+    def light_map(self, shot: Shot, layout: Layout) -> FloatArray | None:
         if not shot.wavelength >= RED or not self["amp"]:
             return None
         ny, nx = layout.shape

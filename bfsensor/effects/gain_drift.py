@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Shot, Values
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Shot
+from bfsensor.typing import FloatArray
 
 
 class GainDrift(Effect):
@@ -23,7 +24,7 @@ class GainDrift(Effect):
             return frames
         return [f * np.asarray(1 + self["slope"] * shot.hours, f.dtype) for f in frames]
 
-    def signal(self, level: Values, axes: Axes, layout: Layout) -> Values:
+    def signal(self, level: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
         if "hours" not in axes:
             return level
         return level * (1 + self["slope"] * np.nan_to_num(axes["hours"]))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Shot, Values
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Shot
+from bfsensor.typing import FloatArray
 
 SCALE = 1e5
 """Signal [e-] that the coefficients are given at."""
@@ -27,7 +28,7 @@ class GainNonlinearity(Effect):
         del shot
         return [self._bent(f) for f in frames]
 
-    def signal(self, level: Values, axes: Axes, layout: Layout) -> Values:
+    def signal(self, level: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
         return self._bent(level)
 
     def _bent(self, signal: Image) -> Image:

@@ -8,8 +8,9 @@ from functools import partial
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from bfsensor.effects.chance import scatter_of_pairs
-from bfsensor.effects.effect import Axes, Effect, Layout, Parameter, Seen, Shot, Values
+from bfsensor.effects.effect import Axes, Effect, Layout, Parameter, Seen, Shot
+from bfsensor.effects.random_covariances import scatter_of_pairs
+from bfsensor.typing import FloatArray
 
 REACH = 4.0
 """Margin around the sensor that the pattern is made on [its width]: nothing comes round."""
@@ -48,7 +49,7 @@ class IlluminationTurbulence(Effect):
 
     def turbulence(
         self, shot: Shot, layout: Layout, rng: np.random.Generator
-    ) -> Values | None:
+    ) -> FloatArray | None:
         if shot.kind != "flat" or not self["rms"]:
             return None
         width = self["corr"] / np.sqrt(2.0)
@@ -59,7 +60,7 @@ class IlluminationTurbulence(Effect):
         # White noise under a Gaussian of this width keeps 1 / (4 pi width^2) of its variance.
         return np.asarray(1 + self["rms"] * np.sqrt(4 * np.pi) * width * inside)
 
-    def covariances(self, c: Values, axes: Axes, layout: Layout) -> Values:
+    def covariances(self, c: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
         side = c.shape[-1]
         level = np.asarray(axes["level"], float)
         amps = np.asarray(axes["amp"]).astype(int)
@@ -74,7 +75,7 @@ class IlluminationTurbulence(Effect):
             added[np.ix_(here, lags % side, lags % side)] = strength[:, None, None] * one
         return np.asarray(c + added)
 
-    def modes(self, word: str, axes: Axes, layout: Layout) -> Values | None:
+    def modes(self, word: str, axes: Axes, layout: Layout) -> FloatArray | None:
         if word == "flat_cov":
             return scatter_of_pairs(self, axes, layout, partial(self._few, layout=layout))
         if word != "flat_mean":
@@ -102,7 +103,7 @@ class IlluminationTurbulence(Effect):
         width = min(self["corr"], layout.box / 3)
         return float(np.sqrt(2 * np.pi * width**2 / (segment.rows * segment.columns)))
 
-    def _along(self, distance: Values) -> Values:
+    def _along(self, distance: FloatArray) -> FloatArray:
         """Correlation along one axis; of a distance it is the product of both."""
         return np.asarray(np.exp(-0.5 * (distance / self["corr"]) ** 2))
 
@@ -114,7 +115,7 @@ class IlluminationTurbulence(Effect):
             ).mean()
         )
 
-    def _left(self, rows: int, columns: int, layout: Layout) -> Values:
+    def _left(self, rows: int, columns: int, layout: Layout) -> FloatArray:
         """What the means of boxes leave of the correlation, by lag [j, i].
 
         Of d(p) d(q) they take the mean over q's box of the correlation with p, and over p's
@@ -132,7 +133,7 @@ class IlluminationTurbulence(Effect):
         boxes = max(round(rows / layout.box), 1) * max(round(columns / layout.box), 1)
         return np.asarray(out + fold @ out @ fold * boxes / (rows * columns))
 
-    def _taken(self, n: int, layout: Layout) -> Values:
+    def _taken(self, n: int, layout: Layout) -> FloatArray:
         """Along one axis by lag: of the pair, of p and q's box, of q and p's, of both boxes."""
         count = max(round(n / layout.box), 1)
         edges = np.round(np.linspace(0, n, count + 1)).astype(int)

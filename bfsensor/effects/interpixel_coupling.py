@@ -6,7 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Shot, Values
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Shot
+from bfsensor.typing import FloatArray
 
 
 class InterpixelCoupling(Effect):
@@ -36,13 +37,13 @@ class InterpixelCoupling(Effect):
         del shot, layout, rng, memory
         return self._coupled(charge)
 
-    def covariances(self, c: Values, axes: Axes, layout: Layout) -> Values:
+    def covariances(self, c: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
         # The kernel with itself: coupled twice, for it is even.
         return self._coupled(self._coupled(c))
 
     def spot_image(
-        self, images: Values, axes: Mapping[str, float], layout: Layout
-    ) -> Values:
+        self, images: FloatArray, axes: Mapping[str, float], layout: Layout
+    ) -> FloatArray:
         return self._coupled(images)
 
     def _coupled(self, image: Image) -> Image:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bfsensor import silicon
+from bfsensor.device import silicon
 from bfsensor.effects.effect import Effect, Layout, Parameter, Shot
 
 BOLTZMANN = 8.617333262e-5

@@ -8,16 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.effects.dark_pixels import mean_bias, struck_pixels
-from bfsensor.effects.effect import (
-    Axes,
-    Effect,
-    Image,
-    Layout,
-    Parameter,
-    Seen,
-    Shot,
-    Values,
-)
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Seen, Shot
+from bfsensor.typing import FloatArray
 
 
 class Persistence(Effect):
@@ -59,15 +51,15 @@ class Persistence(Effect):
         )
         return charge + rng.poisson(trapped).astype(charge.dtype)
 
-    def flat_mean(self, axes: Axes, layout: Layout) -> Values:
+    def flat_mean(self, axes: Axes, layout: Layout) -> FloatArray:
         return self._left_at(axes["exposure"], layout)
 
-    def bias_level(self, axes: Axes, layout: Layout) -> Values:
+    def bias_level(self, axes: Axes, layout: Layout) -> FloatArray:
         return np.where(
             axes["what"] == "level", self._left_at(axes["exposure"], layout), 0.0
         )
 
-    def dark_map(self, axes: Axes, layout: Layout) -> Values:
+    def dark_map(self, axes: Axes, layout: Layout) -> FloatArray:
         noise, more = layout.noise, mean_bias(layout)
         left = self._left_at(axes["exposure"], layout)
         out = np.zeros(len(left))
@@ -79,7 +71,9 @@ class Persistence(Effect):
             out[row] = part * segment.rows * segment.columns if struck else others
         return out
 
-    def spot_ghosts(self, shown: Values, lit: Values, layout: Layout) -> Values | None:
+    def spot_ghosts(
+        self, shown: FloatArray, lit: FloatArray, layout: Layout
+    ) -> FloatArray | None:
         parts = self._after(np.subtract.outer(shown, lit))
         biases = np.array(layout.biases, float)
         if len(biases):
@@ -87,7 +81,7 @@ class Persistence(Effect):
             parts = parts - self._after(np.subtract.outer(biases, lit)).mean(0)
         return np.asarray(parts)
 
-    def modes(self, word: str, axes: Axes, layout: Layout) -> Values | None:
+    def modes(self, word: str, axes: Axes, layout: Layout) -> FloatArray | None:
         if word not in ("flat_mean", "dark_map") or not layout.shots:
             return None
         # Of exposures that are missing the light is not known: as much as that of the others.
@@ -106,12 +100,12 @@ class Persistence(Effect):
             for gap in gaps
         ], axis=1)  # fmt: skip
 
-    def _after(self, later: Values) -> Values:
+    def _after(self, later: FloatArray) -> FloatArray:
         """Part of a charge that shows so many exposures later."""
         shown = self["frac"] * np.exp(-np.maximum(later, 0.0) / self["tau"])
         return np.where(later > 0, shown, 0.0)
 
-    def _left_at(self, number: Values, layout: Layout) -> Values:
+    def _left_at(self, number: FloatArray, layout: Layout) -> FloatArray:
         """Charge that earlier exposures left in these [e-]."""
         lit = [s for s in layout.shots if s.level > 0]
         later = np.subtract.outer(

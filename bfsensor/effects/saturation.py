@@ -7,7 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from bfsensor.effects.effect import Axes, Effect, Law, Layout, Parameter, Seen, Values
+from bfsensor.effects.effect import Axes, Effect, Law, Layout, Parameter, Seen
+from bfsensor.typing import FloatArray
 
 UNEVEN = 3e-3
 """Relative scatter of a flat's light from pixel to pixel, response and shape (assumed)."""
@@ -74,7 +75,7 @@ class Saturation(Effect):
     def law(self) -> Law:
         return Law(full_well=np.inf if self.is_neutral() else self["full_well"])
 
-    def flat_mean(self, axes: Axes, layout: Layout) -> Values:
+    def flat_mean(self, axes: Axes, layout: Layout) -> FloatArray:
         light = axes.get("light", axes["level"])
         if self.is_neutral():
             return np.zeros(len(light))
@@ -86,7 +87,7 @@ class Saturation(Effect):
             out[n] -= short * sigma[n]
         return out
 
-    def modes(self, word: str, axes: Axes, layout: Layout) -> Values | None:
+    def modes(self, word: str, axes: Axes, layout: Layout) -> FloatArray | None:
         """What the closed forms near the full well leave open, of each flat and lag on its own."""
         if word not in ("flat_mean", "flat_cov") or self.is_neutral():
             return None
@@ -108,7 +109,7 @@ class Saturation(Effect):
             out[n, mode] = UNSURE * own
         return out
 
-    def covariances(self, c: Values, axes: Axes, layout: Layout) -> Values:
+    def covariances(self, c: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
         if self.is_neutral():
             return c
         light = axes.get("light", axes["level"])
@@ -132,7 +133,7 @@ def _unevenness(light: float, sigma: float) -> float:
     return UNEVEN * float(light) / float(sigma)
 
 
-def _between(distance: float, uneven: float) -> tuple[float, Values]:
+def _between(distance: float, uneven: float) -> tuple[float, FloatArray]:
     """As :func:`_near`, straight between tenths of both: a fit needs slopes and no steps."""
     tenths = int(np.floor(10 * distance)), int(np.floor(10 * uneven))
     parts = 10 * distance - tenths[0], 10 * uneven - tenths[1]
@@ -145,7 +146,7 @@ def _between(distance: float, uneven: float) -> tuple[float, Values]:
 
 
 @lru_cache(maxsize=1024)
-def _near(distance: float, uneven: float) -> tuple[float, Values]:
+def _near(distance: float, uneven: float) -> tuple[float, FloatArray]:
     """Flats near the full well: what their mean lacks, and covariances along the column.
 
     A small simulation of pairs with fixed random numbers, good to 1 % of the variance.
@@ -181,7 +182,7 @@ def _near(distance: float, uneven: float) -> tuple[float, Values]:
     return short, found
 
 
-def spilled(charge: Values, full_well: float) -> Values:
+def spilled(charge: FloatArray, full_well: float) -> FloatArray:
     """Charge after what exceeds the full well has spilled along the columns, shape (ny, nx).
 
     In the limit of endless sharing no order of steps matters: a pile that topples.

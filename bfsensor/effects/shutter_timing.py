@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bfsensor.effects.effect import Axes, Effect, Layout, Parameter, Seen, Shot, Values
+from bfsensor.effects.effect import Axes, Effect, Layout, Parameter, Seen, Shot
+from bfsensor.typing import FloatArray
 
 
 class ShutterTiming(Effect):
@@ -37,7 +38,7 @@ class ShutterTiming(Effect):
             for sign in (1, -1) for shade in (-0.3, 0.0, 0.3)
         ]  # fmt: skip
 
-    def light_map(self, shot: Shot, layout: Layout) -> Values | None:
+    def light_map(self, shot: Shot, layout: Layout) -> FloatArray | None:
         if shot.kind not in ("flat", "spot") or not shot.seconds > 0:
             return None
         nx = layout.shape[1]
@@ -45,12 +46,12 @@ class ShutterTiming(Effect):
         longer = self["dt"] * (1 + self["shade"] * x)
         return np.broadcast_to(1 + longer / shot.seconds, layout.shape)
 
-    def flat_mean(self, axes: Axes, layout: Layout) -> Values:
+    def flat_mean(self, axes: Axes, layout: Layout) -> FloatArray:
         nx = layout.shape[1]
         middle = np.array([2 * (s.x + 0.5 * s.columns) / nx - 1 for s in layout.segments])
         longer = self["dt"] * (1 + self["shade"] * middle[axes["amp"].astype(int)])
         return np.asarray(axes["level"] * longer / (axes["time"] + longer))
 
-    def spot_flux(self, axes: Axes, layout: Layout) -> Values:
+    def spot_flux(self, axes: Axes, layout: Layout) -> FloatArray:
         # Spots lie on all of the sensor: shade is nothing in their mean.
         return np.asarray(axes["flux"] * self["dt"] / (axes["time"] + self["dt"]))

@@ -7,17 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import ndtr
 
-from bfsensor.effects.chance import scatter_of_pairs
-from bfsensor.effects.effect import (
-    Axes,
-    Edges,
-    Effect,
-    Layout,
-    Parameter,
-    Seen,
-    Shot,
-    Values,
-)
+from bfsensor.effects.effect import Axes, Effect, Layout, Parameter, Seen, Shot
+from bfsensor.effects.random_covariances import scatter_of_pairs
+from bfsensor.typing import Edges, FloatArray
 
 BRIDGE = 12
 """Modes of what chance leaves of the rows that are open: 95 % of the variance."""
@@ -76,7 +68,7 @@ class Tearing(Effect):
             part = (part > np.random.default_rng(shot.number).random()).astype(float)
         return part[:, None] * self._torn(nx), np.zeros((ny + 1, nx))
 
-    def covariances(self, c: Values, axes: Axes, layout: Layout) -> Values:
+    def covariances(self, c: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
         # Flats of a pair are torn in other rows: the difference holds the tear in rows between.
         side = c.shape[-1]
         level = np.asarray(axes["level"], float)
@@ -101,7 +93,7 @@ class Tearing(Effect):
                         added[own, a % side, b % side] = one
         return np.asarray(c + added)
 
-    def modes(self, word: str, axes: Axes, layout: Layout) -> Values | None:
+    def modes(self, word: str, axes: Axes, layout: Layout) -> FloatArray | None:
         if word == "flat_cov":
             # The distance of two rows anywhere alike scatters by 0.71 of its mean.
             return scatter_of_pairs(self, axes, layout, lambda *_: np.sqrt(0.5))
@@ -120,25 +112,25 @@ class Tearing(Effect):
                 out.append(spread * _reduced(rows, area, axes))
         return np.stack(out, axis=1)
 
-    def _torn(self, nx: int) -> Values:
+    def _torn(self, nx: int) -> FloatArray:
         """Displacements of the edges between columns where it is open [pixel]."""
         away = np.abs(np.arange(nx + 1.0) - self["column"] * nx)
         return np.asarray(self["amp"] * np.exp(-away / self["length"]))
 
-    def _open(self, ny: int) -> Values:
+    def _open(self, ny: int) -> FloatArray:
         """Part of the exposures in which rows are open."""
         row, never = np.arange(ny) + 0.5, self["open"] * ny
         above = np.clip((ny - row) / max(ny - never, 1.0), 0.0, 1.0)
         return np.where(row <= never, 1.0, above)
 
-    def _chance(self, ny: int) -> Values:
+    def _chance(self, ny: int) -> FloatArray:
         """Covariance of two rows' being open."""
         part = self._open(ny)
         both = np.minimum(part[:, None], part)
         return np.asarray(both - part[:, None] * part)
 
 
-def _reduced(rows: Values, columns: Values, axes: Axes) -> Values:
+def _reduced(rows: FloatArray, columns: FloatArray, axes: Axes) -> FloatArray:
     """Columns, rows and blocks of a map that is a product; rings hold no more than its square."""
     what = axes["what"]
     out = np.zeros(len(what))
@@ -158,10 +150,10 @@ def _reduced(rows: Values, columns: Values, axes: Axes) -> Values:
     return out
 
 
-def _running(values: Values) -> Values:
+def _running(values: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(values)])
 
 
-def _spacing(places: Values) -> float:
+def _spacing(places: FloatArray) -> float:
     steps = np.diff(np.unique(places))
     return float(steps.min()) if len(steps) else 1.0

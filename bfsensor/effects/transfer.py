@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bfsensor.typing import FloatArray
+
 LATEST = 6
 """Packets by which charge may be late: beyond, of 5e-5 times 4000 transfers, is less than 2e-5."""
 
 
-def late_shares(transfers: ArrayLike, cti: float) -> NDArray[np.float64]:
+def late_shares(transfers: ArrayLike, cti: float) -> FloatArray:
     r"""Shares of a packet that arrive 0, 1, ... packets late.
 
     Each transfer leaves ``cti`` behind, which the next packet takes along: the number of failures
@@ -54,11 +56,11 @@ def leave_behind(frame: NDArray[Any], cti: float, axis: int) -> NDArray[Any]:
 
 
 def behind_flat(
-    k: NDArray[np.float64],
-    packets: NDArray[np.float64],
-    before: NDArray[np.float64],
+    k: FloatArray,
+    packets: FloatArray,
+    before: FloatArray,
     cti: float,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Part of a flat's level in the k-th packet after the last one with light.
 
     Parameters
@@ -78,17 +80,15 @@ def behind_flat(
     return out
 
 
-def trail_covariances(
-    c: NDArray[np.float64], share: NDArray[np.float64], axis: int
-) -> NDArray[np.float64]:
+def trail_covariances(c: FloatArray, share: FloatArray, axis: int) -> FloatArray:
     """Covariances after a part ``share`` of each pixel went to the next one, to first order."""
     part = share.reshape(-1, *(1,) * (c.ndim - 1))
     return np.asarray(c + part * (np.roll(c, 1, axis) + np.roll(c, -1, axis) - 2 * c))
 
 
 def trail_image(
-    images: NDArray[np.float64], share: float, backwards: float, axis: int
-) -> NDArray[np.float64]:
+    images: FloatArray, share: float, backwards: float, axis: int
+) -> FloatArray:
     """Images after a part ``share`` went to the pixel read next.
 
     ``backwards``: share of the images that are read against the axis.

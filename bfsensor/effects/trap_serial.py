@@ -15,8 +15,8 @@ from bfsensor.effects.effect import (
     Seen,
     Segment,
     Shot,
-    Values,
 )
+from bfsensor.typing import FloatArray
 
 
 class TrapSerial(Effect):
@@ -60,7 +60,7 @@ class TrapSerial(Effect):
             return frame
         return self._through(frame)
 
-    def pattern(self, shot: Shot, layout: Layout) -> Values | None:
+    def pattern(self, shot: Shot, layout: Layout) -> FloatArray | None:
         segment = self._segment(layout)
         if segment is None or shot.level <= 0:
             return None
@@ -70,17 +70,17 @@ class TrapSerial(Effect):
         out[segment.y : segment.y + segment.rows, column] = -held / shot.level
         return out
 
-    def flat_mean(self, axes: Axes, layout: Layout) -> Values:
+    def flat_mean(self, axes: Axes, layout: Layout) -> FloatArray:
         return -self._held(axes) / layout.of_amp("columns", axes["amp"])
 
-    def serial_overscan(self, axes: Axes, layout: Layout) -> Values:
+    def serial_overscan(self, axes: Axes, layout: Layout) -> FloatArray:
         # Full behind any light that exceeds it: the last pixel of a flat refills what it lost.
         fall = np.exp(-(axes["k"] - 1) / self["tau"])
         return -np.expm1(-1 / self["tau"]) * self._held(axes) * fall
 
     def spot_image(
-        self, images: Values, axes: Mapping[str, float], layout: Layout
-    ) -> Values:
+        self, images: FloatArray, axes: Mapping[str, float], layout: Layout
+    ) -> FloatArray:
         segment = self._segment(layout)
         if segment is None or self["size"] == 0:
             return images
@@ -103,7 +103,7 @@ class TrapSerial(Effect):
         read = (self._through(lines, held) - level).reshape(images.shape)[..., order]
         return images + share * (read - images)
 
-    def _through(self, frame: Image, held: Values | None = None) -> Image:
+    def _through(self, frame: Image, held: FloatArray | None = None) -> Image:
         """Rows after the trap, first pixel first; what it holds before them is nothing by default."""
         size, reach = self["size"], max(self["reach"], 0.0)
         out = np.empty_like(frame)
@@ -118,7 +118,7 @@ class TrapSerial(Effect):
             held = held + caught
         return out
 
-    def _held(self, axes: Axes) -> Values:
+    def _held(self, axes: Axes) -> FloatArray:
         """Behind the light of a flat, in the trap's amplifier [e-]."""
         mine = axes["amp"].astype(int) == int(self["amp"])
         reached = axes["level"] - max(self["reach"], 0.0)

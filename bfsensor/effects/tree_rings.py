@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bfsensor.effects.effect import Edges, Effect, Layout, Parameter, Seen, Shot, Values
+from bfsensor.effects.effect import Effect, Layout, Parameter, Seen, Shot
+from bfsensor.typing import Edges, FloatArray
 
 AMP = Parameter("amp", "pixel", 1e-3, 0.05, amplitude=True)
 PLACE = (
@@ -42,7 +43,7 @@ class _Rings(Effect):
             if s["shape"] == "rings" and all(n in s for n in names)
         ]
 
-    def turns(self, r: Values) -> Values:
+    def turns(self, r: FloatArray) -> FloatArray:
         """Phase at radii [pixel], in cycles."""
         raise NotImplementedError
 
@@ -57,7 +58,7 @@ class _Rings(Effect):
         )
         return self._along(edge_x, y, edge_x), self._along(x, edge_y, edge_y)
 
-    def _along(self, x: Values, y: Values, axis: Values) -> Values:
+    def _along(self, x: FloatArray, y: FloatArray, axis: FloatArray) -> FloatArray:
         """Displacement at places about the centre, its part along an axis."""
         r = np.sqrt(x * x + y * y)
         return np.asarray(
@@ -100,7 +101,7 @@ class TreeRings(_Rings):
             for phase in (0.0, 0.25)
         ]  # fmt: skip
 
-    def turns(self, r: Values) -> Values:
+    def turns(self, r: FloatArray) -> FloatArray:
         r0 = np.hypot(self["xc"], self["yc"])
         rate = (1 + self["chirp"] / 200.0 * (r - r0)) / self["period"]
         return np.asarray(r * rate + self["phase"])
@@ -131,6 +132,6 @@ class UnevenTreeRings(_Rings):
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
         return cls.sighted(layout)
 
-    def turns(self, r: Values) -> Values:
+    def turns(self, r: FloatArray) -> FloatArray:
         bend = np.sin(2 * np.pi * (r / self["length"] + self["sway_phase"]))
         return np.asarray(r / self["period"] * (1 + self["sway"] * bend) + self["phase"])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from bfsensor.effects.effect import Edges, Effect, Layout, Parameter, Shot, Values
+from bfsensor.effects.effect import Effect, Layout, Parameter, Shot
+from bfsensor.typing import Edges, FloatArray
 
 STEP = 20.0
 """Change of the back bias [V] over which shifts change by delta."""
@@ -20,6 +21,6 @@ class VoltageDependence(Effect):
         "Lage, Bradshaw & Tyson 2017, JINST 12, C03091; range assumed"
     )
 
-    def edges(self, kx: Values, ky: Values, shot: Shot, layout: Layout) -> Edges:
+    def edges(self, kx: FloatArray, ky: FloatArray, shot: Shot, layout: Layout) -> Edges:
         factor = 1 + self["delta"] * (shot.back_bias - layout.reference[1]) / STEP
         return (kx, ky) if factor == 1.0 else (factor * kx, factor * ky)

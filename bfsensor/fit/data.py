@@ -10,10 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from bfsensor.errors import FitError
 from bfsensor.fit.spot_response import SIGMA
-from bfsensor.recording.area_changes import AreaChangeTable
-from bfsensor.recording.exposures import Condition
-from bfsensor.recording.measured import Measured
-from bfsensor.recording.setting_tables import SettingTable
+from bfsensor.recording.campaign.exposures import Condition
+from bfsensor.recording.tables.area_changes import AreaChangeTable
+from bfsensor.recording.tables.measured import MeasuredTable
+from bfsensor.recording.tables.setting_tables import SettingTable
+from bfsensor.typing import FloatArray
 
 KINDS = ("areas", "slopes", "saturation", "diffusion")
 
@@ -65,8 +66,8 @@ class DataSet:
 
     name: str
     kind: str
-    values: NDArray[np.float64]
-    errors: NDArray[np.float64]
+    values: FloatArray
+    errors: FloatArray
     conditions: tuple[Condition, ...]
     places: NDArray[np.int64]
     fitted: bool = True
@@ -160,7 +161,7 @@ def area_data(
 
 
 def data_set(
-    measured: Measured,
+    measured: MeasuredTable,
     *,
     name: str | None = None,
     lags: int = LAGS,
@@ -171,7 +172,7 @@ def data_set(
 
     Parameters
     ----------
-    measured : Measured
+    measured : MeasuredTable
         Table and condition; a row's own setting comes before that of the file.
     name : str, optional
         [name of the file].
@@ -216,7 +217,7 @@ def _joined(own: Condition, common: Condition) -> Condition:
     )
 
 
-def _errors(table: SettingTable) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+def _errors(table: SettingTable) -> tuple[FloatArray, tuple[str, ...]]:
     """Errors of a table's values, and what was assumed of them."""
     notes = []
     errors = table.errors.copy()

@@ -5,20 +5,26 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bfsensor.device import Device
+from bfsensor.device.device import Device
+from bfsensor.device.quantities import DIFFUSION, Prior
 from bfsensor.errors import BFSensorError, FitError
-from bfsensor.fit.changing import fitted_device
 from bfsensor.fit.data import UNITS, DataSet
-from bfsensor.fit.finer import Finer, say
-from bfsensor.fit.missed import DRAWS
+from bfsensor.fit.degeneracies import find_ties, principal
+from bfsensor.fit.device_at import fitted_device
+from bfsensor.fit.finer_mesh import Finer, say
+from bfsensor.fit.least_squares import (
+    FEWEST,
+    FitSolution,
+    LeastSquaresProblem,
+    profile,
+    solve,
+)
 from bfsensor.fit.posterior import find_posterior
+from bfsensor.fit.prediction_error import DRAWS
 from bfsensor.fit.predictors import Emulator, Prediction, Tangents, make_predictors
-from bfsensor.fit.quantities import DIFFUSION, Prior
 from bfsensor.fit.result import FitResult, FittedSet
-from bfsensor.fit.solve import FEWEST, Problem, Solution, profile, solve
-from bfsensor.fit.ties import find_ties, principal
+from bfsensor.typing import FloatArray
 
 FAR = 3.0
 """Spreads of its prior from which a fitted parameter is remarked upon."""
@@ -31,8 +37,6 @@ SETTLED = 0.1
 SHORTEST = 0.1
 """Of steps, relative to that of the tangent."""
 
-Values = NDArray[np.float64]
-
 
 def fit_device(
     device: Device,
@@ -40,9 +44,9 @@ def fit_device(
     priors: Sequence[Prior],
     emulator: Emulator | None,
     *,
-    linearise: Callable[[Values], Emulator] | None = None,
+    linearise: Callable[[FloatArray], Emulator] | None = None,
     tangents: Mapping[str, Tangents] | None = None,
-    solved: Callable[[Values], Emulator] | None = None,
+    solved: Callable[[FloatArray], Emulator] | None = None,
     draws: int = DRAWS,
     progress: Callable[[int, int], None] | None = None,
     profiles: Sequence[str] = (),
@@ -63,15 +67,16 @@ def fit_device(
         Response of the device by its parameters; they must be among the priors.
     linearise : callable, optional
         What solves the device at values of its parameters with all derivatives
-        (:class:`~bfsensor.fit.linearised.Linearise`), in place of ``emulator``; a
-        :class:`~bfsensor.fit.finer.Finer` for the values of a finer mesh, which the result tells.
+        (:class:`~bfsensor.fit.linear_response.Linearise`), in place of ``emulator``; a
+        :class:`~bfsensor.fit.finer_mesh.Finer` for the values of a finer mesh, which the result tells.
     tangents : mapping, optional
         What predicts saturation and diffusion
-        (:func:`~bfsensor.fit.tangents.make_tangents`).
+        (:func:`~bfsensor.fit.linear_predictors.make_tangents`).
     solved : callable, optional
         What solves the device at values of all free parameters without derivatives
-        (:class:`~bfsensor.fit.solved.Solved`): what predictions miss over the posterior then counts
-        in its errors (:mod:`bfsensor.fit.missed`); by default a note says that it does not.
+        (:class:`~bfsensor.fit.full_solutions.FullSolutions`): what predictions miss over the
+        posterior then counts in its errors (:mod:`bfsensor.fit.prediction_error`); by default a
+        note says that it does not.
     draws : int
         From the posterior, at which the device is solved.
     progress : callable, optional
@@ -100,7 +105,7 @@ def fit_device(
             f"{unknown[0]} is not free, and has no profile; free are "
             f"{', '.join(prior.name for prior in priors)}"
         )
-    problem = Problem(
+    problem = LeastSquaresProblem(
         tuple(priors),
         tuple(sets),
         make_predictors(sets, emulator, priors, tangents, late=linearise is not None),
@@ -154,8 +159,8 @@ def fit_device(
 
 
 def _settle(
-    problem: Problem, linearise: Callable[[Values], Emulator]
-) -> tuple[Problem, Solution, list[Prediction], list[str]]:
+    problem: LeastSquaresProblem, linearise: Callable[[FloatArray], Emulator]
+) -> tuple[LeastSquaresProblem, FitSolution, list[Prediction], list[str]]:
     """Gauss and Newton: fit, solve the device where the fit ends, fit again.
 
     Steps that raise what is minimised, or lead to no device, are halved.  Gives the problem and its
@@ -199,7 +204,9 @@ def _settle(
     return now, solve(now, start=values), before, [told]
 
 
-def _objective(problem: Problem, values: Values, scales: Values) -> float:
+def _objective(
+    problem: LeastSquaresProblem, values: FloatArray, scales: FloatArray
+) -> float:
     """What is minimised, at given scales of the errors."""
     total = float(np.sum(((values - problem.means) / problem.spreads) ** 2))
     for data, scale, (found, _) in zip(
@@ -211,15 +218,15 @@ def _objective(problem: Problem, values: Values, scales: Values) -> float:
 
 
 def _exact(
-    problem: Problem, solved: Callable[[Values], Emulator]
-) -> Callable[[Values], list[Values]]:
+    problem: LeastSquaresProblem, solved: Callable[[FloatArray], Emulator]
+) -> Callable[[FloatArray], list[FloatArray]]:
     """Predictions of all sets from a solution at the values."""
     return lambda values: [
         value for value, _ in _with_emulator(problem, solved(values)).predict(values)
     ]
 
 
-def _with_emulator(problem: Problem, emulator: Emulator) -> Problem:
+def _with_emulator(problem: LeastSquaresProblem, emulator: Emulator) -> LeastSquaresProblem:
     """Give the problem with areas and slopes of another emulator."""
     predictors = tuple(
         make_predictors((data,), emulator, problem.priors)[0]
@@ -227,14 +234,14 @@ def _with_emulator(problem: Problem, emulator: Emulator) -> Problem:
         else old
         for data, old in zip(problem.sets, problem.predictors, strict=True)
     )
-    return Problem(problem.priors, problem.sets, predictors)
+    return LeastSquaresProblem(problem.priors, problem.sets, predictors)
 
 
 def _sets(
-    problem: Problem,
-    found: Solution,
+    problem: LeastSquaresProblem,
+    found: FitSolution,
     before: Sequence[Prediction],
-    left: Sequence[Values],
+    left: Sequence[FloatArray],
 ) -> tuple[FittedSet, ...]:
     """Data beside what is predicted before and after."""
     after = problem.predict(found.values)

@@ -1,4 +1,4 @@
-"""The least-squares problem behind :mod:`bfsensor.fit.image_charge`."""
+"""The least-squares problem behind :mod:`bfsensor.fit.image_charge_fit`."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from scipy.optimize import least_squares
 
 from bfsensor.simulate.charge_field import ImageCharge
 from bfsensor.simulate.image_charge import area_changes
+from bfsensor.typing import FloatArray
 
 SHAPE = ("charge_height", "row_height", "column_height", "half_width_x", "half_width_y")
 """Always free: heights [um above the gates] and half sides [um]."""
@@ -31,15 +32,15 @@ _TOLERANCE, _MOST = 1e-7, 20
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class ImageChargeProblem:
     """Data and model.
 
     A vector holds the logarithm of the charge's height, the sealed heights, all above the plane,
     half sides, logarithm of the dipole, offset.
     """
 
-    given: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    given: FloatArray
+    sigma: FloatArray
     lags: NDArray[np.bool_]
     base: ImageCharge
     depth: float
@@ -50,7 +51,7 @@ class Problem:
         """Unit of the offset [1/e-]."""
         return float(np.abs(self.given[self.lags]).max())
 
-    def unpack(self, vector: NDArray[np.float64]) -> tuple[ImageCharge, float, float]:
+    def unpack(self, vector: FloatArray) -> tuple[ImageCharge, float, float]:
         """Model, strength and offset."""
         height, plane = float(np.exp(vector[0])), self.base.plane_height
         model = dataclasses.replace(
@@ -62,20 +63,18 @@ class Problem:
         strength = np.exp(scales["strength"]) / height if "strength" in scales else 1.0
         return model, float(strength), self.size * scales.get("offset", 0.0)
 
-    def predict(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    def predict(self, vector: FloatArray) -> FloatArray:
         """Model of all lags, (n, n) [1/e-]."""
         model, strength, offset = self.unpack(vector)
         reach = len(self.given) - 1
         a = area_changes(model, depth=self.depth, reach=reach)[reach:, reach:]
         return strength * a + offset
 
-    def pulls(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    def pulls(self, vector: FloatArray) -> FloatArray:
         """Predicted less given of the fitted lags, in errors."""
         return ((self.predict(vector) - self.given) / self.sigma)[self.lags]
 
-    def slopes(
-        self, vector: NDArray[np.float64], which: Sequence[int]
-    ) -> NDArray[np.float64]:
+    def slopes(self, vector: FloatArray, which: Sequence[int]) -> FloatArray:
         """Derivatives of the pulls by some entries of the vector."""
         columns = []
         for n in which:
@@ -91,7 +90,7 @@ class Problem:
                 columns.append((self.size / self.sigma)[self.lags])
         return np.array(columns).T
 
-    def bounds(self, height: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def bounds(self, height: float) -> tuple[FloatArray, FloatArray]:
         """Of all but the height of the charge."""
         sealed = height + np.array([_LOWEST, min(_HIGHEST, self.base.thickness / 3)])
         ends = {"strength": np.log([1e-4, 1e4]), "offset": np.array([-1.0, 1.0])}
@@ -102,7 +101,7 @@ class Problem:
             np.array([sealed[1], sealed[1], *half, *(m[1] for m in more)]),
         )
 
-    def at(self, height: float, start: NDArray[np.float64]) -> Any:
+    def at(self, height: float, start: FloatArray) -> Any:
         """Fit all but the height of the charge [um above the plane]."""
         first = [np.log(height)]
         low, high = self.bounds(height)
@@ -113,7 +112,7 @@ class Problem:
             x_scale="jac", ftol=_TOLERANCE, xtol=_TOLERANCE, gtol=None, max_nfev=_MOST,
         )  # fmt: skip
 
-    def profile(self) -> tuple[NDArray[np.float64], list[Any]]:
+    def profile(self) -> tuple[FloatArray, list[Any]]:
         """Best fits over heights of the charge, from the middle outwards until none fits."""
         heights = np.geomspace(0.05, min(6.0, self.base.thickness / 6), _HEIGHTS)
         middle = int(np.argmin(np.abs(heights - STARTS[0][0])))
@@ -134,9 +133,7 @@ class Problem:
         done = sorted(fits)
         return heights[done], [fits[n] for n in done]
 
-    def _carry(
-        self, rest: NDArray[np.float64], height: float, to: float
-    ) -> NDArray[np.float64]:
+    def _carry(self, rest: FloatArray, height: float, to: float) -> FloatArray:
         """Start at another height: what the next order after the dipole tells stays.
 
         z_q^2 - (a^2 + b^2) / 2 and a^2 - b^2 do.
@@ -145,7 +142,7 @@ class Problem:
         out[2:4] = np.sqrt(np.maximum(rest[2:4] ** 2 + to**2 - height**2, _LOWEST**2))
         return out
 
-    def _start(self, given: Sequence[float], height: float) -> NDArray[np.float64]:
+    def _start(self, given: Sequence[float], height: float) -> FloatArray:
         """Rest of a vector, as strong as the data."""
         rest = np.array([*given[1:], *(0.0 for _ in self.names[5:])])
         rest[:2] += height
@@ -156,8 +153,8 @@ class Problem:
 
 
 def parameter_slopes(
-    vector: NDArray[np.float64], names: Sequence[str], strength: float, size: float
-) -> NDArray[np.float64]:
+    vector: FloatArray, names: Sequence[str], strength: float, size: float
+) -> FloatArray:
     """Derivatives of the parameters (rows) by the fit's vector."""
     slopes = np.eye(len(vector))
     slopes[0, 0] = np.exp(vector[0])

@@ -7,10 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bfsensor.errors import ConvergenceError
-from bfsensor.fit.missed import (
+from bfsensor.fit.degeneracies import principal
+from bfsensor.fit.least_squares import FitSolution, LeastSquaresProblem
+from bfsensor.fit.posterior_draws import bent_about, sample_posterior, with_draws
+from bfsensor.fit.prediction_error import (
     DRAWS,
     Exact,
     Missed,
@@ -19,11 +21,7 @@ from bfsensor.fit.missed import (
     relative_errors,
     widen,
 )
-from bfsensor.fit.sampled import bent_about, sample_posterior, with_draws
-from bfsensor.fit.solve import Problem, Solution
-from bfsensor.fit.ties import principal
-
-Values = NDArray[np.float64]
+from bfsensor.typing import FloatArray
 
 STRAIGHT = 1e-3
 """Largest second derivative of predictions that count as straight [errors a squared spread]."""
@@ -41,7 +39,7 @@ class Posterior:
 
     Attributes
     ----------
-    solution : Solution
+    solution : FitSolution
         With the covariance about its values.
     left : tuple of ndarray
         What the posterior leaves open of each set's predictions.
@@ -53,16 +51,16 @@ class Posterior:
         Of the parameters [internal units], where predictions bend.
     """
 
-    solution: Solution
-    left: tuple[Values, ...]
+    solution: FitSolution
+    left: tuple[FloatArray, ...]
     record: dict[str, Any] = field(default_factory=dict)
     words: str = ""
-    draws: Values | None = None
+    draws: FloatArray | None = None
 
 
 def find_posterior(
-    problem: Problem,
-    found: Solution,
+    problem: LeastSquaresProblem,
+    found: FitSolution,
     exact: Exact | None,
     *,
     missed: Missed | None = None,
@@ -138,14 +136,16 @@ def find_posterior(
     return Posterior(found, left, record, f"{words}; they are those of the tangent")
 
 
-def _told(draws: Values) -> dict[str, Any]:
+def _told(draws: FloatArray) -> dict[str, Any]:
     """Means and central intervals."""
     return {"draws": len(draws), "mean": np.mean(draws, axis=0).tolist()} | _intervals(
         draws
     )
 
 
-def _combined(problem: Problem, found: Solution, draws: Values) -> dict[str, Any]:
+def _combined(
+    problem: LeastSquaresProblem, found: FitSolution, draws: FloatArray
+) -> dict[str, Any]:
     """Means and intervals of independent combinations, as far from where the fit ends.
 
     In units of the priors, the best known first.  Where the best known direction turns from place to
@@ -158,7 +158,7 @@ def _combined(problem: Problem, found: Solution, draws: Values) -> dict[str, Any
     return {"mean": np.mean(off, axis=0).tolist()} | _intervals(off)
 
 
-def _intervals(draws: Values) -> dict[str, Any]:
+def _intervals(draws: FloatArray) -> dict[str, Any]:
     out = {}
     for name, share in SHARES.items():
         ends = np.quantile(draws, [(1 - share) / 2, (1 + share) / 2], axis=0)
@@ -166,7 +166,9 @@ def _intervals(draws: Values) -> dict[str, Any]:
     return out
 
 
-def _left(problem: Problem, found: Solution, draws: Values) -> tuple[Values, ...]:
+def _left(
+    problem: LeastSquaresProblem, found: FitSolution, draws: FloatArray
+) -> tuple[FloatArray, ...]:
     """Scatter of predictions over draws about those of the solution."""
     best = [value for value, _ in problem.predict(found.values)]
     some = draws[:: max(len(draws) // PREDICTED, 1)]

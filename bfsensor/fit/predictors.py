@@ -8,17 +8,18 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor.device.quantities import Prior
 from bfsensor.errors import FitError
 from bfsensor.fit.data import DataSet
-from bfsensor.fit.quantities import Prior
 from bfsensor.fit.spot_response import slope_weights
-from bfsensor.recording.exposures import Condition
+from bfsensor.recording.campaign.exposures import Condition
+from bfsensor.typing import FloatArray
 
-Prediction = tuple[NDArray[np.float64], NDArray[np.float64]]
+Prediction = tuple[FloatArray, FloatArray]
 """Values, shape (n,), and their derivatives by all parameters, shape (n, p)."""
 
 
-class Response(Protocol):
+class PredictedEdges(Protocol):
     """Response of a flat at one condition.
 
     ``kx``, ``ky``: mean shifts of right and upper edges [pixel/e-], odd sides, (0, 0) in the
@@ -27,27 +28,27 @@ class Response(Protocol):
     """
 
     @property
-    def kx(self) -> NDArray[np.float64]:
+    def kx(self) -> FloatArray:
         """Of right edges."""
 
     @property
-    def ky(self) -> NDArray[np.float64]:
+    def ky(self) -> FloatArray:
         """Of upper edges."""
 
     @property
-    def dkx(self) -> NDArray[np.float64]:
+    def dkx(self) -> FloatArray:
         """By parameter."""
 
     @property
-    def dky(self) -> NDArray[np.float64]:
+    def dky(self) -> FloatArray:
         """By parameter."""
 
     @property
-    def areas(self) -> NDArray[np.float64]:
+    def areas(self) -> FloatArray:
         """By lag."""
 
     @property
-    def jacobian(self) -> NDArray[np.float64]:
+    def jacobian(self) -> FloatArray:
         """By parameter and lag."""
 
 
@@ -58,14 +59,14 @@ class Emulator(Protocol):
     def parameters(self) -> Sequence[str]:
         """Dotted names."""
 
-    def predict(self, values: NDArray[np.float64], condition: Condition) -> Response:
+    def predict(self, values: FloatArray, condition: Condition) -> PredictedEdges:
         """Response at parameters [internal units] and a condition."""
 
 
-class Predictor(Protocol):
+class DataPredictor(Protocol):
     """Prediction of one data set."""
 
-    def __call__(self, values: NDArray[np.float64]) -> Prediction:
+    def __call__(self, values: FloatArray) -> Prediction:
         """Predict at the values of all free parameters [internal units], shape (p,)."""
 
 
@@ -96,8 +97,8 @@ class _Responses:
         self._means = np.array([priors[k].mean for k in self._at])
 
     def predict(
-        self, values: NDArray[np.float64], condition: Condition
-    ) -> tuple[Response, NDArray[np.int64]]:
+        self, values: FloatArray, condition: Condition
+    ) -> tuple[PredictedEdges, NDArray[np.int64]]:
         """Response, and the fit's parameters that the jacobian's rows are of, -1 where held."""
         stated = held(self._names, condition)
         own = np.where(stated, self._means, values[self._at])
@@ -111,7 +112,7 @@ class AreaPredictor:
         self._data, self._responses = data, _Responses(emulator, priors)
         self._groups = _by_condition(data)
 
-    def __call__(self, values: NDArray[np.float64]) -> Prediction:
+    def __call__(self, values: FloatArray) -> Prediction:
         """Predict."""
         i, j = self._data.places.T
         found = np.zeros(len(i))
@@ -138,7 +139,7 @@ class SlopePredictor:
         self._groups = _by_condition(data)
         self._weights = slope_weights(data.sigma)
 
-    def __call__(self, values: NDArray[np.float64]) -> Prediction:
+    def __call__(self, values: FloatArray) -> Prediction:
         """Predict."""
         axes = self._data.places[:, 0]
         found = np.zeros(len(axes))
@@ -157,13 +158,13 @@ class TangentPredictor:
 
     def __init__(
         self,
-        middle: NDArray[np.float64],
-        values: NDArray[np.float64],
-        derivatives: NDArray[np.float64],
+        middle: FloatArray,
+        values: FloatArray,
+        derivatives: FloatArray,
     ) -> None:
         self._middle, self._values, self._slopes = middle, values, derivatives
 
-    def __call__(self, values: NDArray[np.float64]) -> Prediction:
+    def __call__(self, values: FloatArray) -> Prediction:
         """Predict."""
         return self._values + self._slopes @ (values - self._middle), self._slopes
 
@@ -178,7 +179,7 @@ def make_predictors(
     tangents: Mapping[str, Tangents] | None = None,
     *,
     late: bool = False,
-) -> tuple[Predictor, ...]:
+) -> tuple[DataPredictor, ...]:
     """Make what predicts each data set.
 
     Parameters
@@ -200,7 +201,7 @@ def make_predictors(
     FitError
         A kind for which nothing predicts.
     """
-    out: list[Predictor] = []
+    out: list[DataPredictor] = []
     for data in sets:
         if data.kind in ("areas", "slopes"):
             if emulator is None and late:
@@ -217,7 +218,7 @@ def make_predictors(
     return tuple(out)
 
 
-def _open(values: NDArray[np.float64]) -> Prediction:
+def _open(values: FloatArray) -> Prediction:
     raise FitError("predicted before the device was solved")
 
 

@@ -13,19 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.device import Device
+from bfsensor.device.device import Device
+from bfsensor.device.quantities import DIFFUSION, Quantity, describe, quantities
 from bfsensor.errors import FitError
 from bfsensor.files import written_whole
-from bfsensor.fit.profiles import LEVELS, profile_bounds
-from bfsensor.fit.quantities import DIFFUSION, Quantity, describe, quantities
-from bfsensor.fit.ties import name_combination
+from bfsensor.fit.degeneracies import name_combination
+from bfsensor.inference.profile_bounds import LEVELS, profile_bounds
+from bfsensor.typing import FloatArray
 
 SCHEMA = "bfsensor device fit 1"
 
 WELL_KNOWN = 0.5
 """Posterior over prior width below which a combination is told on the terminal."""
-
-Values = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +62,11 @@ class FittedSet:
     fitted: bool
     labels: tuple[str, ...]
     places: NDArray[np.int64]
-    values: Values
-    errors: Values
-    before: Values
-    after: Values
-    after_error: Values
+    values: FloatArray
+    errors: FloatArray
+    before: FloatArray
+    after: FloatArray
+    after_error: FloatArray
     chi2: float
     chi2_before: float
     scale: float
@@ -75,7 +74,7 @@ class FittedSet:
     determined: float
 
     @property
-    def pulls(self) -> Values:
+    def pulls(self) -> FloatArray:
         """Predicted less measured, in scaled errors.
 
         Of numbers that were not fitted with the prediction's error besides.
@@ -111,7 +110,7 @@ class FitResult:
     ties, silent : tuple of str
         What the data cannot tell apart, and on what they are silent.
     profiles : mapping of str to (ndarray, ndarray)
-        Values and rise of the minimum, for those asked for.
+        FloatArray and rise of the minimum, for those asked for.
     notes : tuple of str
         Assumptions and limits.
     mesh : mapping
@@ -127,27 +126,27 @@ class FitResult:
     device: str
     fitted_device: str
     parameters: tuple[str, ...]
-    prior: Values
-    spread: Values
-    value: Values
-    covariance: Values
+    prior: FloatArray
+    spread: FloatArray
+    value: FloatArray
+    covariance: FloatArray
     sets: tuple[FittedSet, ...]
-    remains: Values
-    weights: Values
+    remains: FloatArray
+    weights: FloatArray
     ties: tuple[str, ...] = ()
     silent: tuple[str, ...] = ()
-    profiles: Mapping[str, tuple[Values, Values]] = field(default_factory=dict)
+    profiles: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     mesh: Mapping[str, Any] = field(default_factory=dict)
     posterior: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def error(self) -> Values:
+    def error(self) -> FloatArray:
         """Posterior errors of the parameters, others free [internal units]."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
-    def pulls(self) -> Values:
+    def pulls(self) -> FloatArray:
         """Shift of each parameter from its prior, in spreads of the prior."""
         return np.asarray((self.value - self.prior) / self.spread)
 

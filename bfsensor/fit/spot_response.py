@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from bfsensor.errors import FitError
+from bfsensor.typing import FloatArray
 
 UNIT_PEAK = 50_000.0
 """Electrons in the central pixel for which slopes are given."""
@@ -42,12 +43,10 @@ class SlopeWeights(NamedTuple):
     50,000 e- in the central pixel.
     """
 
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
+    x: FloatArray
+    y: FloatArray
 
-    def slopes(
-        self, kx: NDArray[np.float64], ky: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def slopes(self, kx: FloatArray, ky: FloatArray) -> FloatArray:
         """Slopes in x and y [%] of shifts [pixel/e-], shape (..., n, n) each."""
         half = self.x.shape[-1] // 2
         there = kx.shape[-1] // 2
@@ -96,7 +95,7 @@ def slope_weights(
         raise FitError(f"sigma = {sigma:g} pixels of spots must be from 0.3 to 3")
     side = STAMP + 2 * reach
     places = (np.arange(phases) + 0.5) / phases - 0.5
-    lines = [_Line(side, place, sigma) for place in places]
+    lines = [_WidthLine(side, place, sigma) for place in places]
     spots = [(one, other) for one in lines for other in lines]
     columns = [_fit_columns(x, y, reach, background) for x, y in spots]
     both = sum(wide.T @ wide for wide in columns)
@@ -120,7 +119,7 @@ def slope_weights(
     return SlopeWeights(weights[0], weights[1])
 
 
-class _Line:
+class _WidthLine:
     """A Gaussian along one axis: in each pixel, at each far edge, and its derivatives."""
 
     def __init__(self, side: int, place: float, sigma: float) -> None:
@@ -132,11 +131,11 @@ class _Line:
         self.by_width = -np.diff(t * density)
 
 
-def _fit_columns(x: _Line, y: _Line, reach: int, background: bool) -> NDArray[np.float64]:
+def _fit_columns(x: _WidthLine, y: _WidthLine, reach: int, background: bool) -> FloatArray:
     """Change of a spot's stamp with both widths, less what its own parameters take of it."""
     inner = slice(reach, len(x.pixels) - reach)
 
-    def plane(along_y: NDArray[np.float64], along_x: NDArray[np.float64]) -> NDArray:
+    def plane(along_y: FloatArray, along_x: FloatArray) -> NDArray:
         return np.outer(along_y[inner], along_x[inner]).ravel()
 
     own = [
@@ -149,9 +148,7 @@ def _fit_columns(x: _Line, y: _Line, reach: int, background: bool) -> NDArray[np
     return np.asarray(wide - basis @ (basis.T @ wide))
 
 
-def _correlate(
-    over: NDArray[np.float64], light: NDArray[np.float64], reach: int
-) -> NDArray[np.float64]:
+def _correlate(over: FloatArray, light: FloatArray, reach: int) -> FloatArray:
     """Sum over pixels of ``over[p] light[p - d]`` for all offsets d to the reach."""
     spectrum = np.fft.rfft2(over) * np.conj(np.fft.rfft2(light))
     whole = np.fft.irfft2(spectrum, s=light.shape)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from bfsensor.errors import MeasurementError
+from bfsensor.typing import FloatArray
 
 
-def to_floats(values: ArrayLike, name: str) -> NDArray[np.float64]:
+def to_floats(values: ArrayLike, name: str) -> FloatArray:
     """Give a new array of floats, nan where a masked array hides what it holds.
 
     Parameters

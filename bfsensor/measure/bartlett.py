@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from bfsensor.typing import FloatArray
 
 
-def image_weights(lags: int) -> NDArray[np.float64]:
+def image_weights(lags: int) -> FloatArray:
     """How many lags of the whole plane each lag of the quadrant stands for: 1, 2 or 4.
 
     Parameters
@@ -28,7 +30,7 @@ def image_weights(lags: int) -> NDArray[np.float64]:
     return np.asarray(once[:, None] * once[None])
 
 
-def unfold(quadrant: ArrayLike, reach: int | None = None) -> NDArray[np.float64]:
+def unfold(quadrant: ArrayLike, reach: int | None = None) -> FloatArray:
     """Mirror a quadrant [j, i] to the plane of lags -reach..reach, zero beyond it.
 
     Parameters
@@ -50,7 +52,7 @@ def unfold(quadrant: ArrayLike, reach: int | None = None) -> NDArray[np.float64]
     return np.pad(plane, [(0, 0)] * (q.ndim - 2) + [(more, more)] * 2)
 
 
-def bartlett_matrix(covariances: ArrayLike, pairs: ArrayLike) -> NDArray[np.float64]:
+def bartlett_matrix(covariances: ArrayLike, pairs: ArrayLike) -> FloatArray:
     r"""Covariance matrix of covariances measured on a Gaussian field.
 
     For the sum over N pairs, summed over all lags m of the plane,

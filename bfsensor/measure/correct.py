@@ -12,11 +12,12 @@ for every edge.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.signal import fftconvolve
 
 from bfsensor.errors import ConvergenceError, MeasurementError
 from bfsensor.measure.arrays import to_floats
+from bfsensor.typing import FloatArray
 
 
 def correct_kernel(
@@ -26,7 +27,7 @@ def correct_kernel(
     conserving: bool = True,
     threshold: float = 10.0,
     iterations: int = 20,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     r"""Correct an image with a scalar kernel.
 
     .. math::
@@ -108,9 +109,7 @@ def correct_kernel(
     )
 
 
-def correct_edges(
-    image: ArrayLike, north: ArrayLike, east: ArrayLike
-) -> NDArray[np.float64]:
+def correct_edges(image: ArrayLike, north: ArrayLike, east: ArrayLike) -> FloatArray:
     r"""Correct an image with the shifts of pixel edges.
 
     With :math:`s` the shift that the charge at the end gives the edge between pixels 1 and 2,
@@ -172,7 +171,7 @@ def correct_edges(
     return given - _gains(moved_y, moved_x, given.shape)
 
 
-def _image(image: ArrayLike) -> NDArray[np.float64]:
+def _image(image: ArrayLike) -> FloatArray:
     """Check an image."""
     array = to_floats(image, "image")
     if array.ndim != 2 or min(array.shape) < 2:
@@ -188,7 +187,7 @@ def _image(image: ArrayLike) -> NDArray[np.float64]:
     return array
 
 
-def _shifts(image: NDArray[np.float64], upper: NDArray[np.float64]) -> NDArray[np.float64]:
+def _shifts(image: FloatArray, upper: FloatArray) -> FloatArray:
     """Shifts [pixel] of the edges between the rows of an image, (ny - 1, nx)."""
     n = len(upper)
     half = np.concatenate([upper[:, :0:-1], upper], axis=1)
@@ -198,9 +197,7 @@ def _shifts(image: NDArray[np.float64], upper: NDArray[np.float64]) -> NDArray[n
     return np.asarray(fftconvolve(padded, whole, mode="valid")[1:-1])
 
 
-def _gains(
-    up: NDArray[np.float64], right: NDArray[np.float64], shape: tuple[int, ...]
-) -> NDArray[np.float64]:
+def _gains(up: FloatArray, right: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     """What pixels gain where the lower, left one of two gains what the other loses."""
     gain = np.zeros(shape)
     gain[:-1] += up
@@ -210,9 +207,7 @@ def _gains(
     return gain
 
 
-def _move_conserving(
-    charge: NDArray[np.float64], potential: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _move_conserving(charge: FloatArray, potential: FloatArray) -> FloatArray:
     """Half the divergence of F grad(potential), by what crosses the edges."""
     inner = potential[1:-1, 1:-1]
     up = 0.25 * (charge[1:] + charge[:-1]) * (inner[1:] - inner[:-1])
@@ -220,9 +215,7 @@ def _move_conserving(
     return _gains(up, right, charge.shape)
 
 
-def _move_expanded(
-    charge: NDArray[np.float64], potential: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _move_expanded(charge: FloatArray, potential: FloatArray) -> FloatArray:
     """Half of grad F grad(potential) + F Laplacian(potential), by central differences."""
     f, p = np.pad(charge, 1, mode="edge"), potential
     along_y = (f[2:, 1:-1] - f[:-2, 1:-1]) * (p[2:, 1:-1] - p[:-2, 1:-1])

@@ -13,9 +13,15 @@ from scipy.stats import chi2 as chi2_distribution
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.bartlett import image_weights
 from bfsensor.measure.covariance_model import expand
-from bfsensor.measure.covariance_solver import Solution, find_turnoff, solve, start_values
+from bfsensor.measure.covariance_solver import (
+    CovarianceSolution,
+    find_turnoff,
+    solve,
+    start_values,
+)
 from bfsensor.measure.curve import CovarianceCurve
 from bfsensor.measure.ecsv import read_ecsv, same_fields, square_lags, write_ecsv
+from bfsensor.typing import FloatArray
 
 SCHEMA = "bfsensor covariance fit"
 _MATRICES = ("a", "c", "noise")
@@ -54,11 +60,11 @@ class CovarianceFit:
         As in the curve.
     """
 
-    a: NDArray[np.float64]
-    c: NDArray[np.float64]
-    noise: NDArray[np.float64]
+    a: FloatArray
+    c: FloatArray
+    noise: FloatArray
     gain: float
-    matrix: NDArray[np.float64]
+    matrix: FloatArray
     held: tuple[str, ...]
     chi2: float
     dof: int
@@ -74,23 +80,23 @@ class CovarianceFit:
 
     __hash__ = None  # type: ignore[assignment]
 
-    def _errors(self, which: int) -> NDArray[np.float64]:
+    def _errors(self, which: int) -> FloatArray:
         n = self.a.size
         variance = np.diag(self.matrix)[which * n : (which + 1) * n]
         return np.asarray(np.sqrt(variance).reshape(self.a.shape))
 
     @property
-    def a_errors(self) -> NDArray[np.float64]:
+    def a_errors(self) -> FloatArray:
         """Errors of a [1/e-]."""
         return self._errors(0)
 
     @property
-    def c_errors(self) -> NDArray[np.float64]:
+    def c_errors(self) -> FloatArray:
         """Errors of c [1/e-^2], zero where it was held."""
         return self._errors(1)
 
     @property
-    def noise_errors(self) -> NDArray[np.float64]:
+    def noise_errors(self) -> FloatArray:
         """Errors of the noise [e-^2]."""
         return self._errors(2)
 
@@ -100,7 +106,7 @@ class CovarianceFit:
         return float(np.sqrt(self.matrix[-1, -1]))
 
     @property
-    def b(self) -> NDArray[np.float64]:
+    def b(self) -> FloatArray:
         """Growth c / a of a with the level [1/e-]; means little where a is within its error of zero."""
         return np.asarray(
             np.divide(self.c, self.a, out=np.zeros_like(self.a), where=self.a != 0)
@@ -123,7 +129,7 @@ class CovarianceFit:
         """Chance of a chi-square as large."""
         return float(chi2_distribution.sf(self.chi2, self.dof))
 
-    def model(self, levels: ArrayLike) -> NDArray[np.float64]:
+    def model(self, levels: ArrayLike) -> FloatArray:
         """Fitted covariances [unit^2] at levels [unit], shape (n, lags + 1, lags + 1)."""
         m = self.gain * np.atleast_1d(np.asarray(levels, float))
         return (expand(self.a, self.c, self.powers).at(m) + self.noise) / self.gain**2
@@ -270,7 +276,7 @@ def fit_covariances(
 def _fit_without_outliers(
     curve: CovarianceCurve, inside: NDArray[np.intp], *, gain: float | None,
     constant_a: bool, powers: int, chance: float,
-) -> tuple[NDArray[np.intp], Solution]:  # fmt: skip
+) -> tuple[NDArray[np.intp], CovarianceSolution]:  # fmt: skip
     """Fit, drop the pairs that do not belong, until none is left to drop."""
     n = (curve.lags + 1) ** 2
     limit = chi2_distribution.isf(chance / len(inside), n)

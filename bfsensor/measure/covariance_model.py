@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.bartlett import unfold
+from bfsensor.typing import FloatArray
 
 
 def model_covariances(
@@ -19,7 +20,7 @@ def model_covariances(
     noise: ArrayLike | None = None,
     gain: float = 1.0,
     powers: int = 8,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     r"""Covariances at given levels, Astier et al. (2019), equation 20.
 
     With m the level in electrons, c = a b, and \* the convolution over the whole plane,
@@ -91,22 +92,20 @@ class Series:
     derivatives by a and c at the lag M, lags flattened.
     """
 
-    value: NDArray[np.float64]
-    by_a: NDArray[np.float64]
-    by_c: NDArray[np.float64]
+    value: FloatArray
+    by_a: FloatArray
+    by_c: FloatArray
 
-    def at(self, m: NDArray[np.float64]) -> NDArray[np.float64]:
+    def at(self, m: FloatArray) -> FloatArray:
         """Sum at levels m [e-], shape (n, lags + 1, lags + 1)."""
         return np.asarray(np.tensordot(self.monomials(m), self.value, 1))
 
-    def monomials(self, m: NDArray[np.float64]) -> NDArray[np.float64]:
+    def monomials(self, m: FloatArray) -> FloatArray:
         """Powers of the levels, shape (n, powers)."""
         return np.asarray(m[:, None] ** np.arange(1, len(self.value) + 1))
 
 
-def expand(
-    a: NDArray[np.float64], c: NDArray[np.float64], powers: int, *, slopes: bool = False
-) -> Series:
+def expand(a: FloatArray, c: FloatArray, powers: int, *, slopes: bool = False) -> Series:
     """Coefficients of the series for a [1/e-] and c [1/e-^2] with the given lags.
 
     From dC/dm = 1 + 2 (a + c m) C, power by power in Fourier space:
@@ -135,7 +134,7 @@ def expand(
     return Series(value[:, side, side], _spread(by_a, lags), _spread(by_c, lags))
 
 
-def _spread(response: NDArray[np.float64], lags: int) -> NDArray[np.float64]:
+def _spread(response: FloatArray, lags: int) -> FloatArray:
     """Change at lag L by a unit at the lag M and its mirror images: (powers, L, M)."""
     j, i = (index.ravel() for index in np.indices((lags + 1, lags + 1)))
     total = np.zeros((len(response), len(j), len(j)))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.stats import chi2 as chi2_distribution
 
@@ -13,39 +12,40 @@ from bfsensor.errors import ConvergenceError, MeasurementError
 from bfsensor.measure.bartlett import bartlett_matrix
 from bfsensor.measure.covariance_model import Series, expand
 from bfsensor.measure.curve import CovarianceCurve
+from bfsensor.typing import FloatArray
 
 REJECT = 1e-4
 """Chance at which a pair counts as not predicted by those below it."""
 
 
 @dataclass(frozen=True)
-class Solution:
+class CovarianceSolution:
     """Parameters, their covariance matrix and the chi-square of each pair.
 
     ``matrix`` is that of a, c, noise (flattened) and gain, with zero rows for held ones.
     """
 
-    a: NDArray[np.float64]
-    c: NDArray[np.float64]
-    noise: NDArray[np.float64]
+    a: FloatArray
+    c: FloatArray
+    noise: FloatArray
     gain: float
-    matrix: NDArray[np.float64]
-    chi2: NDArray[np.float64]
+    matrix: FloatArray
+    chi2: FloatArray
 
     @property
-    def parameters(self) -> NDArray[np.float64]:
+    def parameters(self) -> FloatArray:
         """All parameters in the order of the matrix."""
         return np.concatenate(
             [self.a.ravel(), self.c.ravel(), self.noise.ravel(), [self.gain]]
         )
 
 
-def start_values(curve: CovarianceCurve, gain: float | None = None) -> Solution:
+def start_values(curve: CovarianceCurve, gain: float | None = None) -> CovarianceSolution:
     """Start from a robust parabola of the variance, and from C_ij against level squared."""
     mu, c, error = curve.levels, curve.covariances, curve.errors
     top = mu.max()
 
-    def residual(p: NDArray[np.float64]) -> NDArray[np.float64]:
+    def residual(p: FloatArray) -> FloatArray:
         line = p[0] + p[1] * (mu / top) + p[2] * (mu / top) ** 2
         return np.asarray((c[:, 0, 0] - top * line) / error[:, 0, 0])
 
@@ -71,26 +71,28 @@ def start_values(curve: CovarianceCurve, gain: float | None = None) -> Solution:
     a[0, 0] = parabola.x[2] / top
     noise[0, 0] = parabola.x[0] * top * g**2
     n = a.size
-    return Solution(a, np.zeros_like(a), noise, g, np.zeros((3 * n + 1,) * 2), np.empty(0))
+    return CovarianceSolution(
+        a, np.zeros_like(a), noise, g, np.zeros((3 * n + 1,) * 2), np.empty(0)
+    )
 
 
 def solve(
     curve: CovarianceCurve,
-    start: Solution,
+    start: CovarianceSolution,
     *,
     free_gain: bool,
     free_c: bool,
     powers: int,
     bound: float | None = None,
-    prior: NDArray[np.float64] | None = None,
-) -> Solution:
+    prior: FloatArray | None = None,
+) -> CovarianceSolution:
     """Fit by damped Gauss-Newton, each pair with the inverse of its full error matrix.
 
     Parameters
     ----------
     curve : CovarianceCurve
         Pairs to fit, all of them.
-    start : Solution
+    start : CovarianceSolution
         Where to start; gives what is held.
     free_gain, free_c : bool
         Whether gain and c are fitted.
@@ -161,14 +163,14 @@ _UNFIXED = "the levels do not fix the model's parameters: too few, or all alike"
 
 
 def _chi_squares(
-    curve: CovarianceCurve, model: NDArray[np.float64], inverse: NDArray[np.float64]
-) -> NDArray[np.float64]:
+    curve: CovarianceCurve, model: FloatArray, inverse: FloatArray
+) -> FloatArray:
     """Chi-square of each pair."""
     residual = curve.covariances.reshape(len(curve), -1) - model
     return np.asarray(np.einsum("pi,pij,pj->p", residual, inverse, residual))
 
 
-def _bounded(each: NDArray[np.float64], bound: float | None) -> float:
+def _bounded(each: FloatArray, bound: float | None) -> float:
     """Sum of chi-squares, growing as their root only above the bound."""
     if bound is None:
         return float(each.sum())
@@ -177,17 +179,17 @@ def _bounded(each: NDArray[np.float64], bound: float | None) -> float:
 
 
 def _solution(
-    parameters: NDArray[np.float64], matrix: NDArray[np.float64],
-    each: NDArray[np.float64], shape: tuple[int, ...],
-) -> Solution:  # fmt: skip
+    parameters: FloatArray, matrix: FloatArray,
+    each: FloatArray, shape: tuple[int, ...],
+) -> CovarianceSolution:  # fmt: skip
     a, c, noise = (x.reshape(shape) for x in np.split(parameters[:-1], 3))
-    return Solution(a, c, noise, float(parameters[-1]), matrix, each)
+    return CovarianceSolution(a, c, noise, float(parameters[-1]), matrix, each)
 
 
 def _evaluate(
-    levels: NDArray[np.float64], parameters: NDArray[np.float64], powers: int,
+    levels: FloatArray, parameters: FloatArray, powers: int,
     *, slopes: bool,
-) -> tuple[Series, NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+) -> tuple[Series, FloatArray, FloatArray]:  # fmt: skip
     """Series, powers of the levels [e-], and covariances [unit^2] with lags flattened."""
     side = round(((len(parameters) - 1) / 3) ** 0.5)
     found = _solution(parameters, np.empty(0), np.empty(0), (side, side))
@@ -198,8 +200,8 @@ def _evaluate(
 
 
 def _inverse_errors(
-    curve: CovarianceCurve, parameters: NDArray[np.float64], powers: int
-) -> NDArray[np.float64]:
+    curve: CovarianceCurve, parameters: FloatArray, powers: int
+) -> FloatArray:
     """Inverse of Bartlett's matrix of the modelled covariances, for each pair."""
     *_, model = _evaluate(curve.levels, parameters, powers, slopes=False)
     shape = curve.covariances.shape[1:]
@@ -212,9 +214,9 @@ def _inverse_errors(
 
 
 def _jacobian(
-    series: Series, monomials: NDArray[np.float64], model: NDArray[np.float64],
+    series: Series, monomials: FloatArray, model: FloatArray,
     level: float, gain: float,
-) -> NDArray[np.float64]:  # fmt: skip
+) -> FloatArray:  # fmt: skip
     """Derivatives of the covariances at one level by all parameters."""
     n = len(model)
     out = np.empty((n, 3 * n + 1))
@@ -227,9 +229,9 @@ def _jacobian(
 
 
 def _normal_equations(
-    curve: CovarianceCurve, parameters: NDArray[np.float64],
-    inverse: NDArray[np.float64], powers: int, bound: float | None,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:  # fmt: skip
+    curve: CovarianceCurve, parameters: FloatArray,
+    inverse: FloatArray, powers: int, bound: float | None,
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
     """Normal matrix, right-hand side, and chi-square of each pair."""
     series, monomials, model = _evaluate(curve.levels, parameters, powers, slopes=True)
     residual = curve.covariances.reshape(len(curve), -1) - model

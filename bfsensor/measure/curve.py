@@ -14,7 +14,8 @@ from scipy.stats import chi2 as chi2_distribution
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.bartlett import bartlett_matrix
 from bfsensor.measure.ecsv import read_ecsv, same_fields, square_lags, write_ecsv
-from bfsensor.measure.flats import UNITS, FlatCovariances, flat_covariances
+from bfsensor.measure.flat_pairs import UNITS, FlatCovariances, flat_covariances
+from bfsensor.typing import FloatArray
 
 SCHEMA = "bfsensor covariance curve"
 SCHEMA_SLOPES = "bfsensor correlation slopes"
@@ -46,9 +47,9 @@ class CovarianceCurve:
     array([ 5000., 10000.])
     """
 
-    levels: NDArray[np.float64]
-    covariances: NDArray[np.float64]
-    errors: NDArray[np.float64]
+    levels: FloatArray
+    covariances: FloatArray
+    errors: FloatArray
     pairs: NDArray[np.int64]
     unit: str = "electron"
     region: str = ""
@@ -200,10 +201,10 @@ def measure_curve(
     Parameters
     ----------
     pairs : iterable of (first, second)
-        Each as :func:`~bfsensor.measure.flats.flat_covariances` takes them; read one by
+        Each as :func:`~bfsensor.measure.flat_pairs.flat_covariances` takes them; read one by
         one, so a generator needs the memory of one pair.
     **options
-        Of :func:`~bfsensor.measure.flats.flat_covariances`.
+        Of :func:`~bfsensor.measure.flat_pairs.flat_covariances`.
 
     Returns
     -------
@@ -245,11 +246,11 @@ class CorrelationSlopes:
         As in the curve.
     """
 
-    slopes: NDArray[np.float64]
-    slope_errors: NDArray[np.float64]
-    intercepts: NDArray[np.float64]
-    intercept_errors: NDArray[np.float64]
-    chi2: NDArray[np.float64]
+    slopes: FloatArray
+    slope_errors: FloatArray
+    intercepts: FloatArray
+    intercept_errors: FloatArray
+    chi2: FloatArray
     dof: int
     level_range: tuple[float, float]
     unit: str = "electron"
@@ -260,7 +261,7 @@ class CorrelationSlopes:
 
     __hash__ = None  # type: ignore[assignment]
 
-    def correlations_at(self, level: float) -> tuple[NDArray[np.float64], ...]:
+    def correlations_at(self, level: float) -> tuple[FloatArray, ...]:
         """Give the correlations at a level with their zero-level part taken off, and errors.
 
         The paper quotes them at 80,000 electrons and calls them covariances.
@@ -268,7 +269,7 @@ class CorrelationSlopes:
         return self.slopes * level, self.slope_errors * level
 
     @property
-    def p_values(self) -> NDArray[np.float64]:
+    def p_values(self) -> FloatArray:
         """Chance of a chi-square as large, for each lag; small where a line does not fit."""
         return np.asarray(chi2_distribution.sf(self.chi2, self.dof))
 

@@ -9,12 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.arrays import to_floats
 from bfsensor.measure.spot_fit import fit_spots
 from bfsensor.measure.spots import Stamps
+from bfsensor.typing import FloatArray
 
 UNIT = 50_000.0
 """Electrons in the peak for which slopes are given [e-]."""
@@ -39,12 +40,12 @@ class Growth:
         How many were measured.
     """
 
-    peak: NDArray[np.float64]
-    sigma: NDArray[np.float64] = field(repr=False)
-    growth: NDArray[np.float64]
-    growth_error: NDArray[np.float64] = field(repr=False)
-    slope: NDArray[np.float64]
-    slope_error: NDArray[np.float64]
+    peak: FloatArray
+    sigma: FloatArray = field(repr=False)
+    growth: FloatArray
+    growth_error: FloatArray = field(repr=False)
+    slope: FloatArray
+    slope_error: FloatArray
     spots: int
 
 
@@ -114,7 +115,7 @@ def measure_growth(
     slopes = np.array([p[3] for p in parts])
     factor = (spots - 1) / spots
 
-    def error(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def error(values: FloatArray) -> FloatArray:
         return np.sqrt(factor * np.sum((values - values.mean(0)) ** 2, axis=0))
 
     return Growth(
@@ -123,9 +124,7 @@ def measure_growth(
     )  # fmt: skip
 
 
-def _measure(
-    on: NDArray[np.float64], off: NDArray[np.float64], weights: str
-) -> tuple[NDArray[np.float64], ...]:
+def _measure(on: FloatArray, off: FloatArray, weights: str) -> tuple[FloatArray, ...]:
     """Peak, width, growth by level, and slope of the growth."""
     peak, sigma, growth = [], [], []
     for level in range(on.shape[1]):

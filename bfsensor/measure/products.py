@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.stats import norm
 
+from bfsensor.typing import FloatArray
+
 
 def box_edges(shape: tuple[int, ...], box: int | None) -> list[NDArray[np.int64]]:
     """Edges of boxes of nearly equal size in y and x, the last included."""
@@ -19,15 +21,15 @@ def box_edges(shape: tuple[int, ...], box: int | None) -> list[NDArray[np.int64]
     ]
 
 
-def sum_boxes(image: NDArray[Any], edges: list[NDArray[np.int64]]) -> NDArray[np.float64]:
+def sum_boxes(image: NDArray[Any], edges: list[NDArray[np.int64]]) -> FloatArray:
     """Sum within each box."""
     rows = np.add.reduceat(image, edges[0][:-1], axis=0, dtype=float)
     return np.asarray(np.add.reduceat(rows, edges[1][:-1], axis=1))
 
 
 def subtract_box_means(
-    image: NDArray[np.float64], good: NDArray[np.bool_], edges: list[NDArray[np.int64]]
-) -> NDArray[np.float64]:
+    image: FloatArray, good: NDArray[np.bool_], edges: list[NDArray[np.int64]]
+) -> FloatArray:
     """Subtract each box's mean over its good pixels; bad pixels become zero."""
     count = sum_boxes(good, edges)
     mean = sum_boxes(np.where(good, image, 0.0), edges) / np.maximum(count, 1.0)
@@ -36,8 +38,8 @@ def subtract_box_means(
 
 
 def sum_products(
-    d: NDArray[np.float64], good: NDArray[np.bool_], lags: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    d: FloatArray, good: NDArray[np.bool_], lags: int
+) -> tuple[FloatArray, NDArray[np.int64]]:
     """Sums of products and numbers of pairs, [sign of j, j, i]."""
     # Padding keeps the far sides apart.
     shape = [next_fast_len(n + lags, real=True) for n in d.shape]
@@ -50,7 +52,7 @@ def sum_products(
     return out[0], np.rint(out[1]).astype(np.int64)
 
 
-def undo_clipping(raw: NDArray[np.float64], clip: float) -> NDArray[np.float64]:
+def undo_clipping(raw: FloatArray, clip: float) -> FloatArray:
     """Put back what clipping takes from a Gaussian.
 
     Cut at k sigma its variance is t = 1 - 2 k phi(k) / (2 Phi(k) - 1) of the whole.  Two
@@ -67,8 +69,8 @@ def undo_clipping(raw: NDArray[np.float64], clip: float) -> NDArray[np.float64]:
 
 
 def undo_box_means(
-    raw: NDArray[np.float64], pixels: int, edges: list[NDArray[np.int64]]
-) -> NDArray[np.float64]:
+    raw: FloatArray, pixels: int, edges: list[NDArray[np.int64]]
+) -> FloatArray:
     """Put back what the subtraction of box means takes.
 
     Of a product d(p) d(q) at the lag L it takes the mean of C(p - r) over the box of q, the

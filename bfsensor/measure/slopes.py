@@ -13,6 +13,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.ecsv import read_ecsv, same_fields, write_ecsv
+from bfsensor.typing import FloatArray
 
 UNIT_PEAK = 50_000.0
 """Slopes are per this many electrons in the peak, as published."""
@@ -64,9 +65,9 @@ class BFSlope:
     curvature: float
     low: float
     high: float
-    peak: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    error: NDArray[np.float64]
+    peak: FloatArray
+    sigma: FloatArray
+    error: FloatArray
     used: NDArray[np.bool_]
 
     @property
@@ -97,12 +98,12 @@ class BFSlope:
         return cls(**single, **columns)
 
 
-class _Line(NamedTuple):
+class _SlopeLine(NamedTuple):
     """A line about zero peak: height, growth per electron, their covariance, the fit."""
 
     height: float
     growth: float
-    covariance: NDArray[np.float64]
+    covariance: FloatArray
     chi2: float
     curvature: float
 
@@ -237,7 +238,7 @@ def bf_slopes(
 
 def _points(
     peak: ArrayLike, sigma: ArrayLike, error: ArrayLike, peak_error: ArrayLike
-) -> tuple[NDArray[np.float64], ...]:
+) -> tuple[FloatArray, ...]:
     """Points by rising peak, with the covariance of the widths and the peaks' errors."""
     q, s, e = (np.array(a, float) for a in (peak, sigma, error))
     if q.ndim != 1 or s.shape != q.shape or e.shape not in (q.shape, (q.size, q.size)):
@@ -269,18 +270,16 @@ def _points(
 
 
 def _part(
-    q: NDArray[np.float64],
-    s: NDArray[np.float64],
-    covariance: NDArray[np.float64],
+    q: FloatArray,
+    s: FloatArray,
+    covariance: FloatArray,
     first: int,
     last: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     return q[first:last], s[first:last], covariance[first:last, first:last]
 
 
-def _fit_line(
-    q: NDArray[np.float64], s: NDArray[np.float64], covariance: NDArray[np.float64]
-) -> _Line:
+def _fit_line(q: FloatArray, s: FloatArray, covariance: FloatArray) -> _SlopeLine:
     """Least squares with the covariance matrix; the parabola beside it."""
     unit = UNIT_PEAK
     factor = cho_factor(covariance, lower=True)
@@ -297,7 +296,7 @@ def _fit_line(
         size = float(bent @ cho_solve(factor, bent))
         curvature = float(bent @ weighted) / np.sqrt(size)
     to_electrons = np.diag([1.0, 1 / unit])
-    return _Line(
+    return _SlopeLine(
         float(found[0]),
         float(found[1] / unit),
         to_electrons @ errors @ to_electrons,
@@ -307,9 +306,9 @@ def _fit_line(
 
 
 def _find_range(
-    q: NDArray[np.float64],
-    s: NDArray[np.float64],
-    covariance: NDArray[np.float64],
+    q: FloatArray,
+    s: FloatArray,
+    covariance: FloatArray,
     fewest: int,
     probability: float,
 ) -> tuple[int, int]:
@@ -337,9 +336,9 @@ def _find_range(
 
 
 def _range_effect(
-    q: NDArray[np.float64],
-    s: NDArray[np.float64],
-    covariance: NDArray[np.float64],
+    q: FloatArray,
+    s: FloatArray,
+    covariance: FloatArray,
     first: int,
     last: int,
     fewest: int,

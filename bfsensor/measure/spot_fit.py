@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from bfsensor.errors import ConvergenceError, MeasurementError
 from bfsensor.measure.spot_model import Shape, check_shape, curvatures
-from bfsensor.measure.spot_normal import Normal, Problem, Spots, invert
+from bfsensor.measure.spot_normal import Normal, SpotProblem, Spots, invert
 from bfsensor.measure.spot_result import SpotFit
 from bfsensor.measure.spot_solve import approach, solve, start
 from bfsensor.measure.spots import Stamps
+from bfsensor.typing import FloatArray
 
 _ROUNDS = 10
 # Of chi2 per pixel: a thousandth of the noise, which the tolerances of centres leave as well.
@@ -111,7 +112,7 @@ def fit_spots(
     _check(read_noise, background, correlation, largest_offset, limit)
     if weights not in ("noise", "equal"):
         raise MeasurementError(f"weights = {weights!r} must be 'noise' or 'equal'")
-    problem = Problem(
+    problem = SpotProblem(
         stamps,
         read_noise,
         equal_weights=weights == "equal",
@@ -182,7 +183,7 @@ def _check_enough(used: NDArray[np.bool_], never: NDArray[np.bool_]) -> None:
         )
 
 
-def _masked(problem: Problem) -> NDArray[np.bool_]:
+def _masked(problem: SpotProblem) -> NDArray[np.bool_]:
     """Spots with a bad pixel about the centre or with hardly more pixels than parameters."""
     good = problem.stamps.good
     j, i = problem.ny // 2, problem.nx // 2
@@ -192,7 +193,7 @@ def _masked(problem: Problem) -> NDArray[np.bool_]:
 
 
 def _judge(
-    problem: Problem,
+    problem: SpotProblem,
     spots: Spots,
     normal: Normal,
     used: NDArray[np.bool_],
@@ -235,7 +236,7 @@ def _judge(
 
 
 def _finish(
-    problem: Problem,
+    problem: SpotProblem,
     spots: Spots,
     shape: Shape,
     normal: Normal,
@@ -286,12 +287,12 @@ def _finish(
 
 
 def _bias(
-    problem: Problem,
+    problem: SpotProblem,
     spots: Spots,
     shape: Shape,
     normal: Normal,
     used: NDArray[np.bool_],
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """What to add to the widths for the curvature of the model in the noisy centres.
 
     The covariance of a spot's own parameters times the second derivatives of its model is
@@ -316,12 +317,12 @@ def _bias(
 
 
 def _noisy_derivatives(
-    problem: Problem,
+    problem: SpotProblem,
     spots: Spots,
     shape: Shape,
     normal: Normal,
-    slopes: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    slopes: FloatArray,
+) -> FloatArray:
     """Mean score of each spot from derivatives that its noise has changed, (n, own + shared)."""
     model = spots.flux[:, None] * slopes[0] + spots.background[:, None]
     jacobian = problem.jacobian(spots.flux, slopes)

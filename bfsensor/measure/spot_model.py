@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
 from bfsensor.errors import MeasurementError
+from bfsensor.typing import FloatArray
 
 LARGEST_CORRELATION = 0.8
 """Largest correlation of a spot; below it the integral over it is good to 1e-10."""
@@ -39,10 +40,10 @@ class Shape(NamedTuple):
 class Along(NamedTuple):
     """One axis: integrals over pixels, and normal densities and places of the edges."""
 
-    integral: NDArray[np.float64]
-    by_centre: NDArray[np.float64]
-    by_width: NDArray[np.float64]
-    place: NDArray[np.float64]
+    integral: FloatArray
+    by_centre: FloatArray
+    by_width: FloatArray
+    place: FloatArray
 
 
 def check_shape(shape: Shape) -> None:
@@ -66,7 +67,7 @@ def integrate_gaussian(
     centre_y: ArrayLike,
     shape: Shape,
     size: int | tuple[int, int],
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Integrate Gaussian spots of one electron each over the pixels of their stamps.
 
     Parameters
@@ -109,7 +110,7 @@ def integrate_gaussian(
     return _correlated(along_x, along_y, shape.correlation)
 
 
-def along(centre: NDArray[np.float64], width: float, size: int) -> Along:
+def along(centre: FloatArray, width: float, size: int) -> Along:
     """Integrals along one axis, shape (n, size), and their derivatives."""
     edges = np.arange(size + 1) - 0.5 * size
     t = (edges - centre[:, None]) / width
@@ -125,9 +126,7 @@ def along(centre: NDArray[np.float64], width: float, size: int) -> Along:
     )
 
 
-def gradients(
-    x: NDArray[np.float64], y: NDArray[np.float64], shape: Shape, ny: int, nx: int
-) -> NDArray[np.float64]:
+def gradients(x: FloatArray, y: FloatArray, shape: Shape, ny: int, nx: int) -> FloatArray:
     """Integrals and their derivatives by x, y, sigma_x, sigma_y, correlation, each (n, ny, nx).
 
     Shape (6, n, ny, nx).
@@ -160,8 +159,8 @@ def gradients(
 
 
 def curvatures(
-    slopes: NDArray[np.float64], shape: Shape
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    slopes: FloatArray, shape: Shape
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Second derivatives by xx, yy and xy from what :func:`gradients` gives.
 
     A Gaussian obeys the equation of diffusion: its second derivative by x is twice its
@@ -174,7 +173,7 @@ def curvatures(
     return by_xx, by_yy, by_covariance
 
 
-def _correlated(along_x: Along, along_y: Along, rho: float) -> NDArray[np.float64]:
+def _correlated(along_x: Along, along_y: Along, rho: float) -> FloatArray:
     """Integrals at a correlation: those at none and the integral over it."""
     h, k = along_x.place[:, None, :], along_y.place[:, :, None]
     total = np.zeros(np.broadcast_shapes(h.shape, k.shape))
@@ -183,7 +182,7 @@ def _correlated(along_x: Along, along_y: Along, rho: float) -> NDArray[np.float6
     return _outer(along_y.integral, along_x.integral) + _corners(total)
 
 
-def _density(h: NDArray[np.float64], k: NDArray[np.float64], rho: float) -> NDArray:
+def _density(h: FloatArray, k: FloatArray, rho: float) -> NDArray:
     """Bivariate normal density of unit widths."""
     rest = 1 - rho * rho
     return np.asarray(
@@ -192,10 +191,10 @@ def _density(h: NDArray[np.float64], k: NDArray[np.float64], rho: float) -> NDAr
     )
 
 
-def _corners(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _corners(values: FloatArray) -> FloatArray:
     """Difference over the four corners of each pixel."""
     return np.diff(np.diff(values, axis=1), axis=2)
 
 
-def _outer(of_y: NDArray[np.float64], of_x: NDArray[np.float64]) -> NDArray[np.float64]:
+def _outer(of_y: FloatArray, of_x: FloatArray) -> FloatArray:
     return np.asarray(of_y[:, :, None] * of_x[:, None, :])

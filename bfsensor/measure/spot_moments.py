@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.ecsv import read_ecsv, same_fields, write_ecsv
 from bfsensor.measure.spots import Stamps
+from bfsensor.typing import FloatArray
 
 SCHEMA = "bfsensor.SpotMoments 1"
 PIXEL_VARIANCE = 1 / 12
@@ -84,18 +85,18 @@ class SpotMoments:
 
     x: NDArray[np.int64]
     y: NDArray[np.int64]
-    centre_x: NDArray[np.float64]
-    centre_y: NDArray[np.float64]
-    xx: NDArray[np.float64]
-    xy: NDArray[np.float64]
-    yy: NDArray[np.float64]
-    flux: NDArray[np.float64]
-    centre_x_error: NDArray[np.float64]
-    centre_y_error: NDArray[np.float64]
-    xx_error: NDArray[np.float64]
-    xy_error: NDArray[np.float64]
-    yy_error: NDArray[np.float64]
-    flux_error: NDArray[np.float64]
+    centre_x: FloatArray
+    centre_y: FloatArray
+    xx: FloatArray
+    xy: FloatArray
+    yy: FloatArray
+    flux: FloatArray
+    centre_x_error: FloatArray
+    centre_y_error: FloatArray
+    xx_error: FloatArray
+    xy_error: FloatArray
+    yy_error: FloatArray
+    flux_error: FloatArray
     status: NDArray[np.str_]
 
     @property
@@ -234,11 +235,11 @@ def measure_moments(
 
 
 def _equations(
-    light: NDArray[np.float64],
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    theta: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    light: FloatArray,
+    x: FloatArray,
+    y: FloatArray,
+    theta: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """What must vanish, (n, 5); how each pixel enters it, (n, 6, pixels); its Jacobian.
 
     The sixth is the weighted sum itself.  ``theta`` (n, 5): centre, xx, xy, yy.
@@ -269,8 +270,8 @@ def _equations(
 
 
 def _solve(
-    light: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64], size: int
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    light: FloatArray, x: FloatArray, y: FloatArray, size: int
+) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Centres and moments, (n, 5), and which of them settled.
 
     The weighted moments, doubled, are a safe iteration that halves the error of a Gaussian
@@ -296,9 +297,7 @@ def _solve(
     return theta, settled
 
 
-def _newton(
-    sums: NDArray[np.float64], slopes: NDArray[np.float64], otherwise: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _newton(sums: FloatArray, slopes: FloatArray, otherwise: FloatArray) -> FloatArray:
     """Newton's step, bounded, where the equations can be solved."""
     fine = np.all(np.isfinite(slopes), axis=(1, 2)) & (np.linalg.cond(slopes) < 1e12)
     step = otherwise.copy()
@@ -306,7 +305,7 @@ def _newton(
     return np.clip(step, -0.5, 0.5)
 
 
-def _sane(theta: NDArray[np.float64], size: int) -> NDArray[np.bool_]:
+def _sane(theta: FloatArray, size: int) -> NDArray[np.bool_]:
     """Centre inside the stamp, an ellipse that is one and has room there."""
     cx, cy, xx, xy, yy = theta.T
     half = size / 2
@@ -320,12 +319,12 @@ def _sane(theta: NDArray[np.float64], size: int) -> NDArray[np.bool_]:
 
 
 def _with_errors(
-    light: NDArray[np.float64],
-    variance: NDArray[np.float64],
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    theta: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    light: FloatArray,
+    variance: FloatArray,
+    x: FloatArray,
+    y: FloatArray,
+    theta: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
     """Centre, moments and flux, (6, n), and their errors."""
     sums, enter, slopes = _equations(light, x, y, theta)
     # The flux follows the weighted sum and the area of the weight's ellipse does not

@@ -10,10 +10,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bfsensor.measure.spot_model import Shape, gradients
 from bfsensor.measure.spots import Stamps
+from bfsensor.typing import FloatArray
 
 LEAST_VARIANCE = 1.0
 """Least variance of a pixel [e-^2].  Without it, where noise is left out, the far wings with
@@ -23,10 +23,10 @@ their hundredths of an electron would decide on chi2."""
 class Spots(NamedTuple):
     """Each spot's own parameters, changed in place: shape (n,)."""
 
-    flux: NDArray[np.float64]
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    background: NDArray[np.float64]
+    flux: FloatArray
+    x: FloatArray
+    y: FloatArray
+    background: FloatArray
 
 
 class Normal(NamedTuple):
@@ -41,18 +41,18 @@ class Normal(NamedTuple):
     ``rest``.  ``chi2`` (n,) of each spot, by its noise.
     """
 
-    own_inverse: NDArray[np.float64]
-    cross: NDArray[np.float64]
-    rest: NDArray[np.float64]
-    own_score: NDArray[np.float64]
-    score: NDArray[np.float64]
-    weighted: NDArray[np.float64]
-    own_covariance: NDArray[np.float64]
-    score_variance: NDArray[np.float64]
-    chi2: NDArray[np.float64]
+    own_inverse: FloatArray
+    cross: FloatArray
+    rest: FloatArray
+    own_score: FloatArray
+    score: FloatArray
+    weighted: FloatArray
+    own_covariance: FloatArray
+    score_variance: FloatArray
+    chi2: FloatArray
 
 
-class Problem:
+class SpotProblem:
     """Stamps, their noise and weights, and what is free."""
 
     def __init__(
@@ -76,21 +76,19 @@ class Problem:
         self.own = 4 if free_background else 3
         self.shared = 3 if free_tilt else 2
 
-    def derivatives(self, spots: Spots, shape: Shape) -> NDArray[np.float64]:
+    def derivatives(self, spots: Spots, shape: Shape) -> FloatArray:
         """Fractions of the flux in each pixel and their gradients, (6, n, pixels)."""
         slopes = gradients(spots.x, spots.y, shape, self.ny, self.nx)
         return slopes.reshape(6, len(self.data), -1)
 
-    def variance(self, model: NDArray[np.float64]) -> NDArray[np.float64]:
+    def variance(self, model: FloatArray) -> FloatArray:
         """Variance of each pixel [e-^2]."""
         if self.known is not None:
             return self.known
         # Of the model, not of the data: low pixels must not count for more.
         return np.maximum(np.maximum(model, 0.0) + self.read_noise**2, LEAST_VARIANCE)
 
-    def jacobian(
-        self, flux: NDArray[np.float64], slopes: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def jacobian(self, flux: FloatArray, slopes: FloatArray) -> FloatArray:
         """Derivatives of the model by each spot's own and the shared parameters."""
         # A spot without flux would leave its centre without an equation.
         flux = np.maximum(flux, 1.0)[:, None]
@@ -101,7 +99,7 @@ class Problem:
         return np.stack(rows, axis=1)
 
     def linearise(
-        self, spots: Spots, slopes: NDArray[np.float64], *, with_noise: bool = False
+        self, spots: Spots, slopes: FloatArray, *, with_noise: bool = False
     ) -> Normal:
         """Normal equations at the present parameters; noise is right only if asked for."""
         model = spots.flux[:, None] * slopes[0] + spots.background[:, None]
@@ -146,7 +144,7 @@ class Problem:
         )
 
 
-def invert(blocks: NDArray[np.float64]) -> NDArray[np.float64]:
+def invert(blocks: FloatArray) -> FloatArray:
     """Inverses of small positive matrices, scaled to a unit diagonal before."""
     size = np.sqrt(np.maximum(np.einsum("naa->na", blocks), 1e-300))
     scaled = blocks / (size[:, :, None] * size[:, None, :])

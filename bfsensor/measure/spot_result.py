@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.ecsv import read_ecsv, same_fields, write_ecsv
 from bfsensor.measure.spot_model import Shape, integrate_gaussian
+from bfsensor.typing import FloatArray
 
 REASONS: Mapping[str, str] = {
     "masked": "too few good pixels, or a bad one in the 3 x 3 about the centre",
@@ -89,8 +90,8 @@ class SpotFit:
     sigma_x: float
     sigma_y: float
     correlation: float
-    covariance: NDArray[np.float64]
-    scatter_covariance: NDArray[np.float64]
+    covariance: FloatArray
+    scatter_covariance: FloatArray
     bias_x: float
     bias_y: float
     chi2: float
@@ -99,15 +100,15 @@ class SpotFit:
     weights: str
     x: NDArray[np.int64]
     y: NDArray[np.int64]
-    centre_x: NDArray[np.float64]
-    centre_y: NDArray[np.float64]
-    centre_x_error: NDArray[np.float64]
-    centre_y_error: NDArray[np.float64]
-    flux: NDArray[np.float64]
-    flux_error: NDArray[np.float64]
-    background: NDArray[np.float64]
-    background_error: NDArray[np.float64]
-    spot_chi2: NDArray[np.float64]
+    centre_x: FloatArray
+    centre_y: FloatArray
+    centre_x_error: FloatArray
+    centre_y_error: FloatArray
+    flux: FloatArray
+    flux_error: FloatArray
+    background: FloatArray
+    background_error: FloatArray
+    spot_chi2: FloatArray
     spot_dof: NDArray[np.int64]
     status: NDArray[np.str_]
 
@@ -146,7 +147,7 @@ class SpotFit:
         return float(np.degrees(0.5 * np.arctan2(2 * xy, xx - yy)))
 
     @cached_property
-    def peaks(self) -> NDArray[np.float64]:
+    def peaks(self) -> FloatArray:
         """Signal of each spot's model in a pixel at whose middle the spot stands [e-].
 
         Without background, shape (n,).  It does not depend on where in the pixel the spot
@@ -156,7 +157,7 @@ class SpotFit:
         return self.flux * float(integrate_gaussian([0.0], [0.0], self.shape, 1)[0, 0, 0])
 
     @cached_property
-    def central_signals(self) -> NDArray[np.float64]:
+    def central_signals(self) -> FloatArray:
         """Signal of each spot's model in its central pixel as it fell [e-], shape (n,).
 
         Without background.  Of spots strewn over a pixel the mean is below that of

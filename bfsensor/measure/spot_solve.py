@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from bfsensor.errors import ConvergenceError
 from bfsensor.measure.spot_model import Shape
-from bfsensor.measure.spot_normal import Normal, Problem, Spots, invert
+from bfsensor.measure.spot_normal import Normal, SpotProblem, Spots, invert
 from bfsensor.measure.spots import Stamps
+from bfsensor.typing import FloatArray
 
 _LARGEST_STEPS = 60
 # Where steps end: a thousandth of the smallest errors in use.
@@ -51,7 +52,7 @@ def start(
 
 
 def approach(
-    problem: Problem,
+    problem: SpotProblem,
     spots: Spots,
     shape: Shape,
     used: NDArray[np.bool_],
@@ -78,7 +79,7 @@ def approach(
 
 
 def solve(
-    problem: Problem,
+    problem: SpotProblem,
     spots: Spots,
     shape: Shape,
     used: NDArray[np.bool_],
@@ -116,13 +117,13 @@ def solve(
 
 
 def _move(
-    problem: Problem,
+    problem: SpotProblem,
     spots: Spots,
     shape: Shape,
     normal: Normal,
-    step: NDArray[np.float64],
+    step: FloatArray,
     largest_offset: float,
-) -> tuple[Shape, NDArray[np.float64]]:
+) -> tuple[Shape, FloatArray]:
     """Change shape and spots by a step of the shape; how far each centre moved."""
     largest = 0.2 * min(shape.sigma_x, shape.sigma_y)
     step = np.clip(step, -largest, largest)

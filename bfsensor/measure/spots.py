@@ -18,6 +18,7 @@ from scipy.ndimage import maximum_filter, uniform_filter
 
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.arrays import to_floats
+from bfsensor.typing import FloatArray
 
 STAMP = 9
 """Pixels of a stamp a side, as in Lage et al. (2017), section 2.1: 4 sigma of their spots."""
@@ -77,9 +78,9 @@ class Stamps:
     (3, True)
     """
 
-    electrons: NDArray[np.float64]
+    electrons: FloatArray
     good: NDArray[np.bool_] | Any = None
-    variance: NDArray[np.float64] | None = None
+    variance: FloatArray | None = None
     x: NDArray[np.int64] | Any = None
     y: NDArray[np.int64] | Any = None
 
@@ -216,7 +217,7 @@ def find_spots(
 
 
 def _check_search(
-    data: NDArray[np.float64],
+    data: FloatArray,
     threshold: float,
     separation: int,
     saturation: float,

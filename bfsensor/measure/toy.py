@@ -35,6 +35,7 @@ from scipy.special import exprel
 
 from bfsensor._kernels import toy as kernels
 from bfsensor.errors import MeasurementError
+from bfsensor.typing import FloatArray
 
 LARGEST_RMS_AREA = 0.2
 """Largest rms change of the pixels' areas for which the closed forms are given.
@@ -61,9 +62,9 @@ class PairMoments:
         variance the covariance.
     """
 
-    mean: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    mean: FloatArray
+    variance: FloatArray
+    covariance: FloatArray
 
 
 def _check_pair(alpha: ArrayLike, level: ArrayLike, largest: float) -> list[NDArray]:

@@ -26,9 +26,10 @@ from scipy.special import exprel
 from bfsensor._kernels import toy as kernels
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.toy import LARGEST_RMS_AREA, MOST_DARTS, draw_darts
+from bfsensor.typing import FloatArray
 
 
-def unfold_lags(quadrant: ArrayLike) -> NDArray[np.float64]:
+def unfold_lags(quadrant: ArrayLike) -> FloatArray:
     """Mirror an a-matrix of lags 0 and above to lags of both signs.
 
     Parameters
@@ -58,7 +59,7 @@ def unfold_lags(quadrant: ArrayLike) -> NDArray[np.float64]:
     return np.concatenate([half[:0:-1], half])
 
 
-def close_sum(a: ArrayLike) -> NDArray[np.float64]:
+def close_sum(a: ArrayLike) -> FloatArray:
     """Give the area that an a-matrix lacks to the ring of pixels around it, in equal parts.
 
     Measured and tabulated a-matrices end at some lag, the electric field does not: what
@@ -89,7 +90,7 @@ def close_sum(a: ArrayLike) -> NDArray[np.float64]:
     return np.pad(a, 1) - a.sum() * ring / ring.sum()
 
 
-def _check_lags(a: ArrayLike) -> NDArray[np.float64]:
+def _check_lags(a: ArrayLike) -> FloatArray:
     """An a-matrix with a middle, in finite numbers."""
     a = np.asarray(a, float)
     if a.ndim != 2 or a.shape[0] % 2 == 0 or a.shape[1] % 2 == 0:
@@ -102,7 +103,7 @@ def _check_lags(a: ArrayLike) -> NDArray[np.float64]:
     return a
 
 
-def _wrap(a: ArrayLike, size: int, level: float) -> NDArray[np.float64]:
+def _wrap(a: ArrayLike, size: int, level: float) -> FloatArray:
     """The a-matrix on a periodic array, lag (0, 0) first, if all is allowed."""
     a = _check_lags(a)
     if not max(a.shape) <= size <= 4096:
@@ -123,7 +124,7 @@ def _wrap(a: ArrayLike, size: int, level: float) -> NDArray[np.float64]:
     return np.roll(whole, (-(ny // 2), -(nx // 2)), axis=(0, 1))
 
 
-def predict_array(a: ArrayLike, level: float, *, size: int = 64) -> NDArray[np.float64]:
+def predict_array(a: ArrayLike, level: float, *, size: int = 64) -> FloatArray:
     r"""Covariances of a flat whose pixel areas are linear in the charges, to all orders.
 
     .. math::
@@ -221,9 +222,7 @@ def throw_at_array(
     return charges.reshape(realisations, size, size)
 
 
-def measure_array(
-    charges: ArrayLike, level: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def measure_array(charges: ArrayLike, level: float) -> tuple[FloatArray, FloatArray]:
     """Measure the covariances of many periodic arrays, with errors from their scatter.
 
     Parameters

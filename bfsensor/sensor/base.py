@@ -13,10 +13,11 @@ from bfsensor._kernels.areas import convolved_areas, pixel_areas
 from bfsensor._kernels.photons import Light
 from bfsensor._kernels.shifts import Charges
 from bfsensor.errors import SensorError
-from bfsensor.sensor.applied import AppliedEffects
-from bfsensor.sensor.areas import AreaKernels, area_kernels
-from bfsensor.sensor.exposure import Exposure, Physics
-from bfsensor.sensor.pattern import ShiftMap, make_pattern, sample_rings
+from bfsensor.sensor.applied_effects import AppliedEffects
+from bfsensor.sensor.area_kernels import AreaKernels, area_kernels
+from bfsensor.sensor.image_exposure import ImageExposure, Physics
+from bfsensor.sensor.shift_maps import ShiftMap, make_pattern, sample_rings
+from bfsensor.typing import FloatArray
 
 _EMPTY = np.zeros(0)
 _LARGE = 512 * 512
@@ -39,7 +40,7 @@ class EngineSensor(galsim.SiliconSensor):
 
     # -- what a subclass gives ---------------------------------------------------------
 
-    def _make_physics(self) -> tuple[Physics, NDArray[np.float64]]:
+    def _make_physics(self) -> tuple[Physics, FloatArray]:
         """Give the sensor for the engine and the factor of fixed shifts by height."""
         raise NotImplementedError
 
@@ -63,7 +64,7 @@ class EngineSensor(galsim.SiliconSensor):
         if self._has_rings():
             self._rings = sample_rings(self.treering_func)
         self._kernels: AreaKernels | None = None
-        self._exposure: Exposure | None = None
+        self._exposure: ImageExposure | None = None
         self._last_image = None
 
     def _has_rings(self) -> bool:
@@ -186,11 +187,11 @@ class EngineSensor(galsim.SiliconSensor):
         image: galsim.Image,
         array: NDArray[np.floating],
         orig_center: galsim.PositionI,
-    ) -> Exposure:
+    ) -> ImageExposure:
         origin = (image.bounds.xmin - 0.5, image.bounds.ymin - 0.5)
         # Drawn once an exposure: chunks of photons continue by count.
         key = (int(self.rng.raw()) & 0xFFFFFFFF, int(self.rng.raw()) & 0xFFFFFFFF)
-        return Exposure(
+        return ImageExposure(
             array, self._physics, self._place_pattern(image, orig_center), origin, key,
             self.threads,
         )  # fmt: skip
@@ -242,7 +243,9 @@ class EngineSensor(galsim.SiliconSensor):
         if not use_flux:
             charges = _no_charges(array.shape, self._physics)
         else:
-            charges = Exposure(array, self._physics, pattern, (0.0, 0.0), (0, 0)).charges
+            charges = ImageExposure(
+                array, self._physics, pattern, (0.0, 0.0), (0, 0)
+            ).charges
         if fixed:
             low, low_second = _lowest(charges) if use_flux else (np.float32(0),) * 2
             pixel_areas(
@@ -258,7 +261,7 @@ class EngineSensor(galsim.SiliconSensor):
             ymin=image.bounds.ymin, wcs=galsim.PixelScale(1.0),
         )  # fmt: skip
 
-    def _convolve(self, charges: Charges, out: NDArray[np.float64]) -> None:
+    def _convolve(self, charges: Charges, out: FloatArray) -> None:
         """Areas by convolution, with as many kernels as matter for these charges."""
         if self._kernels is None:
             self._kernels = area_kernels(self._physics.edges)
@@ -363,7 +366,7 @@ def _light(photons: galsim.PhotonArray) -> Light:
 
 def read_numbers(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read a configuration of ``key = value`` lines; numbers become numbers."""
-    from bfsensor.device_import import read_configuration
+    from bfsensor.device.poisson_ccd import read_configuration
 
     out: dict[str, Any] = {}
     for key, text in read_configuration(path).items():

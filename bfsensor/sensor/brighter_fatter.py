@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor._kernels.photons import Medium
-from bfsensor.device import Device
+from bfsensor.device.device import Device
 from bfsensor.effects.effect import Layout
 from bfsensor.errors import SensorError
-from bfsensor.sensor.drift import MEASURED, STEPS, solve_drift
+from bfsensor.sensor.boundary_shifts import make_shifts
+from bfsensor.sensor.drift_field import MEASURED, STEPS, solve_drift
 from bfsensor.sensor.effect_sensor import EffectSensor
-from bfsensor.sensor.exposure import Physics
+from bfsensor.sensor.image_exposure import Physics
 from bfsensor.sensor.options import (
     check_number,
     check_table,
@@ -26,10 +27,10 @@ from bfsensor.sensor.options import (
     find_table,
     load_table,
 )
-from bfsensor.sensor.pattern import ShiftMap
-from bfsensor.sensor.shifts import make_shifts
+from bfsensor.sensor.shift_maps import ShiftMap
 from bfsensor.sensor.silicon_sensor import check_rings
-from bfsensor.table import DistortionTable
+from bfsensor.table.table import DistortionTable
+from bfsensor.typing import FloatArray
 
 _WAVELENGTHS = np.arange(250.0, 1451.0, 1.0)  # nm
 _TRANSPARENT = 1e30  # um; length of light that is not absorbed
@@ -84,13 +85,13 @@ class BrighterFatterSensor(EffectSensor):
     red : {'lost', 'kept'}
         Photons that would cross the silicon are lost, or convert 1 um above the gates.
     absorption : {'law', 'galsim'}
-        Absorption length by wavelength and temperature (:mod:`bfsensor.silicon`), or
+        Absorption length by wavelength and temperature (:mod:`bfsensor.device.silicon`), or
         GalSim's table at one temperature.
     temperature : float, optional
         [K], by default the device's.
     diffusion : {'einstein', 'measured'}
         Width by Einstein's relation in the device's drift field, or 1.92 times that, which
-        Fe55 clusters of LSST sensors ask for (:data:`bfsensor.sensor.drift.MEASURED`).
+        Fe55 clusters of LSST sensors ask for (:data:`bfsensor.sensor.drift_field.MEASURED`).
     full_well : float, optional
         Electrons at which a pixel spills along its column; by default the table's, inf:
         never.
@@ -254,7 +255,7 @@ class BrighterFatterSensor(EffectSensor):
 
     def _usual(self) -> dict[str, Any]:
         """What effects count from where nothing else is said."""
-        from bfsensor.silicon import absorption_length
+        from bfsensor.device.silicon import absorption_length
 
         waves = np.arange(300.0, 1101.0, 10.0)
         lengths = np.asarray(absorption_length(waves, self.temperature), float)
@@ -290,7 +291,7 @@ class BrighterFatterSensor(EffectSensor):
             state["table"] = load_table(*state["_source"])
         super().__setstate__(state)
 
-    def _make_physics(self) -> tuple[Physics, NDArray[np.float64]]:
+    def _make_physics(self) -> tuple[Physics, FloatArray]:
         table = self.table
         factors, edges = make_shifts(
             table, charge_response=self.charge_response, background=self.background,
@@ -329,10 +330,10 @@ class BrighterFatterSensor(EffectSensor):
         )  # fmt: skip
         return physics, drift.ripple if self.depth else np.ones(STEPS + 1)
 
-    def _lengths(self) -> tuple[NDArray[np.float64], float, float]:
+    def _lengths(self) -> tuple[FloatArray, float, float]:
         """Absorption lengths [um] on equal steps of the wavelength [nm]."""
         if self.absorption == "law":
-            from bfsensor.silicon import absorption_length
+            from bfsensor.device.silicon import absorption_length
 
             lengths = np.asarray(absorption_length(_WAVELENGTHS, self.temperature), float)
             return np.minimum(lengths, _TRANSPARENT), float(_WAVELENGTHS[0]), 1.0

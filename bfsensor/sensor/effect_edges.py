@@ -6,17 +6,17 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bfsensor.effects.effect import Effect, Layout, Shot
 from bfsensor.errors import SensorError
+from bfsensor.typing import FloatArray
 
 REACH = 7
 """Farthest charge [pixel] that the engine lets act on an edge."""
 
 _SAME = 1e-9
 
-Sides = tuple[NDArray[np.float64], NDArray[np.float64]]
+Sides = tuple[FloatArray, FloatArray]
 
 
 class EdgeChange(NamedTuple):
@@ -49,7 +49,7 @@ class EdgeChange(NamedTuple):
         return int(far.max(initial=0)) + 1
 
 
-def mean_shifts(sides: Sides, points: NDArray[np.float64]) -> Sides:
+def mean_shifts(sides: Sides, points: FloatArray) -> Sides:
     """Means along right and upper edges of the topmost layer of sides.
 
     Parameters
@@ -135,9 +135,7 @@ def find_change(
     )
 
 
-def change_sides(
-    sides: Sides, points: NDArray[np.float64], change: EdgeChange, reach: int
-) -> Sides:
+def change_sides(sides: Sides, points: FloatArray, change: EdgeChange, reach: int) -> Sides:
     """Change the sides around a charge, for charges up to ``reach`` pixels away.
 
     Factors act on every vertex.  A shift that is added moves all vertices of its edge; corners,
@@ -178,12 +176,12 @@ def change_sides(
 
 
 def _along(
-    start: NDArray[np.float64],
-    end: NDArray[np.float64],
-    mean: NDArray[np.float64],
+    start: FloatArray,
+    end: FloatArray,
+    mean: FloatArray,
     normal: int,
-    points: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    points: FloatArray,
+) -> FloatArray:
     """Shifts (..., points, 2) along edges between corners, of the mean normal shift asked for."""
     t = points[:, None]
     out = start[..., None, :] * (1 - t) + end[..., None, :] * t
@@ -195,7 +193,7 @@ def _along(
     return np.asarray(out)
 
 
-def _lengths(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _lengths(points: FloatArray) -> FloatArray:
     """Part of an edge that each point stands for, of the line through them."""
     out = np.zeros(len(points))
     out[1:] += np.diff(points) / 2
@@ -203,7 +201,7 @@ def _lengths(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
-def _resized(kernel: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+def _resized(kernel: FloatArray, size: int) -> FloatArray:
     """Kernel of another odd size about the same middle, zero beyond."""
     margin = (size - len(kernel)) // 2
     if margin >= 0:

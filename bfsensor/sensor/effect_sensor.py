@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bfsensor._kernels.photons import Light
 from bfsensor.effects.effect import Effect, Layout
 from bfsensor.errors import SensorError
-from bfsensor.sensor.applied import AppliedEffects
+from bfsensor.sensor.applied_effects import AppliedEffects
 from bfsensor.sensor.base import EngineSensor, pixels_of
 from bfsensor.sensor.effect_reports import (
     make_conditions,
@@ -21,7 +21,7 @@ from bfsensor.sensor.effect_reports import (
     read_effects,
     write_entries,
 )
-from bfsensor.sensor.exposure import Exposure
+from bfsensor.sensor.image_exposure import ImageExposure
 
 
 class EffectSensor(EngineSensor):
@@ -126,7 +126,7 @@ class EffectSensor(EngineSensor):
         image: galsim.Image,
         array: NDArray[np.floating],
         orig_center: galsim.PositionI,
-    ) -> Exposure:
+    ) -> ImageExposure:
         exposure = super()._expose(image, array, orig_center)
         if self._applied is not None:
             key = int(exposure.plan.key0), int(exposure.plan.key1)

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from bfsensor.effects.effect import Law
 from bfsensor.errors import SensorError
-from bfsensor.sensor.applied import AppliedEffects
+from bfsensor.sensor.applied_effects import AppliedEffects
 from bfsensor.sensor.base import EngineSensor
 from bfsensor.sensor.effect_sensor import EffectSensor
+from bfsensor.typing import FloatArray
 
 
 def draw_flat(
@@ -22,7 +23,7 @@ def draw_flat(
     *,
     step: float = 1000.0,
     rng: galsim.BaseDeviate | None = None,
-    illumination: NDArray[np.float64] | None = None,
+    illumination: FloatArray | None = None,
     border: int = 8,
     dtype: type = np.float32,
 ) -> galsim.Image:
@@ -89,7 +90,7 @@ def iterate_flat(
     *,
     step: float = 1000.0,
     rng: galsim.BaseDeviate | None = None,
-    illumination: NDArray[np.float64] | None = None,
+    illumination: FloatArray | None = None,
     border: int = 8,
     dtype: type = np.float32,
 ) -> Iterator[galsim.Image]:
@@ -133,7 +134,7 @@ def iterate_flat(
     areas: NDArray[np.floating] = sensor.calculate_pixel_areas(
         whole, centre, use_flux=False
     ).array
-    excess: NDArray[np.float64] = np.zeros(light.shape)
+    excess: FloatArray = np.zeros(light.shape)
     for _ in range(steps):
         middle = whole.copy()
         # Half of the last step's fluctuations count twice: they were not felt in their own.
@@ -158,7 +159,7 @@ def iterate_flat(
 
 def _light_of_effects(
     applied: AppliedEffects, shape: tuple[int, int], border: int, seed: int
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Factor of effects on the light of a flat, with its border; nearest pixels outside."""
     factor = applied.light_map("flat", np.random.default_rng(seed))
     if factor is None:

@@ -7,8 +7,8 @@ from functools import lru_cache
 from pathlib import Path
 
 from bfsensor.errors import SensorError, TableError
-from bfsensor.resources import tables_dir
-from bfsensor.table import DistortionTable
+from bfsensor.files import tables_dir
+from bfsensor.table.table import DistortionTable
 
 
 def find_table(name: str) -> tuple[str, int]:

@@ -9,17 +9,17 @@ from typing import Any
 
 import galsim
 import numpy as np
-from numpy.typing import NDArray
 
 from bfsensor._kernels.charge import Response
 from bfsensor._kernels.photons import Medium
 from bfsensor._kernels.shifts import Edges
 from bfsensor.errors import SensorError, TableError
-from bfsensor.galsim_format import read_sides
 from bfsensor.sensor.base import EngineSensor, read_numbers
-from bfsensor.sensor.drift import MEASURED, STEPS
-from bfsensor.sensor.edges import make_edges, transpose_sides
-from bfsensor.sensor.exposure import Physics
+from bfsensor.sensor.drift_field import MEASURED, STEPS
+from bfsensor.sensor.edge_weights import make_edges, transpose_sides
+from bfsensor.sensor.image_exposure import Physics
+from bfsensor.table.galsim_format import read_sides
+from bfsensor.typing import FloatArray
 
 _DEPTH_SCALE = 12.0  # um; GalSim: shifts grow as tanh(z / 12 um), an empirical fit
 _SURFACE_PATH = 1.0  # um; depth of conversion in GalSim where there are no wavelengths
@@ -144,7 +144,7 @@ class SiliconSensor(EngineSensor):
         kt = 0.026 * c["CCDTemperature"] / 298.0
         return float(MEASURED * np.sqrt(2 * kt / voltage) * c["SensorThickness"])
 
-    def _make_physics(self) -> tuple[Physics, NDArray[np.float64]]:
+    def _make_physics(self) -> tuple[Physics, FloatArray]:
         c = self.config
         thickness = float(c["SensorThickness"])
         steps = np.linspace(0.0, 1.0, STEPS + 1)
@@ -204,7 +204,7 @@ class SiliconSensor(EngineSensor):
 @lru_cache(maxsize=16)
 def _read(
     cfg: str, dat: str, changed: tuple[int, ...]
-) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]:
+) -> tuple[tuple[FloatArray, FloatArray], FloatArray]:
     """Read a table once for all sensors of a process."""
     return read_sides(cfg, dat)
 

@@ -25,6 +25,7 @@ from bfsensor.errors import ConvergenceError, TableError
 from bfsensor.simulate.field import Field
 from bfsensor.simulate.mesh import Surfaces
 from bfsensor.simulate.poisson import Potential
+from bfsensor.typing import FloatArray
 
 SPLIT_HEIGHT = 4.0
 """Boundaries are bisected this far above the silicon surface [um].
@@ -75,16 +76,16 @@ class PixelBoundaries:
         Computed in one quadrant and mirrored.
     """
 
-    depths: NDArray[np.float64]
+    depths: FloatArray
     pitch: tuple[float, float]
     reach: int
-    columns: NDArray[np.float64]
-    rows: NDArray[np.float64]
+    columns: FloatArray
+    rows: FloatArray
     symmetric: bool
 
     def vertices(
-        self, vertices: int, fractions: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        self, vertices: int, fractions: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Displacements of polygon vertices that keep the area of every pixel.
 
         The vertices of a line are the least-squares polyline through it under the
@@ -148,15 +149,15 @@ class PixelBoundaries:
         return corners, horizontal, vertical
 
 
-def _between(fitted: NDArray[np.float64], vertices: int) -> NDArray[np.float64]:
+def _between(fitted: FloatArray, vertices: int) -> FloatArray:
     """The values of a fitted line at the vertices between the corners, pixel by pixel."""
     return fitted[:-1].reshape(-1, vertices + 1)[:, 1:]
 
 
 def mirror_quadrant(
-    corners: NDArray[np.float64],
-    horizontal: NDArray[np.float64],
-    vertical: NDArray[np.float64],
+    corners: FloatArray,
+    horizontal: FloatArray,
+    vertical: FloatArray,
 ) -> None:
     """Copy the quadrant of positive offsets to the other three, in place.
 
@@ -192,12 +193,10 @@ def mirror_quadrant(
 class _LineFit:
     """Linear map from a line's values at quadrature points to its vertices."""
 
-    points: NDArray[np.float64]
-    matrix: NDArray[np.float64]
+    points: FloatArray
+    matrix: FloatArray
 
-    def apply(
-        self, line: NDArray[np.float64], along: int, ends: NDArray[np.float64], z: float
-    ) -> NDArray[np.float64]:
+    def apply(self, line: FloatArray, along: int, ends: FloatArray, z: float) -> FloatArray:
         """Vertices of ``line`` (points (x, y)) at height ``z``; corners at ``ends`` along it."""
         values = np.empty((len(ends) - 1, len(self.points)))
         for p in range(len(ends) - 1):
@@ -262,7 +261,7 @@ class Feet:
     """
 
     axis: int
-    below: tuple[tuple[NDArray[np.float64], NDArray[np.bool_]], ...]
+    below: tuple[tuple[FloatArray, NDArray[np.bool_]], ...]
 
 
 def find_boundaries(
@@ -313,7 +312,7 @@ def find_boundaries(
         A boundary was not found (a well that no longer holds its charge).
     """
     mesh = potential.mesh
-    levels: NDArray[np.float64] = np.array(depths, dtype=np.float64, ndmin=1)
+    levels: FloatArray = np.array(depths, dtype=np.float64, ndmin=1)
     surfaces = Surfaces.of(potential.device)
     lowest = lowest_depth(potential)
     if np.any(np.diff(levels) <= 0):
@@ -390,9 +389,7 @@ def lowest_depth(potential: Potential) -> float:
     return float(potential.mesh.z[np.argmax(potential.phi.max(axis=(1, 2)))])
 
 
-def _seed_positions(
-    reach: int, pitch: float, samples: int, symmetric: bool
-) -> NDArray[np.float64]:
+def _seed_positions(reach: int, pitch: float, samples: int, symmetric: bool) -> FloatArray:
     """Positions along a line: Chebyshev points in each pixel, so denser at the corners."""
     cheb = -0.5 * np.cos(np.pi * (np.arange(samples) + 0.5) / samples) * pitch
     pixels = np.arange(-reach, reach + 1)
@@ -407,15 +404,15 @@ def _seed_positions(
 def _trace_lines(
     field: Field,
     axis: int,
-    edges: NDArray[np.float64],
-    along: NDArray[np.float64],
-    depths: NDArray[np.float64],
+    edges: FloatArray,
+    along: FloatArray,
+    depths: FloatArray,
     split: float,
     coarseness: float,
     ratio: float,
     precision: float,
     turn: float,
-) -> tuple[NDArray[np.float64], tuple[tuple[NDArray[np.float64], NDArray[np.bool_]], ...]]:
+) -> tuple[FloatArray, tuple[tuple[FloatArray, NDArray[np.bool_]], ...]]:
     """Points of the lines across ``axis`` at every depth, (nd, lines, seeds, 2), and feet."""
     shape = (len(edges), len(along))
     out = np.zeros((len(depths), *shape, 2))
@@ -463,7 +460,7 @@ def _trace_lines(
     return out, tuple(feet)
 
 
-def unfold(lines: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+def unfold(lines: FloatArray, axis: int) -> FloatArray:
     """Mirror the lines of a quadrant to the whole neighbourhood."""
     flip_across = np.array([-1.0, 1.0]) if axis == 0 else np.array([1.0, -1.0])
     full = np.concatenate([lines[:, ::-1] * flip_across, lines], axis=1)

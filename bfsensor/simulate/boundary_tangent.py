@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bfsensor._kernels import path_changes
 from bfsensor.simulate.boundaries import (
@@ -24,6 +23,7 @@ from bfsensor.simulate.boundaries import (
 from bfsensor.simulate.field import Field
 from bfsensor.simulate.poisson import Potential
 from bfsensor.simulate.tangent import PotentialChange
+from bfsensor.typing import FloatArray
 
 GROWTH = 1e3
 """Of a deviation from a boundary, beyond which the way down is no longer followed."""
@@ -43,8 +43,8 @@ def boundary_changes(
     lines: PixelBoundaries,
     feet: Sequence[Feet],
     changes: Sequence[PotentialChange],
-    deeper: NDArray[np.float64] | None = None,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    deeper: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray]:
     """Differentiate the points of boundary lines.
 
     Parameters

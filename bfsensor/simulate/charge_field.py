@@ -11,12 +11,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import zeta
 
 from bfsensor._kernels import image_charge as kernel
-from bfsensor.device_parts import Material
+from bfsensor.device.parts import Material
 from bfsensor.errors import DeviceError, TableError
+from bfsensor.typing import FloatArray
 from bfsensor.units import VACUUM_PERMITTIVITY
 
 TOLERANCE = 1e-14
@@ -158,7 +159,7 @@ class ImageCharge:
                 "0 V/um everywhere"
             )
 
-    def drift_at(self, heights: ArrayLike) -> NDArray[np.float64]:
+    def drift_at(self, heights: ArrayLike) -> FloatArray:
         """Give the drift field [V/um] at heights [um]."""
         z = np.asarray(heights, float)
         if isinstance(self.drift_field, tuple):
@@ -180,12 +181,12 @@ class ImageCharge:
 class ImageSeries:
     """Images summed one by one, and the tail of all others; heights above the lower plane."""
 
-    heights: NDArray[np.float64]
-    signs: NDArray[np.float64]
-    tail: NDArray[np.float64]
+    heights: FloatArray
+    signs: FloatArray
+    tail: FloatArray
 
 
-def _tail_terms(model: ImageCharge, pairs: int) -> NDArray[np.float64]:
+def _tail_terms(model: ImageCharge, pairs: int) -> FloatArray:
     """Coefficients of r^l P_l, l = 1, 3, 5, ..., of the images beyond ``pairs``.
 
     Even terms cancel between images above and below.  Exact for a point charge.
@@ -235,7 +236,7 @@ def _sum_images(model: ImageCharge, pairs: int) -> ImageSeries:
 
 def charge_field(
     model: ImageCharge, points: ArrayLike, *, tolerance: float = TOLERANCE
-) -> NDArray[np.float64]:
+) -> FloatArray:
     r"""Give the field of one stored electron between the planes.
 
     The images :math:`|n| \le N` are rectangles in closed form; of those beyond, the terms of
@@ -294,9 +295,7 @@ def charge_field(
     return field.reshape(at.shape)
 
 
-def sum_field(
-    model: ImageCharge, points: NDArray[np.float64], series: ImageSeries
-) -> NDArray[np.float64]:
+def sum_field(model: ImageCharge, points: FloatArray, series: ImageSeries) -> FloatArray:
     """Field at points (n, 3) [V/um per electron] of one series, without any check."""
     points = points - np.array([0.0, 0.0, model.plane_height])
     out = np.zeros_like(points)
@@ -305,7 +304,7 @@ def sum_field(
     return out * model.unit_field
 
 
-def farthest(points: NDArray[np.float64], model: ImageCharge) -> float:
+def farthest(points: FloatArray, model: ImageCharge) -> float:
     """Largest distance from the lower plane's origin of a place or the back above it [um].
 
     Rounded up to a pitch, for the sake of the series that are kept.

@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 
 from bfsensor.errors import DeviceError
 from bfsensor.simulate.mesh import Mesh, Side, Surfaces
+from bfsensor.typing import FloatArray
 from bfsensor.units import VACUUM_PERMITTIVITY
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from bfsensor.device import Device, Implant
+    from bfsensor.device.device import Device
+    from bfsensor.device.parts import Implant
 
 _SAMPLES = 8
 
@@ -36,18 +38,18 @@ class Coefficients:
     """
 
     mesh: Mesh
-    cx: NDArray[np.float64]
-    cy: NDArray[np.float64]
-    cz: NDArray[np.float64]
-    cd: NDArray[np.float64]
+    cx: FloatArray
+    cy: FloatArray
+    cz: FloatArray
+    cd: FloatArray
     kind: NDArray[np.int64]
-    north: NDArray[np.float64]
-    south: NDArray[np.float64]
-    dy: NDArray[np.float64]
-    silicon: NDArray[np.float64]
+    north: FloatArray
+    south: FloatArray
+    dy: FloatArray
+    silicon: FloatArray
     n_front: int
     conductor: NDArray[np.bool_]
-    source: NDArray[np.float64] = field(repr=False)
+    source: FloatArray = field(repr=False)
 
 
 def carrier_region(device: Device) -> float:
@@ -68,8 +70,8 @@ def carrier_region(device: Device) -> float:
 
 
 def dual_widths(
-    nodes: NDArray[np.float64], side: Side, period: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    nodes: FloatArray, side: Side, period: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Intervals left and right of every node, and the widths of the cells around them."""
     gaps = np.diff(nodes)
     if side == "mirror":
@@ -124,19 +126,17 @@ def discretise(device: Device, mesh: Mesh) -> Coefficients:
         for s in steps:
             columns.append((mesh.x + sign * 0.5 * s * gaps, 0.5 * gaps / _SAMPLES))
 
-    def distance(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def distance(x: FloatArray) -> FloatArray:
         pitch = mesh.pitch[0]
         return pitch / 2 - np.abs(x - pitch * np.round(x / pitch))
 
-    def flux_capacity(
-        zz: NDArray[np.float64], d: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def flux_capacity(zz: FloatArray, d: FloatArray) -> FloatArray:
         gate, surface = surfaces.gate(d), surfaces.silicon(d)
         return eps_ox * (np.clip(zz, gate, surface) - gate) + eps_si * np.maximum(
             zz - surface, 0.0
         )
 
-    def resistance(zz: NDArray[np.float64], d: NDArray[np.float64]) -> NDArray[np.float64]:
+    def resistance(zz: FloatArray, d: FloatArray) -> FloatArray:
         gate, surface = surfaces.gate(d), surfaces.silicon(d)
         return (np.clip(zz, gate, surface) - gate) / eps_ox + np.maximum(
             zz - surface, 0.0
@@ -232,9 +232,7 @@ def discretise(device: Device, mesh: Mesh) -> Coefficients:
     )
 
 
-def _halo_x(
-    a: NDArray[np.float64], side: Side, *, links: bool = False
-) -> NDArray[np.float64]:
+def _halo_x(a: FloatArray, side: Side, *, links: bool = False) -> FloatArray:
     """Add the halo columns (periodic images, or nothing) and the axis of row kinds."""
     out = np.zeros((1, a.shape[0], a.shape[1] + 2))
     out[0, :, 1:-1] = a
@@ -246,7 +244,7 @@ def _halo_x(
     return out
 
 
-def link_factors(gaps: NDArray[np.float64], dy: NDArray[np.float64]) -> NDArray[np.float64]:
+def link_factors(gaps: FloatArray, dy: FloatArray) -> FloatArray:
     """Link factor to the next row per row width, zero where there is none; with halo."""
     out = np.zeros(len(gaps) + 2)
     np.divide(1.0, gaps * dy, out=out[1:-1], where=gaps > 0)
@@ -256,15 +254,15 @@ def link_factors(gaps: NDArray[np.float64], dy: NDArray[np.float64]) -> NDArray[
 def _gate_potential(
     device: Device,
     mesh: Mesh,
-    south_gap: NDArray[np.float64],
-    north_gap: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    south_gap: FloatArray,
+    north_gap: FloatArray,
+) -> FloatArray:
     """Gate voltage averaged over the width of each row [V]."""
     pitch = mesh.pitch[1]
     collecting = max(device.gates.edges_y(pitch))
     point = device.operating_point
 
-    def voltage(y: NDArray[np.float64]) -> NDArray[np.float64]:
+    def voltage(y: FloatArray) -> FloatArray:
         offset = np.abs(y - pitch * np.round(y / pitch))
         return np.where(offset < collecting, point.gate_high, point.gate_low)
 
@@ -276,13 +274,13 @@ def _fixed_charge(
     device: Device,
     mesh: Mesh,
     surfaces: Surfaces,
-    columns: list[tuple[NDArray[np.float64], NDArray[np.float64]]],
-    distance: Callable[[NDArray[np.float64]], NDArray[np.float64]],
-    z_lower: NDArray[np.float64],
-    z_upper: NDArray[np.float64],
-    silicon: NDArray[np.float64],
-    dy: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    columns: list[tuple[FloatArray, FloatArray]],
+    distance: Callable[[FloatArray], FloatArray],
+    z_lower: FloatArray,
+    z_upper: FloatArray,
+    silicon: FloatArray,
+    dy: FloatArray,
+) -> FloatArray:
     """Dopants and surface charge of every node [e-], ``[y, z, x]`` with halo."""
     nz, ny, nx = mesh.shape
     channel, stop = device.channel, device.channel_stop
@@ -292,9 +290,9 @@ def _fixed_charge(
     def dose(
         implants: tuple[Implant, ...],
         surface_charge: float,
-        x_surface: NDArray[np.float64],
-        weight: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
+        x_surface: FloatArray,
+        weight: FloatArray,
+    ) -> FloatArray:
         total = np.zeros((nz, nx))
         for implant in implants:
             total += implant.cumulative(
@@ -334,15 +332,15 @@ def _fixed_charge(
     return out
 
 
-def _ripple(device: Device, mesh: Mesh, row: int) -> NDArray[np.float64] | float:
+def _ripple(device: Device, mesh: Mesh, row: int) -> FloatArray | float:
     """Relative background doping of the nodes of a row."""
-    factor: NDArray[np.float64] | float = 1.0
+    factor: FloatArray | float = 1.0
     for ripple in device.silicon.ripples:
         factor = factor * ripple.factor(mesh.x, np.full_like(mesh.x, mesh.y[row]))
     return factor
 
 
-def _dot_share(device: Device, mesh: Mesh) -> NDArray[np.float64]:
+def _dot_share(device: Device, mesh: Mesh) -> FloatArray:
     """Share of each row's width that lies within the channel-stop dots."""
     dots = device.channel_stop.dots
     assert dots is not None  # the caller asked

@@ -37,10 +37,11 @@ from bfsensor.simulate.edge_system import (
 from bfsensor.simulate.mesh import Surfaces
 from bfsensor.simulate.poisson import Potential
 from bfsensor.simulate.unit_cell import solve_unit_cell
+from bfsensor.typing import FloatArray
 from bfsensor.units import VACUUM_PERMITTIVITY
 
 if TYPE_CHECKING:
-    from bfsensor.device import Device
+    from bfsensor.device.device import Device
 
 _BIAS_STEP = 0.04  # of the drop across the silicon, to find the height of the plane
 _CELLS = 16
@@ -74,9 +75,9 @@ class EdgeField:
 
     device: Device
     front: FrontPlane
-    x: NDArray[np.float64]
-    z: NDArray[np.float64]
-    phi: NDArray[np.float64] = field(repr=False)
+    x: FloatArray
+    z: FloatArray
+    phi: FloatArray = field(repr=False)
     neutral: NDArray[np.bool_] = field(repr=False)
     pitch: float
     pixels: int
@@ -125,7 +126,7 @@ def front_plane(device: Device, *, charge: float = 0.0) -> FrontPlane:
     return FrontPlane(height, a1 + b1 * height + _parabola(plain, height))
 
 
-def _parabola(device: Device, z: float | NDArray[np.float64]) -> float:
+def _parabola(device: Device, z: float | FloatArray) -> float:
     """Part of the potential [V] that the background doping makes."""
     permittivity = device.material.permittivity_silicon * VACUUM_PERMITTIVITY
     return -0.5 * device.silicon.background_doping / permittivity * z**2  # type: ignore
@@ -201,7 +202,7 @@ def solve_edge(
     Examples
     --------
     >>> from bfsensor import Device
-    >>> from bfsensor.device_parts import Edge, EdgeStrip
+    >>> from bfsensor.device.parts import Edge, EdgeStrip
     >>> ring = Edge("x", (EdgeStrip(50.0, 20.0, "none"), EdgeStrip(200.0)))
     >>> device = dataclasses.replace(Device.load("itl_sta3800c"), edge=ring)
     >>> edge = solve_edge(device)
@@ -274,7 +275,7 @@ def _check(device: Device, pixels: int | None, refine: int) -> None:
                 )
 
 
-def _check_front_holes(edge: EdgeField, ends: NDArray[np.float64], surface: float) -> None:
+def _check_front_holes(edge: EdgeField, ends: FloatArray, surface: float) -> None:
     """Refuse a first strip into which the holes of the channel stops would flow."""
     device = edge.device
     level = device.operating_point.hole_quasi_fermi_level

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicHermiteSpline
 
 from bfsensor.errors import DeviceError
 from bfsensor.simulate.edge_field import EdgeField
+from bfsensor.typing import FloatArray
 
 _STEEP = 0.05
 """Step as a part of the height above the front plane, and no less than this [um]."""
@@ -53,26 +54,26 @@ class EdgeShift:
 
     side: str
     pitch: float
-    depths: NDArray[np.float64]
-    shifts: NDArray[np.float64]
+    depths: FloatArray
+    shifts: FloatArray
     shadowed: int
 
     @property
-    def distances(self) -> NDArray[np.float64]:
+    def distances(self) -> FloatArray:
         """Distance of the boundaries from the end of the array [um]."""
         return np.asarray(np.arange(self.shifts.shape[1]) * self.pitch, float)
 
     @property
-    def pixel_shifts(self) -> NDArray[np.float64]:
+    def pixel_shifts(self) -> FloatArray:
         """Shifts [pixel], shape (nd, n + 1)."""
         return self.shifts / self.pitch
 
     @property
-    def area_changes(self) -> NDArray[np.float64]:
+    def area_changes(self) -> FloatArray:
         """Relative change of the areas of the pixels, shape (nd, n): what a flat shows."""
         return np.diff(self.shifts, axis=1) / self.pitch
 
-    def displacement(self, positions: ArrayLike, depth: float) -> NDArray[np.float64]:
+    def displacement(self, positions: ArrayLike, depth: float) -> FloatArray:
         """Give the displacement [um] of small images, positive away from the edge.
 
         Parameters
@@ -131,7 +132,7 @@ def trace_edge(edge: EdgeField, depths: ArrayLike) -> EdgeShift:
     --------
     >>> import dataclasses
     >>> from bfsensor import Device
-    >>> from bfsensor.device_parts import Edge, EdgeStrip
+    >>> from bfsensor.device.parts import Edge, EdgeStrip
     >>> from bfsensor.simulate.edge_field import solve_edge
     >>> ring = Edge("x", (EdgeStrip(50.0, 20.0, "none"), EdgeStrip(200.0)))
     >>> device = dataclasses.replace(Device.load("itl_sta3800c"), edge=ring)
@@ -139,7 +140,7 @@ def trace_edge(edge: EdgeField, depths: ArrayLike) -> EdgeShift:
     >>> bool(shift.shifts[1, 2] > 1.0), bool(abs(shift.shifts[1, 40]) < 0.01)
     (True, True)
     """
-    levels: NDArray[np.float64] = np.array(depths, dtype=np.float64, ndmin=1)
+    levels: FloatArray = np.array(depths, dtype=np.float64, ndmin=1)
     low, high = edge.front.height, float(edge.z[-1])
     if np.any(np.diff(levels) <= 0):
         raise DeviceError(f"conversion depths {levels.tolist()} um must ascend")
@@ -156,7 +157,7 @@ def trace_edge(edge: EdgeField, depths: ArrayLike) -> EdgeShift:
             "electrons set free there diffuse, and boundaries are not defined"
         )
     slopes = _Slopes(edge)
-    starts: NDArray[np.float64] = edge.pitch * np.arange(edge.pixels + 1.0)
+    starts: FloatArray = edge.pitch * np.arange(edge.pixels + 1.0)
     first, outer = _outermost(edge, slopes, levels)
     shadowed = int(np.searchsorted(starts, first)) - 1
     traced = _trace_up(slopes, starts[shadowed + 1 :], levels, low, high)
@@ -182,9 +183,7 @@ class _Slopes:
         # The pixels are at one potential, and the plane's end is a corner.
         self.along_x[0, self.x >= 0] = 0.0
 
-    def __call__(
-        self, x: NDArray[np.float64], z: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def __call__(self, x: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gradient of the potential [V/um] at points; beyond the mesh that of its border."""
         i = np.clip(np.searchsorted(self.x, x) - 1, 0, len(self.x) - 2)
         k = np.clip(np.searchsorted(self.z, z) - 1, 0, len(self.z) - 2)
@@ -200,11 +199,11 @@ class _Slopes:
 
 def _trace_up(
     slopes: _Slopes,
-    starts: NDArray[np.float64],
-    levels: NDArray[np.float64],
+    starts: FloatArray,
+    levels: FloatArray,
     low: float,
     high: float,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Places of the lines from the front plane at all levels; nan where they turn back."""
     heights = [low]
     while heights[-1] < high:
@@ -214,7 +213,7 @@ def _trace_up(
     x = starts.copy()
     turned = np.zeros(len(x), bool)
 
-    def slope(x: NDArray[np.float64], z: float) -> NDArray[np.float64]:
+    def slope(x: FloatArray, z: float) -> FloatArray:
         gx, gz = slopes(x, np.full_like(x, z))
         flat = gz > -np.abs(gx) / _FLATTEST
         np.logical_or(turned, flat | (gz >= 0), out=turned)
@@ -236,8 +235,8 @@ def _trace_up(
 
 
 def _outermost(
-    edge: EdgeField, slopes: _Slopes, levels: NDArray[np.float64]
-) -> tuple[float, NDArray[np.float64]]:
+    edge: EdgeField, slopes: _Slopes, levels: FloatArray
+) -> tuple[float, FloatArray]:
     """Where on the front plane the lines begin that reach the back, and the first of them.
 
     Lines from further out end in the strips, or on them where the strips repel electrons.

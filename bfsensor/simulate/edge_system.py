@@ -12,10 +12,11 @@ from scipy.sparse import coo_matrix, csc_matrix, diags
 from scipy.sparse.linalg import splu
 
 from bfsensor.errors import ConvergenceError
+from bfsensor.typing import FloatArray
 from bfsensor.units import VACUUM_PERMITTIVITY
 
 if TYPE_CHECKING:
-    from bfsensor.device import Device
+    from bfsensor.device.device import Device
 
 TOLERANCE = 1e-7
 """Largest last step of Newton's method [V]."""
@@ -45,7 +46,7 @@ class FrontPlane:
 
 def grade_nodes(
     ends: list[float], thickness: float, finest: float, refine: int
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Nodes through all ends, fine there but for the last one, and graded."""
     coarsest = _COARSEST * thickness
     out = [float(ends[0])]
@@ -74,18 +75,18 @@ class System:
     """Matrix [e-/V per um], fixed charge [e- per um] and who is free; flat over (z, x)."""
 
     matrix: csc_matrix
-    charge: NDArray[np.float64]
-    held: NDArray[np.float64]
+    charge: FloatArray
+    held: FloatArray
     free: NDArray[np.bool_]
-    acceptors: NDArray[np.float64]
+    acceptors: FloatArray
 
 
 def assemble(
     device: Device,
     front: FrontPlane,
-    x: NDArray[np.float64],
-    z: NDArray[np.float64],
-    ends: NDArray[np.float64],
+    x: FloatArray,
+    z: FloatArray,
+    ends: FloatArray,
     surface: float,
 ) -> System:
     """Links, charges and conductors, summed over the intervals in x."""
@@ -156,7 +157,7 @@ def assemble(
 
 def relax_holes(
     device: Device, system: System
-) -> tuple[NDArray[np.float64], NDArray[np.float64], list[float]]:
+) -> tuple[FloatArray, FloatArray, list[float]]:
     """Potential [V] and holes [e- per um] of all nodes, and the steps on the way."""
     kt = device.material.thermal_voltage(device.operating_point.temperature)
     bias = device.operating_point.back_bias

@@ -19,10 +19,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import k1
 
 from bfsensor.simulate.poisson import Potential
+from bfsensor.typing import FloatArray
 
 _MODES = 40
 _STEPS = 200
@@ -43,13 +43,13 @@ class FarField:
         Outward shift of a boundary, in arbitrary units.
     """
 
-    distances: NDArray[np.float64]
-    depths: NDArray[np.float64]
-    shifts: NDArray[np.float64]
+    distances: FloatArray
+    depths: FloatArray
+    shifts: FloatArray
 
     @classmethod
     def of(
-        cls, unit: Potential, depths: NDArray[np.float64], ground: float, reach: float
+        cls, unit: Potential, depths: FloatArray, ground: float, reach: float
     ) -> FarField:
         """Compute for the mean field of a unit cell.
 
@@ -91,7 +91,7 @@ class FarField:
         )
         return cls(distances, np.asarray(depths, float), shifts)
 
-    def vectors(self, points: NDArray[np.float64], depth: int) -> NDArray[np.float64]:
+    def vectors(self, points: FloatArray, depth: int) -> FloatArray:
         """Outward shift vectors at ``points`` (..., 2) relative to the dipole."""
         rho = np.hypot(points[..., 0], points[..., 1])
         size = np.exp(
@@ -105,8 +105,8 @@ class FarField:
 
 
 def image_shifts(
-    far: FarField, points: NDArray[np.float64], depth: int, period: tuple[float, float]
-) -> NDArray[np.float64]:
+    far: FarField, points: FloatArray, depth: int, period: tuple[float, float]
+) -> FloatArray:
     """Summed unit shifts at ``points`` (..., 2) from all images but the one at the origin."""
     out = np.zeros_like(points)
     for a in range(-_IMAGES, _IMAGES + 1):

@@ -5,21 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bfsensor.simulate.mesh import Surfaces
 from bfsensor.simulate.poisson import Potential
+from bfsensor.typing import FloatArray
 
 
 @dataclass(frozen=True)
 class Field:
     """A potential padded for interpolation: ``phi`` [y, z, x] and its node positions."""
 
-    phi: NDArray[np.float64]
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    z: NDArray[np.float64]
-    zone: NDArray[np.float64]
+    phi: FloatArray
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+    zone: FloatArray
 
     @classmethod
     def of(cls, potential: Potential) -> Field:
@@ -46,13 +46,13 @@ class Field:
 
 
 def _pad(
-    phi: NDArray[np.float64],
-    nodes: NDArray[np.float64],
+    phi: FloatArray,
+    nodes: FloatArray,
     axis: int,
     side: str,
     period: float,
     cells: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[FloatArray, FloatArray]:
     count = len(nodes)
     if side == "mirror":
         width = min(cells, count - 1)
@@ -66,14 +66,10 @@ def _pad(
     return np.take(phi, order, axis=axis), np.concatenate([low, nodes, high])
 
 
-def _pad_z(
-    phi: NDArray[np.float64], z: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _pad_z(phi: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Two planes more at either end, from the parabola through the last three."""
 
-    def beyond(
-        target: float, nodes: NDArray[np.float64], values: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def beyond(target: float, nodes: FloatArray, values: FloatArray) -> FloatArray:
         a, b, c = nodes
         return (
             values[:, 0] * (target - b) * (target - c) / ((a - b) * (a - c))

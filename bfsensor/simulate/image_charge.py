@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from bfsensor._kernels import image_charge as kernel
 from bfsensor.errors import TableError
@@ -36,6 +36,7 @@ from bfsensor.simulate.charge_field import (
     image_series,
     sum_field,
 )
+from bfsensor.typing import FloatArray
 
 SAMPLES = 48
 """Points of a boundary line per pixel; areas of tables are then good to 5e-4."""
@@ -47,9 +48,7 @@ _RAY_STEPS = 6
 """Runge-Kutta steps in such a panel."""
 
 
-def _panels(
-    model: ImageCharge, seal: float, depths: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _panels(model: ImageCharge, seal: float, depths: FloatArray) -> FloatArray:
     """Heights between which the field along a path is a polynomial to all purposes.
 
     The field's scale is the distance to the rectangle, which grows with height.
@@ -69,11 +68,11 @@ def _panels(
 
 def _shifts(
     model: ImageCharge,
-    places: NDArray[np.float64],
+    places: FloatArray,
     axis: int,
-    depths: NDArray[np.float64],
+    depths: FloatArray,
     tolerance: float,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Shift of boundaries across ``axis``, (nd, n) [um per electron], first order.
 
     ``places`` are points (u, v), (n, 2), u along the axis and v along the boundary, or edges
@@ -101,9 +100,7 @@ def _shifts(
     return np.cumsum(steps, axis=0)
 
 
-def _check_request(
-    model: ImageCharge, depths: ArrayLike, reach: int
-) -> NDArray[np.float64]:
+def _check_request(model: ImageCharge, depths: ArrayLike, reach: int) -> FloatArray:
     levels = np.asarray(depths, float)
     bad = levels[~((levels > 0) & (levels <= model.thickness))]
     if bad.size or not levels.size:
@@ -129,13 +126,13 @@ class EdgeShifts:
         are those of the depths.
     """
 
-    north: NDArray[np.float64]
-    east: NDArray[np.float64]
-    south: NDArray[np.float64]
-    west: NDArray[np.float64]
+    north: FloatArray
+    east: FloatArray
+    south: FloatArray
+    west: FloatArray
 
     @property
-    def area_changes(self) -> NDArray[np.float64]:
+    def area_changes(self) -> FloatArray:
         """Relative area change per electron, the sum of the four."""
         return self.north + self.south + (self.east + self.west)
 
@@ -201,7 +198,7 @@ def edge_shifts(
 
 def area_changes(
     model: ImageCharge, *, depth: ArrayLike, reach: int = 8, tolerance: float = TOLERANCE
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Give the relative area change of every pixel per electron in the central one.
 
     In first order, the coefficients of Astier & Regnault (2023); flats have
@@ -331,18 +328,18 @@ def trace_boundaries(
 
 def _trace(
     model: ImageCharge,
-    start: NDArray[np.float64],
+    start: FloatArray,
     axis: int,
-    depths: NDArray[np.float64],
+    depths: FloatArray,
     charge: float,
     tolerance: float,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Follow field lines up from the sealed height (fourth-order Runge-Kutta in height)."""
     seal = model.row_height if axis else model.column_height
     panels = _panels(model, seal, depths)
     series = image_series(model, farthest(start, model) + model.pitch_x, tolerance)
 
-    def slope(at: NDArray[np.float64], z: float) -> NDArray[np.float64]:
+    def slope(at: FloatArray, z: float) -> FloatArray:
         points = np.column_stack([at, np.full(len(at), z)])
         field = charge * sum_field(model, points, series)
         along = model.drift_at(z) + field[:, 2]
@@ -369,7 +366,7 @@ def _trace(
 
 def _check_lines(
     model: ImageCharge, depths: ArrayLike, charge: float, reach: int, samples: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[FloatArray, FloatArray]:
     """Depths, and positions along a line in pitches: Chebyshev points in every pixel."""
     levels = np.atleast_1d(_check_request(model, depths, reach))
     if levels.ndim != 1 or np.any(np.diff(levels) <= 0):
@@ -387,8 +384,8 @@ def _check_lines(
 
 
 def _line_points(
-    model: ImageCharge, axis: int, seeds: NDArray[np.float64], reach: int
-) -> NDArray[np.float64]:
+    model: ImageCharge, axis: int, seeds: FloatArray, reach: int
+) -> FloatArray:
     """Nominal points (x, y) of the lines at positive offsets, (lines, seeds, 2)."""
     pitch = np.array([model.pitch_x, model.pitch_y])
     points = np.zeros((reach + 1, len(seeds), 2))
@@ -397,7 +394,7 @@ def _line_points(
     return points
 
 
-def _mirror(lines: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+def _mirror(lines: FloatArray, axis: int) -> FloatArray:
     """Mirror the lines of a quadrant to all four."""
     flip = np.array([-1.0, 1.0]) if axis == 0 else np.array([1.0, -1.0])
     both = np.concatenate([lines[:, ::-1] * flip, lines], axis=1)

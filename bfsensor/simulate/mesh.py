@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.errors import DeviceError
+from bfsensor.typing import FloatArray
 
 if TYPE_CHECKING:
-    from bfsensor.device import Device
+    from bfsensor.device.device import Device
 
 Side = Literal["mirror", "periodic"]
 
@@ -52,9 +53,9 @@ class Mesh:
         Cells a pixel.
     """
 
-    x: NDArray[np.float64]
-    y: NDArray[np.float64]
-    z: NDArray[np.float64]
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
     side_x: Side
     side_y: Side
     pitch: tuple[float, float]
@@ -192,9 +193,7 @@ def _segments(device: Device, axis: int) -> list[tuple[float, float]]:
     ]
 
 
-def _half_pixel_nodes(
-    segments: list[tuple[float, float]], cells: int
-) -> NDArray[np.float64]:
+def _half_pixel_nodes(segments: list[tuple[float, float]], cells: int) -> FloatArray:
     """Nodes from the pixel centre to its edge, ``cells`` intervals, all segment ends hit.
 
     Built on a count that halving can reach, then halved, so that the meshes at ``cells``
@@ -221,16 +220,14 @@ def _half_pixel_nodes(
     return out
 
 
-def _halve(nodes: NDArray[np.float64]) -> NDArray[np.float64]:
+def _halve(nodes: FloatArray) -> FloatArray:
     out = np.empty(2 * len(nodes) - 1)
     out[::2] = nodes
     out[1::2] = 0.5 * (nodes[1:] + nodes[:-1])
     return out
 
 
-def _tile_nodes(
-    half: NDArray[np.float64], pitch: float, start: float, stop: float
-) -> NDArray[np.float64]:
+def _tile_nodes(half: FloatArray, pitch: float, start: float, stop: float) -> FloatArray:
     """Repeat the nodes of half a pixel, mirrored, from ``start`` to ``stop``."""
     whole = np.concatenate([-half[:0:-1], half[:-1]])
     n = round((stop - start) / pitch) + 2
@@ -239,7 +236,7 @@ def _tile_nodes(
     return nodes[(nodes > start - 1e-9) & (nodes < stop + 1e-9)]
 
 
-def _z_nodes(device: Device, refine: int) -> NDArray[np.float64]:
+def _z_nodes(device: Device, refine: int) -> FloatArray:
     """Nodes from the gates to the back contact, fine at the surfaces and graded above."""
     surfaces = Surfaces.of(device)
     levels = sorted(
@@ -299,7 +296,7 @@ class Surfaces:
             stop.side_diffusion,
         )
 
-    def ramp(self, distance: NDArray[np.float64], width: float) -> NDArray[np.float64]:
+    def ramp(self, distance: FloatArray, width: float) -> FloatArray:
         """Rise from 0 in the channel stop to 1 in the channel, against distance from the edge."""
         beyond = distance - self.stop_half_width
         if width <= 0:
@@ -307,11 +304,11 @@ class Surfaces:
             return np.where(beyond > 1e-9, 1.0, 0.0)
         return np.clip(beyond / width, 0.0, 1.0)
 
-    def gate(self, distance: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gate(self, distance: FloatArray) -> FloatArray:
         """Height of the gate's lower face [um]."""
         return self.gate_channel * self.ramp(distance, self.taper)
 
-    def silicon(self, distance: NDArray[np.float64]) -> NDArray[np.float64]:
+    def silicon(self, distance: FloatArray) -> FloatArray:
         """Height of the silicon surface [um]."""
         return self.silicon_stop + (self.silicon_channel - self.silicon_stop) * self.ramp(
             distance, self.taper

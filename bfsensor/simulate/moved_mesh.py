@@ -11,13 +11,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bfsensor.errors import DeviceError
 from bfsensor.simulate.mesh import FINE_ABOVE, Mesh, Surfaces
+from bfsensor.typing import FloatArray
 
 if TYPE_CHECKING:
-    from bfsensor.device import Device
+    from bfsensor.device.device import Device
 
 _SAME = 1e-6  # um; nearer than that two surfaces or edges are one
 
@@ -48,7 +48,7 @@ def move_mesh(mesh: Mesh, device: Device, moved: Device) -> Mesh:
 
     Examples
     --------
-    >>> from bfsensor.device import Device
+    >>> from bfsensor.device.device import Device
     >>> from bfsensor.simulate.mesh import make_mesh
     >>> device = Device.load("itl_sta3800c")
     >>> thicker = device.with_value("thickness", "105 um")
@@ -101,12 +101,12 @@ def _heights(device: Device) -> list[float]:
 
 
 def _follow(
-    nodes: NDArray[np.float64],
+    nodes: FloatArray,
     here: list[float],
     there: list[float],
     moved: Device,
     axis: str,
-) -> NDArray[np.float64]:
+) -> FloatArray:
     """Positions of nodes when points go from ``here`` to ``there``, linear between them."""
     order = sorted(range(len(here)), key=lambda n: here[n])
     kept: list[int] = []

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from bfsensor._kernels import relaxation
 from bfsensor.simulate.discretise import Coefficients, dual_widths, link_factors
+from bfsensor.typing import FloatArray
 
 _COARSEST_SWEEPS = 6
 _PINNED = 1e12  # a link strong enough to hold a coarse node inside a conductor at zero
@@ -52,7 +53,7 @@ class Multigrid:
             level = coarser
         self.cycles = 0
 
-    def set_carriers(self, carriers: NDArray[np.float64]) -> None:
+    def set_carriers(self, carriers: FloatArray) -> None:
         """Take the derivative of the mobile charge [e-/V], front planes of the finest level."""
         self.levels[0].carriers[...] = carriers
         for upper, lower in zip(self.levels[:-1], self.levels[1:], strict=True):
@@ -61,7 +62,7 @@ class Multigrid:
                 upper.carriers, upper.weight_x, upper.weight_y, lower.carriers
             )
 
-    def cycle(self, charge: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    def cycle(self, charge: FloatArray, out: FloatArray) -> None:
         """Write the approximate solution of ``A out = charge`` to ``out``."""
         self.cycles += 1
         top = self.levels[0]
@@ -146,9 +147,7 @@ def _make_level(fine: Coefficients) -> _Level:
     )
 
 
-def interpolation_weights(
-    nodes: NDArray[np.float64], side: str, period: float
-) -> NDArray[np.float64]:
+def interpolation_weights(nodes: FloatArray, side: str, period: float) -> FloatArray:
     """Weight of the upper coarse neighbour of every fine node between two, with halo.
 
     Fine node ``f`` (counted from the halo) is coarse where ``f`` is odd; the halo gets
@@ -195,7 +194,7 @@ def _coarsen(fine: Coefficients) -> Coefficients | None:
         conductor[:, :, 0], conductor[:, :, -1] = conductor[:, :, -2], conductor[:, :, 1]
     free = ~conductor
 
-    def gather(a: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gather(a: FloatArray) -> FloatArray:
         out = np.zeros_like(conductor, dtype=float)
         centre = a[:, :, 1:-1][:, :, ::2]
         n = centre.shape[2]

@@ -25,9 +25,10 @@ from bfsensor.errors import ConvergenceError, DeviceError
 from bfsensor.simulate.discretise import discretise
 from bfsensor.simulate.mesh import Mesh
 from bfsensor.simulate.multigrid import Multigrid
+from bfsensor.typing import FloatArray
 
 if TYPE_CHECKING:
-    from bfsensor.device import Device
+    from bfsensor.device.device import Device
 
 TOLERANCE = 1e-6
 """Iteration error [V] at which a solution counts as converged.
@@ -82,12 +83,12 @@ class Potential:
 
     device: Device
     mesh: Mesh
-    charges: NDArray[np.float64]
-    phi: NDArray[np.float64] = field(repr=False)
-    electrons: NDArray[np.float64] = field(repr=False)
-    holes: NDArray[np.float64] = field(repr=False)
-    silicon: NDArray[np.float64] = field(repr=False)
-    quasi_fermi: NDArray[np.float64] = field(repr=False)
+    charges: FloatArray
+    phi: FloatArray = field(repr=False)
+    electrons: FloatArray = field(repr=False)
+    holes: FloatArray = field(repr=False)
+    silicon: FloatArray = field(repr=False)
+    quasi_fermi: FloatArray = field(repr=False)
     error_volts: float
     history: tuple[NewtonStep, ...] = field(repr=False)
 
@@ -154,7 +155,7 @@ class Electrostatics:
         self,
         charges: ArrayLike,
         *,
-        start: NDArray[np.float64] | None = None,
+        start: FloatArray | None = None,
         tolerance: float = TOLERANCE,
     ) -> Potential:
         """Solve for given electrons in each pixel.
@@ -202,7 +203,7 @@ class Electrostatics:
         )  # fmt: skip
         self._check_hole_region()
 
-        def inner(a: NDArray[np.float64]) -> NDArray[np.float64]:
+        def inner(a: FloatArray) -> FloatArray:
             return np.moveaxis(a[1:-1, :, 1:-1], 1, 0).copy()
 
         silicon = c.silicon[c.kind[1:-1]][:, : c.n_front] * c.dy[1:-1, None, None]
@@ -219,9 +220,7 @@ class Electrostatics:
             history=tuple(history),
         )
 
-    def imbalance(
-        self, phi: NDArray[np.float64], charges: ArrayLike
-    ) -> NDArray[np.float64]:
+    def imbalance(self, phi: FloatArray, charges: ArrayLike) -> FloatArray:
         """Charge that a potential leaves unbalanced [e-], node by node.
 
         Parameters
@@ -256,11 +255,11 @@ class Electrostatics:
     def respond(
         self,
         at: Potential,
-        unbalanced: NDArray[np.float64],
+        unbalanced: FloatArray,
         *,
-        start: NDArray[np.float64] | None = None,
+        start: FloatArray | None = None,
         tolerance: float = 1e-3,
-    ) -> tuple[NDArray[np.float64], int]:
+    ) -> tuple[FloatArray, int]:
         """Change of a solution for a small charge that unbalances it: J^-1 of it.
 
         Parameters
@@ -308,24 +307,24 @@ class Electrostatics:
 
     # -- the pieces ------------------------------------------------------------------
 
-    def _counts(self, charges: ArrayLike) -> NDArray[np.float64]:
+    def _counts(self, charges: ArrayLike) -> FloatArray:
         """Electrons of each pixel inside the domain."""
         whole = np.broadcast_to(np.asarray(charges, float), self.pixel_shape)
         return np.asarray(whole * self._share_y[:, None] * self._share_x[None, :]).ravel()
 
-    def _padded(self, a: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _padded(self, a: FloatArray) -> FloatArray:
         """A field as the kernels want it: ``[y, z, x]`` with halo."""
         out = np.zeros(self._shape)
         out[1:-1, :, 1:-1] = np.moveaxis(a, 0, 1)
         self._fill_halo(out)
         return out
 
-    def _fill_halo(self, a: NDArray[np.float64]) -> None:
+    def _fill_halo(self, a: FloatArray) -> None:
         relaxation.fill_halo(
             a, self.mesh.side_x == "periodic", self.mesh.side_y == "periodic"
         )
 
-    def _empty_start(self) -> NDArray[np.float64]:
+    def _empty_start(self) -> FloatArray:
         """A first guess without carriers: linear solution, held above the hole level."""
         c = self.coefficients
         self._stiffness[...] = 0.0
@@ -355,9 +354,7 @@ class Electrostatics:
         front[silicon] = np.maximum(front[silicon], floor)
         return np.moveaxis(phi[1:-1, :, 1:-1], 1, 0).copy()
 
-    def _open_wells(
-        self, phi: NDArray[np.float64], charges: NDArray[np.float64]
-    ) -> NDArray[np.float64] | None:
+    def _open_wells(self, phi: FloatArray, charges: FloatArray) -> FloatArray | None:
         """Make room in wells that the start has empty; their levels, or None if none is new.
 
         An empty well's maximum lies far above any electron level.  The potential is cut
@@ -403,9 +400,7 @@ class Electrostatics:
         self._fill_halo(phi)
         return fermi
 
-    def _fermi_levels(
-        self, phi: NDArray[np.float64], count: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _fermi_levels(self, phi: FloatArray, count: FloatArray) -> FloatArray:
         """Quasi-Fermi level [V] at which each pixel holds its count."""
         c = self.coefficients
         n_px = len(self._share_x)
@@ -436,11 +431,11 @@ class Electrostatics:
 
     def _newton(
         self,
-        phi: NDArray[np.float64],
-        count: NDArray[np.float64],
+        phi: FloatArray,
+        count: FloatArray,
         history: list[NewtonStep],
         tolerance: float,
-        fermi: NDArray[np.float64] | None = None,
+        fermi: FloatArray | None = None,
     ) -> float:
         """Newton's method in place; with ``fermi`` at fixed levels, else at fixed counts."""
         c = self.coefficients
@@ -499,7 +494,7 @@ class Electrostatics:
             [step.asked for step in history],
         )
 
-    def _linear_solve(self, conserved: NDArray[np.float64], forcing: float) -> int:
+    def _linear_solve(self, conserved: FloatArray, forcing: float) -> int:
         """Conjugate gradients for the Newton step; residual is consumed."""
         c = self.coefficients
         n_px = len(self._share_x)
@@ -553,8 +548,8 @@ class Electrostatics:
 
 
 def _pixel_of_node(
-    nodes: NDArray[np.float64], pitch: float, pixels: NDArray[np.int64], side: str
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    nodes: FloatArray, pitch: float, pixels: NDArray[np.int64], side: str
+) -> tuple[NDArray[np.int64], FloatArray]:
     """Pixel number of every node (with halo; -1 on borders) and each pixel's share inside."""
     offset = nodes / pitch + 0.5
     border = np.abs(offset - np.round(offset)) < 1e-6

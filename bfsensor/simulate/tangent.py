@@ -16,15 +16,15 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bfsensor.simulate.mesh import Mesh
 from bfsensor.simulate.moved_mesh import move_mesh
 from bfsensor.simulate.poisson import Electrostatics, Potential
 from bfsensor.simulate.unit_cell import tile
+from bfsensor.typing import FloatArray
 
 if TYPE_CHECKING:
-    from bfsensor.device import Device
+    from bfsensor.device.device import Device
 
 TOLERANCE = 1e-3
 """Relative error of a change in the norm of the energy, beyond that of the uniform array.
@@ -52,10 +52,8 @@ class PotentialChange:
         Of the unit cell, where that was used.
     """
 
-    at_nodes: NDArray[np.float64] = field(repr=False)
-    velocity: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]] = field(
-        repr=False
-    )
+    at_nodes: FloatArray = field(repr=False)
+    velocity: tuple[FloatArray, FloatArray, FloatArray] = field(repr=False)
     step: float
     iterations: int
     unit: PotentialChange | None = field(default=None, repr=False)
@@ -134,8 +132,6 @@ class Tangent:
         return PotentialChange(at_nodes, (vx, vy, vz), step, iterations, small)
 
 
-def _repeat(
-    values: NDArray[np.float64], unit: Potential, mesh: Mesh
-) -> NDArray[np.float64]:
+def _repeat(values: FloatArray, unit: Potential, mesh: Mesh) -> FloatArray:
     """Values on the nodes of a unit cell, over the whole array."""
     return tile(replace(unit, phi=values), mesh)

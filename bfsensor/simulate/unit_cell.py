@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from bfsensor.simulate.mesh import Mesh, make_mesh
 from bfsensor.simulate.poisson import Electrostatics, Potential
+from bfsensor.typing import FloatArray
 
 if TYPE_CHECKING:
-    from bfsensor.device import Device
+    from bfsensor.device.device import Device
 
 
 def solve_unit_cell(
@@ -41,7 +42,7 @@ def solve_unit_cell(
     return solver.solve(charge, start=empty.phi) if charge > 0 else empty
 
 
-def tile(unit: Potential, mesh: Mesh) -> NDArray[np.float64]:
+def tile(unit: Potential, mesh: Mesh) -> FloatArray:
     """Repeat the potential of a unit cell over a mesh with the same pixel nodes.
 
     Parameters
@@ -57,9 +58,7 @@ def tile(unit: Potential, mesh: Mesh) -> NDArray[np.float64]:
         Potential [V].
     """
 
-    def index(
-        nodes: NDArray[np.float64], pitch: float, cell: NDArray[np.float64]
-    ) -> NDArray[np.int64]:
+    def index(nodes: FloatArray, pitch: float, cell: FloatArray) -> NDArray[np.int64]:
         folded = np.abs(nodes - pitch * np.round(nodes / pitch))
         return np.argmin(np.abs(folded[:, None] - cell[None, :]), axis=1)
 

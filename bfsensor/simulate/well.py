@@ -13,7 +13,7 @@ from bfsensor.simulate.poisson import Electrostatics, Potential
 from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 
 if TYPE_CHECKING:
-    from bfsensor.device import Device
+    from bfsensor.device.device import Device
 
 _PERIOD = 4
 _LARGEST_WELL = 2e6  # e-: no pixel of a science CCD holds more

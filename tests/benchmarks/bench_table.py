@@ -16,12 +16,14 @@ import time
 import numpy as np
 from astropy.table import Table
 
-from bfsensor.build import PERIOD, plan_table, solve_level
-from bfsensor.device import Device
+from bfsensor.device.device import Device
+from bfsensor.response.periodic_images import PERIOD
 from bfsensor.simulate.boundaries import find_boundaries
 from bfsensor.simulate.mesh import make_mesh
 from bfsensor.simulate.poisson import Electrostatics
 from bfsensor.simulate.unit_cell import solve_unit_cell, tile
+from bfsensor.table.levels import solve_level
+from bfsensor.table.table_plan import plan_table
 
 PEER_CPU, PEER_MEMORY = 694.0, 1.78
 

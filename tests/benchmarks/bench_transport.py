@@ -13,10 +13,10 @@ import time
 
 import numpy as np
 
-from bfsensor.device import Device
+from bfsensor.device.device import Device
+from bfsensor.direct.transport import Tracer, Transport
 from bfsensor.simulate.mesh import make_mesh
 from bfsensor.simulate.poisson import Electrostatics
-from bfsensor.simulate.transport import Tracer, Transport
 
 CASES = {
     "steps": (20_000, Transport()),

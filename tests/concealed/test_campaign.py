@@ -176,7 +176,7 @@ def test_draws_have_the_fractions_asked_for():
         (lambda: make_effect("cti_serial", {"f": 1}), "needs \\['cti'\\]"),
         (lambda: make_effect("dark_hot", {"rate": 1.0}, "x"), "variant = 'x'"),
         (lambda: draw_effects(np.random.default_rng(1), null_fraction=1.5), "at most 1"),
-        (lambda: list(iterate_exposures("XL", seed=1)), "size = 'XL': one of S, M, L"),
+        (lambda: list(iterate_exposures("XL", seed=1)), "size = 'XL': one of T, S, M, L"),
         (lambda: Geometry(65, 2), "a multiple of the amplifiers"),
         (lambda: write_campaign("nowhere", seed=1, size="Q"), "size = 'Q'"),
     ],

@@ -8,12 +8,14 @@ import pytest
 from astropy.table import Table
 from click.testing import CliRunner
 
-from bfsensor.cli import main
-from bfsensor.diagnose.diagnosis import SCHEMA, diagnose, diagnose_measured, fit_bounded
-from bfsensor.diagnose.extract import measure_channels
-from bfsensor.diagnose.locate import Scanner, locate_mismatch, tail_probability
-from bfsensor.diagnose.report import write_report
-from bfsensor.diagnose.scans import DEVICE_SCAN
+from bfsensor.cli.main import main
+from bfsensor.diagnose.data.measure_channels import measure_channels
+from bfsensor.diagnose.detect.locate import Scanner, locate_mismatch, tail_probability
+from bfsensor.diagnose.detect.scans import DEVICE_SCAN
+from bfsensor.diagnose.diagnosis import diagnose, diagnose_measured
+from bfsensor.diagnose.fit.baseline_fit import fit_bounded
+from bfsensor.diagnose.report.diagnosis_result import SCHEMA
+from bfsensor.diagnose.report.html_report import write_report
 from validation.concealed.campaign import write_campaign
 from validation.concealed.library import make_effect
 from validation.concealed.plan import Size

@@ -8,12 +8,16 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
+from bfsensor.diagnose.data.reduced_channels import measure_reduced
 from bfsensor.diagnose.diagnosis import diagnose, diagnose_measured
-from bfsensor.diagnose.free_baseline import free_baseline
-from bfsensor.diagnose.reduced_channels import measure_reduced
-from bfsensor.diagnose.sources import CampaignSource, find_baseline, find_reduced_recording
+from bfsensor.diagnose.model.free_baseline import free_baseline
+from bfsensor.diagnose.model.open_baseline import (
+    CampaignSource,
+    find_baseline,
+    find_reduced_recording,
+)
 from bfsensor.errors import MeasurementError
-from bfsensor.recording.campaign import read_campaign
+from bfsensor.recording.campaign.campaign import read_campaign
 
 OFFSET, NOISE, GAIN, SIDE = 200.0, 4.0, 2.0, 160
 

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from bfsensor import silicon
-from bfsensor.diagnose.baseline import area_matrix
-from bfsensor.diagnose.conditions import Condition
-from bfsensor.diagnose.predict_flats import periodic_covariances
+from bfsensor.device import silicon
+from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.diagnose.model.flat_predictions import periodic_covariances
 from bfsensor.effects.bf_long_range import shifts_of_tail
 from bfsensor.effects.device_parameter import device_parameters
 from bfsensor.effects.effect import Law, Layout, Shot
@@ -21,6 +20,7 @@ from bfsensor.effects.lateral_diffusion import diffusion_variance
 from bfsensor.effects.library import LIBRARY, make_effect
 from bfsensor.effects.saturation import Saturation, spilled
 from bfsensor.errors import EffectError
+from bfsensor.response.edge_response import area_matrix
 from validation.concealed.card import NOMINAL, SPREAD, shifts_at
 from validation.concealed.electrostatics import EdgeShifts
 from validation.concealed.library import make_effect as make_theirs

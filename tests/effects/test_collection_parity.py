@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.extract import measure_channels
-from bfsensor.diagnose.predict import Predictor, used_channels
+from bfsensor.diagnose.data.measure_channels import measure_channels
+from bfsensor.diagnose.model.predictor import Predictor, used_channels
 from bfsensor.effects.device_parameter import device_parameters
 from bfsensor.effects.library import make_effect
 from validation.concealed.card import NOMINAL, SPREAD

@@ -5,9 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.predict_spots import grow_spots, predict_spots, representative_phases
-from bfsensor.diagnose.spot_channels import stamp_moments
-from bfsensor.diagnose.spot_widths import fit_widths
+from bfsensor.diagnose.data.spot_channels import stamp_moments
+from bfsensor.diagnose.data.spot_widths import fit_widths
+from bfsensor.diagnose.model.spot_predictions import (
+    grow_spots,
+    predict_spots,
+    representative_phases,
+)
 from bfsensor.effects.effect import Law
 from bfsensor.measure.spot_fit import fit_spots
 from bfsensor.measure.spots import Stamps

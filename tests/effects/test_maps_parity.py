@@ -3,18 +3,18 @@
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.predict import Predictor
-from bfsensor.diagnose.screen import Screen
+from bfsensor.diagnose.detect.candidate_screen import Screen
+from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.library import LIBRARY
-from tests.effects.parity import (
+from tests.effects.parity import SMALL, disagreements
+from validation.effect_parity import (
     ENGINES,
     PLACES,
-    SMALL,
-    disagreements,
+    SEED,
     effect_at,
     known_to_the_sensor,
+    own_effect,
 )
-from validation.effect_parity import SEED, own_effect
 from validation.effects_on_pixels import OnPixels, compare, null_campaign
 from validation.virtual_source import VirtualSource, virtual_baseline
 

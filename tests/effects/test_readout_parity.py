@@ -3,8 +3,9 @@
 import pytest
 
 from bfsensor.effects.library import LIBRARY
-from tests.effects.parity import ENGINES, PLACES, SMALL, disagreements, effect_at
+from tests.effects.parity import SMALL, disagreements
 from validation.concealed.library import make_effect
+from validation.effect_parity import ENGINES, PLACES, effect_at
 from validation.effects_on_pixels import compare
 
 WORDS = (

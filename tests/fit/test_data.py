@@ -9,8 +9,8 @@ import pytest
 
 from bfsensor.errors import FitError
 from bfsensor.fit.data import MODEL_ERROR, area_data, data_set, select
-from bfsensor.recording.exposures import Condition
-from bfsensor.recording.measured import read_measured
+from bfsensor.recording.campaign.exposures import Condition
+from bfsensor.recording.tables.measured import read_measured
 
 DATA = Path(__file__).parents[1] / "data"
 

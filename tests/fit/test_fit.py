@@ -10,14 +10,14 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from bfsensor import Device
+from bfsensor.device.quantities import choose_priors, quantities, with_priors
 from bfsensor.errors import FitError
+from bfsensor.fit.degeneracies import combinations, find_ties
 from bfsensor.fit.fit import fit_device
-from bfsensor.fit.quantities import choose_priors, quantities, with_priors
 from bfsensor.fit.result import WELL_KNOWN, FitResult
-from bfsensor.fit.ties import combinations, find_ties
-from tests.fit.linear_emulator import quadrant
-from tests.fit.test_solve import TRUTH
+from tests.fit.test_least_squares import TRUTH
 from tests.fit.toys import MEANS, PRIORS, SPREADS, toy_data, toy_emulator
+from tests.response.linear_emulator import quadrant
 
 DEVICE = Device.load("itl_sta3800c")
 

@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bfsensor.device.quantities import Prior
 from bfsensor.errors import ConvergenceError, FitError
 from bfsensor.fit import posterior
 from bfsensor.fit.data import DataSet
-from bfsensor.fit.missed import Missed, measure_missed, widen
+from bfsensor.fit.degeneracies import principal
+from bfsensor.fit.least_squares import LeastSquaresProblem, profile, solve
 from bfsensor.fit.posterior import find_posterior
-from bfsensor.fit.profiles import LEVELS, profile_bounds
-from bfsensor.fit.quantities import Prior
-from bfsensor.fit.sampled import bent_about, sample_posterior, with_draws
-from bfsensor.fit.solve import Problem, profile, solve
-from bfsensor.fit.ties import principal
-from bfsensor.recording.exposures import Condition
+from bfsensor.fit.posterior_draws import bent_about, sample_posterior, with_draws
+from bfsensor.fit.prediction_error import Missed, measure_missed, widen
+from bfsensor.inference.profile_bounds import LEVELS, profile_bounds
+from bfsensor.recording.campaign.exposures import Condition
 
 TURN = 0.4
 """How the first number bends with the second parameter [errors a squared spread, over 5]."""
@@ -39,7 +39,7 @@ def problem(turn=TURN, priors=PRIORS, values=(0.3, 0.1)):
         "two", "areas", np.array(values), np.array([0.2, 2.0]), (Condition(),) * 2,
         np.zeros((2, 2), int), scaled=False,
     )  # fmt: skip
-    return Problem(priors, (data,), (lambda v: bent(v, turn),))
+    return LeastSquaresProblem(priors, (data,), (lambda v: bent(v, turn),))
 
 
 def on_a_grid(whole, unknown=None):
@@ -126,7 +126,7 @@ def test_what_predictions_miss_is_an_error_of_theirs():
     wider, left = widen(whole, found, missed)
     data = whole.sets[0]
     errors = np.hypot(data.errors, size)
-    larger = Problem(PRIORS, (replace(data, errors=errors),), whole.predictors)
+    larger = LeastSquaresProblem(PRIORS, (replace(data, errors=errors),), whole.predictors)
     np.testing.assert_allclose(wider.covariance, solve(larger).covariance, rtol=1e-10)
     assert np.all(left[0] <= np.hypot(np.sqrt(np.diag(
         bent(found.values, 0.0)[1] @ found.covariance @ bent(found.values, 0.0)[1].T

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bfsensor.device.quantities import Prior
 from bfsensor.errors import FitError
 from bfsensor.fit.data import DataSet
+from bfsensor.fit.least_squares import LeastSquaresProblem, solve
 from bfsensor.fit.predictors import make_predictors
-from bfsensor.fit.quantities import Prior
-from bfsensor.fit.solve import Problem, solve
 from bfsensor.fit.spot_response import slope_weights
-from bfsensor.recording.exposures import Condition
-from tests.fit.test_solve import TRUTH
+from bfsensor.recording.campaign.exposures import Condition
+from tests.fit.test_least_squares import TRUTH
 from tests.fit.toys import MEANS, PRIORS, SPREADS, toy_data, toy_emulator
 
 CONDITIONS = (Condition(), Condition(), Condition(back_bias=-50.0))
@@ -61,7 +61,7 @@ def test_slopes_add_to_what_areas_tell():
     spots = replace(spots, errors=np.full(3, 1e-3))
     covariances = []
     for sets in ((areas,), (areas, spots)):
-        problem = Problem(PRIORS, sets, make_predictors(sets, emulator, PRIORS))
+        problem = LeastSquaresProblem(PRIORS, sets, make_predictors(sets, emulator, PRIORS))
         found = solve(problem)
         assert np.all(np.abs(found.values - TRUTH) < 4 * np.sqrt(np.diag(found.covariance)))
         covariances.append(found.covariance)

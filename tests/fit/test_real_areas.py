@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from bfsensor import Device
+from bfsensor.device.quantities import choose_priors, with_priors
 from bfsensor.fit.data import data_set
 from bfsensor.fit.fit import fit_device
-from bfsensor.fit.linearised import Linearise
-from bfsensor.fit.quantities import choose_priors, with_priors
-from bfsensor.recording.exposures import Condition
-from bfsensor.recording.measured import read_measured
+from bfsensor.fit.linear_response import Linearise
+from bfsensor.recording.campaign.exposures import Condition
+from bfsensor.recording.tables.measured import read_measured
 
 DATA = Path(__file__).parents[1] / "data"
 FREE = ("all", "back_bias:5 V", "gate_high:0.5 V", "gate_low:0.5 V")

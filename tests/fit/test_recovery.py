@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bfsensor import Device
-from bfsensor.fit.quantities import choose_priors
+from bfsensor.device.quantities import choose_priors
 from tests.fit.toys import MEANS, PRIORS, SPREADS, toy_emulator
 from validation.mock_fits import draw_truth, pulls_of_ranks, recover
 

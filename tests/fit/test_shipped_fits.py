@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from bfsensor import BrighterFatterSensor
-from bfsensor.device import Device
-from bfsensor.fit.missed import DRAWS
-from bfsensor.fit.parameters import parameter_value
-from bfsensor.fit.quantities import quantities
+from bfsensor.device.device import Device
+from bfsensor.device.parameters import parameter_value
+from bfsensor.device.quantities import quantities
+from bfsensor.files import tables_dir
+from bfsensor.fit.prediction_error import DRAWS
 from bfsensor.fit.result import FitResult
-from bfsensor.resources import tables_dir
-from bfsensor.response import CHARGE, LEVEL
-from bfsensor.table import DistortionTable
+from bfsensor.response.edge_response import CHARGE, LEVEL
+from bfsensor.table.table import DistortionTable
 
 FITTED = {"itl_sta3800c_2019": "itl_sta3800c_60", "e2v_ccd250_2019": "e2v_ccd250_70"}
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from bfsensor import Device
-from bfsensor.diagnose.predict_spots import WING, grow_spots
-from bfsensor.diagnose.spot_widths import fit_widths
-from bfsensor.diagnose.walk import walk
+from bfsensor.diagnose.data.spot_channels import WING
+from bfsensor.diagnose.data.spot_widths import fit_widths
+from bfsensor.diagnose.model.cached_response import walk
+from bfsensor.diagnose.model.spot_predictions import grow_spots
 from bfsensor.errors import FitError
 from bfsensor.fit.spot_response import STAMP, UNIT_PEAK, slope_weights
 from tests.fit.toys import toy_emulator

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from bfsensor.device.quantities import Prior
 from bfsensor.fit.data import DataSet, area_data
-from bfsensor.fit.quantities import Prior
-from tests.fit.linear_emulator import LinearEmulator, quadrant
+from tests.response.linear_emulator import LinearEmulator, quadrant
 
 NAMES = ("silicon.thickness", "silicon.background_doping", "operating_point.back_bias")
 SPREADS = (5.0, 0.8, 2.0)

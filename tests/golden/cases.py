@@ -73,7 +73,7 @@ def _digest(part: Any) -> str:
 
 def run_command(*words: object) -> str:
     """Run a command of the package in this process and give its standard output."""
-    from bfsensor.cli import main
+    from bfsensor.cli.main import main
 
     out, said = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(said):

@@ -6,13 +6,13 @@ import numpy as np
 
 from bfsensor._kernels import edges as kernel
 from bfsensor._kernels.photons import Pattern
-from bfsensor.galsim_format import read_sides
-from bfsensor.resources import tables_dir
-from bfsensor.sensor.edges import make_edges
-from bfsensor.sensor.exposure import Exposure, Physics
-from bfsensor.sensor.response import factor_table
+from bfsensor.files import tables_dir
+from bfsensor.sensor.charge_response import factor_table
+from bfsensor.sensor.edge_weights import make_edges
+from bfsensor.sensor.image_exposure import ImageExposure, Physics
 from bfsensor.sensor.silicon_sensor import SiliconSensor
-from bfsensor.table import DistortionTable
+from bfsensor.table.galsim_format import read_sides
+from bfsensor.table.table import DistortionTable
 
 NEAR = 1
 """Reach of the second mode [pixel]."""
@@ -77,7 +77,7 @@ NO_PATTERN = Pattern(
 
 
 def expose(sensor, image):
-    return Exposure(image, sensor.physics, NO_PATTERN, (0.0, 0.0), (31, 57))
+    return ImageExposure(image, sensor.physics, NO_PATTERN, (0.0, 0.0), (31, 57))
 
 
 def find_pixels(sensor, exposure, x, y, z, edges=None, hot=None):

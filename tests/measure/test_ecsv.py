@@ -13,7 +13,7 @@ from bfsensor.measure.curve import (
     fit_correlation_slopes,
 )
 from bfsensor.measure.ecsv import read_ecsv, square_lags, write_ecsv
-from bfsensor.measure.flats import FlatCovariances, flat_covariances
+from bfsensor.measure.flat_pairs import FlatCovariances, flat_covariances
 from bfsensor.measure.slopes import BFSlope, bf_slopes
 
 COLUMNS = {

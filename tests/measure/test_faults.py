@@ -8,7 +8,7 @@ from bfsensor.measure.arrays import to_floats
 from bfsensor.measure.covariance_fit import fit_covariances
 from bfsensor.measure.covariance_model import model_covariances
 from bfsensor.measure.curve import CovarianceCurve, fit_correlation_slopes, measure_curve
-from bfsensor.measure.flats import flat_covariances, measure_regions
+from bfsensor.measure.flat_pairs import flat_covariances, measure_regions
 from bfsensor.measure.growth import measure_growth
 from bfsensor.measure.spot_model import Shape, integrate_gaussian
 from bfsensor.measure.spot_moments import measure_moments

@@ -8,7 +8,7 @@ from scipy.stats import norm
 
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.bartlett import bartlett_matrix, image_weights, unfold
-from bfsensor.measure.flats import FlatCovariances, flat_covariances, measure_regions
+from bfsensor.measure.flat_pairs import FlatCovariances, flat_covariances, measure_regions
 from bfsensor.measure.products import sum_products
 
 PLAIN = {"clip": np.inf, "box": None}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bfsensor.errors import MeasurementError
-from bfsensor.measure.response import measure_response
+from bfsensor.measure.pixel_response import measure_response
 from bfsensor.measure.toy_array import close_sum, unfold_lags
 
 QUADRANT = np.array([[-2e-6, 1.5e-7, 2e-8], [3e-7, 5e-8, 1e-8], [4e-8, 1e-8, 0.0]])

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from bfsensor.measure.bartlett import image_weights
-from bfsensor.measure.flats import flat_covariances
-from bfsensor.recording.fits_images import read_bias, read_raw
-from bfsensor.recording.lsst_datasets import BrighterFatterKernel
+from bfsensor.measure.flat_pairs import flat_covariances
+from bfsensor.recording.raw.fits_images import read_bias, read_raw
+from bfsensor.recording.tables.lsst_datasets import BrighterFatterKernel
 
 SHARED = Path(__file__).parents[2].parent / "shared" / "recordings"
 if not SHARED.is_dir():

@@ -6,14 +6,14 @@ import galsim
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.baseline import area_matrix
-from bfsensor.diagnose.predict_flats import flat_covariances_of
-from bfsensor.diagnose.predict_spots import grow_spots
+from bfsensor.diagnose.model.flat_predictions import flat_covariances_of
+from bfsensor.diagnose.model.spot_predictions import grow_spots
 from bfsensor.effects.effect import Law
 from bfsensor.effects.library import make_effect
 from bfsensor.errors import SensorError
+from bfsensor.response.edge_response import area_matrix
+from bfsensor.response.vertices import vertex_fractions
 from bfsensor.sensor.flats import draw_flat
-from bfsensor.table import vertex_fractions
 from tests.sensor.contract_cases import blank, draw, photons
 from tests.sensor.effect_cases import (
     PLAIN,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
-from bfsensor.device import Channel, ChannelStop, Device, GateStack, Implant
+from bfsensor.device.device import Device
+from bfsensor.device.parts import BuriedChannel, ChannelStop, GateStack, Implant
 
 
 def flat_device(
@@ -24,7 +25,7 @@ def flat_device(
         device,
         name="flat",
         material=material,
-        channel=Channel(surface_charge, implants),
+        channel=BuriedChannel(surface_charge, implants),
         channel_stop=ChannelStop(0.0),
         gates=GateStack(4, 2, 0.15, 0.15),
         operating_point=dataclasses.replace(

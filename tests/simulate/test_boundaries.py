@@ -5,15 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from bfsensor.device import Device
+from bfsensor.device.device import Device
 from bfsensor.errors import ConvergenceError, TableError
+from bfsensor.response.vertices import vertex_fractions
 from bfsensor.simulate import boundaries
 from bfsensor.simulate.boundaries import find_boundaries, lowest_depth
 from bfsensor.simulate.far_field import FarField, image_shifts
 from bfsensor.simulate.mesh import Surfaces, make_mesh
 from bfsensor.simulate.poisson import Electrostatics
 from bfsensor.simulate.unit_cell import solve_unit_cell, tile
-from bfsensor.table import DistortionTable, vertex_fractions
+from bfsensor.table.table import DistortionTable
 
 CHARGE = 1e5
 

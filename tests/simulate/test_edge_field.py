@@ -10,11 +10,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from bfsensor import Device
-from bfsensor.device_parts import Edge, EdgeStrip, Implant, Ripple
+from bfsensor.device.parts import Edge, EdgeStrip, Implant, Ripple
 from bfsensor.errors import ConvergenceError, DeviceError
 from bfsensor.simulate.boundaries import find_boundaries
-from bfsensor.simulate.edge_field import FrontPlane, front_plane, solve_edge
+from bfsensor.simulate.edge_field import front_plane, solve_edge
 from bfsensor.simulate.edge_shift import trace_edge
+from bfsensor.simulate.edge_system import FrontPlane
 from bfsensor.simulate.mesh import Surfaces, make_mesh
 from bfsensor.simulate.poisson import Electrostatics
 from bfsensor.units import VACUUM_PERMITTIVITY

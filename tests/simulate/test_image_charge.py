@@ -10,6 +10,7 @@ import pytest
 from scipy.integrate import quad, solve_ivp, trapezoid
 
 from bfsensor.errors import TableError
+from bfsensor.response.vertices import vertex_fractions
 from bfsensor.simulate import image_charge as engine
 from bfsensor.simulate.charge_field import ImageCharge, charge_field
 from bfsensor.simulate.far_field import FarField
@@ -19,7 +20,6 @@ from bfsensor.simulate.image_charge import (
     edge_shifts,
     trace_boundaries,
 )
-from bfsensor.table import vertex_fractions
 from bfsensor.units import VACUUM_PERMITTIVITY
 
 MODEL = ImageCharge(

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from bfsensor.device import Device, Edge, EdgeStrip, Implant, Ripple
+from bfsensor.device.device import Device
+from bfsensor.device.parts import Edge, EdgeStrip, Implant, Ripple
 from bfsensor.errors import ConvergenceError, DeviceError
 from bfsensor.simulate import poisson
 from bfsensor.simulate.discretise import discretise

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from bfsensor import Device
+from bfsensor.device.parameters import change_parameter, device_parameters
 from bfsensor.errors import DeviceError
-from bfsensor.fit.parameters import change_parameter, device_parameters
 from bfsensor.simulate.boundaries import TURN, find_boundaries
 from bfsensor.simulate.boundary_tangent import boundary_changes
 from bfsensor.simulate.mesh import Surfaces, make_mesh

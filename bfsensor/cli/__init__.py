@@ -1,0 +1,1 @@
+"""The command line: ``bfsensor COMMAND``, one file each."""

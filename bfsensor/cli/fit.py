@@ -1,0 +1,306 @@
+"""``bfsensor fit``: device parameters from measurements."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from bfsensor.cli.common import Bar, load_device, parse_settings
+from bfsensor.errors import BFSensorError, FitError, RecordingError
+
+if TYPE_CHECKING:
+    from bfsensor.fit.data import DataSet
+    from bfsensor.fit.result import FitResult
+    from bfsensor.recording.tables.measured import MeasuredTable
+
+
+def parse_conditions(
+    ctx: click.Context, param: click.Parameter, values: Sequence[str]
+) -> list[tuple[str, dict[str, str]]]:
+    """Split ``[FILE:]KEY=VALUE,...`` options."""
+    out = []
+    for text in values:
+        file, colon, rest = text.rpartition(":")
+        if colon and "=" in file:
+            file, rest = "", text
+        given = {}
+        for part in rest.split(","):
+            key, sign, value = part.partition("=")
+            if not sign or not key.strip() or not value.strip():
+                raise click.BadParameter(
+                    f"{text!r} is not of the form [FILE:]KEY=VALUE,..., such as "
+                    "itl.csv:back_bias=-60V,wavelength=620nm"
+                )
+            given[key.strip()] = value.strip()
+        out.append((file, given))
+    return out
+
+
+@click.command("fit")
+@click.argument("device")
+@click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--set", "settings", multiple=True, callback=parse_settings, metavar="KEY=VALUE",
+              help="Change a value of the device, such as gate_high=4V; repeatable.")  # fmt: skip
+@click.option(
+    "--free", multiple=True, metavar="NAME[:[MEAN+-]SPREAD]",
+    help="Let a quantity be free within the uncertainty that its file states, or within SPREAD, "
+    "of the file's value or of MEAN: silicon.thickness, back_bias:5V, 'thickness:98 um+-2 um'; "
+    "'all' for all with an uncertainty; repeatable. By default those whose origin is 'guessed'.",
+)  # fmt: skip
+@click.option(
+    "--at", "conditions", multiple=True, callback=parse_conditions,
+    metavar="[FILE:]KEY=VALUE,...",
+    help="Condition of one recording, or of all: back_bias, gate_high, gate_low, wavelength, "
+    "temperature with units, sigma of spots in pixels. What is stated is not free there; what is "
+    "not, is the device's.",
+)  # fmt: skip
+@click.option("--hold", multiple=True, type=click.Path(path_type=Path), metavar="FILE",
+              help="Do not fit these recordings: hold them against the fit; repeatable.")  # fmt: skip
+@click.option("--lags", default=4, show_default=True, type=click.IntRange(1, 8),
+              help="Largest lag of a_ij.")  # fmt: skip
+@click.option("--errors", default="scaled", show_default=True,
+              type=click.Choice(["scaled", "stated"]),
+              help="Estimate a scale of each recording's errors, or take them as they are.")  # fmt: skip
+@click.option("--profile", "profiles", multiple=True, metavar="NAME",
+              help="Profile likelihood of a free quantity; repeatable.")  # fmt: skip
+@click.option("--cells", default=16, show_default=True, help="Mesh cells a pixel.")
+@click.option(
+    "--finer", type=click.IntRange(min=0),
+    help="Cells a pixel of a finer mesh, on which a_ij and slopes are solved besides, 8 CPU s a "
+    "condition and round on 48; derivatives stay on --cells. 0: none. [48 where --cells is below]",
+)  # fmt: skip
+@click.option(
+    "--curved", is_flag=True,
+    help="Fit with an emulator to second order about the device (2 solutions for each free "
+    "quantity, kept in the folder) instead of solving it anew where each round ends. Errors are then "
+    "those of draws, and profiles bend: without it both are those of the tangent.",
+)  # fmt: skip
+@click.option(
+    "--draws", default=12, show_default=True, type=click.IntRange(min=0),
+    help="Devices drawn from the posterior that are solved on the finer mesh: what predictions miss "
+    "there counts in the errors.",
+)  # fmt: skip
+@click.option("-o", "--output", type=click.Path(path_type=Path),
+              help="Folder for fit.json, device.toml and fit.png [DEVICE_fit].")  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print fit.json instead of a table.")
+def fit(
+    device: str,
+    recordings: tuple[Path, ...],
+    settings: list[tuple[str, str]],
+    free: tuple[str, ...],
+    conditions: list[tuple[str, dict[str, str]]],
+    hold: tuple[Path, ...],
+    lags: int,
+    errors: str,
+    profiles: tuple[str, ...],
+    cells: int,
+    finer: int | None,
+    curved: bool,
+    draws: int,
+    output: Path | None,
+    as_json: bool,
+) -> None:
+    """Fit a DEVICE (name or .toml) to RECORDINGS.
+
+    RECORDINGS: measured a_ij (columns i_serial, j_parallel, cov_per_e, err_per_e; or LSST's
+    photon transfer dataset), B-F slopes (axis, slope, slope_error), saturation levels
+    (saturation, saturation_error), diffusion widths (diffusion, diffusion_error), the last three
+    with back_bias, gate_high, gate_low by row; comma-separated or ECSV, whose header may
+    have an entry 'conditions'.
+
+    Values of the device file are priors, Gaussian of its uncertainties.  A scale of each
+    recording's errors is estimated.  The last line gives chi2/n with the errors as stated.
+
+    \b
+    Examples:
+      bfsensor fit itl_sta3800c_60 itl.csv --free all --free back_bias:5V -o itl_fit
+      bfsensor fit itl_sta3800c itl.csv slopes.csv --free all --at itl.csv:back_bias=-60V
+      bfsensor fit itl_sta3800c slopes.csv --hold itl.csv --free silicon.background_doping
+    """
+    from bfsensor.device.quantities import DIFFUSION, choose_priors, with_priors
+    from bfsensor.fit.finer_mesh import FINER
+    from bfsensor.fit.fit import fit_device
+    from bfsensor.fit.linear_predictors import SPILL, make_tangents
+    from bfsensor.recording.tables.measured import read_measured
+
+    loaded = load_device(device, settings)
+    read = [(path, read_measured(path)) for path in (*recordings, *hold)]
+    sets = _data_sets(read, conditions, len(recordings), lags, errors == "scaled")
+    fitted = {data.kind for data in sets if data.fitted}
+    more = (
+        *([SPILL] if "saturation" in fitted else []),
+        *([DIFFUSION] if "diffusion" in fitted else []),
+    )
+    priors = choose_priors(loaded, free, more=more)
+    names = [prior.name for prior in priors]
+    chosen = [_resolve(name, names) for name in profiles]
+    folder = output or Path(f"{loaded.name}_fit")
+    known = with_priors(loaded, priors)
+    emulator = linearise = solved = None
+    if {"areas", "slopes"} & {data.kind for data in sets}:
+        if finer is None:
+            finer = FINER if cells < FINER else 0
+        moving = tuple(prior for prior in priors if prior.name not in (SPILL, DIFFUSION))
+        if curved:
+            names = [prior.name for prior in moving]
+            emulator = build_emulator(known, names, sets, cells, folder)
+        else:
+            linearise = make_linearise(known, moving, priors, sets, cells)
+        if finer:
+            solve = linearise or (lambda values, fixed=emulator: fixed)
+            linearise = make_finer(solve, known, priors, sets, finer, cells, folder)
+            emulator = None
+        if draws:
+            solved = make_solved(known, priors, sets, cells, finer, folder)
+    result = fit_device(
+        known, sets, priors, emulator, linearise=linearise,
+        tangents=make_tangents(known, cells=min(cells, 8), progress=Bar("settings")),
+        solved=solved, draws=draws, progress=Bar("devices drawn"), profiles=chosen,
+        source=f"bfsensor fit of {', '.join(data.name for data in sets if data.fitted)}; "
+        "errors are correlated: fit.json",
+        notes=[
+            f"{path.name}: {note}" for path, one in read for note in one.table.warnings if note
+        ],
+    )  # fmt: skip
+    written = _write(result, folder)
+    if as_json:
+        click.echo(json.dumps(result.to_dict(), indent=1))
+        return
+    lines = result.said().splitlines()
+    click.echo("\n".join(lines[:-1]))
+    click.echo(f"{folder}: {', '.join(written)}")
+    click.echo(lines[-1])
+
+
+def responding(sets: Sequence[DataSet]) -> tuple[Any, ...]:
+    """Conditions of all areas and slopes, which the response of flats predicts."""
+    return tuple(
+        dict.fromkeys(
+            condition
+            for data in sets
+            if data.kind in ("areas", "slopes")
+            for condition in data.conditions
+        )
+    )
+
+
+def build_emulator(
+    device: Any, parameters: list[str], sets: Sequence[DataSet], cells: int, folder: Path
+) -> Any:
+    """Build the emulator of a device at the conditions of all areas and slopes."""
+    from bfsensor.response.emulator import DeviceEmulator
+
+    return DeviceEmulator.build(
+        device, parameters, conditions=responding(sets), cells=cells,
+        keep=folder / "emulator", progress=Bar("emulator"),
+    )  # fmt: skip
+
+
+def make_linearise(
+    device: Any,
+    moving: Sequence[Any],
+    priors: Sequence[Any],
+    sets: Sequence[DataSet],
+    cells: int,
+) -> Any:
+    """Make what solves the device with derivatives, by the values of all free parameters."""
+    from bfsensor.fit.linear_response import Linearise
+
+    solve = Linearise(device, tuple(moving), responding(sets), cells, Bar("solutions"))
+    at = [k for k, prior in enumerate(priors) if prior in moving]
+    return lambda values: solve(values[at])
+
+
+def make_finer(
+    linearise: Any,
+    device: Any,
+    priors: Sequence[Any],
+    sets: Sequence[DataSet],
+    finer: int,
+    cells: int,
+    folder: Path,
+) -> Any:
+    """Carry what solves the device to a finer mesh."""
+    from bfsensor.fit.finer_mesh import Finer
+
+    return Finer(
+        linearise, device, tuple(priors), responding(sets), finer, cells,
+        keep=folder / "finer", progress=Bar("finer mesh"),
+    )  # fmt: skip
+
+
+def make_solved(
+    device: Any,
+    priors: Sequence[Any],
+    sets: Sequence[DataSet],
+    cells: int,
+    finer: int,
+    folder: Path,
+) -> Any:
+    """Make what solves the device without derivatives, on the finer mesh if there is one."""
+    from bfsensor.fit.finer_mesh import REFINE_Z
+    from bfsensor.fit.full_solutions import FullSolutions
+    from bfsensor.response.edge_response import REFINE_Z as OWN
+
+    mesh = (finer, REFINE_Z) if finer else (cells, OWN)
+    return FullSolutions(
+        device, tuple(priors), responding(sets), *mesh, keep=folder / "finer"
+    )
+
+
+def _data_sets(
+    read: Sequence[tuple[Path, MeasuredTable]],
+    conditions: Sequence[tuple[str, dict[str, str]]],
+    fitted: int,
+    lags: int,
+    scaled: bool,
+) -> list[DataSet]:
+    """Data sets of what was read, with the conditions that the options state."""
+    from bfsensor.fit.data import data_set
+
+    for file, _ in conditions:
+        if file and not any(file in (str(path), path.name, path.stem) for path, _ in read):
+            raise FitError(
+                f"--at {file}: no such recording; given are "
+                f"{', '.join(path.name for path, _ in read)}"
+            )
+    out = []
+    for n, (path, measured) in enumerate(read):
+        for file, given in conditions:
+            if not file or file in (str(path), path.name, path.stem):
+                try:
+                    measured = measured.at(given)
+                except RecordingError as error:
+                    raise FitError(f"--at {file}: {error}") from None
+        out.append(data_set(measured, lags=lags, fitted=n < fitted, scaled=scaled))
+    return out
+
+
+def _resolve(name: str, names: Sequence[str]) -> str:
+    """Name of a free parameter from the end of it."""
+    ends = [one for one in names if one == name or one.endswith(f".{name}")]
+    if len(ends) != 1:
+        raise FitError(f"--profile {name}: not one of the free {', '.join(names)}")
+    return ends[0]
+
+
+def _write(result: FitResult, folder: Path) -> list[str]:
+    """Write the result, the fitted device and the figure; says so where that cannot be drawn."""
+    from bfsensor.device.device import Device
+    from bfsensor.fit.fit_figures import figure_for_fit
+
+    folder.mkdir(parents=True, exist_ok=True)
+    result.write(folder / "fit.json")
+    Device.from_toml(result.fitted_device).write(folder / "device.toml")
+    written = ["fit.json", "device.toml"]
+    try:
+        figure = figure_for_fit(result)
+    except BFSensorError as error:
+        click.echo(f"bfsensor: no figure: {error}", err=True)
+        return written
+    figure.savefig(folder / "fit.png", dpi=120)
+    return [*written, "fit.png"]

@@ -1,0 +1,178 @@
+"""The command line: ``bfsensor COMMAND``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from bfsensor.cli.check import check
+from bfsensor.cli.common import load_device, parse_settings
+from bfsensor.cli.diagnose import diagnose
+from bfsensor.cli.fit import fit
+from bfsensor.cli.measure import measure
+from bfsensor.cli.spots import spots
+from bfsensor.cli.sweep import sweep
+from bfsensor.cli.table import table
+from bfsensor.errors import BFSensorError
+
+
+class _Commands(click.Group):
+    """Turns the package's errors into one line on stderr and exit status 1."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except BFSensorError as error:
+            click.echo(f"bfsensor: {error}", err=True)
+            ctx.exit(1)
+        except OSError as error:
+            where = f"{error.filename}: " if error.filename else ""
+            click.echo(f"bfsensor: {where}{error.strerror or error}", err=True)
+            ctx.exit(1)
+        except KeyboardInterrupt:
+            click.echo(
+                "bfsensor: interrupted; what is finished is kept, run again to go on",
+                err=True,
+            )
+            ctx.exit(130)
+
+
+@click.group(
+    cls=_Commands,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+@click.version_option(package_name="bfsensor")
+def main() -> None:
+    """Device physics of thick CCDs: from a device file to distorted pixel boundaries."""
+
+
+@main.command()
+@click.option("--json", "as_json", is_flag=True, help="Print JSON for a program to read.")
+def devices(as_json: bool) -> None:
+    """List the built-in devices.
+
+    \b
+    Example:
+      bfsensor devices
+    """
+    from bfsensor.device.device import Device, builtin_devices
+
+    rows = []
+    for name in builtin_devices():
+        device = Device.load(name)
+        point = device.operating_point
+        rows.append(
+            {
+                "name": name,
+                "pitch [um]": device.pixel.pitch_x,
+                "thickness [um]": device.silicon.thickness,
+                "gates low/high [V]": f"{point.gate_low:g}/{point.gate_high:g}",
+                "back bias [V]": point.back_bias,
+                "temperature [K]": point.temperature,
+            }
+        )
+    if as_json:
+        click.echo(json.dumps(rows, indent=1))
+        return
+    _print_table(rows)
+
+
+def _print_table(rows: Sequence[dict[str, Any]]) -> None:
+    names = list(rows[0])
+    cells = [
+        [f"{row[n]:g}" if isinstance(row[n], float) else str(row[n]) for n in names]
+        for row in rows
+    ]
+    widths = [max(len(n), *(len(c[i]) for c in cells)) for i, n in enumerate(names)]
+    click.echo("  ".join(n.ljust(w) for n, w in zip(names, widths, strict=True)).rstrip())
+    for row in cells:
+        click.echo("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip())
+
+
+@main.group()
+def device() -> None:
+    """Make and check device files."""
+
+
+@device.command("import")
+@click.argument("cfg", type=click.Path(path_type=Path))
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), help="Device file [FILE.toml]."
+)
+@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
+def import_(cfg: Path, output: Path | None, overwrite: bool) -> None:
+    """Turn a Poisson_CCD or GalSim configuration CFG into a device file.
+
+    \b
+    Example:
+      bfsensor device import lsst_itl_50_8.cfg -o itl.toml
+    """
+    from bfsensor.device.poisson_ccd import import_poisson_ccd
+    from bfsensor.errors import DeviceError
+
+    result = import_poisson_ccd(cfg)
+    target = output or cfg.with_suffix(".toml")
+    if target.exists() and not overwrite:
+        raise DeviceError(f"{target} exists; give --overwrite to replace it")
+    result.write(target)
+    click.echo(f"{target}: {result.name}")
+
+
+@main.command()
+@click.argument("source")
+@click.option("--set", "settings", multiple=True, callback=parse_settings, metavar="KEY=VALUE",
+              help="Change a device quantity (repeatable).")  # fmt: skip
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), help="Figure [SOURCE.png]."
+)
+def show(source: str, settings: list[tuple[str, str]], output: Path | None) -> None:
+    """Draw a table (.fits, GalSim stem) or a DEVICE (name or .toml).
+
+    A table: distorted pixel boundaries with their areas, the response against charge,
+    background and depth.  A device, four figures, each with its name before the suffix:
+    potentials and carriers (profiles, sections), drift paths (paths), and electrons that
+    drift, that diffuse, and that a full pixel repels (diffusion).
+
+    \b
+    Examples:
+      bfsensor show itl.fits -o itl.png
+      bfsensor show itl_sta3800c -o device.png
+    """
+    from bfsensor.plots import table as figures
+    from bfsensor.table.galsim_format import read_galsim
+    from bfsensor.table.table import DistortionTable
+
+    path = Path(source)
+    is_stem = (
+        path.with_name(path.name + ".dat").exists()
+        and path.with_name(path.name + ".cfg").exists()
+    )
+    if path.suffix == ".fits" or is_stem:
+        result = read_galsim(path) if is_stem else DistortionTable.read(path)
+        drawn = {"": figures.figure_for_table(result)}
+        target = output or path.with_suffix(".png")
+    else:
+        loaded = load_device(source, settings)
+        drawn = figures.figure_for_device(loaded)
+        target = output or Path(f"{loaded.name}.png")
+    for name, figure in drawn.items():
+        where = target.with_name(f"{target.stem}_{name}{target.suffix}") if name else target
+        figure.savefig(where, dpi=120)
+        click.echo(str(where))
+
+
+main.add_command(table)
+main.add_command(sweep)
+main.add_command(spots)
+main.add_command(measure)
+main.add_command(check)
+main.add_command(diagnose)
+main.add_command(fit)
+
+
+if __name__ == "__main__":
+    main()

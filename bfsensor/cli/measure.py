@@ -1,0 +1,248 @@
+"""``bfsensor measure``: spot sizes with their slopes, covariances of flat pairs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from bfsensor.errors import MeasurementError
+from bfsensor.files import written_whole
+
+_FILES = click.argument(
+    "files", nargs=-1, required=True, type=click.Path(path_type=Path, exists=True)
+)
+_GAIN = click.option("--gain", type=float, help="[e-/ADU]; by default from the header.")
+_OVERSCAN = click.option(
+    "--overscan", default="row median", show_default=True,
+    type=click.Choice(["row median", "row mean", "median", "none"]), help="How it is taken off.",
+)  # fmt: skip
+_OUTPUT = click.option(
+    "-o", "--output", type=click.Path(path_type=Path), help="ECSV to write."
+)
+_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+
+
+@click.group()
+def measure() -> None:
+    """Measure spots or flats in FITS files: raw with overscan, or images in electrons."""
+
+
+@measure.command("spots")
+@_FILES
+@click.option("--threshold", type=float, required=True,
+              help="Least signal of a spot's brightest pixel [e-].")  # fmt: skip
+@click.option("--saturation", type=float, default=float("inf"),
+              help="Spots that reach it are left out [e-].")  # fmt: skip
+@click.option("--stamp", default=9, show_default=True, help="Side of the stamps [pixel].")
+@click.option("--weights", default="equal", show_default=True,
+              type=click.Choice(["equal", "noise"]),
+              help="Of the pixels: 'equal', as published, for slopes.")  # fmt: skip
+@_GAIN
+@_OVERSCAN
+@_OUTPUT
+@_JSON
+def spots(
+    files: Sequence[Path],
+    threshold: float,
+    saturation: float,
+    stamp: int,
+    weights: str,
+    gain: float | None,
+    overscan: str,
+    output: Path | None,
+    as_json: bool,
+) -> None:
+    """Fit the size of the spots in each amplifier of each file, and the B-F slopes.
+
+    Every amplifier of a file is a region: one (sigma_x, sigma_y) for all its spots, with a
+    free peak, centre and background for each.  With five files or more the slope of
+    sigma against the peak is fitted over the linear range that is found.
+
+    \b
+    Example:
+      bfsensor measure spots ladder_*.fits --threshold 2000 --gain 4.8 -o spots.ecsv
+    """
+    from bfsensor.measure.spot_fit import fit_spots
+    from bfsensor.measure.spots import cut_stamps, find_spots
+    from bfsensor.recording.raw.fits_images import read_raw
+
+    rows = []
+    for path in files:
+        for amplifier in read_raw(
+            path, gain=gain, overscan=None if overscan == "none" else overscan
+        ):
+            if amplifier.unit != "electron":
+                raise MeasurementError(
+                    f"{path}: {amplifier.name}: no gain in the header, and slopes are against "
+                    "electrons: give --gain"
+                )
+            found = find_spots(
+                amplifier.image, threshold=threshold, saturation=saturation,
+                separation=stamp, mask=amplifier.mask, stamp=stamp,
+            )  # fmt: skip
+            if not len(found.x):
+                raise MeasurementError(
+                    f"{path}: {amplifier.name}: no spot above {threshold:g} "
+                    f"{amplifier.unit}; rejected: {dict(found.rejected)}"
+                )
+            stamps = cut_stamps(amplifier.image, found, size=stamp, mask=amplifier.mask)
+            try:
+                fit = fit_spots(stamps, weights=weights)
+            except MeasurementError as error:
+                raise MeasurementError(f"{path}: {amplifier.name}: {error}") from None
+            # One spot has no scatter.
+            errors = fit.scatter_covariance if fit.used.sum() > 1 else fit.covariance
+            rows.append(
+                {
+                    "file": str(path), "amplifier": amplifier.name, "unit": amplifier.unit,
+                    "spots": int(fit.used.sum()), "dropped": int((~fit.used).sum()),
+                    "peak": fit.peak, "sigma_x": fit.sigma_x,
+                    "sigma_x_error": float(errors[0, 0] ** 0.5), "sigma_y": fit.sigma_y,
+                    "sigma_y_error": float(errors[1, 1] ** 0.5),
+                    "chi2_per_dof": fit.chi2 / fit.dof,
+                }
+            )  # fmt: skip
+    _finish(rows, _slopes(rows), output, as_json)
+
+
+def _slopes(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """B-F slopes of each amplifier that has five levels or more."""
+    from bfsensor.measure.slopes import bf_slopes
+
+    out: dict[str, Any] = {}
+    for name in dict.fromkeys(row["amplifier"] for row in rows):
+        part = sorted(
+            (row for row in rows if row["amplifier"] == name), key=lambda r: r["peak"]
+        )
+        if len(part) < 5:
+            continue
+        for axis in "xy":
+            line = bf_slopes(
+                [r["peak"] for r in part], [r[f"sigma_{axis}"] for r in part],
+                [r[f"sigma_{axis}_error"] for r in part],
+            )  # fmt: skip
+            out[f"{name} slope {axis} [% per 50,000]"] = (
+                f"{line.slope:.4f} +- {line.slope_error:.4f} (range {line.range_error:.4f}), "
+                f"{line.low:.0f} to {line.high:.0f}"
+            )
+    return out
+
+
+@measure.command("flats")
+@_FILES
+@click.option("--lags", default=8, show_default=True, help="Largest lag [pixel].")
+@click.option("--fit/--no-fit", default=None,
+              help="Fit a, b, gain and noise [with six pairs or more].")  # fmt: skip
+@_GAIN
+@_OVERSCAN
+@_OUTPUT
+@_JSON
+def flats(
+    files: Sequence[Path],
+    lags: int,
+    fit: bool | None,
+    gain: float | None,
+    overscan: str,
+    output: Path | None,
+    as_json: bool,
+) -> None:
+    """Measure the covariances of pairs of flats: files 1 and 2, 3 and 4, ...
+
+    \b
+    Example:
+      bfsensor measure flats flat_*.fits --gain 4.8 -o covariances.ecsv
+    """
+    from bfsensor.measure.covariance_fit import fit_covariances
+    from bfsensor.measure.curve import CovarianceCurve
+    from bfsensor.measure.flat_pairs import flat_covariances
+    from bfsensor.recording.raw.fits_images import read_raw
+
+    if len(files) % 2:
+        raise MeasurementError(f"{len(files)} files do not make pairs")
+    pairs: dict[str, list[Any]] = {}
+    rows = []
+    for first, second in zip(files[::2], files[1::2], strict=True):
+        both = [
+            {a.name: a for a in read_raw(
+                path, gain=gain, overscan=None if overscan == "none" else overscan
+            )}
+            for path in (first, second)
+        ]  # fmt: skip
+        if set(both[0]) != set(both[1]):
+            raise MeasurementError(
+                f"{first} and {second} hold different amplifiers: {sorted(both[0])} and "
+                f"{sorted(both[1])}"
+            )
+        for name, one in both[0].items():
+            other = both[1][name]
+            if one.image.shape != other.image.shape or one.unit != other.unit:
+                raise MeasurementError(
+                    f"{first} and {second}: {name}: {one.image.shape} pixels in {one.unit} and "
+                    f"{other.image.shape} in {other.unit} are no pair"
+                )
+            try:
+                pair = flat_covariances(
+                    one.image, other.image, mask=one.mask | other.mask, lags=lags,
+                    unit=one.unit, region=name,
+                )  # fmt: skip
+            except MeasurementError as error:
+                raise MeasurementError(f"{first} and {second}: {name}: {error}") from None
+            pairs.setdefault(name, []).append(pair)
+            for j in range(lags + 1):
+                for i in range(lags + 1):
+                    rows.append(
+                        {
+                            "first": str(first), "second": str(second), "amplifier": name,
+                            "unit": one.unit, "level": pair.level, "lag_x": i, "lag_y": j,
+                            "covariance": float(pair.covariances[j, i]),
+                            "error": float(pair.errors[j, i]),
+                        }
+                    )  # fmt: skip
+    summary: dict[str, Any] = {}
+    for name, found in pairs.items():
+        for measured in sorted(found, key=lambda p: p.level):
+            c, e = measured.covariances, measured.errors
+            summary[f"{name} at {measured.level:.0f} {measured.unit}"] = (
+                f"C00 {c[0, 0]:.1f} +- {e[0, 0]:.1f}, C10/C00 {c[0, 1] / c[0, 0]:.5f} +- "
+                f"{e[0, 1] / c[0, 0]:.5f}, C01/C00 {c[1, 0] / c[0, 0]:.5f} +- "
+                f"{e[1, 0] / c[0, 0]:.5f}"
+            )
+        if fit or (fit is None and len(found) >= 6):
+            result = fit_covariances(CovarianceCurve.from_pairs(found))
+            a, da = result.a, result.a_errors
+            summary[f"{name} fit"] = (
+                f"a00 {a[0, 0]:.3e} +- {da[0, 0]:.1e}, a10 {a[0, 1]:.3e} +- {da[0, 1]:.1e}, a01 "
+                f"{a[1, 0]:.3e} +- {da[1, 0]:.1e} per electron, gain {result.gain:.4f} +- "
+                f"{result.gain_error:.4f}, chi2 {result.chi2:.1f} of {result.dof}"
+            )
+    _finish(rows, summary, output, as_json)
+
+
+def _finish(
+    rows: list[dict[str, Any]], summary: dict[str, Any], output: Path | None, as_json: bool
+) -> None:
+    """Write the rows, print the summary."""
+    if output is not None:
+        from astropy.table import Table
+
+        table = Table(rows=rows)
+        table.meta = {"summary": summary}
+        with written_whole(output, MeasurementError) as beside:
+            table.write(beside, format="ascii.ecsv", overwrite=True)
+    if as_json:
+        click.echo(json.dumps({"rows": rows, "summary": summary}, indent=1))
+        return
+    if len(rows) <= 60 and "sigma_x" in rows[0]:
+        for row in rows:
+            click.echo(
+                f"{row['file']} {row['amplifier']}: {row['spots']} spots, peak {row['peak']:.0f} "
+                f"{row['unit']}, sigma {row['sigma_x']:.4f} +- {row['sigma_x_error']:.4f}, "
+                f"{row['sigma_y']:.4f} +- {row['sigma_y_error']:.4f} pixel, chi2/dof "
+                f"{row['chi2_per_dof']:.2f}"
+            )
+    for key, value in summary.items():
+        click.echo(f"{key}: {value}")

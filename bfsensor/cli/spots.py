@@ -1,0 +1,170 @@
+"""``bfsensor spots``: the direct simulation of spots."""
+
+from __future__ import annotations
+
+import json
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+
+from bfsensor.cli.common import load_device, parse_settings
+from bfsensor.errors import BFSensorError, SimulationError
+from bfsensor.files import written_whole
+
+
+def _spot_path(folder: Path, key: str, number: int) -> Path:
+    return folder / f"spot_{key}_{number:04d}.fits"
+
+
+@click.command()
+@click.argument("device")
+@click.option("--set", "settings", multiple=True, callback=parse_settings, metavar="KEY=VALUE",
+              help="Change a value of the device, such as back_bias=-60V; repeatable.")  # fmt: skip
+@click.option("--spots", "count", default=8, show_default=True, type=click.IntRange(min=1),
+              help="Spots, each with its own centre and electrons.")  # fmt: skip
+@click.option("--peak", default=80_000.0, show_default=True,
+              help="Electrons in the brightest pixel of a centred spot.")  # fmt: skip
+@click.option("--sigma", default=10.0, show_default=True, help="Width of the spot [um].")
+@click.option("--steps", default=80, show_default=True,
+              help="Steps of charge; the field is solved again in each.")  # fmt: skip
+@click.option("--pixels", default=13, show_default=True, help="Period of the array, odd.")
+@click.option("--cells", default=8, show_default=True, help="Mesh cells a pixel.")
+@click.option("--depth", type=float,
+              help="Height of conversion [um above the gates; 5 below the back].")  # fmt: skip
+@click.option("--wavelength", type=float, help="Of the light [nm], instead of a depth.")
+@click.option("--diffusion", default=1.0, show_default=True,
+              help="Width of the diffusion relative to Einstein's; the published simulations "
+              "have 2.12.")  # fmt: skip
+@click.option("--seed", default=20170, show_default=True, help="Of all random numbers.")
+@click.option("--workers", default=2, show_default=True, type=click.IntRange(min=1),
+              help="Processes.")  # fmt: skip
+@click.option("--executor", default="process", show_default=True,
+              type=click.Choice(["process", "dask", "parsl"]), help="Where they run.")  # fmt: skip
+@click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("spots"),
+              show_default=True, help="Folder for the images, slopes and figure.")  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+def spots(
+    device: str,
+    settings: list[tuple[str, str]],
+    count: int,
+    peak: float,
+    sigma: float,
+    steps: int,
+    pixels: int,
+    cells: int,
+    depth: float | None,
+    wavelength: float | None,
+    diffusion: float,
+    seed: int,
+    workers: int,
+    executor: str,
+    output: Path,
+    as_json: bool,
+) -> None:
+    """Build up spots in a DEVICE (name or .toml), electron by electron.
+
+    Electrons go through the field of the charge that is there, in steps; the same electrons
+    also through the empty sensor.  Every finished spot is kept in the folder: a run that was
+    interrupted goes on when the same command is given again, and more spots can be added.
+
+    \b
+    Examples:
+      bfsensor spots itl_sta3800c --set back_bias=-60V --set gate_high=4V -o spots_60
+      bfsensor spots e2v_ccd250 --spots 2 --steps 20 --peak 150000
+    """
+    from tqdm import tqdm
+
+    from bfsensor.direct.spot_exposure import Spot, SpotPlan, simulate_spot
+    from bfsensor.direct.transport import Transport
+    from bfsensor.sweeps.executors import open_executor, run_points
+
+    plan = SpotPlan(
+        load_device(device, settings), peak=peak, sigma=sigma, steps=steps,
+        pixels=pixels, cells=cells, depth=depth, wavelength=wavelength,
+        transport=Transport(diffusion=diffusion), seed=seed,
+    )  # fmt: skip
+    plan.check_full_well()  # before any worker starts
+    output.mkdir(parents=True, exist_ok=True)
+    bar = tqdm(total=count, unit="spot", file=sys.stderr)
+
+    def progress(done: int, total: int) -> None:
+        bar.n = done
+        bar.refresh()
+
+    def write(spot: Spot, path: Path) -> None:
+        spot.write(path)
+
+    try:
+        with open_executor(executor, min(workers, count)) as pool:
+            made = run_points(
+                partial(simulate_spot, plan), range(count),
+                path=lambda n: _spot_path(output, plan.key, n), read=Spot.read, write=write,
+                executor=pool, progress=progress,
+            )  # fmt: skip
+    finally:
+        bar.close()
+    _report(plan, made, output, as_json)
+
+
+def _report(plan: Any, made: list[Any], output: Path, as_json: bool) -> None:
+    """Measure, print and draw."""
+    import numpy as np
+    from astropy.table import Table
+
+    from bfsensor.measure.growth import measure_growth
+
+    on, off = (np.array([getattr(spot, name) for spot in made]) for name in ("on", "off"))
+    levels = np.unique(np.round(np.linspace(0, plan.steps, 9)[1:]).astype(int)) - 1
+    summary: dict[str, Any] = {
+        "folder": str(output),
+        "spots": len(made),
+        "electrons_a_spot": plan.electrons,
+        "cpu_s_a_spot": round(float(np.mean([spot.cpu_seconds for spot in made])), 1),
+    }
+    if len(made) > 1:
+        growth = measure_growth(on[:, levels], off[:, levels], stamp=min(9, plan.pixels))
+        table = Table(
+            {
+                "steps": levels + 1, "peak": growth.peak,
+                **{
+                    f"{name}_{axis}": getattr(growth, name)[:, n]
+                    for name in ("sigma", "growth", "growth_error")
+                    for n, axis in enumerate("xy")
+                },
+            }
+        )  # fmt: skip
+        summary["slope_percent_per_50000e"] = {
+            axis: f"{growth.slope[n]:.4f} +- {growth.slope_error[n]:.4f}"
+            for n, axis in enumerate("xy")
+        }
+        table.meta = {"device": plan.device.name, "key": plan.key, **summary}
+        with written_whole(output / "growth.ecsv", SimulationError) as beside:
+            table.write(beside, format="ascii.ecsv", overwrite=True)
+        _draw(plan, made, growth, output / "growth.png")
+    else:
+        summary["slope_percent_per_50000e"] = "needs 2 spots for an error"
+    if as_json:
+        click.echo(json.dumps(summary, indent=1))
+        return
+    for key, value in summary.items():
+        text = (
+            ", ".join(f"{k} {v}" for k, v in value.items())
+            if isinstance(value, dict)
+            else value
+        )
+        click.echo(f"{key:26} {text}")
+
+
+def _draw(plan: Any, made: list[Any], growth: Any, path: Path) -> None:
+    """Draw the growth and how charge builds up; says so where matplotlib is missing."""
+    from bfsensor.plots.spots import figure_for_spots
+
+    try:
+        figure = figure_for_spots(plan, made, growth)
+    except BFSensorError as error:
+        click.echo(f"bfsensor: no figure: {error}", err=True)
+        return
+    figure.savefig(path, dpi=120)

@@ -1,0 +1,343 @@
+"""``bfsensor table``: from a device to its distortion table."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import click
+from click.core import ParameterSource
+
+from bfsensor.cli.common import load_device, parse_settings
+from bfsensor.errors import BFSensorError, DeviceError, TableError
+from bfsensor.files import written_whole
+
+
+def _numbers(
+    ctx: click.Context, param: click.Parameter, value: str | None
+) -> tuple[float, ...] | None:
+    if value is None:
+        return None
+    try:
+        return tuple(float(v) for v in value.split(","))
+    except ValueError:
+        raise click.BadParameter(
+            f"{value!r} is not a list of numbers such as 0,25000,50000"
+        ) from None
+
+
+@click.command()
+@click.argument("device")
+@click.option("--set", "settings", multiple=True, callback=parse_settings, metavar="KEY=VALUE",
+              help="Change a quantity: --set back_bias=-60V (repeatable).")  # fmt: skip
+@click.option(
+    "--charges", callback=_numbers, metavar="Q,Q,...", help="Source charges [e-]."
+)
+@click.option("--backgrounds", callback=_numbers, metavar="B,B,...",
+              help="Uniform charges of all other pixels [e-].")  # fmt: skip
+@click.option("--depths", callback=_numbers, metavar="Z,Z,...",
+              help="Conversion depths [um above the gates].")  # fmt: skip
+@click.option(
+    "--vertices", default=32, show_default=True, help="Vertices a side between corners."
+)
+@click.option(
+    "--pixels", default=9, show_default=True, help="Width of the table [pixel], odd."
+)
+@click.option("--engine", default="poisson", show_default=True,
+              type=click.Choice(["poisson", "image_charge"]),
+              help="Poisson's equation, or charge rectangles between planes: a second, "
+              "linear in charge, fitted parameters.")  # fmt: skip
+@click.option("--image-charge", "parameters", multiple=True, callback=parse_settings,
+              metavar="KEY=VALUE",
+              help="Parameter of the engine image_charge: --image-charge row_height=1.2um "
+              "(repeatable).")  # fmt: skip
+@click.option("--accuracy", default=0.01, show_default=True,
+              help="Mesh accuracy aimed at (measured errors go to the header). "
+              "[poisson]")  # fmt: skip
+@click.option("--workers", type=click.IntRange(min=1), default=2, show_default=True,
+              help="Processes. [poisson]")  # fmt: skip
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), help="Table to write [DEVICE.fits]."
+)
+@click.option("--galsim", type=click.Path(path_type=Path), metavar="STEM",
+              help="Write STEM.cfg and STEM.dat for galsim.SiliconSensor instead: one "
+              "charge, no background, one depth.")  # fmt: skip
+@click.option(
+    "--assess/--no-assess",
+    default=None,
+    help="Measure mesh, tracing and superposition errors for the header [poisson, whole tables].",
+)
+@click.option(
+    "--figure/--no-figure", default=True, help="Draw the table beside it (needs [plots])."
+)
+@click.option("--overwrite", is_flag=True, help="Replace an existing output.")
+@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+@click.pass_context
+def table(
+    context: click.Context,
+    device: str,
+    settings: list[tuple[str, str]],
+    charges: tuple[float, ...] | None,
+    backgrounds: tuple[float, ...] | None,
+    depths: tuple[float, ...] | None,
+    vertices: int,
+    pixels: int,
+    engine: str,
+    parameters: list[tuple[str, str]],
+    accuracy: float,
+    workers: int,
+    output: Path | None,
+    galsim: Path | None,
+    assess: bool | None,
+    figure: bool,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Solve a DEVICE (name or .toml) and write its distortion table.
+
+    The table holds the displacement of every vertex of the pixel boundaries against the
+    charge of a source pixel, the uniform charge of all others, and the conversion depth.
+    An interrupted run goes on where it was when the same command is given again.
+
+    \b
+    Examples:
+      bfsensor table itl_sta3800c -o itl.fits
+      bfsensor table e2v_ccd250 --set back_bias=-70V --galsim sensors/e2v_70
+      bfsensor table itl_sta3800c --engine image_charge -o analytic.fits \\
+        --image-charge charge_height=0.32um --image-charge row_height=1.21um \\
+        --image-charge column_height=2.57um --image-charge half_width_x=0.2um \\
+        --image-charge half_width_y=3.8um \\
+        --image-charge drift_field=0um:0.736V/um,100um:0.364V/um
+    """
+    from bfsensor.table.build import build_table, peak_memory
+    from bfsensor.table.build_image_charge import default_depths
+    from bfsensor.table.galsim_format import write_galsim
+    from bfsensor.table.table_plan import plan_table
+
+    began, cpu_began = time.perf_counter(), _cpu_seconds()
+    _check_engine(context, engine, parameters)
+    loaded = load_device(device, settings)
+    model = _image_charge(loaded, parameters) if engine == "image_charge" else None
+    if galsim is not None:
+        charges = charges or (100000.0,)
+        backgrounds = (0.0,)
+        depths = depths or (95.0 / 100.0 * loaded.silicon.thickness,)
+        if len(charges) != 1 or len(depths) != 1:
+            raise TableError(
+                f"a GalSim table holds one charge and one depth, not {len(charges)} and "
+                f"{len(depths)}"
+            )
+        targets = [galsim.with_name(galsim.name + ending) for ending in (".cfg", ".dat")]
+    else:
+        targets = [output or Path(f"{loaded.name}.fits")]
+        if model is not None:  # linear: two charges and one background hold it all
+            charges, backgrounds = charges or (0.0, 100_000.0), backgrounds or (0.0,)
+            depths = depths or default_depths(model)
+    for target in targets:
+        if target.exists() and not overwrite:
+            raise TableError(f"{target} exists; give --overwrite to replace it")
+        if not target.parent.is_dir():
+            raise TableError(f"{target.parent} is not a folder")
+    plan = plan_table(
+        loaded, charges=charges, backgrounds=backgrounds, depths=depths, vertices=vertices,
+        pixels=pixels, accuracy=accuracy,
+    )  # fmt: skip
+    click.echo(
+        f"{loaded.name}: full well {plan.full_well:,.0f} e-, {len(plan.charges)} charges x "
+        f"{len(plan.backgrounds)} backgrounds x {len(plan.depths)} depths, "
+        + (f"{plan.cells} cells a pixel" if model is None else "image charges"),
+        err=True,
+    )
+    checkpoint = targets[0].with_name(targets[0].name + ".levels")
+    provenance = {"command": " ".join(["bfsensor", *sys.argv[1:]])}
+    if model is None:
+        wanted = assess if assess is not None else galsim is None
+        result = _solve(plan, workers, wanted, checkpoint, provenance)
+    else:
+        result = build_table(
+            plan, engine="image_charge", image_charge=model, provenance=provenance
+        )
+    if galsim is not None:
+        write_galsim(
+            result,
+            galsim,
+            charge=plan.charges[0],
+            depth=plan.depths[0],
+            overwrite=overwrite,
+        )
+    else:
+        result.write(targets[0], overwrite=overwrite)
+    if model is None:
+        shutil.rmtree(checkpoint)
+    written = [str(t) for t in targets]
+    if figure:
+        drawn = _draw(result, targets[0].with_suffix(".png"))
+        written += [drawn] if drawn else []
+    summary = {
+        "written": written,
+        "full_well_e": plan.full_well,
+        **(_effort(plan, result) if model is None else {"engine": engine}),
+        "errors": dict(result.errors),
+        "cpu_s": round(_cpu_seconds() - cpu_began, 1),
+        "wall_s": round(time.perf_counter() - began, 1),
+        "memory_GB": round(peak_memory(), 3),
+    }
+    if as_json:
+        click.echo(json.dumps(summary, indent=1, default=str))
+    else:
+        for key, value in summary.items():
+            click.echo(f"{key:18} {_plain(value)}")
+
+
+def _check_engine(
+    context: click.Context, engine: str, parameters: Sequence[tuple[str, str]]
+) -> None:
+    """Refuse options of the other engine."""
+    if engine == "poisson":
+        wrong = ["--image-charge"] if parameters else []
+    else:
+        wrong = [
+            f"--{name}"
+            for name in ("accuracy", "workers", "assess")
+            if context.get_parameter_source(name) == ParameterSource.COMMANDLINE
+        ]
+    if wrong:
+        raise click.UsageError(f"{', '.join(wrong)}: not for --engine {engine}")
+
+
+_LENGTHS = (
+    "charge_height", "row_height", "column_height", "half_width_x", "half_width_y",
+    "plane_height",
+)  # fmt: skip
+
+
+def _image_charge(device: Any, parameters: Sequence[tuple[str, str]]) -> Any:
+    """Parameters of the analytic engine in a device, from texts with units."""
+    from bfsensor.simulate.charge_field import ImageCharge
+    from bfsensor.units import to_internal
+
+    values: dict[str, Any] = {}
+    for name, text in parameters:
+        if name not in (*_LENGTHS, "drift_field"):
+            raise DeviceError(
+                f"image charge: no parameter {name!r}; there are {', '.join(_LENGTHS)} and "
+                "drift_field; thickness, pitch and permittivity are the device's"
+            )
+        try:
+            if name in _LENGTHS:
+                values[name] = to_internal(text, "length")
+            elif ":" in text:
+                pairs = [part.partition(":")[::2] for part in text.split(",")]
+                values[name] = tuple(
+                    (to_internal(height, "length"), to_internal(field, "field"))
+                    for height, field in pairs
+                )
+            else:
+                values[name] = to_internal(text, "field")
+        except DeviceError as error:
+            raise DeviceError(f"image charge: {name}: {error}") from None
+    lacking = [n for n in (*_LENGTHS[:-1], "drift_field") if n not in values]
+    if lacking:
+        raise DeviceError(
+            f"image charge: {', '.join(lacking)} missing; give each by --image-charge KEY=VALUE"
+        )
+    return ImageCharge(
+        **values, thickness=device.silicon.thickness, pitch_x=device.pixel.pitch_x,
+        pitch_y=device.pixel.pitch_y, permittivity=device.material.permittivity_silicon,
+    )  # fmt: skip
+
+
+def _solve(
+    plan: Any, workers: int, assessed: bool, checkpoint: Path, provenance: dict[str, str]
+) -> Any:
+    """Solve a plan with a bar, on processes, so that it can be taken up again."""
+    from tqdm import tqdm
+
+    from bfsensor.table.build import build_table
+
+    bar = tqdm(
+        total=len(plan.charges) * len(plan.backgrounds), unit="level", file=sys.stderr
+    )
+
+    def progress(done: int, total: int) -> None:
+        bar.n = done
+        bar.refresh()
+
+    executor = ProcessPoolExecutor(workers) if workers > 1 else None
+    try:
+        errors = _start_assessment(plan, executor, checkpoint) if assessed else None
+        return build_table(
+            plan, executor=executor, checkpoint=checkpoint, progress=progress,
+            errors=errors, provenance=provenance,
+        )  # fmt: skip
+    finally:
+        bar.close()  # ends its line, before any message
+        if executor is not None:
+            executor.shutdown(cancel_futures=True)
+
+
+def _effort(plan: Any, result: Any) -> dict[str, Any]:
+    """What the solver did."""
+    return {
+        "cells_a_pixel": plan.cells,
+        "nodes": result.provenance.get("nodes"),
+        "newton_steps": int(result.provenance["newton steps"]),
+        "linear_iterations": int(result.provenance["linear iterations"]),
+    }
+
+
+def _start_assessment(
+    plan: Any, executor: ProcessPoolExecutor | None, checkpoint: Path
+) -> Callable[[], dict[str, float]]:
+    """Begin to measure the errors of a table; the answer is kept like its levels."""
+    from bfsensor.table.assess import assess
+
+    kept = checkpoint / plan.key / "errors.json"
+    if kept.exists():
+        return lambda: dict(json.loads(kept.read_text()))
+    pending = executor.submit(assess, plan) if executor is not None else None
+
+    def finish() -> dict[str, float]:
+        errors = pending.result() if pending is not None else assess(plan)
+        with written_whole(kept, TableError) as beside:
+            beside.write_text(json.dumps(errors))
+        return errors
+
+    return finish
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(map(str, value))
+    if isinstance(value, dict):
+        return "; ".join(
+            f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in value.items()
+        )
+    return f"{value:,.0f}" if isinstance(value, float) and value > 1000 else str(value)
+
+
+def _draw(result: Any, path: Path) -> str | None:
+    """Draw a table beside it; says so and goes on where matplotlib is missing."""
+    from bfsensor.plots import table as show
+
+    try:
+        figure = show.figure_for_table(result)
+    except BFSensorError as error:
+        click.echo(f"bfsensor: no figure: {error}", err=True)
+        return None
+    figure.savefig(path, dpi=120)
+    return str(path)
+
+
+def _cpu_seconds() -> float:
+    import resource
+
+    own = resource.getrusage(resource.RUSAGE_SELF)
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return own.ru_utime + own.ru_stime + children.ru_utime + children.ru_stime

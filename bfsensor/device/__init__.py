@@ -1,0 +1,1 @@
+"""What a sensor is made of and how it is operated; laws of silicon."""

@@ -1,0 +1,241 @@
+"""The quantities of a device by dotted name: value, unit, range, prior."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bfsensor.device.device import Device
+from bfsensor.device.parts import Provenance
+from bfsensor.errors import DeviceError, FitError
+from bfsensor.units import INTERNAL, to_internal
+
+DIFFUSION = "transport.diffusion"
+"""Width of the diffusion over Einstein's: no quantity of a device, yet free with widths."""
+
+DIFFUSION_SPREAD = 0.5
+"""Prior of it: the published simulations have 2.12, Einstein 1; not settled."""
+
+
+class Quantity(NamedTuple):
+    """One number of a device [internal units] and the range that it may have."""
+
+    value: float
+    kind: str
+    unit: str
+    low: float
+    high: float
+
+    def text(self, value: float, digits: int = 4) -> str:
+        """Write a value, rounded, with its unit.
+
+        Examples
+        --------
+        >>> Quantity(100.0, "length", "um", 5.0, 1e3).text(101.23456)
+        '101.2 um'
+        """
+        return f"{self.number(value):.{digits}g} {self.unit}".rstrip()
+
+    def number(self, value: float) -> float:
+        """Give a value in the unit of device files."""
+        return float(value * INTERNAL[self.kind].to(self.unit))
+
+
+@dataclasses.dataclass(frozen=True)
+class Prior:
+    """What is known of a free parameter before the fit: a Gaussian within bounds.
+
+    Attributes
+    ----------
+    name : str
+        Dotted.
+    mean, spread : float
+        [internal unit].
+    low, high : float
+        Outside it is no device: thicknesses above 0, doses of one sign.
+    """
+
+    name: str
+    mean: float
+    spread: float
+    low: float = -np.inf
+    high: float = np.inf
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.spread) and self.spread > 0):
+            raise FitError(
+                f"{self.name}: spread of the prior {self.spread!r} must be above 0"
+            )
+        if not self.low <= self.mean <= self.high:
+            raise FitError(
+                f"{self.name}: {self.mean:g} lies outside {self.low:g} to {self.high:g}"
+            )
+
+
+def quantities(device: Device) -> dict[str, Quantity]:
+    """Every number of a device that has a unit, by dotted name.
+
+    Examples
+    --------
+    >>> quantities(Device.load("itl_sta3800c"))["channel_stop.implant[0].dose"].high
+    -0.0
+    """
+    out: dict[str, Quantity] = {}
+    for spec in dataclasses.fields(device):
+        part = getattr(device, spec.name)
+        if dataclasses.is_dataclass(part):
+            _collect(part, spec.name, out)
+    return out
+
+
+def _collect(part: Any, path: str, out: dict[str, Quantity]) -> None:
+    for spec in dataclasses.fields(part):
+        value = getattr(part, spec.name)
+        if isinstance(value, tuple):
+            # Files name one implant, Python the tuple of them.
+            for n, member in enumerate(value):
+                _collect(member, f"{path}.{spec.name[:-1]}[{n}]", out)
+        elif dataclasses.is_dataclass(value):
+            _collect(value, f"{path}.{spec.name}", out)
+        elif spec.metadata and value is not None:
+            known = spec.metadata
+            low = -np.inf if known["low"] is None else float(known["low"])
+            high = np.inf if known["high"] is None else float(known["high"])
+            if known["kind"] in ("dose", "density") and value:
+                # Acceptors do not become donors.
+                low, high = (max(low, 0.0), high) if value > 0 else (low, min(high, -0.0))
+            out[f"{path}.{spec.name}"] = Quantity(
+                float(value), known["kind"], known["unit"], low, high
+            )
+
+
+def describe(name: str) -> str:
+    """Name a quantity as a reader of the device file would.
+
+    Examples
+    --------
+    >>> describe("silicon.background_doping"), describe("channel.implant[0].dose")
+    ('background doping', 'channel implant 1 dose')
+    """
+    words = []
+    for part in name.split("."):
+        word, _, number = part.partition("[")
+        words.append(word.replace("_", " "))
+        if number:
+            words[-1] += f" {int(number[:-1]) + 1}"
+    if words[0] in ("silicon", "gates", "operating point", "well", "transport", "material"):
+        words = words[1:]
+    return " ".join(words).replace("quasi fermi", "quasi-Fermi")
+
+
+def choose_priors(
+    device: Device, asked: tuple[str, ...] = (), *, more: tuple[str, ...] = ()
+) -> tuple[Prior, ...]:
+    """Priors of the parameters that are to be free.
+
+    Parameters
+    ----------
+    device : Device
+        Values are means, uncertainties spreads.
+    asked : tuple of str
+        Names, dotted or the end of one where that is unique, each with a spread of its own after
+        a colon, such as ``'back_bias:5 V'``, or mean and spread, such as
+        ``'background_doping:-1.7e12 cm-3 +- 0.7e12 cm-3'``; 'all' for all with an uncertainty, except
+        ``well.spill_barrier``, which only saturation sees.  None: those whose origin is 'guessed'.
+    more : tuple of str
+        Free besides, if the device states an uncertainty.
+
+    Raises
+    ------
+    FitError
+        No such quantity, none with an uncertainty, or a spread that is none.
+
+    Examples
+    --------
+    >>> device = Device.load("itl_sta3800c")
+    >>> [p.name for p in choose_priors(device)]
+    ['operating_point.hole_quasi_fermi_level']
+    >>> choose_priors(device, ("back_bias:5 V",))[0].spread
+    5.0
+    >>> choose_priors(device, ("thickness:98 um +- 2 um",))[0].mean
+    98.0
+    """
+    known = quantities(device)
+    spreads = {
+        key: float(known_of.uncertainty)
+        for key, known_of in device.provenance.items()
+        if known_of.uncertainty
+    }
+    chosen: dict[str, float] = {}
+    means: dict[str, float] = {}
+    for text in asked:
+        name, _, spread = text.partition(":")
+        if name == "all":
+            chosen |= {k: s for k, s in spreads.items() if k != "well.spill_barrier"}
+            continue
+        key = name if name == DIFFUSION else _resolve(name, known)
+        if spread:
+            kind = "number" if key == DIFFUSION else known[key].kind
+            mean, sign, width = spread.partition("+-")
+            try:
+                if sign:
+                    means[key], spread = to_internal(mean.strip(), kind), width.strip()
+                chosen[key] = abs(to_internal(spread, kind))
+            except DeviceError as error:
+                raise FitError(f"--free {text}: {error}") from None
+        elif key == DIFFUSION:
+            chosen[key] = DIFFUSION_SPREAD
+        elif key in spreads:
+            chosen[key] = spreads[key]
+        else:
+            raise FitError(
+                f"{device.name} states no uncertainty of {key}: give one, such as "
+                f"{key}:{known[key].text(0.1 * abs(known[key].value) or 1.0)}"
+            )
+    if not asked:
+        chosen = {
+            k: s for k, s in spreads.items() if device.provenance[k].origin == "guessed"
+        }
+    for key in more:
+        if key == DIFFUSION:
+            chosen.setdefault(key, DIFFUSION_SPREAD)
+        elif key in spreads:
+            chosen.setdefault(key, spreads[key])
+    if not chosen:
+        raise FitError(
+            f"{device.name}: nothing is 'guessed', so nothing is free by default; name what is: "
+            f"all, or {', '.join(spreads)}"
+        )
+    return tuple(
+        Prior(DIFFUSION, means.get(key, 1.0), spread, 0.0)
+        if key == DIFFUSION
+        else Prior(
+            key, means.get(key, known[key].value), spread, known[key].low, known[key].high
+        )
+        for key, spread in chosen.items()
+    )
+
+
+def _resolve(name: str, known: dict[str, Quantity]) -> str:
+    """Dotted name of a quantity from the end of it."""
+    if name in known:
+        return name
+    ends = [key for key in known if key.endswith(f".{name}")]
+    if len(ends) == 1:
+        return ends[0]
+    close = ends or difflib.get_close_matches(name, known, 3, 0.5)
+    hint = f"; did you mean {' or '.join(close)}?" if close else ""
+    raise FitError(f"no quantity {name!r} in the device{hint}")
+
+
+def with_priors(device: Device, priors: tuple[Prior, ...]) -> Device:
+    """Give the device with the priors' spreads as its uncertainties."""
+    known = dict(device.provenance)
+    for prior in priors:
+        if prior.name != DIFFUSION:
+            old = known.get(prior.name, Provenance())
+            known[prior.name] = dataclasses.replace(old, uncertainty=prior.spread)
+    return dataclasses.replace(device, provenance=known)

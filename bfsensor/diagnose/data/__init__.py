@@ -1,0 +1,1 @@
+"""From exposures to channels: numbers with errors, and where each belongs."""

@@ -1,0 +1,406 @@
+"""Frames without light: noise in readout order, bias levels and rows, darks, tracks of particles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft
+
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.exposures import Axes, Condition, ExposureInfo, Frame
+from bfsensor.effects.read_noise import READOUT_LAGS, near_lags
+from bfsensor.typing import FloatArray
+
+OUTLIER = 6.0
+"""Deviation [sigma] from which a pixel of a dark or bias counts as struck: one in 5e8 by noise."""
+
+TRACK = 20.0
+"""Deviation [sigma] from which a pixel has no part in the bias level: more than ghosts of spots."""
+
+UNEVEN = 1.25
+"""Scatter of a dark's columns over that of noise from which columns count as uneven by nature:
+four standard deviations of the scatter of 128."""
+
+HOT = 10.0
+"""Deviation of the mean of a column of spots [its sigma] from which it is hot."""
+
+STANDS_OUT = 5.0
+"""Deviation [sigma] from which a covariance of the noise counts in the errors of all of them."""
+
+FRAME_ERROR = 0.1
+"""Scatter of the bias level from frame to frame that a quiet system may have [ADU] (assumed)."""
+
+LEVEL_ERROR = 0.05
+"""How well the overscan's level stands for the image's in a quiet system [ADU] (assumed)."""
+
+
+class BiasChannels:
+    """Takes bias frames one by one; gives their channels, the mean bias and the read noise."""
+
+    def __init__(self, fold: str = "fit") -> None:
+        self._fold = fold
+        self._last: list[tuple[NDArray[np.float32], float]] = []
+        self._sum: dict[str, FloatArray] = {}
+        self._names: list[str] = []
+        self.frames = 0
+        self._spectra: list[list[FloatArray]] = []
+        self._cross: list[FloatArray] = []
+        self._rows: list[list[tuple[float, float, float]]] = []
+        self._levels: list[tuple[ExposureInfo, list[tuple[float, float]]]] = []
+        self._long: list[list[FloatArray]] = []
+        self._zeros: list[list[tuple[float, float]]] = []
+        self._size = 0
+        self._condition = Condition(np.nan, np.nan, np.nan)
+
+    def add(self, exposure: ExposureInfo, frames: Sequence[Frame]) -> None:
+        """Add a bias frame."""
+        self._condition = Condition.of(exposure)
+        self._names = [f.name for f in frames]
+        zeros = self.add_level(exposure, frames)
+        for frame, zero in zip(frames, zeros, strict=True):
+            if frame.name not in self._sum:
+                self._sum[frame.name] = np.zeros(frame.pixels.shape)
+            self._sum[frame.name] += frame.pixels.astype(np.float64) - zero
+        self.frames += 1
+        here = [(f.pixels, zero) for f, zero in zip(frames, zeros, strict=True)]
+        if not self._last:
+            self._last = here
+            return
+        # Each frame is used once: differences of frames that follow one another.
+        self._size = here[0][0].size
+        flat = np.empty((len(here), self._size))
+        spectra, long, rows = [], [], []
+        for own, (a, zero_a), (b, zero_b) in zip(flat, self._last, here, strict=True):
+            first, second = a.astype(np.float64) - zero_a, b.astype(np.float64) - zero_b
+            noise = _without_outliers((first - second) / np.sqrt(2.0))
+            own[:] = noise.ravel()
+            long.append(_autocovariance(noise))
+            spectra.append(long[-1][: READOUT_LAGS + 1])
+            rows.append(_row_excess(noise))
+        self._last = []
+        self._spectra.append(spectra)
+        self._long.append(long)
+        self._rows.append(rows)
+        flat -= flat.mean(1, keepdims=True)
+        self._cross.append(flat @ flat.T / (self._size - (len(flat) > 1)))
+
+    def add_level(
+        self,
+        exposure: ExposureInfo,
+        frames: Sequence[Frame],
+        lit: Sequence[NDArray[np.bool_]] = (),
+    ) -> list[float]:
+        """Add a bias frame to the levels alone; gives its zeros [ADU].
+
+        What stands in pixels that were ``lit`` before is no particle's.
+        """
+        zeros, levels = [], []
+        for n, frame in enumerate(frames):
+            over = frame.serial_overscan.astype(np.float64)
+            # Without an overscan the mean bias is the zero of flats: its level stays in it.
+            zeros.append(float(over.mean()) if over.size else 0.0)
+            image = frame.image.astype(np.float64)
+            if over.size:
+                # Tracks of particles would tell their own number, not the level.
+                struck = _struck(image, TRACK)
+                image = image[~(struck & ~lit[n]) if lit else ~struck]
+                share = image.var() / image.size + over.var() / over.size
+                levels.append((float(image.mean()) - zeros[-1], share + LEVEL_ERROR**2))
+        if len(levels) == len(frames):
+            self._levels.append((exposure, levels))
+            overs = [f.serial_overscan.astype(np.float64) for f in frames]
+            self._zeros.append([(o.mean(), o.var() / o.size) for o in overs])
+        return zeros
+
+    def mean(self, name: str) -> FloatArray | None:
+        """Mean bias of an amplifier's whole frame, any overscan's level taken off [ADU]."""
+        total = self._sum.get(name)
+        return None if total is None else total / self.frames
+
+    def forget_mean(self) -> None:
+        """Give up what :meth:`mean` is made of, which is large, once it is known."""
+        self._sum.clear()
+
+    @property
+    def read_noise(self) -> dict[str, float]:
+        """Of each amplifier [ADU]; empty with fewer than two frames."""
+        if not self._spectra:
+            return {}
+        variance = np.mean([[s[0] for s in one] for one in self._spectra], axis=0)
+        return {n: float(np.sqrt(v)) for n, v in zip(self._names, variance, strict=True)}
+
+    def channels(self) -> list[Channel]:
+        """Noise by lag in readout order, rows, levels, and what amplifiers share."""
+        if not self._spectra:
+            return []
+        pairs = len(self._spectra)
+        values, blocks, axes = [], [], Axes()
+        found = [self._seen(amp) for amp in range(len(self._names))]
+        for amp, seen in enumerate(found):
+            mean = np.mean([s[amp] for s in self._spectra], axis=0)
+            values.append(mean)
+            blocks.append(_errors_in_order(seen) / (self._size * pairs))
+            axes.add(len(mean), self._condition, amp=amp, lag=np.arange(len(mean)))
+        out = [
+            Channel("bias_cov", np.concatenate(values), tuple(blocks), axes.columns(), "adu2",
+                    self._fold)
+        ]  # fmt: skip
+        out.append(self._bias_levels())
+        if len(self._names) > 1:
+            out.append(self._shared(found, pairs))
+        return out
+
+    def _seen(self, amp: int) -> FloatArray:
+        """Covariances of the noise at all lags, those that do not stand out set to zero."""
+        c = np.mean([s[amp] for s in self._long], axis=0)
+        error = c[0] / np.sqrt(self._size * len(self._long))
+        return np.where(np.abs(c) > STANDS_OUT * error, c, 0.0)
+
+    def _bias_levels(self) -> Channel:
+        """Rows' excess variance by pair, levels above the overscan by frame, frames' scatter."""
+        values, blocks, axes = [], [], Axes()
+        excess = np.array([[e for e, *_ in one] for one in self._rows])
+        # The scatter of a variance goes with it, where it is certain that there is more.
+        mean = excess.mean(0)
+        least = STANDS_OUT * np.array([e for _, e, _ in self._rows[0]]) / len(excess) ** 0.5
+        more = np.where(mean > least, 1 + mean, 1.0)
+        # Of a wave each frame has another phase, the same in all its rows.
+        # One pair alone cannot tell that scatter: its excess is held against noise.
+        apart = excess.std(0, ddof=1) if len(excess) > 1 else np.zeros(len(mean))
+        apart = np.where(np.abs(mean) > least, apart, 0.0)
+        for n, one in enumerate(self._rows):
+            value, error, white = np.array(one).T
+            values.append(value)
+            blocks.append(np.diag(np.maximum(more * error, apart) ** 2))
+            axes.add(len(one), self._condition, amp=np.arange(len(one)), exposure=2 * n,
+                     what="rows", white=white)  # fmt: skip
+        for exposure, levels in self._levels:
+            level, variance = np.array(levels).T
+            values.append(level)
+            blocks.append(np.diag(variance))
+            axes.add(len(level), self._condition, amp=np.arange(len(level)),
+                     exposure=exposure.number, what="level", white=variance)  # fmt: skip
+        if len(self._zeros) > 2:
+            zeros = np.array(self._zeros)
+            freedom = len(zeros) - 1
+            white = zeros[..., 1].mean(0) + FRAME_ERROR**2
+            scatter = zeros[..., 0].var(0, ddof=1) + FRAME_ERROR**2
+            values.append(np.log(scatter / white))
+            blocks.append(2.0 / freedom * np.eye(len(white)))
+            axes.add(len(white), self._condition, amp=np.arange(len(white)), exposure=-1,
+                     what="frames", white=white)  # fmt: skip
+        return Channel("bias_level", np.concatenate(values), tuple(blocks), axes.columns(), "adu",
+                       self._fold)  # fmt: skip
+
+    def _shared(self, found: list[FloatArray], pairs: int) -> Channel:
+        """Covariance of the noise between amplifiers at the same readout time."""
+        mean = np.mean(self._cross, axis=0)
+        a, b = np.triu_indices(len(mean), 1)
+        axes = Axes()
+        axes.add(len(a), self._condition, amp=a, other=b, what="noise")
+        n = self._size * pairs
+        error = [
+            (2 * found[i] @ found[j] - found[i][0] * found[j][0] + mean[i, j] ** 2) / n
+            for i, j in zip(a, b, strict=True)
+        ]
+        return Channel("amp_cross", mean[a, b], tuple(np.array([[e]]) for e in error),
+                       axes.columns(), "adu2", self._fold)  # fmt: skip
+
+
+class DarkChannels:
+    """Takes darks one by one: level against time and order, columns, struck pixels."""
+
+    def __init__(
+        self,
+        bias: dict[str, FloatArray],
+        read_noise: dict[str, float],
+        fold: str = "fit",
+        *,
+        biases: int = 0,
+    ) -> None:
+        self._bias, self._noise, self._fold = bias, read_noise, fold
+        self._biases = biases
+        self._rows: list[
+            tuple[ExposureInfo, float, list[tuple[float, float, int, int]]]
+        ] = []
+        self._columns: list[_Columns] = []
+        self._names: list[str] = []
+        self._condition = Condition(np.nan, np.nan, np.nan)
+
+    def add(
+        self, exposure: ExposureInfo, frames: Sequence[Frame], *, after: float = 0.0
+    ) -> None:
+        """Add a dark; ``after`` is the mean level [ADU] of the exposure before it."""
+        self._condition = Condition.of(exposure)
+        found = []
+        lines = _Columns(exposure.exposure_time or 0.0, [], [], [])
+        self._names = [f.name for f in frames]
+        for frame in frames:
+            over = frame.serial_overscan
+            zero = float(over[:, over.shape[1] // 2 :].mean()) if over.size else 0.0
+            image = frame.image.astype(np.float64) - zero
+            bias = self._bias.get(frame.name)
+            if bias is not None:
+                image = image - bias
+            sigma = self._noise.get(frame.name) or 1.4826 * float(
+                np.median(np.abs(image - np.median(image)))
+            )
+            struck = np.abs(image - np.median(image)) > OUTLIER * sigma
+            good = image[~struck]
+            error = good.var() / good.size
+            if over.size:
+                error += float(over.var()) / (over.size // 2)
+            found.append((float(good.mean()), float(error), int(struck.sum()), image.size))
+            # What strikes most of a column is no particle: a hot column is told as it is.
+            hot = struck.mean(0) > 0.5
+            kept = np.where(struck & ~hot, np.nan, image)
+            lines.means.append(np.nanmean(kept, 0))
+            lines.own.append(np.nanvar(kept, 0) / image.shape[0])
+            lines.noise.append(float(good.var()) / image.shape[0])
+        self._rows.append((exposure, after, found))
+        self._columns.append(lines)
+
+    def channels(self) -> list[Channel]:
+        """Levels and struck pixels by dark; columns of the longest darks."""
+        if not self._rows:
+            return []
+        values, blocks, axes = [], [], Axes()
+        for exposure, after, found in self._rows:
+            level, variance, struck, _ = (
+                np.array(c, float) for c in zip(*found, strict=True)
+            )
+            amps = np.arange(len(level))
+            common = {"amp": amps, "time": exposure.exposure_time or 0.0,
+                      "exposure": exposure.number, "after": after}  # fmt: skip
+            values.append(level)
+            blocks.append(np.diag(variance))
+            axes.add(len(level), self._condition, what="level", x=-1, **common)
+            # A Poisson number; one is added to its variance, for none was seen of few expected.
+            values.append(struck)
+            blocks.append(np.diag(struck + 1.0))
+            axes.add(len(level), self._condition, what="struck", x=-1, **common)
+        longest = max(c.seconds for c in self._columns)
+        chosen = [c for c in self._columns if c.seconds == longest]
+        for amp in range(len(self._names)):
+            mean = np.mean([c.means[amp] for c in chosen], axis=0)
+            noise = float(np.mean([c.noise[amp] for c in chosen]))
+            own = np.mean([c.own[amp] for c in chosen], axis=0)
+            usual = self._column_error(mean, amp, noise, len(chosen)) ** 2
+            # Charge of a hot column has a shot noise of its own.
+            sure = STANDS_OUT * np.sqrt(2.0 / self._rows_of(amp, mean) / len(chosen))
+            more = np.where(own > noise * (1 + sure), own - noise, 0.0) / len(chosen)
+            values.append(mean - np.median(mean))
+            blocks.extend((usual + more)[:, None, None])
+            axes.add(len(mean), self._condition, what="column", x=np.arange(len(mean)), amp=amp,
+                     time=longest, exposure=-1, after=0.0)  # fmt: skip
+        return [Channel("dark_map", np.concatenate(values), tuple(blocks), axes.columns(), "adu",
+                        self._fold)]  # fmt: skip
+
+    def _column_error(self, mean: FloatArray, amp: int, noise: float, darks: int) -> float:
+        """Error of a column's mean: of the pixels' noise, or of what most columns do.
+
+        The scatter of a hundred columns is itself known to 10 % only, which would make farther
+        outliers of the farthest; it counts where columns are uneven beyond noise.
+
+        Parameters
+        ----------
+        mean : ndarray
+            Of the columns [ADU].
+        amp : int
+            Amplifier.
+        noise : float
+            Variance of a column's mean in one dark, the mean bias's share in it [ADU^2].
+        darks : int
+            Whose mean it is.
+        """
+        scatter = max(1.4826 * float(np.median(np.abs(mean - np.median(mean)))), 1e-6)
+        read = self._noise.get(self._names[amp], 0.0)
+        pixels = self._rows_of(amp, mean)
+        # The mean bias is the same in all darks.
+        shared = read**2 / self._biases / pixels if self._biases else 0.0
+        expected = float(np.sqrt(max(noise - shared, 0.0) / darks + shared))
+        return expected if scatter < UNEVEN * expected else scatter
+
+    def _rows_of(self, amp: int, mean: FloatArray) -> float:
+        """Pixels of a column."""
+        return self._rows[0][2][amp][3] / len(mean)
+
+
+class _Columns(NamedTuple):
+    """Columns of one dark, by amplifier."""
+
+    seconds: float
+    means: list[FloatArray]
+    own: list[FloatArray]
+    """Variance of each column's mean, of its own pixels [ADU^2]."""
+    noise: list[float]
+    """Of all pixels [ADU^2]."""
+
+
+def without_hot_columns(image: FloatArray, noise: float) -> FloatArray:
+    """Image of spots with columns that stand out as a whole put on the others' level [ADU].
+
+    Spots are told from a column by its median: of columns through a row of them it is half a
+    standard deviation of the noise up.
+    """
+    columns = np.nanmedian(image, axis=0)
+    excess = columns - np.nanmedian(columns)
+    hot = excess > noise * (1.0 + HOT / np.sqrt(image.shape[0]))
+    return image - np.where(hot, excess, 0.0) if hot.any() else image
+
+
+def _without_outliers(noise: FloatArray) -> FloatArray:
+    """Set struck pixels to the mean: 6 median deviations, as of a Gaussian."""
+    return np.where(_struck(noise), 0.0, noise - np.median(noise))
+
+
+def _struck(noise: FloatArray, limit: float = OUTLIER) -> NDArray[np.bool_]:
+    """Pixels beyond so many median deviations, as of a Gaussian; a converter's steps are none."""
+    away = np.abs(noise - np.median(noise))
+    return np.asarray(away > limit * max(1.4826 * float(np.median(away)), 0.3))
+
+
+def _autocovariance(noise: FloatArray) -> FloatArray:
+    """Covariance of pixels as they are read out, at lags up to a quarter of the frame."""
+    series = noise.ravel() - noise.mean()
+    n = len(series)
+    size = next_fast_len(2 * n, real=True)
+    lags = max(n // 4, min(n, READOUT_LAGS + 1))
+    power = np.abs(rfft(series, size)) ** 2
+    return np.asarray(irfft(power, size)[:lags] / (n - np.arange(lags)))
+
+
+def _errors_in_order(c: FloatArray) -> FloatArray:
+    """Covariance matrix of covariances at the first lags of one pixel of a long series (Bartlett).
+
+    Of a wave that keeps its phase through a frame a quarter of the lags tells nearly all.
+    """
+    n = len(c)
+    size = next_fast_len(2 * n + 2 * READOUT_LAGS, real=True)
+    even = np.zeros(size)
+    even[:n] = c
+    even[size - n + 1 :] = c[:0:-1]
+    g = irfft(rfft(even).real ** 2, size)
+    h = np.arange(READOUT_LAGS + 1)
+    return np.asarray(g[np.abs(h[:, None] - h)] + g[h[:, None] + h])
+
+
+def _row_excess(noise: FloatArray) -> tuple[float, float, float]:
+    """Variance of the rows' means over what white noise gives, less one; its error; and that.
+
+    Without the share of pixels that are few lags apart: those covariances are told by themselves,
+    and what is told twice would count twice.
+    """
+    rows, columns = noise.shape
+    share = noise.var() / columns
+    excess = float(noise.mean(1).var(ddof=1) / share - 1.0)
+    noise = noise - noise.mean()
+    lags = near_lags(columns)
+    near = sum((noise[:, k:] * noise[:, :-k]).sum() / rows / columns for k in lags.tolist())
+    excess -= 2 * float(near) / float(noise.var())
+    # All products of two pixels of a row have the same variance, and no covariance.
+    far = 2.0 / (rows - 1) - 4.0 / rows / columns * float((1 - lags / columns).sum())
+    return excess, float(np.sqrt(far)), float(share)

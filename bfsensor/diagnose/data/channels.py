@@ -1,0 +1,238 @@
+"""Channels: what recordings say, as numbers with errors and where each belongs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import solve_triangular
+from scipy.sparse import block_diag, csr_array, diags_array
+
+from bfsensor.errors import DiagnosisError
+from bfsensor.typing import FloatArray
+
+WORDS = (
+    "flat_cov", "flat_mean", "flat_map", "serial_overscan", "parallel_overscan", "bias_cov",
+    "bias_level", "dark_map", "spot", "amp_cross", "code_hist", "time",
+)  # fmt: skip
+"""The channels there are."""
+
+PER_ELECTRON = "1/e-"
+"""Unit of covariances that are a_ij: areas themselves, of no level, without gain or noise."""
+
+FOLDS = ("fit", "select", "held-out")
+
+
+@dataclass(frozen=True, eq=False)
+class Common:
+    """What the errors of some values tell of those of others: ``spread @ gather`` times them.
+
+    Attributes
+    ----------
+    spread : csr_array, shape (n, m)
+        To the values that are told of.
+    gather : csr_array, shape (m, n)
+        From those that tell, which are others: of them nothing is told.
+
+    Examples
+    --------
+    The last of three values is the mean of the first two, and noise of its own:
+
+    >>> both = Common(csr_array([[0.0], [0.0], [1.0]]), csr_array([[0.5, 0.5, 0.0]]))
+    >>> c = Channel("flat_map", np.zeros(3), (np.eye(1),) * 3, {"x": np.arange(3)}, "", common=both)
+    >>> c.whiten(np.array([2.0, 4.0, 3.0]))
+    array([2., 4., 0.])
+    """
+
+    spread: csr_array
+    gather: csr_array
+
+    def __post_init__(self) -> None:
+        if self.spread.shape != self.gather.shape[::-1]:
+            raise DiagnosisError(
+                f"noise in common: {self.spread.shape} and {self.gather.shape} do not match"
+            )
+        if (self.gather @ self.spread).count_nonzero():
+            raise DiagnosisError("noise in common: what values tell of is told to others")
+
+    @classmethod
+    def none(cls, n: int) -> Common:
+        """Nothing, of ``n`` values."""
+        return cls(csr_array((n, 0)), csr_array((0, n)))
+
+    @property
+    def size(self) -> int:
+        """Number of values."""
+        return int(self.spread.shape[0])
+
+    @property
+    def tells(self) -> NDArray[np.bool_]:
+        """Which values tell of others."""
+        out = np.zeros(self.size, bool)
+        out[self.gather.indices] = True
+        return out
+
+    def told(self, errors: FloatArray) -> FloatArray:
+        """Parts of errors, shape (n, ...), that the others tell."""
+        return np.asarray(self.spread @ (self.gather @ errors))
+
+    def variance(self, own: FloatArray) -> FloatArray:
+        """Variance that is told, from what values have themselves."""
+        middle = (self.gather * own) @ self.gather.T
+        return np.asarray((self.spread @ middle).multiply(self.spread).sum(1)).ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """Numbers of one kind, the covariance of their errors, and where each belongs.
+
+    Attributes
+    ----------
+    word : str
+        Which channel, of :data:`WORDS`.
+    values : ndarray, shape (n,)
+        What was measured, in ``unit``.
+    blocks : tuple of ndarray
+        Covariance matrices of consecutive values [unit^2]; values of different blocks are
+        independent, but for what ``common`` tells.
+    axes : mapping of str to ndarray, shape (n,)
+        Coordinates of each value: 'amp', 'level' [e- or ADU], 'i', 'j', 'wavelength' [nm], ...
+    unit : str
+        Of the values.
+    fold : str
+        Which exposures they come from: 'fit', 'select' or 'held-out'.
+    common : Common, optional
+        Noise that values share with others before them; ``blocks`` are of what is left.
+
+    Examples
+    --------
+    >>> c = Channel("bias_cov", np.zeros(3), (np.eye(2), 4 * np.eye(1)), {"lag": np.arange(3)}, "adu2")
+    >>> c.whiten(np.array([1.0, 2.0, 2.0]))
+    array([1., 2., 1.])
+    """
+
+    word: str
+    values: FloatArray
+    blocks: tuple[FloatArray, ...]
+    axes: Mapping[str, NDArray]
+    unit: str
+    fold: str = "fit"
+    common: Common | None = None
+    _whitener: csr_array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.word not in WORDS:
+            raise DiagnosisError(f"channel {self.word!r} is not one of {', '.join(WORDS)}")
+        if self.fold not in FOLDS:
+            raise DiagnosisError(f"fold {self.fold!r} is not one of {', '.join(FOLDS)}")
+        values = np.array(self.values, float)
+        sizes = [len(b) for b in self.blocks]
+        if values.ndim != 1 or sum(sizes) != len(values):
+            raise DiagnosisError(
+                f"{self.word}: {values.shape} values and blocks of {sum(sizes)} do not match"
+            )
+        axes = {name: np.asarray(column) for name, column in self.axes.items()}
+        for name, column in axes.items():
+            if column.shape != values.shape:
+                raise DiagnosisError(
+                    f"{self.word}: axis {name} has the shape {column.shape}, not {values.shape}"
+                )
+        if not np.all(np.isfinite(values)):
+            raise DiagnosisError(
+                f"{self.word}: {int((~np.isfinite(values)).sum())} values are not finite"
+            )
+        if self.common is not None and self.common.size != len(values):
+            raise DiagnosisError(
+                f"{self.word}: noise in common of {self.common.size} values, not {len(values)}"
+            )
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "axes", MappingProxyType(axes))
+        object.__setattr__(self, "_whitener", self._invert())
+
+    def _invert(self) -> csr_array:
+        """Inverse roots of the blocks as one sparse matrix."""
+        single = np.array([len(b) == 1 for b in self.blocks], bool)
+        if single.all():
+            variance = np.array([b[0, 0] for b in self.blocks])
+            if not np.all(variance > 0):
+                raise DiagnosisError(f"{self.word}: an error is not above 0")
+            return csr_array(diags_array(1.0 / np.sqrt(variance)))
+        roots = []
+        for block in self.blocks:
+            try:
+                root = np.linalg.cholesky(block)
+            except np.linalg.LinAlgError:
+                raise DiagnosisError(
+                    f"{self.word}: an error matrix of {block.shape} is not positive definite"
+                ) from None
+            roots.append(solve_triangular(root, np.eye(len(root)), lower=True))
+        return csr_array(block_diag(roots, format="csr"))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        given = (self.word, self.values, self.blocks, dict(self.axes), self.unit, self.fold)
+        return Channel, (*given, self.common)
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    @property
+    def errors(self) -> FloatArray:
+        """Standard error of each value [unit]."""
+        if not self.blocks:
+            return np.zeros(0)
+        variance = np.concatenate([np.diag(b) for b in self.blocks])
+        if self.common is not None:
+            variance += self.common.variance(variance)
+        return np.sqrt(variance)
+
+    def whiten(self, residuals: ArrayLike) -> FloatArray:
+        """Divide by the errors: independent numbers of variance 1 where the errors are right.
+
+        Parameters
+        ----------
+        residuals : array_like, shape (n, ...)
+            Differences, or derivatives, in ``unit``.
+        """
+        given = np.asarray(residuals, float)
+        if self.common is not None:
+            given = given - self.common.told(given)
+        return np.asarray(self._whitener @ given)
+
+    def unwhiten(self, white: ArrayLike) -> FloatArray:
+        """Undo :meth:`whiten`: residuals in ``unit``, shape (n,)."""
+        given = np.asarray(white, float)
+        out, start = np.empty_like(given), 0
+        for block in self.blocks:
+            part = slice(start, start + len(block))
+            out[part] = np.linalg.cholesky(block) @ given[part]
+            start += len(block)
+        return out if self.common is None else out + self.common.told(out)
+
+
+def join_channels(channels: Sequence[Channel]) -> Channel:
+    """Join channels of one word and unit; axes that not all have are left out."""
+    first = channels[0]
+    names = [n for n in first.axes if all(n in c.axes for c in channels)]
+    return Channel(
+        first.word,
+        np.concatenate([c.values for c in channels]),
+        tuple(b for c in channels for b in c.blocks),
+        {n: np.concatenate([c.axes[n] for c in channels]) for n in names},
+        first.unit,
+        first.fold,
+        join_common([c.common or Common.none(len(c)) for c in channels])
+        if any(c.common for c in channels)
+        else None,
+    )
+
+
+def join_common(parts: Sequence[Common]) -> Common:
+    """Noise in common of values one after another, of which these parts share none."""
+    return Common(
+        csr_array(block_diag([p.spread for p in parts], format="csr")),
+        csr_array(block_diag([p.gather for p in parts], format="csr")),
+    )

@@ -1,0 +1,140 @@
+# ruff: noqa: D102  (protocols: the class says what its attributes are)
+"""What tells exposures apart: conditions, levels, and the fold each pair of flats goes to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Condition(NamedTuple):
+    """Light [nm] and operating point [V, deg C] of an exposure; nan where not known."""
+
+    wavelength: float
+    back_bias: float
+    temperature: float
+
+    @classmethod
+    def of(cls, exposure: ExposureInfo) -> Condition:
+        """Condition of an exposure, rounded to what headers repeat."""
+        values = (exposure.wavelength, exposure.back_bias, exposure.temperature)
+        return cls(*(np.nan if v is None else round(float(v), 2) for v in values))
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """As text: nan equals nan."""
+        return tuple(f"{v:g}" for v in self)
+
+
+class Axes:
+    """Columns that grow block by block."""
+
+    def __init__(self) -> None:
+        self._parts: dict[str, list[NDArray]] = {}
+
+    def add(self, count: int, condition: Condition, **columns: object) -> None:
+        """Add rows; numbers are repeated."""
+        for name, value in {**condition._asdict(), **columns}.items():
+            self._parts.setdefault(name, []).append(
+                np.broadcast_to(np.asarray(value), (count,))
+            )
+
+    def columns(self) -> dict[str, NDArray]:
+        """All rows."""
+        return {name: np.concatenate(parts) for name, parts in self._parts.items()}
+
+
+class ExposureInfo(Protocol):
+    """What the channels ask of an exposure, temperature in deg C; None where not known."""
+
+    @property
+    def number(self) -> int: ...
+    @property
+    def kind(self) -> str: ...
+    @property
+    def exposure_time(self) -> float | None: ...
+    @property
+    def wavelength(self) -> float | None: ...
+    @property
+    def back_bias(self) -> float | None: ...
+    @property
+    def temperature(self) -> float | None: ...
+    @property
+    def lamp(self) -> float | None: ...
+    @property
+    def mjd(self) -> float | None: ...
+    @property
+    def pair(self) -> int | None: ...
+
+
+class Frame(Protocol):
+    """What the channels ask of one amplifier's frame, in readout order [ADU]."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def pixels(self) -> NDArray[np.float32]: ...
+    @property
+    def mask(self) -> NDArray[np.bool_]: ...
+    @property
+    def image(self) -> NDArray[np.float32]: ...
+    @property
+    def prescan(self) -> NDArray[np.float32]: ...
+    @property
+    def serial_overscan(self) -> NDArray[np.float32]: ...
+    @property
+    def parallel_overscan(self) -> NDArray[np.float32]: ...
+    @property
+    def flip_x(self) -> bool: ...
+    @property
+    def flip_y(self) -> bool: ...
+    @property
+    def origin(self) -> tuple[int, int] | None: ...
+
+
+HELD = 5
+"""One in so many exposures of a kind is held out, the fourth first, of twice as many or more."""
+
+
+def is_held_out(place: int, count: int) -> bool:
+    """Whether an exposure, or pair of them, other than flats is held out of all fits.
+
+    Parameters
+    ----------
+    place, count : int
+        Its place among those of its kind, in order of time, and how many there are.
+
+    Examples
+    --------
+    >>> [n for n in range(12) if is_held_out(n, 12)], is_held_out(3, 8)
+    ([3, 8], False)
+    """
+    return count >= 2 * HELD and place % HELD == HELD - 2
+
+
+def assign_folds(pairs: Iterable[int], shift: int = 0) -> list[str]:
+    """Give each pair of one level its fold: three of five fit, one selects, one is held out.
+
+    Parameters
+    ----------
+    pairs : iterable
+        The pairs, in order of time.
+    shift : int
+        Where the pattern begins: another for each level, so that few pairs a level still
+        fill all folds.
+
+    Examples
+    --------
+    >>> assign_folds(range(4))
+    ['fit', 'held-out', 'fit', 'select']
+    """
+    pattern = ("fit", "held-out", "fit", "select", "fit")
+    given = list(pairs)
+    if len(given) == 1:
+        return ["fit"]
+    if len(given) == 2:
+        return ["fit", ("held-out", "select")[shift % 2]]
+    return [pattern[(n + (shift if len(given) >= 5 else 0)) % 5] for n in range(len(given))]

@@ -1,0 +1,272 @@
+"""Flats: covariances of pairs, means against the lamp, and the overscan behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.exposures import Axes, Condition, ExposureInfo, Frame
+from bfsensor.measure.bartlett import bartlett_matrix
+from bfsensor.measure.flat_pairs import flat_covariances
+from bfsensor.typing import FloatArray
+
+LAGS = 4
+TAIL = 8
+"""Last pixels of an overscan, held for free of what was deferred: the profile's zero."""
+
+UNEVEN = 1.25
+"""Variance of overscan profiles between exposures, over that of white noise, from which on it is
+believed."""
+
+LAMP_UNKNOWN = 0.02
+"""Relative error of the light of an exposure without a lamp monitor: fluxes repeat to a few
+per cent in shuttered exposures of laboratory lamps; wide enough not to speak of linearity."""
+
+
+@dataclass
+class _FlatGroup:
+    """Sums over the pairs of one condition, exposure time, amplifier and fold."""
+
+    covariances: list[FloatArray] = field(default_factory=list)
+    counts: list[NDArray[np.int64]] = field(default_factory=list)
+    levels: list[float] = field(default_factory=list)
+    hours: list[float] = field(default_factory=list)
+    serial: list[FloatArray] = field(default_factory=list)
+    parallel: list[FloatArray] = field(default_factory=list)
+    clipped: int = 0
+
+
+class FlatChannels:
+    """Takes pairs of flats one by one and gives their channels.
+
+    Parameters
+    ----------
+    bias : mapping of str to ndarray
+        Mean bias of each amplifier's whole frame less its overscan [ADU]; may lack some.
+    read_noise : mapping of str to float
+        Of each amplifier [ADU].
+    lamp_error : float
+        Relative error of the lamp monitor.
+    lags : int
+        Largest lag of the covariances [pixel].
+    start : float
+        When the first exposure of all was taken [MJD]; nan where not known.
+    """
+
+    def __init__(
+        self,
+        bias: dict[str, FloatArray],
+        read_noise: dict[str, float],
+        *,
+        lamp_error: float,
+        lags: int = LAGS,
+        start: float = np.nan,
+    ) -> None:
+        self._bias, self._noise, self._start = bias, read_noise, start
+        self._lamp_error, self._lags = lamp_error, lags
+        self._groups: dict[tuple, _FlatGroup] = {}
+        self._conditions: dict[tuple[str, ...], Condition] = {}
+        self._means: dict[str, list[tuple]] = {}
+        self._ratios: dict[int, list[tuple[float, float]]] = {}
+
+    def add_pair(
+        self,
+        first: tuple[ExposureInfo, Sequence[Frame]],
+        second: tuple[ExposureInfo, Sequence[Frame]],
+        *,
+        fold: str,
+    ) -> None:
+        """Measure one pair of flats and add it to its group."""
+        condition = Condition.of(first[0])
+        self._conditions[condition.key] = condition
+        time = first[0].exposure_time or 0.0
+        means: list[list[tuple[float, float, int]]] = [[], []]
+        for n, frames in enumerate(zip(first[1], second[1], strict=True)):
+            name = frames[0].name
+            images = [self.clean(f) for f in frames]
+            mask = frames[0].mask | frames[1].mask
+            found = flat_covariances(
+                *images, mask=mask, lags=self._lags, unit="adu", region=name
+            )
+            group = self._groups.setdefault((condition.key, time, n, fold), _FlatGroup())
+            group.covariances.append(found.covariances)
+            group.counts.append(found.pairs)
+            group.levels.append(found.level)
+            group.hours += [self._hours(e) for e, _ in (first, second)]
+            group.clipped += found.clipped
+            for frame in frames:
+                group.serial.append(profile(frame.serial_overscan, 1))
+                group.parallel.append(profile(frame.parallel_overscan, 0))
+            for k in (0, 1):
+                m = found.means[k]
+                read = self._noise.get(name, 0.0) ** 2
+                zero = (
+                    read / max(frames[k].serial_overscan.size // 2, 1) + read / found.pixels
+                )
+                means[k].append((m, zero, found.pixels))
+                self._ratios.setdefault(n, []).append(
+                    (m, (found.covariances[0, 0] - read) / m)
+                )
+        for (exposure, _), values in zip((first, second), means, strict=True):
+            self._means.setdefault(fold, []).append((exposure, condition, values))
+
+    def clean(self, frame: Frame) -> FloatArray:
+        """Image less the frame's overscan level and the mean bias [ADU]."""
+        over = frame.serial_overscan
+        level = float(np.mean(over[:, over.shape[1] // 2 :])) if over.size else 0.0
+        image = frame.image.astype(np.float64) - level
+        bias = self._bias.get(frame.name)
+        return image if bias is None else image - bias
+
+    def _hours(self, exposure: ExposureInfo) -> float:
+        """Since the first exposure of all [h]; nan where not known."""
+        return np.nan if exposure.mjd is None else 24.0 * (exposure.mjd - self._start)
+
+    def channels(self) -> list[Channel]:
+        """All that was added, by fold."""
+        return [*self._covariances(), *self._mean_levels(), *self._overscans()]
+
+    def _covariances(self) -> list[Channel]:
+        out = []
+        j, i = (index.ravel() for index in np.indices((self._lags + 1,) * 2))
+        for fold in dict.fromkeys(key[3] for key in self._groups):
+            values, blocks, axes = [], [], Axes()
+            for (condition, time, amp, which), group in self._groups.items():
+                if which != fold:
+                    continue
+                pairs = np.sum(group.counts, axis=0)
+                mean = np.average(group.covariances, axis=0, weights=group.counts)
+                values.append(mean.ravel())
+                blocks.append(bartlett_matrix(mean, pairs))
+                level = float(np.mean(group.levels))
+                axes.add(
+                    len(j), self._conditions[condition], amp=amp, time=time, level=level,
+                    pairs=len(group.levels), hours=float(np.mean(group.hours)), i=i, j=j,
+                )  # fmt: skip
+            out.append(
+                Channel("flat_cov", np.concatenate(values), tuple(blocks), axes.columns(),
+                        "adu2", fold)
+            )  # fmt: skip
+        return out
+
+    def _mean_levels(self) -> list[Channel]:
+        out = []
+        for fold, rows in self._means.items():
+            values, blocks, axes = [], [], Axes()
+            for exposure, condition, amplifiers in rows:
+                m, zero, pixels = np.array(amplifiers).T
+                # The effect moves charge between pixels: the noise of the sum of many is Poisson's.
+                variance = m * [self._poisson(n) for n in range(len(m))] / pixels + zero
+                known = exposure.lamp is not None
+                error = self._lamp_error if known else LAMP_UNKNOWN
+                values.append(m)
+                blocks.append(np.diag(variance) + error**2 * np.outer(m, m))
+                axes.add(
+                    len(m), condition, amp=np.arange(len(m)), time=exposure.exposure_time,
+                    lamp=exposure.lamp if known else 1.0, exposure=exposure.number, level=m,
+                    mjd=np.nan if exposure.mjd is None else exposure.mjd,
+                    hours=self._hours(exposure),
+                )  # fmt: skip
+            out.append(
+                Channel("flat_mean", np.concatenate(values), tuple(blocks), axes.columns(),
+                        "adu", fold)
+            )  # fmt: skip
+        return out
+
+    def _poisson(self, amp: int) -> float:
+        """Variance of a pixel over its mean in weak flats [ADU]."""
+        level, ratio = np.array(self._ratios[amp]).T
+        weak = level <= np.quantile(level, 0.3)
+        return float(max(np.median(ratio[weak]), 0.0))
+
+    def _overscans(self) -> list[Channel]:
+        out = []
+        for word, name in (
+            ("serial_overscan", "serial"),
+            ("parallel_overscan", "parallel"),
+        ):
+            uneven = self._unevenness(name)
+            for fold in dict.fromkeys(key[3] for key in self._groups):
+                values, blocks, axes = [], [], Axes()
+                for (condition, time, amp, which), group in self._groups.items():
+                    profiles = [p for p in getattr(group, name) if len(p)]
+                    if which != fold or not profiles:
+                        continue
+                    mean, matrix = mean_profile(np.array(profiles))
+                    values.append(mean)
+                    blocks.append(uneven[amp] * matrix)
+                    axes.add(
+                        len(mean), self._conditions[condition], amp=amp, time=time,
+                        level=float(np.mean(group.levels)), k=np.arange(1, len(mean) + 1),
+                    )  # fmt: skip
+                if values:
+                    out.append(
+                        Channel(word, np.concatenate(values), tuple(blocks), axes.columns(),
+                                "adu", fold)
+                    )  # fmt: skip
+        return out
+
+    def _unevenness(self, name: str) -> dict[int, float]:
+        """Variance of profiles from exposure to exposure over that of white noise, by amplifier.
+
+        Rows that move together, and noise that one pixel hands on to the next, make profiles
+        scatter more than their pixels' noise says; 1 where nothing is seen of that.
+        """
+        seen: dict[int, list[tuple[float, int]]] = {}
+        for (_, _, amp, _), group in self._groups.items():
+            profiles = [p for p in getattr(group, name) if len(p)]
+            if len(profiles) > 1:
+                seen.setdefault(amp, []).append(_scatter(np.array(profiles)))
+        out = {amp: 1.0 for _, _, amp, _ in self._groups}
+        for amp, both in seen.items():
+            total, freedom = np.sum(both, axis=0)
+            if total / freedom - 1 > max(UNEVEN - 1, 5 * np.sqrt(2 / freedom)):
+                out[amp] = float(total / freedom)
+        return out
+
+
+def _scatter(profiles: FloatArray) -> tuple[float, int]:
+    """Squares of what profiles above their tails differ by, in their errors; and how many."""
+    values, variance = profiles[..., 0], profiles[..., 1]
+    head = values.shape[1] - TAIL
+    above = values[:, :head] - values[:, head:].mean(1, keepdims=True)
+    error = variance[:, :head] + variance[:, head:].mean(1, keepdims=True) / TAIL
+    square = (above - above.mean(0)) ** 2 / error.mean(0)
+    return float(square.sum()), (len(profiles) - 1) * head
+
+
+def profile(strip: NDArray[np.float32], axis: int) -> FloatArray:
+    """Mean and variance of the mean of an overscan along its depth, shape (n, 2); empty if short.
+
+    ``axis`` is that along which charge would be deferred: 1 in the serial overscan.
+    """
+    depth = strip.shape[axis] if strip.ndim == 2 else 0
+    lines = strip.size // depth if depth else 0
+    if depth <= TAIL or lines < 8:
+        return np.zeros((0, 2))
+    other = 1 - axis
+    values = strip.astype(np.float64)
+    return np.stack([values.mean(other), values.var(other, ddof=1) / lines], axis=1)
+
+
+def mean_profile(
+    profiles: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Profile above its own tail, averaged over exposures, and its error matrix.
+
+    Parameters
+    ----------
+    profiles : ndarray, shape (exposures, n, 2)
+        From :func:`profile`.
+    """
+    count = len(profiles)
+    mean = profiles[..., 0].mean(0)
+    variance = profiles[..., 1].mean(0) / count
+    head = len(mean) - TAIL
+    values = mean[:head] - mean[head:].mean()
+    matrix = np.diag(variance[:head]) + variance[head:].mean() / TAIL
+    return values, matrix

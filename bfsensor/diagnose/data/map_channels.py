@@ -1,0 +1,528 @@
+"""Maps: what flats show against position, free of light's smooth shape in the prediction."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import rfft2
+
+from bfsensor.diagnose.data.channels import Channel, Common, join_common
+from bfsensor.diagnose.data.exposures import Axes, Condition
+from bfsensor.diagnose.data.map_borders import Border, find_borders
+from bfsensor.diagnose.data.map_noise import BlockNoise, block_noise
+from bfsensor.diagnose.data.map_texture import map_texture, texture_noise
+from bfsensor.diagnose.data.map_waves import find_patterns, without_shape
+from bfsensor.typing import FloatArray
+
+BLOCKS = 16
+"""Blocks of a map along its longer side."""
+
+RINGS = 24
+"""Bins of the spatial frequency, from 0 to half a cycle a pixel."""
+
+FULL = 0.5
+"""Part of the light's noise below which a flat's wells are full."""
+
+LOW = 8
+"""Side of the boxes [pixel] that tell noise over many pixels."""
+
+LONG = 4
+"""Blocks in the shortest wave that tells noise over still more: light of its own in each flat."""
+
+CERTAIN = 5.0
+"""Standard deviations by which that must be above the boxes' to count."""
+
+SHORT = 0.25
+"""Part of the longest exposure time below which flats count as short."""
+
+
+class MapShare(NamedTuple):
+    """Part of a map that flats of one condition and exposure time make up.
+
+    Attributes
+    ----------
+    weight : float
+        Of the flats in the map; below 0 where the map is divided by them.
+    condition : Condition
+        Of the light.
+    seconds, level : float
+        Exposure time [s] and mean level [ADU].
+    flats : int
+        How many they are.
+    """
+
+    weight: float
+    condition: Condition
+    seconds: float
+    level: float
+    flats: int = 1
+
+
+class MapChannels:
+    """Adds up flats on the sensor, each over its amplifier's mean.
+
+    Of large sensors few maps can be held: exposure times are weighted and added up into two
+    sums of a condition, short ones and long ones, as soon as the next begins.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Rows and columns of the sensor.
+    longest : mapping of tuple to float
+        Longest exposure time [s] of the flats of each condition, by its key.
+    fold : str
+        Which exposures are added.
+    amplifiers : sequence of (slice, slice)
+        Rows and columns of each on the sensor.
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        longest: Mapping[tuple[str, ...], float],
+        fold: str = "fit",
+        amplifiers: Sequence[tuple[slice, slice]] = (),
+    ) -> None:
+        self._shape, self._longest, self.fold = shape, longest, fold
+        self._amplifiers = tuple(amplifiers)
+        self.sightings: tuple[Mapping[str, Any], ...] = ()
+        self._borders: dict[tuple[int, int], Border] = {}
+        self._groups: list[_MapGroup] = []
+        self._sums: dict[tuple[tuple[str, ...], bool], _Sum] = {}
+        self._closed = True
+        self._total = np.zeros((0, 0), np.float32)
+        self._count = np.zeros((0, 0), np.uint16)
+
+    def add_pair(
+        self,
+        condition: Condition,
+        time: float,
+        first: NDArray[np.float32],
+        second: NDArray[np.float32],
+        shared: float = 0.0,
+        level: float = 0.0,
+    ) -> None:
+        """Add a pair of flats, each over its amplifiers' means less one.
+
+        Parameters
+        ----------
+        condition : Condition
+            Of the light.
+        time : float
+            Exposure time [s]; pairs of one should follow one another.
+        first, second : ndarray of float32, shape of the sensor
+            nan where no amplifier reads or a pixel is bad.
+        shared : float
+            Noise that all flats share, that of the mean bias, over the mean.
+        level : float
+            Mean level [ADU].
+        """
+        last = self._groups[-1] if self._groups else None
+        if last is None or (last.condition.key, last.time) != (condition.key, time):
+            self._close()
+            self._groups.append(_MapGroup(condition, time))
+            self._total = np.zeros(self._shape, np.float32)
+            self._count = np.zeros(self._shape, np.uint16)
+            self._closed = False
+        group = self._groups[-1]
+        for image in (first, second):
+            good = np.isfinite(image)
+            np.add(self._total, image, out=self._total, where=good)
+            self._count += good
+        # Charges repel: noise is smaller over few pixels than over many.
+        noise = first - second
+        noise *= np.float32(np.sqrt(0.5))
+        np.nan_to_num(noise, copy=False)
+        side = LOW
+        ny, nx = (n // side * side for n in self._shape)
+        boxes = noise[:ny, :nx].reshape(ny // side, side, nx // side, side)
+        group.low += float((boxes.mean((1, 3), dtype=np.float64) * side).var())
+        group.high += float(np.diff(noise, axis=1).var(dtype=np.float64)) / 2
+        modes = rfft2(noise)
+        group.power += spectrum_rings(modes, self._shape)
+        group.long += long_power(modes, self._shape)
+        group.pairs += 1
+        group.shared += shared
+        group.level += level
+
+    def _close(self) -> None:
+        """Add what is open to the sum of its condition, by inverse variance of its noise."""
+        if self._closed:
+            return
+        self._closed = True
+        group = self._groups[-1]
+        if self._is_full(group):
+            self._groups.pop()
+            return
+        weight = group.weight
+        with np.errstate(invalid="ignore", divide="ignore"):
+            self._total /= self._count
+        self._total *= np.float32(weight)
+        name = group.condition.key, self._is_short(group)
+        if name in self._sums:
+            self._sums[name].image += self._total
+            self._sums[name].weight += weight
+        else:
+            self._sums[name] = _Sum(self._total, weight)
+        self._total = np.zeros((0, 0), np.float32)
+
+    def _keep(self, border: Border) -> None:
+        """Remember a border that was cut, as the map shows it that does so most."""
+        name = border.axis, border.line
+        self._borders[name] = max(
+            border, self._borders.get(name, border), key=lambda b: b.ratio
+        )
+
+    @property
+    def notes(self) -> list[str]:
+        """What there is to say of the maps."""
+        return [str(border) for border in self._borders.values()]
+
+    def _is_short(self, group: _MapGroup) -> bool:
+        return group.time < SHORT * self._longest[group.condition.key]
+
+    def channels(self) -> list[Channel]:
+        """Columns, rows, blocks and rings of the map of all light, and of what differs.
+
+        'all': all flats of the commonest condition together, weighted by their light; 'short':
+        its short exposures over its long ones; other conditions over the commonest.
+        """
+        self._close()
+        if not self._groups:
+            return []
+        values, axes = [], Axes()
+        blocks: list[FloatArray] = []
+        common: list[Common] = []
+        # One map is held, and one that others are divided by: that of the commonest condition.
+        kept: tuple[list[_MapGroup], _Map] | None = None
+        for name, (groups, below) in self._plan().items():
+            image = self._average(groups)
+            if name == "all":
+                kept = groups, image
+            if below:
+                if kept is None or kept[0] is not below:
+                    kept = None
+                    kept = below, self._average(below)
+                image = image.over(kept[1])
+            if self.fold == "fit" and name != "short":
+                self.sightings += tuple(find_patterns(image.values, name, self._amplifiers))
+            parts, noise = self._parts(image, own=name == "all")
+            for v, e, columns in parts:
+                values.append(v)
+                blocks.extend([e] if e.ndim == 2 else np.square(e)[:, None, None])
+                axes.add(len(v), groups[0].condition, map=name, **columns)
+            others = sum(len(v) for v, _, _ in parts[3:])
+            common += [noise.common(), Common.none(others)]
+        return [Channel("flat_map", np.concatenate(values), tuple(blocks), axes.columns(), "",
+                        self.fold, join_common(common))]  # fmt: skip
+
+    def _plan(self) -> dict[str, tuple[list[_MapGroup], list[_MapGroup]]]:
+        """Flats of each map, and of what it is divided by."""
+        members: dict[tuple[str, ...], list[_MapGroup]] = {}
+        for group in self._groups:
+            members.setdefault(group.condition.key, []).append(group)
+        common = max(members, key=lambda k: sum(g.pairs for g in members[k]))
+        ordered = sorted(members[common], key=lambda g: g.time)
+        out: dict[str, tuple[list[_MapGroup], list[_MapGroup]]] = {"all": (ordered, [])}
+        short = [g for g in ordered if self._is_short(g)]
+        if short and len(short) < len(ordered):
+            out["short"] = short, [g for g in ordered if not self._is_short(g)]
+        for other, own in members.items():
+            if other != common:
+                out["/".join(other)] = own, ordered
+        return out
+
+    def _is_full(self, group: _MapGroup) -> bool:
+        """Whether flats are at the full well: without their light's noise, without its pattern.
+
+        Noise over many pixels is Poisson's whatever charges do to one another: relative
+        variance times level is one number, larger only where read noise adds to it.  Flats come
+        by rising level: those before tell the usual one.
+        """
+        white = [g.low * g.level / g.pairs**2 for g in (*self._groups[:-1], group)]
+        return len(white) > 2 and white[-1] < FULL * float(np.median(white[:-1]))
+
+    def shares(self) -> dict[str, tuple[MapShare, ...]]:
+        """Of which flats each map is made."""
+        out = {}
+        for name, both in (self._plan() if self._groups else {}).items():
+            out[name] = tuple(
+                MapShare(
+                    sign * float(w), g.condition, g.time, g.level / g.pairs, 2 * g.pairs
+                )
+                for groups, sign in zip(both, (1.0, -1.0), strict=True)
+                for g, w in zip(groups, _weights(groups), strict=True)
+            )
+        return out
+
+    def _average(self, groups: list[_MapGroup]) -> _Map:
+        """Map of all short exposures of a condition, or all long ones, or both."""
+        weights = _weights(groups)
+        which = dict.fromkeys((g.condition.key, self._is_short(g)) for g in groups)
+        sums = [self._sums[name] for name in which]
+        whole = np.float32(sum(s.weight for s in sums))
+        image = sums[0].image / whole
+        for other in sums[1:]:
+            image += other.image / whole
+        # The mean bias is the same in all; of it differences of pairs know nothing.
+        common = (
+            sum(w * g.shared / g.pairs for w, g in zip(weights, groups, strict=True)) ** 2
+        )
+        # A mean of 2 n flats, whose single noise each pair tells.
+        low = sum(
+            w**2 * g.low / (2 * g.pairs**2) for w, g in zip(weights, groups, strict=True)
+        )
+        power = sum(
+            w**2 * g.power / (2 * g.pairs**2) for w, g in zip(weights, groups, strict=True)
+        )
+        for border in find_borders(image):
+            border.cut(image)
+            self._keep(border)
+        pairs = sum(g.pairs for g in groups)
+        ratio = sum(g.low / max(g.high, 1e-30) * g.pairs for g in groups) / pairs
+        long = self._long(groups, weights)
+        return _Map(
+            image, float(low) + common, np.asarray(power) + common, float(ratio), pairs,
+            max(long - float(low), 0.0),
+        )  # fmt: skip
+
+    def _long(self, groups: list[_MapGroup], weights: FloatArray) -> float:
+        """Noise of a mean over long waves as a pixel's variance; 0 unless certainly the larger."""
+        modes = int(_is_long(self._shape).sum())
+        parts = np.array(
+            [w**2 / (2 * g.pairs**2) for w, g in zip(weights, groups, strict=True)]
+        )
+        low, long = (np.array([getattr(g, k) for g in groups]) for k in ("low", "long"))
+        pairs = np.array([g.pairs for g in groups])
+        if not modes:
+            return 0.0
+        error = np.sqrt(float(((parts * low) ** 2 / (modes * pairs)).sum()))
+        found = float(parts @ long)
+        return found if found > float(parts @ low) + CERTAIN * error else 0.0
+
+    def _parts(
+        self, image: _Map, *, own: bool
+    ) -> tuple[list[tuple[NDArray, NDArray, Mapping[str, object]]], BlockNoise]:
+        """Columns, rows, blocks, and rings and others of a map, with errors or their covariance.
+
+        ``own``: the map holds the pixels' own response, of which its neighbours tell.
+        """
+        ny, nx = self._shape
+        single = np.sqrt(image.low)
+        if own:
+            steps = np.diff(image.values, axis=1).ravel()
+            steps = steps[np.isfinite(steps)]
+            steps -= np.median(steps)
+            seen = 1.4826 * float(np.median(np.abs(steps, out=steps))) / np.sqrt(2.0)
+            del steps
+            single = max(single, seen * np.sqrt(image.ratio))
+        sigma = np.sqrt(single**2 + image.long)
+        good = np.isfinite(image.values)
+        filled = np.where(good, image.values, np.float32(0.0))
+        out: list[tuple[NDArray, NDArray, Mapping[str, object]]] = []
+        for what, axis, n in (("column", 0, nx), ("row", 1, ny)):
+            count = np.maximum(good.sum(axis), 1)
+            at = (
+                {"x": np.arange(n), "y": -1.0}
+                if what == "column"
+                else {"x": -1.0, "y": np.arange(n)}
+            )
+            out.append(
+                (
+                    filled.sum(axis, dtype=np.float64) / count,
+                    sigma / np.sqrt(count),
+                    {"what": what, "k": -1.0, **at},
+                )
+            )
+        side = block_side(self._shape)
+        rows, columns = ny // side, nx // side
+        count = _blocks(good, side).sum((1, 3))
+        mean = _blocks(filled, side).sum((1, 3), dtype=np.float64) / np.maximum(count, 1)
+        y, x = ((index + 0.5) * side - 0.5 for index in np.indices((rows, columns)))
+        noise = block_noise(good, side)
+        mean, x, y = (v.ravel()[noise.kept] for v in (mean, x, y))
+        told = {"what": "block", "k": -1.0, "x": x, "y": y}
+        out.append((mean, sigma**2 * noise.covariance, told))
+        free = without_shape(filled)
+        power = ring_power(free)
+        keep = self._modes > 50
+        frequency = (np.arange(RINGS) + 0.5) / (2 * RINGS)
+        # Of n modes, each exponential; in parts per million of a pixel.
+        out.append(
+            (
+                1e6 * (power - image.power)[keep],
+                1e6
+                * np.sqrt(
+                    (power**2 + image.power**2 / image.pairs) / np.maximum(self._modes, 1)
+                )[keep],
+                {"what": "ring", "k": frequency[keep], "x": -1.0, "y": -1.0},
+            )
+        )
+        texture = map_texture(free)
+        spread = texture_noise(free, texture, int(good.sum()))
+        told = {"what": "texture", "k": -1.0, "x": texture.dx, "y": texture.dy}
+        out.append((texture.values, spread, told))
+        chess, centres = map_chess(filled)
+        # Single pixels' noise is not evened out as that over many is.
+        error = np.sqrt(single**2 / image.ratio * len(chess) / max(good.sum(), 1))
+        out.append(
+            (chess, np.full(len(chess), error), {"what": "chess", "k": -1.0, "x": centres, "y": -1.0})
+        )  # fmt: skip
+        return out, noise
+
+    @property
+    def _modes(self) -> NDArray[np.int64]:
+        """Modes of each ring."""
+        return ring_modes(self._shape)
+
+
+@dataclass
+class _MapGroup:
+    """What the pairs of one condition and exposure time have in common."""
+
+    condition: Condition
+    time: float
+    low: float = 0.0
+    high: float = 0.0
+    long: float = 0.0
+    power: FloatArray = field(default_factory=lambda: np.zeros(RINGS))
+    pairs: int = 0
+    shared: float = 0.0
+    level: float = 0.0
+
+    @property
+    def weight(self) -> float:
+        """Inverse variance of the noise of their mean."""
+        return float(self.pairs**2 / max(self.low, 1e-30))
+
+
+@dataclass
+class _Sum:
+    """Weighted sum of the maps of several exposure times: 4 bytes a pixel, of large sensors too."""
+
+    image: NDArray[np.float32]
+    weight: float
+
+
+@dataclass
+class _Map:
+    """A map less one, its noise over many pixels as a pixel's variance, and by ring.
+
+    ``ratio``: of that variance to the one between neighbours; the effect evens the response of
+    single pixels out as it does their noise, to first order.  ``long``: what noise over
+    blocks has more.
+    """
+
+    values: NDArray[np.float32]
+    low: float
+    power: FloatArray
+    ratio: float
+    pairs: int
+    long: float = 0.0
+
+    def over(self, other: _Map) -> _Map:
+        """Ratio of two maps, less one."""
+        return _Map(
+            (self.values - other.values) / (1 + other.values), self.low + other.low,
+            self.power + other.power, self.ratio, min(self.pairs, other.pairs),
+            self.long + other.long,
+        )  # fmt: skip
+
+
+def block_side(shape: tuple[int, int]) -> int:
+    """Side of the blocks of a map [pixel]."""
+    return int(np.ceil(max(shape) / BLOCKS))
+
+
+def _weights(groups: list[_MapGroup]) -> FloatArray:
+    """Of groups in their mean, by inverse variance of their noise."""
+    weights = np.array([g.weight for g in groups])
+    return np.asarray(weights / weights.sum())
+
+
+def _blocks(image: NDArray, side: int) -> NDArray:
+    ny, nx = (n // side for n in image.shape)
+    return image[: ny * side, : nx * side].reshape(ny, side, nx, side)
+
+
+@lru_cache(maxsize=1)
+def _ring_bins(shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """Ring of each mode, :data:`RINGS` where it is not used: rows' and columns' own are not."""
+    fy, fx = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None]
+    bins = np.minimum((np.hypot(fy, fx) * 2 * RINGS).astype(np.uint8), RINGS)
+    bins[0], bins[:, 0] = RINGS, RINGS
+    bins.setflags(write=False)
+    return bins
+
+
+@lru_cache(maxsize=1)
+def _is_long(shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Modes longer than so many blocks; rows' and columns' own are not."""
+    fy, fx = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None]
+    out = np.hypot(fy, fx) * LONG * block_side(shape) < 1
+    out[0], out[:, 0] = False, False
+    out.setflags(write=False)
+    return out
+
+
+def long_power(modes: NDArray, shape: tuple[int, int]) -> float:
+    """Mean power of a mode longer than :data:`LONG` blocks, of a map's transform.
+
+    Examples
+    --------
+    >>> noise = np.random.default_rng(1).standard_normal((128, 128))
+    >>> 0.5 < long_power(rfft2(noise), noise.shape) < 2.0
+    True
+    """
+    own = modes[_is_long(shape)]
+    return (
+        float((own.real**2 + own.imag**2).mean()) / (shape[0] * shape[1])
+        if own.size
+        else 0.0
+    )
+
+
+def ring_modes(shape: tuple[int, int]) -> NDArray[np.int64]:
+    """Modes of each ring of a map of that shape."""
+    return np.bincount(_ring_bins(shape).ravel(), minlength=RINGS)[:RINGS]
+
+
+def ring_power(image: NDArray) -> FloatArray:
+    """Mean power of a mode by ring; that of white noise is a pixel's variance."""
+    ny, nx = image.shape
+    return spectrum_rings(rfft2(image), (ny, nx))
+
+
+def spectrum_rings(modes: NDArray, shape: tuple[int, int]) -> FloatArray:
+    """Mean power of a mode by ring, of a map's transform."""
+    bins = _ring_bins(shape).ravel()
+    power = modes.real**2
+    power += modes.imag**2
+    count = np.bincount(bins, minlength=RINGS + 1)[:RINGS]
+    total = np.bincount(bins, power.ravel(), minlength=RINGS + 1)[:RINGS]
+    return np.asarray(total / (shape[0] * shape[1]) / np.maximum(count, 1))
+
+
+def map_chess(image: NDArray) -> tuple[FloatArray, FloatArray]:
+    """Half of the difference of even and odd pixels (row plus column), in strips, and their x.
+
+    Columns and rows do not show it, nor do rings, which end at half a cycle a pixel.
+
+    Examples
+    --------
+    >>> values, x = map_chess(np.indices((32, 32)).sum(0) % 2)
+    >>> float(values.min()), float(values.max()), x[:3].tolist()
+    (-0.5, -0.5, [0.5, 2.5, 4.5])
+    """
+    ny, nx = image.shape
+    side = block_side((ny, nx))
+    columns = image[::2].sum(0, dtype=np.float64) - image[1::2].sum(0, dtype=np.float64)
+    columns[1::2] *= -1.0
+    kept = columns[: nx // side * side].reshape(-1, side)
+    centres = np.arange(len(kept), dtype=np.float64) * side + 0.5 * (side - 1)
+    return np.asarray(kept.mean(1) / ny, float), centres

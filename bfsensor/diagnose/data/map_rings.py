@@ -1,0 +1,295 @@
+"""Rings in maps of flats, evenly spaced or not: where fits of tree rings may begin."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from bfsensor.typing import FloatArray
+
+HIGHEST = 0.2
+"""Frequency [1/pixel] of the finest rings that are sought."""
+
+ORDERS = 7
+"""Of the polynomial that a phase is followed by."""
+
+CLEARER = 30.0
+"""Chi-square that uneven spacing must take beyond an even change to be told."""
+
+
+class RingLaw(NamedTuple):
+    """Phase of rings against the radius: names of its numbers, starts, and steps of derivatives."""
+
+    names: tuple[str, ...]
+    steps: tuple[float, ...]
+
+
+EVEN = RingLaw(("period", "chirp"), (0.0, 1e-3))
+UNEVEN = RingLaw(("period", "sway", "length", "sway_phase"), (0.0, 1e-3, 0.3, 1e-3))
+
+
+def turns_of(
+    law: RingLaw, r: FloatArray, r0: float, p: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Phase [cycles] and its slope [1/pixel] at radii; of :data:`EVEN` or :data:`UNEVEN`.
+
+    ``r0``: radius of the pixel (0, 0).
+    """
+    if law is EVEN:
+        turns = r / p[0] * (1 + p[1] * (r - r0) / 200.0)
+        return turns, (1 + p[1] * (2 * r - r0) / 200.0) / p[0]
+    angle = 2 * np.pi * (r / p[2] + p[3])
+    sine = p[1] * np.sin(angle)
+    bend = p[1] * np.cos(angle) * (2 * np.pi / p[2])
+    return r / p[0] * (1 + sine), (1 + sine + r * bend) / p[0]
+
+
+def find_rings(
+    values: FloatArray,
+    x: FloatArray,
+    y: FloatArray,
+    start: tuple[float, float, float, float],
+) -> list[tuple[float, dict[str, float]]]:
+    """Fit rings to a map from circles nearby.
+
+    The profile about the centre is followed in radius, its phase free to bend, and told by a
+    frequency that changes evenly or, if that is not enough, by one that sways.
+
+    Parameters
+    ----------
+    values : ndarray, shape (ny, nx)
+        Map, in units of its noise.
+    x, y : ndarray, shape (ny, nx)
+        Places [pixel].
+    start : (float, float, float, float)
+        Centre [pixel], period at the pixel (0, 0) [pixel] and change of the frequency per 100
+        pixels.
+
+    Returns
+    -------
+    list of (float, dict)
+        Chi-square explained, and parameters of the tree rings: 'xc', 'yc', 'period', 'phase',
+        'amp', and 'chirp' or 'sway', 'length', 'sway_phase'.
+
+    Examples
+    --------
+    >>> y, x = np.mgrid[:96., :96.]
+    >>> r = np.hypot(x + 60, y - 150)
+    >>> _, rings = find_rings(5 * np.cos(2 * np.pi * r / 14), x, y, (-55., 146., 14.2, 0.))[0]
+    >>> round(rings["period"], 2), round(rings["xc"]), round(rings["yc"])
+    (14.0, -60, 150)
+    """
+    found = [_fit(EVEN, values, x, y, np.array(start))]
+    tried = [f for f in found if f is not None]
+    if not tried:
+        return []
+    xc, yc = tried[0][1]["xc"], tried[0][1]["yc"]
+    for law, numbers in _followed(
+        values, np.hypot(x - xc, y - yc), float(np.hypot(xc, yc))
+    ):
+        one = _fit(law, values, x, y, np.array([xc, yc, *numbers]))
+        if one is not None:
+            tried.append(one)
+    even = max((t for t in tried if "chirp" in t[1]), key=lambda t: t[0])
+    best = max(tried, key=lambda t: t[0])
+    # Fits may begin at both: what is near an even change is that.
+    return [best, even] if best[0] > even[0] + CLEARER else [even]
+
+
+def _fit(
+    law: RingLaw, values: FloatArray, x: FloatArray, y: FloatArray, point: FloatArray
+) -> tuple[float, dict[str, float]] | None:
+    """Least squares of centre and phase (Levenberg-Marquardt), strength and phase linear."""
+    flat = values.ravel()
+
+    def solve(p: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        r, r0 = np.hypot(x - p[0], y - p[1]), float(np.hypot(p[0], p[1]))
+        turns, slope = turns_of(law, r, r0, p[2:])
+        # Areas change as the slope of a displacement along the radius.
+        turns, rate = 2 * np.pi * turns, 2 * np.pi * slope
+        basis = np.stack([(rate * np.cos(turns)).ravel(), (-rate * np.sin(turns)).ravel()])
+        found = np.linalg.lstsq(basis @ basis.T, basis @ flat, rcond=None)[0]
+        model = found @ basis
+        return float(((flat - model) ** 2).sum()), np.asarray(found, float), model
+
+    steps = np.array([0.5, 0.5, *(s or 1e-3 * point[2] for s in law.steps)])
+    square, found, model = solve(point)
+    damping = 1e-3
+    for _ in range(15):
+        slopes = np.stack([
+            (solve(point + d)[2] - model) / d.sum() for d in np.diag(steps)
+        ])  # fmt: skip
+        normal = slopes @ slopes.T
+        scale = np.sqrt(np.diag(normal))
+        if not np.all(scale > 0):
+            return None
+        normal = normal / np.outer(scale, scale) + damping * np.eye(len(steps))
+        step = np.linalg.solve(normal, slopes @ (flat - model) / scale) / scale
+        new = point + step
+        if not new[2] > 2.0:
+            damping *= 8
+            continue
+        left, more, there = solve(new)
+        if left < square:
+            done = square - left < 1e-3
+            point, square, found, model, damping = new, left, more, there, damping / 5
+            if done:
+                break
+        else:
+            damping *= 8
+            if damping > 1e5:
+                break
+    if not np.isfinite(point).all():
+        return None
+    names = ("xc", "yc", *law.names)
+    out = dict(zip(names, (float(v) for v in point), strict=True))
+    if "sway_phase" in out:
+        out["sway_phase"] = (out["sway_phase"] + 0.5) % 1.0 - 0.5
+    phase = float(np.arctan2(found[1], found[0]) / (2 * np.pi))
+    out |= {"amp": float(np.hypot(*found)), "phase": phase}
+    return float(flat @ flat) - square, out
+
+
+def _followed(
+    values: FloatArray, r: FloatArray, r0: float
+) -> list[tuple[RingLaw, list[float]]]:
+    """Phases of both laws along the profile of a map in radius."""
+    bins = np.floor(r - r.min()).astype(int).ravel()
+    count = np.bincount(bins)
+    kept = count > 3
+    place = (np.bincount(bins, r.ravel()) / np.maximum(count, 1))[kept]
+    mean = (np.bincount(bins, values.ravel()) / np.maximum(count, 1))[kept]
+    weight = np.sqrt(count[kept])
+    best: tuple[float, FloatArray, FloatArray] | None = None
+    for middle, width, frequency in _windows(place, mean, weight)[:3]:
+        one = _follow(place, mean, weight, middle, width, frequency)
+        if one is not None and (best is None or one[0] < best[0]):
+            best = one
+    if best is None:
+        return []
+    _, turns, rate = best
+    out = []
+    sure = weight * np.abs(rate)
+    design = np.stack([np.ones_like(place), place, place * (place - r0) / 200.0], axis=1)
+    line = np.linalg.lstsq(design * sure[:, None], turns * sure, rcond=None)[0]
+    if abs(line[1]) > 1e-4:
+        out.append((EVEN, [1 / line[1], line[2] / line[1]]))
+    span = float(np.ptp(place))
+    swaying = []
+    for length in np.geomspace(0.4 * span, 4 * span, 60):
+        angle = 2 * np.pi * place / length
+        design = np.stack([np.ones_like(place), place, place * np.sin(angle),
+                           place * np.cos(angle)], axis=1)  # fmt: skip
+        line = np.linalg.lstsq(design * sure[:, None], turns * sure, rcond=None)[0]
+        left = float((((design @ line - turns) * sure) ** 2).sum())
+        sway = float(np.hypot(line[2], line[3]) / max(abs(line[1]), 1e-9))
+        if sway < 0.5:
+            phase = float(np.arctan2(line[3] / line[1], line[2] / line[1]) / (2 * np.pi))
+            swaying.append((left, [1 / line[1], sway, float(length), phase]))
+    if swaying:
+        out.append((UNEVEN, min(swaying, key=lambda s: s[0])[1]))
+    # Which way phases run the fit of strength and phase settles.
+    return [(law, [abs(n[0]), *n[1:]]) for law, n in out]
+
+
+def _windows(
+    place: FloatArray, mean: FloatArray, weight: FloatArray
+) -> list[tuple[float, float, float]]:
+    """Middle, width and frequency of the clearest waves in parts of a profile."""
+    span = float(np.ptp(place))
+    found = []
+    for part in (2, 4, 8):
+        width = span / part
+        if width < 20:
+            continue
+        frequencies = np.arange(0.7 / width, HIGHEST, 0.15 / width)
+        for low in np.arange(place[0], place[-1] - 0.9 * width, 0.5 * width):
+            own = (place >= low) & (place < low + width)
+            level = np.average(mean[own], weights=weight[own] ** 2)
+            target = (mean[own] - level) * weight[own]
+            for f in frequencies:
+                angle = 2 * np.pi * f * place[own]
+                design = np.stack([np.sin(angle), np.cos(angle)]) * weight[own]
+                normal = design @ design.T
+                along = design @ target
+                gain = float(along @ np.linalg.solve(normal, along))
+                # Of what a window holds, so that small ones where rings are clear count.
+                found.append(
+                    (
+                        gain / float(target @ target),
+                        gain,
+                        low + 0.5 * width,
+                        width,
+                        float(f),
+                    )
+                )
+    clear = [f for f in found if f[1] > 30.0]
+    clear.sort(key=lambda f: -f[0])
+    out: list[tuple[float, float, float]] = []
+    for _, _, middle, width, f in clear:
+        if all(abs(middle - m) > 0.25 * width for m, _, _ in out):
+            out.append((middle, width, f))
+    return out
+
+
+def _follow(
+    place: FloatArray,
+    mean: FloatArray,
+    weight: FloatArray,
+    middle: float,
+    width: float,
+    frequency: float,
+) -> tuple[float, FloatArray, FloatArray] | None:
+    """Fit a wave in ever wider parts of a profile, its phase a polynomial of rising order.
+
+    Gives what is left, the phase [cycles] and its slope [1/pixel] at all radii.
+    """
+    reach, order = 0.5 * width, 1
+    far = max(place[-1] - middle, middle - place[0])
+    phase = np.array([0.0, frequency])
+    strength: FloatArray | None = None
+    while True:
+        own = np.abs(place - middle) <= reach
+        away = (place - middle) / reach
+        powers = np.arange(order + 1)
+        # Powers of the distance in units of the reach.
+        start = np.zeros(order + 1)
+        start[: len(phase)] = phase * reach ** np.arange(len(phase))
+
+        def wave(
+            p: FloatArray,
+            u: FloatArray,
+            powers: NDArray[np.int64] = powers,
+            reach: float = reach,
+        ) -> tuple[FloatArray, FloatArray, FloatArray]:
+            turns = (u[:, None] ** powers) @ p[2:]
+            slope = (u[:, None] ** np.maximum(powers - 1, 0) * powers) @ p[2:] / reach
+            angle = 2 * np.pi * turns
+            return 10 * slope * (p[0] * np.cos(angle) - p[1] * np.sin(angle)), turns, slope
+
+        if strength is None:
+            unit = np.concatenate([[1.0, 0.0], start]), np.concatenate([[0.0, 1.0], start])
+            design = np.stack([wave(p, away[own])[0] for p in unit], axis=1)
+            strength = np.asarray(
+                np.linalg.lstsq(
+                    design * weight[own, None], mean[own] * weight[own], rcond=None
+                )[0],
+                float,
+            )
+        found = least_squares(
+            lambda p, u=away[own], m=mean[own], w=weight[own], wave=wave: (wave(p, u)[0] - m) * w,
+            np.concatenate([strength, start]), max_nfev=30,
+        )  # fmt: skip
+        strength, phase = found.x[:2], found.x[2:] / reach**powers
+        if not np.isfinite(found.x).all():
+            return None
+        if reach >= far:
+            if order == ORDERS:
+                _, turns, slope = wave(found.x, away)
+                return 2 * float(found.cost), turns, slope
+            order += 1
+            continue
+        reach, order = min(1.25 * reach, far), min(order + 1, ORDERS)

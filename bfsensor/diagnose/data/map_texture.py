@@ -1,0 +1,142 @@
+"""Texture: a map of flats held against itself, a few pixels apart, and the errors of that."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft, rfft2
+
+from bfsensor.typing import FloatArray
+
+NEAREST, FARTHEST = 4, 40
+"""Distances in x [pixel] at which a map is held against itself: nearer ones share boundaries."""
+
+STRIPE = 256
+"""Rows of a map that are transformed at a time."""
+
+CLEAR = 18.0
+"""Power over the noise's above which a mode is a pattern's: of 1e6 modes of noise none."""
+
+STRONGEST = 4096
+"""Modes that count as a pattern's, at most; weaker ones count as noise, which errs to the safe side."""
+
+
+class Texture(NamedTuple):
+    """Mean products of a map with itself, shifted.
+
+    Attributes
+    ----------
+    values : ndarray, shape (n,)
+        Products [1e-6].
+    dx, dy : ndarray, shape (n,)
+        Shifts [pixel].
+    """
+
+    values: FloatArray
+    dx: FloatArray
+    dy: FloatArray
+
+
+def map_texture(image: NDArray) -> Texture:
+    """Hold a map against itself: mean products [1e-6] of pixels (dx, dy) apart, with dx and dy.
+
+    In the same row and from one row to the next: patterns that go with the time of readout
+    keep step along a row and start the next one with another phase.  Means of columns and of
+    rows are taken off: they are told by themselves.
+
+    Examples
+    --------
+    >>> wave = np.sin(2 * np.pi * np.arange(64 * 100) / 8.1).reshape(64, 100)
+    >>> values, dx, dy = map_texture(wave)
+    >>> [float(values[(dx == n) & (dy == 0)][0].round(-5)) for n in (4, 8)]
+    [-500000.0, 500000.0]
+    """
+    ny, nx = image.shape
+    columns = image.mean(0, dtype=np.float64)
+    reach = min(FARTHEST, nx // 2)
+    side = next_fast_len(nx + reach + 1, real=True)
+    same, following = np.zeros(side), np.zeros(side)
+    # Some rows at a time: transforms of large sensors need not be held.
+    for start in range(0, ny, STRIPE):
+        rows = image[start : start + STRIPE + 1]
+        rows = rows - columns - rows.mean(1, dtype=np.float64)[:, None] + columns.mean()
+        modes = rfft(rows, side, axis=1)
+        own = modes[:STRIPE]
+        same += irfft((own.real**2 + own.imag**2).sum(0), side)
+        following += irfft((modes[:-1].conj() * modes[1:]).sum(0), side)
+    near, all_ = np.arange(NEAREST, reach + 1), np.arange(-reach, reach + 1)
+    all_ = all_[np.abs(all_) >= NEAREST]
+    # A row's mean, taken off, leaves white noise anticorrelated by 1/nx.
+    values = [
+        same[near] / (ny * (nx - near)) + same[0] / (ny * nx**2),
+        following[all_] / ((ny - 1) * (nx - np.abs(all_))),
+    ]
+    dy = np.repeat([0.0, 1.0], [len(near), len(all_)])
+    return Texture(
+        1e6 * np.concatenate(values), np.concatenate([near, all_]).astype(float), dy
+    )
+
+
+def texture_noise(image: NDArray, texture: Texture, pixels: int) -> FloatArray:
+    r"""Errors of a texture, or their covariance where the map has a pattern.
+
+    Products of noise with noise are independent of one another.  Those of noise with a pattern
+    are not: the noise n of a pixel is multiplied by the pattern s on both sides of it, so that
+
+    .. math::
+        \mathrm{cov}(T_d, T_{d'}) = \frac{1}{N} \Big( \sigma^4 \delta_{d d'} + 4 \sigma^2
+        \sum_k P_k \cos(k \cdot d) \cos(k \cdot d') \Big),
+
+    P the pattern's power in modes k, which are those far above the noise's.
+
+    Parameters
+    ----------
+    image : ndarray, shape (ny, nx)
+        The map, without its smooth shape.
+    texture : Texture
+        Of it.
+    pixels : int
+        That are read.
+
+    Returns
+    -------
+    ndarray, shape (n,) or (n, n)
+        Errors [1e-6], or covariance [1e-12].
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> noise = rng.normal(0, 0.003, (128, 128))
+    >>> place = np.arange(128)
+    >>> wave = 0.002 * np.sin(place / 3) * np.cos(place / 5)[:, None]
+    >>> [texture_noise(m, map_texture(m), m.size).ndim for m in (noise, noise + wave)]
+    [1, 2]
+    """
+    ny, nx = image.shape
+    products = np.maximum(
+        pixels * (1 - np.abs(texture.dx) / nx) * (1 - texture.dy / ny), 1.0
+    )
+    variance = float(image.var(dtype=np.float64))
+    modes = rfft2(image)
+    power = (modes.real**2 + modes.imag**2) / (ny * nx)
+    # Means of columns and rows are not in it.
+    power[0], power[:, 0] = 0.0, 0.0
+    noise = float(np.median(power[1:, 1:])) / np.log(2.0)
+    row, column = np.nonzero(power > CLEAR * noise)
+    if not len(row):
+        return np.asarray(1e6 * variance / np.sqrt(products))
+    order = np.argsort(power[row, column])[::-1][:STRONGEST]
+    row, column = row[order], column[order]
+    # Each stands for itself and its mirror image, but for those that have none.
+    twice = np.where((column == 0) | (2 * column == nx), 1.0, 2.0)
+    strength = twice * power[row, column] / (ny * nx)
+    turns = np.outer(texture.dx, column / nx) + np.outer(
+        texture.dy, np.fft.fftfreq(ny)[row]
+    )
+    # Round-off of strong patterns aside, noise is no less than that of the usual mode.
+    own = max(variance - float(strength.sum()), noise)
+    spread = 2 * np.sqrt(own * strength) * np.cos(2 * np.pi * turns)
+    spread *= (1e6 / np.sqrt(products))[:, None]
+    return np.asarray(spread @ spread.T + np.diag((1e6 * own) ** 2 / products))

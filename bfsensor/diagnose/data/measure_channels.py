@@ -1,0 +1,458 @@
+# ruff: noqa: D102  (protocol: the class says what its attributes are)
+"""From the exposures of a campaign to channels, one exposure or pair in memory at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.data.bias_channels import (
+    BiasChannels,
+    DarkChannels,
+    without_hot_columns,
+)
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.code_channels import CodeChannels, CrosstalkChannels
+from bfsensor.diagnose.data.exposures import (
+    Condition,
+    ExposureInfo,
+    Frame,
+    assign_folds,
+    is_held_out,
+)
+from bfsensor.diagnose.data.flat_channels import FlatChannels
+from bfsensor.diagnose.data.flat_pairing import (
+    Flat,
+    PairFinder,
+    UnlikePair,
+    by_level,
+    describe_unlike,
+    group_flats,
+    scan_unlike,
+)
+from bfsensor.diagnose.data.map_channels import MapChannels, MapShare
+from bfsensor.diagnose.data.spot_channels import SpotChannels
+from bfsensor.diagnose.data.spot_ghosts import describe_ghosts, find_ghosts
+from bfsensor.diagnose.data.spot_places import PlacedSpots
+from bfsensor.effects.effect import Segment, Shot
+from bfsensor.errors import MeasurementError
+from bfsensor.typing import FloatArray
+
+
+class Source(Protocol):
+    """What exposures are taken from."""
+
+    @property
+    def exposures(self) -> Sequence[Any]: ...
+    @property
+    def lamp_error(self) -> float: ...
+    @property
+    def shape(self) -> tuple[int, int]: ...
+    def read(self, exposure: Any) -> Sequence[Any]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredChannels:
+    """Channels of a campaign, and what its prediction must know of it.
+
+    Attributes
+    ----------
+    channels : tuple of Channel
+        Of all folds.
+    amplifiers : tuple of str
+        Names, in the order of the axis 'amp'.
+    gains : tuple of float
+        Rough gains [e-/ADU] from variance over mean at low levels.
+    read_noise : tuple of float
+        [ADU].
+    phases : tuple of ndarray
+        Centres of the spots within their pixels, by exposure [pixel].
+    columns : tuple of int
+        Columns of each amplifier, which charge is shifted through.
+    flips : tuple of (bool, bool)
+        Which amplifiers read backwards in x and y.
+    origins : tuple of (int, int)
+        Lower left corner (x, y) of each amplifier on the sensor.
+    notes : tuple of str
+        What could not be measured, and why.
+    lamp_known : bool
+        Whether every flat has a reading of the lamp.
+    counts : mapping of str to int
+        Exposures of each kind.
+    unlike : tuple of UnlikePair
+        Flats of unlike exposure beside one another; in no channel.
+    segments : tuple of Segment
+        Where each amplifier lies, and what is read before and after it.
+    shots : tuple of Shot
+        All exposures in the order of time; levels by the rough gains.
+    maps : mapping of (fold, map) to tuple of MapShare
+        Of which flats each map is made.
+    neighbours : (float, float)
+        Distance of the next spots in x and y [pixel], and how many of those places hold one.
+    offsets : tuple of float
+        Mean code of each amplifier without light, of one exposure; nan without overscan.
+    biases : tuple of int
+        Numbers of the frames that the mean bias is made of.
+    sightings : tuple of mapping
+        Waves in the maps: where fits of such patterns may begin.
+    placed : tuple of PlacedSpots
+        Spots of all folds, in the order of time.
+    """
+
+    channels: tuple[Channel, ...]
+    amplifiers: tuple[str, ...]
+    gains: tuple[float, ...]
+    read_noise: tuple[float, ...]
+    phases: tuple[FloatArray, ...]
+    columns: tuple[int, ...]
+    flips: tuple[tuple[bool, bool], ...]
+    origins: tuple[tuple[int, int], ...]
+    shape: tuple[int, int]
+    notes: tuple[str, ...] = ()
+    lamp_known: bool = True
+    counts: Mapping[str, int] = field(default_factory=dict)
+    unlike: tuple[UnlikePair, ...] = ()
+    segments: tuple[Segment, ...] = ()
+    shots: tuple[Shot, ...] = ()
+    maps: Mapping[tuple[str, str], tuple[MapShare, ...]] = field(default_factory=dict)
+    neighbours: tuple[float, float] = (np.inf, 0.0)
+    offsets: tuple[float, ...] = ()
+    biases: tuple[int, ...] = ()
+    sightings: tuple[Mapping[str, Any], ...] = ()
+    placed: tuple[PlacedSpots, ...] = ()
+
+
+def measure_channels(
+    source: Source,
+    *,
+    lags: int = 4,
+    progress: Callable[[int, int], None] | None = None,
+    ghosts: bool | Mapping[int, list[NDArray[np.bool_]]] = True,
+) -> MeasuredChannels:
+    """Measure all channels that a campaign's exposures allow.
+
+    Parameters
+    ----------
+    source : Source
+        Exposures in order of time, and how each is read.
+    lags : int
+        Largest lag of the flats' covariances [pixel].
+    progress : callable, optional
+        Called with (exposures done, exposures in all).
+    ghosts : bool, or mapping of int to list of ndarray of bool
+        Whether biases and darks that hold what spots left are sought, and set apart; if not,
+        campaigns with and without an effect have the same values.  Or those that are set apart,
+        as :func:`~bfsensor.diagnose.data.spot_ghosts.find_ghosts` gives them.
+
+    Returns
+    -------
+    MeasuredChannels
+        Pairs of flats are spread over the folds; of other exposures, where there are many, one
+        in five is held out, the others are in the fold 'fit'.
+
+    Raises
+    ------
+    MeasurementError
+        No exposure can be used, or nothing can be measured with those there are.
+    """
+    exposures = list(source.exposures)
+    kinds: dict[str, list[ExposureInfo]] = {}
+    for exposure in exposures:
+        kinds.setdefault(exposure.kind, []).append(exposure)
+    notes: list[str] = []
+    done = 0
+
+    def read(exposure: ExposureInfo) -> Sequence[Frame]:
+        nonlocal done
+        frames = source.read(exposure)
+        done += 1
+        if progress is not None:
+            progress(done, len(exposures))
+        return frames
+
+    if isinstance(ghosts, bool):
+        haunted = find_ghosts(exposures, source.read) if ghosts else {}
+    else:
+        haunted = dict(ghosts)
+    if haunted:
+        notes.append(describe_ghosts(haunted, exposures))
+    biases, late_biases = BiasChannels(), BiasChannels("held-out")
+    in_mean: list[int] = []
+    for exposure in kinds.get("bias", []):
+        if exposure.number in haunted:
+            biases.add_level(exposure, read(exposure), haunted[exposure.number])
+    quiet = [e for e in kinds.get("bias", []) if e.number not in haunted]
+    for n, exposure in enumerate(quiet):
+        # Noise is measured in differences of two frames: they go together.
+        held = is_held_out(n // 2, len(quiet) // 2)
+        (late_biases if held else biases).add(exposure, read(exposure))
+        if not held:
+            in_mean.append(exposure.number)
+    bias_images: dict[str, FloatArray] = {}
+    layout: Sequence[Frame] | None = None
+    groups = group_flats(kinds.get("flat", []))
+    if not any(kinds.get(kind) for kind in ("flat", "spot", "bias", "dark")):
+        raise MeasurementError(
+            "no bias, flat, dark or spots among "
+            f"{', '.join(f'{len(v)} {k}' for k, v in kinds.items()) or 'no exposures'}"
+        )
+    first = next(
+        kinds[kind] for kind in ("flat", "spot", "bias", "dark") if kinds.get(kind)
+    )[0]
+    layout = source.read(first)
+    for frame in layout:
+        if (whole := biases.mean(frame.name)) is not None:
+            bias_images[frame.name] = _data_section(frame, whole)
+    for each in (biases, late_biases):
+        each.forget_mean()
+    noise = biases.read_noise
+    start = min((e.mjd for e in exposures if e.mjd is not None), default=np.nan)
+    flats = FlatChannels(
+        bias_images, noise, lamp_error=source.lamp_error, lags=lags, start=start
+    )
+    longest: dict[tuple[str, ...], float] = {}
+    for flat in kinds.get("flat", []):
+        key = Condition.of(flat).key
+        longest[key] = max(longest.get(key, 0.0), flat.exposure_time or 0.0)
+    amplifiers = [
+        np.s_[s.y : s.y + s.rows, s.x : s.x + s.columns] for s in map(_segment, layout)
+    ]
+    maps, late_maps = (
+        MapChannels(source.shape, longest, fold, amplifiers) for fold in ("fit", "held-out")
+    )
+    codes, late_codes = CodeChannels(), CodeChannels("held-out")
+    gains: list[list[float]] = [[] for _ in layout]
+    finder = PairFinder(read, lambda frames: _mean_level(flats, frames))
+    by_fold = {
+        "fit": (maps, codes),
+        "select": (maps, codes),
+        "held-out": (late_maps, late_codes),
+    }
+    levels = _take_pairs(finder, groups, flats, by_fold, biases, source.shape, notes)
+    unlike = scan_unlike(
+        sorted([*finder.single, *(g[0] for g in groups if len(g) == 1)], key=lambda f: f.number),
+        lambda flat: [_good(flats, f) for f in read(flat)], lags=lags,
+    )  # fmt: skip
+    notes += [*finder.notes, *describe_unlike(unlike), *codes.notes, *late_codes.notes]
+    # Sums of maps are the largest that is held: they go before the spots come.
+    found_maps, late_found_maps = maps.channels(), late_maps.channels()
+    notes += [*maps.notes, *(f"held out: {n}" for n in late_maps.notes)]
+    shares = {(e.fold, k): v for e in (maps, late_maps) for k, v in e.shares().items()}
+    sightings = maps.sightings
+    del maps, late_maps, by_fold
+    for channel in flats.channels():
+        if channel.word == "flat_cov":
+            _rough_gains(channel, gains)
+    rough = tuple(float(np.median(g)) if g else 1.0 for g in gains)
+    darks, late_darks = (
+        DarkChannels(bias_images, noise, fold, biases=biases.frames)
+        for fold in ("fit", "held-out")
+    )
+    before: dict[int, float] = {}
+    last = 0.0
+    for exposure in exposures:
+        before[exposure.number] = last
+        last = levels.get(exposure.number, 0.0)
+    seen: dict[float | None, int] = {}
+    dark = [e for e in kinds.get("dark", []) if e.number not in haunted]
+    times = [e.exposure_time for e in dark]
+    for exposure in dark:
+        turn = seen.get(exposure.exposure_time, 0)
+        seen[exposure.exposure_time] = turn + 1
+        # The third of at least four of an exposure time.
+        held = turn == 2 and times.count(exposure.exposure_time) >= 4
+        (late_darks if held else darks).add(
+            exposure, read(exposure), after=before[exposure.number]
+        )
+    mean_noise = float(
+        np.mean([noise.get(f.name, 0.0) * g for f, g in zip(layout, rough, strict=True)])
+    )
+    spots = SpotChannels(read_noise=mean_noise, lamp_error=source.lamp_error, start=start)
+    crosstalk, late_crosstalk = CrosstalkChannels(), CrosstalkChannels("held-out")
+    for n, exposure in enumerate(kinds.get("spot", [])):
+        held = is_held_out(n, len(kinds["spot"]))
+        spot_frames = read(exposure)
+        images = [
+            without_hot_columns(flats.clean(f), noise.get(f.name, 0.0)) for f in spot_frames
+        ]
+        (late_crosstalk if held else crosstalk).add(
+            images, [noise.get(f.name, 1.0) for f in spot_frames]
+        )
+        image = np.full(source.shape, np.nan)
+        for frame, cleaned, gain in zip(spot_frames, images, rough, strict=True):
+            place(image, frame, cleaned * gain)
+        levels[exposure.number] = float(np.mean([np.nanmean(i) for i in images]))
+        reason = spots.add(exposure, image, fold="held-out" if held else "fit")
+        if reason:
+            notes.append(f"spots {exposure.number}: {reason}")
+    channels = [
+        *flats.channels(), *found_maps, *codes.channels(), *biases.channels(),
+        *darks.channels(), *spots.channels(), *crosstalk.channels(),
+        *late_found_maps, *late_codes.channels(), *late_biases.channels(),
+        *late_darks.channels(), *late_crosstalk.channels(),
+    ]  # fmt: skip
+    if not channels:
+        raise MeasurementError(
+            f"nothing can be measured: {len(kinds.get('flat', []))} flats make no pair of equal "
+            f"exposure and level, biases {len(kinds.get('bias', []))} (2 are needed), no dark, no "
+            f"spots that could be fitted{'; ' + '; '.join(notes) if notes else ''}"
+        )
+    if "bias" not in kinds and any(f.serial_overscan.size == 0 for f in layout):
+        notes.append(
+            "no bias and no overscan: the zero level is not known and stays in the levels, "
+            "read noise is not known"
+        )
+    return MeasuredChannels(
+        channels=tuple(channels),
+        amplifiers=tuple(f.name for f in layout),
+        gains=rough,
+        read_noise=tuple(noise.get(f.name, np.nan) for f in layout),
+        phases=tuple(spots.phases),
+        columns=tuple(f.image.shape[1] + f.prescan.shape[1] for f in layout),
+        flips=tuple((f.flip_x, f.flip_y) for f in layout),
+        origins=tuple(f.origin or (0, 0) for f in layout),
+        shape=source.shape,
+        notes=tuple(notes),
+        lamp_known=all(e.lamp is not None for e in kinds.get("flat", [])),
+        counts={k: len(v) for k, v in kinds.items()},
+        unlike=tuple(unlike),
+        segments=tuple(_segment(f) for f in layout),
+        shots=_shots(exposures, levels, float(np.mean(rough))),
+        maps=shares,
+        neighbours=spots.neighbours,
+        placed=tuple(spots.placed),
+        offsets=tuple(
+            float(f.serial_overscan.mean()) if f.serial_overscan.size else np.nan
+            for f in layout
+        ),
+        biases=tuple(in_mean),
+        sightings=sightings,
+    )
+
+
+def _take_pairs(
+    finder: PairFinder,
+    groups: Sequence[Sequence[ExposureInfo]],
+    flats: FlatChannels,
+    by_fold: Mapping[str, tuple[MapChannels, CodeChannels]],
+    biases: BiasChannels,
+    shape: tuple[int, int],
+    notes: list[str],
+) -> dict[int, float]:
+    """Read all pairs of flats, level by level; gives the mean level of each flat [ADU]."""
+    levels: dict[int, float] = {}
+    for members in sorted(by_level(groups), key=lambda m: m[0][0].exposure_time or 0.0):
+        folds = iter(
+            assign_folds(range(sum(len(g) // 2 for g in members)), shift=len(levels))
+        )
+        for pair in finder.pairs(members):
+            fold = next(folds)
+            try:
+                flats.add_pair(*pair, fold=fold)
+            except MeasurementError as error:
+                notes.append(f"flats {pair[0][0].number}, {pair[1][0].number}: {error}")
+                continue
+            levels |= _add_to_maps(pair, flats, *by_fold[fold], biases, shape)
+    return levels
+
+
+def _add_to_maps(
+    pair: Sequence[Flat],
+    flats: FlatChannels,
+    maps: MapChannels,
+    codes: CodeChannels,
+    biases: BiasChannels,
+    shape: tuple[int, int],
+) -> dict[int, float]:
+    """Add a pair of flats to maps and codes; gives the mean level of either [ADU]."""
+    levels, departures = {}, []
+    for exposure, frames in pair:
+        image = np.full(shape, np.nan, np.float32)
+        means = []
+        for frame in frames:
+            values = _good(flats, frame)
+            means.append(float(np.nanmean(values)))
+            place(image, frame, values / means[-1] - 1.0)
+        levels[exposure.number] = float(np.mean(means))
+        departures.append(image)
+        codes.add(frames)
+    first, (_, frames) = pair[0][0], pair[1]
+    noise = [
+        biases.read_noise.get(f.name, 0.0) / np.sqrt(max(biases.frames, 1)) / m
+        for f, m in zip(frames, means, strict=True)
+    ]
+    maps.add_pair(
+        Condition.of(first), first.exposure_time or 0.0, departures[0], departures[1],
+        level=levels[first.number], shared=float(np.sqrt(np.mean(np.square(noise)))),
+    )  # fmt: skip
+    return levels
+
+
+def _segment(frame: Frame) -> Segment:
+    rows, columns = frame.image.shape
+    x, y = frame.origin or (0, 0)
+    depth = [strip.shape[axis] if strip.size else 0 for strip, axis in (
+        (frame.prescan, 1), (frame.serial_overscan, 1), (frame.parallel_overscan, 0))]  # fmt: skip
+    return Segment(x, y, columns, rows, frame.flip_x, frame.flip_y, *depth)
+
+
+def _shots(
+    exposures: Sequence[ExposureInfo], levels: Mapping[int, float], gain: float
+) -> tuple[Shot, ...]:
+    """All exposures as effects see them; without a level unless they are flats or spots."""
+    times = [e.mjd for e in exposures if e.mjd is not None]
+    out = []
+    for e in exposures:
+        hours = 0.0 if e.mjd is None else 24.0 * (e.mjd - min(times))
+        level = gain * levels.get(e.number, 0.0)
+        out.append(
+            Shot(e.kind, e.number, e.exposure_time or 0.0, *Condition.of(e), hours, level)
+        )
+    return tuple(out)
+
+
+def place(image: NDArray[np.floating], frame: Frame, values: FloatArray) -> None:
+    """Put an amplifier's values, in readout order, where they lie on the sensor."""
+    values = values[:, ::-1] if frame.flip_x else values
+    values = values[::-1] if frame.flip_y else values
+    x, y = frame.origin or (0, 0)
+    image[y : y + values.shape[0], x : x + values.shape[1]] = values
+
+
+def _data_section(frame: Frame, whole: FloatArray) -> FloatArray:
+    """Cut what belongs to the image out of a whole frame."""
+    start = frame.prescan.shape[1] if frame.prescan.ndim == 2 else 0
+    ny, nx = frame.image.shape
+    return whole[:ny, start : start + nx]
+
+
+def _mean_level(flats: FlatChannels, frames: Sequence[Frame]) -> float:
+    return float(np.mean([np.nanmean(_good(flats, f)) for f in frames]))
+
+
+def _good(flats: FlatChannels, frame: Frame) -> FloatArray:
+    """Clean image, nan where a pixel is masked."""
+    return np.where(frame.mask, np.nan, flats.clean(frame))
+
+
+def _rough_gains(channel: Channel, gains: list[list[float]]) -> None:
+    """Gain from mean over variance at low levels [e-/ADU]."""
+    a = channel.axes
+    variance = (a["i"] == 0) & (a["j"] == 0)
+    for amp, found in enumerate(gains):
+        rows = variance & (a["amp"] == amp)
+        if not rows.any():
+            continue
+        level, value = a["level"][rows], channel.values[rows]
+        # Full pixels have next to no variance.
+        rising = value >= 0.5 * np.median(value / level) * level
+        level, value = level[rising], value[rising]
+        # The slope where light begins: read noise is in the lowest of them, and pixels that
+        # repel bend the line, by a sixth of its slope at half of a full well.
+        degree = min(2, len(set(level)) - 1)
+        slope = np.polyfit(level, value, degree, w=1 / value)[-2] if degree > 0 else 0.0
+        found.append(1.0 / slope if slope > 0 else float(level[0] / value[0]))

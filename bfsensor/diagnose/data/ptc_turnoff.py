@@ -1,0 +1,107 @@
+"""Where the variance of flats collapses with the level: pixels are full, and say nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
+
+COLLAPSED = 0.5
+"""Part of the variance that light at so high a level should have, below which pixels are full.
+The brighter-fatter effect takes a fifth at most at a full well of 1e5 e-."""
+
+WEAK = 0.4
+"""Part of the levels, the lowest, that tell what variance light has."""
+
+NEARLY = 0.8
+"""Part of the full well that the peak of a spot may reach."""
+
+
+class TurnOff(NamedTuple):
+    """Level of each amplifier at which flats turn off.
+
+    Attributes
+    ----------
+    levels : dict of int to float
+        Lowest level whose variance has collapsed, by amplifier [ADU].
+    electrons : float
+        The lowest of them [e-], by the gain that the weak levels tell.
+    """
+
+    levels: dict[int, float]
+    electrons: float
+
+    @property
+    def said(self) -> str:
+        """One sentence for the report."""
+        lowest = min(self.levels.values())
+        return (
+            f"the variance of flats collapses at {lowest:.0f} ADU (near {self.electrons:.3g} e-): "
+            "the baseline is fitted to fainter flats and spots, and held against all"
+        )
+
+
+def find_turn_off(channels: Sequence[Channel]) -> TurnOff | None:
+    """Find the level at which the variance of flats collapses; None where it does not.
+
+    Parameters
+    ----------
+    channels : sequence of Channel
+        What was measured, 'flat_cov' in it.
+    """
+    levels: dict[int, float] = {}
+    electrons = np.inf
+    for channel in channels:
+        if channel.word != "flat_cov" or channel.unit == PER_ELECTRON:
+            continue
+        x = channel.axes
+        for amp in np.unique(x["amp"]):
+            here = (x["i"] == 0) & (x["j"] == 0) & (x["amp"] == amp)
+            level, variance = x["level"][here], channel.values[here]
+            weak = level <= np.quantile(level, WEAK)
+            ratio = float(np.median(variance[weak] / level[weak]))
+            full = ~weak & (variance < COLLAPSED * ratio * level)
+            if full.any() and ratio > 0:
+                lowest = float(level[full].min())
+                key = int(amp)
+                levels[key] = min(levels.get(key, np.inf), lowest)
+                electrons = min(electrons, lowest / ratio)
+    return TurnOff(levels, float(electrons)) if levels else None
+
+
+def below(channels: Sequence[Channel], off: TurnOff) -> list[Channel]:
+    """Channels without flats and spots that reach the turn-off."""
+    return [_keep(c, _faint(c, off)) for c in channels]
+
+
+def _faint(channel: Channel, off: TurnOff) -> NDArray[np.bool_]:
+    x = channel.axes
+    keep = np.ones(len(channel), bool)
+    if channel.word in ("flat_cov", "flat_mean") and "level" in x:
+        ends = np.array([off.levels.get(int(a), np.inf) for a in x["amp"]])
+        # Whatever is within a few standard deviations of full is partly so.
+        keep = x["level"] < 0.97 * ends
+    elif channel.word == "spot":
+        narrow = [channel.values[x["what"] == f"sigma_{d}"] for d in "xy"]
+        width = float(np.prod([v.min() for v in narrow if v.size]))
+        keep = x["flux"] / (2 * np.pi * width) < NEARLY * off.electrons
+    return keep
+
+
+def _keep(channel: Channel, keep: NDArray[np.bool_]) -> Channel:
+    """Some values of a channel, with their errors."""
+    if keep.all():
+        return channel
+    blocks, start = [], 0
+    for block in channel.blocks:
+        part = keep[start : start + len(block)]
+        if part.any():
+            blocks.append(block[np.ix_(part, part)])
+        start += len(block)
+    axes = {k: v[keep] for k, v in channel.axes.items()}
+    return replace(channel, values=channel.values[keep], blocks=tuple(blocks), axes=axes)

@@ -1,0 +1,133 @@
+"""Channels of recordings that others reduced: measured a_ij, and covariances of flats."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
+from bfsensor.diagnose.data.exposures import Axes, Condition
+from bfsensor.diagnose.data.measure_channels import MeasuredChannels
+from bfsensor.errors import DiagnosisError
+from bfsensor.recording.tables.area_changes import AreaChangeTable
+from bfsensor.recording.tables.covariance_tables import CovarianceTable
+from bfsensor.typing import FloatArray
+
+
+def measure_reduced(
+    recording: AreaChangeTable | CovarianceTable, *, reach: int
+) -> MeasuredChannels:
+    """Turn a reduced recording into a campaign of the one channel 'flat_cov'.
+
+    Parameters
+    ----------
+    recording : AreaChangeTable or CovarianceTable
+        From :func:`bfsensor.recording.tables.reduced.find_reduced`.
+    reach : int
+        Largest lag that the baseline predicts; further ones are left out.
+
+    Returns
+    -------
+    MeasuredChannels
+        Of a_ij: unit 1/e-, no amplifier and so neither gain nor noise, (0, 0) left out where
+        it was set by the sum of the others.  Of covariances: e-^2, a gain near 1 and a noise
+        near 0 of each amplifier, which float.
+
+    Raises
+    ------
+    DiagnosisError
+        Nothing is left within the reach.
+    """
+    if isinstance(recording, AreaChangeTable):
+        return _of_areas(recording, reach)
+    return _of_covariances(recording, reach)
+
+
+def _of_areas(table: AreaChangeTable, reach: int) -> MeasuredChannels:
+    j, i = (np.asarray(index) for index in np.indices(table.a.shape))
+    inside = (i <= reach) & (j <= reach)
+    used = inside & table.independent & (table.errors > 0)
+    if not used.any():
+        raise DiagnosisError(
+            f"{table.path}: no independent a_ij with an error within lags of {reach}"
+        )
+    notes = list(table.warnings) + _beyond(~inside & np.isfinite(table.a), reach)
+    if (inside & table.independent & ~used).any():
+        notes.append(
+            f"{int((inside & table.independent & ~used).sum())} a_ij without an error"
+        )
+    notes.append(
+        "errors of a_ij are taken as independent: what they share is not in the table"
+    )
+    axes = Axes()
+    axes.add(
+        int(used.sum()), Condition(np.nan, np.nan, np.nan), i=i[used], j=j[used], amp=0,
+        level=1.0, time=0,
+    )  # fmt: skip
+    errors = table.errors[used]
+    channel = Channel(
+        "flat_cov", table.a[used], tuple(np.square(errors)[:, None, None]), axes.columns(),
+        PER_ELECTRON,
+    )  # fmt: skip
+    return _measured(channel, (), notes)
+
+
+def _of_covariances(table: CovarianceTable, reach: int) -> MeasuredChannels:
+    inside = (table.lag_x <= reach) & (table.lag_y <= reach) & (table.level > 0)
+    if not inside.any():
+        raise DiagnosisError(f"{table.path}: no covariances within lags of {reach}")
+    notes = list(table.warnings) + _beyond(~inside, reach)
+    rows = np.flatnonzero(inside)
+    names, amp = np.unique(table.amplifier[rows], return_inverse=True)
+    # One level of all amplifiers: the same place in the order of each one's levels.
+    place = np.zeros(len(rows), np.int64)
+    for n in range(len(names)):
+        own = amp == n
+        place[own] = np.unique(table.level[rows][own], return_inverse=True)[1]
+    order = np.lexsort((table.lag_x[rows], table.lag_y[rows], place, amp))
+    rows, amp, place = rows[order], amp[order], place[order]
+    blocks: tuple[FloatArray, ...]
+    if table.matrix is None:
+        blocks = tuple(np.square(table.error[rows])[:, None, None])
+    else:
+        blocks = _blocks(table.matrix[np.ix_(rows, rows)], amp, place)
+    axes = Axes()
+    axes.add(
+        len(rows), Condition(np.nan, np.nan, np.nan), i=table.lag_x[rows], j=table.lag_y[rows],
+        amp=amp, level=table.level[rows], time=place,
+    )  # fmt: skip
+    columns = axes.columns() | {
+        "wavelength": table.wavelength[rows], "back_bias": table.back_bias[rows],
+    }  # fmt: skip
+    channel = Channel("flat_cov", table.covariance[rows], blocks, columns, "electron2")
+    return _measured(channel, tuple(str(n) for n in names), notes)
+
+
+def _blocks(
+    matrix: FloatArray, amp: NDArray[np.int64], place: NDArray[np.int64]
+) -> tuple[FloatArray, ...]:
+    """Cut an error matrix into amplifiers and levels; whole where it ties them together."""
+    starts = np.flatnonzero(np.diff(amp, prepend=-1) | np.diff(place, prepend=-1))
+    ends = np.append(starts[1:], len(amp))
+    parts = [matrix[a:b, a:b] for a, b in zip(starts, ends, strict=True)]
+    inside = sum(np.count_nonzero(p) for p in parts)
+    return tuple(parts) if inside == np.count_nonzero(matrix) else (matrix,)
+
+
+def _beyond(out: NDArray[np.bool_], reach: int) -> list[str]:
+    count = int(out.sum())
+    return [f"{count} values beyond lags of {reach} left out: the baseline ends there"] * (
+        count > 0
+    )
+
+
+def _measured(
+    channel: Channel, names: tuple[str, ...], notes: list[str]
+) -> MeasuredChannels:
+    """A campaign of one channel; nothing of it lies anywhere on a sensor."""
+    n = len(names)
+    return MeasuredChannels(
+        channels=(channel,), amplifiers=names, gains=(1.0,) * n, read_noise=(0.0,) * n,
+        phases=(), columns=(0,) * n, flips=((False, False),) * n, origins=((0, 0),) * n,
+        shape=(0, 0), notes=tuple(notes),
+    )  # fmt: skip

@@ -1,0 +1,234 @@
+"""Spots: widths, flux, asymmetry and wings against exposure time, condition by condition."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from bfsensor.diagnose.data.channels import FOLDS, Channel
+from bfsensor.diagnose.data.exposures import Axes, Condition, ExposureInfo
+from bfsensor.diagnose.data.spot_places import PlacedSpots
+from bfsensor.errors import MeasurementError
+from bfsensor.measure.spot_fit import fit_spots
+from bfsensor.measure.spots import SpotList, cut_stamps, find_spots
+from bfsensor.typing import FloatArray
+
+STAMP = 11
+WING = 21
+"""Sides of the stamps [pixel] that are fitted, and that the wings are summed in."""
+
+REPEATS = 8
+"""Exposures of equal light, less one a group, from which on their fluxes' scatter is believed."""
+
+CLIP = 8.0
+"""Median deviations from which on a pixel of the rim is struck: 5.4 sigma of noise."""
+
+QUIET = 2.0
+"""Least median deviation of a pixel [e-]: that of a read noise of 3 e-."""
+
+WING_ERROR = 2e-4
+"""Error of the share of a spot's flux outside its stamp: backgrounds are known to about 0.1 e- a
+pixel of 320 (assumed)."""
+
+
+class SpotChannels:
+    """Takes images of spots on the sensor in electrons, one by one, and gives their channel."""
+
+    def __init__(
+        self, *, read_noise: float, lamp_error: float, start: float = np.nan
+    ) -> None:
+        self._noise, self._lamp_error, self._start = read_noise, lamp_error, start
+        self._rows: list[
+            tuple[ExposureInfo, dict[str, tuple[float, float]], NDArray, str]
+        ] = []
+        self._backgrounds: dict[int, float] = {}
+        self.dropped: dict[str, int] = {}
+        self._grids: list[tuple[float, float]] = []
+        self.placed: list[PlacedSpots] = []
+
+    def add(
+        self, exposure: ExposureInfo, image: FloatArray, *, fold: str = "fit"
+    ) -> str | None:
+        """Measure an exposure; gives why it could not be, or None."""
+        background = float(np.nanmedian(image))
+        peak = float(np.nanpercentile(image, 99.9)) - background
+        if peak < 10 * max(self._noise, 1.0):
+            return "no spots stand out"
+        filled = np.where(np.isfinite(image), image, background)
+        try:
+            spots = find_spots(
+                filled, threshold=background + 0.3 * peak, separation=WING // 2, stamp=STAMP
+            )
+            inside = _inside(spots, filled.shape, WING // 2 + 1)
+            if len(inside) < 4:
+                return f"{len(inside)} spots"
+            stamps = cut_stamps(filled, inside, size=STAMP)
+            fit = fit_spots(
+                stamps, read_noise=self._noise, weights="equal", largest_offset=1.5
+            )
+        except MeasurementError as error:
+            return str(error)
+        used = fit.used
+        if used.sum() < 4:
+            return f"{int(used.sum())} spots are left by the fit"
+        wide = cut_stamps(filled, inside, size=WING).electrons[used]
+        values = stamp_moments(
+            stamps.electrons[used], wide, fit.centre_x[used], fit.centre_y[used]
+        )
+        n = used.sum()
+        errors = np.sqrt(np.diag(fit.scatter_covariance))
+        out = {
+            "sigma_x": (fit.sigma_x, float(errors[0])),
+            "sigma_y": (fit.sigma_y, float(errors[1])),
+        }
+        self._backgrounds[exposure.number] = float(np.mean(values.pop("background")))
+        flux = values.pop("flux")
+        total = float(flux.mean())
+        out["flux"] = (total, float(flux.std(ddof=1) / np.sqrt(n)))
+        for name, column in values.items():
+            out[name] = (float(column.mean()), float(column.std(ddof=1) / np.sqrt(n)))
+        phases = np.stack([fit.centre_x[used], fit.centre_y[used]], axis=1)
+        self._rows.append((exposure, out, phases, fold))
+        self._grids.append(_grid(inside))
+        corners = np.column_stack([stamps.x, stamps.y])[used]
+        self.placed.append(
+            PlacedSpots(
+                exposure.number, total, (fit.sigma_x, fit.sigma_y), corners + phases
+            )
+        )
+        return None
+
+    def channels(self) -> list[Channel]:
+        """Widths, fluxes, skewness and wings of each exposure."""
+        return [self._channel(fold) for fold in self._folds]
+
+    @property
+    def _folds(self) -> list[str]:
+        """Folds that there are, what is fitted first."""
+        return [f for f in FOLDS if any(row[3] == f for row in self._rows)]
+
+    def _channel(self, fold: str) -> Channel:
+        values, blocks, axes = [], [], Axes()
+        repeat = self._flux_scatter()
+        for exposure, found, _, own in self._rows:
+            if own != fold:
+                continue
+            lamp = exposure.lamp
+            light = (exposure.exposure_time or 0.0) * (1.0 if lamp is None else lamp)
+            mjd = np.nan if exposure.mjd is None else exposure.mjd
+            for what, (value, error) in found.items():
+                variance = error**2
+                if what == "flux":
+                    # Pinholes differ: how much of that is the same in all exposures, exposures of
+                    # equal light tell; without such the error is that of as many strangers.
+                    scatter = error / value if repeat is None else repeat
+                    variance = (value * np.hypot(scatter, self._lamp_error)) ** 2
+                if what == "wings":
+                    variance += WING_ERROR**2
+                values.append(np.array([value]))
+                blocks.append(np.array([[max(variance, 1e-30)]]))
+                axes.add(1, Condition.of(exposure), what=what, light=light,
+                         flux=found["flux"][0], time=exposure.exposure_time or 0.0,
+                         background=self._backgrounds[exposure.number],
+                         exposure=exposure.number, hours=24.0 * (mjd - self._start))  # fmt: skip
+        return Channel("spot", np.concatenate(values), tuple(blocks), axes.columns(), "",
+                       fold)  # fmt: skip
+
+    def _flux_scatter(self) -> float | None:
+        """Relative scatter of the fluxes of exposures of equal light; None of too few."""
+        groups: dict[tuple, list[float]] = {}
+        for exposure, found, *_ in self._rows:
+            key = (Condition.of(exposure).key, exposure.exposure_time)
+            groups.setdefault(key, []).append(found["flux"][0] / (exposure.lamp or 1.0))
+        square, number = 0.0, 0
+        for fluxes in groups.values():
+            ratio = np.array(fluxes) / np.mean(fluxes)
+            square += float(((ratio - 1) ** 2).sum())
+            number += len(fluxes) - 1
+        return float(np.sqrt(square / number)) if number >= REPEATS else None
+
+    @property
+    def phases(self) -> list[FloatArray]:
+        """Centres of each exposure's spots within their pixels, shape (n, 2) [pixel].
+
+        In the order of the channels' exposures.
+        """
+        return [row[2] for fold in self._folds for row in self._rows if row[3] == fold]
+
+    @property
+    def neighbours(self) -> tuple[float, float]:
+        """Distance of the next spots [pixel], and how many of the four places hold one."""
+        if not self._grids:
+            return np.inf, 0.0
+        pitch, share = np.median(self._grids, axis=0)
+        return float(pitch), float(share)
+
+
+def _grid(spots: SpotList) -> tuple[float, float]:
+    """Pitch of a square grid of spots [pixel], and share of a spot's four neighbours there are."""
+    places = np.column_stack([spots.x, spots.y])
+    tree = cKDTree(places)
+    # The nearest but itself, and of a square grid four and their diagonals.
+    away, which = tree.query(places, k=min(9, len(places)))
+    pitch = float(np.median(away[:, 1]))
+    step = np.abs(places[which[:, 1:]] - places[:, None])
+    beside = (np.abs(away[:, 1:] - pitch) < 0.1 * pitch) & (step.min(-1) < 0.1 * pitch)
+    return pitch, float(beside.sum(1).mean() / 4)
+
+
+def _inside(spots: SpotList, shape: tuple[int, int], border: int) -> SpotList:
+    """Spots whose wide stamps lie inside."""
+    keep = (
+        (spots.x >= border) & (spots.x < shape[1] - border)
+        & (spots.y >= border) & (spots.y < shape[0] - border)
+    )  # fmt: skip
+    return SpotList(spots.x[keep], spots.y[keep], dict(spots.rejected))
+
+
+def _clipped_mean(values: FloatArray) -> FloatArray:
+    """Mean along the last axis without what is struck or a neighbour's light.
+
+    Not the median: of codes, some of which are too wide, it lies a tenth of one off.
+    """
+    middle = np.median(values, axis=-1, keepdims=True)
+    away = np.abs(values - middle)
+    # Of predictions, which have no noise, as much counts as in recordings.
+    usual = np.maximum(np.median(away, axis=-1, keepdims=True), QUIET)
+    near = away <= CLIP * usual
+    return np.asarray((values * near).sum(-1) / near.sum(-1))
+
+
+def stamp_moments(
+    stamps: FloatArray,
+    wide: FloatArray,
+    x: FloatArray,
+    y: FloatArray,
+) -> dict[str, FloatArray]:
+    """Flux, skewness along x and y, share of the flux in the wings, background, spot by spot.
+
+    Skewness: the third power of the distance from the fitted centre, with a Gaussian weight of
+    2 pixels, over the flux.  Wings: what lies in the wide stamp outside the fitted one.
+    """
+    size = stamps.shape[-1]
+    step = np.arange(size) - size // 2
+    rim = np.concatenate(
+        [
+            wide[:, [0, -1]].reshape(len(wide), -1),
+            wide[:, 1:-1, [0, -1]].reshape(len(wide), -1),
+        ],
+        axis=1,
+    )
+    background = _clipped_mean(rim)[:, None, None]
+    signal = stamps - background
+    dx, dy = step[None] - x[:, None], step[None] - y[:, None]
+    weight = np.exp(-(dx[:, None] ** 2 + dy[..., None] ** 2) / 8.0)
+    flux = (signal * weight).sum((1, 2))
+    total = (wide - background).sum((1, 2))
+    return {
+        "skew_x": (signal * weight * dx[:, None] ** 3).sum((1, 2)) / flux,
+        "skew_y": (signal * weight * dy[..., None] ** 3).sum((1, 2)) / flux,
+        "flux": total,
+        "background": background[:, 0, 0],
+        "wings": 1.0 - signal.sum((1, 2)) / total,
+    }

@@ -1,0 +1,1 @@
+"""Whether and where something is left: scans and matched filters at one false-alarm rate."""

@@ -1,0 +1,1 @@
+"""What explains what is left: effects of the library, or nonparametric terms."""

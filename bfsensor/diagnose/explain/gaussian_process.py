@@ -1,0 +1,114 @@
+"""Gaussian process over lag and level: what covariances of flats do, no law assumed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.explain.pursuit import Choice, Dictionary
+from bfsensor.diagnose.explain.terms import Family, Scene, Term, lag_family
+from bfsensor.typing import FloatArray
+
+KNOTS = 5
+"""Levels that the process is given at, evenly in the logarithm, straight between them."""
+
+UNIT = 1e-3
+"""Covariance over the level of a coefficient of 1."""
+
+SIZES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
+"""Tried for the process, in that unit."""
+
+RANGES = ((0.01, 1.0), (0.01, 3.0), (1.5, 1.0), (1.5, 3.0))
+"""Tried ranges of its correlation: in lags [pixel], and in the logarithm of the level."""
+
+
+def process_choice(scene: Scene) -> Choice | None:
+    """Fit the process by the likelihood of its size and ranges; its mean is one term.
+
+    Whatever the fit's parameters can do is projected out first: the process takes nothing from
+    them.  The score is twice the logarithm of the likelihood over that without it.
+    """
+    lags = lag_family(scene)
+    if lags is None:
+        return None
+    places = sorted({t.where["lags"][0] for t in lags.terms})
+    channels = [c for c in scene.model.fit.channels if c.word == "flat_cov"]
+    levels = np.concatenate([_level(scene, c) for c in channels])
+    knots = np.linspace(np.log(levels.min()), np.log(levels.max()), KNOTS)
+    terms = tuple(_terms(scene, places, knots))
+    d = Dictionary(Family("process", terms, ("flat_cov",)), scene.model.fit)
+    a = d.x.T @ d.x - d.u.T @ d.u
+    b = d.products(scene.model.fit.left)
+    distance = np.array(
+        [[np.hypot(p[0] - q[0], p[1] - q[1]) for q in places] for p in places]
+    )
+    steps = np.abs(knots[:, None] - knots)
+    best: tuple[float, FloatArray] | None = None
+    for near, wide in RANGES:
+        shape = np.kron(
+            np.exp(-0.5 * (distance / near) ** 2), np.exp(-0.5 * (steps / wide) ** 2)
+        )
+        root = np.linalg.cholesky(shape + 1e-6 * np.eye(len(shape)))
+        values, vectors = np.linalg.eigh(root.T @ a @ root)
+        turned = vectors.T @ (root.T @ b)
+        for size in SIZES:
+            spread = 1 + size**2 * np.maximum(values, 0)
+            score = float((size**2 * turned**2 / spread).sum() - np.log(spread).sum())
+            if best is None or score > best[0]:
+                mean = root @ (vectors @ (size**2 * turned / spread))
+                best = score, mean
+    if best is None or best[0] < d.critical:
+        return None
+    score, mean = best
+    template = np.sum([m * d.template(n) for n, m in enumerate(mean) if m], axis=0)
+    length = float(template @ template)
+    if not length:
+        return None
+    grid = mean.reshape(len(places), KNOTS)
+    farthest = np.argsort(-np.abs(grid).max(1))
+    largest = np.abs(grid).max()
+    told = [places[n] for n in farthest if np.abs(grid[n]).max() > 0.3 * largest]
+
+    def column(channel: Channel) -> FloatArray | None:
+        if channel.word != "flat_cov":
+            return None
+        parts = [m * t.column(channel) for m, t in zip(mean, terms, strict=True) if m]
+        return np.asarray(np.sum(parts, axis=0))
+
+    where = {"lags": told, "levels": np.exp(knots).tolist(), "values": grid.tolist()}
+    term = Term("smooth change of covariances", where, column)
+    whole = Family("smooth covariances over lag and level", (term,), ("flat_cov",))
+    chosen = Dictionary(whole, scene.model.fit).choose()
+    if chosen is None:
+        return None
+    return Choice(
+        whole, (term,), chosen.z, score - d.critical, chosen.select, chosen.template
+    )
+
+
+def _level(scene: Scene, channel: Channel) -> FloatArray:
+    x = channel.axes
+    return np.asarray(scene.gains[x["amp"].astype(int)] * x["level"])
+
+
+def _terms(
+    scene: Scene, places: list[tuple[int, int]], knots: FloatArray
+) -> Iterator[Term]:
+    def column(lag: tuple[int, int], k: int) -> Callable[[Channel], FloatArray | None]:
+        def change(channel: Channel) -> FloatArray | None:
+            if channel.word != "flat_cov":
+                return None
+            x = channel.axes
+            level = _level(scene, channel)
+            hat = np.interp(np.log(level), knots, np.eye(len(knots))[k])
+            gain = scene.gains[x["amp"].astype(int)]
+            here = (x["i"] == lag[0]) & (x["j"] == lag[1])
+            return np.where(here, UNIT * level * hat / gain**2, 0.0)
+
+        return change
+
+    for lag in places:
+        for k in range(len(knots)):
+            yield Term(f"{lag} {k}", {"lags": [lag]}, column(lag, k))

@@ -1,0 +1,330 @@
+"""Free-form models of what flats show against position, and of its power of the level."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.map_channels import RINGS, ring_modes
+from bfsensor.diagnose.explain.pursuit import Dictionary
+from bfsensor.diagnose.explain.terms import SCALE, Family, Scene, Term
+from bfsensor.diagnose.model.map_predictions import reduce_map
+from bfsensor.diagnose.model.map_shapes import Places
+from bfsensor.typing import FloatArray
+
+POWERS = (0, 1)
+"""Of the level, that relative patterns go with: additive ones go with -1, which few flats tell."""
+
+OCTAVES = 5
+"""Sizes of strips and boxes, from half of the side on."""
+
+PERIODS = 160
+"""Tried of ripples, evenly in frequency."""
+
+FINE = 61
+"""Tried of each between its neighbours."""
+
+FINEST, WIDE = 9, 4.0
+"""Tried with all that a ripple does, twice: over so many of those steps to either side, as the
+closed form leaks, and between neighbours of the best."""
+
+SHORTEST, LONGEST = 4.0, 100.0
+"""Period of ripples in readout time [pixel times]."""
+
+AXES = {"column": "x", "row": "y"}
+
+
+def share_powers(scene: Scene, p: int) -> dict[tuple[str, str], float]:
+    """By fold and map: how much of a pattern that goes with the level to the power p it has."""
+    measured = scene.model.predictor.measured
+    gain = float(np.mean(scene.gains)) / SCALE
+    return {
+        key: float(sum(s.weight * (gain * s.level) ** p for s in shares))
+        for key, shares in measured.maps.items()
+    }
+
+
+def pattern_column(
+    change: FloatArray, shares: Mapping[tuple[str, str], float], channel: Channel
+) -> FloatArray:
+    """What a relative change of flats does to columns, rows, blocks and the chess pattern.
+
+    Rings and texture, which go with its square, are left out.
+    """
+    out = np.zeros(len(channel))
+    x = channel.axes
+    linear = np.isin(x["what"], ("column", "row", "block", "chess"))
+    found: FloatArray | None = None
+    for name in dict.fromkeys(x["map"]):
+        rows = np.nonzero(linear & (x["map"] == name))[0]
+        share = shares.get((channel.fold, str(name)), 0.0)
+        if not share or not len(rows):
+            continue
+        axes = {k: v[rows] for k, v in x.items()}
+        # Maps have the same columns, rows and blocks, unless pixels lack.
+        if found is None or len(found) != len(rows):
+            found = reduce_map(change, axes)
+        out[rows] = share * found
+    return out
+
+
+def map_families(scene: Scene) -> list[Family]:
+    """Patterns of columns, rows and boxes; of two-pixel parity; ripples in readout time."""
+    if not any(c.word == "flat_map" for c in scene.model.fit.channels):
+        return []
+    kinds: list[tuple[str, dict[str, Any], dict[tuple[str, str], float]]] = [
+        (f" x S^{p}" if p else "", {"power": p}, share_powers(scene, p)) for p in POWERS
+    ]
+    names = {name for _, name in scene.model.predictor.measured.maps} - {"all", "short"}
+    kinds += [
+        (f" at {name}", {"condition": name}, {(f, name): 1.0 for f in ("fit", "held-out")})
+        for name in sorted(names)
+    ]
+    out: list[Family] = []
+    for label, told, shares in kinds:
+        places: list[Term] = []
+        for name, where, along, what in _shapes(scene):
+            column = partial(_separable, scene, along, shares)
+            image = partial(np.outer, along[1], along[0])
+            more = (_squared(name + label, image, shares),) if what == "box" else ()
+            places.append(Term(name + label, {**where, **told}, column, more=more))
+        out.append(Family("pattern of position", tuple(places), ("flat_map",)))
+    parity = [
+        Term(
+            name + label, {**where, **told}, partial(_pattern, image, shares),
+            more=(_squared(name + label, image, shares),),
+        )
+        for label, told, shares in kinds[: len(POWERS)] for name, where, image in _parities(scene)
+    ]  # fmt: skip
+    ripples = [_ripple(scene, f) for f in np.linspace(1 / LONGEST, 1 / SHORTEST, PERIODS)]
+    out.append(Family("pattern of two-pixel parity", tuple(parity), ("flat_map",)))
+    out.append(Family("ripple in readout time", tuple(ripples), ("flat_map",)))
+    return out
+
+
+def refine_ripple(scene: Scene, term: Term) -> Family:
+    """The ripple of the frequency near one's that fits best, down to what the texture resolves.
+
+    One alone: beside it a neighbour would share its amplitude.
+    """
+    step = (1 / SHORTEST - 1 / LONGEST) / (PERIODS - 1)
+    for count, rough, wider in (
+        (FINE, True, 1.0),
+        (FINEST, False, WIDE),
+        (FINEST, False, 1.0),
+    ):
+        step *= wider
+        middle = 1 / term.where["period"]
+        near = [_ripple(scene, middle + d) for d in np.linspace(-1, 1, count) * step]
+        near = near if rough else [replace(t, rough=None) for t in near]
+        family = Family("ripple in readout time", tuple(near), ("flat_map",))
+        d = Dictionary(family, scene.model.fit)
+        b = d.products(scene.model.fit.left)
+        gain = np.where(d.free > 0, b / np.sqrt(np.where(d.free > 0, d.free, 1.0)), -np.inf)
+        term = near[int(np.argmax(gain))]
+        step *= 2 / (count - 1)
+    return replace(family, terms=(term,), tried=PERIODS)
+
+
+def _pattern(
+    image: Callable[[], FloatArray],
+    shares: Mapping[tuple[str, str], float],
+    channel: Channel,
+) -> FloatArray | None:
+    """Column of a pattern given as an image."""
+    return pattern_column(image(), shares, channel) if channel.word == "flat_map" else None
+
+
+def _squared(
+    name: str, image: Callable[[], FloatArray], shares: Mapping[tuple[str, str], float]
+) -> Term:
+    """What a pattern does to rings and texture, which go with its square."""
+
+    def column(channel: Channel) -> FloatArray | None:
+        if channel.word != "flat_map":
+            return None
+        out = np.zeros(len(channel))
+        square = np.isin(channel.axes["what"], ("ring", "texture"))
+        for label in dict.fromkeys(channel.axes["map"]):
+            rows = np.nonzero(square & (channel.axes["map"] == label))[0]
+            share = shares.get((channel.fold, str(label)), 0.0)
+            if share and len(rows):
+                axes = {k: v[rows] for k, v in channel.axes.items()}
+                out[rows] = share**2 * reduce_map(image(), axes)
+        return out
+
+    return Term(f"square of {name}", {"square": True}, column)
+
+
+def _parities(
+    scene: Scene,
+) -> Iterator[tuple[str, dict[str, Any], Callable[[], FloatArray]]]:
+    """Odd and even columns, rows and both, on the sensor; columns as they are read out."""
+    layout = scene.model.predictor.layout
+
+    def image(by_x: int, by_y: int, read: bool) -> FloatArray:
+        y, x = np.indices(layout.shape)
+        if read:
+            for s in layout.segments:
+                own = np.s_[s.y : s.y + s.rows, s.x : s.x + s.columns]
+                column, row = x[own] - s.x, y[own] - s.y
+                x[own] = s.columns - 1 - column if s.flip_x else column
+                y[own] = s.rows - 1 - row if s.flip_y else row
+        return np.asarray(0.5 - (by_x * x + by_y * y) % 2)
+
+    mirrored = any(s.flip_x or s.flip_y for s in layout.segments)
+    for by_x, by_y, word in (
+        (1, 0, "odd and even columns"), (0, 1, "odd and even rows"), (1, 1, "checkerboard")
+    ):  # fmt: skip
+        yield word, {"parity": word}, partial(image, by_x, by_y, False)
+        if mirrored:
+            told = f"{word} in readout order"
+            yield told, {"parity": told}, partial(image, by_x, by_y, True)
+
+
+def _shapes(
+    scene: Scene,
+) -> Iterator[tuple[str, dict[str, Any], tuple[FloatArray, FloatArray], str]]:
+    """Separable shapes: name, where, their values along x and y, and what they are of."""
+    ny, nx = scene.model.predictor.layout.shape
+    for what, n in (("column", nx), ("row", ny)):
+        axis = AXES[what]
+        place = np.arange(n)
+
+        def both(v: FloatArray, what: str = what) -> tuple[FloatArray, FloatArray]:
+            return (v, np.ones(ny)) if what == "column" else (np.ones(nx), v)
+
+        for one in range(n):
+            yield f"{what} {one}", {axis: (one, one + 1)}, both(1.0 * (place == one)), what
+        for octave in range(1, OCTAVES + 1):
+            width = n / 2**octave
+            for k in range(2 ** (octave + 1) - 1):
+                low, high = int(0.5 * k * width), int(np.ceil((0.5 * k + 1) * width))
+                strip = ((place >= low) & (place < high)).astype(np.float64)
+                yield f"{what}s {low} to {high}", {axis: (low, high)}, both(strip), what
+        for length in (2.0, 6.0, 15.0):
+            for side, distance in (("low", place), ("high", n - 1 - place)):
+                where = {
+                    axis: (0, int(3 * length))
+                    if side == "low"
+                    else (n - int(3 * length), n)
+                }
+                name = f"{what}s at the {side} end, exp(-d/{length:g})"
+                yield (
+                    name,
+                    where,
+                    both(np.asarray(np.exp(-distance / length), np.float64)),
+                    what,
+                )
+        for cycles in range(3, n // 4):
+            phase = 2 * np.pi * cycles * (place + 0.5) / n
+            for part, word in ((np.cos, "cosine"), (np.sin, "sine")):
+                told = {"period": n / cycles, "along": axis}
+                yield (
+                    f"{word} along {axis} of {n / cycles:.3g} pixels",
+                    told,
+                    both(part(phase)),
+                    what,
+                )
+    for octave in range(1, 4):
+        wide, tall = nx / 2**octave, ny / 2**octave
+        for a in range(2**octave):
+            for b in range(2**octave):
+                x, y = (
+                    (int(a * wide), int((a + 1) * wide)),
+                    (int(b * tall), int((b + 1) * tall)),
+                )
+                v, w = np.zeros(nx), np.zeros(ny)
+                v[slice(*x)], w[slice(*y)] = 1.0, 1.0
+                yield f"box {x}, {y}", {"x": x, "y": y}, (v, w), "box"
+
+
+def _places(
+    scene: Scene, channel: Channel
+) -> tuple[Places, NDArray[np.str_], NDArray[np.int64]]:
+    """Where a channel's values belong, names of its maps and which of them each is of; kept."""
+    kept = scene.kept.get(("maps", id(channel)))
+    if kept is None or kept[0] is not channel:
+        places = Places.of(channel.axes, scene.model.predictor.layout.shape)
+        found = places, *np.unique(channel.axes["map"], return_inverse=True)
+        kept = scene.kept["maps", id(channel)] = channel, found
+    return kept[1]
+
+
+def _separable(
+    scene: Scene,
+    along: tuple[FloatArray, FloatArray],
+    shares: Mapping[tuple[str, str], float],
+    channel: Channel,
+) -> FloatArray | None:
+    """Column of a product of a function of x and one of y, without making the image."""
+    if channel.word != "flat_map":
+        return None
+    places, names, maps = _places(scene, channel)
+    out = places.product(*along, len(channel))
+    factor = np.array([shares.get((channel.fold, str(n)), 0.0) for n in names])
+    return np.asarray(out * factor[maps])
+
+
+def _ripple(scene: Scene, frequency: float) -> Term:
+    """Sine of the readout time, the same in all frames; its coefficient is the square of its size.
+
+    Relative to the signal: ratios of maps do not show it.
+    """
+    return Term(
+        f"ripple of {1 / frequency:.4g} pixel times", {"period": 1 / frequency},
+        partial(_ripple_column, scene, frequency), partial(_ripple_rough, scene, frequency),
+    )  # fmt: skip
+
+
+def _ripple_column(scene: Scene, frequency: float, channel: Channel) -> FloatArray | None:
+    if channel.word != "flat_map":
+        return None
+    layout = scene.model.predictor.layout
+    image = np.zeros(layout.shape)
+    for s in layout.segments:
+        width = s.prescan + s.columns + s.serial_overscan
+        row, column = np.indices((s.rows, s.columns))
+        wave = np.sin(2 * np.pi * frequency * (row * width + s.prescan + column))
+        wave = wave[::-1] if s.flip_y else wave
+        image[s.y : s.y + s.rows, s.x : s.x + s.columns] = (
+            wave[:, ::-1] if s.flip_x else wave
+        )
+    own = (channel.axes["map"] == "all") & np.isin(
+        channel.axes["what"], ("ring", "texture")
+    )
+    out = np.zeros(len(channel))
+    out[own] = reduce_map(image, {k: v[own] for k, v in channel.axes.items()})
+    return 1e-6 * out
+
+
+def _ripple_rough(scene: Scene, frequency: float, channel: Channel) -> FloatArray | None:
+    """The same in closed form, what leaks into other rings left out."""
+    if channel.word != "flat_map":
+        return None
+    x = channel.axes
+    layout = scene.model.predictor.layout
+    out = np.zeros(len(channel))
+    texture, ring = ((x["map"] == "all") & (x["what"] == w) for w in ("texture", "ring"))
+    rings = (np.round(x["k"][ring] * 2 * RINGS - 0.5)).astype(int)
+    power = np.zeros(RINGS + 1)
+    modes = ring_modes(layout.shape)
+    pixels = layout.shape[0] * layout.shape[1]
+    for s in layout.segments:
+        share = s.rows * s.columns / pixels
+        width = s.prescan + s.columns + s.serial_overscan
+        way = (-1 if s.flip_x else 1) * (-1 if s.flip_y else 1)
+        lag = x["x"][texture] * way + x["y"][texture] * width
+        out[texture] += 0.5 * share * np.cos(2 * np.pi * frequency * lag)
+        down = abs((frequency * width + 0.5) % 1 - 0.5)
+        place = min(int(np.hypot(frequency, down) * 2 * RINGS), RINGS)
+        if place < RINGS:
+            power[place] += 0.25 * share * pixels / max(modes[place], 1)
+    out[ring] = power[rings]
+    return out

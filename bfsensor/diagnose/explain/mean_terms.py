@@ -1,0 +1,211 @@
+"""Free-form models of the mean of flats: by level, in time, by the exposure before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.explain.pursuit import Choice, Dictionary
+from bfsensor.diagnose.explain.terms import SCALE, Family, Scene, Term
+from bfsensor.typing import FloatArray
+
+LEVEL_POWERS = (1, 2, 3, 4)
+"""Of the relative change of the mean with the level."""
+
+CURVES = 5
+"""Highest order of the polynomial in time."""
+
+CYCLES, CYCLE_STEP = 10, 0.25
+"""Most waves over the campaign, and between one number of them that is tried and the next."""
+
+EIGHTHS = range(4)
+"""Phases of a wave that are tried, in eighths of it: the other half has the other sign."""
+
+PERIODS = 41
+"""Tried of the best wave, from the one before to the one after."""
+
+
+def mean_families(scene: Scene) -> list[Family]:
+    """Means of flats, and fluxes of spots: by level, in time, by the exposure before."""
+    flats = [c for c in scene.model.fit.channels if c.word == "flat_mean"]
+    if not flats:
+        return []
+    out = [Family("mean by level", tuple(_by_level(scene, flats)), ("flat_mean",))]
+    shots = scene.model.predictor.measured.shots
+    hours = {s.number: s.hours for s in shots}
+    if len(set(hours.values())) < len(hours):
+        # Without times of their own exposures follow one another evenly.
+        hours = {s.number: float(n) for n, s in enumerate(shots)}
+    if hours:
+        terms = tuple(_in_time(flats, hours, len(scene.gains)))
+        out.append(Family("mean in time", terms, ("flat_mean",)))
+        terms = tuple(_after_exposure(scene))
+        out.append(Family("mean by the exposure before", terms, ("flat_mean",)))
+    return out
+
+
+Times = Callable[[Channel], FloatArray]
+"""Hours since the first flat of all values of a channel."""
+
+
+def _relative(
+    name: str,
+    where: Mapping[str, Any],
+    change: Callable[[Channel], FloatArray],
+    *,
+    spots: bool = True,
+) -> Term:
+    """Term that multiplies means of flats, and of spots the flux."""
+
+    def column(channel: Channel) -> FloatArray | None:
+        x = channel.axes
+        if channel.word == "flat_mean":
+            return np.asarray(x["level"] * change(channel))
+        if channel.word == "spot" and spots:
+            return np.where(x["what"] == "flux", x["flux"] * change(channel), 0.0)
+        return None
+
+    return Term(name, where, column)
+
+
+def _by_level(scene: Scene, flats: list[Channel]) -> Iterator[Term]:
+    """Powers of the level, and single levels, of all amplifiers and of each."""
+    times = np.unique(np.concatenate([c.axes["time"] for c in flats]))
+
+    def own(channel: Channel, amp: int | None) -> FloatArray:
+        return np.where(amp is None or channel.axes["amp"] == amp, 1.0, 0.0)
+
+    def power(p: int, amp: int | None) -> Callable[[Channel], FloatArray]:
+        def change(c: Channel) -> FloatArray:
+            level = scene.gains[c.axes["amp"].astype(int)] * c.axes["level"]
+            return np.asarray(own(c, amp) * (level / SCALE) ** p)
+
+        return change
+
+    def single(time: float, amp: int | None) -> Callable[[Channel], FloatArray]:
+        return lambda c: own(c, amp) * (c.axes["time"] == time)
+
+    for amp, label in _amplifiers(scene):
+        for p in LEVEL_POWERS:
+            yield _relative(
+                f"mean x S^{p}{label}", {"power": p, "amp": amp}, power(p, amp), spots=False
+            )
+        for time in times if len(times) > 3 else ():
+            level = np.concatenate([c.axes["level"][c.axes["time"] == time] for c in flats])
+            told = {"level": float(level.mean() * scene.gains.mean()), "amp": amp}
+            yield _relative(
+                f"mean at {time:g} s{label}", told, single(float(time), amp), spots=False
+            )
+
+
+def _amplifiers(scene: Scene) -> list[tuple[int | None, str]]:
+    """All amplifiers together, and each."""
+    count = len(scene.gains)
+    each = [(n, f", amplifier {n + 1}") for n in range(count)] if count > 1 else []
+    return [(None, ""), *each]
+
+
+def _in_time(flats: list[Channel], hours: dict[int, float], count: int) -> Iterator[Term]:
+    """Polynomials, waves and steps in time."""
+    taken = np.unique(np.concatenate([c.axes["exposure"] for c in flats]))
+    first, last = hours[int(taken[0])], hours[int(taken[-1])]
+    span = max(last - first, 1e-9)
+
+    def at(channel: Channel) -> FloatArray:
+        # Of exposures that were not taken nothing is known: the campaign's middle.
+        there = [hours.get(int(n), first + span / 2) for n in channel.axes["exposure"]]
+        return np.array(there) - first
+
+    def curve(p: int) -> Callable[[Channel], FloatArray]:
+        return lambda c: np.polynomial.legendre.Legendre.basis(p)(2 * at(c) / span - 1)
+
+    def step(number: int) -> Callable[[Channel], FloatArray]:
+        return lambda c: np.where(c.axes["exposure"] >= number, 1.0, 0.0)
+
+    for p in range(1, CURVES + 1):
+        yield _relative(f"mean, order {p} in time", {"order": p}, curve(p))
+    most = min(CYCLES, len(taken) // 6)
+    for cycles in np.arange(1, most + CYCLE_STEP, CYCLE_STEP):
+        for eighth in EIGHTHS:
+            yield _wave(at, span, span / cycles, eighth * np.pi / 4)
+    for number in taken[2:-1:2]:
+        yield _relative(
+            f"mean from exposure {int(number)}",
+            {"exposure": int(number)},
+            step(int(number)),
+        )
+
+
+def _wave(at: Times, span: float, period: float, phase: float) -> Term:
+    """One wave of the mean, as a cosine from the first flat on."""
+
+    def change(c: Channel) -> FloatArray:
+        return np.asarray(np.cos(2 * np.pi * at(c) / period - phase))
+
+    told = {"period": period, "phase": phase, "wave": (at, span)}
+    late = f", {np.degrees(phase) % 360:.0f} degrees late" if phase else ""
+    return _relative(f"mean, wave of {period:.3g} h{late}", told, change)
+
+
+def refine_wave(choice: Choice, scene: Scene) -> Choice:
+    """Choose again with the period and the phase that fit best in place of the first wave.
+
+    What is left of its phase is a coefficient of its own.
+    """
+    first = choice.terms[0]
+    if "wave" not in first.where:
+        return choice
+    fit = scene.model.fit
+    at, span = first.where["wave"]
+    cycles = span / first.where["period"]
+    best = (-np.inf, 0.0, 0.0, 0.0)
+    for n in np.linspace(cycles - CYCLE_STEP, cycles + CYCLE_STEP, PERIODS):
+        pair = tuple(_wave(at, span, span / n, phase) for phase in (0.0, np.pi / 2))
+        d = Dictionary(replace(choice.family, terms=pair), fit)
+        c = np.linalg.lstsq(
+            d.x.T @ d.x - d.u.T @ d.u, b := d.products(fit.left), rcond=1e-6
+        )[0]
+        best = max(best, (float(b @ c), n, float(c[0]), float(c[1])))
+    _, n, cosine, sine = best
+    phase = float(np.arctan2(sine, cosine))
+    quarter = replace(_wave(at, span, span / n, phase + np.pi / 2), where={"quarter": True})
+    wave = replace(_wave(at, span, span / n, phase), more=(quarter,))
+    others = [
+        t for t in choice.family.terms
+        if "wave" not in t.where or abs(span / t.where["period"] - n) > 1
+    ]  # fmt: skip
+    family = replace(choice.family, terms=(wave, *others), tried=len(choice.family.terms))
+    return Dictionary(family, fit).choose() or choice
+
+
+def _after_exposure(scene: Scene) -> Iterator[Term]:
+    """Powers of the mean level of the exposure before; what that was where one is missing."""
+    measured = scene.model.predictor.measured
+    # Levels of exposures are by rough gains.
+    scale = float(np.mean(scene.gains) / np.mean(measured.gains))
+    before: dict[int, float] = {}
+    known: dict[int, bool] = {}
+    last = None
+    for shot in measured.shots:
+        before[shot.number] = 0.0 if last is None else scale * last.level / SCALE
+        known[shot.number] = last is None or last.number == shot.number - 1
+        last = shot
+
+    def power(p: int) -> Callable[[Channel], FloatArray]:
+        def change(c: Channel) -> FloatArray:
+            numbers = [int(n) for n in c.axes["exposure"]]
+            return np.array([before[n] ** p if known.get(n) else 0.0 for n in numbers])
+
+        return change
+
+    def missing(c: Channel) -> FloatArray:
+        return np.array([0.0 if known.get(int(n)) else 1.0 for n in c.axes["exposure"]])
+
+    for p in (1, 2):
+        yield _relative(f"mean x S^{p} of the exposure before", {"power": p}, power(p))
+    if not all(known.values()):
+        yield _relative("mean after exposures not given", {"missing": True}, missing)

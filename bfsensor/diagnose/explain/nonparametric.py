@@ -1,0 +1,374 @@
+"""Free-form models of what no effect of the library explains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.detect.candidate_screen import Rival
+from bfsensor.diagnose.detect.locate import Mismatch, locate_mismatch
+from bfsensor.diagnose.detect.model_error import explained_by_word, stands_out
+from bfsensor.diagnose.explain.edge_terms import kernel_families
+from bfsensor.diagnose.explain.gaussian_process import process_choice
+from bfsensor.diagnose.explain.map_terms import map_families, refine_ripple
+from bfsensor.diagnose.explain.mean_terms import mean_families, refine_wave
+from bfsensor.diagnose.explain.pursuit import Choice, Dictionary
+from bfsensor.diagnose.explain.readout_terms import filter_family
+from bfsensor.diagnose.explain.shift_constraints import test_constraints
+from bfsensor.diagnose.explain.terms import Family, Scene, Term, lag_family
+from bfsensor.diagnose.fit.baseline_fit import BaselineFit
+from bfsensor.diagnose.fit.fitted_model import Model, compare_held_out
+from bfsensor.typing import FloatArray
+
+MOST_GROUPS = 3
+"""Free-form models that are put together."""
+
+SHORTLIST = 8
+"""Terms of the shifts that are looked at in spots as well."""
+
+PREFIX = "free "
+"""Of the names of coefficients among the fit's parameters."""
+
+FILTER = "readout filter"
+WITH_TESTS = (
+    "boundary shifts", "odd boundary shifts", "covariances by lag",
+    "smooth covariances over lag and level",
+)  # fmt: skip
+"""Groups that are held against what physics asks of shifts."""
+
+HIDDEN = ("edges", "wave")
+"""What terms keep to be made again."""
+
+By = dict[str, tuple[float, float, int]]
+"""Chi-square before and after, and number of values, by channel."""
+
+
+@dataclass(frozen=True, eq=False)
+class Coefficient:
+    """One number of a free-form model.
+
+    Attributes
+    ----------
+    name : str
+        Of its term.
+    value, error : float
+        In the unit of the term: see the module of its group.
+    where : mapping
+        What the term stands for.
+    """
+
+    name: str
+    value: float
+    error: float
+    where: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class OpenWorld:
+    """A free-form model of what is outside the library.
+
+    Attributes
+    ----------
+    groups : tuple of str
+        Which of the models were needed, the one that explains most first.
+    coefficients : tuple of Coefficient
+        Refitted together with all else, without any penalty.
+    by_group : mapping of str to tuple of str
+        Names of each group's coefficients.
+    folds : mapping of str to dict
+        By fold ('fit', 'select', 'held-out'): chi-square before and after, and number of
+        values, by channel; before is without the free-form model.
+    scores : mapping of str to float
+        Of the groups that competed: decrease of the chi-square less what chance gives.
+    tests : mapping of str to mapping
+        Constraints: 'p_value', and 'value' with 'error' where there is one.
+    nearest : tuple of (str, float)
+        Candidates of the library with the angle [degrees] between what they and this change.
+    alike : mapping of str to tuple of (str, float)
+        By group: terms that explain as much in the place of its first, with their coefficients.
+    mismatch : Mismatch
+        What is left with it.
+    """
+
+    groups: tuple[str, ...]
+    coefficients: tuple[Coefficient, ...]
+    by_group: Mapping[str, tuple[str, ...]]
+    folds: Mapping[str, By]
+    scores: Mapping[str, float]
+    tests: Mapping[str, Mapping[str, float]]
+    nearest: tuple[tuple[str, float], ...]
+    alike: Mapping[str, tuple[tuple[str, float], ...]]
+    mismatch: Mismatch
+
+    @property
+    def group(self) -> str:
+        """The one that explains most."""
+        return self.groups[0]
+
+    def of_group(self, group: str) -> list[Coefficient]:
+        """Coefficients of one group."""
+        names = self.by_group[group]
+        return [c for c in self.coefficients if c.name in names]
+
+    def chi2dof(self, fold: str = "held-out") -> tuple[float, float]:
+        """Chi-square per value of a fold, before and after; nan where it is empty."""
+        held = self.folds.get(fold, {})
+        n = sum(v[2] for v in held.values())
+        if not n:
+            return np.nan, np.nan
+        return sum(v[0] for v in held.values()) / n, sum(v[1] for v in held.values()) / n
+
+
+def explain_outside(
+    base: Model,
+    mismatch: Mismatch,
+    rivals: Sequence[Rival] = (),
+    *,
+    free: FreeFit | None = None,
+    seed: int = 1,
+) -> tuple[OpenWorld, Model] | None:
+    """Model freely what nothing of the library explains; None where no free form does.
+
+    Parameters
+    ----------
+    base : Model
+        With those effects that stay.
+    mismatch : Mismatch
+        What it leaves.
+    rivals : sequence of Rival
+        Candidates of the library, screened against the same fit, for the nearest of them.
+    free : FreeFit, optional
+        Of the same, if it is there already.
+    seed : int
+        Of the noise that p-values come from.
+
+    Returns
+    -------
+    OpenWorld
+    Model
+        With it.
+    """
+    free = fit_free_form(base, mismatch, seed=seed) if free is None else free
+    if not free.choices:
+        return None
+    fit = free.model.fit
+    relative = _gain_error(fit)
+    values = dict(zip(fit.names, zip(fit.values, fit.errors, strict=True), strict=True))
+    coefficients: list[Coefficient] = []
+    members: dict[str, tuple[str, ...]] = {}
+    found: list[tuple[Term, float]] = []
+    for choice in free.choices:
+        names = []
+        for term in [each for t in choice.terms for each in (t, *t.more)]:
+            if PREFIX + term.name not in values:
+                continue
+            value, error = (float(v) for v in values[PREFIX + term.name])
+            if choice.family.group == FILTER:
+                # Coefficients are fitted at the gains that came out.
+                error = float(np.hypot(error, abs(value) * relative))
+            coefficients.append(Coefficient(term.name, value, error, _plain(term.where)))
+            names.append(term.name)
+            found.append((term, value))
+        members[choice.family.group] = tuple(
+            dict.fromkeys([*members.get(choice.family.group, ()), *names])
+        )
+    seen = {c.word for c in fit.channels}
+    kernel = any(g in WITH_TESTS for g in members)
+    tests = (
+        test_constraints(free.model, dict(found))
+        if kernel and seen & {"flat_cov", "spot"}
+        else {}
+    )
+    folds = compare_folds(base, free.model)
+    nearest = nearest_of(free.choices[0].template, rivals)
+    groups = tuple(dict.fromkeys(c.family.group for c in free.choices))
+    out = OpenWorld(
+        groups, tuple(coefficients), members, folds, free.scores, tests, tuple(nearest[:5]),
+        {c.family.group: tuple((t.name, v) for t, v in c.alike) for c in free.choices},
+        free.mismatch,
+    )  # fmt: skip
+    return out, free.model
+
+
+def _gain_error(fit: BaselineFit) -> float:
+    """Relative error of the gains."""
+    own = [
+        e / v
+        for n, v, e in zip(fit.names, fit.values, fit.errors, strict=True)
+        if n.startswith("gain ")
+    ]
+    return float(np.mean(own)) if own else 0.0
+
+
+def _plain(where: Mapping[str, Any]) -> dict[str, Any]:
+    """What a report can hold: without kernels."""
+    return {
+        k: v for k, v in where.items() if not isinstance(v, np.ndarray) and k not in HIDDEN
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class FreeFit:
+    """A model with the columns of free-form terms, and how they were found."""
+
+    model: Model
+    choices: tuple[Choice, ...]
+    scores: Mapping[str, float]
+    mismatch: Mismatch
+    first: Choice | None = None
+
+    @property
+    def penalty(self) -> float:
+        """What chance would have given: chi-square that does not count as explained."""
+        gain = sum(z * z for c in self.choices for z in c.z)
+        return float(gain - sum(c.score for c in self.choices))
+
+
+def fit_free_form(
+    model: Model, mismatch: Mismatch, *, before: BaselineFit | None = None, seed: int = 1
+) -> FreeFit:
+    """Choose the free-form model that explains most, refit all, and so on while something counts.
+
+    Parameters
+    ----------
+    model : Model
+        With effects that stay, or without.
+    mismatch : Mismatch
+        What it leaves.
+    before : BaselineFit, optional
+        Without effects: of what these explain a small part may be left; by default the model's.
+    seed : int
+        Of the noise that p-values come from.
+    """
+    before = model.fit if before is None else before
+    choices: list[Choice] = []
+    scores: dict[str, float] = {}
+    while stands_out(
+        mismatch, explained_by_word(before, model.fit),
+        fits=len(model.effects) + sum(len(c.terms) for c in choices),
+    ):  # fmt: skip
+        if len(choices) == MOST_GROUPS:
+            break
+        found = compete(Scene(model), mismatch)
+        if not found:
+            break
+        if not choices:
+            scores = {c.family.group: c.score for c in reversed(found)}
+        best = found[0]
+        taken = {t.name for c in choices for t in c.terms}
+        terms = [t for t in best.terms if t.name not in taken]
+        if not terms:
+            break
+        model = model.with_columns(Columns(terms))
+        choices.append(best)
+        mismatch = locate_mismatch(model.fit, seed=seed)
+    return FreeFit(model, tuple(choices), scores, mismatch, choices[0] if choices else None)
+
+
+class Columns:
+    """Columns of terms as the predictor takes them; each is made once a channel."""
+
+    def __init__(self, terms: Sequence[Term]) -> None:
+        self.terms = tuple(each for t in terms for each in (t, *t.more))
+        self._kept: dict[int, tuple[Channel, dict[str, FloatArray]]] = {}
+
+    def __call__(self, channel: Channel) -> dict[str, FloatArray]:
+        """Columns of a channel by name."""
+        kept = self._kept.get(id(channel))
+        if kept is None or kept[0] is not channel:
+            found = {PREFIX + t.name: t.column(channel) for t in self.terms}
+            there = {k: v for k, v in found.items() if v is not None}
+            kept = self._kept[id(channel)] = channel, there
+        return kept[1]
+
+
+def compete(scene: Scene, mismatch: Mismatch) -> list[Choice]:
+    """Choices of all families that what is left concerns, the best first."""
+    words = {f.word for f in mismatch.findings}
+    fit = scene.model.fit
+    out: list[Choice] = []
+    for family in _families(scene, words):
+        positive = family.group == "ripple in readout time"
+        choice = Dictionary(family, fit).choose(positive=positive)
+        if choice is None:
+            continue
+        if family.group == "boundary shifts":
+            choice = _with_spots(choice, fit) or choice
+        if positive:
+            refined = refine_ripple(scene, choice.terms[0])
+            choice = Dictionary(refined, fit).choose(positive=True)
+        if choice is not None and family.group == "mean in time":
+            choice = refine_wave(choice, scene)
+        if choice is not None:
+            out.append(choice)
+    if "flat_cov" in words and (process := process_choice(scene)) is not None:
+        out.append(process)
+    return sorted(out, key=lambda c: -c.score)
+
+
+def _families(scene: Scene, words: set[str]) -> list[Family]:
+    """Families that see any of the channels that stand out."""
+    out: list[Family] = []
+    if words & {"flat_cov", "spot"}:
+        out += kernel_families(scene, spots="spot" in words)
+    if words & {"serial_overscan", "flat_cov"}:
+        found = filter_family(scene)
+        out += [found] if found else []
+    if "flat_map" in words:
+        out += map_families(scene)
+    if words & {"flat_mean", "spot"}:
+        out += mean_families(scene)
+    if "flat_cov" in words:
+        lags = lag_family(scene)
+        out += [lags] if lags else []
+    return out
+
+
+def _with_spots(choice: Choice, fit: BaselineFit) -> Choice | None:
+    """Choose again among the nearest terms, spots in view."""
+    if not any(c.word == "spot" for c in fit.channels):
+        return None
+    rough = Dictionary(choice.family, fit)
+    z = np.abs(rough.products(fit.left)) / np.sqrt(
+        np.where(rough.free > 0, rough.free, np.inf)
+    )
+    names = {t.name for t in choice.terms}
+    order = [choice.family.terms[n] for n in np.argsort(-z)]
+    short = [*choice.terms, *(t for t in order if t.name not in names)][:SHORTLIST]
+    full = tuple(replace(t, rough=None) for t in short)
+    return Dictionary(Family(choice.family.group, full, ("flat_cov", "spot")), fit).choose()
+
+
+def nearest_of(template: FloatArray, rivals: Sequence[Rival]) -> list[tuple[str, float]]:
+    """Angles [degrees] between a template and those of candidates, nearest first."""
+    out = []
+    for rival in rivals:
+        if rival.template.shape != template.shape:
+            continue
+        norm = np.sqrt(float(rival.template @ rival.template) * float(template @ template))
+        if norm > 0:
+            cosine = abs(float(rival.template @ template)) / norm
+            out.append((rival.effect.name, float(np.degrees(np.arccos(min(cosine, 1.0))))))
+    return sorted(out, key=lambda t: t[1])
+
+
+def compare_folds(before: Model, after: Model) -> dict[str, By]:
+    """Chi-squares before and after by fold and channel."""
+    out: dict[str, By] = {"held-out": compare_held_out(before, after)}
+    for n, channel in enumerate(after.fit.channels):
+        rows = slice(int(after.fit.starts[n]), int(after.fit.starts[n + 1]))
+        squares = [
+            float(m.fit.residuals[rows] @ m.fit.residuals[rows]) for m in (before, after)
+        ]
+        held = out.setdefault(channel.fold, {})
+        old = held.get(channel.word, (0.0, 0.0, 0))
+        held[channel.word] = (
+            old[0] + squares[0],
+            old[1] + squares[1],
+            old[2] + len(channel),
+        )
+    return out

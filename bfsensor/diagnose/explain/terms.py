@@ -1,0 +1,214 @@
+"""Terms that free-form models are made of: what they see, and covariances by lag."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
+from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.diagnose.fit.fitted_model import Model
+from bfsensor.diagnose.model.effect_parameters import fitted
+from bfsensor.diagnose.model.flat_predictions import flat_response, periodic_covariances
+from bfsensor.effects.effect import Effect
+from bfsensor.typing import FloatArray
+
+SCALE = 1e5
+"""Signal [e-] that coefficients of powers of it are given at."""
+
+LAG_POWERS = (0, 1, 2, 3)
+"""Of the covariances at one lag with the level."""
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """One column of a free-form model.
+
+    Attributes
+    ----------
+    name : str
+        Of the coefficient.
+    where : mapping
+        What it stands for, for words: 'lag', 'power', 'period', ...
+    column : callable
+        Gives the change of a channel for a coefficient of 1, in its unit; None where there is none.
+    rough : callable, optional
+        The same, quicker, good enough to be searched with.
+    more : tuple of Term
+        What goes with it beyond the first order, each with a coefficient of its own.
+    simple : bool
+        Taken before others that explain as much.
+    """
+
+    name: str
+    where: Mapping[str, Any]
+    column: Callable[[Channel], FloatArray | None]
+    rough: Callable[[Channel], FloatArray | None] | None = None
+    more: tuple[Term, ...] = ()
+    simple: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """Terms of one kind, among which a few are chosen.
+
+    Attributes
+    ----------
+    group : str
+        Which of the free-form models.
+    terms : tuple of Term
+    words : tuple of str
+        Channels that the search looks at; the fit looks at all.
+    tried : int
+        Terms that these were chosen from before, if more than there are.
+    """
+
+    group: str
+    terms: tuple[Term, ...]
+    words: tuple[str, ...]
+    tried: int = 0
+
+
+class Flats(NamedTuple):
+    """Flats of one condition in a channel of covariances.
+
+    ``rows`` of the channel; ``flat``: which of the flats each belongs to; ``gain`` [e-/ADU],
+    ``level`` [e-], changes of areas ``a`` [1/e-] and covariances ``c`` [e-^2] at all lags of a
+    periodic array, by flat.
+    """
+
+    condition: Condition
+    rows: NDArray[np.int64]
+    flat: NDArray[np.int64]
+    gain: FloatArray
+    level: FloatArray
+    a: FloatArray
+    c: FloatArray
+
+
+@dataclass(eq=False)
+class Scene:
+    """A fitted model as terms see it.
+
+    Attributes
+    ----------
+    model : Model
+        Whose remainder is to be explained.
+    """
+
+    model: Model
+    kept: dict[Any, Any] = field(default_factory=dict)
+    _flats: dict[int, tuple[Channel, list[Flats]]] = field(default_factory=dict)
+    _here: dict[int, tuple[Channel, FloatArray]] = field(default_factory=dict)
+    _responses: dict[tuple[int, int], tuple[Flats, FloatArray]] = field(
+        default_factory=dict
+    )
+
+    @property
+    def gains(self) -> FloatArray:
+        """Of the amplifiers, as fitted [e-/ADU]."""
+        count = len(self.model.predictor.measured.amplifiers)
+        return np.asarray(self.model.fit.values[:count])
+
+    @property
+    def device(self) -> dict[str, float]:
+        """Device parameters as fitted, away from nominal."""
+        p, baseline = self.model.predictor, self.model.predictor.baseline
+        return {
+            name: float(self.model.fit.values[row]) * baseline.spread[name]
+            for name, row in zip(baseline.parameters, p.prior_rows, strict=True)
+        }
+
+    def changed_by(self, effect: Effect, channel: Channel) -> FloatArray:
+        """What an effect adds to the prediction of a channel, in its unit."""
+        p = self.model.predictor
+        point = self.model.fit.values[: len(p.names)]
+        more = p.with_effects((*p.effects, effect), point)
+        both = np.concatenate([point, more.start[len(more.names) - len(fitted(effect)) :]])
+        return np.asarray(more.predict(channel, both) - self.here(channel))
+
+    def here(self, channel: Channel) -> FloatArray:
+        """What the model predicts of a channel, linear terms left out."""
+        kept = self._here.get(id(channel))
+        if kept is None or kept[0] is not channel:
+            p = self.model.predictor
+            predicted = p.predict(channel, self.model.fit.values[: len(p.names)])
+            kept = self._here[id(channel)] = channel, predicted
+        return kept[1]
+
+    def responses(self, flats: Flats, p: int) -> FloatArray:
+        """Change of the flats' power for a response that goes with the level to the power p."""
+        kept = self._responses.get((id(flats), p))
+        if kept is None or kept[0] is not flats:
+            response = flat_response(flats.a, flats.level, power=p)
+            kept = self._responses[id(flats), p] = flats, response
+        return kept[1]
+
+    def flats(self, channel: Channel) -> list[Flats]:
+        """Flats of a channel of covariances, by condition; what effects do to them is left out."""
+        kept = self._flats.get(id(channel))
+        if kept is not None and kept[0] is channel:
+            return kept[1]
+        out, x = [], channel.axes
+        predictor = self.model.predictor
+        chain = predictor.chain(self.model.fit.values[: len(predictor.names)])
+        for where, rows in conditions_of(channel):
+            pairs = np.stack([x["amp"][rows].astype(float), x["level"][rows]], axis=1)
+            flats, index = np.unique(pairs, axis=0, return_inverse=True)
+            gain = self.gains[flats[:, 0].astype(int)]
+            level = gain * flats[:, 1]
+            a = predictor.baseline.flat_areas(where, self.device, level)
+            law = {} if chain is None else {"law": chain.law}
+            c = periodic_covariances(a, level, **law)
+            out.append(Flats(where, rows, index.ravel(), gain, level, a, c))
+        self._flats[id(channel)] = channel, out
+        return out
+
+
+def conditions_of(channel: Channel) -> Iterator[tuple[Condition, NDArray[np.int64]]]:
+    """Conditions of a channel with their rows."""
+    columns = np.column_stack([channel.axes[n].astype(float) for n in Condition._fields])
+    kinds, index = np.unique(np.nan_to_num(columns, nan=-1e99), axis=0, return_inverse=True)
+    for n in range(len(kinds)):
+        rows = np.nonzero(index.ravel() == n)[0]
+        yield Condition(*(float(v) for v in columns[rows[0]])), rows
+
+
+def at_lags(
+    c: FloatArray, flat: NDArray[np.int64], i: NDArray[np.int64], j: NDArray[np.int64]
+) -> FloatArray:
+    """Periodic covariances by flat, at lags: the mean of (i, j) and (i, -j)."""
+    return np.asarray(0.5 * (c[flat, j, i] + c[flat, -j, i]))
+
+
+def lag_family(scene: Scene) -> Family | None:
+    """Covariances of flats at single lags, by power of the level."""
+    channels = [c for c in scene.model.fit.channels if c.word == "flat_cov"]
+    if not channels or channels[0].unit == PER_ELECTRON:
+        return None
+    lags = sorted({
+        (int(i), int(j)) for c in channels
+        for i, j in zip(c.axes["i"], c.axes["j"], strict=True)
+    })  # fmt: skip
+
+    def column(lag: tuple[int, int], p: int) -> Callable[[Channel], FloatArray | None]:
+        def change(channel: Channel) -> FloatArray | None:
+            if channel.word != "flat_cov":
+                return None
+            x = channel.axes
+            gain = scene.gains[x["amp"].astype(int)]
+            here = (x["i"] == lag[0]) & (x["j"] == lag[1])
+            level = gain * x["level"] / SCALE
+            return np.where(here, level**p / gain**2, 0.0)
+
+        return change
+
+    terms = tuple(
+        Term(f"covariance ({i}, {j}) x S^{p}", {"lags": [(i, j)], "power": p}, column((i, j), p))
+        for i, j in lags for p in LAG_POWERS
+    )  # fmt: skip
+    return Family("covariances by lag", terms, ("flat_cov",))

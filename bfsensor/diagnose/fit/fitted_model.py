@@ -1,0 +1,81 @@
+"""A baseline with effects and columns, fitted; and what it makes of recordings not fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.fit.baseline_fit import BaselineFit, fit_baseline
+from bfsensor.diagnose.model.predictor import Columns, Predictor, used_channels
+from bfsensor.effects.effect import Effect
+from bfsensor.typing import FloatArray
+
+
+class Model:
+    """The baseline with some effects, and columns of other models, fitted."""
+
+    def __init__(self, predictor: Predictor, fit: BaselineFit) -> None:
+        self.predictor, self.fit = predictor, fit
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """Effects with their fitted parameters."""
+        return self.predictor.effects_at(self.fit.values[: len(self.predictor.names)])
+
+    def with_effects(self, effects: Sequence[Effect]) -> Model:
+        """Fit again, with these effects."""
+        predictor = self.predictor.with_effects(effects, self.fit.values)
+        return Model(predictor, fit_baseline(predictor, self.fit.channels, like=self.fit))
+
+    def with_columns(self, columns: Columns) -> Model:
+        """Fit again, with further linear parameters."""
+        predictor = self.predictor.with_columns(columns, self.fit.values)
+        return Model(predictor, fit_baseline(predictor, self.fit.channels, like=self.fit))
+
+    def errors(self, n: int) -> dict[str, float]:
+        """Standard errors of the parameters of the n-th effect."""
+        start = f"effect {n} "
+        return {
+            name.split()[-1]: float(e)
+            for name, e in zip(self.fit.names, self.fit.errors, strict=True)
+            if name.startswith(start)
+        }
+
+    def left(self, channel: Channel) -> FloatArray:
+        """Residuals of a channel over errors and chance, fitted or not, all parameters as fitted."""
+        values = dict(zip(self.fit.names, self.fit.values, strict=True))
+        point = self.fit.values[: len(self.predictor.names)]
+        predicted = self.predictor.predict(channel, point)
+        for name, column in self.predictor.linear(channel).items():
+            predicted = predicted + values.get(name, 0.0) * column
+        left = channel.whiten(channel.values - predicted)
+        modes = self.predictor.modes(channel, point)
+        if not modes.shape[1]:
+            return left
+        shapes, sizes, _ = np.linalg.svd(channel.whiten(modes), full_matrices=False)
+        wider = 1 - 1 / np.sqrt(1 + sizes**2)
+        return np.asarray(left - shapes @ (wider * (shapes.T @ left)))
+
+
+def compare_held_out(before: Model, after: Model) -> dict[str, tuple[float, float, int]]:
+    """Chi-squares of what was not fitted, by channel, by one model and by another.
+
+    Returns
+    -------
+    dict of str to (float, float, int)
+        Before, after, and number of values.
+    """
+    out: dict[str, tuple[float, float, int]] = {}
+    for channel in used_channels(before.predictor.measured.channels, ("held-out",)):
+        if not len(channel):
+            continue
+        squares = [
+            float(left @ left) for left in (m.left(channel) for m in (before, after))
+        ]
+        old = out.get(channel.word, (0.0, 0.0, 0))
+        out[channel.word] = (
+            old[0] + squares[0], old[1] + squares[1], old[2] + len(channel)
+        )  # fmt: skip
+    return out

@@ -1,0 +1,1 @@
+"""What a baseline and effects predict of every channel."""

@@ -1,0 +1,318 @@
+"""What effects change in each channel: from what they do to light, charge and signal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.diagnose.data.flat_channels import TAIL
+from bfsensor.diagnose.data.measure_channels import MeasuredChannels
+from bfsensor.diagnose.model.baseline import Baseline, level_areas
+from bfsensor.diagnose.model.map_predictions import MapChange, shot_at
+from bfsensor.effects.effect import STAGES, Axes, Effect, Law, Layout, Shot
+from bfsensor.response.edge_response import area_matrix
+from bfsensor.typing import Edges, FloatArray
+
+ADDED = (
+    "flat_mean", "serial_overscan", "parallel_overscan", "bias_cov", "bias_level", "dark_map",
+    "amp_cross", "code_hist",
+)  # fmt: skip
+"""Channels whose change effects give themselves, by a method of that name."""
+
+ROUNDS = 4
+"""Of the inversion of the signal's law: its departure from 1 is a few per cent at most."""
+
+
+def layout_of(measured: MeasuredChannels, baseline: Baseline) -> Layout:
+    """Sensor and campaign as effects see them."""
+    wavelength, bias = baseline.reference
+    card = baseline.card
+    reference = [s.temperature for s in measured.shots if np.isfinite(s.temperature)]
+    return Layout(
+        measured.shape, measured.segments, measured.shots, measured.gains,
+        (wavelength if np.isfinite(wavelength) else 620.0, bias if np.isfinite(bias) else -60.0,
+         float(np.median(reference)) if reference else -100.0),
+        offsets=measured.offsets, read_noise=measured.read_noise, biases=measured.biases,
+        map_noise={
+            name: float(sum(s.weight**2 / s.flats for s in shares))
+            for name, shares in measured.maps.items()
+        },
+        sightings=measured.sightings, **card,
+    )  # fmt: skip
+
+
+class EffectChain:
+    """Several effects in the order of their stages, as a campaign shows them.
+
+    Parameters
+    ----------
+    effects : sequence of Effect
+        Any order.
+    layout : Layout
+        Sensor and campaign.
+    measured : MeasuredChannels
+        Of which flats the maps are made.
+    baseline : Baseline
+        Its shifts even patterns out.
+    kept : dict
+        Filled with what does not depend on effects.
+    evening : (float, mapping of str to float)
+        Gain [e-/ADU] and departures of the device's parameters from nominal by which patterns
+        are evened out.
+    """
+
+    def __init__(
+        self,
+        effects: Sequence[Effect],
+        layout: Layout,
+        measured: MeasuredChannels,
+        baseline: Baseline,
+        kept: dict[tuple, Any],
+        evening: tuple[float, Mapping[str, float]],
+    ) -> None:
+        self.effects = tuple(sorted(effects, key=lambda e: STAGES.index(e.stage)))
+        self.layout, self.measured, self.baseline = layout, measured, baseline
+        self._kept, self._evening = kept, evening
+        self._maps: MapChange | None = None
+        self.law = Law()
+        for effect in self.effects:
+            self.law = self.law.with_law(effect.law())
+
+    def shot(self, condition: Condition, kind: str = "flat", seconds: float = 0.0) -> Shot:
+        """Exposure at a condition; what is not known is the reference's."""
+        return shot_at(self.layout, condition, kind, seconds)
+
+    def edges(self, edges: Edges, condition: Condition) -> Edges:
+        """Shifts with all effects."""
+        for effect in self.effects:
+            edges = effect.edges(*edges, self.shot(condition), self.layout)
+        return edges
+
+    @property
+    def leaves_spots(self) -> bool:
+        """Whether spots grow and are read as without effects, their light apart."""
+        own = ("edges", "law", "level_response", "spot_light", "spot_image", "signal")
+        return all(
+            getattr(type(e), name) is getattr(Effect, name)
+            for e in self.effects
+            for name in own
+        )
+
+    def area_change(self, edges: Edges, condition: Condition) -> FloatArray:
+        """What effects add to the area changes of given shifts [1/e-]."""
+        changed = self.edges(edges, condition)
+        if changed is edges:
+            return np.zeros_like(edges[0])
+        a, more = area_matrix(*edges), area_matrix(*changed)
+        if more.shape == a.shape:
+            return more - a
+        # Shifts may reach farther than the baseline's.
+        margin = (more.shape[0] - a.shape[0]) // 2
+        return np.asarray(more - np.pad(a, margin))
+
+    def level_change(
+        self, condition: Condition, levels: FloatArray, *, grown: bool = True
+    ) -> FloatArray | None:
+        """What effects that go with the level add to the areas [1/e-]; None: nothing."""
+        total = None
+        for level, slope, bend in self._level_responses(condition):
+            one = level_areas(slope, bend, level, levels, grown=grown)
+            total = one if total is None else total + one
+        return total
+
+    def _level_responses(self, condition: Condition) -> list[tuple[float, Edges, Edges]]:
+        found = [e.level_response(self.shot(condition), self.layout) for e in self.effects]
+        return [f for f in found if f is not None]
+
+    def spot_edges(
+        self, edges: Edges, slopes: Edges | None, condition: Condition
+    ) -> tuple[Edges, Edges | None]:
+        """Shifts without charge and their slopes, of spots, with all effects."""
+        kx, ky = self.edges(edges, condition)
+        # Shifts may reach farther than their slopes do.
+        reach = kx.shape[0] // 2
+        if slopes is not None:
+            slopes = pad_areas(slopes[0], reach), pad_areas(slopes[1], reach)
+        for level, slope, _ in self._level_responses(condition):
+            sx, sy = (pad_areas(s, reach) for s in slope)
+            kx, ky = kx - level * sx, ky - level * sy
+            slopes = (sx, sy) if slopes is None else (slopes[0] + sx, slopes[1] + sy)
+        return (kx, ky), slopes
+
+    def signal(self, level: FloatArray, axes: Axes) -> FloatArray:
+        """Signal after the amplifier of collected charge [e-]."""
+        for effect in self.effects:
+            level = effect.signal(level, axes, self.layout)
+        return level
+
+    def collected(self, signal: FloatArray, axes: Axes) -> FloatArray:
+        """Collected charge of a signal [e-]."""
+        level = signal
+        for _ in range(ROUNDS):
+            level = signal - (self.signal(level, {**axes, "level": level}) - level)
+        return np.asarray(level)
+
+    def covariances(self, c: FloatArray, axes: Axes) -> FloatArray:
+        """Covariances of flats after all effects, the signal's slope among them [e-^2]."""
+        level = np.asarray(axes["level"], float)
+        for effect in self.effects:
+            step = 1e-3 * np.maximum(level, 1.0)
+            ends = level + step, level - step
+            up, down = (effect.signal(x, {**axes, "level": x}, self.layout) for x in ends)
+            if not (np.array_equal(up, ends[0]) and np.array_equal(down, ends[1])):
+                c = c * (((up - down) / (2 * step)) ** 2)[:, None, None]
+            c = effect.covariances(c, axes, self.layout)
+        return c
+
+    def added(
+        self, channel: Channel, gains: FloatArray, axes: dict[str, NDArray]
+    ) -> FloatArray:
+        """Change of a channel, of :data:`ADDED`, in its unit; axes as measured, levels in ADU."""
+        own, axes = self._in_electrons(channel, gains, axes)
+        out = np.zeros(len(channel))
+        for effect in self.effects:
+            if channel.word in effect.touches:
+                out += getattr(effect, channel.word)(axes, self.layout)
+            if channel.word in ("serial_overscan", "parallel_overscan"):
+                out -= self._in_overscan(effect, channel.word, axes, TAIL)
+            if channel.word == "flat_mean":
+                out -= self._in_overscan(effect, "serial_overscan", axes, None)
+        if channel.word == "flat_mean":
+            level = axes["level"]
+            out += self.signal(level, axes) - level
+            if self.law.loss:
+                # Light that brings the level m with a loss q: (exp(q m) - 1) / q.
+                out += level - np.expm1(self.law.loss * level) / self.law.loss
+        out = out / _unit(channel, own, gains)
+        if channel.word == "bias_level":
+            # Variances over those that white noise makes.
+            what, ratio = axes["what"], out / own / axes["white"]
+            out = np.where(what == "rows", ratio, out)
+            out = np.where(what == "frames", np.log1p(np.maximum(ratio, 0.0)), out)
+        return np.asarray(out)
+
+    def _in_electrons(
+        self, channel: Channel, gains: FloatArray, axes: dict[str, NDArray]
+    ) -> tuple[FloatArray, dict[str, NDArray]]:
+        """Gain of each value, and axes with levels in electrons."""
+        rows = len(channel)
+        amp = axes.get("amp", np.zeros(rows)).astype(int)
+        own = gains[amp] if len(gains) else np.ones(rows)
+        axes = dict(axes)
+        if "level" in axes:
+            axes["level"] = self.collected(own * axes["level"], axes)
+        if channel.word == "dark_map":
+            axes["after"] = own * axes["after"]
+        return own, axes
+
+    def _in_overscan(
+        self, effect: Effect, word: str, axes: dict[str, NDArray], last: int | None
+    ) -> FloatArray:
+        """Mean of what an effect adds to an overscan's last pixels, or to its second half [e-]."""
+        out = np.zeros(len(axes["amp"]))
+        if word not in effect.touches:
+            return out
+        depth = self.layout.of_amp(word, axes["amp"]).astype(int)
+        for deep in np.unique(depth[depth > 0]):
+            rows = depth == deep
+            here = {k: v[rows] for k, v in axes.items()}
+            first = deep // 2 if last is None else deep - last
+            pixels = range(first + 1, deep + 1)
+            change = [
+                getattr(effect, word)(
+                    {**here, "k": np.full(rows.sum(), float(k))}, self.layout
+                )
+                for k in pixels
+            ]
+            out[rows] = np.mean(change, axis=0)
+        return out
+
+    def spot_change(
+        self, condition: Condition
+    ) -> tuple[float, tuple[float, float], Mapping[str, float]]:
+        """Added variance [pixel^2], halo and axes of the spots at a condition."""
+        shot = self.shot(condition, "spot")
+        variance, share, wide = 0.0, 0.0, 1.0
+        for effect in self.effects:
+            v, f, s = effect.spot_light(shot, self.layout)
+            variance += v
+            if f:
+                share, wide = f, s
+        axes = {k: getattr(shot, k) for k in ("wavelength", "back_bias", "temperature")}
+        return variance, (share, wide), axes
+
+    def spot_image(self, images: FloatArray, axes: Mapping[str, float]) -> FloatArray:
+        """Mean images of spots [e-] as they are read."""
+        for effect in self.effects:
+            images = effect.spot_image(images, axes, self.layout)
+            shaped = {
+                **{k: np.full(images.shape, v) for k, v in axes.items()},
+                "level": images,
+            }
+            images = effect.signal(images, shaped, self.layout)
+        return images
+
+    def map_change(self, channel: Channel) -> FloatArray:
+        """Change of the flats' maps."""
+        if self._maps is None:
+            self._maps = MapChange(
+                self.effects,
+                self.layout,
+                self.measured,
+                self.baseline,
+                self._kept,
+                self._evening,
+            )
+        return self._maps.of(channel)
+
+    def spot_flux(self, axes: Axes) -> FloatArray:
+        """Added to electrons of spots, exposure by exposure [e-]."""
+        out = np.zeros(len(axes["flux"]))
+        for effect in self.effects:
+            if "spot" in effect.touches:
+                out += effect.spot_flux(axes, self.layout)
+        return out
+
+    def spot_ghosts(self, shown: FloatArray, lit: FloatArray) -> FloatArray | None:
+        """Parts of the charge of spots that others show, shape (n, m); None of none."""
+        parts = [e.spot_ghosts(shown, lit, self.layout) for e in self.effects]
+        some = [p for p in parts if p is not None]
+        return np.sum(some, axis=0) if some else None
+
+    def modes(
+        self, channel: Channel, gains: FloatArray, axes: dict[str, NDArray]
+    ) -> FloatArray:
+        """Shapes of what chance adds to a channel, in its unit, shape (n, modes)."""
+        own, axes = self._in_electrons(channel, gains, axes)
+        axes["fold"] = np.full(len(channel), channel.fold)
+        found = [
+            e.modes(channel.word, axes, self.layout)
+            for e in self.effects if channel.word in e.touches
+        ]  # fmt: skip
+        parts = [m / _unit(channel, own, gains)[:, None] for m in found if m is not None]
+        return np.concatenate([np.zeros((len(channel), 0)), *parts], axis=1)
+
+
+def pad_areas(a: FloatArray, reach: int) -> FloatArray:
+    """Area changes on a wider window."""
+    more = reach - a.shape[-1] // 2
+    if more <= 0:
+        return a
+    return np.pad(a, [(0, 0)] * (a.ndim - 2) + [(more, more)] * 2)
+
+
+def _unit(channel: Channel, own: FloatArray, gains: FloatArray) -> FloatArray:
+    """Electrons of one unit of each value."""
+    if channel.unit == "adu2" and "other" in channel.axes:
+        return np.asarray(own * gains[channel.axes["other"].astype(int)])
+    if channel.unit == "adu2":
+        return np.asarray(own**2)
+    if channel.unit != "adu":
+        return np.ones(len(channel))
+    counted = channel.axes["what"] == "struck" if "what" in channel.axes else False
+    return np.where(counted, 1.0, own)

@@ -1,0 +1,117 @@
+"""Columns of the linear parameters of a baseline: light, darks, shape of the light, fluxes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.measure_channels import MeasuredChannels
+from bfsensor.diagnose.model.map_shapes import Places
+from bfsensor.typing import FloatArray
+
+MAP_ORDER = 4
+"""Order of the polynomial in x and y that the light on the sensor may have."""
+
+Rows = Mapping[tuple[str, ...], NDArray[np.int64]]
+"""Values of a channel by condition."""
+
+
+def linear_columns(
+    channel: Channel, rows: Rows, measured: MeasuredChannels
+) -> dict[str, FloatArray]:
+    """What the values of a channel change with each linear parameter, by name.
+
+    Light by amplifier and condition, dark current, shape of the light, flux of the spots; the
+    same name is the same parameter in all channels.
+
+    Parameters
+    ----------
+    channel : Channel
+        Whose values.
+    rows : mapping
+        Which of them belong to each condition.
+    measured : MeasuredChannels
+        The campaign, for its amplifiers.
+    """
+    if channel.word == "flat_mean":
+        return _mean_columns(channel, rows)
+    if channel.word == "flat_map":
+        return _map_columns(channel, measured)
+    if channel.word == "dark_map":
+        return _dark_columns(channel)
+    if channel.word == "spot":
+        return _spot_columns(channel, rows)
+    return {}
+
+
+def _mean_columns(channel: Channel, rows_of: Rows) -> dict[str, FloatArray]:
+    x = channel.axes
+    out = {}
+    light = x["time"] * x["lamp"]
+    for key, rows in rows_of.items():
+        for amp in np.unique(x["amp"][rows]):
+            here = rows[x["amp"][rows] == amp]
+            column = np.zeros(len(channel))
+            column[here] = light[here]
+            out[f"light {int(amp)} {'/'.join(key)}"] = column
+    for amp in np.unique(x["amp"]):
+        out[f"dark {int(amp)}"] = np.where(x["amp"] == amp, x["time"], 0.0)
+    return out
+
+
+def _dark_columns(channel: Channel) -> dict[str, FloatArray]:
+    x = channel.axes
+    out = {}
+    level, column = x["what"] == "level", x["what"] == "column"
+    for amp in np.unique(x["amp"]):
+        here = x["amp"] == amp
+        out[f"dark {int(amp)}"] = np.where(here & level, x["time"], 0.0)
+        out[f"dark level {int(amp)}"] = np.where(here & level, 1.0, 0.0)
+        out[f"dark column {int(amp)}"] = np.where(here & column, 1.0, 0.0)
+    return out
+
+
+def _map_columns(channel: Channel, measured: MeasuredChannels) -> dict[str, FloatArray]:
+    x, size = channel.axes, len(channel)
+    ny, nx = measured.shape
+    out: dict[str, FloatArray] = {}
+    places = Places.of(x, measured.shape)
+    u, v = (2 * (np.arange(n) + 0.5) / n - 1 for n in (nx, ny))
+    smooth = {
+        f"light {p}{q}": places.product(u**p, v**q, size)
+        for p in range(MAP_ORDER + 1) for q in range(MAP_ORDER + 1 - p)
+    }  # fmt: skip
+    # Amplifiers were divided by their means: steps between them are free.
+    for amp, s in enumerate(measured.segments[1:], 1):
+        inside = np.zeros(nx), np.zeros(ny)
+        inside[0][s.x : s.x + s.columns] = 1.0
+        inside[1][s.y : s.y + s.rows] = 1.0
+        smooth[f"amp {amp}"] = places.product(*inside, size)
+    for name in dict.fromkeys(x["map"]):
+        here = x["map"] == name
+        for what, column in smooth.items():
+            out[f"map {name} {what}"] = np.where(here, column, 0.0)
+        ring = here & (x["what"] == "ring")
+        if ring.any():
+            # Sizes of pixels, and the effect, which evens the pixels' response out: more at
+            # some levels and conditions than at others, so that ratios keep of it.
+            for power in (2, 4):
+                out[f"map {name} rings k{power}"] = np.where(ring, x["k"] ** power, 0.0)
+        if name == "all" and ring.any():
+            out["map rings white"] = np.where(ring, 1.0, 0.0)
+    return out
+
+
+def _spot_columns(channel: Channel, rows_of: Rows) -> dict[str, FloatArray]:
+    x = channel.axes
+    out = {}
+    for key, rows in rows_of.items():
+        for what in ("flux", "skew_x", "skew_y"):
+            here = rows[x["what"][rows] == what]
+            column = np.zeros(len(channel))
+            column[here] = x["light"][here] if what == "flux" else 1.0
+            out[f"spot {what} {'/'.join(key)}"] = column
+    return out

@@ -1,0 +1,379 @@
+"""What effects change in the maps of flats, in the spatial frequencies that even them out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import fft, ifft, irfft, irfft2, rfft, rfft2
+
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.diagnose.data.map_channels import (
+    RINGS,
+    MapShare,
+    block_side,
+    map_chess,
+    spectrum_rings,
+)
+from bfsensor.diagnose.data.map_texture import map_texture
+from bfsensor.diagnose.data.map_waves import smooth_shapes
+from bfsensor.diagnose.data.measure_channels import MeasuredChannels
+from bfsensor.diagnose.model.baseline import Baseline
+from bfsensor.effects.effect import Axes, Effect, Layout, Shot
+from bfsensor.response.edge_response import area_matrix
+from bfsensor.typing import FloatArray
+
+Spectrum = NDArray[np.complex128]
+
+FAINT = 0.01
+"""Part of its error that a texture's change must reach to be worked out."""
+
+KEPT, KEPT_PIXELS = 12, 2_000_000
+"""Changes by single effects that are kept, and up to which size of a sensor."""
+
+
+def shot_at(
+    layout: Layout, condition: Condition, kind: str = "flat", seconds: float = 0.0
+) -> Shot:
+    """Exposure at a condition; what is not known is the reference's."""
+    values = (
+        float(own) if np.isfinite(own) else usual
+        for own, usual in zip(condition, layout.reference, strict=True)
+    )
+    return Shot(kind, -1, seconds, *values)
+
+
+class MapChange:
+    """Change of the flats' maps by effects.
+
+    A pattern of pixel areas fills up unevenly and is evened out by the shifts that its own
+    charge makes, mode by mode as the fluctuations of the light are: (exp(a m) - 1) / (a m) of it
+    is left at the level m.  Light's patterns are taken as wide against the reach of the shifts,
+    which are even there: of waves of 40 pixels that keeps 1 % too much.  What comes after
+    collection is not evened out.
+
+    Parameters
+    ----------
+    effects : sequence of Effect
+        In the order of their stages.
+    layout : Layout
+        Sensor and campaign.
+    measured : MeasuredChannels
+        Of which flats the maps are made.
+    baseline : Baseline
+        Its shifts even patterns out.
+    kept : dict
+        Filled with what does not depend on effects.
+    evening : (float, mapping of str to float)
+        Gain [e-/ADU] and departures of the device's parameters from nominal by which patterns
+        are evened out.
+    """
+
+    def __init__(
+        self,
+        effects: Sequence[Effect],
+        layout: Layout,
+        measured: MeasuredChannels,
+        baseline: Baseline,
+        kept: dict[tuple, Any],
+        evening: tuple[float, Mapping[str, float]],
+    ) -> None:
+        self.effects = [e for e in effects if "flat_map" in e.touches]
+        self.layout, self.measured, self.baseline = layout, measured, baseline
+        self._kept, self._device = kept, dict(evening[1])
+        self._gain = evening[0]
+        state = self._gain, *self._device.values()
+        if kept.get(("state",)) != state:
+            for key in [k for k in kept if k[0] == "left"]:
+                del kept[key]
+            kept["state",] = state
+        self._by_time = any(e.by_time for e in self.effects)
+        self._standing = all(e.standing for e in self.effects)
+        self._made: dict[tuple, Spectrum | None] = {}
+
+    def of(self, channel: Channel) -> FloatArray:
+        """Change of all values of the channel."""
+        out = np.zeros(len(channel))
+        if not self.effects:
+            return out
+        for (fold, name), shares in self.measured.maps.items():
+            if fold != channel.fold:
+                continue
+            delta = self._spectrum((fold, name), shares)
+            if delta is None or not np.abs(delta).max() > 0:
+                continue
+            rows, axes = self._rows(channel, name)
+            if len(rows):
+                out[rows] = reduce_spectrum(delta, self.layout.shape, axes)
+        return out
+
+    def _spectrum(
+        self, name: tuple[str, str], shares: Sequence[MapShare]
+    ) -> Spectrum | None:
+        """Transform of a map's change."""
+        total: Spectrum | None = None
+        for key, group in self._groups(shares).items():
+            first = group[0]
+            found = [
+                None if one is None else one * factor((*name, *key), group)
+                for one, factor in (
+                    (self._areas(key, first), self._left), (self._light(key, first), self._weights),
+                )
+            ]  # fmt: skip
+            for one in (*found, self._patterns(group)):
+                if one is not None:
+                    total = one if total is None else total + one
+        return total
+
+    def _groups(self, shares: Sequence[MapShare]) -> dict[tuple, list[MapShare]]:
+        """Flats that effects treat alike."""
+        out: dict[tuple, list[MapShare]] = {}
+        for share in shares:
+            where = () if self._standing else share.condition.key
+            out.setdefault((where, share.seconds if self._by_time else 0.0), []).append(
+                share
+            )
+        return out
+
+    def _weights(self, key: tuple, group: Sequence[MapShare]) -> float:
+        del key
+        return float(sum(s.weight for s in group))
+
+    def _left(self, key: tuple, group: Sequence[MapShare]) -> FloatArray:
+        """Weights of the flats by mode: what is left of a pattern in each."""
+        found = self._kept.get(("left", *key))
+        if found is None:
+            found = np.sum(
+                [s.weight * self._evened(s.condition, self._gain * s.level) for s in group],
+                axis=0,
+            )
+            self._kept["left", *key] = found
+        return np.asarray(found)
+
+    def _evened(self, condition: Condition, level: float) -> FloatArray:
+        """What is left of a pattern's modes at a level [e-], on the sensor's grid."""
+        a = area_matrix(*self.baseline.at(condition, self._device)[0])
+        wide = np.zeros(self.layout.shape)
+        half = a.shape[0] // 2
+        rows, columns = (np.arange(-half, half + 1) % n for n in self.layout.shape)
+        np.add.at(wide, (rows[:, None], columns[None]), a)
+        x = rfft2(wide).real * level
+        small = np.abs(x) < 1e-9
+        return np.where(small, 1 + x / 2, np.expm1(x) / np.where(small, 1.0, x))
+
+    def _areas(self, key: tuple, share: MapShare) -> Spectrum | None:
+        """Of the pixels' areas in a weak flat."""
+
+        def change(effect: Effect, shot: Shot) -> FloatArray | None:
+            return area_change(effect, shot, self.layout)
+
+        return self._sum("areas", key, share, change)
+
+    def _light(self, key: tuple, share: MapShare) -> Spectrum | None:
+        """Of the light."""
+
+        def change(effect: Effect, shot: Shot) -> FloatArray | None:
+            factor = effect.light_map(shot, self.layout)
+            return None if factor is None else factor - 1.0
+
+        return self._sum("light", key, share, change)
+
+    def _patterns(self, group: Sequence[MapShare]) -> Spectrum | None:
+        """Of what comes after collection, which goes with each flat's own level."""
+        total: FloatArray | None = None
+        for share in group:
+            shot = self._shot(share)
+            for effect in self.effects:
+                one = effect.pattern(shot, self.layout)
+                if one is not None:
+                    total = share.weight * one + (0.0 if total is None else total)
+        return None if total is None else self._transform(total)
+
+    def _shot(self, share: MapShare) -> Shot:
+        shot = shot_at(self.layout, share.condition, "flat", share.seconds)
+        return shot._replace(level=self._gain * share.level)
+
+    def _sum(
+        self,
+        word: str,
+        key: tuple,
+        share: MapShare,
+        change: Callable[[Effect, Shot], FloatArray | None],
+    ) -> Spectrum | None:
+        """Transform of what all effects change, made once."""
+        if (word, *key) not in self._made:
+            shot = self._shot(share)
+            parts = [
+                p for e in self.effects
+                if (p := self._part(word, e, shot, change)) is not None
+            ]  # fmt: skip
+            self._made[word, *key] = (
+                self._transform(np.sum(parts, axis=0)) if parts else None
+            )
+        return self._made[word, *key]
+
+    def _part(
+        self,
+        word: str,
+        effect: Effect,
+        shot: Shot,
+        change: Callable[[Effect, Shot], FloatArray | None],
+    ) -> FloatArray | None:
+        """Change by one effect; of some effects that stay as they are it is kept."""
+        if len(self.effects) == 1 or np.prod(self.layout.shape) > KEPT_PIXELS:
+            return change(effect, shot)
+        kept = self._kept.setdefault(("parts",), {})
+        key = word, effect, None if effect.standing else shot
+        if key not in kept:
+            if len(kept) >= KEPT:
+                del kept[next(iter(kept))]
+            kept[key] = change(effect, shot)
+        else:
+            kept[key] = kept.pop(key)
+        return kept[key]
+
+    def _transform(self, change: FloatArray) -> Spectrum:
+        """Spatial frequencies of a relative change, each amplifier over its mean."""
+        total = 1.0 + np.broadcast_to(change, self.layout.shape)
+        for segment in self.layout.segments:
+            part = np.s_[segment.y : segment.y + segment.rows,
+                         segment.x : segment.x + segment.columns]  # fmt: skip
+            total[part] /= total[part].mean()
+        total -= 1.0
+        return np.asarray(rfft2(total))
+
+    def _rows(self, channel: Channel, name: str) -> tuple[NDArray[np.int64], Axes]:
+        """Values of a map, found once: channels do not change."""
+        key = ("rows", id(channel), name)
+        kept = self._kept.get(key)
+        if kept is None or kept[0] is not channel:
+            rows = np.nonzero(channel.axes["map"] == name)[0]
+            axes = {k: channel.axes[k][rows] for k in ("what", "x", "y", "k")}
+            parts = parts_of(axes)
+            errors = channel.errors[rows[parts["texture"]]]
+            parts["faint"] = np.array(1e-6 * FAINT * min(errors, default=0.0))
+            kept = self._kept[key] = channel, rows, parts
+        return kept[1], kept[2]
+
+
+def area_change(effect: Effect, shot: Shot, layout: Layout) -> FloatArray | None:
+    """Relative change of the pixels' areas by an effect; None of none."""
+    moved = effect.displacements(shot, layout)
+    if moved is None:
+        return None
+    return np.asarray(np.diff(moved[0], axis=1) + np.diff(moved[1], axis=0))
+
+
+def lines_of_map(effect: Effect, channel: Channel, layout: Layout) -> FloatArray:
+    """Change of columns, rows and blocks of the map of all light alone, nothing evened out."""
+    x, out = channel.axes, np.zeros(len(channel))
+    own = np.nonzero(x["map"] == "all")[0]
+    if not len(own):
+        return out
+    where = Condition(*(float(x[n][own[0]]) for n in Condition._fields))
+    shot = shot_at(layout, where)
+    light, change = effect.light_map(shot, layout), area_change(effect, shot, layout)
+    total = np.zeros(layout.shape)
+    for part in (change, None if light is None else light - 1.0):
+        if part is not None:
+            total += part
+    for segment in layout.segments:
+        box = np.s_[segment.y : segment.y + segment.rows,
+                    segment.x : segment.x + segment.columns]  # fmt: skip
+        total[box] -= total[box].mean()
+    for what, axis, name in (("column", 0, "x"), ("row", 1, "y")):
+        rows = own[x["what"][own] == what]
+        out[rows] = total.mean(axis)[x[name][rows].astype(int)]
+    rows = own[x["what"][own] == "block"]
+    out[rows] = block_means(total)[block_places(x, rows, layout.shape)]
+    return out
+
+
+def block_means(change: FloatArray) -> FloatArray:
+    """Means of a map's blocks."""
+    ny, nx = change.shape
+    side = block_side((ny, nx))
+    whole = change[: ny // side * side, : nx // side * side]
+    return np.asarray(whole.reshape(ny // side, side, nx // side, side).mean((1, 3)))
+
+
+def block_places(
+    axes: Axes, rows: NDArray[np.int64], shape: tuple[int, int]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Which row and column of blocks values belong to."""
+    side = block_side(shape)
+    y, x = (((axes[n][rows] + 0.5) / side).astype(int) for n in "yx")
+    return y, x
+
+
+PARTS = ("column", "row", "block", "ring", "texture", "chess")
+
+
+def parts_of(axes: Axes) -> dict[str, NDArray[Any]]:
+    """Axes 'x', 'y', 'k' of a map's values, and which of them are each of :data:`PARTS`."""
+    found = {w: np.nonzero(axes["what"] == w)[0] for w in PARTS}
+    return found | {k: axes[k] for k in ("x", "y", "k")}
+
+
+def reduce_map(change: FloatArray, axes: Axes) -> FloatArray:
+    """What a change of a map does to its values.
+
+    Parameters
+    ----------
+    change : ndarray, shape (ny, nx)
+        Relative.
+    axes : mapping
+        'what', 'x', 'y', 'k' of the values.
+    """
+    ny, nx = change.shape
+    return reduce_spectrum(rfft2(change), (ny, nx), parts_of(axes))
+
+
+def reduce_spectrum(delta: Spectrum, shape: tuple[int, int], axes: Axes) -> FloatArray:
+    """What a change of a map does to its columns, rows, blocks, rings, texture and chess pattern.
+
+    Parameters
+    ----------
+    delta : ndarray, shape (ny, nx // 2 + 1)
+        Transform of the change.
+    shape : tuple of int
+        Rows and columns.
+    axes : mapping
+        'x', 'y', 'k' of the values, and which of them are each of :data:`PARTS`; 'faint': mean
+        square up to which a change has no texture.
+    """
+    ny, nx = shape
+    column, row, block, ring, texture, chess = (axes[w] for w in PARTS)
+    out = np.zeros(len(axes["x"]))
+    out[column] = (irfft(delta[0], n=nx) / ny)[axes["x"][column].astype(int)]
+    out[row] = (ifft(delta[:, 0]).real / nx)[axes["y"][row].astype(int)]
+    if not sum(map(len, (block, ring, texture, chess))):
+        return out
+    change = irfft2(delta, s=shape)
+    if len(block):
+        out[block] = block_means(change)[block_places(axes, block, shape)]
+    if len(chess):
+        out[chess] = map_chess(change)[0]
+    if len(ring) or len(texture):
+        # Rings and texture are those of a map without its smooth shape.
+        q_y, q_x = (smooth_shapes(n) for n in shape)
+        (f_y, _), (_, f_x) = (_smooth_spectra(n) for n in shape)
+        smooth = q_y.T @ change @ q_x
+        rough = delta - f_y @ smooth @ f_x.T
+        power = spectrum_rings(rough, shape)
+        out[ring] = 1e6 * power[(axes["k"][ring] * 2 * RINGS).astype(int)]
+        square = 2 * float((rough.real**2).sum() + (rough.imag**2).sum()) / (ny * nx) ** 2
+        if len(texture) and square > axes.get("faint", 0.0):
+            out[texture] = map_texture(change - q_y @ smooth @ q_x.T)[0]
+    return out
+
+
+@lru_cache(maxsize=8)
+def _smooth_spectra(n: int) -> tuple[Spectrum, Spectrum]:
+    """Transforms of the smooth shapes along a side, all frequencies and those from 0 on."""
+    shapes = smooth_shapes(n)
+    return fft(shapes, axis=0), rfft(shapes, axis=0)

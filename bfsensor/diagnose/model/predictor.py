@@ -1,0 +1,488 @@
+"""Every channel from one set of parameters: device, gains, noise, lamp, pixel response."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import copy
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.data.channel_rows import KeptRows, condition_at
+from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
+from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.diagnose.data.map_channels import MapShare
+from bfsensor.diagnose.data.measure_channels import MeasuredChannels
+from bfsensor.diagnose.model.baseline import Baseline
+from bfsensor.diagnose.model.effect_chain import ADDED, EffectChain, layout_of, pad_areas
+from bfsensor.diagnose.model.effect_parameters import FittedEffects
+from bfsensor.diagnose.model.flat_predictions import (
+    flat_covariances_of,
+    periodic_covariances,
+    quadrant,
+)
+from bfsensor.diagnose.model.linear_terms import linear_columns
+from bfsensor.diagnose.model.spot_predictor import SpotPredictor, width_of
+from bfsensor.effects.effect import Effect, Layout
+from bfsensor.response.edge_response import area_matrix
+from bfsensor.typing import FloatArray
+
+REDUCED_LEVEL = 40_000.0
+"""Background [e-] at which a_ij without a level are predicted: halfway to a flat of 80,000 e-, at
+which published covariances are quoted."""
+
+Columns = Callable[[Channel], dict[str, FloatArray]]
+"""Columns of further linear parameters of a channel, by name, in its unit."""
+
+
+class Predictor:
+    """Predicts the channels of a campaign; what may float honestly is a parameter.
+
+    Non-linear parameters: gain of each amplifier [e-/ADU], variance of its read noise [ADU^2],
+    the device's parameters in units of their spread, widths of the spots without charge for
+    each wavelength and temperature.  Linear ones, as columns of :meth:`linear`: light by amplifier and
+    condition, dark current, shape of the light, levels of bias and noise, flux of the spots.
+
+    Parameters
+    ----------
+    measured : MeasuredChannels
+        The campaign, for its amplifiers, conditions and positions of spots.
+    baseline : Baseline
+        Boundary shifts.
+    effects : sequence of Effect
+        What is added to it; their parameters are non-linear ones.
+    """
+
+    def __init__(
+        self, measured: MeasuredChannels, baseline: Baseline, effects: Sequence[Effect] = ()
+    ) -> None:
+        self.measured, self.baseline = measured, baseline
+        self.layout = layout_of(measured, baseline)
+        self._evened: dict[tuple, Any] = {}
+        self._lit: dict[int, tuple[Channel, FloatArray]] = {}
+        self._amps = len(measured.amplifiers)
+        self._rows = KeptRows()
+        self.spots = SpotPredictor(measured, baseline)
+        self.notes: list[str] = []
+        noise = [0.0 if not np.isfinite(n) else n**2 for n in measured.read_noise]
+        self.names = (
+            *(f"gain {a}" for a in range(self._amps)),
+            *(f"noise {a}" for a in range(self._amps)),
+            *(f"device {p}" for p in baseline.parameters),
+            *(f"sigma_{axis} {width}" for width in self.spots.widths for axis in "xy"),
+        )
+        self.start = np.array([
+            *measured.gains, *noise, *(0.0 for _ in baseline.parameters), *self.spots.start,
+        ])  # fmt: skip
+        self.steps = np.array([
+            *(1e-3 * g for g in measured.gains), *(0.01 * max(n, 0.1) for n in noise),
+            *(0.1 for _ in baseline.parameters), *(2e-3 for _ in self.spots.start),
+        ])  # fmt: skip
+        n, p = 2 * self._amps, len(baseline.parameters)
+        self.prior_rows = np.arange(n, n + p)
+        """Parameters with a prior of mean 0 and width 1."""
+        self._noise_told = _noise_told(measured)
+        if not self._noise_told.all():
+            names = [
+                a
+                for a, told in zip(measured.amplifiers, self._noise_told, strict=True)
+                if not told
+            ]
+            self.notes.append(
+                f"read noise of {', '.join(names)} taken as {np.sqrt(noise[0]):.3g} ADU: no biases, "
+                "and flats of one level cannot tell it from the gain"
+            )
+        exact = {
+            key: baseline.at(condition_at(c, rows[0]))[1]
+            for c in measured.channels if c.word in ("flat_cov", "spot")
+            for key, rows in self._rows.of(c).items()
+        }  # fmt: skip
+        for key, held in exact.items():
+            if not held:
+                self.notes.append(
+                    f"baseline has no shifts at {'/'.join(key)}: the nearest condition's are taken"
+                )
+
+        self.columns: tuple[Columns, ...] = ()
+        self._free = FittedEffects()
+        self._add(effects)
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """Effects that are added to the baseline, as they were given."""
+        return self._free.effects
+
+    def with_effects(
+        self, effects: Sequence[Effect], point: FloatArray | None = None
+    ) -> Predictor:
+        """Copy with other effects, which shares what does not depend on them.
+
+        Parameters
+        ----------
+        effects : sequence of Effect
+            Instead of those there are.
+        point : ndarray, optional
+            Where fits begin: parameters other than effects'.
+        """
+        other = copy(self)
+        plain = len(self.names) - len(self._free)
+        other.names, other.steps = self.names[:plain], self.steps[:plain]
+        other.start = (self.start if point is None else point)[:plain].copy()
+        other._add(effects)
+        return other
+
+    def with_columns(self, columns: Columns, point: FloatArray | None = None) -> Predictor:
+        """Copy with further linear parameters; fits begin at ``point``."""
+        other = copy(self)
+        other.columns = (*self.columns, columns)
+        if point is not None:
+            other.start = point[: len(self.names)].copy()
+        return other
+
+    def with_shifts(
+        self,
+        edges: tuple[FloatArray, FloatArray],
+        slopes: tuple[FloatArray, FloatArray] | None = None,
+    ) -> Predictor:
+        """Copy with shifts of boundaries added to the baseline's [pixel/e-].
+
+        Parameters
+        ----------
+        edges : tuple of ndarray
+            Of right and upper edges; at other conditions scaled as the baseline's own are.
+        slopes : tuple of ndarray, optional
+            Their change with the charge that pushes [pixel/e-^2].
+        """
+        other = copy(self)
+        own = self.baseline
+        scales = {k: own.scale_at(k) for k in own.edges}
+        if slopes is not None:
+            # The baseline's own hold at a level that may not be 0.
+            edges = edges[0] + own.level * slopes[0], edges[1] + own.level * slopes[1]
+        moved = {
+            k: tuple(o + scales[k] * d for o, d in zip(own.edges[k], edges, strict=True))
+            for k in own.edges
+        }
+        changed: dict[str, object] = {"edges": moved}
+        if slopes is not None:
+            nothing = (np.zeros_like(edges[0]),) * 2
+            changed["slopes"] = {
+                k: tuple(
+                    o + scales[k] * d
+                    for o, d in zip(own.slopes.get(k, nothing), slopes, strict=True)
+                )
+                for k in own.edges
+            }
+        other.baseline = replace(own, **changed)  # type: ignore[arg-type]
+        # What was kept goes with the baseline.
+        other._evened, other.spots = {}, self.spots.with_baseline(other.baseline, slopes)
+        return other
+
+    def with_exposures(
+        self,
+        spots: Iterable[Condition] = (),
+        maps: Mapping[tuple[str, str], tuple[MapShare, ...]] | None = None,
+    ) -> Predictor:
+        """Copy that predicts spots at further conditions, and further maps, as well.
+
+        Spots fall on their pixels as others of the same light and temperature do.
+
+        Parameters
+        ----------
+        spots : iterable of Condition
+            Conditions that the campaign may lack.
+        maps : mapping of (fold, map) to tuple of MapShare, optional
+            Of which flats each is made.
+
+        Raises
+        ------
+        DiagnosisError
+            The campaign has no spots of that wavelength and temperature: nothing tells their width.
+        """
+        other = copy(self)
+        other.spots = self.spots.with_conditions(spots)
+        if maps:
+            other.measured = replace(self.measured, maps={**self.measured.maps, **maps})
+        return other
+
+    def _add(self, effects: Sequence[Effect]) -> None:
+        """Append the parameters of effects."""
+        self._free = FittedEffects(effects)
+        self.names = (*self.names, *self._free.names)
+        self.start = np.append(self.start, self._free.start)
+        self.steps = np.append(self.steps, self._free.steps)
+
+    def predict(
+        self,
+        channel: Channel,
+        parameters: FloatArray,
+        *,
+        only: str | None = None,
+    ) -> FloatArray:
+        """What a channel should read, linear terms left out.
+
+        Parameters
+        ----------
+        channel : Channel
+            Its axes say where.
+        parameters : ndarray
+            In the order of ``names``.
+        only : str, optional
+            Predict spots of this wavelength and temperature alone, such as '620/173.15'.
+        """
+        a = self._amps
+        chain = self.chain(parameters)
+        gains, noise = parameters[:a], parameters[a : 2 * a]
+        count = len(self.baseline.parameters)
+        device = self._device(parameters)
+        if channel.word == "flat_cov":
+            return self._flat_cov(channel, gains, noise, device, chain)
+        if channel.word == "spot":
+            return self.spots.predict(
+                channel, self._rows.of(channel), gains, device,
+                parameters[2 * a + count :], only=only, chain=chain,
+            )  # fmt: skip
+        out = np.zeros(len(channel))
+        if channel.word == "bias_cov":
+            own = noise[channel.axes["amp"].astype(int)]
+            out = np.where(channel.axes["lag"] == 0, own, 0.0)
+        if chain is not None:
+            if channel.word in ADDED:
+                out = out + chain.added(channel, gains, self._with_light(channel, gains))
+            elif channel.word == "flat_map":
+                out = out + chain.map_change(channel)
+        return out
+
+    def chain(self, parameters: FloatArray) -> EffectChain | None:
+        """Effects with their parameters as given; None of none."""
+        if not self.effects:
+            return None
+        return EffectChain(
+            self.effects_at(parameters),
+            self._layout_at(parameters),
+            self.measured,
+            self.baseline,
+            self._evened,
+            # Patterns are evened out as where the fit began: they hardly depend on it.
+            (_mean_gain(self.start[: self._amps]), self._device(self.start)),
+        )
+
+    def modes(self, channel: Channel, parameters: FloatArray) -> FloatArray:
+        """What chance adds to a channel by its effects, in its unit, shape (n, modes).
+
+        Shapes whose strengths are independent and of variance 1: the values' covariance grows
+        by ``modes @ modes.T``.
+        """
+        chain = self.chain(parameters)
+        if chain is None:
+            return np.zeros((len(channel), 0))
+        gains = parameters[: self._amps]
+        return chain.modes(channel, gains, self._with_light(channel, gains))
+
+    def _device(self, parameters: FloatArray) -> dict[str, float]:
+        """Departures of the device's parameters from nominal."""
+        own = parameters[2 * self._amps : 2 * self._amps + len(self.baseline.parameters)]
+        return {
+            name: float(value) * self.baseline.spread[name]
+            for name, value in zip(self.baseline.parameters, own, strict=True)
+        }
+
+    def _layout_at(self, parameters: FloatArray) -> Layout:
+        """Layout with the gains and the read noise that parameters say."""
+        gains, noise = parameters[: self._amps], parameters[self._amps : 2 * self._amps]
+        # Levels of exposures are by the rough gains, which may be a quarter off.
+        scale = _mean_gain(gains) / _mean_gain(np.array(self.layout.gains))
+        return replace(
+            self.layout,
+            gains=tuple(gains.tolist()),
+            read_noise=tuple(np.sqrt(np.maximum(noise, 0.0)).tolist()),
+            shots=tuple(s._replace(level=scale * s.level) for s in self.layout.shots),
+        )
+
+    def effects_at(self, parameters: FloatArray) -> tuple[Effect, ...]:
+        """Effects with their parameters as given."""
+        return self._free.at(parameters[len(parameters) - len(self._free) :])
+
+    @property
+    def kept(self) -> dict[tuple, Any]:
+        """What copies with other effects share; filled by those who use it."""
+        return self._evened
+
+    def shapes(self) -> NDArray[np.bool_]:
+        """Which parameters are of the shape of an effect, not its amplitude."""
+        plain = len(self.names) - len(self._free)
+        return np.append(np.zeros(plain, bool), self._free.shapes)
+
+    def reach(self, point: FloatArray) -> FloatArray:
+        """Smallest and largest steps of a fit from a point, shape (2, parameters)."""
+        plain = len(self.names) - len(self._free)
+        free = np.repeat([[-np.inf], [np.inf]], plain, axis=1)
+        return np.concatenate([free, self._free.reach(point[plain:])], axis=1)
+
+    def _with_light(self, channel: Channel, gains: FloatArray) -> dict[str, NDArray]:
+        """Axes, of flats with 'light': electrons that light in proportion would bring."""
+        if channel.word not in ("flat_mean", "flat_cov") or channel.unit == PER_ELECTRON:
+            return dict(channel.axes)
+        kept = self._lit.get(id(channel))
+        if kept is None or kept[0] is not channel:
+            x = channel.axes
+            light = x["time"] * x.get("lamp", np.array(1.0))
+            out = np.zeros(len(channel))
+            for rows in self._rows.of(channel).values():
+                for amp in np.unique(x["amp"][rows]):
+                    here = rows[x["amp"][rows] == amp]
+                    ratio = x["level"][here] / np.maximum(light[here], 1e-300)
+                    weak = light[here] <= np.quantile(light[here], 0.4)
+                    out[here] = np.median(ratio[weak]) * light[here]
+            kept = self._lit[id(channel)] = channel, out
+        amps = channel.axes["amp"].astype(int)
+        return dict(channel.axes) | {"light": gains[amps] * kept[1]}
+
+    def depends(self, channel: Channel) -> NDArray[np.bool_]:
+        """Which parameters a channel can depend on: the others need no derivative."""
+        names = np.array(self.names)
+        device = np.char.startswith(names, "device")
+        sigma = np.char.startswith(names, "sigma")
+        plain = self._baseline_depends(channel, device, sigma)
+        plain[len(names) - len(self._free) :] |= self._free.touch(channel.word)
+        return plain
+
+    def _baseline_depends(
+        self, channel: Channel, device: NDArray[np.bool_], sigma: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        a, names = self._amps, np.array(self.names)
+        gain = np.char.startswith(names, "gain")
+        noise = np.char.startswith(names, "noise")
+        noise[a : 2 * a] &= self._noise_told
+        if channel.word == "flat_cov":
+            return device if channel.unit == PER_ELECTRON else gain | noise | device
+        if channel.word == "spot":
+            return gain | device | sigma
+        if channel.word == "flat_mean" and any(
+            "flat_mean" in e.touches for e in self.effects
+        ):
+            return gain
+        return noise if channel.word == "bias_cov" else np.zeros(len(names), bool)
+
+    def slope(
+        self,
+        channel: Channel,
+        parameters: FloatArray,
+        n: int,
+        here: FloatArray,
+    ) -> FloatArray:
+        """Derivative of a channel by one parameter, given the prediction there."""
+        step = parameters.copy()
+        step[n] += self.steps[n]
+        if channel.word == "spot" and self.names[n].startswith("sigma"):
+            # Of one width the spots of others know nothing.
+            first = self.names.index(next(m for m in self.names if m.startswith("sigma")))
+            only = self.spots.widths[(n - first) // 2]
+            moved = self.predict(channel, step, only=only)
+            out = np.zeros(len(channel))
+            for key, rows in self._rows.of(channel).items():
+                if width_of(key) == only:
+                    out[rows] = (moved[rows] - here[rows]) / self.steps[n]
+            return out
+        ratio = self.names[n].startswith("gain") or self.names[n].endswith(" full_well")
+        if channel.word == "flat_mean" and ratio:
+            # Full pixels tell the ratio of full well and gain to one part in 1e5: both sides.
+            back = parameters.copy()
+            back[n] -= self.steps[n]
+            both = self.predict(channel, step) - self.predict(channel, back)
+            return both / (2 * self.steps[n])
+        return (self.predict(channel, step) - here) / self.steps[n]
+
+    def linear(self, channel: Channel) -> dict[str, FloatArray]:
+        """Columns of the linear parameters, by name; the same name is the same parameter."""
+        out = linear_columns(channel, self._rows.of(channel), self.measured)
+        for more in self.columns:
+            out |= more(channel)
+        return out
+
+    def _flat_cov(
+        self,
+        channel: Channel,
+        gains: FloatArray,
+        noise: FloatArray,
+        device: dict[str, float],
+        chain: EffectChain | None,
+    ) -> FloatArray:
+        x = channel.axes
+        i, j = x["i"].astype(int), x["j"].astype(int)
+        amp = x["amp"].astype(int)
+        lags = int(max(i.max(), j.max()))
+        out = np.empty(len(channel))
+        for rows in self._rows.of(channel).values():
+            if channel.unit == PER_ELECTRON:
+                where = condition_at(channel, rows[0])
+                edges = self.baseline.edges_on(where, device, REDUCED_LEVEL)
+                a = area_matrix(*edges)
+                if chain is not None:
+                    more = chain.area_change(edges, where)
+                    a = a * (1 + chain.law.bend * REDUCED_LEVEL)
+                    reach = max(more.shape[-1], a.shape[-1]) // 2
+                    a = pad_areas(a, reach) + pad_areas(more, reach)
+                    bent = chain.level_change(where, np.array([REDUCED_LEVEL]), grown=False)
+                    if bent is not None:
+                        a = a + pad_areas(bent[0], reach)
+                y, x0 = (n // 2 for n in a.shape)
+                out[rows] = 0.5 * (
+                    a[y + j[rows], x0 + i[rows]] + a[y - j[rows], x0 + i[rows]]
+                )
+                continue
+            pairs = np.stack([amp[rows], x["level"][rows]], axis=1)
+            groups, first, index = np.unique(
+                pairs, axis=0, return_index=True, return_inverse=True
+            )
+            own = gains[groups[:, 0].astype(int)]
+            levels = own * groups[:, 1]
+            where = condition_at(channel, rows[0])
+            if chain is None:
+                a = self.baseline.flat_areas(where, device, levels)
+                c = flat_covariances_of(a, levels, lags=lags) / own[:, None, None] ** 2
+            else:
+                lit = self._with_light(channel, gains)
+                axes = {k: v[rows[first]] for k, v in lit.items()} | {"level": levels}
+                axes["level"] = levels = chain.collected(levels, axes)
+                more = chain.area_change(self.baseline.at(where, device)[0], where)
+                a = self.baseline.flat_areas(where, device, levels)
+                reach = max(more.shape[-1], a.shape[-1]) // 2
+                a = pad_areas(a, reach) + pad_areas(more, reach)
+                bent = chain.level_change(where, levels)
+                if bent is not None:
+                    a = a + pad_areas(bent, reach)
+                whole = periodic_covariances(a, levels, law=chain.law)
+                c = quadrant(chain.covariances(whole, axes), lags) / own[:, None, None] ** 2
+            c[:, 0, 0] += noise[groups[:, 0].astype(int)]
+            out[rows] = c[index.ravel(), j[rows], i[rows]]
+        return out
+
+
+def _mean_gain(gains: FloatArray) -> float:
+    """Mean over amplifiers; 1 for a_ij, which have none."""
+    return float(np.mean(gains)) if len(gains) else 1.0
+
+
+def _noise_told(measured: MeasuredChannels) -> NDArray[np.bool_]:
+    """Of which amplifiers biases, or flats of several levels, tell the read noise."""
+    count = len(measured.amplifiers)
+    told = np.zeros(count, bool)
+    levels: list[set[float]] = [set() for _ in range(count)]
+    for channel in measured.channels:
+        if channel.word not in ("bias_cov", "flat_cov") or channel.unit == PER_ELECTRON:
+            continue
+        for n in np.unique(channel.axes["amp"]).astype(int):
+            own = channel.axes["amp"] == n
+            told[n] |= channel.word == "bias_cov"
+            if channel.word == "flat_cov":
+                levels[n] |= set(channel.axes["time"][own].tolist())
+    flats = any(levels)
+    return told | np.array([len(v) > 1 or not flats for v in levels], bool)
+
+
+def used_channels(channels: Sequence[Channel], folds: Sequence[str]) -> list[Channel]:
+    """Channels of some folds."""
+    return [c for c in channels if c.fold in folds]

@@ -1,0 +1,260 @@
+"""The channel of spots, condition by condition, from shifts, widths without charge and effects."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from copy import copy
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.diagnose.data.channel_rows import Rows, condition_at
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.diagnose.data.measure_channels import MeasuredChannels
+from bfsensor.diagnose.data.spot_places import widening
+from bfsensor.diagnose.model.baseline import Baseline
+from bfsensor.diagnose.model.effect_chain import EffectChain
+from bfsensor.diagnose.model.spot_predictions import predict_spots, representative_phases
+from bfsensor.errors import DiagnosisError
+from bfsensor.typing import Edges, FloatArray
+
+Found = dict[str, FloatArray]
+
+
+class SpotPredictor:
+    """Predicts spots; their widths without charge are parameters.
+
+    Optics know of the wavelength, diffusion of the silicon's temperature, of which cards do not
+    speak: a width for each of both.  What goes with voltages at one temperature is left to be found.
+
+    Parameters
+    ----------
+    measured : MeasuredChannels
+        The campaign, for its conditions and the places of its spots.
+    baseline : Baseline
+        Boundary shifts.
+
+    Attributes
+    ----------
+    widths : list of str
+        Wavelength and temperature of each width, such as '620/173.15'.
+    start : list of float
+        Along x and y of each: where fits begin [pixel].
+    """
+
+    def __init__(self, measured: MeasuredChannels, baseline: Baseline) -> None:
+        self.measured, self.baseline = measured, baseline
+        self.widths: list[str] = []
+        self.start: list[float] = []
+        self._slopes: Edges | None = None
+        self._gained: FloatArray | None = None
+        self._conditions: dict[tuple[str, ...], Condition] = {}
+        self._kept: dict[tuple[str, ...], tuple[tuple[NDArray, ...], Found]] = {}
+        phases: dict[tuple[str, ...], list[FloatArray]] = {}
+        places = iter(measured.phases)
+        for channel in (c for c in measured.channels if c.word == "spot"):
+            for row in np.nonzero(channel.axes["what"] == "sigma_x")[0]:
+                condition = condition_at(channel, row)
+                phases.setdefault(condition.key, []).append(next(places))
+                if condition.key in self._conditions:
+                    continue
+                self._conditions[condition.key] = condition
+                if width_of(condition.key) not in self.widths:
+                    self.widths.append(width_of(condition.key))
+                    self.start += [float(v) for v in channel.values[row : row + 2]]
+        self._phases = {
+            k: representative_phases(np.concatenate(p)) for k, p in phases.items()
+        }
+
+    def with_baseline(self, baseline: Baseline, slopes: Edges | None) -> SpotPredictor:
+        """Copy of another baseline; ``slopes`` where its own are not of spots."""
+        other = copy(self)
+        other.baseline, other._kept = baseline, {}
+        if slopes is not None:
+            other._slopes = slopes
+        return other
+
+    def with_conditions(self, conditions: Iterable[Condition]) -> SpotPredictor:
+        """Copy that predicts spots at further conditions as well.
+
+        Spots fall on their pixels as others of the same light and temperature do.
+
+        Raises
+        ------
+        DiagnosisError
+            The campaign has no spots of that wavelength and temperature: nothing tells their width.
+        """
+        other = copy(self)
+        other._conditions, other._phases = dict(self._conditions), dict(self._phases)
+        for condition in conditions:
+            key = condition.key
+            if key in other._conditions:
+                continue
+            width = width_of(key)
+            like = next((k for k in self._conditions if width_of(k) == width), None)
+            if like is None:
+                raise DiagnosisError(
+                    f"spots at wavelength/temperature {width}: their width without charge is known "
+                    f"at {', '.join(self.widths) or 'none'} only"
+                )
+            other._conditions[key], other._phases[key] = condition, self._phases[like]
+        return other
+
+    def predict(
+        self,
+        channel: Channel,
+        rows_of: Rows,
+        gains: FloatArray,
+        device: Mapping[str, float],
+        sigmas: FloatArray,
+        *,
+        only: str | None = None,
+        chain: EffectChain | None = None,
+    ) -> FloatArray:
+        """What the channel should read, linear terms left out.
+
+        Parameters
+        ----------
+        channel : Channel
+            Of spots.
+        rows_of : dict
+            Its rows by condition.
+        gains : ndarray
+            Of the amplifiers [e-/ADU].
+        device : mapping of str to float
+            Departures of the device's parameters.
+        sigmas : ndarray, shape (2 widths,)
+            Widths without charge [pixel], x and y in turn.
+        only : str, optional
+            The only one of ``widths`` that is predicted; elsewhere 0.
+        chain : EffectChain, optional
+            Effects.
+        """
+        x = channel.axes
+        # Images were put on the scale of electrons with rough gains.
+        scale = float(np.mean(gains / np.array(self.measured.gains)))
+        out = np.zeros(len(channel))
+        for key in self._conditions:
+            rows = rows_of.get(key, np.zeros(0, int))
+            if not len(rows) or (only is not None and width_of(key) != only):
+                continue
+            n = self.widths.index(width_of(key))
+            edges, slopes = self._shifts(self._conditions[key], device)
+            sigma = float(sigmas[2 * n]), float(sigmas[2 * n + 1])
+            fluxes = scale * x["flux"][rows]
+            if chain is None or chain.leaves_spots:
+                state = (*edges, np.array(sigma), fluxes)
+                found = dict(self._unchanged(key, state, slopes))
+            else:
+                found = self._changed(
+                    key, edges, slopes, sigma, fluxes, chain, _axes(x, rows)
+                )
+            found["flux"] = found["flux"] / scale
+            for what, values in found.items():
+                here = x["what"][rows] == what
+                out[rows[here]] = values[here]
+        if chain is not None:
+            here = x["what"] == "flux"
+            axes = {k: v[here] for k, v in x.items()} | {"flux": scale * x["flux"][here]}
+            out[here] += chain.spot_flux(axes) / scale
+            self._add_ghosts(out, x, chain)
+        return out
+
+    def _add_ghosts(
+        self, out: FloatArray, x: Mapping[str, NDArray], chain: EffectChain
+    ) -> None:
+        """Add to fluxes and widths what spots of all folds left behind."""
+        placed = self.measured.placed
+        lit = np.array([s.number for s in placed], float)
+        fluxes = np.array([s.flux for s in placed])
+        place_of = {s.number: n for n, s in enumerate(placed)}
+        for what in ("flux", "sigma_x", "sigma_y"):
+            rows = np.flatnonzero(x["what"] == what)
+            numbers = x["exposure"][rows].astype(int)
+            parts = chain.spot_ghosts(numbers.astype(float), lit)
+            if parts is None or not len(placed):
+                return
+            if what == "flux":
+                out[rows] += parts @ fluxes
+                continue
+            # Exposures that are only planned lie nowhere yet.
+            known = np.isin(numbers, list(place_of))
+            rows, own = rows[known], [place_of[n] for n in numbers[known].tolist()]
+            if self._gained is None:
+                self._gained = widening(placed, placed)
+            shares = parts[known] * fluxes / fluxes[own, None]
+            gained = (shares * self._gained["xy".index(what[-1]), own]).sum(1)
+            out[rows] += gained / (2 * out[rows])
+
+    def _shifts(
+        self, condition: Condition, device: Mapping[str, float]
+    ) -> tuple[Edges, Edges | None]:
+        """Shifts of spots, without charge where they go with it, and their slopes."""
+        (kx, ky), _ = self.baseline.at(condition, device)
+        key = self.baseline.nearest(condition)
+        if not self.baseline.spots_bend or key not in self.baseline.slopes:
+            return (kx, ky), self._slopes
+        # Slopes of free forms are among them.
+        sx, sy = self.baseline.slopes[key]
+        level = self.baseline.level
+        return (kx - level * sx, ky - level * sy), (sx, sy)
+
+    def _unchanged(
+        self,
+        key: tuple[str, ...],
+        state: tuple[FloatArray, ...],
+        slopes: Edges | None,
+    ) -> Found:
+        """Spots that no effect changes, at a condition; kept while effects' parameters alone move."""
+        kept = self._kept.get(key)
+        if kept is None or not all(map(np.array_equal, kept[0], state)):
+            kx, ky, sigma, fluxes = state
+            found = predict_spots(
+                kx, ky, sigma=(float(sigma[0]), float(sigma[1])), phases=self._phases[key],
+                fluxes=fluxes, slopes=slopes,
+            )  # fmt: skip
+            kept = self._kept[key] = state, found
+        return kept[1]
+
+    def _changed(
+        self,
+        key: tuple[str, ...],
+        edges: Edges,
+        slopes: Edges | None,
+        sigma: tuple[float, float],
+        fluxes: FloatArray,
+        chain: EffectChain,
+        given: Mapping[str, float],
+    ) -> Found:
+        """Spots with effects, at a condition; ``given`` goes to what happens after collection."""
+        condition = self._conditions[key]
+        variance, halo, axes = chain.spot_change(condition)
+        wide = sigma
+        if variance:
+            squares = [max(s * s + variance, 0.01 * s * s) for s in sigma]
+            wide = float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))
+        edges, slopes = chain.spot_edges(edges, slopes, condition)
+        return predict_spots(
+            *edges, sigma=wide,
+            phases=self._phases[key], fluxes=fluxes, halo=halo, law=chain.law,
+            neighbours=self.measured.neighbours, slopes=slopes,
+            change=partial(chain.spot_image, axes={**axes, **given}),
+        )  # fmt: skip
+
+
+def width_of(key: tuple[str, ...]) -> str:
+    """Wavelength and temperature of a condition: what spots have one width at."""
+    return f"{key[0]}/{key[2]}"
+
+
+def _axes(x: Mapping[str, NDArray], rows: NDArray[np.int64]) -> dict[str, float]:
+    """Of a condition's exposures: when they were taken, and background for each electron."""
+    out = {}
+    if "hours" in x:
+        out["hours"] = float(np.mean(x["hours"][rows]))
+    if "background" in x:
+        # Dark current grows with the time that the flux takes.
+        out["background"] = float(x["background"][rows].sum() / x["flux"][rows].sum())
+    return out

@@ -1,0 +1,306 @@
+"""Which recording tells apart what the recordings so far cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from bfsensor.diagnose.detect.candidate_screen import Rival
+from bfsensor.diagnose.explain.attribution import Attribution, Found
+from bfsensor.diagnose.fit.fitted_model import Model
+from bfsensor.diagnose.plan.catalogue import Recording, make_recordings
+from bfsensor.diagnose.plan.forecast import Forecaster
+from bfsensor.diagnose.plan.planned_exposures import Forecast, Information, Planned
+from bfsensor.errors import ConvergenceError, DiagnosisError
+
+ENOUGH = 25.0
+"""Expected difference of the chi-squares from which on a recording decides."""
+
+TIMES = (1, 2, 4, 8)
+"""How often a recording's exposures may be taken."""
+
+
+@dataclass(frozen=True)
+class Advice:
+    """A recording for one pair of classes.
+
+    Attributes
+    ----------
+    recording : Recording
+        What to take.
+    times : int
+        How often its exposures.
+    separates : tuple of str
+        The two classes.
+    expected : float
+        Difference of the chi-squares of the two, each fitted to all there is by then, of the
+        new recordings alone; the smaller of the two directions.
+    others : tuple of (str, int, float)
+        Other recordings: name, exposures, expected difference; best first.
+    """
+
+    recording: Recording
+    times: int
+    separates: tuple[str, str]
+    expected: float
+    others: tuple[tuple[str, int, float], ...] = ()
+    taken: int = 0
+
+    @property
+    def exposures(self) -> int:
+        """Number of exposures."""
+        return self.times * (self.recording.exposures or self.taken)
+
+    @property
+    def decides(self) -> bool:
+        """Whether it is expected to be enough."""
+        return self.expected >= ENOUGH
+
+    def said(self) -> str:
+        """Give the advice in a sentence."""
+        one, other = self.separates
+        # Of a reduced recording it is not known how many were taken.
+        count = f"{self.exposures} exposures" if self.exposures else f"{self.times} times"
+        text = (
+            f"{self.recording.words} ({count}{_levels(self)}): expected to tell "
+            f"{one} from {other} by a chi-square difference of {self.expected:.3g}"
+        )
+        if not self.decides:
+            text += f", which does not reach {ENOUGH:g}, but nothing planned tells more"
+        if self.recording.rule is not None:
+            text += f"; {self.recording.rule.why}"
+        return text + "."
+
+    def to_report(self) -> dict[str, Any]:
+        """Block of report.json."""
+        out = {
+            "recording": self.recording.name,
+            "separates": list(self.separates),
+            "expected_delta_chi2": self.expected,
+            "exposures": self.exposures,
+            "decides": self.decides,
+            "recipe": [_recipe(p, self.times) for p in self.recording.planned],
+            "others": [
+                {"recording": n, "exposures": k, "expected_delta_chi2": v}
+                for n, k, v in self.others
+            ],
+        }
+        if self.recording.rule is not None:
+            rule = self.recording.rule
+            out["rule"] = {
+                "keeps": {w: rule.of(w) for w in self.separates},
+                "why": rule.why,
+                "source": rule.source,
+            }
+        return out
+
+
+@dataclass(frozen=True)
+class RecordingPlan:
+    """Advice for each pair of classes that is tied; empty where none is."""
+
+    advised: tuple[Advice, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def said(self) -> list[str]:
+        """Sentences, one for each recording."""
+        return list(dict.fromkeys(a.said() for a in self.advised))
+
+    def to_report(self) -> list[dict[str, Any]]:
+        """Give the key 'plan' of report.json."""
+        return [a.to_report() for a in self.advised]
+
+
+def plan(
+    attribution: Attribution, candidates: Sequence[Recording] | None = None
+) -> RecordingPlan:
+    """Find the cheapest recording that is expected to tell apart what is tied.
+
+    Each pair of tied classes is fitted to the recordings there are, one in the place of the
+    other.  For each candidate the two fits' predictions are held against one another as its
+    noise will allow, the wrong one's parameters refitted
+    (:class:`~bfsensor.diagnose.plan.planned_exposures.Information`); recordings that are not
+    predicted follow their rule (:func:`ruled`).  The one that reaches :data:`ENOUGH` with the
+    fewest exposures is advised, else the one that comes nearest.
+
+    Parameters
+    ----------
+    attribution : Attribution
+        What was found, with what it is tied to.
+    candidates : sequence of Recording, optional
+        By default :func:`~bfsensor.diagnose.plan.catalogue.make_recordings` of the campaign.
+    """
+    model = Model(attribution.predictor, attribution.fit)
+    pairs = [(f, r) for f in attribution.found for r in _tied(f)]
+    if not pairs:
+        return RecordingPlan()
+    here = Forecaster(model.predictor, model.fit)
+    if candidates is None:
+        candidates = make_recordings(here.usual, here.brightest, here.brightest_spot)
+    made: dict[str, list[Forecast]] = {}
+    for recording in candidates:
+        if recording.rule is None and not recording.again:
+            try:
+                found = here.forecasts(recording.planned)
+            except DiagnosisError:
+                continue  # Of a light that the campaign has not: nothing is predicted.
+            if found:
+                made[recording.name] = found
+    advised, notes = [], []
+    for found_, rival in pairs:
+        names = [e.name for e in model.effects]
+        effects = list(model.effects)
+        effects[names.index(found_.effect.name)] = rival.effect
+        try:
+            other = model.with_effects(effects)
+        except ConvergenceError as error:
+            notes.append(f"no plan for {found_.effect.word} and {rival.word}: {error}")
+            continue
+        there = Forecaster(other.predictor, other.fit)
+        judged = []
+        for recording in candidates:
+            try:
+                values = _expected(recording, here, there, made, found_, rival)
+            except DiagnosisError as error:
+                notes.append(
+                    f"no forecast of {recording.name} for {found_.effect.word} and "
+                    f"{rival.word}: {error}"
+                )
+                continue
+            if values is not None:
+                judged.append((recording, values))
+        taken = sum(model.predictor.measured.counts.values())
+        if judged:
+            words = found_.effect.word, rival.word
+            advised.append(_choose(judged, words, taken))
+    return RecordingPlan(tuple(advised), tuple(notes))
+
+
+def _tied(found: Found) -> list[Rival]:
+    """Best rival of each other class that is tied."""
+    return [
+        next(r for r in found.rivals if r.word == word)
+        for word in found.tied
+        if word != found.effect.word
+    ]
+
+
+def _expected(
+    recording: Recording,
+    here: Forecaster,
+    there: Forecaster,
+    made: dict[str, list[Forecast]],
+    found: Found,
+    rival: Rival,
+) -> list[float] | None:
+    """Expected differences of the chi-squares, by :data:`TIMES`; None where none is known."""
+    if recording.rule is not None:
+        return [ruled(recording, here, found, rival, times=t) for t in TIMES]
+    if recording.again:
+        # What sets the two apart in what there is, without its noise.
+        n = len(here.fit.residuals)
+        away = here.fit.left[:n] - there.fit.left[:n]
+        return [t * float(away @ away) for t in TIMES]
+    if recording.name not in made:
+        return None
+    ours = made[recording.name]
+    theirs = there.same(ours, here)
+    both = Information(ours, theirs, there.fit), Information(theirs, ours, here.fit)
+    return [min(i.delta_chi2(t) for i in both) for t in TIMES]
+
+
+def ruled(
+    recording: Recording, here: Forecaster, found: Found, rival: Rival, *, times: int = 1
+) -> float:
+    r"""Expected difference of the chi-squares in a recording that follows a rule.
+
+    Of two templates that are alike in what was recorded and are left with :math:`f_a` and
+    :math:`f_b` of themselves in the new recording,
+
+    .. math::
+        \Delta\chi^2 = \frac{(f_a - f_b)^2\, G}{1 + f^2 G / G_0} ,
+
+    G the gain that as many exposures of the kind recorded would bring, :math:`G_0` that of all
+    there are: the amplitude of the wrong one, f the larger of the two, gives way within its error.
+
+    Parameters
+    ----------
+    recording : Recording
+        With its rule.
+    here : Forecaster
+        Of the accepted fit.
+    found, rival
+        The two.
+    times : int
+        How often its exposures are taken.
+    """
+    rule = recording.rule
+    if rule is None:
+        raise DiagnosisError(
+            f"{recording.name}: predicted channel by channel, without a rule"
+        )
+    own, other = rule.of(found.effect.word), rule.of(rival.word)
+    if own == other:
+        return 0.0
+    layout = here.predictor.layout
+    if rule.strength is not None:
+        if not layout.segments:
+            return 0.0  # A reduced recording tells neither pixels nor read noise.
+        noise = float(np.nanmean(np.array(here.measured.read_noise) * here.gains))
+        seen = found.effect if own else rival.effect
+        return times * recording.exposures * rule.strength(seen, layout, noise)
+    rows = np.zeros(len(rival.template), bool)
+    for word in rule.channels:
+        rows[: len(here.fit.residuals)] |= here.fit.of(word)
+    before = sum(n for kind, n in here.measured.counts.items() if kind == rule.exposures)
+    if not before:
+        return 0.0
+    gain = float(rival.template[rows] @ rival.template[rows])
+    gain *= times * recording.exposures / before
+    whole = float(rival.template @ rival.template)
+    if not whole:
+        return 0.0
+    return (own - other) ** 2 * gain / (1 + max(own**2, other**2) * gain / whole)
+
+
+def _choose(
+    judged: Sequence[tuple[Recording, Sequence[float]]], words: tuple[str, str], taken: int
+) -> Advice:
+    """Fewest exposures that are enough; the greatest difference where none are."""
+    options = [
+        Advice(r, t, words, v, taken=taken)
+        for r, values in judged for t, v in zip(TIMES, values, strict=True)
+    ]  # fmt: skip
+    order = sorted(
+        options,
+        key=lambda o: (0, o.exposures, -o.expected) if o.decides else (1, 0, -o.expected),
+    )
+    seen: dict[str, Advice] = {}
+    for option in order:
+        seen.setdefault(option.recording.name, option)
+    best, *rest = seen.values()
+    others = tuple((o.recording.name, o.exposures, o.expected) for o in rest[:5])
+    return Advice(best.recording, best.times, words, best.expected, others, taken)
+
+
+def _levels(advice: Advice) -> str:
+    """Levels and conditions of a recipe, in words."""
+    planned = advice.recording.planned
+    levels = [p.level for p in planned if p.kind == "flat" and np.isfinite(p.level)]
+    if not levels:
+        return ""
+    return " at " + ", ".join(f"{v / 1e3:.0f}" for v in levels) + " thousand electrons"
+
+
+def _recipe(planned: Planned, times: int) -> dict[str, Any]:
+    """What is given of planned exposures."""
+    usual = Planned(planned.kind, 0)
+    told = {
+        name: value
+        for name, value in asdict(planned).items()
+        if value != getattr(usual, name) and value == value
+    }
+    return {**told, "kind": planned.kind, "count": planned.count * times}

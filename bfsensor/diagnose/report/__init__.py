@@ -1,0 +1,1 @@
+"""A diagnosis in words and figures: report.json and report.html."""

@@ -1,0 +1,296 @@
+"""What recordings and a baseline say of one another: the diagnosis, as data and in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2 as chi2_distribution
+
+import bfsensor
+from bfsensor.diagnose.data.measure_channels import (
+    MeasuredChannels,
+)
+from bfsensor.diagnose.detect.locate import ALARM, Finding, Mismatch
+from bfsensor.diagnose.detect.scans import DEVICE, DEVICE_SEEN
+from bfsensor.diagnose.explain.attribution import Attribution
+from bfsensor.diagnose.explain.location import place_effects
+from bfsensor.diagnose.fit.baseline_fit import BaselineFit
+from bfsensor.diagnose.model.predictor import Predictor, used_channels
+from bfsensor.diagnose.plan.advice import RecordingPlan
+from bfsensor.diagnose.plan.gaps import find_untested
+from bfsensor.diagnose.report.attribution_words import reported, said_of
+
+SCHEMA = "bfsensor-diagnosis-1"
+FARTHEST, OF_EACH = 50, 10
+"""Findings that report.json holds: of all, and of each channel at least."""
+
+NO_PLAN = RecordingPlan()
+
+NAMES = {
+    DEVICE: "device's parameters",
+    "flat_cov": "covariances of flats", "flat_mean": "mean of flats against the lamp",
+    "flat_map": "flats against position", "serial_overscan": "serial overscan",
+    "parallel_overscan": "parallel overscan", "bias_cov": "noise in readout order",
+    "bias_level": "bias levels", "dark_map": "darks", "spot": "spots",
+    "amp_cross": "amplifiers against one another", "code_hist": "converter codes",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """What recordings and baseline say of one another.
+
+    Attributes
+    ----------
+    campaign : str
+        Its name.
+    baseline : str
+        What predicted.
+    measured : MeasuredChannels
+        The channels.
+    fit : BaselineFit
+        The baseline with all that may float.
+    mismatch : Mismatch
+        What is left, and how unlikely that is.
+    heldout : float
+        Chi-square over degrees of freedom of the fold that was not fitted; nan without one.
+    notes : tuple of str
+        What was set aside, warned of or assumed.
+    read : int
+        How many of them, the first, are of the reading.
+    attribution : Attribution, optional
+        What explains it; None where nothing stands out.
+    plan : RecordingPlan
+        Recordings that tell apart what is tied.
+    predictor : Predictor, optional
+        Of the baseline's fit.
+    """
+
+    campaign: str
+    baseline: str
+    measured: MeasuredChannels
+    fit: BaselineFit
+    mismatch: Mismatch
+    heldout: float
+    notes: tuple[str, ...] = ()
+    read: int = 0
+    attribution: Attribution | None = None
+    plan: RecordingPlan = NO_PLAN
+    predictor: Predictor | None = None
+
+    @property
+    def accepted(self) -> tuple[Predictor | None, BaselineFit]:
+        """Predictor and fit of what is believed: with the effects found, or the baseline's."""
+        of = self.attribution or self
+        return of.predictor, of.fit
+
+    @property
+    def gain(self) -> float:
+        """Mean gain of the amplifiers [e-/ADU]; nan where there is none."""
+        count = len(self.measured.amplifiers)
+        return float(np.mean(self.fit.values[:count])) if count else np.nan
+
+    def location(self) -> dict[str, Any]:
+        """Where the mismatch is, as report.json has it; empty lists where nothing was found."""
+        out: dict[str, Any] = {
+            "channels": [], "lags": [], "flux_e": [], "x": [], "y": [], "amps": [],
+            "wavelength": [], "exposures": [],
+        }  # fmt: skip
+        if not self.mismatch.detected:
+            return out
+        if self.attribution is not None:
+            count = len(self.measured.amplifiers)
+            placed = place_effects(self.attribution, self.fit, self.measured.shape, count)
+            if placed is not None:
+                return placed
+        # Of all that stands out most is shadow of the same: the parts are what makes it up.
+        # Channels cast none on one another: those that no part is in follow by their farthest.
+        found = [f for f in self.mismatch.findings if f.family != "chi-square"]
+        seen = {p.word for p in self.mismatch.parts}
+        others = {f.word: f for f in reversed(found) if f.word not in seen}
+        parts = [*self.mismatch.parts, *list(others.values())[::-1]]
+        words = dict.fromkeys(f.word for f in (*parts, *self.mismatch.findings))
+        there = {c.word for c in self.fit.channels}
+        shown = [w for word in words for w in (DEVICE_SEEN if word == DEVICE else (word,))]
+        out["channels"] = [w for w in dict.fromkeys(shown) if w in there]
+        best: dict[str, Any] = {}
+        for part in parts:
+            for key in part.where:
+                best.setdefault(key, part)
+        lags = [p for part in parts for p in part.where.get("lags", ())]
+        out["lags"] = [list(p) for p in dict.fromkeys(lags)]
+        if "level" in best:
+            part = best["level"]
+            scale = 1.0 if part.word == "spot" else self.gain
+            out["flux_e"] = [float(v) * scale for v in part.where["level"]]
+        else:
+            out["flux_e"] = self._all_flux(out["channels"])
+        ny, nx = self.measured.shape
+        for key, size in (("x", nx), ("y", ny)):
+            if key in best:
+                out[key] = [int(v) for v in best[key].where[key]]
+            elif size:
+                out[key] = [0, size]
+        count = len(self.measured.amplifiers)
+        amps: set[int] = set()
+        for part in parts:
+            amp = part.where.get("amp", "all")
+            amps |= set(range(1, count + 1)) if amp == "all" else {int(amp) + 1}
+            if "other" in part.where:
+                amps.add(int(part.where["other"]) + 1)
+        out["amps"] = sorted(amps) or list(range(1, count + 1))
+        if "condition" in best:
+            out["wavelength"] = [float(best["condition"].where["condition"].split("/")[0])]
+        if "exposure" in best:
+            out["exposures"] = [int(v) for v in best["exposure"].where["exposure"]]
+        return out
+
+    def _heldout(self) -> dict[str, Any]:
+        """Chi-square over number of what was not fitted, before and after, by channel too."""
+        out: dict[str, Any] = {
+            "chi2dof_before": _finite(self.heldout), "chi2dof_after": None,
+            "values": sum(map(len, used_channels(self.measured.channels, ("held-out",)))),
+            "channels": {},
+        }  # fmt: skip
+        told = self.attribution
+        if told is not None and (told.found or told.free_form is not None):
+            out["chi2dof_after"] = _finite(told.chi2dof()[1])
+        if self.attribution is not None:
+            out["fails_in"] = list(self.attribution.fails_in)
+            out["channels"] = {
+                word: {"before": b / n, "after": a / n, "values": n}
+                for word, (b, a, n) in self.attribution.heldout.items()
+                if n
+            }
+        return out
+
+    def _all_flux(self, words: list[str]) -> list[float]:
+        """Lowest and highest flux [e-] of the first of channels that has any."""
+        for word in words:
+            name, scale = ("flux", 1.0) if word == "spot" else ("level", self.gain)
+            held = [
+                c.axes[name] for c in self.fit.channels if c.word == word and name in c.axes
+            ]
+            if held:
+                both = scale * np.concatenate(held).astype(float)
+                return [float(both.min()), float(both.max())]
+        return []
+
+    def said(self) -> str:
+        """Give the diagnosis in two or three plain sentences."""
+        m = self.mismatch
+        if not m.detected:
+            parts = [
+                "Nothing stands out: the largest of all statistics has a family-wise p of "
+                f"{m.p_value:.2g}.",
+                f"{len(self.fit.residuals)} values in {len(m.chi2)} channels were held against the "
+                "baseline; what these recordings cannot see is not excluded.",
+            ]  # fmt: skip
+        else:
+            first = m.findings[0]
+            others = self._elsewhere(first)
+            parts = [
+                f"The recordings differ from the baseline (family-wise p {m.p_value:.2g}), most in "
+                f"the {NAMES[first.word]} ({first.family}, {abs(first.z):.1f} standard deviations)."
+            ]  # fmt: skip
+            if others:
+                parts.append(f"It is also seen in: {', '.join(others)}.")
+            if self.attribution is not None:
+                parts += said_of(self.attribution)
+        far = {k: v for k, v in self.accepted[1].pulls.items() if abs(v) > 3}
+        if far:
+            text = ", ".join(f"{k} {v:+.1f}" for k, v in far.items())
+            parts.append(f"Device parameters off the card, in units of its spread: {text}.")
+        return " ".join(parts)
+
+    def _elsewhere(self, first: Finding) -> list[str]:
+        """Channels with findings beside the first's, each with its farthest lags, if it has any."""
+        out = []
+        for word in self.location()["channels"]:
+            own = [f for f in self.mismatch.findings if f.word == word]
+            lags = next((f for f in own if "lags" in f.where), None)
+            if word != first.word:
+                out.append(NAMES[word] + (f" ({_said_lags(lags)})" if lags else ""))
+        return out
+
+    def to_report(self) -> dict[str, Any]:
+        """Contents of report.json."""
+        fitted = {
+            name: {"value": float(v), "error": float(e)}
+            for name, v, e in zip(
+                self.fit.names, self.fit.values, self.fit.errors, strict=True
+            )
+            if not name.startswith(("map ", "spot ", "light ", "dark "))
+        }
+        return {
+            "schema": SCHEMA,
+            "campaign": self.campaign,
+            "version": bfsensor.__version__,
+            "baseline": self.baseline,
+            "detected": bool(self.mismatch.detected),
+            "p_value": self.mismatch.p_value,
+            "p_chi2": self.mismatch.p_chi2,
+            "p_scans": self.mismatch.p_scans,
+            "alarm": ALARM,
+            **reported(self.attribution),
+            "location": self.location(),
+            "recommended_recordings": self.plan.said(),
+            "plan": self.plan.to_report(),
+            "not_tested": [u.to_report() for u in find_untested(self.measured)],
+            "heldout": self._heldout(),
+            "channels": {
+                word: {"chi2": s, "dof": d, "p_value": float(chi2_distribution.sf(s, d))}
+                for word, (s, d) in self.mismatch.chi2.items()
+            },
+            "parts": [
+                {"family": f.family, "channel": f.word, "z": f.z, "p_value": f.p_value,
+                 "where": _plain(f.where)}
+                for f in self.mismatch.parts
+            ],
+            "findings": [
+                {"family": f.family, "channel": f.word, "z": f.z, "p_value": f.p_value,
+                 "where": _plain(f.where)}
+                for f in _shown(self.mismatch.findings)
+            ],
+            "parameters": fitted,
+            "exposures": dict(self.measured.counts),
+            "unlike_flats": [
+                {k: float(v) for k, v in vars(p).items()} | {"rises": bool(p.rises)}
+                for p in self.measured.unlike
+            ],
+            "notes": list(self.notes),
+            "said": self.said(),
+        }  # fmt: skip
+
+
+def _shown(findings: Sequence[Finding]) -> list[Finding]:
+    """The farthest of all, and of each channel: one must not crowd out the others."""
+    kept = list(findings[:FARTHEST])
+    for word in dict.fromkeys(f.word for f in findings):
+        kept += [f for f in findings if f.word == word][:OF_EACH]
+    chosen = {id(f) for f in kept}
+    return [f for f in findings if id(f) in chosen]
+
+
+def _said_lags(finding: Finding) -> str:
+    lags = finding.where["lags"]
+    text = f"lag ({lags[0][0]}, {lags[0][1]})" if len(lags) == 1 else f"{len(lags)} lags"
+    return f"{text}, {finding.z:+.1f}"
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _plain(where: dict[str, Any]) -> dict[str, Any]:
+    """Tuples as lists, numpy's numbers as Python's."""
+
+    def plain(v: Any) -> Any:
+        if isinstance(v, list | tuple):
+            return [plain(x) for x in v]
+        return v.item() if isinstance(v, np.generic) else v
+
+    return {k: plain(v) for k, v in where.items()}

@@ -1,0 +1,250 @@
+"""The figures of a report: residuals by channel, of the baseline and beside it with the effects."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from bfsensor.diagnose.data.channels import PER_ELECTRON
+from bfsensor.diagnose.fit.baseline_fit import BaselineFit
+from bfsensor.diagnose.report.diagnosis_result import NAMES, Diagnosis
+from bfsensor.plots import residuals as show
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Draw = Callable[["Axes"], None]
+DOTS = 130
+"""Dots per inch: sharp at half of a page."""
+
+VISIBLE = 0.2
+"""Change of a pull that is seen in a figure."""
+
+LAGS = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
+
+
+class Picture(NamedTuple):
+    """One figure: its parts one under another, so that a telephone shows them large enough."""
+
+    caption: str
+    size: tuple[float, float]
+    parts: tuple[Draw, ...]
+
+
+class Drawn(NamedTuple):
+    """Files of a figure: of the baseline, and with the effects where there are any.
+
+    Attributes
+    ----------
+    name, caption : str
+        Short name and caption.
+    before : Path
+        The baseline's, or the only one.
+    after : Path or None
+        With the effects, on the same scales.
+    """
+
+    name: str
+    caption: str
+    before: Path
+    after: Path | None = None
+
+    @property
+    def files(self) -> list[Path]:
+        """All files."""
+        return [p for p in (self.before, self.after) if p is not None]
+
+
+SAME_PIXELS = (
+    " Maps of all light are of the same pixels, whose own response is the same in all flats: "
+    "that a pattern comes again is no more evidence that it is what it is taken for."
+)
+"""What recordings of one sensor do not tell."""
+
+
+def draw_figures(diagnosis: Diagnosis, folder: Path) -> list[Drawn]:
+    """Draw what the channels allow.  Nothing without matplotlib."""
+    try:
+        import matplotlib
+    except ImportError:
+        return []
+    del matplotlib
+    out = []
+    for name, picture in _summary(diagnosis).items():
+        figure = _figure(picture)
+        out.append(Drawn(name, picture.caption, _save(figure, folder / f"{name}.png")))
+    attribution = diagnosis.attribution
+    before = _pictures(diagnosis.fit, diagnosis.mismatch.chi2)
+    after: Mapping[str, Picture] = {}
+    if attribution is not None and attribution.found:
+        after = _pictures(attribution.fit, attribution.mismatch.chi2)
+    changed = _changed(diagnosis)
+    # What the effects change comes first.
+    for name, picture in sorted(before.items(), key=lambda t: t[0] not in changed):
+        other = after.get(name) if name in changed else None
+        figures = [_figure(p) for p in (picture, other) if p is not None]
+        if len(figures) == 2:
+            _share(*figures)
+        paths = [
+            _save(f, folder / f"{name}{end}.png")
+            for f, end in zip(figures, ("", "_with_effects"), strict=False)
+        ]
+        out.append(Drawn(name, picture.caption, *paths))
+    return out
+
+
+def _changed(diagnosis: Diagnosis) -> set[str]:
+    """Names of figures that effects change to the eye."""
+    out = {"channels", "device"}
+    attribution = diagnosis.attribution
+    if attribution is not None:
+        away = np.abs(diagnosis.fit.residuals - attribution.fit.residuals)
+        for word in {c.word for c in diagnosis.fit.channels}:
+            if away[diagnosis.fit.of(word)].max(initial=0.0) > VISIBLE:
+                out.add(word)
+    return out
+
+
+def _summary(diagnosis: Diagnosis) -> dict[str, Picture]:
+    """Classes, and what effects do to recordings that were not fitted."""
+    out: dict[str, Picture] = {}
+    attribution = diagnosis.attribution
+    if attribution is None:
+        return out
+    shown = {w: p for w, p in attribution.probability.items() if p >= 5e-4}
+    if shown:
+        tied = [w for f in attribution.found if len(f.tied) > 1 for w in f.tied]
+        height = 0.7 + 0.32 * len(shown)
+        out["classes"] = Picture(
+            "Probability of each class to be among what was left out"
+            + ("; classes that these recordings cannot tell apart are in orange." if tied else "."),
+            (5.2, height), (lambda ax: show.draw_classes(shown, ax, tied=tied),),
+        )  # fmt: skip
+    held = {
+        NAMES.get(w, w): (b / n, a / n, n)
+        for w, (b, a, n) in attribution.heldout.items() if n
+    }  # fmt: skip
+    if attribution.found and held:
+        out["heldout"] = Picture(
+            "Recordings that no fit has seen: chi-square per value by the baseline and with the "
+            "effects. The grey bars are where noise alone leaves it in 95 of 100 cases."
+            + (SAME_PIXELS if NAMES["flat_map"] in held else ""),
+            (6.2, 0.9 + 0.36 * len(held)), (lambda ax: show.draw_held_out(held, ax),),
+        )  # fmt: skip
+    return out
+
+
+def _pictures(
+    fit: BaselineFit, chi2: Mapping[str, tuple[float, float]]
+) -> dict[str, Picture]:
+    """Residuals of one fit, by channel."""
+    found = {}
+    for word in dict.fromkeys(c.word for c in fit.channels):
+        parts = [
+            (c, fit.residuals[s : s + len(c)])
+            for c, s in zip(fit.channels, fit.starts, strict=False)
+            if c.word == word
+        ]
+        found[word] = max(parts, key=lambda p: len(p[0]))
+    out: dict[str, Picture] = {}
+    out["channels"] = Picture(
+        "How far each channel is, all that may float fitted; noise alone stays in the grey band.",
+        (5.2, 3.6), (lambda ax: show.draw_channels(_named(chi2), ax),),
+    )  # fmt: skip
+    errors = {
+        n.removeprefix("device "): float(e)
+        for n, e in zip(fit.names, fit.errors, strict=True) if n.startswith("device ")
+    }  # fmt: skip
+    if fit.pulls:
+        out["device"] = Picture(
+            "The device's parameters against its card.", (5.2, 0.9 + 0.32 * len(fit.pulls)),
+            (lambda ax: show.draw_parameters(fit.pulls, errors, ax),),
+        )  # fmt: skip
+    if "flat_cov" in found:
+        channel, pulls = found["flat_cov"]
+        caption = "Covariances of flats: pulls by lag"
+        panels: list[Draw] = [lambda ax: show.draw_lags(channel.axes, pulls, ax)]
+        if channel.unit != PER_ELECTRON:
+            caption += ", weighted by the square of the level, and of the nearest lags against level"
+            panels.append(
+                lambda ax: show.draw_lag_levels(channel.axes, pulls, ax, lags=LAGS)
+            )
+        out["flat_cov"] = Picture(f"{caption}.", (5.2, 3.5 * len(panels)), tuple(panels))
+    if "flat_mean" in found:
+        channel_m, pulls_m = found["flat_mean"]
+        left = channel_m.unwhiten(pulls_m) / np.maximum(channel_m.values, 1e-9)
+        out["flat_mean"] = Picture(
+            "Means of flats against exposure time and lamp.", (5.2, 3.4),
+            (lambda ax: show.draw_means(channel_m.axes, left, ax),),
+        )  # fmt: skip
+    for word in ("serial_overscan", "parallel_overscan"):
+        if word in found:
+            channel_o, pulls_o = found[word]
+            residual = channel_o.unwhiten(pulls_o)
+            out[word] = Picture(
+                f"{NAMES[word].capitalize()}: mean profile behind the brightest flats.", (5.2, 3.4),
+                (lambda ax, c=channel_o, r=residual: show.draw_overscan(c.axes, r, c.errors, ax),),  # type: ignore[misc]
+            )  # fmt: skip
+    if "flat_map" in found:
+        channel_p, pulls_p = found["flat_map"]
+        out["flat_map"] = Picture(
+            "Flats against position, the light's smooth shape taken off: blocks, columns and rows.",
+            (5.2, 7.0),
+            (lambda ax: show.draw_map(channel_p.axes, pulls_p, ax, name="all"),
+             lambda ax: show.draw_profile(channel_p.axes, pulls_p, ax, name="all")),
+        )  # fmt: skip
+    if "spot" in found:
+        channel_s, pulls_s = found["spot"]
+        out["spot"] = Picture(
+            "Spots: widths, flux, asymmetry and wings.", (5.2, 3.6),
+            (lambda ax: show.draw_spots(channel_s.axes, pulls_s, ax),),
+        )  # fmt: skip
+    if "bias_cov" in found:
+        channel_n, pulls_n = found["bias_cov"]
+        out["bias_cov"] = Picture(
+            "Noise in readout order.", (5.2, 3.4),
+            (lambda ax: show.draw_noise(channel_n.axes, pulls_n, ax),),
+        )  # fmt: skip
+    return out
+
+
+def _named(chi2: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    return {NAMES.get(w, w): v for w, v in chi2.items()}
+
+
+def _figure(picture: Picture) -> Figure:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=picture.size, layout="constrained")
+    for n, part in enumerate(picture.parts):
+        part(figure.add_subplot(len(picture.parts), 1, n + 1))
+    return figure
+
+
+def _share(one: Figure, other: Figure) -> None:
+    """Give both figures the same scales: what is gone is to look gone."""
+    for a, b in zip(one.axes, other.axes, strict=True):
+        for image, like in zip(a.images, b.images, strict=True):
+            ends = [f(*v) for f, v in zip((min, max), zip(image.get_clim(), like.get_clim(),
+                                                          strict=True), strict=True)]  # fmt: skip
+            image.set_clim(*ends)
+            like.set_clim(*ends)
+        if a.images or not (a.lines or a.containers or a.collections):
+            continue
+        for axis in "xy":
+            ends_a, ends_b = (getattr(ax, f"get_{axis}lim")() for ax in (a, b))
+            both = min(ends_a[0], ends_b[0]), max(ends_a[1], ends_b[1])
+            for ax in (a, b):
+                getattr(ax, f"set_{axis}lim")(*both)
+
+
+def _save(figure: Figure, path: Path) -> Path:
+    temporary = path.with_suffix(".tmp.png")
+    figure.savefig(temporary, dpi=DOTS)
+    os.replace(temporary, path)
+    return path

@@ -1,0 +1,81 @@
+"""GalSim's configuration learns our sensor types, without importing GalSim for it.
+
+``modules: [bfsensor]`` in a configuration only imports bfsensor.  Where GalSim's
+configuration is loaded already the types are registered at once.  Where it is not, a finder
+in ``sys.meta_path`` registers them as soon as it is: GalSim executes ``import bfsensor``,
+which does nothing when bfsensor was imported before GalSim, and importing GalSim here would
+make ``import bfsensor`` twenty times as slow.
+"""
+
+from __future__ import annotations
+
+import importlib.abc
+import importlib.machinery
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+_WATCHED = "galsim.config.sensor"
+
+
+class _Builder:
+    """Builds a sensor of a class that is imported when it is first needed."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def buildSensor(self, config: Any, base: Any, logger: Any) -> Any:  # noqa: N802
+        """Build the sensor that a configuration describes."""
+        import bfsensor
+
+        options = import_module("bfsensor.sensor.config")
+        builder = options.EffectSensorBuilder(getattr(bfsensor, self.name))
+        return builder.buildSensor(config, base, logger)
+
+
+def register(*, silicon: bool = False) -> None:
+    """Register the sensor type BrighterFatter, and with ``silicon`` replace Silicon."""
+    from galsim.config.sensor import RegisterSensorType
+
+    RegisterSensorType("BrighterFatter", _Builder("BrighterFatterSensor"))
+    if silicon:
+        RegisterSensorType("Silicon", _Builder("SiliconSensor"))
+
+
+class _Loader(importlib.abc.Loader):
+    """Loads GalSim's module, then registers."""
+
+    def __init__(self, loader: Any) -> None:
+        self.loader = loader
+
+    def create_module(self, spec: importlib.machinery.ModuleSpec) -> ModuleType | None:
+        return self.loader.create_module(spec)
+
+    def exec_module(self, module: ModuleType) -> None:
+        self.loader.exec_module(module)
+        register()
+
+
+class _Watch(importlib.abc.MetaPathFinder):
+    """Waits for GalSim's registry of sensors to be imported, once."""
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        if name != _WATCHED:
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.machinery.PathFinder.find_spec(name, path)
+        if spec is not None and spec.loader is not None:
+            spec.loader = _Loader(spec.loader)
+        return spec
+
+
+def register_when_loaded() -> None:
+    """Register now if GalSim's registry is loaded, else when it is."""
+    if _WATCHED in sys.modules:
+        register()
+    else:
+        sys.meta_path.insert(0, _Watch())

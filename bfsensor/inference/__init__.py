@@ -1,0 +1,1 @@
+"""Statistics without physics: numpy and scipy only."""

@@ -1,0 +1,1 @@
+"""Figures: functions that draw plain arrays or results into axes."""

@@ -1,0 +1,425 @@
+"""Figures of a solved device: potentials and carriers under the gates; all pages of a device.
+
+They follow figures 6 and 7 of Lage, Bradshaw & Tyson (2017).  Axes are in um, x serial and
+y parallel, z up from the gates; light comes from the top.  :mod:`bfsensor.plots.table` gives these
+functions together with the figures of tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.direct.transport import Transport
+from bfsensor.plots.paths import draw_collected_paths, draw_electron_paths
+from bfsensor.plots.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    PURPLE,
+    RED,
+    SHOWN_CHARGE,
+    central_pixel,
+    electrons_text,
+    import_matplotlib,
+    new_figure,
+)
+from bfsensor.simulate.mesh import Surfaces, make_mesh
+from bfsensor.simulate.poisson import Electrostatics, Potential
+from bfsensor.simulate.unit_cell import solve_unit_cell, tile
+from bfsensor.typing import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from bfsensor.device.device import Device
+
+ELECTRON_COLOUR, HOLE_COLOUR, DOPANT_COLOUR = BLUE, RED, GREEN
+
+_FAINTEST = 1e2  # carriers/um^3 below which a cross section is left white
+
+
+def draw_potential_profiles(
+    potential: Potential,
+    axes: NDArray[Any] | Sequence[Sequence[Axes]],
+    *,
+    empty: Potential | None = None,
+    height: float = 4.0,
+) -> None:
+    """Draw potential and charge density against z under the gates of pixel (0, 0).
+
+    Parameters
+    ----------
+    potential : Potential
+        Solved with charge in pixel (0, 0).
+    axes : array of matplotlib.axes.Axes, shape (2, 3)
+        Above: potentials [V], with an inset to the full thickness; below: densities of
+        dopants, holes and electrons [1/um^3], positive for positive charge.  From the
+        left: centre of the collecting gate, of the channel stop beside it, of the barrier
+        gate.
+    empty : Potential, optional
+        The same device without stored charge, drawn dashed under the collecting gate.
+    height : float
+        Upper end of z [um].
+
+    Raises
+    ------
+    BFSensorError
+        Matplotlib is missing.
+    """
+    import_matplotlib()
+    device, mesh = potential.device, potential.mesh
+    surfaces = Surfaces.of(device)
+    point = device.operating_point
+    half_x, half_y = mesh.pitch[0] / 2, mesh.pitch[1] / 2
+    places = (
+        (f"collecting gate, {point.gate_high:+g} V", 0.0, 0.0, half_x),
+        ("channel stop", half_x, 0.0, 0.0),
+        (f"barrier gate, {point.gate_low:+g} V", 0.0, half_y, half_x),
+    )
+    charge = float(potential.charges[central_pixel(potential)])
+    for column, (name, x, y, distance) in enumerate(places):
+        above, below = axes[0][column], axes[1][column]
+        gate = float(surfaces.gate(np.array([distance]))[0])
+        silicon = float(surfaces.silicon(np.array([distance]))[0])
+        for ax in (above, below):
+            ax.axvspan(0.0, gate, color="#8C8C8C", linewidth=0)
+            ax.axvspan(gate, silicon, color="#DDDDDD", linewidth=0)
+            ax.set_xlim(0.0, height)
+            ax.set_xlabel("z above the gates [µm]")
+        above.set_title(name)
+        above.set_ylabel("potential [V]")
+        below.set_ylabel("charge density [e/µm³]")
+
+        full = above.inset_axes((0.6, 0.62, 0.38, 0.3))
+        solutions = [(potential, electrons_text(charge), "-", BLACK)]
+        if empty is not None and column == 0:
+            solutions.append((empty, "empty", "--", PURPLE))
+        for solved, label, style, colour in solutions:
+            phi = solved.phi[:, _node(solved, 1, y), _node(solved, 0, x)]
+            shown = (mesh.z >= gate - 1e-9) & (mesh.z <= 1.1 * height)
+            above.plot(
+                mesh.z[shown], phi[shown], style, color=colour, linewidth=1.5, label=label
+            )
+            full.plot(mesh.z, phi, style, color=colour, linewidth=1.0)
+        shown = (mesh.z >= gate - 1e-9) & (mesh.z <= height)
+        profile = potential.phi[shown, _node(potential, 1, y), _node(potential, 0, x)]
+        top, low = float(profile.max()), float(profile.min())
+        if empty is not None and column == 0:
+            top = max(
+                top, float(empty.phi[shown, _node(empty, 1, y), _node(empty, 0, x)].max())
+            )
+        # Room above the curve for the inset.
+        above.set_ylim(low - 0.08 * (top - low), top + 0.9 * (top - low))
+        full.set_xlim(0.0, mesh.z[-1])
+        full.tick_params(labelsize=7)
+        full.set_title("to the back surface", fontsize=8, pad=3)
+        if column == 0 and empty is not None:
+            above.legend(
+                loc="upper left", bbox_to_anchor=(0.17, 1.0), fontsize=8, frameon=False
+            )
+
+        z, holes, electrons = _carrier_profiles(potential, x, y)
+        heights = np.linspace(silicon, height, 401)
+        dopants = _dopant_density(device, surfaces, x, y, heights)
+        below.fill_between(
+            heights, 0.0, dopants, color=DOPANT_COLOUR, alpha=0.25, linewidth=0
+        )
+        below.plot(heights, dopants, color=DOPANT_COLOUR, linewidth=1.3, label="dopants")
+        below.plot(z, holes, color=HOLE_COLOUR, linewidth=1.5, label="holes")
+        below.plot(z, -electrons, color=ELECTRON_COLOUR, linewidth=1.5, label="electrons")
+        below.axhline(0.0, color=BLACK, linewidth=0.6)
+        # Decades, linear within 1000: inversion layers are far denser than stored charge.
+        below.set_yscale("symlog", linthresh=1e3, linscale=0.5)
+        decades = [10.0**power for power in range(3, 8)]
+        below.set_yticks([-d for d in reversed(decades)] + [0.0, *decades])
+        below.minorticks_off()
+        largest = max(float(np.abs(a).max()) for a in (dopants, holes, electrons))
+        below.set_ylim(-2.5 * largest, 2.5 * largest)
+        below.legend(loc="lower right", fontsize=8, frameon=False)
+
+
+def draw_charge_cross_sections(
+    potential: Potential, fig: Figure, *, height: float = 4.0
+) -> None:
+    """Draw free carriers and potential in the x-z and y-z planes through pixel (0, 0).
+
+    Parameters
+    ----------
+    potential : Potential
+        Solved with charge in pixel (0, 0).
+    fig : matplotlib.figure.Figure
+        An empty figure; gets three panels (x-z under the collecting gate, x-z under the
+        barrier gate, y-z along the channel) and two colour bars.  Holes are red,
+        electrons blue; gates dark, oxide light grey.
+    height : float
+        Upper end of z [um].
+
+    Raises
+    ------
+    BFSensorError
+        Matplotlib is missing.
+    """
+    import_matplotlib()
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LogNorm
+
+    device, mesh = potential.device, potential.mesh
+    surfaces = Surfaces.of(device)
+    point = device.operating_point
+    densities = [_density(potential, c) for c in (potential.holes, potential.electrons)]
+    maps = []
+    for density, colours in zip(densities, ("Reds", "Blues"), strict=True):
+        highest = max(float(density.max()), 10 * _FAINTEST)
+        maps.append(ScalarMappable(LogNorm(_FAINTEST, highest), colours))
+    axes = list(fig.subplots(3, 1))
+    half_y = mesh.pitch[1] / 2
+    panels = (
+        (
+            0,
+            _node(potential, 1, 0.0),
+            f"x-z at y = 0: collecting gate, {point.gate_high:+g} V",
+        ),
+        (
+            0,
+            _node(potential, 1, half_y),
+            f"x-z at y = {half_y:g} µm: barrier gate, {point.gate_low:+g} V",
+        ),
+        (1, _node(potential, 0, 0.0), "y-z at x = 0: along the channel"),
+    )
+    front = mesh.z[: potential.electrons.shape[0]]
+    extent = 1.5
+    for ax, (axis, node, title) in zip(axes, panels, strict=True):
+        across = "xy"[axis]
+        pitch = mesh.pitch[axis]
+        along, order = _unfolded_nodes(potential, axis, extent * pitch)
+
+        def section(
+            a: FloatArray,
+            axis: int = axis,
+            node: int = node,
+            order: NDArray[np.int64] = order,
+        ) -> FloatArray:
+            plane = a[:, node, :] if axis == 0 else a[:, :, node]
+            return plane[:, order]
+
+        for density, shades in zip(densities, maps, strict=True):
+            values = section(density)
+            ax.pcolormesh(
+                along, front, np.ma.masked_less(values, _FAINTEST), norm=shades.norm,
+                cmap=shades.cmap, shading="nearest", rasterized=True, zorder=1,
+            )  # fmt: skip
+        fine = np.linspace(-extent * pitch, extent * pitch, 1201)
+        if axis == 0:
+            distance = pitch / 2 - np.abs(fine - pitch * np.round(fine / pitch))
+        else:
+            distance = np.full(fine.shape, mesh.pitch[0] / 2)
+        gate, silicon = surfaces.gate(distance), surfaces.silicon(distance)
+        ax.fill_between(fine, -0.25, gate, color="#8C8C8C", linewidth=0, zorder=3)
+        ax.fill_between(fine, gate, silicon, color="#DDDDDD", linewidth=0, zorder=3)
+        ax.plot(fine, gate, color=BLACK, linewidth=0.8, zorder=4)
+        ax.plot(fine, silicon, color=BLACK, linewidth=0.8, zorder=4)
+        shown = mesh.z <= 1.2 * height
+        surface = np.interp(along, fine, silicon)
+        phi = np.ma.masked_where(
+            mesh.z[shown, None] < surface[None, :] - 1e-6, section(potential.phi)[shown]
+        )
+        inside = phi.compressed()
+        step = _round_step((inside.max() - inside.min()) / 10)
+        levels = (
+            np.arange(np.floor(inside.min() / step), np.ceil(inside.max() / step) + 1)
+            * step
+        )
+        lines = ax.contour(
+            along, mesh.z[shown], phi, levels=levels, colors="#444444", linewidths=0.6,
+            linestyles="solid", zorder=2,
+        )  # fmt: skip
+        # Labels at the top of each line, where neighbours are farthest apart.
+        segments = [line for group in lines.allsegs for line in group if len(line)]
+        tops = [line[np.argmax(line[:, 1])] for line in segments]
+        places: list[tuple[float, float]] = []
+        for a, z in sorted(map(tuple, tops), key=lambda top: -top[1]):
+            visible = (
+                abs(a) < 0.9 * extent * pitch
+                # Lines crowd at the edges of gates: no labels there.
+                and np.interp(a, fine, silicon) + 0.06 * height < z < height - 0.2
+            )
+            if visible and all(
+                abs(a - b) > 0.2 * pitch or q - z > 0.06 * height for b, q in places
+            ):
+                places.append((a, z))
+        if places:
+            ax.clabel(lines, manual=places, fontsize=7, fmt="%g V")
+        if axis == 1:
+            edges = device.gates.edges_y(pitch)
+            for m in range(-2, 3):
+                for edge in edges:
+                    ax.plot(
+                        [edge + m * pitch] * 2,
+                        [-0.25, gate[0]],
+                        color="white",
+                        linewidth=1.5,
+                        zorder=5,
+                    )
+                if abs(m) <= extent - 0.5:
+                    _write_in_gate(ax, m * pitch, gate[0], f"{point.gate_high:+g} V")
+                if abs(m + 0.5) < extent:
+                    _write_in_gate(ax, (m + 0.5) * pitch, gate[0], f"{point.gate_low:+g} V")
+        ax.set_xlim(-extent * pitch, extent * pitch)
+        ax.set_ylim(-0.25, height)
+        ax.set_xlabel(f"{across}, {'serial' if axis == 0 else 'parallel'} [µm]")
+        ax.set_ylabel("z [µm]")
+        ax.set_title(title)
+    fig.colorbar(maps[0], ax=axes, shrink=0.6, pad=0.01, label="holes [µm⁻³]")
+    fig.colorbar(maps[1], ax=axes, shrink=0.6, pad=0.01, label="electrons [µm⁻³]")
+
+
+def figure_for_device(device: Device) -> dict[str, Figure]:
+    """Solve an empty and a filled pixel and draw them.
+
+    Parameters
+    ----------
+    device : Device
+        What to solve: a period of 4 pixels of 16 cells, pixel (0, 0) once empty, once with
+        :data:`~bfsensor.plots.style.SHOWN_CHARGE`.
+
+    Returns
+    -------
+    figures : dict of str to matplotlib.figure.Figure
+        ``profiles``, ``sections``, ``paths`` (drift alone) and ``diffusion`` (drift, with
+        diffusion, with diffusion above a full pixel), each to be written with ``savefig``.
+
+    Raises
+    ------
+    BFSensorError
+        Matplotlib is missing.
+    ConvergenceError, DeviceError
+        The device has no such solution.
+    """
+    profiles = new_figure(13.0, 7.5)  # before the solution: matplotlib may be missing
+    mesh = make_mesh(device, pixels=(4, 4), cells=16)
+    solver = Electrostatics(device, mesh)
+    unit = solve_unit_cell(device, 0.0, cells=16)
+    empty = solver.solve(0.0, start=tile(unit, mesh))
+    charges = np.zeros(solver.pixel_shape)
+    charges[central_pixel(empty)] = SHOWN_CHARGE
+    filled = solver.solve(charges, start=empty.phi)
+
+    draw_potential_profiles(filled, profiles.subplots(2, 3), empty=empty)
+    sections = new_figure(11.0, 10.0)
+    draw_charge_cross_sections(filled, sections)
+    paths = new_figure(12.0, 13.0)
+    axes = paths.subplots(3, 2)
+    # The lowest part again, empty and filled: that is where the paths bend.
+    for row, (solved, height) in enumerate(((filled, None), (empty, 12.0), (filled, 12.0))):
+        draw_electron_paths(solved, axes[row, 0], plane="x", paths=16, height=height)
+        draw_electron_paths(solved, axes[row, 1], plane="y", paths=16, height=height)
+    diffusion = _diffusion_page(empty, filled)
+    return {
+        "profiles": profiles,
+        "sections": sections,
+        "paths": paths,
+        "diffusion": diffusion,
+    }
+
+
+def _diffusion_page(empty: Potential, filled: Potential) -> Figure:
+    """Drift, diffusion and repulsion: the whole thickness, and close to the wells."""
+    figure = new_figure(14.0, 13.5)
+    axes = figure.subplots(3, 3)
+    still = Transport(diffusion=0.0)
+    planes: tuple[Literal["x", "y"], ...] = ("x", "x", "y")
+    for row, plane, height in zip(axes, planes, (None, 12.0, 12.0), strict=True):
+        draw_collected_paths(empty, row[0], plane=plane, height=height, transport=still)
+        draw_collected_paths(empty, row[1], plane=plane, height=height)
+        draw_collected_paths(filled, row[2], plane=plane, height=height, compare=empty)
+    return figure
+
+
+def _write_in_gate(ax: Axes, position: float, top: float, text: str) -> None:
+    ax.text(
+        position, 0.5 * (top - 0.25), text, ha="center", va="center", fontsize=8,
+        color="white", zorder=6,
+    )  # fmt: skip
+
+
+def _node(potential: Potential, axis: int, position: float) -> int:
+    """Find the node nearest to a position [um] along x (0) or y (1)."""
+    nodes = potential.mesh.x if axis == 0 else potential.mesh.y
+    return int(np.argmin(np.abs(nodes - position)))
+
+
+def _unfolded_nodes(
+    potential: Potential, axis: int, extent: float
+) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Node positions [um] just beyond -extent to extent, and their indices in the mesh."""
+    mesh = potential.mesh
+    nodes, side = ((mesh.x, mesh.side_x), (mesh.y, mesh.side_y))[axis]
+    index = np.arange(len(nodes))
+    if side == "mirror":
+        mirrored = 2 * nodes[0] - nodes[:0:-1]
+        nodes, index = (
+            np.concatenate([mirrored, nodes]),
+            np.concatenate([index[:0:-1], index]),
+        )
+    period = mesh.period[axis]
+    # The last node of an unfolded mirror domain is the first of its next period.
+    if side == "mirror":
+        nodes, index = nodes[:-1], index[:-1]
+    nodes = np.concatenate([nodes + m * period for m in (-2, -1, 0, 1, 2)])
+    index = np.tile(index, 5)
+    inside = np.nonzero(np.abs(nodes) <= extent + 1e-9)[0]
+    keep = slice(max(inside[0] - 1, 0), inside[-1] + 2)
+    return nodes[keep], index[keep]
+
+
+def _density(potential: Potential, carriers: FloatArray) -> FloatArray:
+    """Carriers per um^3 of silicon, zero outside it."""
+    out = np.zeros_like(carriers)
+    return np.divide(carriers, potential.silicon, out=out, where=potential.silicon > 0)
+
+
+def _carrier_profiles(
+    potential: Potential, x: float, y: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Heights [um], hole and electron densities of a column of nodes in the silicon."""
+    j, i = _node(potential, 1, y), _node(potential, 0, x)
+    silicon = potential.silicon[:, j, i] > 0
+    z = potential.mesh.z[: len(silicon)][silicon]
+    holes = _density(potential, potential.holes)[silicon, j, i]
+    electrons = _density(potential, potential.electrons)[silicon, j, i]
+    return z, holes, electrons
+
+
+def _dopant_density(
+    device: Device, surfaces: Surfaces, x: float, y: float, z: FloatArray
+) -> FloatArray:
+    """Give the fixed charge [e/um^3] at heights z [um] of a column; no sheet charges."""
+    pitch_x, pitch_y = device.pixel.pitch_x, device.pixel.pitch_y
+    distance = np.array([pitch_x / 2 - abs(x - pitch_x * round(x / pitch_x))])
+    depth = np.maximum(z - surfaces.silicon(distance)[0], 0.0)
+    stop = device.channel_stop
+    parts = [(1.0 - surfaces.ramp(distance, surfaces.side_diffusion)[0], stop.implants)]
+    if surfaces.ramp(distance, surfaces.taper)[0] >= 1.0:
+        parts.append((1.0, device.channel.implants))
+    if stop.dots is not None:
+        offset = y - (stop.dots.centre - pitch_y / 2)
+        if abs(offset - pitch_y * round(offset / pitch_y)) < stop.dots.height / 2:
+            parts.append((parts[0][0], stop.dots.implants))
+    total = np.full(z.shape, device.silicon.background_doping)
+    for ripple in device.silicon.ripples:
+        total = total * ripple.factor(np.array([x]), np.array([y]))
+    for share, implants in parts:
+        for implant in implants:
+            total = total + share * implant.density(depth)
+    return total
+
+
+def _round_step(step: float) -> float:
+    """Round up to 1, 2 or 5 times a power of ten."""
+    power = 10.0 ** np.floor(np.log10(step))
+    return float(power * next(m for m in (1.0, 2.0, 5.0, 10.0) if m * power >= step))

@@ -1,0 +1,218 @@
+"""Figures of electrons on their way to the wells: drift, diffusion, repulsion.
+
+They follow figure 6 of Lage, Bradshaw & Tyson (2017).  Axes are in um, x serial and y parallel,
+z up from the gates; light comes from the top.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from bfsensor._kernels import drift
+from bfsensor.direct.transport import Tracer, Transport
+from bfsensor.errors import BFSensorError
+from bfsensor.plots.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    RED,
+    central_pixel,
+    electrons_text,
+    import_matplotlib,
+)
+from bfsensor.simulate.field import Field
+from bfsensor.simulate.poisson import Potential
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_PATH_STEP = 0.25  # of the local scale, as for finding boundaries
+_MOST_STEPS = 3000
+# Shorter than the default: a path of steps of 5 um would be drawn as a polygon.
+_DRAWN = Transport(part=0.1, longest=0.5)
+_SEED = 5417
+
+
+def draw_electron_paths(
+    potential: Potential,
+    ax: Axes,
+    *,
+    plane: Literal["x", "y"] = "x",
+    paths: int = 8,
+    height: float | None = None,
+) -> None:
+    """Draw drift paths, without diffusion, from the light side to the wells.
+
+    Parameters
+    ----------
+    potential : Potential
+        Solved; paths start in the plane of pixel (0, 0), 1 um below the back surface.
+    ax : matplotlib.axes.Axes
+        Where; colours tell in which undistorted pixel a path started.
+    plane : {'x', 'y'}
+        Along x (y = 0) or along y (x = 0).
+    paths : int
+        Paths a pixel.
+    height : float, optional
+        Upper end of the view [um]; by default the back surface.
+
+    Raises
+    ------
+    BFSensorError
+        Matplotlib is missing, or ``plane`` is neither.
+    """
+    import_matplotlib()
+    from matplotlib.collections import LineCollection
+
+    axis, pitch, reach = _plane(potential, plane)
+    mesh = potential.mesh
+    pixels = np.arange(0, reach + 1)
+    # Starts avoid centres and edges of pixels, where a path may end on a saddle.
+    fractions = (np.arange(paths) + 0.5) / paths - 0.5
+    starts = np.zeros((len(pixels) * paths, 3))
+    starts[:, axis] = ((pixels[:, None] + fractions) * pitch).ravel()
+    starts[:, 2] = mesh.z[-1] - 1.0
+    field = Field.of(potential)
+    out = np.zeros((len(starts), _MOST_STEPS, 3))
+    lengths = np.zeros(len(starts), np.int64)
+    drift.trace_down(
+        field.phi,
+        field.x,
+        field.y,
+        field.z,
+        starts,
+        field.zone,
+        _PATH_STEP,
+        _MOST_STEPS,
+        out,
+        lengths,
+    )
+    lines, colours = [], []
+    for start, path, length in zip(starts, out, lengths, strict=True):
+        pixel = int(np.round(start[axis] / pitch))
+        colour = (RED, BLUE, GREEN)[pixel % 3]
+        line = path[:length][:, [axis, 2]]
+        lines.append(line)
+        colours.append(colour)
+        if pixel > 0:
+            lines.append(line * np.array([-1.0, 1.0]))
+            colours.append(colour)
+    ax.add_collection(LineCollection(lines, colors=colours, linewidths=0.7, zorder=2))
+
+    _frame(potential, ax, plane, height)
+    ax.set_title(f"Drift paths along {plane}, {_content(potential)}")
+
+
+def draw_collected_paths(
+    potential: Potential,
+    ax: Axes,
+    *,
+    plane: Literal["x", "y"] = "x",
+    paths: int = 24,
+    height: float | None = None,
+    transport: Transport | None = None,
+    compare: Potential | None = None,
+    seed: int = _SEED,
+) -> None:
+    """Draw electrons from the light side to the pixels that collect them.
+
+    Parameters
+    ----------
+    potential : Potential
+        Solved; electrons start in the plane of pixel (0, 0), 1 um below the back surface, and
+        leave that plane as they diffuse: what is drawn is their projection.
+    ax : matplotlib.axes.Axes
+        Where; colours tell which pixel along the plane collects an electron.
+    plane : {'x', 'y'}
+        Along x (y = 0) or along y (x = 0).
+    paths : int
+        Electrons a pixel.
+    height : float, optional
+        Upper end of the view [um]; by default the back surface.
+    transport : Transport, optional
+        How they move (default: drift and diffusion by Einstein's relation, in steps short
+        enough to draw).
+    compare : Potential, optional
+        The same electrons, with the same random numbers, in this potential: drawn in grey
+        below.  Those that it leads to another pixel, in x or in y, are heavy and black, and
+        counted in the title.
+    seed : int
+        Of the random numbers.
+
+    Raises
+    ------
+    BFSensorError
+        Matplotlib is missing, or ``plane`` is neither.
+    """
+    import_matplotlib()
+    from matplotlib.collections import LineCollection
+
+    axis, pitch, reach = _plane(potential, plane)
+    transport = transport or _DRAWN
+    # Starts avoid centres and edges of pixels, where a path may end on a saddle.
+    count = (2 * reach + 1) * paths
+    places = ((np.arange(count) + 0.5) / paths - reach - 0.5) * pitch
+    starts = np.zeros((count, 3))
+    starts[:, axis] = places
+    starts[:, 2] = potential.mesh.z[-1] - 1.0
+    here = Tracer(potential).trace(starts, seed=seed, transport=transport, keep_paths=True)
+    ends = here.pixels[:, axis]
+    colours = [(RED, BLUE, GREEN)[abs(int(end)) % 3] for end in ends]
+    widths = [0.7] * count
+    what = "drift" if transport.diffusion == 0 else "drift and diffusion"
+    title = f"{what} along {plane}, {_content(potential)}"
+    own = np.round(places / pitch) == 0
+    kept = int(np.count_nonzero(own & (ends == 0)))
+    title += f"\n{kept} of {int(own.sum())} from above the centre collected there"
+    lines = [path[:, [axis, 2]] for path in here.paths]
+    order = np.arange(count)
+    if compare is not None:
+        there = Tracer(compare).trace(
+            starts, seed=seed, transport=transport, keep_paths=True
+        )
+        shadows = [path[:, [axis, 2]] for path in there.paths]
+        ax.add_collection(LineCollection(shadows, colors=GREY, linewidths=0.6, zorder=1.5))
+        moved = (here.pixels != there.pixels).any(1)
+        for n in np.nonzero(moved)[0]:
+            colours[n], widths[n] = BLACK, 1.6
+        order = np.argsort(moved, kind="stable")  # the heavy ones on top
+        title += f"\ngrey: {_content(compare)}; black: {int(moved.sum())} to another pixel"
+    drawn = LineCollection(
+        [lines[n] for n in order],
+        colors=[colours[n] for n in order],
+        linewidths=[widths[n] for n in order],
+        zorder=2,
+    )
+    ax.add_collection(drawn)
+    _frame(potential, ax, plane, height)
+    ax.set_title(title, fontsize=10)
+
+
+def _plane(potential: Potential, plane: str) -> tuple[int, float, int]:
+    """Axis, pitch [um] and pixels shown on either side of the centre."""
+    if plane not in ("x", "y"):
+        raise BFSensorError(f"plane = {plane!r} must be 'x' or 'y'")
+    axis = 0 if plane == "x" else 1
+    pitch = potential.mesh.pitch[axis]
+    reach = max(0, min(2, int((potential.mesh.period[axis] / pitch - 1) / 2)))
+    return axis, pitch, reach
+
+
+def _frame(potential: Potential, ax: Axes, plane: str, height: float | None) -> None:
+    """Pixel edges, limits and labels."""
+    _, pitch, reach = _plane(potential, plane)
+    for edge in np.arange(-reach, reach + 2) - 0.5:
+        ax.axvline(edge * pitch, color=GREY, linewidth=0.8, linestyle="--", zorder=1)
+    ax.set_xlim(-(reach + 0.55) * pitch, (reach + 0.55) * pitch)
+    ax.set_ylim(0.0, potential.mesh.z[-1] if height is None else height)
+    ax.set_xlabel(f"{plane}, {'serial' if plane == 'x' else 'parallel'} [µm]")
+    ax.set_ylabel("z above the gates [µm]")
+
+
+def _content(potential: Potential) -> str:
+    """What the central pixel holds, in words."""
+    charge = float(potential.charges[central_pixel(potential)])
+    return f"{electrons_text(charge)} in the centre" if charge > 0 else "empty"

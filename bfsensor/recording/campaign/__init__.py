@@ -1,0 +1,1 @@
+"""Campaigns: folders of raw exposures, listed, checked and read."""

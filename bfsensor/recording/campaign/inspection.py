@@ -1,0 +1,261 @@
+"""What the pixels of a campaign show to be wrong: one pass, one exposure at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.errors import RecordingError
+from bfsensor.recording.campaign.amplifiers import AmplifierFrame, read_exposure
+from bfsensor.recording.campaign.campaign import Campaign
+from bfsensor.recording.campaign.exposures import (
+    Caution,
+    Exposure,
+    Progress,
+    count_of,
+    named,
+)
+from bfsensor.recording.campaign.frame_statistics import FrameStatistics, PairStatistics
+from bfsensor.recording.campaign.level_checks import (
+    MISMATCH,
+    check_gain,
+    check_level_steps,
+    check_levels,
+    check_pedestals,
+    check_saturation,
+)
+from bfsensor.recording.raw.fits_sections import MAD_TO_SIGMA
+
+BOX = 256
+"""Side of the box in the middle of each amplifier from which levels and variances come: a
+pair's variance has an error of 0.6 % there."""
+
+SKIP = 2
+"""Overscan columns left out of its level: deferred charge comes out in them."""
+
+MOST_NAN = 0.1
+"""Share of pixels that are not finite above which an exposure is set aside."""
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """A campaign after its pixels were looked at.
+
+    Attributes
+    ----------
+    campaign : Campaign
+        With what was found among its warnings, and unreadable exposures set aside.
+    frames : tuple of FrameStatistics
+        By exposure and amplifier.
+    pairs : tuple of PairStatistics
+        By pair and amplifier.
+    """
+
+    campaign: Campaign
+    frames: tuple[FrameStatistics, ...]
+    pairs: tuple[PairStatistics, ...]
+
+    def levels(self, exposure: int) -> dict[str, float]:
+        """Give the level of each amplifier in an exposure [ADU]."""
+        return {f.amplifier: f.level for f in self.frames if f.exposure == exposure}
+
+
+def inspect_campaign(campaign: Campaign, *, progress: Progress | None = None) -> Inspection:
+    """Read every exposure once, and hold levels, variances and gains against one another.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        As :func:`bfsensor.recording.campaign.campaign.read_campaign` gives it.
+    progress : callable, optional
+        Called with the exposures done and their number.
+
+    Returns
+    -------
+    inspection : Inspection
+        Exposures whose pixels cannot be read, or of which more than a tenth are not finite,
+        are set aside in its campaign.  Saturated pairs, gains that the header has wrong by
+        more than 20 %, flats whose level steps or stands out, biases with light, drifting
+        pedestals and unequal pairs stay and are named.
+
+    Notes
+    -----
+    Held at a time: one exposure, and the boxes of flats that wait for their partners.
+    """
+    frames: list[FrameStatistics] = []
+    pairs: list[PairStatistics] = []
+    waiting: dict[int, tuple[Exposure, dict[str, NDArray[np.float32]]]] = {}
+    found = campaign
+    holed: list[Exposure] = []
+    for k, one in enumerate(campaign.exposures):
+        if progress is not None:
+            progress(k, len(campaign.exposures))
+        try:
+            read = read_exposure(campaign, one)
+        except RecordingError as error:
+            found = found.without(one, str(error).removeprefix(f"{one.path}: "))
+            continue
+        mine = [_statistics(frame) for frame in read]
+        worst = max(mine, key=lambda f: f.not_finite)
+        if worst.not_finite > MOST_NAN:
+            found = found.without(
+                one,
+                f"{worst.not_finite:.0%} of the pixels of {worst.amplifier} are not finite",
+            )
+            continue
+        if worst.not_finite:
+            holed.append(one)
+        frames += mine
+        if one.kind == "flat" and one.pair is not None:
+            boxes = {frame.name: _box(frame) for frame in read}
+            if one.pair in waiting:
+                partner, others = waiting.pop(one.pair)
+                pairs += [_compare(partner, one, n, others[n], boxes[n]) for n in boxes]
+            else:
+                waiting[one.pair] = (one, boxes)
+        del read
+    if progress is not None:
+        progress(len(campaign.exposures), len(campaign.exposures))
+    frames = _above_biases(found, frames)
+    pairs = _with_levels(pairs, frames)
+    cautions = []
+    if holed:
+        cautions.append(
+            Caution(
+                "pixels",
+                f"pixels that are not finite in {named(holed)}; they are masked",
+                exposures=tuple(one.number for one in holed),
+            )
+        )
+    cautions += check_mismatch(found, pairs)
+    cautions += check_saturation(found, frames, pairs)
+    cautions += check_gain(found, frames, pairs)
+    cautions += check_levels(found, frames)
+    cautions += check_level_steps(found, frames)
+    cautions += check_pedestals(found, frames)
+    return Inspection(found.with_warnings(*cautions), tuple(frames), tuple(pairs))
+
+
+def check_mismatch(campaign: Campaign, pairs: Sequence[PairStatistics]) -> list[Caution]:
+    """Name the pairs whose two levels differ: their fixed pattern does not drop out."""
+    wrong = sorted({(p.first, p.second) for p in pairs if abs(p.mismatch) > MISMATCH})
+    if not wrong:
+        return []
+    most = max(abs(p.mismatch) for p in pairs)
+    first = [one for one in campaign.exposures if one.number in {a for a, _ in wrong}]
+    return [
+        Caution(
+            "pairs",
+            f"{count_of(len(wrong), 'pair')} of unequal levels, by up to {most:.1%} ({named(first)})",
+            "fixed pattern does not drop out of them",
+            tuple(n for pair in wrong for n in pair),
+        )
+    ]
+
+
+def _statistics(frame: AmplifierFrame) -> FrameStatistics:
+    """Level, pedestal and shares of bad pixels of one amplifier."""
+    image = frame.image
+    finite = np.isfinite(image)
+    share = 1.0 - float(np.count_nonzero(finite)) / image.size
+    top = float(np.max(image, where=finite, initial=-np.inf))
+    over = frame.serial_overscan[:, SKIP:]
+    over = over[np.isfinite(over)] if over.shape[1] > 2 else over[:0]
+    pedestal, noise = _mean_and_scatter(over)
+    box = _box(frame)
+    raw, _ = _mean_and_scatter(box[np.isfinite(box)])
+    return FrameStatistics(
+        exposure=frame.exposure,
+        amplifier=frame.name,
+        level=raw if np.isnan(pedestal) else raw - pedestal,
+        pedestal=pedestal,
+        noise=noise,
+        not_finite=share,
+        saturated=float(np.count_nonzero(image >= frame.saturation)) / image.size,
+        top=float(np.count_nonzero(image == top)) / image.size,
+    )
+
+
+def _mean_and_scatter(values: NDArray[np.float32]) -> tuple[float, float]:
+    """Mean and standard deviation of what lies within 5 sigma of the median.
+
+    Medians of whole numbers would be whole numbers.
+    """
+    if not values.size:
+        return float("nan"), float("nan")
+    middle = float(np.median(values))
+    sigma = MAD_TO_SIGMA * float(np.median(np.abs(values - middle)))
+    kept = values[np.abs(values - middle) <= 5 * max(sigma, 0.5)].astype(np.float64)
+    return float(kept.mean()), float(kept.std())
+
+
+def _box(frame: AmplifierFrame) -> NDArray[np.float32]:
+    """Middle of an image, copied, nan where it is masked but not for saturation."""
+    ny, nx = frame.image.shape
+    y, x = max((ny - BOX) // 2, 0), max((nx - BOX) // 2, 0)
+    place = np.s_[y : y + BOX, x : x + BOX]
+    box = frame.image[place].copy()
+    box[frame.mask[place] & (box < frame.saturation)] = np.nan
+    return box
+
+
+def _compare(
+    first: Exposure, second: Exposure, amplifier: str, one: NDArray[np.float32],
+    other: NDArray[np.float32],
+) -> PairStatistics:  # fmt: skip
+    """Variance of a pair; its level is filled in once the pedestals are known."""
+    difference = (one - other).astype(np.float64)
+    difference = difference[np.isfinite(difference)]
+    if difference.size < 100:
+        return PairStatistics(
+            first.number, second.number, amplifier, np.nan, np.nan, 0, 0.0
+        )
+    middle = np.median(difference)
+    sigma = MAD_TO_SIGMA * np.median(np.abs(difference - middle))
+    # Differences that are all equal (saturated) have no MAD; none is cut then.
+    kept = difference[np.abs(difference - middle) <= 5 * sigma] if sigma else difference
+    return PairStatistics(
+        first.number,
+        second.number,
+        amplifier,
+        np.nan,
+        float(kept.var() / 2),
+        kept.size,
+        0.0,
+    )
+
+
+def _above_biases(
+    campaign: Campaign, frames: Sequence[FrameStatistics]
+) -> list[FrameStatistics]:
+    """Take the biases' level off where there was no overscan."""
+    biases = {one.number for one in campaign.of("bias")}
+    out = []
+    for name in dict.fromkeys(f.amplifier for f in frames):
+        raw = [f for f in frames if f.amplifier == name and np.isnan(f.pedestal)]
+        levels = [f.level for f in raw if f.exposure in biases]
+        if not levels:
+            continue
+        pedestal = float(np.median(levels))
+        out += [replace(f, level=f.level - pedestal, pedestal=pedestal) for f in raw]
+    done = {(f.exposure, f.amplifier): f for f in out}
+    return [done.get((f.exposure, f.amplifier), f) for f in frames]
+
+
+def _with_levels(
+    pairs: Sequence[PairStatistics], frames: Sequence[FrameStatistics]
+) -> list[PairStatistics]:
+    """Fill in the level of each pair and the difference of its two."""
+    level = {(f.exposure, f.amplifier): f.level for f in frames}
+    out = []
+    for pair in pairs:
+        a, b = level[pair.first, pair.amplifier], level[pair.second, pair.amplifier]
+        mean = (a + b) / 2
+        off = (b - a) / mean if mean > 0 else 0.0
+        # Two dim flats differ by their pedestals' errors: no mismatch of the light.
+        off = off if abs(b - a) > 5.0 else 0.0
+        out.append(replace(pair, level=mean, mismatch=off))
+    return out

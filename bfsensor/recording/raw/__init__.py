@@ -1,0 +1,1 @@
+"""Raw FITS files: keywords, sections, masks, pixels."""

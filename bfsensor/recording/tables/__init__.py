@@ -1,0 +1,1 @@
+"""Recordings that others reduced: tables of a_ij, covariances, spots, settings."""

@@ -1,0 +1,1 @@
+"""The differential response of a device: shifts of pixel edges per electron, derivatives, emulator."""

@@ -1,0 +1,318 @@
+"""The differential response of a device: shifts of pixel edges per electron, and derivatives.
+
+What a small charge on a uniform background does to the edges around it, straight from the
+solution, without a table; and how that changes with any quantity of the device, from the
+linearised system instead of solutions of other devices.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bfsensor.device import silicon
+from bfsensor.device.device import Device
+from bfsensor.errors import TableError
+from bfsensor.response.periodic_images import PERIOD, SAMPLES, Images
+from bfsensor.response.vertices import vertex_fractions
+from bfsensor.simulate.boundaries import TURN, Feet, PixelBoundaries, find_boundaries
+from bfsensor.simulate.boundary_tangent import boundary_changes
+from bfsensor.simulate.far_field import FarField
+from bfsensor.simulate.mesh import Surfaces, make_mesh
+from bfsensor.simulate.moved_mesh import move_mesh
+from bfsensor.simulate.poisson import Electrostatics, Potential
+from bfsensor.simulate.tangent import TOLERANCE, PotentialChange, Tangent
+from bfsensor.simulate.unit_cell import tile
+from bfsensor.typing import Edges, FloatArray
+
+LEVEL = 40_000.0
+"""Background about which the response is taken [e-]: the middle of a flat of 80,000 e-."""
+
+CHARGE = 5_000.0
+"""Above the background [e-]: the response is differential, so a small one."""
+
+REACH = 4
+"""Of the shifts [pixel]; a ring more holds edges that do not move."""
+
+VERTICES = 32
+
+PRECISION = 1e-7
+"""Of the bisection of boundaries [um]: with that of tables, 1e-5, derivatives that are small,
+such as by the field oxide, are wrong by up to 25 %."""
+
+REFINE_Z = 1
+"""Halvings of the mesh in z, from steps of 0.05 um in the front.
+
+The sheet of stored electrons is not thicker than two such steps: without halving a_00 wavers by
+0.4 % as a parameter carries it through them (ITL, field oxide to 0.1 um either way), which ruins
+second derivatives and small first ones; halved once it goes straight to within 0.01 %."""
+
+_COARSE = 4  # vertices with which the change of the images is found: they are smooth
+_SHIFT = 3e-3  # um, to which derivatives of lines are scaled where edges are differentiated
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeResponse:
+    """Shifts of edges per electron by depth of conversion, and their derivatives.
+
+    Attributes
+    ----------
+    depths : ndarray, shape (nd,)
+        [um above the gates], the last one the back surface.
+    kx, ky : ndarray, shape (nd, 2 REACH + 3, 2 REACH + 3)
+        Mean shifts of right and upper edges per electron [pixel/e-], [depth, row, column].
+    dkx, dky : ndarray, shape (changes, nd, 2 REACH + 3, 2 REACH + 3)
+        Their derivatives, at depths that go with the thickness (:func:`response_depths`).
+    seconds : tuple of float
+        CPU time of the solution with its boundaries, and of all derivatives.
+    """
+
+    depths: FloatArray
+    kx: FloatArray
+    ky: FloatArray
+    dkx: FloatArray
+    dky: FloatArray
+    seconds: tuple[float, float]
+
+    def edges(self, wavelength: float | None, temperature: float) -> Edges:
+        """Shifts for light of a wavelength [nm], in silicon of a temperature [K]."""
+        return mixed(self.kx, self.ky, self.depths, wavelength, temperature)
+
+
+def response_depths(device: Device) -> tuple[float, ...]:
+    """Depths of conversion at which the response is taken [um above the gates]."""
+    thickness = device.silicon.thickness
+    return 5.0, 20.0, 0.5 * thickness, thickness
+
+
+def mixed(
+    kx: FloatArray,
+    ky: FloatArray,
+    depths: FloatArray,
+    wavelength: float | None,
+    temperature: float,
+) -> Edges:
+    """Shifts weighted by where the light converts; the axis of depths is the third last.
+
+    Parameters
+    ----------
+    kx, ky : ndarray, shape (..., nd, ny, nx)
+        By depth.
+    depths : ndarray, shape (nd,)
+        [um], the last one the back surface.
+    wavelength : float or None
+        Of the light [nm]; None: all of it converts at the back surface.
+    temperature : float
+        Of the silicon [K].
+    """
+    if wavelength is None:
+        return kx[..., -1, :, :], ky[..., -1, :, :]
+    weights = conversion_weights(depths, float(depths[-1]), wavelength, temperature)
+    return (
+        np.einsum("...dji,d->...ji", kx, weights),
+        np.einsum("...dji,d->...ji", ky, weights),
+    )
+
+
+def conversion_weights(
+    depths: FloatArray, thickness: float, wavelength: float, temperature: float
+) -> FloatArray:
+    """Share of the light that the response at each depth stands for, linear between them."""
+    length = float(silicon.absorption_length(wavelength, temperature))
+    z = np.linspace(0.0, thickness, 4001)
+    light = np.exp(-(thickness - z) / length)
+    light /= light.sum()
+    weights = np.array([
+        np.interp(z, depths, np.eye(len(depths))[n]) @ light for n in range(len(depths))
+    ])  # fmt: skip
+    return weights / weights.sum()
+
+
+def area_matrix(kx: FloatArray, ky: FloatArray) -> FloatArray:
+    """Change of the areas per electron [1/e-], from the shifts of right and upper edges."""
+    return kx - np.roll(kx, 1, -1) + ky - np.roll(ky, 1, -2)
+
+
+def solve_response(
+    device: Device,
+    *,
+    level: float = LEVEL,
+    cells: int = 16,
+    refine_z: int = REFINE_Z,
+    period: int = PERIOD,
+    laid_for: Device | None = None,
+    changed: Sequence[tuple[Device, float]] = (),
+    tolerance: float = TOLERANCE,
+) -> EdgeResponse:
+    """Solve for the response of a device about a uniform background, and differentiate it.
+
+    Parameters
+    ----------
+    device : Device
+        Mirror-symmetric.
+    level : float
+        Electrons in every pixel [e-].
+    cells : int
+        Of the mesh, a pixel.
+    refine_z : int
+        Halvings of its steps in z (:data:`REFINE_Z`).
+    period : int
+        Pixels from a charge to its periodic image, even, above 2 REACH + 2; half of them are
+        solved, between mirrors.
+    laid_for : Device, optional
+        A device near to it for which the mesh is laid before it is moved
+        (:func:`~bfsensor.simulate.moved_mesh.move_mesh`), so that the two compare without the
+        error of the mesh; by default the device itself.
+    changed : sequence of (Device, float)
+        Devices with one quantity changed by a small step, and that step
+        (:meth:`~bfsensor.simulate.tangent.Tangent.change`): what to differentiate by.
+    tolerance : float
+        Of the linear systems of the derivatives.
+
+    Returns
+    -------
+    EdgeResponse
+
+    Raises
+    ------
+    DeviceError, ConvergenceError
+        The device has no mirror planes, or no such solution.
+    TableError
+        The period is odd, or the images are among the edges.
+    """
+    if period % 2 or period <= 2 * REACH + 2:
+        raise TableError(f"period = {period} pixels must be even and above {2 * REACH + 2}")
+    began = time.process_time()
+    model = device if laid_for is None else laid_for
+    fine, small = (
+        move_mesh(
+            make_mesh(model, pixels=(n, n), cells=cells, refine_z=refine_z), model, device
+        )
+        for n in (period, 1)
+    )
+    unit_solver, solver = Electrostatics(device, small), Electrostatics(device, fine)
+    unit = unit_solver.solve(level, start=unit_solver.solve(0.0).phi)
+    charges = np.full(solver.pixel_shape, level)
+    charges[0, 0] += CHARGE
+    potential = solver.solve(charges, start=tile(unit, fine))
+    depths = np.array(response_depths(device))
+    feet: list[Feet] = []
+    lines = find_boundaries(
+        potential,
+        depths,
+        reach=REACH,
+        samples=SAMPLES,
+        precision=PRECISION,
+        turn=TURN,
+        feet=feet,
+    )
+    edges = _Edges.of(unit, depths, period)
+    moved = edges.moved(lines)
+    kx, ky = edges.mean(moved)
+    middle = time.process_time()
+    tangent = Tangent(solver, potential, Tangent(unit_solver, unit))
+    changes = [tangent.change(*c, tolerance=tolerance) for c in changed]
+    shape = (len(changes), *kx.shape)
+    dkx, dky = np.zeros(shape), np.zeros(shape)
+    if changes:
+        deeper = np.array([
+            (np.array(response_depths(d)) - depths) / step for d, step in changed
+        ])  # fmt: skip
+        columns, rows = boundary_changes(potential, lines, feet, changes, deeper)
+        for n, change in enumerate(changes):
+            size = _SHIFT / max(np.abs(columns[n]).max(), np.abs(rows[n]).max(), 1e-30)
+            further = replace(
+                lines,
+                columns=lines.columns + size * columns[n],
+                rows=lines.rows + size * rows[n],
+            )
+            x, y = edges.mean(edges.moved(further))
+            dkx[n], dky[n] = (x - kx) / size, (y - ky) / size
+            by_images = edges.image_change(unit, change, *changed[n], moved)
+            dkx[n] += by_images[0]
+            dky[n] += by_images[1]
+    return EdgeResponse(
+        depths, kx, ky, dkx, dky, (middle - began, time.process_time() - middle)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Edges:
+    """From boundary lines to mean shifts of edges [pixel/e-], without periodic images."""
+
+    far: FarField
+    images: Images
+    coarse: Images
+    pitch: tuple[float, float]
+    period: int
+
+    @classmethod
+    def of(cls, unit: Potential, depths: FloatArray, period: int) -> _Edges:
+        """Prepare for a device and its depths."""
+        far = _far_field(unit, depths, period)
+        images, coarse = (_images(far, unit, period, n) for n in (VERTICES, _COARSE))
+        return cls(far, images, coarse, unit.mesh.pitch, period)
+
+    @staticmethod
+    def moved(lines: PixelBoundaries) -> tuple[FloatArray, ...]:
+        """Displacements of corners and vertices."""
+        return lines.vertices(VERTICES, vertex_fractions(VERTICES))
+
+    def mean(self, moved: tuple[FloatArray, ...]) -> Edges:
+        """Mean shifts, images taken off."""
+        return self._mean(self.images.taken_off(moved)[0])
+
+    def image_change(
+        self,
+        unit: Potential,
+        change: PotentialChange,
+        device: Device,
+        step: float,
+        moved: tuple[FloatArray, ...],
+    ) -> Edges:
+        """Change of the shifts because the images' far field changes with the unit cell."""
+        assert change.unit is not None  # made with one
+        vx, vy, vz = change.unit.velocity
+        mesh = unit.mesh
+        there = replace(
+            unit, device=device, phi=unit.phi + step * change.unit.at_nodes,
+            mesh=replace(mesh, x=mesh.x + step * vx, y=mesh.y + step * vy, z=mesh.z + step * vz),
+        )  # fmt: skip
+        far = _far_field(there, np.array(response_depths(device)), self.period)
+        other = _images(far, unit, self.period, _COARSE)
+        at = np.linspace(0, VERTICES - 1, _COARSE).round().astype(int)
+        few = moved[0], moved[1][..., at, :], moved[2][..., at, :]
+        here, gone = (self._mean(i.taken_off(few)[0]) for i in (self.coarse, other))
+        return (gone[0] - here[0]) / step, (gone[1] - here[1]) / step
+
+    def _mean(self, moved: tuple[FloatArray, ...]) -> Edges:
+        """Mean along each edge: trapezoids between corners and vertices."""
+        corners, horizontal, vertical = moved
+        nd, n = len(corners), 2 * REACH + 3
+        kx, ky = np.zeros((2, nd, n, n))
+        for out, ends, sides, axis in (
+            (kx[:, 1:-1, :-1], corners[..., 0], vertical[..., 0], 1),
+            (ky[:, :-1, 1:-1], corners[..., 1], horizontal[..., 1], 2),
+        ):
+            at = np.concatenate([[0.0], vertex_fractions(sides.shape[-1]), [1.0]])
+            low, high = (
+                np.take(ends, np.arange(k, ends.shape[axis] - 1 + k), axis) for k in (0, 1)
+            )
+            along = np.concatenate([low[..., None], sides, high[..., None]], -1)
+            out[...] = np.trapezoid(along, at, axis=-1) / (CHARGE * self.pitch[axis - 1])
+        return kx, ky
+
+
+def _far_field(unit: Potential, depths: FloatArray, period: int) -> FarField:
+    pitch = unit.mesh.pitch
+    ground = Surfaces.of(unit.device).silicon_stop
+    return FarField.of(unit, depths, ground, 5 * period * max(pitch))
+
+
+def _images(far: FarField, unit: Potential, period: int, vertices: int) -> Images:
+    pitch = unit.mesh.pitch
+    apart = period * pitch[0], period * pitch[1]
+    return Images.of(far, REACH, pitch, apart, vertex_fractions(vertices))

@@ -1,0 +1,118 @@
+"""A charged pixel in a periodic domain: its images, taken off the shifts that were found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.response.vertices import nominal_positions
+from bfsensor.simulate.far_field import FarField, image_shifts
+from bfsensor.typing import FloatArray
+
+PERIOD = 12
+"""Period of the domain [pixel]; what its images do is subtracted (``far_field``)."""
+
+SAMPLES = 24
+"""Points of a boundary line per pixel."""
+
+
+@dataclass(frozen=True)
+class Images:
+    """Shifts that the periodic images of a unit dipole make, and what gives its amplitude.
+
+    Attributes
+    ----------
+    shifts : list of (ndarray, ndarray, ndarray) or None
+        Of corners and vertices, by depth; None where nothing moves.
+    models : list of (ndarray, ndarray) or None
+        Dipole and images together, across vertical and horizontal edges.
+    near : tuple of ndarray
+        Vertices of vertical and horizontal edges that stand for the outermost boundaries.
+    """
+
+    shifts: list[tuple[FloatArray, ...] | None]
+    models: list[tuple[FloatArray, ...] | None]
+    near: tuple[NDArray[np.bool_], ...]
+
+    @classmethod
+    def of(
+        cls,
+        far: FarField,
+        reach: int,
+        pitch: tuple[float, float],
+        period: tuple[float, float],
+        fractions: FloatArray,
+    ) -> Images:
+        """Sum the images of a far field at the vertices of a neighbourhood."""
+        at = nominal_positions(pitch, reach, fractions)
+        near = (
+            np.abs(at.vertical[..., 1]) < 1.5 * pitch[1],
+            np.abs(at.horizontal[..., 0]) < 1.5 * pitch[0],
+        )
+        shifts: list[tuple[FloatArray, ...] | None] = []
+        models: list[tuple[FloatArray, ...] | None] = []
+        for d in range(len(far.depths)):
+            if far.shifts[d].max() <= 0:
+                shifts.append(None)
+                models.append(None)
+                continue
+            images = tuple(
+                image_shifts(far, points, d, period)
+                for points in (at.corners, at.horizontal, at.vertical)
+            )
+            shifts.append(images)
+            models.append((
+                (far.vectors(at.vertical, d) + images[2])[..., 0],
+                (far.vectors(at.horizontal, d) + images[1])[..., 1],
+            ))  # fmt: skip
+        return cls(shifts, models, near)
+
+    def taken_off(
+        self, moved: tuple[FloatArray, ...]
+    ) -> tuple[tuple[FloatArray, ...], float]:
+        """Displacements without the images, linear in them; and their share at the corner."""
+        corners, horizontal, vertical = (a.copy() for a in moved)
+        share = 0.0
+        for d, (images, models) in enumerate(zip(self.shifts, self.models, strict=True)):
+            if images is None or models is None:
+                continue
+            amplitudes = []
+            for model, data, facing, near in (
+                (models[0], vertical[d, ..., 0], (slice(None), [0, -1]), self.near[0]),
+                (models[1], horizontal[d, ..., 1], ([0, -1], slice(None)), self.near[1]),
+            ):
+                use = near[facing]
+                amplitudes.append(
+                    (model[facing][use] @ data[facing][use])
+                    / (model[facing][use] @ model[facing][use])
+                )
+            amplitude = float(np.mean(amplitudes))
+            for a, shift in zip(
+                (corners[d], horizontal[d], vertical[d]), images, strict=True
+            ):
+                a -= amplitude * shift
+            share = max(
+                share,
+                float(
+                    np.abs(amplitude * images[0][-1, -1]).max()
+                    / np.abs(moved[0][d, -1, -1]).max()
+                ),
+            )
+        return (corners, horizontal, vertical), share
+
+
+def without_images(
+    far: FarField,
+    moved: tuple[FloatArray, ...],
+    pitch: tuple[float, float],
+    period: tuple[float, float],
+    fractions: FloatArray,
+) -> tuple[tuple[FloatArray, ...], float]:
+    """Take the periodic images off displacements; returns also their share at the corner.
+
+    The amplitude is the one with which dipole and images together give the outermost
+    boundaries that face the source.
+    """
+    return Images.of(far, moved[1].shape[2] // 2, pitch, period, fractions).taken_off(moved)

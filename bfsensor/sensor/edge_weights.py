@@ -1,0 +1,264 @@
+"""Weights of the charges around an edge, and bounds on what they can do."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor._kernels.shifts import Edges
+from bfsensor.typing import FloatArray
+
+_BINS = 128
+_NEAR = 1
+RANGES = np.append(250.0 * 2.0 ** (np.arange(97) / 8), np.inf)
+"""Ranges of effective charge [e-] for which errors are bounded; the last, any range."""
+
+
+def join_sides(
+    corners: FloatArray,
+    horizontal: FloatArray,
+    vertical: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Give every side the corners it ends in.
+
+    Parameters
+    ----------
+    corners, horizontal, vertical : ndarray, shapes (..., n + 1, n + 1, 2), \
+(..., n + 1, n, v, 2), (..., n, n + 1, v, 2)
+        Shifts as in :class:`bfsensor.DistortionTable`.
+
+    Returns
+    -------
+    vertical, horizontal : ndarray, shapes (..., n, n + 1, v + 2, 2), (..., n + 1, n, v + 2, 2)
+    """
+    c = corners[..., None, :]
+    upright = np.concatenate([c[..., :-1, :, :, :], vertical, c[..., 1:, :, :, :]], -2)
+    flat = np.concatenate([c[..., :, :-1, :, :], horizontal, c[..., :, 1:, :, :]], -2)
+    return upright, flat
+
+
+def transpose_sides(
+    vertical: FloatArray, horizontal: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Exchange x and y of sides as :func:`join_sides` gives them."""
+    axes = (*range(horizontal.ndim - 4), -3, -4, -2, -1)
+    order = tuple(a % horizontal.ndim for a in axes)
+    return (
+        horizontal.transpose(order)[..., ::-1],
+        vertical.transpose(order)[..., ::-1],
+    )
+
+
+def window_weights(
+    vertical: FloatArray, horizontal: FloatArray, reach: int
+) -> tuple[FloatArray, FloatArray]:
+    """Order the shifts around one source as weights of the sources around one edge.
+
+    Parameters
+    ----------
+    vertical, horizontal : ndarray, shapes (layers, n, n + 1, points, 2), \
+(layers, n + 1, n, points, 2)
+        Shifts (dx, dy) [pixel per electron] around a source in the middle.
+    reach : int
+        Sources up to so many pixels away, at most (n - 1) / 2.
+
+    Returns
+    -------
+    vertical, horizontal : ndarray, shapes (layers, points, 2, 2 reach + 1, 2 reach + 2), \
+(layers, points, 2, 2 reach + 2, 2 reach + 1)
+        Normal and tangential, by row and column of the source.
+    """
+    middle = vertical.shape[1] // 2
+    q = reach
+    across = slice(middle - q, middle + q + 1)
+    lines = slice(middle - q, middle + q + 2)
+    v = vertical[:, across, lines][:, ::-1, ::-1]
+    h = horizontal[:, lines, across][:, ::-1, ::-1]
+    return v.transpose(0, 3, 4, 1, 2), h[..., ::-1].transpose(0, 3, 4, 1, 2)
+
+
+def make_edges(
+    first: tuple[FloatArray, FloatArray],
+    second: tuple[FloatArray, FloatArray] | None,
+    points: FloatArray,
+    heights: FloatArray,
+    reach: int,
+    *,
+    scale: FloatArray | None = None,
+) -> Edges:
+    """Pack the shifts of both modes for the kernels, with bounds of what they can do.
+
+    Parameters
+    ----------
+    first, second : pair of ndarray
+        Vertical and horizontal sides of each mode as for :func:`window_weights`; of the
+        second only sources within one pixel count.
+    points : ndarray
+        Nominal positions along a side, from 0 to 1.
+    heights : ndarray, shape (layers,)
+        Equal steps of the logarithm [um].
+    reach : int
+        Sources up to so many pixels away.
+    scale : ndarray, optional
+        Factor of all shifts on equal steps from the gates to the height of the one layer.
+
+    Returns
+    -------
+    Edges
+    """
+    lanes = 8 if 2 * reach + 2 <= 8 else 16
+    modes = [window_weights(*first, reach)]
+    if second is not None:
+        modes.append(window_weights(*second, _NEAR))
+    near = len(modes) == 2
+    sums = np.zeros((2, *modes[0][0].shape[:3], 2))
+    blocks = []
+    for side in (0, 1):
+        for m, mode in enumerate(modes):
+            sums[side, ..., m] = mode[side].sum((-2, -1))
+        blocks.append(_pack(modes[0][side], lanes))
+    for side in (0, 1):
+        blocks.append(_pack(modes[1][side], 8) if near else np.zeros(0, np.float32))
+    centres = (np.arange(_BINS) + 0.5) / _BINS
+    nearest = np.abs(centres[:, None] - points).argmin(1)
+    normal, doubts = _bounds(modes, points, nearest)
+    return Edges(
+        weights=np.concatenate(blocks),
+        scale=np.zeros(0, np.float32) if scale is None else scale.astype(np.float32),
+        per_um=0.0 if scale is None else (len(scale) - 1) / float(heights[-1]),
+        starts=np.cumsum([0, *(block.size for block in blocks[:3])]),
+        sums=sums.astype(np.float32).swapaxes(2, 3).ravel(),
+        points=np.ascontiguousarray(points, float),
+        nearest=nearest.astype(np.int64),
+        doubts=doubts,
+        alike=_alike(modes),
+        shares=(normal / normal.max() if normal.max() > 0 else np.ones(2)).astype(
+            np.float32
+        ),
+        normal=float(normal.max()),
+        reach=int(reach),
+        lanes=lanes,
+        layers=len(heights),
+        modes=len(modes),
+        log_z0=float(np.log(heights[0])),
+        log_step=float(np.log(heights[1] / heights[0])) if len(heights) > 1 else 1.0,
+    )
+
+
+def _pack(weights: FloatArray, lanes: int) -> NDArray[np.float32]:
+    packed = np.zeros((*weights.shape[:-1], lanes), np.float32)
+    packed[..., : weights.shape[-1]] = weights
+    return packed.swapaxes(1, 2).ravel()
+
+
+def _bounds(
+    modes: list[tuple[FloatArray, FloatArray]],
+    points: FloatArray,
+    nearest: NDArray[np.int64],
+) -> tuple[FloatArray, NDArray[np.float32]]:
+    """Bound the normal shift, and its change from the nearest point to the true place.
+
+    Effective charges in a range r, less any value in it, move a point by at most r times
+    the larger of the sums of its positive and its negative weights, plus their sum.
+
+    Returns
+    -------
+    normal : ndarray, shape (2,)
+        Bound of any normal shift by range [pixel per electron], vertical and horizontal.
+    doubts : ndarray, shape (2, ranges, bins)
+        Bound of (shift of the polyline at a place along the edge) - (shift of the nearest
+        point in the nearest layer) for the ranges of ``RANGES``, vertical and horizontal.
+    """
+    top = np.zeros(2)
+    doubts = np.zeros((2, len(RANGES), _BINS), np.float32)
+    for side in (0, 1):
+        normal = tangential = layer = np.zeros(len(points))
+        slope = np.zeros(len(points) - 1)
+        ends = 0.0
+        for sides in modes:
+            weights = sides[side]
+            normal = normal + _largest(weights[:, :, 0])
+            tangential = tangential + _largest(weights[:, :, 1])
+            if len(weights) > 1:
+                layer = layer + _largest(0.5 * np.diff(weights[:, :, 0], axis=0))
+            gaps = np.diff(points)[:, None, None]
+            slope = slope + _largest(np.diff(weights[:, :, 0], axis=1) / gaps)
+            # The next edge of the line: its window lies one row (column) further on.
+            before, after = [(0, 0), (0, 0), (0, 0)], [(0, 0), (0, 0), (0, 0)]
+            before[1 + side], after[1 + side] = (0, 1), (1, 0)
+            for c in (0, 1):
+                jump = np.pad(weights[:, -1, c], before) - np.pad(weights[:, 0, c], after)
+                ends += float(_largest(jump[:, None]).max())
+        top[side] = normal.max()
+        doubts[side, -1] = np.inf
+        # Three edges in a row: what is looked up may lie beyond a corner.
+        at = np.concatenate([points - 1, points, points + 1])
+        move = np.tile(tangential, 3)
+        climb = np.concatenate([[*slope, 0.0]] * 3)[:-1]
+        way = np.concatenate([[0.0], np.cumsum(climb * np.diff(at))])
+        between = np.array([
+            np.maximum.accumulate(np.where(np.arange(len(at)) < k, 0.0, move))
+            for k in range(len(at))
+        ])  # fmt: skip
+        for n, r in enumerate(RANGES[:-1]):
+            doubts[side, n] = _doubt(
+                r * between, r * way, r * layer, r * ends, at, points, nearest
+            )
+    return 1.00001 * top, 1.00001 * doubts
+
+
+def _alike(
+    modes: list[tuple[FloatArray, FloatArray]],
+) -> NDArray[np.int64]:
+    """Row of the first range for which half a step to the next layer is above 5e-5 pixel.
+
+    The mean over the points of an edge counts: next to corners points move along their
+    edge by more, which changes no area.
+    """
+    steps = np.zeros(max(len(modes[0][0]) - 1, 1))
+    if len(modes[0][0]) > 1:
+        for side in (0, 1):
+            change = sum(
+                np.abs(0.5 * np.diff(mode[side], axis=0)).sum((-2, -1)).mean((1, 2))
+                for mode in modes
+            )
+            steps = np.maximum(steps, change)
+    return np.searchsorted(RANGES, 5e-5 / np.maximum(steps, 1e-30), side="right")
+
+
+def _largest(weights: FloatArray) -> FloatArray:
+    """Bound by point, over the layers, for charges in a range of 1."""
+    up = np.maximum(weights, 0).sum((-2, -1))
+    down = np.maximum(-weights, 0).sum((-2, -1))
+    return np.asarray((np.maximum(up, down) + np.abs(weights.sum((-2, -1)))).max(0))
+
+
+def _doubt(
+    between: FloatArray,
+    way: FloatArray,
+    layer: FloatArray,
+    ends: float,
+    at: FloatArray,
+    points: FloatArray,
+    nearest: NDArray[np.int64],
+) -> FloatArray:
+    """Bound of the error of the nearest point's shift, by place along the edge.
+
+    ``between[a, b]``: largest tangential shift of the points ``at`` from a to b; ``way``:
+    the normal shift's largest change up to each.
+    """
+    most = between[0, -1]
+    if most >= 0.9:
+        return np.full(_BINS, np.inf)
+    low = np.arange(_BINS) / _BINS
+    high = low + 1 / _BINS
+    reach = np.full(_BINS, most)
+    for _ in range(8):
+        first = np.clip(np.searchsorted(at, low - reach) - 1, 0, len(at) - 1)
+        last = np.clip(np.searchsorted(at, high + reach), 0, len(at) - 1)
+        reach = np.minimum(reach, between[first, last])
+    here = points[nearest]
+    up = np.interp(high + reach, at, way) - np.interp(here, at, way)
+    down = np.interp(here, at, way) - np.interp(low - reach, at, way)
+    crosses = (low - reach < 0) | (high + reach > 1)
+    return np.maximum(np.maximum(up, down), 0) + layer[nearest] + ends * crosses

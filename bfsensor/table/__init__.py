@@ -1,0 +1,1 @@
+"""Distortion tables: planned, solved level by level, assessed, read and written in three formats."""

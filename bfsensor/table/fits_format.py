@@ -1,0 +1,182 @@
+"""Distortion tables as FITS: the file's layout, its checks, and the quadrant of symmetric ones."""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from astropy.utils.exceptions import AstropyWarning
+from numpy.typing import NDArray
+
+from bfsensor.errors import TableError
+from bfsensor.files import refuse_existing, written_whole
+from bfsensor.typing import FloatArray
+
+SCHEMA = "bfsensor distortion table"
+SCHEMA_VERSION = 1
+
+ARRAYS = ("corners", "horizontal", "vertical")
+AXES = ("charges", "backgrounds", "depths")
+
+
+def write_table(table: Any, path: str | os.PathLike[str], *, overwrite: bool) -> None:
+    """Write a :class:`~bfsensor.table.table.DistortionTable`, see its ``write``."""
+    refuse_existing(path, overwrite, TableError)
+    arrays = {name: getattr(table, name) for name in ARRAYS}
+    quadrants = {name: _quadrant(array) for name, array in arrays.items()}
+    quadrant = table.symmetric and all(
+        np.array_equal(_whole(name, quadrants[name]), array)
+        for name, array in arrays.items()
+    )
+    if quadrant:
+        arrays = quadrants
+    primary = fits.PrimaryHDU()
+    header = primary.header
+    header["SCHEMA"] = (SCHEMA, "what this file is")
+    header["SCHEMAV"] = (SCHEMA_VERSION, "version of the schema")
+    header["BUNIT"] = ("um", "unit of all displacements")
+    header["VERTICES"] = (table.vertices, "vertices a side between the corners")
+    header["REACH"] = (table.reach, "largest pixel offset")
+    header["QUADRANT"] = (quadrant, "only offsets >= 0 are stored, the rest mirrored")
+    header["SYMMETRC"] = (table.symmetric, "mirror-symmetric about the source pixel")
+    header["PITCHX"] = (table.pitch[0], "[um] pixel pitch along the gates")
+    header["PITCHY"] = (table.pitch[1], "[um] pixel pitch along the channel stops")
+    header["THICKNSS"] = (table.thickness, "[um] height of the back surface")
+    if np.isfinite(table.full_well):
+        header["FULLWELL"] = (
+            table.full_well,
+            "[electron] charge at which a pixel spills",
+        )
+    header["DATE"] = (
+        datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"),
+        "[UTC] when this file was written",
+    )
+    # For people who look at the header; META is what is read back.
+    for key, text in table.provenance.items():
+        header["HISTORY"] = _printable(f"{key} = {text}")
+    for key, error in table.errors.items():
+        header["COMMENT"] = _printable(f"error: {key} = {error:.3g}")
+    hdus = [primary]
+    for name, array in arrays.items():
+        hdu = fits.ImageHDU(array.astype(np.float32), name=name.upper())
+        hdu.header["BUNIT"] = "um"
+        hdus.append(hdu)
+    for name, unit in zip(AXES, ("electron", "electron", "um"), strict=True):
+        hdu = fits.ImageHDU(getattr(table, name), name=name.upper())
+        hdu.header["BUNIT"] = unit
+        hdus.append(hdu)
+    meta = json.dumps(
+        {"errors": dict(table.errors), "provenance": dict(table.provenance)},
+        sort_keys=True,
+    )
+    for name, text in (("META", meta), ("DEVICE", table.device_text)):
+        data = np.frombuffer(text.encode(), np.uint8) if text else None
+        hdus.append(fits.ImageHDU(data, name=name))
+    with written_whole(path, TableError) as beside:
+        fits.HDUList(hdus).writeto(beside, checksum=True, overwrite=True)
+
+
+def read_fields(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read the fields of a table, by name.
+
+    Raises
+    ------
+    TableError
+        Not such a file, an unknown schema, or damaged; names the file.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise TableError(f"{path}: no such file")
+    try:
+        with warnings.catch_warnings():
+            # astropy only warns of a wrong checksum or a short file.
+            warnings.simplefilter("error", AstropyWarning)
+            # Opened here: astropy leaves a file open in whose headers it fails.
+            with open(path, "rb") as stream, fits.open(stream, checksum=True) as hdus:
+                header = hdus[0].header
+                _check_schema(header, path)
+                data = {hdu.name: hdu.data for hdu in hdus[1:]}
+                hdus[0].verify("exception")
+    except TableError:
+        raise
+    # Damaged headers end in many kinds of exception inside astropy.
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise TableError(f"{path}: not a FITS file, or damaged: {reason}") from None
+    needed = [name.upper() for name in (*ARRAYS, *AXES, "meta", "device")]
+    missing = [name for name in needed if name not in data]
+    if missing:
+        raise TableError(f"{path}: truncated: {', '.join(missing)} is missing")
+    try:
+        return _fields(header, data)
+    except KeyError as error:
+        raise TableError(f"{path}: not a FITS file, or damaged: {error.args[0]}") from None
+    except (ValueError, TypeError, AttributeError, IndexError) as error:
+        raise TableError(f"{path}: {error}") from None
+
+
+def _fields(header: Mapping[str, Any], data: dict[str, Any]) -> dict[str, Any]:
+    arrays = {}
+    for name in ARRAYS:
+        array = np.array(data[name.upper()], float)
+        arrays[name] = _whole(name, array) if header["QUADRANT"] else array
+    meta = json.loads(_text(data["META"]))
+    return {
+        **{name: np.array(data[name.upper()], float) for name in AXES},
+        "pitch": (header["PITCHX"], header["PITCHY"]),
+        "thickness": header["THICKNSS"],
+        "vertices": header["VERTICES"],
+        "reach": header["REACH"],
+        "full_well": header.get("FULLWELL", float("nan")),
+        "errors": meta["errors"],
+        "provenance": meta["provenance"],
+        "device_text": _text(data["DEVICE"]),
+        "symmetric": header["SYMMETRC"],
+        **arrays,
+    }
+
+
+def _check_schema(header: Mapping[str, Any], path: Path) -> None:
+    """Refuse what is not a table of the schema that this version reads."""
+    if header.get("SCHEMA") != SCHEMA:
+        raise TableError(f"{path}: not a distortion table (no SCHEMA = '{SCHEMA}')")
+    if header.get("SCHEMAV") != SCHEMA_VERSION:
+        raise TableError(
+            f"{path}: schema version {header.get('SCHEMAV')} is not {SCHEMA_VERSION}, the "
+            "one this version of bfsensor reads"
+        )
+
+
+def _printable(text: str) -> str:
+    """Turn text into what a FITS header may hold."""
+    return text.encode("unicode_escape").decode("ascii")
+
+
+def _text(data: NDArray[np.uint8] | None) -> str:
+    """Decode the text of an extension; none where it has no data."""
+    return "" if data is None else data.astype(np.uint8).tobytes().decode()
+
+
+def _quadrant(array: FloatArray) -> FloatArray:
+    """Cut out the offsets from the source pixel's centre on."""
+    ny, nx = array.shape[3:5]
+    return array[:, :, :, ny // 2 :, nx // 2 :]
+
+
+def _whole(name: str, quadrant: FloatArray) -> FloatArray:
+    """Mirror a quadrant to the whole array; the source's own row and column stay."""
+    x, y, vertex = 4, 3, 5
+    for axis, sides, sign in ((x, "horizontal", (-1.0, 1.0)), (y, "vertical", (1.0, -1.0))):
+        mirrored = np.flip(quadrant, axis) * np.array(sign)
+        if name == sides:  # its vertices run along the axis, and it counts pixels there
+            mirrored = np.flip(mirrored, vertex)
+            mirrored = np.delete(mirrored, -1, axis)
+        quadrant = np.concatenate([mirrored, quadrant], axis) + 0.0
+    return quadrant

@@ -1,0 +1,124 @@
+"""Levels of a distortion table, solved one by one with Poisson's equation.
+
+A level is one source charge on one background.  Levels do not depend on each other,
+not even as starting points: any number of processes gives the same bits, and a run that
+was interrupted goes on with the levels that are missing.
+"""
+
+from __future__ import annotations
+
+import time
+import zipfile
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bfsensor.errors import TableError
+from bfsensor.files import written_whole
+from bfsensor.response.periodic_images import PERIOD, SAMPLES, without_images
+from bfsensor.response.vertices import vertex_fractions
+from bfsensor.simulate.boundaries import find_boundaries
+from bfsensor.simulate.far_field import FarField
+from bfsensor.simulate.mesh import Surfaces, make_mesh
+from bfsensor.simulate.poisson import Electrostatics
+from bfsensor.simulate.unit_cell import solve_unit_cell, tile
+from bfsensor.table.table_plan import TablePlan, storage_height
+from bfsensor.typing import FloatArray
+
+
+@dataclass(frozen=True)
+class Level:
+    """Displacements of one source charge on one background, all depths, and its cost."""
+
+    corners: FloatArray
+    horizontal: FloatArray
+    vertical: FloatArray
+    newton: int
+    linear_iterations: int
+    error_volts: float
+    cpu_seconds: float
+    image_share: float
+
+    def write(self, path: Path) -> None:
+        """Write it whole or not at all: half a level never exists."""
+        with written_whole(path, TableError) as beside, open(beside, "wb") as stream:
+            np.savez(stream, **self.__dict__)
+
+    @classmethod
+    def read(cls, path: Path) -> Level:
+        """Read what :meth:`write` wrote."""
+        try:
+            with path.open("rb") as stream, np.load(stream) as data:
+                values = {name: data[name] for name in data.files}
+            scalars = {k: v.item() for k, v in values.items() if v.ndim == 0}
+            return cls(**{**values, **scalars})
+        except (ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            raise TableError(
+                f"{path}: not a finished level; delete it to solve it again ({error})"
+            ) from None
+
+
+@lru_cache(maxsize=1)
+def _workshop(device_text: str, cells: int, refine_z: int) -> tuple[Any, Any, Any]:
+    """Build the device, solver and mesh of a process, once for all its levels."""
+    from bfsensor.device.device import Device
+
+    device = Device.from_toml(device_text)
+    mesh = make_mesh(device, pixels=(PERIOD, PERIOD), cells=cells, refine_z=refine_z)
+    return device, Electrostatics(device, mesh), mesh
+
+
+def solve_level(plan: TablePlan, charge: float, background: float) -> Level:
+    """Solve one level of a plan.
+
+    Parameters
+    ----------
+    plan : TablePlan
+        From :func:`plan_table`.
+    charge, background : float
+        Source charge and charge of all other pixels [e-].
+
+    Returns
+    -------
+    Level
+    """
+    began = time.process_time()
+    device, solver, mesh = _workshop(plan.device.to_toml(), plan.cells, plan.refine_z)
+    unit = solve_unit_cell(device, background, cells=plan.cells, refine_z=plan.refine_z)
+    n = 2 * plan.reach + 1
+    nd = len(plan.depths)
+    fractions = vertex_fractions(plan.vertices)
+    shapes = (
+        (nd, n + 1, n + 1, 2),
+        (nd, n + 1, n, plan.vertices, 2),
+        (nd, n, n + 1, plan.vertices, 2),
+    )
+    if charge == background:
+        corners, horizontal, vertical = (np.zeros(s) for s in shapes)
+        return Level(
+            corners, horizontal, vertical, 0, 0, 0.0, time.process_time() - began, 0.0
+        )
+    charges = np.full(solver.pixel_shape, background)
+    charges[0, 0] = charge
+    potential = solver.solve(charges, start=tile(unit, mesh))
+    depths = np.array(plan.depths)
+    fixed = depths <= storage_height(device) + 1e-9
+    moved = tuple(np.zeros(shape) for shape in shapes)
+    if not fixed.all():
+        lines = find_boundaries(
+            potential, depths[~fixed], reach=plan.reach, samples=SAMPLES
+        )
+        for whole, found in zip(
+            moved, lines.vertices(plan.vertices, fractions), strict=True
+        ):
+            whole[~fixed] = found
+    far = FarField.of(unit, depths, Surfaces.of(device).silicon_stop, 5 * max(mesh.period))
+    moved, share = without_images(far, moved, mesh.pitch, mesh.period, fractions)
+    corners, horizontal, vertical = moved
+    return Level(
+        corners, horizontal, vertical, len(potential.history), potential.linear_iterations,
+        potential.error_volts, time.process_time() - began, share,
+    )  # fmt: skip

@@ -1,0 +1,403 @@
+"""Distortion tables: how far every vertex of the pixel boundaries moves.
+
+The source pixel holds a charge, all other pixels a uniform background, and the light
+converts at some depth; the table holds the total displacement of the vertices around the
+source pixel for levels of all three.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from bfsensor.errors import TableError
+from bfsensor.response.vertices import Displacements, nominal_positions, vertex_fractions
+from bfsensor.table.interpolation import polynomial_weights, spline_weights
+from bfsensor.typing import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class DistortionTable:
+    """Total displacement of the pixel vertices around a source pixel.
+
+    Attributes
+    ----------
+    charges : ndarray, shape (nq,)
+        Charge of the source pixel [e-], ascending.
+    backgrounds : ndarray, shape (nb,)
+        Charge of every other pixel [e-], ascending.
+    depths : ndarray, shape (nd,)
+        Conversion depths [um above the gates], ascending, above 0 up to the thickness.
+    pitch : tuple of float
+        Pixel pitch in x and y [um].
+    thickness : float
+        Height of the back surface [um].
+    vertices : int
+        Vertices a side between the corners, at :func:`vertex_fractions`.
+    reach : int
+        Pixel offsets -reach..reach.
+    corners : ndarray, shape (nq, nb, nd, 2 reach + 2, 2 reach + 2, 2)
+        Displacement (dx, dy) [um] of the corners, by edge line in y, then x.
+    horizontal : ndarray, shape (nq, nb, nd, 2 reach + 2, 2 reach + 1, vertices, 2)
+        Of vertices on edges along x: edge line in y, pixel in x.
+    vertical : ndarray, shape (nq, nb, nd, 2 reach + 1, 2 reach + 2, vertices, 2)
+        Of vertices on edges along y: pixel in y, edge line in x.
+    full_well : float
+        Charge at which a pixel spills along its column [e-]; nan where not known.
+    errors : mapping of str to float
+        Estimated errors, units in the names; nan where an estimate failed.
+    provenance : mapping of str to str
+        How it was made.
+    device_text : str
+        The device file, empty where not known.
+    symmetric : bool
+        Whether x and y through the source pixel's centre are mirror lines.
+
+    Notes
+    -----
+    Where the source charge equals the background nothing moves.  Between levels the
+    response D / (Q - B) is interpolated and multiplied by Q - B, so that this holds
+    everywhere: cubic splines in charge and background (below four levels the polynomial
+    through them), monotone cubics in the logarithm of depth.  At a node with Q = B the
+    response is that of the polynomial through the three nearest charges.  Nodes come back
+    to round-off.  A table of one charge is linear in charge from 0 on, as GalSim's are.
+
+    Arrays are kept in single precision (1e-7 of a displacement) so that reading what was
+    written gives the same bits.
+
+    Examples
+    --------
+    >>> from bfsensor.files import tables_dir
+    >>> table = DistortionTable.read(tables_dir() / "itl_sta3800c" / "table.fits")
+    >>> change = table.area_changes(charge=50000.0, depth=95.0)
+    >>> bool(change[4, 4] < 0 < change[4, 5] < change[5, 4])
+    True
+    """
+
+    charges: FloatArray
+    backgrounds: FloatArray
+    depths: FloatArray
+    pitch: tuple[float, float]
+    thickness: float
+    vertices: int
+    reach: int
+    corners: FloatArray = field(repr=False)
+    horizontal: FloatArray = field(repr=False)
+    vertical: FloatArray = field(repr=False)
+    full_well: float = float("nan")
+    errors: Mapping[str, float] = field(default_factory=dict, repr=False)
+    provenance: Mapping[str, str] = field(default_factory=dict, repr=False)
+    device_text: str = field(default="", repr=False)
+    symmetric: bool = True
+
+    def __post_init__(self) -> None:
+        self._check_numbers()
+        for name in ("charges", "backgrounds", "depths"):
+            axis = np.array(getattr(self, name), float)
+            if (
+                axis.ndim != 1
+                or not len(axis)
+                or not np.all(np.isfinite(axis))
+                or np.any(np.diff(axis) <= 0)
+            ):
+                raise TableError(f"{name} = {axis.tolist()} must be finite and ascend")
+            _keep(self, name, axis)
+        if self.charges[0] < 0 or self.backgrounds[0] < 0:
+            raise TableError("charges and backgrounds must not be negative")
+        if self.depths[0] <= 0:
+            raise TableError(
+                f"depths = {self.depths.tolist()} must be above the gates, 0 um"
+            )
+        if self.depths[-1] > self.thickness * (1 + 1e-9):
+            raise TableError(
+                f"depths = {self.depths.tolist()} um must not be above the thickness, "
+                f"{self.thickness:g} um"
+            )
+        if len(self.charges) == 1 and self.charges[0] in self.backgrounds:
+            raise TableError(
+                f"charges = {self.charges.tolist()} e- must hold one that differs from the "
+                f"background, {self.charges[0]:g} e-: where they are equal nothing moves"
+            )
+        for name, shape in self._shapes().items():
+            with np.errstate(over="ignore"):
+                # Adding 0 turns -0 into 0, so that mirrored arrays are equal in their bits.
+                array = np.array(getattr(self, name), np.float32).astype(float) + 0.0
+            if array.shape != shape:
+                raise TableError(f"{name} has the shape {array.shape}, not {shape}")
+            if not np.all(np.isfinite(array)):
+                raise TableError(f"{name} holds values that are not finite")
+            if np.any(array[self.charges[:, None] == self.backgrounds]):
+                raise TableError(
+                    f"{name} holds shifts where the charge equals the background and "
+                    "nothing moves"
+                )
+            _keep(self, name, array)
+        errors = {str(k): float(v) for k, v in self.errors.items()}
+        provenance = {str(k): str(v) for k, v in self.provenance.items()}
+        object.__setattr__(self, "errors", MappingProxyType(errors))
+        object.__setattr__(self, "provenance", MappingProxyType(provenance))
+
+    def _check_numbers(self) -> None:
+        for name, low in (("vertices", 1), ("reach", 0)):
+            value = getattr(self, name)
+            if int(value) != value or value < low:
+                raise TableError(f"{name} = {value} must be a whole number from {low}")
+            object.__setattr__(self, name, int(value))
+        if len(self.pitch) != 2:
+            raise TableError(f"pitch = {self.pitch} um must be the pitch in x and in y")
+        object.__setattr__(self, "pitch", (float(self.pitch[0]), float(self.pitch[1])))
+        for name in ("thickness", "full_well"):
+            object.__setattr__(self, name, float(getattr(self, name)))
+        object.__setattr__(self, "symmetric", bool(self.symmetric))
+        for name, value in (
+            ("pitch x", self.pitch[0]),
+            ("pitch y", self.pitch[1]),
+            ("thickness", self.thickness),
+        ):
+            if not 0 < value < np.inf:
+                raise TableError(f"{name} = {value} um must be finite and above 0 um")
+        if not (np.isnan(self.full_well) or 0 < self.full_well < np.inf):
+            raise TableError(
+                f"full_well = {self.full_well} e- must be above 0 e- (nan: not known)"
+            )
+
+    def _shapes(self) -> dict[str, tuple[int, ...]]:
+        levels = (len(self.charges), len(self.backgrounds), len(self.depths))
+        n, nv = 2 * self.reach + 1, self.vertices
+        return {
+            "corners": (*levels, n + 1, n + 1, 2),
+            "horizontal": (*levels, n + 1, n, nv, 2),
+            "vertical": (*levels, n, n + 1, nv, 2),
+        }
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, DistortionTable):
+            return NotImplemented
+        for name in self.__dataclass_fields__:
+            a, b = getattr(self, name), getattr(other, name)
+            if name == "errors":
+                same = a.keys() == b.keys() and all(
+                    np.array_equal(a[k], b[k], equal_nan=True) for k in a
+                )
+            elif isinstance(a, np.ndarray | float):
+                same = np.array_equal(a, b, equal_nan=True)
+            else:
+                same = a == b
+            if not same:
+                return False
+        return True
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        values["errors"], values["provenance"] = dict(self.errors), dict(self.provenance)
+        return _make, (values,)
+
+    # -- questions ---------------------------------------------------------------------
+
+    @cached_property
+    def _responses(self) -> tuple[FloatArray, ...]:
+        """D / (Q - B) on the grid; where Q = B, from its neighbours in charge."""
+        step = self.charges[:, None] - self.backgrounds[None, :]
+        out = []
+        for array in (self.corners, self.horizontal, self.vertical):
+            flat = array.reshape(*step.shape, -1)
+            response = np.divide(
+                flat, step[..., None], out=np.zeros_like(flat), where=step[..., None] != 0
+            )
+            for b in range(step.shape[1]):
+                known = step[:, b] != 0
+                if known.all():
+                    continue
+                missing = int(np.nonzero(~known)[0][0])
+                order = np.argsort(np.abs(self.charges[known] - self.charges[missing]))[:3]
+                near = np.nonzero(known)[0][np.sort(order)]
+                weights = polynomial_weights(self.charges[near], self.charges[missing])
+                response[missing, b] = weights @ response[near, b]
+            out.append(response.reshape(array.shape))
+        return tuple(out)
+
+    def displacements(
+        self, *, charge: float, background: float = 0.0, depth: float
+    ) -> Displacements:
+        """Displacements between the levels of the table.
+
+        Parameters
+        ----------
+        charge, background : float
+            Source charge and charge of all other pixels [e-].
+        depth : float
+            Conversion depth [um above the gates].
+
+        Returns
+        -------
+        Displacements
+
+        Raises
+        ------
+        TableError
+            A value outside the table; names the range, and for the charge the full well.
+        """
+        low = 0.0 if len(self.charges) == 1 else float(self.charges[0])
+        well = "" if np.isnan(self.full_well) else f" (full well {self.full_well:,.0f} e-)"
+        self._inside("charge", charge, low, self.charges[-1], f"e-{well}")
+        self._inside(
+            "background", background, self.backgrounds[0], self.backgrounds[-1], "e-"
+        )
+        self._inside("depth", depth, self.depths[0], self.depths[-1], "um")
+        wq, wb = (
+            spline_weights(self.charges, charge),
+            spline_weights(self.backgrounds, background),
+        )
+        out = []
+        for response in self._responses:
+            at = np.tensordot(wq, np.tensordot(wb, response, (0, 1)), (0, 0))
+            if len(self.depths) == 1:
+                value = at[0]
+            else:
+                value = PchipInterpolator(np.log(self.depths), at, axis=0)(np.log(depth))
+            out.append((charge - background) * value)
+        return Displacements(*out)
+
+    @staticmethod
+    def _inside(name: str, value: float, low: float, high: float, unit: str) -> None:
+        margin = 1e-9 * max(abs(low), abs(high))
+        if not low - margin <= value <= high + margin:
+            allowed = f"{low:g}" if low == high else f"from {low:g} to {high:g}"
+            raise TableError(
+                f"{name} = {value:g} is outside the table, which holds {allowed} {unit}"
+            )
+
+    def nominal(self) -> Displacements:
+        """Give the positions (x, y) [um] of undistorted vertices, source centre at 0."""
+        return nominal_positions(self.pitch, self.reach, vertex_fractions(self.vertices))
+
+    def _outlines(self, moved: Displacements) -> FloatArray:
+        """Polygons of all pixels, (n, n, 4 nv + 4, 2), anticlockwise from lower left."""
+        at = self.nominal()
+        c = at.corners + moved.corners
+        h = at.horizontal + moved.horizontal
+        v = at.vertical + moved.vertical
+        return np.concatenate(
+            [
+                c[:-1, :-1, None], h[:-1], c[:-1, 1:, None], v[:, 1:],
+                c[1:, 1:, None], h[1:, :, ::-1], c[1:, :-1, None], v[:, :-1, ::-1],
+            ],
+            axis=2,
+        )  # fmt: skip
+
+    def polygon(
+        self, i: int, j: int, *, charge: float, background: float = 0.0, depth: float
+    ) -> FloatArray:
+        """Boundary of the pixel at offset (i, j) from the source.
+
+        Parameters
+        ----------
+        i, j : int
+            Offset in x and in y [pixel], whole numbers from -reach to reach.
+        charge, background, depth : float
+            As in :meth:`displacements`.
+
+        Returns
+        -------
+        points : ndarray, shape (4 vertices + 4, 2)
+            Vertices (x, y) [um], the source pixel's centre at 0, counter-clockwise from the
+            middle of the left side, just below the pixel's centre, as in GalSim's tables.
+
+        Raises
+        ------
+        TableError
+            An offset or a value outside the table.
+        """
+        if max(abs(i), abs(j)) > self.reach:
+            raise TableError(
+                f"offset ({i}, {j}) is outside the table, which reaches {self.reach} pixels"
+            )
+        moved = self.displacements(charge=charge, background=background, depth=depth)
+        outline = self._outlines(moved)[j + self.reach, i + self.reach]
+        return np.roll(outline, self.vertices // 2, axis=0)
+
+    def areas(self, *, charge: float, background: float = 0.0, depth: float) -> FloatArray:
+        """Areas of all pixels [um^2].
+
+        Returns
+        -------
+        areas : ndarray, shape (2 reach + 1, 2 reach + 1)
+            ``areas[j + reach, i + reach]`` for offset i in x and j in y.
+        """
+        p = self._outlines(
+            self.displacements(charge=charge, background=background, depth=depth)
+        )
+        q = np.roll(p, -1, axis=2)
+        return np.asarray(
+            0.5 * np.sum(p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0], axis=2)
+        )
+
+    def area_changes(
+        self, *, charge: float, background: float = 0.0, depth: float
+    ) -> FloatArray:
+        """Areas less the nominal area [um^2], see :meth:`areas`."""
+        return (
+            self.areas(charge=charge, background=background, depth=depth)
+            - self.pitch[0] * self.pitch[1]
+        )
+
+    # -- files -------------------------------------------------------------------------
+
+    def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Write a FITS file (beside, then renamed).
+
+        Of a table that is mirror-symmetric bit for bit only a quadrant is stored.
+
+        Parameters
+        ----------
+        path : path-like
+            Where to.
+        overwrite : bool
+            Replace an existing file.
+
+        Raises
+        ------
+        TableError
+            The file exists and ``overwrite`` is not set, or it cannot be written.
+        """
+        # Not at the top: astropy is slow to load.
+        from bfsensor.table.fits_format import write_table
+
+        write_table(self, path, overwrite=overwrite)
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> DistortionTable:
+        """Read what :meth:`write` wrote.
+
+        Raises
+        ------
+        TableError
+            Not such a file, an unknown schema, or damaged; names the file.
+        """
+        from bfsensor.table.fits_format import read_fields
+
+        fields = read_fields(path)
+        try:
+            return cls(**fields)
+        except (ValueError, TypeError, AttributeError, IndexError) as error:
+            raise TableError(f"{Path(path)}: {error}") from None
+
+
+def _make(values: dict[str, Any]) -> DistortionTable:
+    return DistortionTable(**values)
+
+
+def _keep(table: DistortionTable, name: str, array: FloatArray) -> None:
+    """Set a frozen attribute, read-only."""
+    array.flags.writeable = False
+    object.__setattr__(table, name, array)

@@ -1,0 +1,41 @@
+"""Crosstalk from spots: found where it is, and not where spots lie across amplifiers' border."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import ndtr
+
+from bfsensor.diagnose.data.code_channels import CrosstalkChannels
+
+NOISE, PITCH, SIZE = 4.0, 30, 240
+
+
+def spots_over_a_border(crosstalk: float) -> CrosstalkChannels:
+    """Two amplifiers that read away from one another, a column of spots on their border."""
+    out = CrosstalkChannels()
+    for seed in range(8641, 8645):
+        rng = np.random.default_rng(seed)
+        edge = np.arange(2 * SIZE + 1) - 0.5
+
+        def along(start: float, stop: int, edge=edge, rng=rng) -> np.ndarray:
+            places = np.arange(start, stop, PITCH)
+            places = places + rng.uniform(-0.4, 0.4, len(places))
+            return np.diff(ndtr((edge[: stop + 1] - places[:, None]) / 1.1), axis=1)
+
+        # SIZE is a multiple of the pitch: every eighth column lies on the border.
+        image = 6e5 * along(15.0, SIZE).sum(0)[:, None] * along(0.4, 2 * SIZE).sum(0)
+        left, right = image[:, :SIZE][:, ::-1], image[:, SIZE:]
+        frames = [left + crosstalk * right, right + crosstalk * left]
+        out.add([f + NOISE * rng.standard_normal(f.shape) for f in frames], [NOISE, NOISE])
+    return out
+
+
+def test_spots_on_the_border_are_no_crosstalk() -> None:
+    (channel,) = spots_over_a_border(0.0).channels()
+    assert np.all(np.abs(channel.values) < 4 * channel.errors)
+
+
+def test_crosstalk_is_found() -> None:
+    (channel,) = spots_over_a_border(1e-4).channels()
+    assert np.all(np.abs(channel.values - 1e-4) < 4 * channel.errors)
+    assert np.all(channel.values > 6 * channel.errors)

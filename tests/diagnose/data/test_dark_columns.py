@@ -1,0 +1,72 @@
+"""Columns of darks: errors from the pixels' noise, or from columns that are uneven by nature."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bfsensor.diagnose.data.bias_channels import DarkChannels
+
+ROWS, COLUMNS, NOISE, BIASES, DARKS = 64, 128, 3.0, 10, 4
+
+
+HOT = 17
+"""Which column is."""
+
+
+def columns(
+    rng: np.random.Generator, uneven: float = 0.0, hot: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Columns of one campaign's darks, and the same over their errors."""
+    pattern = uneven * rng.standard_normal(COLUMNS)
+    bias = NOISE / np.sqrt(BIASES) * rng.standard_normal((ROWS, COLUMNS))
+    darks = DarkChannels({"one": bias}, {"one": NOISE}, biases=BIASES)
+    for number in range(DARKS):
+        image = NOISE * rng.standard_normal((ROWS, COLUMNS)) + pattern
+        image[:, HOT] += rng.poisson(hot, ROWS)
+        over = NOISE * rng.standard_normal((ROWS, 24))
+        frame = SimpleNamespace(name="one", image=image, serial_overscan=over)
+        exposure = SimpleNamespace(
+            number=number,
+            exposure_time=60.0,
+            wavelength=None,
+            back_bias=None,
+            temperature=None,
+        )
+        darks.add(exposure, [frame])
+    channel = darks.channels()[0]
+    own = channel.axes["what"] == "column"
+    return channel.values[own], channel.whiten(channel.values)[own]
+
+
+def pulls(rng: np.random.Generator, uneven: float = 0.0) -> np.ndarray:
+    """Whitened columns of one campaign's darks."""
+    return columns(rng, uneven)[1]
+
+
+def test_chi_square_of_columns_scatters_as_it_should() -> None:
+    rng = np.random.default_rng(2718)
+    squares = np.array([((p := pulls(rng)) - p.mean()) @ (p - p.mean()) for _ in range(60)])
+    deviates = (squares - (COLUMNS - 1)) / np.sqrt(2.0 * (COLUMNS - 1))
+    # Errors from the columns' own scatter gave deviates of 1.6.
+    assert deviates.mean() == pytest.approx(0.0, abs=4 / np.sqrt(60))
+    assert deviates.std() == pytest.approx(1.0, abs=4 / np.sqrt(120))
+
+
+def test_uneven_columns_are_held_against_their_own_scatter() -> None:
+    rng = np.random.default_rng(2719)
+    mean = np.mean([np.square(pulls(rng, uneven=2.0)).mean() for _ in range(20)])
+    # Held against noise alone it would be 14; a scatter is known to 10 %.
+    assert mean == pytest.approx(1.0, abs=0.2)
+
+
+def test_a_hot_column_has_the_noise_of_its_own_charge() -> None:
+    """Of 400 e- in each of its pixels; errors of all others stay as they are."""
+    rng = np.random.default_rng(2720)
+    values, whitened = np.array([columns(rng, hot=400.0) for _ in range(60)]).swapaxes(0, 1)
+    assert np.square(np.delete(whitened, HOT, axis=1)).mean() == pytest.approx(1.0, abs=0.1)
+    errors = values[:, HOT] / whitened[:, HOT]
+    # Of read noise alone they would be 3 / 20 of it.
+    assert errors.mean() == pytest.approx(values[:, HOT].std(ddof=1), rel=0.3)

@@ -1,0 +1,25 @@
+"""Rims and combs: what no single column or row tells is seen as a whole."""
+
+import pytest
+
+from bfsensor.diagnose.data.measure_channels import measure_channels
+from bfsensor.diagnose.detect.locate import locate_mismatch
+from bfsensor.diagnose.fit.baseline_fit import fit_bounded
+from validation.concealed.library import make_effect
+from validation.virtual_source import VirtualSource, virtual_baseline
+
+
+@pytest.mark.parametrize(
+    ("word", "values", "family"),
+    [
+        ("edge_rolloff", {"amp": 0.0037, "length": 3.0}, "rims"),
+        ("mask_stitch", {"amp": -0.0007, "period": 37.0}, "combs"),
+    ],
+)
+def test_effects_of_twelve_standard_deviations_are_located(word, values, family):
+    measured = measure_channels(
+        VirtualSource(seed=777, effects=[make_effect(word, values)])
+    )
+    found = locate_mismatch(fit_bounded(measured, virtual_baseline())[1], seed=1)
+    assert found.detected and found.findings[0].family == family
+    assert abs(found.findings[0].z) > 8

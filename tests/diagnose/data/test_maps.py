@@ -1,0 +1,144 @@
+"""Maps: sums over exposure times against maps held apart, and steps between amplifiers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.diagnose.data.map_channels import LOW, MapChannels, block_side
+from bfsensor.diagnose.data.measure_channels import MeasuredChannels
+from bfsensor.diagnose.model.predictor import Predictor
+from bfsensor.effects.effect import Segment
+from validation.virtual_source import virtual_baseline
+
+HERE, THERE = Condition(620.0, -60.0, 173.0), Condition(870.0, -60.0, 173.0)
+ROWS, COLUMNS = 120, 128
+"""Of four amplifiers, whose border in y cuts blocks of 8 pixels."""
+
+SEGMENTS = tuple(
+    Segment(x, y, COLUMNS // 2, ROWS // 2, x > 0, y > 0, 8, 16, 8)
+    for y in (0, ROWS // 2)
+    for x in (0, COLUMNS // 2)
+)
+FLATS = {(HERE, 1.0): 2, (HERE, 3.0): 2, (HERE, 8.0): 3, (HERE, 16.0): 4, (THERE, 16.0): 2}
+"""Pairs by condition and exposure time."""
+
+ALONG_Y, ALONG_X = (np.linspace(-1, 1, n) for n in (ROWS, COLUMNS))
+LIGHT = 1 + 0.02 * ALONG_X + 0.01 * ALONG_Y[:, None]
+
+
+def make_flats(seed: int) -> dict[tuple[Condition, float], np.ndarray]:
+    """Flats over their amplifiers' means, by condition and exposure time."""
+    rng = np.random.default_rng(seed)
+    response = LIGHT * (1 + 1e-3 * rng.standard_normal((ROWS, COLUMNS)))
+    out = {}
+    for (condition, time), pairs in FLATS.items():
+        noise = 0.01 / np.sqrt(time) * rng.standard_normal((2 * pairs, ROWS, COLUMNS))
+        flats = response + noise
+        for s in SEGMENTS:
+            part = flats[:, s.y : s.y + s.rows, s.x : s.x + s.columns]
+            part /= part.mean((1, 2), keepdims=True)
+        out[condition, time] = flats
+    out[HERE, 8.0][1:, 5, 7] = np.nan
+    return out
+
+
+def measure(
+    flats: dict[tuple[Condition, float], np.ndarray],
+) -> tuple[MapChannels, Channel]:
+    maps = MapChannels((ROWS, COLUMNS), {HERE.key: 16.0, THERE.key: 16.0})
+    for (condition, time), images in flats.items():
+        for first, second in zip(images[::2], images[1::2], strict=True):
+            maps.add_pair(
+                condition,
+                time,
+                (first - 1).astype(np.float32),
+                (second - 1).astype(np.float32),
+            )
+    (channel,) = maps.channels()
+    return maps, channel
+
+
+def test_sums_are_the_weighted_means() -> None:
+    """Of maps that are all held at once, in double precision."""
+    flats = make_flats(8821)
+    maps, channel = measure(flats)
+    means, weights = {}, {}
+    for key, images in flats.items():
+        noise = np.nan_to_num((images[::2] - images[1::2]) / np.sqrt(2))
+        n = len(noise)
+        boxes = noise.reshape(n, ROWS // LOW, LOW, COLUMNS // LOW, LOW).mean((2, 4)) * LOW
+        means[key] = np.nanmean(images, 0)
+        weights[key] = n**2 / boxes.reshape(n, -1).var(1).sum()
+    wanted = {
+        "all": [k for k in flats if k[0] == HERE],
+        "short": [(HERE, 1.0), (HERE, 3.0)],
+        "long": [(HERE, 8.0), (HERE, 16.0)],
+        "870/-60/173": [(THERE, 16.0)],
+    }
+    average = {
+        name: np.average(
+            [means[k] for k in keys], axis=0, weights=[weights[k] for k in keys]
+        )
+        for name, keys in wanted.items()
+    }
+    average["short"] /= average.pop("long")
+    average["870/-60/173"] /= average["all"]
+    assert set(channel.axes["map"]) == set(average)
+    for name, image in average.items():
+        own = channel.axes["map"] == name
+        for what, axis in (("column", 0), ("row", 1)):
+            rows = own & (channel.axes["what"] == what)
+            # Single precision of departures of 0.03, averaged over 120 pixels.
+            np.testing.assert_allclose(
+                channel.values[rows], image.mean(axis) - 1, atol=1e-8
+            )
+    shares = {s.seconds: s.weight for s in maps.shares()["all"]}
+    whole = sum(weights[k] for k in wanted["all"])
+    assert shares == pytest.approx(
+        {k[1]: weights[k] / whole for k in wanted["all"]}, rel=1e-5
+    )
+
+
+def test_levels_in_two_runs_are_one_mean() -> None:
+    flats = make_flats(8822)
+    maps, _ = measure(flats)
+    order = [(HERE, 16.0), (HERE, 1.0), (HERE, 3.0), (HERE, 8.0), (THERE, 16.0)]
+    split = MapChannels((ROWS, COLUMNS), {HERE.key: 16.0, THERE.key: 16.0})
+    for key, part in [
+        *((k, slice(0, 4)) for k in order),
+        *((k, slice(4, 8)) for k in order),
+    ]:
+        images = (flats[key][part] - 1).astype(np.float32)
+        for first, second in zip(images[::2], images[1::2], strict=True):
+            split.add_pair(*key, first, second)
+    one, other = maps.channels()[0], split.channels()[0]
+    np.testing.assert_allclose(one.values, other.values, atol=3 * float(one.errors.max()))
+    total = sum(s.weight for s in split.shares()["all"])
+    assert total == pytest.approx(1.0)
+
+
+def test_amplifiers_in_two_rows_leave_no_steps() -> None:
+    """Light that falls off towards the top makes steps in y between amplifiers over their means."""
+    flats = make_flats(8823)
+    maps, channel = measure(flats)
+    measured = MeasuredChannels(
+        channels=(channel,), amplifiers=tuple("abcd"), gains=(1.0,) * 4, read_noise=(3.0,) * 4,
+        phases=(), columns=(72,) * 4, flips=tuple((s.flip_x, s.flip_y) for s in SEGMENTS),
+        origins=tuple((s.x, s.y) for s in SEGMENTS), shape=(ROWS, COLUMNS), segments=SEGMENTS,
+        maps={("fit", k): v for k, v in maps.shares().items()},
+    )  # fmt: skip
+    columns = Predictor(measured, virtual_baseline()).linear(channel)
+
+    def left(names: list[str]) -> float:
+        design = np.array([channel.whiten(columns[n]) for n in names]).T
+        white = channel.whiten(channel.values)
+        best = np.linalg.lstsq(design, white, rcond=None)[0]
+        chosen = (channel.axes["map"] == "all") & (channel.axes["what"] != "ring")
+        return float(np.square(white - design @ best)[chosen].sum() / chosen.sum())
+
+    assert block_side((ROWS, COLUMNS)) == 8
+    assert left(list(columns)) < 1.15
+    assert left([n for n in columns if " amp " not in n]) > 3

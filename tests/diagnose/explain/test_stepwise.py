@@ -1,0 +1,168 @@
+"""Attribution: what was left out of a baseline is named, with its parameters, or not named."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bfsensor.diagnose.data.measure_channels import measure_channels
+from bfsensor.diagnose.detect.candidate_screen import Rival, Screen, evidence
+from bfsensor.diagnose.detect.candidates import with_fitted
+from bfsensor.diagnose.detect.locate import locate_mismatch
+from bfsensor.diagnose.explain.attribution import class_probabilities, tied_classes
+from bfsensor.diagnose.explain.location import place_effects
+from bfsensor.diagnose.explain.stepwise import attribute
+from bfsensor.diagnose.fit.baseline_fit import fit_bounded
+from bfsensor.diagnose.fit.fitted_model import Model
+from bfsensor.diagnose.fit.local_likelihood import valley_of
+from bfsensor.effects.charge_loss import ChargeLoss
+from bfsensor.effects.gain_nonlinearity import GainNonlinearity
+from bfsensor.effects.interpixel_coupling import InterpixelCoupling
+from bfsensor.effects.tearing import Tearing
+from bfsensor.effects.trap_serial import TrapSerial
+from validation.concealed.library import make_effect
+from validation.concealed.plan import Size
+from validation.virtual_source import VirtualSource, virtual_baseline
+
+SMALL = Size(128, 4, 1, dithers=1)
+KINDS = (ChargeLoss, GainNonlinearity, InterpixelCoupling, Tearing, TrapSerial)
+
+
+def fitted(seed, *effects):
+    source = VirtualSource(seed=seed, size=SMALL, effects=effects)
+    predictor, fit = fit_bounded(measure_channels(source), virtual_baseline())
+    return predictor, fit, locate_mismatch(fit)
+
+
+def explained(seed, *effects):
+    return attribute(*fitted(seed, *effects), kinds=KINDS)
+
+
+@pytest.fixture(scope="module")
+def torn():
+    return explained(
+        7101, make_effect("tearing", {"amp": 0.008, "length": 2.0, "column": 0.3})
+    )
+
+
+def test_an_effect_is_named_with_its_parameters(torn):
+    found = torn.found[0]
+    assert found.effect.word == "tearing" and torn.probability["tearing"] > 0.9
+    told = found.intervals()
+    # 3 sigma; the tear is open in 0.7 of the rows on average, in a few tens of exposures.
+    for name, truth, more in (("amp", 0.008, 0.0015), ("length", 2.0, 0.2)):
+        width = 1.5 * (told[name]["hi68"] - told[name]["lo68"]) + more
+        assert abs(told[name]["value"] - truth) < width, name
+    assert abs(told["column"]["value"] * 128 - 0.3 * 128) < 1.0
+
+
+def test_the_valley_about_a_fit_is_that_of_the_fit(torn):
+    """Its lowest place, and errors by what all else takes of one effect's derivatives."""
+    # Fitted once more from its end: chance is then that of the place the valley is about.
+    model = Model(torn.predictor, torn.fit)
+    model = model.with_effects(model.effects)
+    valley = valley_of(model, 0)
+    errors = np.array(list(model.errors(0).values()))
+    np.testing.assert_allclose(valley.errors, errors, rtol=0.05)
+    # Steps end where they gain a hundredth; errors that chance widens have their logarithm apart.
+    assert abs(valley.square + model.fit.chance - model.fit.total) < 0.5
+    aside = valley.best + 0.5 * errors * [1.0, 0.0, 0.0, 0.0]
+    assert (valley.left(aside) ** 2).sum() > valley.square
+
+
+def test_recordings_that_were_not_fitted_agree_better(torn):
+    before, after = torn.chi2dof()
+    square_before, square_after, values = torn.heldout["flat_map"]
+    assert square_before - square_after > 15
+    # Scatter of a chi-square of so many values, 4 sigma.
+    assert abs(square_after / values - 1) < 4 * np.sqrt(2 / values) + 0.05
+    assert after < before
+
+
+@pytest.mark.slow
+def test_a_twin_is_in_the_class():
+    """Lost charge bends the mean as a curved response does; eight levels hardly tell them."""
+    found = explained(7102, make_effect("charge_loss", {"q": 5e-8})).found
+    assert "charge_loss" in {w for f in found for w in f.tied}
+    assert len(found) == 1
+
+
+def test_nothing_is_named_where_nothing_stands_out():
+    predictor, fit, mismatch = fitted(7103)
+    assert not mismatch.detected
+    out = attribute(predictor, fit, mismatch, kinds=KINDS)
+    assert out.found == () and not out.open_world and out.probability == {}
+
+
+def test_a_screen_finds_the_amplitude_to_its_error():
+    truth = 12.0
+    effect = make_effect("trap_serial", {"size": truth, "tau": 1.5, "amp": 1})
+    predictor, fit, _ = fitted(7104, effect)
+    screen = Screen(predictor, fit)
+    best = screen.best(screen.tried(TrapSerial))
+    assert best.effect["amp"] == 1.0
+    error = truth / np.sqrt(best.gain)
+    # 4 sigma; tau is fitted too, which doubles the error.
+    assert abs(best.effect["size"] - truth) < 8 * error + 0.01 * truth
+
+
+def rival(kind, values, gain, z, template):
+    return Rival(kind(values), gain, z, np.asarray(template, float))
+
+
+def test_probabilities_and_ties_follow_evidence_and_gain():
+    loss = rival(ChargeLoss, {"q": 1e-7}, 40.0, 15.0, [1, 0, 0])
+    bent = rival(GainNonlinearity, {"c2": 1e-3, "c3": 0.0}, 38.0, 13.0, [0.99, 0.1, 0])
+    torn = rival(
+        Tearing,
+        {"amp": 0.1, "length": 2.0, "column": 0.5, "open": 0.4},
+        9.0,
+        0.0,
+        [0, 0, 1],
+    )
+    out = class_probabilities([loss, bent, torn])
+    assert out["charge_loss"] == pytest.approx(1 / (1 + np.exp(-2.0)), rel=1e-5)
+    assert tied_classes(loss.effect, [loss, bent, torn]) == (
+        "charge_loss",
+        "gain_nonlinearity",
+    )
+
+
+def test_an_effect_that_was_fitted_has_the_gain_of_its_fit():
+    """A search that ended short of it must not make another one more probable."""
+    loss = rival(ChargeLoss, {"q": 1e-7}, 400.0, 195.0, [1, 0])
+    short = rival(GainNonlinearity, {"c2": -5e-3, "c3": -8e-4}, 350.0, 170.0, [1, 0])
+    bent = GainNonlinearity({"c2": -8e-3, "c3": 6e-4})
+    assert class_probabilities([loss, short])["charge_loss"] > 0.999
+    out = with_fitted([loss, short], bent, 410.0)
+    assert [r.effect for r in out] == [bent, loss.effect]
+    assert class_probabilities(out)["gain_nonlinearity"] > 0.99
+    assert with_fitted([loss, short], bent, 300.0) == [loss, short]
+
+
+def test_evidence_falls_with_the_room_a_parameter_has():
+    """Laplace: gain/2 + ln prior + ln of the Gaussian's volume, prior flat in the logarithm."""
+    effect = ChargeLoss({"q": 5e-8})
+    (p,) = ChargeLoss.parameters
+    sigma = 5e-9
+    expected = (
+        50.0
+        - np.log(5e-8 * np.log(p.high / p.low))
+        + 0.5 * np.log(2 * np.pi)
+        + np.log(sigma)
+    )
+    assert evidence(effect, [p], 100.0, np.array([[1 / sigma]])) == pytest.approx(
+        expected, abs=0.1
+    )
+
+
+def test_a_found_effect_says_itself_where_it_is(torn):
+    """A tear of two pixels' length at column 38 of 128: columns around it, by its own template."""
+    placed = place_effects(torn, torn.fit, (128, 128), 2)
+    assert placed["channels"][0] == "flat_map"
+    low, high = placed["x"]
+    assert 26 <= low < 38 < high <= 52
+    none = replace(torn, found=())
+    assert place_effects(none, torn.fit, (128, 128), 2) is None

@@ -1,0 +1,59 @@
+"""Recordings that are nothing like the baseline: a fit that does not settle still tells what is left."""
+
+import numpy as np
+import pytest
+
+from bfsensor.diagnose.data.measure_channels import measure_channels
+from bfsensor.diagnose.data.ptc_turnoff import below, find_turn_off
+from bfsensor.diagnose.diagnosis import diagnose_measured
+from bfsensor.diagnose.fit import baseline_fit as mismatch
+from bfsensor.diagnose.fit.baseline_fit import UNSETTLED
+from validation.concealed.library import make_effect
+from validation.concealed.plan import Size
+from validation.virtual_source import VirtualSource, virtual_baseline
+
+SMALL = Size(128, 4, 1, dithers=1)
+FULL = 5e4
+
+
+@pytest.fixture(scope="module")
+def saturated():
+    effect = make_effect("saturation", {"full_well": FULL}, "")
+    return measure_channels(VirtualSource(seed=5177, size=SMALL, effects=[effect]))
+
+
+@pytest.mark.slow
+def test_flats_beyond_the_full_well_are_saturated(saturated):
+    """Fainter flats tell the baseline; full ones then tell the full well, and nothing else."""
+    found = diagnose_measured(saturated, virtual_baseline())
+    assert any("the variance of flats collapses" in n for n in found.notes)
+    assert found.mismatch.detected and found.mismatch.findings[0].word.startswith("flat_")
+    (one,) = found.attribution.found
+    assert one.effect.word == "saturation"
+    assert one.effect["full_well"] == pytest.approx(FULL, abs=4 * one.errors["full_well"])
+    assert one.errors["full_well"] < 0.02 * FULL
+    # Spots of 950 nm, of which only a saturated one is fitted, keep a width that is hardly known.
+    for word in ("flat_cov", "flat_mean"):
+        before, after, values = found.attribution.heldout[word]
+        assert before > 1e3 * values and after < 1.3 * values
+        assert word not in found.attribution.fails_in
+
+
+def test_turn_off_is_where_pixels_are_full(saturated):
+    off = find_turn_off(saturated.channels)
+    assert off.electrons == pytest.approx(FULL, rel=0.1)
+    faint = below(saturated.channels, off)
+    for old, new in zip(saturated.channels, faint, strict=True):
+        if old.word == "flat_cov":
+            assert 0 < len(new) < len(old)
+            assert new.axes["level"].max() < min(off.levels.values())
+    assert find_turn_off(faint) is None
+
+
+def test_a_baseline_that_does_not_settle_is_told(saturated, monkeypatch):
+    monkeypatch.setattr(mismatch, "find_turn_off", lambda channels: None)
+    found = diagnose_measured(saturated, virtual_baseline(), explain=False)
+    assert UNSETTLED in found.notes
+    assert found.mismatch.detected
+    assert any(f.word.startswith("flat_") for f in found.mismatch.findings)
+    assert np.isfinite(found.fit.values).all() and np.isfinite(found.fit.residuals).all()

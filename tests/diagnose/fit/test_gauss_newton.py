@@ -1,0 +1,136 @@
+"""Steps of a fit where amplitudes follow shapes along a curved valley."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.fit.gauss_newton import Steps
+from bfsensor.effects.illumination_turbulence import IlluminationTurbulence
+from bfsensor.effects.psf_wings import PsfWings
+
+PLACES = np.linspace(0.0, 6.0, 40)
+
+
+def light(frac, sigma):
+    """Of a halo, seen over a window that it outgrows, and what that adds to a width."""
+    return frac * np.exp(-0.5 * (PLACES / sigma) ** 2) / sigma
+
+
+class Halo:
+    """One channel: a halo whose width is hardly known, above a level."""
+
+    names = ("effect 0 psf_wings frac", "effect 0 psf_wings sigma")
+    prior_rows = np.array([], int)
+    effects = (PsfWings({"frac": 0.01, "sigma": 3.0}),)
+    notes = ()
+
+    def __init__(self, start):
+        self.start = np.array(start, float)
+
+    def predict(self, channel, point):
+        del channel
+        return 1e4 * light(*point)
+
+    def slope(self, channel, point, n, here):
+        step = np.array(point)
+        step[n] += 1e-5 * max(point[n], 1e-3)
+        return (self.predict(channel, step) - here) / (step[n] - point[n])
+
+    def depends(self, channel):
+        del channel
+        return np.ones(2, bool)
+
+    def linear(self, channel):
+        return {"level": np.ones(len(channel))}
+
+    def modes(self, channel, point):
+        del point
+        return np.zeros((len(channel), 0))
+
+    def shapes(self):
+        return np.array([False, True])
+
+    def reach(self, point):
+        return np.array([[0.0 - point[0], -0.5 * point[1]], [0.5 - point[0], point[1]]])
+
+
+def channel(truth, seed=3):
+    values = (
+        1e4 * light(*truth) + 5.0 + np.random.default_rng(seed).normal(0, 1, len(PLACES))
+    )
+    axes = {"n": np.arange(len(PLACES))}
+    return Channel("spot", values, (np.eye(len(PLACES)),), axes, "", "fit")
+
+
+@pytest.mark.parametrize("start", [(0.05, 0.5), (0.002, 1.0), (0.3, 20.0), (0.0, 2.0)])
+def test_the_valley_is_followed_to_its_end(start):
+    one = channel((0.02, 3.0))
+    steps = Steps(Halo(start), [one])
+    steps.go_carefully()
+    # The least of a grid over widths, with amplitude and level at their best.
+    best = np.inf
+    for sigma in np.geomspace(0.3, 30, 400):
+        design = np.array([1e4 * light(1.0, sigma), np.ones(len(PLACES))]).T
+        best = min(best, float(np.linalg.lstsq(design, one.values, rcond=None)[1][0]))
+    assert steps.solved.left @ steps.solved.left == pytest.approx(best, abs=0.05)
+    # What is told is what the point gives.
+    left = one.values - 1e4 * light(*steps.point)
+    left = left - left.mean()
+    assert left @ left == pytest.approx(
+        float(steps.solved.left @ steps.solved.left), abs=0.02
+    )
+
+
+def test_harm_is_not_told_as_gain():
+    """Derivatives of the wrong sign: nothing gains, and the fit stays where it was."""
+    halo = Halo((0.01, 3.0))
+    forward = halo.slope
+    halo.slope = lambda *args: -forward(*args)
+    one = channel((0.02, 3.0))
+    steps = Steps(halo, [one])
+    steps.go_carefully()
+    left = one.values - 1e4 * light(*steps.point)
+    left = left - left.mean()
+    assert left @ left == pytest.approx(
+        float(steps.solved.left @ steps.solved.left), abs=1e-6
+    )
+    np.testing.assert_allclose(steps.point, (0.01, 3.0))
+
+
+class Chance(Halo):
+    """Of an effect that leaves much to chance, and a width that is held by a prior."""
+
+    prior_rows = np.array([1])
+    steps = np.array([1e-3, 1e-3])
+    effects = (IlluminationTurbulence({"rms": 1e-3, "corr": 20.0}),)
+
+    def modes(self, channel, point):
+        del point
+        # Fewer and more columns than values, one of them along the level.
+        count = 3 * len(channel)
+        out = np.random.default_rng(8).normal(0, 0.4, (len(channel), count))
+        out[:, 0] = 2.0
+        return out
+
+
+@pytest.mark.parametrize("held", [None, np.array([False, True]), np.array([True, True])])
+@pytest.mark.parametrize("start", [(0.02, 3.0), (0.0, 2.0), (0.4, 3.0)])
+def test_what_is_left_to_chance_is_projected_out(start, held):
+    """Steps, errors and chi-squares of the small problem are those of the whole one."""
+    steps = Steps(Chance(start), [channel((0.02, 3.0))])
+    predicted, residuals = steps.residuals(steps.point)
+    steps.differentiate(np.ones(2, bool), steps.point, predicted)
+    whole, small = (f(residuals, steps.point, held) for f in (steps.solve, steps._solve))
+    assert len(whole.solution) > 100 and len(small.solution) == 2
+    np.testing.assert_allclose(small.solution, whole.solution[:2], rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(small.errors, whole.errors[:2], rtol=1e-8)
+    assert small.left @ small.left == pytest.approx(whole.left @ whole.left, rel=1e-10)
+
+
+def test_it_is_told_whole_at_the_end():
+    steps = Steps(Chance((0.02, 3.0)), [channel((0.02, 3.0))])
+    steps.go_carefully()
+    assert len(steps.solved.solution) == 2 + 1 + 3 * len(PLACES)
+    assert steps.solved.basis.shape[1] > 100

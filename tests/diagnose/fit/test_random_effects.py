@@ -1,0 +1,108 @@
+"""Amplitudes that the scatter of values tells, fitted by scores."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.fit.gauss_newton import Steps
+from bfsensor.diagnose.fit.random_effects import likeliest
+from bfsensor.effects.illumination_turbulence import IlluminationTurbulence
+
+COUNT = 80
+STRENGTHS = np.geomspace(300.0, 3e4, COUNT)
+"""Scatter of each value by an amplitude of one, noise being one."""
+
+
+class Shaken:
+    """Predicts values of one level, which an effect makes scatter and else leaves as they are."""
+
+    names = ("effect 0 illumination_turbulence rms",)
+    prior_rows = np.array([], int)
+    effects = (IlluminationTurbulence({"rms": 1e-3, "corr": 20.0}),)
+    steps = np.array([1e-6])
+
+    def __init__(self, start: float) -> None:
+        self.start = np.array([start])
+
+    def predict(self, channel, point):
+        del point
+        return np.zeros(len(channel))
+
+    def linear(self, channel):
+        return {"level": np.ones(len(channel))}
+
+    def depends(self, channel):
+        del channel
+        return np.array([False])
+
+    def modes(self, channel, point):
+        del channel
+        return np.diag(point[0] * STRENGTHS)
+
+    def shapes(self):
+        return np.array([False])
+
+    def reach(self, point):
+        return np.array([0.0 - point, 0.1 - point])
+
+
+def channel(amplitude: float, seed: int) -> Channel:
+    noise = np.random.default_rng(seed).standard_normal((2, COUNT))
+    values = 7.0 + noise[0] + amplitude * STRENGTHS * noise[1]
+    return Channel(
+        "flat_mean", values, (np.eye(COUNT),), {"n": np.arange(COUNT)}, "", "fit"
+    )
+
+
+def restricted(amplitude: float, values: np.ndarray) -> float:
+    """Minus twice the logarithm of the restricted likelihood, the level unknown."""
+    weights = 1 / (1 + (amplitude * STRENGTHS) ** 2)
+    mean = float(weights @ values) / weights.sum()
+    square = float(weights @ (values - mean) ** 2)
+    return square - float(np.log(weights).sum()) + float(np.log(weights.sum()))
+
+
+@pytest.mark.parametrize("start", [1e-4, 3e-4, 1e-3, 0.02])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_likeliest_amplitude_is_found(start, seed):
+    one = channel(1e-3, seed)
+    steps = Steps(Shaken(start), [one])
+    steps.go_carefully()
+    grid = np.geomspace(1e-4, 1e-2, 2000)
+    best = grid[np.argmin([restricted(a, one.values) for a in grid])]
+    assert steps.point[0] == pytest.approx(best, rel=0.02)
+
+
+def test_errors_are_those_of_the_scatter():
+    pulls = []
+    for seed in range(100):
+        steps = Steps(Shaken(5e-4), [channel(1e-3, 100 + seed)])
+        steps.go_carefully()
+        pulls.append((steps.point[0] - 1e-3) / steps.solved.errors[0])
+    assert np.mean(pulls) == pytest.approx(0.0, abs=0.4)
+    assert np.std(pulls) == pytest.approx(1.0, abs=0.25)
+
+
+def test_what_no_channel_tells_stays(monkeypatch):
+    monkeypatch.setattr(IlluminationTurbulence, "told_by_scatter", ())
+    steps = Steps(Shaken(3e-4), [channel(1e-3, 0)])
+    steps.go_carefully()
+    assert steps.point[0] == 3e-4 and len(steps.score.target) == 0
+
+
+def test_gain_before_a_fit_is_that_of_the_likelihood():
+    """Values change too: by the factor and by its square."""
+    rng = np.random.default_rng(5)
+    modes = rng.normal(0, 0.3, (COUNT, 30))
+    one, two = rng.normal(0, 0.5, (2, COUNT))
+    left = 2 * one + 4 * two + 2 * modes @ rng.standard_normal(30)
+    left += rng.standard_normal(COUNT)
+    gain, factor = likeliest(modes, left, one, two)
+    covariance = np.eye(COUNT) + factor**2 * modes @ modes.T
+    after = left - factor * one - factor**2 * two
+    square = float(after @ np.linalg.solve(covariance, after))
+    square += float(np.linalg.slogdet(covariance)[1])
+    assert gain == pytest.approx(float(left @ left) - square, rel=1e-9)
+    assert factor == pytest.approx(2.0, rel=0.15)

@@ -1,0 +1,175 @@
+"""The report of a campaign whose mismatch is explained: before and after, ties, advice, omissions."""
+
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from bfsensor.diagnose.data.measure_channels import measure_channels
+from bfsensor.diagnose.detect.locate import locate_mismatch
+from bfsensor.diagnose.explain.attribution import FAILS
+from bfsensor.diagnose.explain.stepwise import attribute
+from bfsensor.diagnose.fit.baseline_fit import fit_bounded, held_out
+from bfsensor.diagnose.plan.advice import plan
+from bfsensor.diagnose.report.class_words import CLASS_WORDS
+from bfsensor.diagnose.report.diagnosis_result import Diagnosis
+from bfsensor.diagnose.report.html_report import write_report
+from bfsensor.effects.charge_loss import ChargeLoss
+from bfsensor.effects.gain_nonlinearity import GainNonlinearity
+from bfsensor.plots import residuals as show
+from validation.concealed.library import EFFECTS, make_effect
+from validation.concealed.plan import Size
+from validation.virtual_source import VirtualSource, virtual_baseline
+
+SMALL = Size(128, 4, 1, dithers=1)
+VOID = {"meta", "img", "link", "br", "hr"}
+
+
+class Page(HTMLParser):
+    """Checks that tags close in order; keeps headings, text and pictures."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.headings, self.words, self.pictures = [], [], [], 0
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        if tag == "img":
+            self.pictures += 1
+            assert dict(attrs)["alt"] and dict(attrs)["src"].startswith("data:image/png")
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] == "h2":
+            self.headings.append(data)
+        if "style" not in self.open:
+            self.words.append(data)
+
+
+@pytest.fixture(scope="module")
+def explained():
+    source = VirtualSource(
+        seed=7101, size=SMALL, effects=[make_effect("charge_loss", {"q": 1.5e-7})]
+    )
+    measured = measure_channels(source)
+    predictor, fit = fit_bounded(measured, virtual_baseline())
+    mismatch = locate_mismatch(fit)
+    found = attribute(predictor, fit, mismatch, kinds=(ChargeLoss, GainNonlinearity))
+    return Diagnosis(
+        campaign="a <small> campaign", baseline="virtual", measured=measured, fit=fit,
+        mismatch=mismatch, heldout=held_out(predictor, fit, measured), attribution=found,
+        plan=plan(found), predictor=predictor, notes=("a note",),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def written(explained, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    return folder, write_report(explained, folder)
+
+
+def test_report_json_has_plan_advice_and_what_was_not_tested(explained, written):
+    report = json.loads((written[0] / "report.json").read_text())
+    assert len(report["recommended_recordings"]) == len(report["plan"]) == 1
+    block = report["plan"][0]
+    assert set(block["separates"]) == set(report["equivalence_class"])
+    assert block["recording"] == "binned_serial" and block["expected_delta_chi2"] > 25
+    assert [t["class"] for t in report["not_tested"]] == ["outside_library"]
+    assert "Fe55" in report["not_tested"][0]["recording"]
+    held = report["heldout"]
+    assert held["chi2dof_after"] < 1.2 < held["chi2dof_before"]
+    assert held["channels"]["flat_mean"]["before"] > 10
+    assert held["channels"]["flat_mean"]["after"] < 2
+    assert held["fails_in"] == [] and "fails" not in report["said"]
+    # A channel without values is none of them.
+    assert all(row["values"] > 0 for row in held["channels"].values())
+
+
+def test_what_fails_on_other_recordings_says_so(explained):
+    told = explained.attribution
+    before, _, n = told.heldout["flat_mean"]
+    worse = {**told.heldout, "flat_mean": (before, before + 2 * FAILS, n)}
+    astray = replace(explained, attribution=replace(told, heldout=worse))
+    assert astray.to_report()["heldout"]["fails_in"] == ["flat_mean"]
+    assert "fails in the channel 'flat_mean'" in astray.said()
+    assert "not to be relied on" in astray.said()
+
+
+def test_the_page_is_whole_and_says_it_all(written):
+    page = Page((written[0] / "report.html").read_text())
+    assert page.open == []
+    assert page.headings == [
+        "What explains it", "What to record next", "Where the recordings differ",
+        "On recordings that were not fitted", "Channels as fitted",
+        "Residuals, channel by channel", "What stands out of the baseline",
+        "What was not tested", "Notes",
+    ]  # fmt: skip
+    text = " ".join(page.words)
+    assert "a <small> campaign" in text and "a note" in text
+    assert "or gain nonlinearity" in text or "or charge loss" in text
+    assert "binned by two along the row" in text and "Astier" in text
+    assert re.search(r"1\.\d+e-07 to 1\.\d+e-07", text)
+    # What maps of the same pixels that were not fitted are worth.
+    assert "whose own response is the same in all flats" in text
+
+
+def test_figures_come_in_pairs_of_one_scale(written):
+    folder, files = written
+    names = {p.stem for p in files if p.suffix == ".png"}
+    both = {n for n in names if f"{n}_with_effects" in names}
+    assert {"channels", "flat_cov", "flat_mean", "spot"} <= both
+    assert {"classes", "heldout", "serial_overscan", "flat_map"} <= names
+    # What no effect touches is not shown twice.
+    assert not {"serial_overscan", "flat_map", "bias_cov"} & both
+    page = Page((folder / "report.html").read_text())
+    assert page.pictures == len(names)
+    assert not list(folder.glob("*.tmp*"))
+
+
+def test_what_is_missing_is_told(explained, tmp_path):
+    kept = tuple(
+        c for c in explained.measured.channels if c.word not in ("spot", "dark_map")
+    )
+    less = replace(explained, measured=replace(explained.measured, channels=kept))
+    report = less.to_report()
+    told = {entry["class"]: entry for entry in report["not_tested"]}
+    assert (
+        told["psf_wings"]["because"] == "no spot"
+        and "spots" in told["psf_wings"]["recording"]
+    )
+    assert "cti_serial" not in told
+    write_report(less, tmp_path)
+    text = " ".join(Page((tmp_path / "report.html").read_text()).words)
+    assert "What was not tested" in text and "no darks" in text
+
+
+def test_classes_have_plain_words():
+    # Pieces of the device's physics are classes of their own.
+    assert set(CLASS_WORDS) == {*EFFECTS, "free_holes", "stop_diffusion"}
+
+
+def test_figures_of_the_summary_draw_what_they_are_given():
+    from matplotlib.figure import Figure
+
+    ax = Figure().add_subplot()
+    show.draw_classes({"cti_serial": 0.9, "trap_serial": 0.1}, ax, tied=["cti_serial"])
+    widths = [bar.get_width() for bar in ax.patches]
+    assert widths == [0.1, 0.9]
+    colours = {bar.get_facecolor() for bar in ax.patches}
+    assert len(colours) == 2
+    ax = Figure().add_subplot()
+    show.draw_held_out({"flats": (50.0, 1.1, 100), "spots": (1.2, 1.0, 20)}, ax)
+    marks = [
+        line.get_xdata()[0] for line in ax.lines if len(np.ravel(line.get_xdata())) == 1
+    ]
+    assert sorted(marks) == [1.0, 1.1, 1.2, 50.0]
+    low, high = ax.get_xlim()
+    assert low < 1 < 50 < high

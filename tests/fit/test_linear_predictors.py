@@ -1,0 +1,78 @@
+"""Tangents of saturation and diffusion against full solutions and the closed form."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bfsensor import Device
+from bfsensor.device.quantities import DIFFUSION, Prior, choose_priors
+from bfsensor.errors import FitError
+from bfsensor.fit.data import DataSet
+from bfsensor.fit.device_at import device_at
+from bfsensor.fit.linear_predictors import SPILL, START, make_tangents
+from bfsensor.recording.campaign.exposures import Condition
+from bfsensor.simulate.edge_field import front_plane
+from bfsensor.simulate.well import full_well
+from bfsensor.units import VACUUM_PERMITTIVITY
+
+DEVICE = Device.load("itl_sta3800c")
+
+
+def data(kind, condition, value=1.0):
+    return DataSet(
+        "one", kind, np.array([value]), np.array([0.1]), (condition,),
+        np.zeros((1, 2), np.int64),
+    )  # fmt: skip
+
+
+def test_full_wells_follow_the_parameters():
+    names = (SPILL, "gates.gate_oxide", "gate_low:0.5 V")
+    priors = choose_priors(DEVICE, names)
+    stated = Condition(gate_high=1.0)
+    predictor = make_tangents(DEVICE)["saturation"](data("saturation", stated), priors)
+    middle = np.array([prior.mean for prior in priors])
+    well, slopes = predictor(middle)
+    there = replace(DEVICE, operating_point=replace(DEVICE.operating_point, gate_high=1.0))
+    # full_well stops at 0.1 %.
+    assert well[0] == pytest.approx(full_well(there, cells=8), rel=2e-3)
+    for n, prior in enumerate(priors):
+        moved = middle.copy()
+        moved[n] += 0.7 * prior.spread
+        changed = device_at(DEVICE, stated, priors, moved)
+        full = full_well(changed, cells=8) - well[0]
+        # Straight to a tenth, and the root is good to 0.2 % of the well.
+        assert predictor(moved)[0][0] - well[0] == pytest.approx(
+            full, rel=0.1, abs=2e-3 * well[0]
+        )
+        assert abs(slopes[0, n] * prior.spread) > 0.005 * well[0]
+
+
+def test_diffusion_is_einsteins_in_a_nearly_even_field():
+    priors = choose_priors(DEVICE, (DIFFUSION, "silicon.thickness", "back_bias:5 V"))
+    at = Condition(back_bias=-60.0)
+    predictor = make_tangents(DEVICE)["diffusion"](data("diffusion", at), priors)
+    middle = np.array([prior.mean for prior in priors])
+    width, slopes = predictor(middle)
+    # A field that falls evenly with the doping: 2 kT/q times a logarithm.
+    here = device_at(DEVICE, at)
+    front = front_plane(here)
+    length = 100.0 - front.height
+    bend = 2.4 / (11.7 * VACUUM_PERMITTIVITY)
+    mean = (front.potential + 60.0) / length
+    high = mean + bend * (0.5 * length - (START - front.height))
+    kt = DEVICE.material.thermal_voltage(173.0)
+    expected = np.sqrt(2 * kt / bend * np.log(high / (mean - 0.5 * bend * length)))
+    assert width[0] == pytest.approx(expected, rel=0.01)
+    assert slopes[0, 0] == pytest.approx(width[0])
+    # Width goes with the thickness; the stated voltage is not free.
+    assert slopes[0, 1] == pytest.approx(width[0] / 98.0, rel=0.15)
+    assert slopes[0, 2] == 0.0
+
+
+def test_a_device_that_cannot_be_is_refused():
+    priors = (Prior("gates.gate_oxide", 0.1, 0.01),)
+    with pytest.raises(FitError, match=r"no such device: .*field_oxide"):
+        device_at(DEVICE, Condition(), priors, np.array([2.0]))
