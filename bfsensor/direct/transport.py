@@ -66,7 +66,7 @@ class Transport:
     -----
     Beside a full pixel the default steps give the same share of electrons to a well as steps
     a fourth as long within 0.2 % at Einstein's width; at the published width they give
-    0.9 % less (errors 0.2 and 0.3 %, ``validation/transport.ipynb``).
+    0.9 % less (errors 0.2 and 0.3 %, ``validation/transport/transport.ipynb``).
     """
 
     diffusion: float = 1.0

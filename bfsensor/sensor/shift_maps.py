@@ -100,7 +100,7 @@ class ShiftMap:
         boundaries is held, so that light beyond the last pixel lands where they say.  The
         shift grows with the height of conversion like that of long doping ripples ('bulk'):
         that of a guard ring does so from about three thicknesses / pi on; nearer, light that
-        converts deep is moved too little or too much (``validation/edge_shift.ipynb``).
+        converts deep is moved too little or too much (``validation/edges/edge_shift.ipynb``).
 
         Parameters
         ----------

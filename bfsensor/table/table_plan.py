@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 ACCURACIES = {0.05: 16, 0.02: 24, 0.01: 32, 0.005: 48}
 """Cells a pixel for an accuracy aimed at in the nearest area changes.
 
-Measured against 64 cells for the two LSST devices (``python -m validation.convergence``): at 32
-cells 0.2 % or less at the centre, 0.5 % at (0, 1), 0.1 % at (1, 1), and at (1, 0) 0.1 % (ITL) and
-1.1 % (E2V)."""
+Measured against 64 cells for the two LSST devices
+(``python -m validation.boundaries.convergence``): at 32 cells 0.2 % or less at the
+centre, 0.5 % at (0, 1), 0.1 % at (1, 1), and at (1, 0) 0.1 % (ITL) and 1.1 % (E2V)."""
 
 CHARGE_FRACTIONS = (0.03, 0.15, 0.35, 0.55, 0.75, 0.9)
 """Source charges of a table in full wells; the response bends most at small charges."""

@@ -158,7 +158,7 @@ def main() -> None:
     if options.output:
         from astropy.table import Table
 
-        from validation.write_results import write_results
+        from validation.common.write_results import write_results
 
         names = ("case", "sensor", "cpu_s", "cpu_s_worst", "ratio", "limit", "aim", "bytes")
         write_results(

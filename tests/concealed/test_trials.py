@@ -8,14 +8,14 @@ import pytest
 from click.testing import CliRunner
 
 from tests.concealed.reports import report
-from validation import concealed_trials as trials
-from validation import trial_amplitudes as amplitudes
+from validation.challenge import concealed_trials as trials
+from validation.challenge import trial_amplitudes as amplitudes
+from validation.challenge.trial_amplitudes import Amplitudes, headroom, strongest
 from validation.concealed.library import EFFECTS, make_effect
 from validation.concealed.opening import Opened, from_row, to_row
 from validation.concealed.plan import Size
 from validation.concealed.rows import read_rows
 from validation.concealed.submit import digest
-from validation.trial_amplitudes import Amplitudes, headroom, strongest
 
 EVERY = [(w, v) for w, k in EFFECTS.items() for v in sorted(k.variants)]
 

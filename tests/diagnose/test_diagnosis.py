@@ -16,10 +16,10 @@ from bfsensor.diagnose.diagnosis import diagnose, diagnose_measured
 from bfsensor.diagnose.fit.baseline_fit import fit_bounded
 from bfsensor.diagnose.report.diagnosis_result import SCHEMA
 from bfsensor.diagnose.report.html_report import write_report
+from validation.common.virtual_source import VirtualSource, virtual_baseline
 from validation.concealed.campaign import write_campaign
 from validation.concealed.library import make_effect
 from validation.concealed.plan import Size
-from validation.virtual_source import VirtualSource, virtual_baseline
 
 SMALL = Size(128, 4, 1, dithers=1)
 

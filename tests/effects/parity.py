@@ -1,7 +1,7 @@
 """Whether a prediction agrees with pixels, channel by channel; of any effects of the library."""
 
 from validation.concealed.plan import Size
-from validation.effect_parity import (
+from validation.effects.effect_parity import (
     ENGINES,
     PLACES,
     compare_at,

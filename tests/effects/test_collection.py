@@ -21,11 +21,11 @@ from bfsensor.effects.library import LIBRARY, make_effect
 from bfsensor.effects.saturation import Saturation, spilled
 from bfsensor.errors import EffectError
 from bfsensor.response.edge_response import area_matrix
+from validation.common.virtual_source import virtual_baseline
 from validation.concealed.card import NOMINAL, SPREAD, shifts_at
 from validation.concealed.electrostatics import EdgeShifts
 from validation.concealed.library import make_effect as make_theirs
 from validation.concealed.plan import Exposure, Geometry
-from validation.virtual_source import virtual_baseline
 
 WORDS = (
     "bf_anisotropy", "bf_chromatic", "bf_long_range", "bf_nonlinear", "charge_loss",

@@ -9,12 +9,18 @@ from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.model.predictor import Predictor, used_channels
 from bfsensor.effects.device_parameter import device_parameters
 from bfsensor.effects.library import make_effect
+from validation.common.virtual_source import VirtualSource, virtual_baseline
 from validation.concealed.card import NOMINAL, SPREAD
 from validation.concealed.library import make_effect as make_theirs
 from validation.concealed.plan import Geometry, Size
 from validation.concealed.sensor import VirtualSensor
-from validation.effects_on_pixels import FOLDS, SHADOW, compare, null_campaign, residuals
-from validation.virtual_source import VirtualSource, virtual_baseline
+from validation.effects.effects_on_pixels import (
+    FOLDS,
+    SHADOW,
+    compare,
+    null_campaign,
+    residuals,
+)
 
 SMALL = Size(128, 2, 1, dithers=1, flat_seconds=(5.0, 20.0, 40.0, 60.0),
              spot_seconds=(3.75, 15.0, 30.0))  # fmt: skip

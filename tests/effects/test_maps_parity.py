@@ -7,7 +7,8 @@ from bfsensor.diagnose.detect.candidate_screen import Screen
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.library import LIBRARY
 from tests.effects.parity import SMALL, disagreements
-from validation.effect_parity import (
+from validation.common.virtual_source import VirtualSource, virtual_baseline
+from validation.effects.effect_parity import (
     ENGINES,
     PLACES,
     SEED,
@@ -15,8 +16,7 @@ from validation.effect_parity import (
     known_to_the_sensor,
     own_effect,
 )
-from validation.effects_on_pixels import OnPixels, compare, null_campaign
-from validation.virtual_source import VirtualSource, virtual_baseline
+from validation.effects.effects_on_pixels import OnPixels, compare, null_campaign
 
 WORDS = (
     "tree_rings", "edge_rolloff", "mask_stitch", "tearing", "fringing", "shutter_timing",

@@ -5,8 +5,8 @@ import pytest
 from bfsensor.effects.library import LIBRARY
 from tests.effects.parity import SMALL, disagreements
 from validation.concealed.library import make_effect
-from validation.effect_parity import ENGINES, PLACES, effect_at
-from validation.effects_on_pixels import compare
+from validation.effects.effect_parity import ENGINES, PLACES, effect_at
+from validation.effects.effects_on_pixels import compare
 
 WORDS = (
     "cti_serial", "cti_parallel", "trap_serial", "electronic_memory", "amp_crosstalk",

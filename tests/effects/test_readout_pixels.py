@@ -14,7 +14,7 @@ from tests.effects.test_readout_parity import KINDS, NAMES
 from validation.concealed.plan import Exposure as Taken
 from validation.concealed.plan import Geometry
 from validation.concealed.readout import Context, Electronics
-from validation.effect_parity import effect_at, own_effect
+from validation.effects.effect_parity import effect_at, own_effect
 
 SEGMENTS = (
     Segment(0, 0, 10, 12, False, False, 3, 8, 8),

@@ -7,7 +7,7 @@ import numpy as np
 from bfsensor import Device
 from bfsensor.device.quantities import choose_priors
 from tests.fit.toys import MEANS, PRIORS, SPREADS, toy_emulator
-from validation.mock_fits import draw_truth, pulls_of_ranks, recover
+from validation.device_fit.mock_fits import draw_truth, pulls_of_ranks, recover
 
 MOCKS = 150
 EMULATOR = toy_emulator()

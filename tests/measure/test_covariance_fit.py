@@ -18,7 +18,7 @@ from bfsensor.measure.curve import (
     fit_correlation_slopes,
     measure_curve,
 )
-from validation.flat_mocks import (
+from validation.measurement_errors.flat_mocks import (
     draw_field_pairs,
     draw_pixel_pairs,
     make_truth,

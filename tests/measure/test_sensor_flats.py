@@ -11,7 +11,7 @@ from bfsensor.files import tables_dir
 from bfsensor.measure.covariance_fit import fit_covariances
 from bfsensor.measure.curve import measure_curve
 from bfsensor.sensor.flats import draw_flat
-from validation.sensor_flats import predict
+from validation.sensor.sensor_flats import predict
 
 DEVICE = "e2v_ccd250"
 

@@ -11,7 +11,7 @@ from bfsensor.sensor.base import _lowest
 from bfsensor.sensor.flats import draw_flat
 from bfsensor.sensor.image_exposure import ImageExposure
 from tests.kernels.plain_edges import NO_PATTERN
-from validation.sensor_flats import predict
+from validation.sensor.sensor_flats import predict
 
 BOTH = pytest.mark.parametrize("kind", [SiliconSensor, BrighterFatterSensor])
 

@@ -13,7 +13,7 @@ import pytest
 
 import bfsensor
 
-EXAMPLES = Path(__file__).parents[2] / "validation"
+EXAMPLES = Path(__file__).parents[2] / "validation" / "sensor"
 
 
 def read(name, folder, **changes):

@@ -282,7 +282,9 @@ def test_unconverged_holes_are_refused(monkeypatch):
 
 
 def test_a_device_file_describes_the_edge():
-    device = Device.load(Path(__file__).parents[2] / "validation" / "decam_like.toml")
+    device = Device.load(
+        Path(__file__).parents[2] / "validation" / "edges" / "decam_like.toml"
+    )
     assert Device.from_toml(device.to_toml()) == device
     edge = solve_edge(device)
     shift = trace_edge(edge, [250.0])

@@ -9,7 +9,7 @@ import pytest
 
 from bfsensor.simulate.charge_field import ImageCharge
 from bfsensor.simulate.image_charge import area_changes
-from validation.image_charge import FITTED, NAMES, compare, fit_lags
+from validation.image_charge.image_charge import FITTED, NAMES, compare, fit_lags
 
 TRUTH = ImageCharge(
     0.7, 1.5, 3.3, 2.0, 3.0, drift_field=((0.0, 0.73), (100.0, 0.36)), plane_height=0.2

@@ -8,8 +8,8 @@ import pytest
 from astropy.table import Table
 
 from bfsensor.errors import MeasurementError
-from validation import psf_requirement
-from validation.psf_requirement import (
+from validation.psf_requirement import psf_requirement
+from validation.psf_requirement.psf_requirement import (
     MODELS,
     Model,
     collect,
@@ -21,7 +21,7 @@ from validation.psf_requirement import (
     share_light,
     star_light,
 )
-from validation.shear_bias import (
+from validation.psf_requirement.shear_bias import (
     adaptive_shape,
     open_shape,
     regaussianised_bias,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bfsensor.device.device import Device
-from validation import real_rings, real_spots
+from validation.real import real_rings, real_spots
 
 N = 940
 """Radii of a drawn profile, as many as of the measured ones."""

@@ -2,7 +2,7 @@
 
 from astropy.table import Table
 
-from validation.write_results import commit_here, replace_run
+from validation.common.write_results import commit_here, replace_run
 
 
 def test_a_run_replaces_its_own_rows_and_says_what_made_them(tmp_path):

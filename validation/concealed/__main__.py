@@ -187,7 +187,8 @@ def run(folder: Path, output: Path | None, command: str) -> None:
 @click.option(
     "--more",
     type=click.Path(path_type=Path),
-    help="JSON, by campaign: snr, where, tie_broken (as `validation.concealed_trials snr` writes).",
+    help="JSON, by campaign: snr, where, tie_broken "
+    "(as `validation.challenge.concealed_trials snr` writes).",
 )
 def open_(
     folder: Path, results: Path, truths: Path, output: Path, more: Path | None

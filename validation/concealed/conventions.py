@@ -108,7 +108,7 @@ def expected_location(truth: Mapping[str, Any]) -> dict[str, Any]:
     Parameters
     ----------
     truth : mapping
-        ``effects``, ``size``; ``where`` of :mod:`validation.concealed_trials` if there is one,
+        ``effects``, ``size``; ``where`` of :mod:`validation.challenge.concealed_trials` if there is one,
         with the fluxes (by channel) that the effect's signature holds.
 
     Returns

@@ -5,8 +5,8 @@ import pytest
 from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.detect.locate import locate_mismatch
 from bfsensor.diagnose.fit.baseline_fit import fit_bounded
+from validation.common.virtual_source import VirtualSource, virtual_baseline
 from validation.concealed.library import make_effect
-from validation.virtual_source import VirtualSource, virtual_baseline
 
 
 @pytest.mark.parametrize(

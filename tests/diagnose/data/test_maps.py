@@ -11,7 +11,7 @@ from bfsensor.diagnose.data.map_channels import LOW, MapChannels, block_side
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.effect import Segment
-from validation.virtual_source import virtual_baseline
+from validation.common.virtual_source import virtual_baseline
 
 HERE, THERE = Condition(620.0, -60.0, 173.0), Condition(870.0, -60.0, 173.0)
 ROWS, COLUMNS = 120, 128

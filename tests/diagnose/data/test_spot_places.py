@@ -13,8 +13,8 @@ from bfsensor.diagnose.data.spot_channels import SpotChannels
 from bfsensor.diagnose.data.spot_places import PlacedSpots, widening
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.persistence import Persistence
+from validation.common.virtual_source import VirtualSource, virtual_baseline
 from validation.concealed.plan import Size
-from validation.virtual_source import VirtualSource, virtual_baseline
 
 PIXELS, PITCH, SHARE = 256, 40, 0.01
 SIGMAS = (1.05, 1.12), (1.1, 1.15)

@@ -12,7 +12,7 @@ from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.data.spot_widths import fit_widths
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.errors import ConvergenceError
-from validation.virtual_source import virtual_baseline
+from validation.common.virtual_source import virtual_baseline
 
 CONDITIONS = (
     Condition(620.0, -60.0, -100.0), Condition(620.0, -40.0, -100.0),

@@ -19,8 +19,8 @@ from bfsensor.diagnose.fit.fitted_model import Model
 from bfsensor.effects.persistence import Persistence
 from bfsensor.effects.tearing import Tearing
 from bfsensor.effects.tree_rings import TreeRings
+from validation.common.virtual_source import VirtualSource, virtual_baseline
 from validation.concealed.plan import Size
-from validation.virtual_source import VirtualSource, virtual_baseline
 
 SMALL = Size(128, 4, 1, dithers=1)
 

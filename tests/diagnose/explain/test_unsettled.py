@@ -8,9 +8,9 @@ from bfsensor.diagnose.data.ptc_turnoff import below, find_turn_off
 from bfsensor.diagnose.diagnosis import diagnose_measured
 from bfsensor.diagnose.fit import baseline_fit as mismatch
 from bfsensor.diagnose.fit.baseline_fit import UNSETTLED
+from validation.common.virtual_source import VirtualSource, virtual_baseline
 from validation.concealed.library import make_effect
 from validation.concealed.plan import Size
-from validation.virtual_source import VirtualSource, virtual_baseline
 
 SMALL = Size(128, 4, 1, dithers=1)
 FULL = 5e4

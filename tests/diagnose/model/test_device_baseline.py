@@ -14,8 +14,8 @@ from bfsensor.diagnose.model.device_baseline import baseline_of_device
 from bfsensor.diagnose.model.open_baseline import find_baseline, simulate_baseline
 from bfsensor.errors import DeviceError, DiagnosisError, FitError
 from bfsensor.response.edge_response import area_matrix
+from validation.common.virtual_source import virtual_baseline
 from validation.concealed.card import NOMINAL, SPREAD, shifts_at
-from validation.virtual_source import virtual_baseline
 
 LIMITS = {"silicon.background_doping": (0.03, 0.06), "silicon.thickness": (0.3, 0.6)}
 HERE = Condition(620.0, -50.0, np.nan)

@@ -11,7 +11,7 @@ from bfsensor.diagnose.model.flat_predictions import flat_covariances_of
 from bfsensor.diagnose.model.table_baseline import baseline_of_table
 from bfsensor.files import tables_dir
 from bfsensor.table.table import DistortionTable
-from validation.sensor_flats import predict as integrate
+from validation.sensor.sensor_flats import predict as integrate
 
 BACK = Condition(400.0, np.nan, np.nan)
 """All of this light converts at the back surface, as the integration has it."""

@@ -18,9 +18,15 @@ from bfsensor.cli.main import main
 from bfsensor.diagnose.model.open_baseline import simulate_baseline
 from bfsensor.recording.tables.area_changes import read_area_changes
 from bfsensor.response.edge_response import area_matrix
+from validation.common.virtual_source import virtual_baseline
 from validation.concealed.card import NOMINAL, SPREAD, shifts_at
-from validation.floating_devices import LAGS, SHIFT, draw_table, prove, shifted_areas
-from validation.virtual_source import virtual_baseline
+from validation.explanation.floating_devices import (
+    LAGS,
+    SHIFT,
+    draw_table,
+    prove,
+    shifted_areas,
+)
 
 DATA = Path(__file__).parents[2] / "data"
 DRAWS = 24

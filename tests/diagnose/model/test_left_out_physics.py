@@ -27,7 +27,7 @@ from bfsensor.effects.bf_long_range import BrighterFatterLongRange
 from bfsensor.effects.effect import Layout, Shot
 from bfsensor.response.edge_response import area_matrix
 from bfsensor.sensor.drift_field import STEPS, Drift
-from validation.concealed_physics import REFERENCE, _measured
+from validation.explanation.concealed_physics import REFERENCE, _measured
 
 CELLS = 8
 COLD = REFERENCE.temperature

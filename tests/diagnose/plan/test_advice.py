@@ -19,9 +19,9 @@ from bfsensor.diagnose.plan.gaps import ALWAYS, NEEDS, find_untested
 from bfsensor.diagnose.plan.planned_exposures import Forecast, Information, Planned
 from bfsensor.effects.charge_loss import ChargeLoss
 from bfsensor.effects.gain_nonlinearity import GainNonlinearity
+from validation.common.virtual_source import VirtualSource, virtual_baseline
 from validation.concealed.library import KNOWN, make_effect
 from validation.concealed.plan import Size
-from validation.virtual_source import VirtualSource, virtual_baseline
 
 SMALL = Size(128, 4, 1, dithers=1)
 SEED = 7101

@@ -20,9 +20,9 @@ from bfsensor.diagnose.report.html_report import write_report
 from bfsensor.effects.charge_loss import ChargeLoss
 from bfsensor.effects.gain_nonlinearity import GainNonlinearity
 from bfsensor.plots import residuals as show
+from validation.common.virtual_source import VirtualSource, virtual_baseline
 from validation.concealed.library import EFFECTS, make_effect
 from validation.concealed.plan import Size
-from validation.virtual_source import VirtualSource, virtual_baseline
 
 SMALL = Size(128, 4, 1, dithers=1)
 VOID = {"meta", "img", "link", "br", "hr"}

@@ -1,0 +1,1 @@
+"""The diagnosis scored on campaigns whose truth is concealed."""

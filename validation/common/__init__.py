@@ -1,0 +1,1 @@
+"""What every check shares: results with their header, and the virtual sensor as a recording."""

@@ -1,0 +1,1 @@
+"""What corrections in LSST's formats leave of an effect that they know exactly."""

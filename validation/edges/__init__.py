@@ -1,0 +1,1 @@
+"""Shift of pixel boundaries near the edge of a sensor."""

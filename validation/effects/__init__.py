@@ -1,0 +1,1 @@
+"""Each effect's prediction agrees with what the effect does to pixels."""

@@ -1,0 +1,1 @@
+"""The potential of a device is the solution of Poisson's equation."""

@@ -1,0 +1,1 @@
+"""Covariances of flats follow from pixel areas, and agree with measured ones."""

@@ -1,0 +1,1 @@
+"""False alarms, power and place of mismatches that the diagnosis detects."""

@@ -1,0 +1,1 @@
+"""Memory and time of reading and of diagnosing campaigns of large sensors."""

@@ -1,0 +1,1 @@
+"""Broken recordings are set aside by name, never lost in silence."""

@@ -1,0 +1,1 @@
+"""The full well of a device beside measured saturation levels."""

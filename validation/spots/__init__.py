@@ -1,0 +1,1 @@
+"""Growth of spots with flux at the settings of the seed paper."""

@@ -1,0 +1,1 @@
+"""Electrons drift and diffuse as the field and Einstein's relation say."""
