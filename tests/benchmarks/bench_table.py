@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import resource
-import subprocess
 import time
 
 import numpy as np
@@ -106,17 +105,9 @@ def main() -> None:
     print("\n".join(table.pformat(max_width=-1)))
     print(f"peer: {PEER_CPU:.0f} CPU s and {PEER_MEMORY} GB a level, not converged")
     if args.output:
-        commit = subprocess.run(
-            ["git", "rev-parse", "--short", "HEAD"],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        table.meta = {
-            "command": "python tests/benchmarks/bench_table.py",
-            "commit": commit.stdout.strip(),
-        }
-        table.write(args.output, format="ascii.ecsv", overwrite=True)
+        from validation.common.write_results import write_results
+
+        write_results(table, args.output, "python tests/benchmarks/bench_table.py")
 
 
 if __name__ == "__main__":

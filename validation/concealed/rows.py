@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import os
-import subprocess
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy.table import Table
+
+from validation.common.run_header import commit_here, run_header
 
 Row = Mapping[str, Any]
 
@@ -34,7 +35,10 @@ def _plain(value: Any, kind: str) -> Any:
 
 
 def write_rows(path: str | Path, rows: Sequence[Row], command: str) -> None:
-    """Write rows that have the same columns; command and commit go into the header.
+    """Write rows that have the same columns; what made them goes into the header.
+
+    A file that is there already is taken for one with earlier rows among these, and what its header
+    says of them is kept.
 
     Examples
     --------
@@ -45,8 +49,9 @@ def write_rows(path: str | Path, rows: Sequence[Row], command: str) -> None:
     [{'name': 'a', 'p': 0.5}, {'name': '', 'p': 0.1}]
     """
     table = Table({name: [row[name] for row in rows] for name in (rows[0] if rows else {})})
-    table.meta = {"command": command, "commit": _commit()}
     path = Path(path)
+    there = Table.read(path, format="ascii.ecsv").meta if path.exists() else None
+    table.meta = run_header(command, there=there)
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
@@ -54,13 +59,6 @@ def write_rows(path: str | Path, rows: Sequence[Row], command: str) -> None:
         os.replace(beside, path)
     finally:
         beside.unlink(missing_ok=True)
-
-
-def _commit() -> str:
-    told = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
-    )
-    return told.stdout.strip()
 
 
 def append_rows(
@@ -109,7 +107,7 @@ def append_rows(
         # Rows of before commits were told one by one are of the header's.
         made = Table.read(path, format="ascii.ecsv").meta.get("commit", "") if old else ""
         old = [{**r, "commit": r.get("commit", made)} for r in old]
-        new = [{**r, "commit": _commit()} for r in rows]
+        new = [{**r, "commit": commit_here()} for r in rows]
         taken = {tuple(r[k] for k in key) for r in (new if replace else old)}
         kept, others = (new, old) if replace else (old, new)
         others = [r for r in others if tuple(r[k] for k in key) not in taken]

@@ -297,7 +297,7 @@ def _append(path: Path, key: dict, make: Callable[[], dict]) -> None:
     new = Table(rows=[tuple(row.values())], names=tuple(row))
     if old is not None:
         new = vstack([old, new], metadata_conflicts="silent")
-    write_results(new, str(path), COMMAND)
+    write_results(new, path, COMMAND, added=True)
 
 
 @click.command(help=__doc__)

@@ -29,7 +29,8 @@ from bfsensor.response.edge_response import (
 )
 from bfsensor.response.emulator import DeviceEmulator
 from bfsensor.response.emulator_nodes import STEP
-from validation.common.write_results import commit_here, replace_run
+from validation.common.run_header import commit_here
+from validation.common.write_results import replace_run
 
 RESULTS = Path(__file__).parents[1] / "results" / "device_derivatives.ecsv"
 COMMAND = "python -m validation.derivatives.device_derivatives"

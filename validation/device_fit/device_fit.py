@@ -66,7 +66,8 @@ from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.recording.tables.measured import read_measured
 from bfsensor.response.edge_response import area_matrix
 from bfsensor.simulate.well import full_well
-from validation.common.write_results import commit_here, replace_run
+from validation.common.run_header import commit_here
+from validation.common.write_results import replace_run
 
 RESULTS = Path(__file__).parents[1] / "results" / "device_fit.ecsv"
 COMMAND = "python -m validation.device_fit.device_fit REFERENCE"

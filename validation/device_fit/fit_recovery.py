@@ -43,7 +43,8 @@ from bfsensor.files import written_whole
 from bfsensor.fit.predictors import Emulator
 from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.recording.tables.area_changes import read_area_changes
-from validation.common.write_results import commit_here, replace_run
+from validation.common.run_header import commit_here
+from validation.common.write_results import replace_run
 from validation.device_fit.mock_fits import Areas, draw_truth, recover
 
 RESULTS = Path(__file__).parents[1] / "results" / "fit_recovery.ecsv"

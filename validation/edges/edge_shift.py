@@ -245,10 +245,7 @@ def main() -> None:
         "half_mesh_pixel",
         "area_change",
     )
-    write_results(
-        Table(rows=rows, names=names), str(RESULTS / "edge_shift.ecsv"), command,
-        cpu_s=round(time.process_time() - begin, 1),
-    )  # fmt: skip
+    write_results(Table(rows=rows, names=names), RESULTS / "edge_shift.ecsv", command)
     names = (
         "sensor",
         "voltage_V",

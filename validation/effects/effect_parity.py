@@ -172,7 +172,7 @@ def main() -> None:
                 both = (
                     new if old is None else vstack([old, new], metadata_conflicts="silent")
                 )
-                write_results(both, str(PATH), COMMAND, size="S", seed=SEED)
+                write_results(both, PATH, COMMAND, added=True, size="S", seed=SEED)
                 worst = max(
                     rows, key=lambda r: abs(r.factor - 1) * r.said if r.factor else 0
                 )

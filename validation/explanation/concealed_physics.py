@@ -56,7 +56,8 @@ from bfsensor.diagnose.model.predictor import Predictor, used_channels
 from bfsensor.effects.effect import Effect, Segment, Shot
 from bfsensor.measure.bartlett import bartlett_matrix
 from bfsensor.response.edge_response import area_matrix
-from validation.common.write_results import commit_here, write_results
+from validation.common.run_header import commit_here
+from validation.common.write_results import write_results
 
 RESULTS = "validation/results/concealed_physics.ecsv"
 FIGURE = "validation/figures/concealed_physics.png"
@@ -493,7 +494,7 @@ def main() -> None:
             if column.dtype.kind == "f":
                 column.info.format = ".4g"
         total = round(float(np.sum(table["cpu_s"])), 1)
-        write_results(table, RESULTS, COMMAND, cpu_s=total, pairs=PAIRS)
+        write_results(table, RESULTS, COMMAND, added=True, cpu_s=total, pairs=PAIRS)
         draw(table, FIGURE)
 
 

@@ -19,7 +19,6 @@ Rows go to ``validation/results/floating_devices.ecsv``.
 from __future__ import annotations
 
 import argparse
-import time
 from pathlib import Path
 from tempfile import gettempdir
 
@@ -183,7 +182,6 @@ def main() -> None:
         "--keep", type=Path, default=Path(gettempdir()) / "bfsensor_floating"
     )
     given = parser.parse_args()
-    begin = time.process_time()
     rows = []
     for device, kind, name, factor in CASES:
         path = given.shared / "reference" / f"{kind}_covariances_21oct19.csv"
@@ -202,8 +200,7 @@ def main() -> None:
     command = (
         f"python -m validation.explanation.floating_devices SHARED --draws {given.draws}"
     )
-    cpu = round(time.process_time() - begin, 1)
-    write_results(table, RESULTS, command, cpu_s=cpu, background_e=LEVEL)
+    write_results(table, RESULTS, command, background_e=LEVEL)
 
 
 if __name__ == "__main__":

@@ -171,7 +171,7 @@ def main() -> None:
                     if rows is None
                     else vstack([rows, row], metadata_conflicts="silent")
                 )
-                write_results(whole, str(path), COMMAND)
+                write_results(whole, path, COMMAND, added=True)
         print(f"{seed}: done", flush=True)
     rows = Table.read(path, format="ascii.ecsv")
     for device in DEVICES:

@@ -113,7 +113,9 @@ def main() -> None:
         new = Table(rows=rows, names=("setting", "x", "y", "measured", "error", "published",
                                       *QUESTIONS, "cpu_s"))  # fmt: skip
         done = new if done is None else vstack([done, new], metadata_conflicts="silent")
-        write_results(done, str(path), "python -m validation.flats.covariances REFERENCE")
+        write_results(
+            done, path, "python -m validation.flats.covariances REFERENCE", added=True
+        )
         print(f"{name}: {cpu:.0f} CPU s; 1e-8 per electron")
         for row in new:
             if row["x"] <= 2 and row["y"] <= 2:

@@ -108,7 +108,7 @@ def main() -> None:
             row, there = reduce_flat(plan, flat), rows()
             if there is not None:
                 row = vstack([there, row], metadata_conflicts="silent")
-            write_results(row, str(path), COMMAND)
+            write_results(row, path, COMMAND, added=True)
             print(f"flat {flat.number}: {flat.cpu_seconds:.0f} CPU s, "
                   f"{time.monotonic() - begin:.0f} s in all", flush=True)  # fmt: skip
     tables = path.with_name(f"{path.stem}_tables.ecsv")

@@ -97,7 +97,8 @@ def append(path: Path, row: dict[str, Any]) -> None:
     """Add a row to a file of results, made if it is not there."""
     one = Table({name: [value] for name, value in row.items()})
     there = [Table.read(path, format="ascii.ecsv")] if path.exists() else []
-    write_results(vstack([*there, one], metadata_conflicts="silent"), str(path), COMMAND)
+    rows = vstack([*there, one], metadata_conflicts="silent")
+    write_results(rows, path, COMMAND, added=True)
 
 
 def seeds_of(path: Path) -> set[int]:

@@ -96,7 +96,7 @@ def main() -> None:
             row["found"] = row["found"].astype(object)
             row = vstack([there, row], metadata_conflicts="silent")
         row["found"] = row["found"].astype(str)
-        write_results(row, str(path), COMMAND)
+        write_results(row, path, COMMAND, added=True)
     summarise(Table.read(path, format="ascii.ecsv"))
 
 

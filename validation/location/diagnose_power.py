@@ -340,7 +340,7 @@ def append(name: str, row: Table) -> None:
         for column in ("found", "effect", "kind"):
             if column in row.colnames:
                 row[column] = row[column].astype(str)
-    write_results(row, str(path), COMMAND)
+    write_results(row, path, COMMAND, added=True)
 
 
 def there(name: str, **values: Any) -> bool:

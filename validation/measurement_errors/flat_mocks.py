@@ -273,10 +273,10 @@ def main() -> None:
         table["turnoffs"] = sum(fit.range_reason == "found" for fit in fits)
         table["cpu_s"] = round(time.process_time() - began, 1)
         command = f"{COMMAND} --mocks {options.mocks} --side {options.side}"
-        write_results(replace_kind(path, table, kind), str(path), command)
+        write_results(replace_kind(path, table, kind), path, command, added=True)
         where = path.with_name(PULLS)
         listed = list_pulls(kind, truth, fits)
-        write_results(replace_kind(where, listed, kind), str(where), command)
+        write_results(replace_kind(where, listed, kind), where, command, added=True)
     wanted = ["kind", "parameter", "truth", "mean", "scatter", "stated_error", "pull_mean"]
     Table.read(path, format="ascii.ecsv")[
         [*wanted, "pull_rms", "within_1_sigma", "within_1.96_sigma"]

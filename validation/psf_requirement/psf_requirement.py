@@ -315,8 +315,8 @@ def run(path: Path, part: str, report: Callable[[str], None] = print) -> None:
             continue
         rows += draw_models(missing, *star)
         write_results(
-            Table(rows=rows), str(path), "python -m validation.psf_requirement.psf_requirement",
-            device=DEVICE, fwhm_arcsec=FWHM, pixel_arcsec=SCALE,
+            Table(rows=rows), path, "python -m validation.psf_requirement.psf_requirement",
+            added=True, device=DEVICE, fwhm_arcsec=FWHM, pixel_arcsec=SCALE,
         )  # fmt: skip
         report(f"{part}: {star} {len(missing)} models")
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -191,7 +190,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("shared", type=Path)
     shared = parser.parse_args().shared
-    begin = time.process_time()
     rows, unlike, lags = [], [], []
     sbig = [shared / "recordings" / "sbig_flats" / n for n in ("langford", "bergeson")]
     campaigns = {"langford": sbig[:1], "bergeson": sbig[1:], "both runs": sbig}
@@ -222,14 +220,13 @@ def main() -> None:
         table[column].info.format = ".3g"
     nulls = Table(diagnose_nulls(120))
     nulls["p"].info.format = ".4g"
-    cpu = round(time.process_time() - begin, 1)
     for made, name in (
         (table, "real_location"),
         (ladder, "real_unlike"),
         (areas, "real_lags"),
         (nulls, "real_nulls"),
     ):
-        write_results(made, str(RESULTS / f"{name}.ecsv"), COMMAND, cpu_s=cpu)
+        write_results(made, RESULTS / f"{name}.ecsv", COMMAND)
     table.pprint_all()
     for name in [*dict.fromkeys(ladder["recording"]), ""]:
         quiet = ladder[~np.array(ladder["rises"], bool)]

@@ -85,8 +85,9 @@ def main() -> None:
         rows.append((low, high, level, *wells, here, cpu))
         write_results(
             Table(rows=rows, names=names),
-            str(path),
+            path,
             "python -m validation.saturation.saturation REFERENCE",
+            added=True,
         )
         print(
             f"Vpl {low:5.1f}  Vph {high:4.1f}  measured {level:8.0f}  at 0.4, 1.1, 2.2 V "

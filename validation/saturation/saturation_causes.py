@@ -173,8 +173,9 @@ def main() -> None:
             rows.append(row)
             write_results(
                 Table(rows=rows, names=names),
-                str(path),
+                path,
                 "python -m validation.saturation.saturation_causes REFERENCE",
+                added=True,
             )
             print(*row, flush=True)
 

@@ -136,7 +136,7 @@ def main() -> None:
         # Another device may have written meanwhile.
         rows = Table.read(path, format="ascii.ecsv") if path.exists() else None
         whole = row if rows is None else vstack([rows, row], metadata_conflicts="silent")
-        write_results(whole, str(path), COMMAND)
+        write_results(whole, path, COMMAND, added=True)
         print(f"{options.device} {seed}: {row['cpu_s'][0]} CPU s", flush=True)
     table = Table.read(path, format="ascii.ecsv")
     for device in sorted(set(table["device"])):

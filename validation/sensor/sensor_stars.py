@@ -297,7 +297,7 @@ def _append(path: Path, row: dict, command: str) -> None:
     if path.exists():
         old = Table.read(path, format="ascii.ecsv")
         new = vstack([old, new], metadata_conflicts="silent")
-    write_results(new, str(path), command)
+    write_results(new, path, command, added=True)
 
 
 def main() -> None:

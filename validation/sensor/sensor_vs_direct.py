@@ -119,8 +119,9 @@ def main() -> None:
              "sensor_error", "ratio", "ratio_error", "moved", "differ", "p")  # fmt: skip
     write_results(
         Table(rows=rows, names=names),
-        str(path),
+        path,
         "python -m validation.sensor.sensor_vs_direct FOLDER",
+        added=True,
     )
 
 

@@ -66,7 +66,7 @@ def one_full_pixel() -> Potential:
 def keep(path: Path, rows: list[tuple], names: tuple[str, ...], command: str) -> None:
     """Append rows to what is there."""
     old = [tuple(r) for r in Table.read(path, format="ascii.ecsv")] if path.exists() else []
-    write_results(Table(rows=[*old, *rows], names=names), str(path), command)
+    write_results(Table(rows=[*old, *rows], names=names), path, command, added=True)
 
 
 def find_shares(electrons: int, output: Path) -> None:
