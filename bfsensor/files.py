@@ -1,13 +1,58 @@
-"""Files written whole or not at all, and where the files that come with the package lie."""
+"""Files written whole or not at all, those that come with the package, and a cache in memory."""
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable, Iterator
 from pathlib import Path
+from typing import Any, TypeVar
 
 from bfsensor.errors import BFSensorError
+
+T = TypeVar("T")
+
+
+class Cache:
+    """Values in memory, each made once.
+
+    Parameters
+    ----------
+    most : int, optional
+        How many are held at most: the one that was asked for longest ago is dropped for a
+        new one.  All are held by default.
+
+    Examples
+    --------
+    >>> kept = Cache()
+    >>> kept.get("a", list) is kept.get("a", list)
+    True
+    """
+
+    def __init__(self, most: int | None = None) -> None:
+        self._most = most
+        self._values: dict[Hashable, Any] = {}
+
+    def get(self, key: Hashable, make: Callable[[], T]) -> T:
+        """Give the value of a key, made if there is none.
+
+        Parameters
+        ----------
+        key : hashable
+            What the value belongs to, or a tuple with it.  Objects that are equal only to
+            themselves serve: the cache holds them, so that no other can take their place.
+        make : callable
+            Gives the value; what it raises passes, and nothing is kept.
+        """
+        if key in self._values:
+            value = self._values.pop(key)
+        else:
+            value = make()
+            if self._most is not None and len(self._values) >= self._most:
+                del self._values[next(iter(self._values))]
+        # Asked for last, dropped last.
+        self._values[key] = value
+        return value
 
 
 def refuse_existing(

@@ -1,9 +1,13 @@
-"""Files are written whole or not at all, whatever fails and wherever."""
+"""Files are written whole or not at all, whatever fails and wherever; a cache holds its keys."""
 
+import pickle
+
+import numpy as np
 import pytest
 
+from bfsensor.diagnose.data.channels import Channel
 from bfsensor.errors import BFSensorError, SweepError, TableError
-from bfsensor.files import refuse_existing, written_whole
+from bfsensor.files import Cache, refuse_existing, written_whole
 
 
 def test_the_old_file_stays_until_the_new_one_is_whole(tmp_path):
@@ -55,3 +59,59 @@ def test_existing_files_are_replaced_only_when_told(tmp_path):
     refuse_existing(path, True, TableError)
     with pytest.raises(BFSensorError, match=r"a\.txt exists; say overwrite to replace it"):
         refuse_existing(path, False, TableError)
+
+
+def make_channel(value=1.0):
+    return Channel(
+        "bias_cov", np.full(1, value), (np.eye(1),), {"lag": np.arange(1)}, "adu2"
+    )
+
+
+def test_a_value_is_made_once_for_each_owner():
+    cache, asked = Cache(), []
+
+    def make(channel):
+        asked.append(channel)
+        return channel.values.sum()
+
+    # Equal in all they hold: that they are two is all that tells them apart.
+    one, other = make_channel(), make_channel()
+    for channel in (one, other, one, other):
+        assert cache.get(("sum", channel), lambda c=channel: make(c)) == 1.0
+    assert asked == [one, other]
+
+
+def test_a_key_cannot_be_taken_by_what_is_made_in_its_place():
+    cache = Cache()
+    # Each is gone at once for all but the cache: without it, its place in memory is reused.
+    for n in range(50):
+        channel = make_channel(float(n))
+        assert cache.get(channel, lambda c=channel: float(c.values[0])) == n
+
+
+def test_what_was_asked_for_longest_ago_goes_first():
+    cache, made = Cache(most=2), []
+
+    def ask(key):
+        cache.get(key, lambda: made.append(key))
+
+    for key in "abacab":
+        ask(key)
+    # c drops b, not a, which was asked for after it; b is made again and drops c.
+    assert made == ["a", "b", "c", "b"]
+
+
+def test_a_failure_is_not_kept():
+    cache = Cache()
+    with pytest.raises(ZeroDivisionError):
+        cache.get("a", lambda: 1 / 0)
+    assert cache.get("a", lambda: 2) == 2
+
+
+def test_pickled_with_its_owners_a_cache_knows_them():
+    cache, channel = Cache(), make_channel()
+    cache.get(channel, lambda: "kept")
+    again, same = pickle.loads(pickle.dumps((cache, channel)))
+    assert same is not channel
+    assert again.get(same, lambda: "made") == "kept"
+    assert again.get(channel, lambda: "made") == "made"

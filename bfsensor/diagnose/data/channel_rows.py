@@ -12,20 +12,6 @@ Rows = dict[tuple[str, ...], NDArray[np.int64]]
 """Of each condition, by its key."""
 
 
-class KeptRows:
-    """Rows of each condition, found once a channel: channels do not change."""
-
-    def __init__(self) -> None:
-        self._kept: dict[int, tuple[Channel, Rows]] = {}
-
-    def of(self, channel: Channel) -> Rows:
-        """Rows of a channel by condition."""
-        kept = self._kept.get(id(channel))
-        if kept is None or kept[0] is not channel:
-            kept = self._kept[id(channel)] = channel, rows_by_condition(channel)
-        return kept[1]
-
-
 def rows_by_condition(channel: Channel) -> Rows:
     """Rows of each condition."""
     columns = np.column_stack([channel.axes[n].astype(float) for n in Condition._fields])

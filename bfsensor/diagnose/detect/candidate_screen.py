@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from bfsensor.diagnose.data.channels import Channel
@@ -17,6 +18,7 @@ from bfsensor.diagnose.model.map_predictions import lines_of_map
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.effect import Effect, Layout, Parameter
 from bfsensor.errors import BFSensorError, ConvergenceError
+from bfsensor.files import Cache
 from bfsensor.typing import FloatArray
 
 REFINED = 2
@@ -119,9 +121,7 @@ class Screen:
         priors = np.zeros(len(fit.left) - len(fit.residuals), bool)
         self._select = np.concatenate([*select, priors])
         # Of starts: what they change hardly depends on the effects that there are.
-        self._kept = predictor.kept.setdefault(("starts", *map(id, fit.channels)), {})
-        self._channels = predictor.kept.setdefault(("channels",), set())
-        self._channels.add(fit.channels)
+        self._starts = predictor.kept.get(("starts", *fit.channels), Cache)
         self.passed_over: dict[str, str] = {}
         """Candidates of which a start or a fit could not be worked out, and why."""
         self._scaled_templates: dict[Effect, FloatArray] = {}
@@ -131,16 +131,15 @@ class Screen:
         """What an effect changes: whitened, priors' rows after it, parameters projected out."""
         return self._projected(self._change(effect))
 
-    def _projected(self, change: FloatArray) -> FloatArray:
+    def _projected(self, change: NDArray[np.floating]) -> FloatArray:
         out = np.zeros(len(self.fit.left))
         out[: len(change)] = change
         return np.asarray(out - self.fit.basis @ (self.fit.basis.T @ out))
 
     def _change_of_start(self, effect: Effect) -> FloatArray:
         """As :meth:`change`, found once for all screens of an attribution."""
-        if effect not in self._kept:
-            self._kept[effect] = self._change(effect).astype(np.float32)
-        return self._projected(self._kept[effect])
+        change = self._starts.get(effect, lambda: self._change(effect).astype(np.float32))
+        return self._projected(change)
 
     def _change(self, effect: Effect) -> FloatArray:
         """What an effect changes, whitened."""

@@ -249,12 +249,12 @@ def _places(
     scene: Scene, channel: Channel
 ) -> tuple[Places, NDArray[np.str_], NDArray[np.int64]]:
     """Where a channel's values belong, names of its maps and which of them each is of; kept."""
-    kept = scene.kept.get(("maps", id(channel)))
-    if kept is None or kept[0] is not channel:
+
+    def find() -> tuple[Places, NDArray[np.str_], NDArray[np.int64]]:
         places = Places.of(channel.axes, scene.model.predictor.layout.shape)
-        found = places, *np.unique(channel.axes["map"], return_inverse=True)
-        kept = scene.kept["maps", id(channel)] = channel, found
-    return kept[1]
+        return places, *np.unique(channel.axes["map"], return_inverse=True)
+
+    return scene.kept.get(("maps", channel), find)
 
 
 def _separable(

@@ -22,6 +22,7 @@ from bfsensor.diagnose.explain.shift_constraints import test_constraints
 from bfsensor.diagnose.explain.terms import Family, Scene, Term, lag_family
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 from bfsensor.diagnose.fit.fitted_model import Model, compare_held_out
+from bfsensor.files import Cache
 from bfsensor.typing import FloatArray
 
 MOST_GROUPS = 3
@@ -274,16 +275,15 @@ class Columns:
 
     def __init__(self, terms: Sequence[Term]) -> None:
         self.terms = tuple(each for t in terms for each in (t, *t.more))
-        self._kept: dict[int, tuple[Channel, dict[str, FloatArray]]] = {}
+        self._kept = Cache()
 
     def __call__(self, channel: Channel) -> dict[str, FloatArray]:
         """Columns of a channel by name."""
-        kept = self._kept.get(id(channel))
-        if kept is None or kept[0] is not channel:
-            found = {PREFIX + t.name: t.column(channel) for t in self.terms}
-            there = {k: v for k, v in found.items() if v is not None}
-            kept = self._kept[id(channel)] = channel, there
-        return kept[1]
+        return self._kept.get(channel, lambda: self._made(channel))
+
+    def _made(self, channel: Channel) -> dict[str, FloatArray]:
+        found = {PREFIX + t.name: t.column(channel) for t in self.terms}
+        return {k: v for k, v in found.items() if v is not None}
 
 
 def compete(scene: Scene, mismatch: Mismatch) -> list[Choice]:

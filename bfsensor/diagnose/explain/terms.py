@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from bfsensor.diagnose.fit.fitted_model import Model
 from bfsensor.diagnose.model.effect_parameters import fitted
 from bfsensor.diagnose.model.flat_predictions import flat_response, periodic_covariances
 from bfsensor.effects.effect import Effect
+from bfsensor.files import Cache
 from bfsensor.typing import FloatArray
 
 SCALE = 1e5
@@ -73,7 +74,8 @@ class Family:
     tried: int = 0
 
 
-class Flats(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Flats:
     """Flats of one condition in a channel of covariances.
 
     ``rows`` of the channel; ``flat``: which of the flats each belongs to; ``gain`` [e-/ADU],
@@ -98,15 +100,12 @@ class Scene:
     ----------
     model : Model
         Whose remainder is to be explained.
+    kept : Cache
+        What terms share, by a word and what it is of.
     """
 
     model: Model
-    kept: dict[Any, Any] = field(default_factory=dict)
-    _flats: dict[int, tuple[Channel, list[Flats]]] = field(default_factory=dict)
-    _here: dict[int, tuple[Channel, FloatArray]] = field(default_factory=dict)
-    _responses: dict[tuple[int, int], tuple[Flats, FloatArray]] = field(
-        default_factory=dict
-    )
+    kept: Cache = field(default_factory=Cache)
 
     @property
     def gains(self) -> FloatArray:
@@ -133,26 +132,21 @@ class Scene:
 
     def here(self, channel: Channel) -> FloatArray:
         """What the model predicts of a channel, linear terms left out."""
-        kept = self._here.get(id(channel))
-        if kept is None or kept[0] is not channel:
-            p = self.model.predictor
-            predicted = p.predict(channel, self.model.fit.values[: len(p.names)])
-            kept = self._here[id(channel)] = channel, predicted
-        return kept[1]
+        p = self.model.predictor
+        point = self.model.fit.values[: len(p.names)]
+        return self.kept.get(("here", channel), lambda: p.predict(channel, point))
 
     def responses(self, flats: Flats, p: int) -> FloatArray:
         """Change of the flats' power for a response that goes with the level to the power p."""
-        kept = self._responses.get((id(flats), p))
-        if kept is None or kept[0] is not flats:
-            response = flat_response(flats.a, flats.level, power=p)
-            kept = self._responses[id(flats), p] = flats, response
-        return kept[1]
+        return self.kept.get(
+            ("response", flats, p), lambda: flat_response(flats.a, flats.level, power=p)
+        )
 
     def flats(self, channel: Channel) -> list[Flats]:
         """Flats of a channel of covariances, by condition; what effects do to them is left out."""
-        kept = self._flats.get(id(channel))
-        if kept is not None and kept[0] is channel:
-            return kept[1]
+        return self.kept.get(("flats", channel), lambda: self._found_flats(channel))
+
+    def _found_flats(self, channel: Channel) -> list[Flats]:
         out, x = [], channel.axes
         predictor = self.model.predictor
         chain = predictor.chain(self.model.fit.values[: len(predictor.names)])
@@ -165,7 +159,6 @@ class Scene:
             law = {} if chain is None else {"law": chain.law}
             c = periodic_covariances(a, level, **law)
             out.append(Flats(where, rows, index.ravel(), gain, level, a, c))
-        self._flats[id(channel)] = channel, out
         return out
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.model.baseline import Baseline, level_areas
 from bfsensor.diagnose.model.map_predictions import MapChange, shot_at
 from bfsensor.effects.effect import STAGES, Axes, Effect, Law, Layout, Shot
+from bfsensor.files import Cache
 from bfsensor.response.edge_response import area_matrix
 from bfsensor.typing import Edges, FloatArray
 
@@ -59,8 +59,8 @@ class EffectChain:
         Of which flats the maps are made.
     baseline : Baseline
         Its shifts even patterns out.
-    kept : dict
-        Filled with what does not depend on effects.
+    kept : Cache
+        Of what :class:`MapChange` makes that outlasts a change of the effects.
     evening : (float, mapping of str to float)
         Gain [e-/ADU] and departures of the device's parameters from nominal by which patterns
         are evened out.
@@ -72,7 +72,7 @@ class EffectChain:
         layout: Layout,
         measured: MeasuredChannels,
         baseline: Baseline,
-        kept: dict[tuple, Any],
+        kept: Cache,
         evening: tuple[float, Mapping[str, float]],
     ) -> None:
         self.effects = tuple(sorted(effects, key=lambda e: STAGES.index(e.stage)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from bfsensor.diagnose.data.map_waves import smooth_shapes
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.effects.effect import Axes, Effect, Layout, Shot
+from bfsensor.files import Cache
 from bfsensor.response.edge_response import area_matrix
 from bfsensor.typing import FloatArray
 
@@ -66,8 +67,9 @@ class MapChange:
         Of which flats the maps are made.
     baseline : Baseline
         Its shifts even patterns out.
-    kept : dict
-        Filled with what does not depend on effects.
+    kept : Cache
+        Of what outlasts a change of the effects: rows of maps, what is left of patterns, and
+        changes by single effects.
     evening : (float, mapping of str to float)
         Gain [e-/ADU] and departures of the device's parameters from nominal by which patterns
         are evened out.
@@ -79,18 +81,17 @@ class MapChange:
         layout: Layout,
         measured: MeasuredChannels,
         baseline: Baseline,
-        kept: dict[tuple, Any],
+        kept: Cache,
         evening: tuple[float, Mapping[str, float]],
     ) -> None:
         self.effects = [e for e in effects if "flat_map" in e.touches]
         self.layout, self.measured, self.baseline = layout, measured, baseline
-        self._kept, self._device = kept, dict(evening[1])
-        self._gain = evening[0]
+        self._gain, self._device = evening[0], dict(evening[1])
+        self._rows = kept.get("rows", Cache)
+        self._parts = kept.get("parts", partial(Cache, KEPT))
+        # Arrays as large as the sensor: those of one gain and device at a time.
         state = self._gain, *self._device.values()
-        if kept.get(("state",)) != state:
-            for key in [k for k in kept if k[0] == "left"]:
-                del kept[key]
-            kept["state",] = state
+        self._evened = kept.get("evened", partial(Cache, 1)).get(state, Cache)
         self._by_time = any(e.by_time for e in self.effects)
         self._standing = all(e.standing for e in self.effects)
         self._made: dict[tuple, Spectrum | None] = {}
@@ -106,7 +107,7 @@ class MapChange:
             delta = self._spectrum((fold, name), shares)
             if delta is None or not np.abs(delta).max() > 0:
                 continue
-            rows, axes = self._rows(channel, name)
+            rows, axes = self._rows.get((channel, name), partial(_rows, channel, name))
             if len(rows):
                 out[rows] = reduce_spectrum(delta, self.layout.shape, axes)
         return out
@@ -145,16 +146,16 @@ class MapChange:
 
     def _left(self, key: tuple, group: Sequence[MapShare]) -> FloatArray:
         """Weights of the flats by mode: what is left of a pattern in each."""
-        found = self._kept.get(("left", *key))
-        if found is None:
-            found = np.sum(
-                [s.weight * self._evened(s.condition, self._gain * s.level) for s in group],
-                axis=0,
-            )
-            self._kept["left", *key] = found
-        return np.asarray(found)
 
-    def _evened(self, condition: Condition, level: float) -> FloatArray:
+        def evened() -> FloatArray:
+            parts = [
+                s.weight * self._left_at(s.condition, self._gain * s.level) for s in group
+            ]
+            return np.asarray(np.sum(parts, axis=0))
+
+        return self._evened.get(key, evened)
+
+    def _left_at(self, condition: Condition, level: float) -> FloatArray:
         """What is left of a pattern's modes at a level [e-], on the sensor's grid."""
         a = area_matrix(*self.baseline.at(condition, self._device)[0])
         wide = np.zeros(self.layout.shape)
@@ -226,15 +227,8 @@ class MapChange:
         """Change by one effect; of some effects that stay as they are it is kept."""
         if len(self.effects) == 1 or np.prod(self.layout.shape) > KEPT_PIXELS:
             return change(effect, shot)
-        kept = self._kept.setdefault(("parts",), {})
         key = word, effect, None if effect.standing else shot
-        if key not in kept:
-            if len(kept) >= KEPT:
-                del kept[next(iter(kept))]
-            kept[key] = change(effect, shot)
-        else:
-            kept[key] = kept.pop(key)
-        return kept[key]
+        return self._parts.get(key, lambda: change(effect, shot))
 
     def _transform(self, change: FloatArray) -> Spectrum:
         """Spatial frequencies of a relative change, each amplifier over its mean."""
@@ -246,18 +240,14 @@ class MapChange:
         total -= 1.0
         return np.asarray(rfft2(total))
 
-    def _rows(self, channel: Channel, name: str) -> tuple[NDArray[np.int64], Axes]:
-        """Values of a map, found once: channels do not change."""
-        key = ("rows", id(channel), name)
-        kept = self._kept.get(key)
-        if kept is None or kept[0] is not channel:
-            rows = np.nonzero(channel.axes["map"] == name)[0]
-            axes = {k: channel.axes[k][rows] for k in ("what", "x", "y", "k")}
-            parts = parts_of(axes)
-            errors = channel.errors[rows[parts["texture"]]]
-            parts["faint"] = np.array(1e-6 * FAINT * min(errors, default=0.0))
-            kept = self._kept[key] = channel, rows, parts
-        return kept[1], kept[2]
+
+def _rows(channel: Channel, name: str) -> tuple[NDArray[np.int64], Axes]:
+    """Values of a map: which they are, and where they belong."""
+    rows = np.nonzero(channel.axes["map"] == name)[0]
+    parts = parts_of({k: channel.axes[k][rows] for k in ("what", "x", "y", "k")})
+    errors = channel.errors[rows[parts["texture"]]]
+    parts["faint"] = np.array(1e-6 * FAINT * min(errors, default=0.0))
+    return rows, parts
 
 
 def area_change(effect: Effect, shot: Shot, layout: Layout) -> FloatArray | None:

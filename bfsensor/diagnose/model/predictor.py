@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.data.channel_rows import KeptRows, condition_at
+from bfsensor.diagnose.data.channel_rows import Rows, condition_at, rows_by_condition
 from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.data.exposures import Condition
 from bfsensor.diagnose.data.map_channels import MapShare
@@ -26,6 +25,7 @@ from bfsensor.diagnose.model.flat_predictions import (
 from bfsensor.diagnose.model.linear_terms import linear_columns
 from bfsensor.diagnose.model.spot_predictor import SpotPredictor, width_of
 from bfsensor.effects.effect import Effect, Layout
+from bfsensor.files import Cache
 from bfsensor.response.edge_response import area_matrix
 from bfsensor.typing import FloatArray
 
@@ -53,6 +53,11 @@ class Predictor:
         Boundary shifts.
     effects : sequence of Effect
         What is added to it; their parameters are non-linear ones.
+
+    Attributes
+    ----------
+    kept : Cache
+        Shared with copies of the same baseline; those who use predictors keep theirs in it.
     """
 
     def __init__(
@@ -60,10 +65,9 @@ class Predictor:
     ) -> None:
         self.measured, self.baseline = measured, baseline
         self.layout = layout_of(measured, baseline)
-        self._evened: dict[tuple, Any] = {}
-        self._lit: dict[int, tuple[Channel, FloatArray]] = {}
+        self.kept = Cache()
+        self._of_channels = Cache()
         self._amps = len(measured.amplifiers)
-        self._rows = KeptRows()
         self.spots = SpotPredictor(measured, baseline)
         self.notes: list[str] = []
         noise = [0.0 if not np.isfinite(n) else n**2 for n in measured.read_noise]
@@ -97,7 +101,7 @@ class Predictor:
         exact = {
             key: baseline.at(condition_at(c, rows[0]))[1]
             for c in measured.channels if c.word in ("flat_cov", "spot")
-            for key, rows in self._rows.of(c).items()
+            for key, rows in self._rows(c).items()
         }  # fmt: skip
         for key, held in exact.items():
             if not held:
@@ -177,7 +181,7 @@ class Predictor:
             }
         other.baseline = replace(own, **changed)  # type: ignore[arg-type]
         # What was kept goes with the baseline.
-        other._evened, other.spots = {}, self.spots.with_baseline(other.baseline, slopes)
+        other.kept, other.spots = Cache(), self.spots.with_baseline(other.baseline, slopes)
         return other
 
     def with_exposures(
@@ -241,7 +245,7 @@ class Predictor:
             return self._flat_cov(channel, gains, noise, device, chain)
         if channel.word == "spot":
             return self.spots.predict(
-                channel, self._rows.of(channel), gains, device,
+                channel, self._rows(channel), gains, device,
                 parameters[2 * a + count :], only=only, chain=chain,
             )  # fmt: skip
         out = np.zeros(len(channel))
@@ -264,7 +268,7 @@ class Predictor:
             self._layout_at(parameters),
             self.measured,
             self.baseline,
-            self._evened,
+            self.kept,
             # Patterns are evened out as where the fit began: they hardly depend on it.
             (_mean_gain(self.start[: self._amps]), self._device(self.start)),
         )
@@ -305,10 +309,9 @@ class Predictor:
         """Effects with their parameters as given."""
         return self._free.at(parameters[len(parameters) - len(self._free) :])
 
-    @property
-    def kept(self) -> dict[tuple, Any]:
-        """What copies with other effects share; filled by those who use it."""
-        return self._evened
+    def _rows(self, channel: Channel) -> Rows:
+        """Rows of a channel by condition, found once: channels do not change."""
+        return self._of_channels.get(("rows", channel), lambda: rows_by_condition(channel))
 
     def shapes(self) -> NDArray[np.bool_]:
         """Which parameters are of the shape of an effect, not its amplitude."""
@@ -325,20 +328,22 @@ class Predictor:
         """Axes, of flats with 'light': electrons that light in proportion would bring."""
         if channel.word not in ("flat_mean", "flat_cov") or channel.unit == PER_ELECTRON:
             return dict(channel.axes)
-        kept = self._lit.get(id(channel))
-        if kept is None or kept[0] is not channel:
-            x = channel.axes
-            light = x["time"] * x.get("lamp", np.array(1.0))
-            out = np.zeros(len(channel))
-            for rows in self._rows.of(channel).values():
-                for amp in np.unique(x["amp"][rows]):
-                    here = rows[x["amp"][rows] == amp]
-                    ratio = x["level"][here] / np.maximum(light[here], 1e-300)
-                    weak = light[here] <= np.quantile(light[here], 0.4)
-                    out[here] = np.median(ratio[weak]) * light[here]
-            kept = self._lit[id(channel)] = channel, out
+        light = self._of_channels.get(("light", channel), lambda: self._light(channel))
         amps = channel.axes["amp"].astype(int)
-        return dict(channel.axes) | {"light": gains[amps] * kept[1]}
+        return dict(channel.axes) | {"light": gains[amps] * light}
+
+    def _light(self, channel: Channel) -> FloatArray:
+        """Light of flats in units of the level that weak ones show [ADU]."""
+        x = channel.axes
+        light = x["time"] * x.get("lamp", np.array(1.0))
+        out = np.zeros(len(channel))
+        for rows in self._rows(channel).values():
+            for amp in np.unique(x["amp"][rows]):
+                here = rows[x["amp"][rows] == amp]
+                ratio = x["level"][here] / np.maximum(light[here], 1e-300)
+                weak = light[here] <= np.quantile(light[here], 0.4)
+                out[here] = np.median(ratio[weak]) * light[here]
+        return out
 
     def depends(self, channel: Channel) -> NDArray[np.bool_]:
         """Which parameters a channel can depend on: the others need no derivative."""
@@ -382,7 +387,7 @@ class Predictor:
             only = self.spots.widths[(n - first) // 2]
             moved = self.predict(channel, step, only=only)
             out = np.zeros(len(channel))
-            for key, rows in self._rows.of(channel).items():
+            for key, rows in self._rows(channel).items():
                 if width_of(key) == only:
                     out[rows] = (moved[rows] - here[rows]) / self.steps[n]
             return out
@@ -397,7 +402,7 @@ class Predictor:
 
     def linear(self, channel: Channel) -> dict[str, FloatArray]:
         """Columns of the linear parameters, by name; the same name is the same parameter."""
-        out = linear_columns(channel, self._rows.of(channel), self.measured)
+        out = linear_columns(channel, self._rows(channel), self.measured)
         for more in self.columns:
             out |= more(channel)
         return out
@@ -415,7 +420,7 @@ class Predictor:
         amp = x["amp"].astype(int)
         lags = int(max(i.max(), j.max()))
         out = np.empty(len(channel))
-        for rows in self._rows.of(channel).values():
+        for rows in self._rows(channel).values():
             if channel.unit == PER_ELECTRON:
                 where = condition_at(channel, rows[0])
                 edges = self.baseline.edges_on(where, device, REDUCED_LEVEL)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -268,11 +269,12 @@ class Diagnosis:
 
 def _shown(findings: Sequence[Finding]) -> list[Finding]:
     """The farthest of all, and of each channel: one must not crowd out the others."""
-    kept = list(findings[:FARTHEST])
-    for word in dict.fromkeys(f.word for f in findings):
-        kept += [f for f in findings if f.word == word][:OF_EACH]
-    chosen = {id(f) for f in kept}
-    return [f for f in findings if id(f) in chosen]
+    out, count = [], Counter[str]()
+    for n, finding in enumerate(findings):
+        count[finding.word] += 1
+        if n < FARTHEST or count[finding.word] <= OF_EACH:
+            out.append(finding)
+    return out
 
 
 def _said_lags(finding: Finding) -> str:

@@ -39,12 +39,12 @@ def with_change(null, effect, length):
     seen = screen.change(effect)
     factor = length / np.sqrt(seen @ seen)
     parts = {
-        id(c): factor * bare[s : s + len(c)]
+        c: factor * bare[s : s + len(c)]
         for c, s in zip(fit.channels, fit.starts, strict=False)
     }
     channels = tuple(
-        replace(c, values=c.values + c.unwhiten(parts[id(c)]))
-        if id(c) in parts else c
+        replace(c, values=c.values + c.unwhiten(parts[c]))
+        if c in parts else c
         for c in measured.channels
     )  # fmt: skip
     changed = replace(measured, channels=channels)
