@@ -24,6 +24,9 @@ ELECTRON_MASS = 5.685630e-24
 """Free electron's mass by its charge [V s^2 / um^2]: 9.1093837e-31 kg / 1.602176634e-19 C
 (CODATA 2022)."""
 
+ZERO_CELSIUS = 273.15
+"""0 deg C [K], exact by definition."""
+
 INTERNAL = {
     "length": u.um,
     "potential": u.V,
@@ -78,6 +81,22 @@ def to_internal(text: str, kind: str) -> float:
     except u.UnitConversionError:
         expected = f"a unit such as {_name(kind)}" if kind != "number" else "no unit"
         raise DeviceError(f"{text!r} is not a {kind}; expected {expected}") from None
+
+
+def to_kelvin(celsius: float) -> float:
+    """Convert a temperature in deg C to K, to 1e-6 K: :func:`to_celsius` undoes it exactly.
+
+    Examples
+    --------
+    >>> to_kelvin(-100.0), to_celsius(to_kelvin(-100.0))
+    (173.15, -100.0)
+    """
+    return round(celsius + ZERO_CELSIUS, 6)
+
+
+def to_celsius(kelvin: float) -> float:
+    """Convert a temperature in K to deg C, to 1e-6 K: :func:`to_kelvin` undoes it exactly."""
+    return round(kelvin - ZERO_CELSIUS, 6)
 
 
 @cache

@@ -14,7 +14,9 @@ from bfsensor.units import (
     INTERNAL,
     VACUUM_PERMITTIVITY,
     from_internal,
+    to_celsius,
     to_internal,
+    to_kelvin,
 )
 
 WRITTEN = {
@@ -105,6 +107,15 @@ def test_refusals(text, kind, message):
     with pytest.raises(DeviceError) as caught:
         to_internal(text, kind)
     assert str(caught.value) == message
+
+
+@given(st.integers(-27_315, 10_000))
+def test_temperatures_come_back_from_celsius_as_they_were(hundredths):
+    celsius = hundredths / 100
+    assert to_celsius(to_kelvin(celsius)) == celsius
+    assert to_kelvin(celsius) == pytest.approx(celsius + 273.15, abs=1e-6)
+    kelvin = (27_315 + hundredths) / 100
+    assert to_kelvin(to_celsius(kelvin)) == kelvin
 
 
 def test_constants_follow_from_the_si():

@@ -14,8 +14,8 @@ from bfsensor.typing import FloatArray
 DOUBLING = 6.0
 """Rise of the temperature [K] that doubles the rate (assumed)."""
 
-REFERENCE = -100.0
-"""Temperature [C] that rates are given for."""
+REFERENCE = 173.15
+"""Temperature [K] that rates are given for: -100 C."""
 
 MOST = 6
 """Hot columns at most."""

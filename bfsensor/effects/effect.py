@@ -84,7 +84,7 @@ class Shot(NamedTuple):
     seconds : float
         Commanded exposure time [s].
     wavelength, back_bias, temperature : float
-        [nm], [V], [C].
+        [nm], [V], [K].
     hours : float
         Since the first exposure [h].
     level : float
@@ -129,7 +129,7 @@ class Layout:
         Of the flats' covariances: side of the boxes whose means are taken off and largest lag
         [pixel], and the deviation [sigma] from which a pixel is left out, its neighbours too.
     reference : tuple of float
-        Wavelength [nm], back bias [V] and temperature [C] that a baseline is given for.
+        Wavelength [nm], back bias [V] and temperature [K] that a baseline is given for.
     pixel, thickness : float
         Pitch and thickness [um].
     front : float
@@ -142,7 +142,7 @@ class Layout:
     segments: tuple[Segment, ...]
     shots: tuple[Shot, ...] = ()
     gains: tuple[float, ...] = ()
-    reference: tuple[float, float, float] = (620.0, -60.0, -100.0)
+    reference: tuple[float, float, float] = (620.0, -60.0, 173.15)
     pixel: float = 10.0
     thickness: float = 100.0
     front: float = 8.0

@@ -6,11 +6,7 @@ import numpy as np
 
 from bfsensor.device import silicon
 from bfsensor.effects.effect import Effect, Layout, Parameter, Shot
-
-BOLTZMANN = 8.617333262e-5
-"""[eV/K]."""
-
-ZERO_CELSIUS = 273.15
+from bfsensor.units import BOLTZMANN
 
 
 class LateralDiffusion(Effect):
@@ -54,7 +50,7 @@ def diffusion_variance(shot: Shot, layout: Layout) -> float:
     # Mean depth of an exponential that ends at the gates.
     left = np.exp(-thickness / length)
     depth = length - thickness * left / (1 - left)
-    heat = BOLTZMANN * (shot.temperature + ZERO_CELSIUS)
+    heat = BOLTZMANN * shot.temperature
     volts = layout.front - shot.back_bias
     path = thickness - depth
     return float(2 * heat * path * thickness / volts / layout.pixel**2)

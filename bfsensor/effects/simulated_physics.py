@@ -11,7 +11,6 @@ import numpy as np
 
 from bfsensor.effects.device_parameter import add_edges, nearest_edges
 from bfsensor.effects.effect import Effect, Layout, Parameter, Seen, Shot
-from bfsensor.effects.lateral_diffusion import ZERO_CELSIUS
 from bfsensor.effects.tree_rings import TreeRings
 from bfsensor.typing import Edges, FloatArray
 
@@ -42,7 +41,7 @@ class Moved(NamedTuple):
 
 
 class DiffusionWidths(NamedTuple):
-    """Variance of the landing place [pixel^2] by condition, at a temperature [C]."""
+    """Variance of the landing place [pixel^2] by condition, at a temperature [K]."""
 
     held: tuple[tuple[Key, float], ...]
     temperature: float
@@ -133,7 +132,7 @@ class FieldDiffusion(LeftOut):
     def spot_light(self, shot: Shot, layout: Layout) -> tuple[float, float, float]:
         del layout
         told = self.template
-        heat = (shot.temperature + ZERO_CELSIUS) / (told.temperature + ZERO_CELSIUS)
+        heat = shot.temperature / told.temperature
         heat = heat if np.isfinite(heat) else 1.0
         return self["strength"] * heat * _nearest(told.held, shot), 0.0, 1.0
 
@@ -243,7 +242,7 @@ def left_out(
     >>> k = np.zeros((3, 3)); k[1, 1] = -1e-6
     >>> told = Moved((((620.0, -50.0), (k, k.T)),))
     >>> kind = left_out(MovedEdges, "free_holes", "", told, "a test")
-    >>> shot = Shot("flat", 0, 1.0, 620.0, -50.0, -100.0)
+    >>> shot = Shot("flat", 0, 1.0, 620.0, -50.0, 173.15)
     >>> float(kind({"strength": 0.5}).edges(k, k.T, shot, None)[0][1, 1])
     -1.5e-06
     """

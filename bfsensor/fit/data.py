@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bfsensor.device.condition import Condition
 from bfsensor.errors import FitError
 from bfsensor.fit.spot_response import SIGMA
-from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.recording.tables.area_changes import AreaChangeTable
 from bfsensor.recording.tables.measured import MeasuredTable
 from bfsensor.recording.tables.setting_tables import SettingTable

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
+from bfsensor.device.condition import Condition
 from bfsensor.device.device import Device
 from bfsensor.device.parameters import change_parameter
 from bfsensor.device.parts import Provenance
 from bfsensor.device.quantities import DIFFUSION, Prior, quantities
 from bfsensor.errors import BFSensorError, FitError
-from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.typing import FloatArray
 
 

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 
 import bfsensor
+from bfsensor.device.condition import Condition
 from bfsensor.device.device import Device
 from bfsensor.device.quantities import Prior
 from bfsensor.errors import FitError
 from bfsensor.fit.full_solutions import Shifts, solve_shifts
 from bfsensor.fit.linear_response import LinearResponse
 from bfsensor.fit.predictors import Emulator
-from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.response.edge_response import LEVEL
 from bfsensor.typing import FloatArray
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from bfsensor.device.condition import Condition
 from bfsensor.device.device import Device
 from bfsensor.device.quantities import Prior
 from bfsensor.fit.device_at import device_at
 from bfsensor.fit.linear_response import LinearEmulator, LinearResponse
-from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.response.edge_response import LEVEL, mixed, response_depths
 from bfsensor.response.emulator_nodes import Node, solve_nodes
 from bfsensor.typing import FloatArray

@@ -11,13 +11,13 @@ from functools import partial
 
 import numpy as np
 
+from bfsensor.device.condition import Condition
 from bfsensor.device.device import Device
 from bfsensor.device.quantities import DIFFUSION, Prior
 from bfsensor.errors import FitError
 from bfsensor.fit.data import DataSet
 from bfsensor.fit.device_at import device_at
 from bfsensor.fit.predictors import TangentPredictor, Tangents, held
-from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.sensor.drift_field import solve_drift
 from bfsensor.simulate.mesh import make_mesh
 from bfsensor.simulate.poisson import Electrostatics

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bfsensor.device.condition import Condition
 from bfsensor.device.device import Device
 from bfsensor.device.quantities import Prior
 from bfsensor.errors import FitError
 from bfsensor.fit.device_at import device_at
 from bfsensor.fit.predictors import PredictedEdges, held
-from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.response.edge_response import area_matrix, mixed, solve_response
 from bfsensor.typing import FloatArray
 

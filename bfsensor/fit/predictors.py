@@ -8,11 +8,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor.device.condition import Condition
 from bfsensor.device.quantities import Prior
 from bfsensor.errors import FitError
 from bfsensor.fit.data import DataSet
 from bfsensor.fit.spot_response import slope_weights
-from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.typing import FloatArray
 
 Prediction = tuple[FloatArray, FloatArray]

@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import bfsensor
+from bfsensor.device.condition import Condition
 from bfsensor.device.device import Device
 from bfsensor.device.parameters import change_parameter, device_parameters, parameter_value
 from bfsensor.errors import ConvergenceError, DeviceError, FitError
 from bfsensor.files import written_whole
-from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.response.edge_response import (
     LEVEL,
     REFINE_Z,

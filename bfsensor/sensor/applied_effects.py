@@ -19,6 +19,7 @@ from bfsensor.sensor.effect_edges import EdgeChange, Sides, find_change, mean_sh
 from bfsensor.sensor.effect_reports import STORED
 from bfsensor.sensor.shift_maps import Stills, fine_stills
 from bfsensor.typing import FloatArray
+from bfsensor.units import to_celsius, to_kelvin
 
 _ANYWHERE = (4096, 4096)
 """Sensor of effects that do not ask for places, where none is given."""
@@ -40,7 +41,7 @@ class AppliedEffects:
     effects : sequence of Effect
         Any; those at their neutral values and those of later stages are left out.
     conditions : mapping
-        What is known of the exposures, of the fields of Shot.
+        What is known of the exposures, of the fields of Shot, but the temperature in deg C.
     layout : Layout, or None
         Of the sensor that the effects were found on, in the frame of the device.
     usual : mapping
@@ -80,6 +81,8 @@ class AppliedEffects:
                        strict=True)),
             **conditions,
         }  # fmt: skip
+        if "temperature" in conditions:
+            values["temperature"] = to_kelvin(conditions["temperature"])
         self.shot = Shot(**values)
         self.law = Law()
         for effect in self.effects:
@@ -138,7 +141,8 @@ class AppliedEffects:
                     if not good:
                         raise ValueError("values that are not finite")
             except ValueError as error:
-                known = {k: v for k, v in self.shot._asdict().items() if v == v}
+                given = self.shot._replace(temperature=to_celsius(self.shot.temperature))
+                known = {k: v for k, v in given._asdict().items() if v == v}
                 raise SensorError(
                     f"effects: {effect.name} cannot act ({error}) under the conditions {known}; "
                     "conditions={'seconds': ...} may be what it needs"
@@ -247,7 +251,7 @@ class AppliedEffects:
             self._warned = True
             _warn(
                 f"effects: {', '.join(idle)} change nothing at {self.shot.wavelength:g} nm, "
-                f"{self.shot.back_bias:g} V, {self.shot.temperature:g} C: give conditions"
+                f"{self.shot.back_bias:g} V, {to_celsius(self.shot.temperature):g} C: give conditions"
             )
         return find_change(effects, shifts, self.shot, layout)
 

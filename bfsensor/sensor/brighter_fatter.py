@@ -34,7 +34,6 @@ from bfsensor.typing import FloatArray
 
 _WAVELENGTHS = np.arange(250.0, 1451.0, 1.0)  # nm
 _TRANSPARENT = 1e30  # um; length of light that is not absorbed
-_CELSIUS = 273.15  # K
 
 
 class BrighterFatterSensor(EffectSensor):
@@ -117,8 +116,8 @@ class BrighterFatterSensor(EffectSensor):
     layout : Layout or mapping, optional
         Sensor that the effects were found on, by default the report's: ``shape`` (rows, columns),
         its first pixel (1, 1) of the original image; ``segments`` (by default one amplifier
-        covers it); ``reference``, wavelength [nm], back bias [V] and temperature [C] that the
-        effects count from, by default 620 nm and the device's own.
+        covers it); ``reference``, wavelength [nm], back bias [V] and temperature [C; of a Layout
+        K] that the effects count from, by default 620 nm and the device's own.
 
     Notes
     -----
@@ -261,7 +260,7 @@ class BrighterFatterSensor(EffectSensor):
         lengths = np.asarray(absorption_length(waves, self.temperature), float)
         bias = float(self._device.operating_point.back_bias)
         return {
-            "reference": (620.0, bias, self.temperature - _CELSIUS),
+            "reference": (620.0, bias, self.temperature),
             "pixel": float(self.table.pitch[0]),
             "thickness": float(self.table.thickness),
             "front": Layout.front,

@@ -11,6 +11,7 @@ from typing import Any
 from bfsensor.effects.effect import STAGES, Effect, Layout, Segment, Shot
 from bfsensor.effects.library import LIBRARY, make_effect
 from bfsensor.errors import EffectError, SensorError
+from bfsensor.units import to_celsius, to_kelvin
 
 SCHEMA = "bfsensor-diagnosis-1"
 """Of the report.json that ``bfsensor diagnose`` writes."""
@@ -138,10 +139,11 @@ def make_layout(given: Any, usual: Mapping[str, Any]) -> Layout:
     ----------
     given : Layout or mapping
         'shape' (rows, columns) and any of 'segments', 'reference', 'pixel', 'thickness',
-        'front', as in :class:`bfsensor.effects.effect.Layout`.  Without segments one amplifier
-        covers the sensor.
+        'front', as in :class:`bfsensor.effects.effect.Layout`, but for the temperature of a
+        mapping's 'reference', which is in deg C.  Without segments one amplifier covers the
+        sensor.
     usual : mapping
-        What holds where nothing is given.
+        What holds where nothing is given, temperature in K.
 
     Raises
     ------
@@ -173,6 +175,8 @@ def make_layout(given: Any, usual: Mapping[str, Any]) -> Layout:
             f"layout: shape = {ny, nx} must be rows and columns, reference = {reference} "
             "wavelength [nm], back bias [V] and temperature [C]"
         )
+    if "reference" in values:
+        reference = (*reference[:2], to_kelvin(reference[2]))
     for s in segments:
         if s.x < 0 or s.y < 0 or s.x + s.columns > nx or s.y + s.rows > ny:
             raise SensorError(f"layout: {s} does not lie in {ny} rows x {nx} columns")
@@ -190,6 +194,8 @@ def make_layout(given: Any, usual: Mapping[str, Any]) -> Layout:
 def make_conditions(given: Any) -> dict[str, Any]:
     """Check what is said of exposures: fields of :class:`bfsensor.effects.effect.Shot`.
 
+    The temperature of a mapping, and of what is given back, is in deg C.
+
     Raises
     ------
     SensorError
@@ -198,6 +204,7 @@ def make_conditions(given: Any) -> dict[str, Any]:
     if given is None:
         return {}
     if isinstance(given, Shot):
+        given = given._replace(temperature=to_celsius(given.temperature))
         given = {k: v for k, v in given._asdict().items() if v == v}
     if not isinstance(given, Mapping):
         raise SensorError(f"conditions must be names and values, not {given!r}")

@@ -22,6 +22,7 @@ from bfsensor.sensor.effect_reports import (
     write_entries,
 )
 from bfsensor.sensor.image_exposure import ImageExposure
+from bfsensor.units import to_celsius
 
 
 class EffectSensor(EngineSensor):
@@ -89,9 +90,10 @@ class EffectSensor(EngineSensor):
         if self.layout is not None:
             at = self.layout
             segments = [s._asdict() for s in at.segments]
+            reference = (*at.reference[:2], to_celsius(at.reference[2]))
             out.append(
                 f"layout={{'shape': {at.shape!r}, 'segments': {segments!r}, "
-                f"'reference': {at.reference!r}, 'pixel': {at.pixel!r}, "
+                f"'reference': {reference!r}, 'pixel': {at.pixel!r}, "
                 f"'thickness': {at.thickness!r}, 'front': {at.front!r}}}"
             )
         if self.conditions is not None:

@@ -177,7 +177,7 @@ def test_measured_areas_beside_tables(kind, baseline, detected):
     assert len(channel) == 24
 
 
-def test_recordings_tell_kelvin_conditions_celsius(tmp_path):
+def test_temperatures_are_in_kelvin_from_the_header_on(tmp_path):
     """Of dark current that doubles every 6 K a mistake of 273 would be a factor of 5e13."""
     write(
         tmp_path, [("BIAS", 0.0, 0, -95.0)] * 2 + [("FLAT", 5.0, 2e4, -95.0)] * 2, seed=73
@@ -185,6 +185,6 @@ def test_recordings_tell_kelvin_conditions_celsius(tmp_path):
     campaign = read_campaign(tmp_path)
     assert campaign.exposures[0].temperature == pytest.approx(178.15)
     source = CampaignSource(campaign)
-    assert source.exposures[0].temperature == pytest.approx(-95.0)
+    assert source.exposures[0].temperature == pytest.approx(178.15)
     (flat,) = (c for c in run(tmp_path).measured.channels if c.word == "flat_cov")
-    np.testing.assert_allclose(flat.axes["temperature"], -95.0, atol=0.01)
+    np.testing.assert_allclose(flat.axes["temperature"], 178.15, atol=0.01)

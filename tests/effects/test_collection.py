@@ -11,7 +11,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from bfsensor.device import silicon
-from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.device.condition import Condition
+from bfsensor.diagnose.data.exposures import numbers_of
 from bfsensor.diagnose.model.flat_predictions import periodic_covariances
 from bfsensor.effects.bf_long_range import shifts_of_tail
 from bfsensor.effects.device_parameter import device_parameters
@@ -21,6 +22,7 @@ from bfsensor.effects.library import LIBRARY, make_effect
 from bfsensor.effects.saturation import Saturation, spilled
 from bfsensor.errors import EffectError
 from bfsensor.response.edge_response import area_matrix
+from bfsensor.units import to_kelvin
 from validation.common.virtual_source import virtual_baseline
 from validation.concealed.card import NOMINAL, SPREAD, shifts_at
 from validation.concealed.electrostatics import EdgeShifts
@@ -31,7 +33,7 @@ WORDS = (
     "bf_anisotropy", "bf_chromatic", "bf_long_range", "bf_nonlinear", "charge_loss",
     "interpixel_coupling", "lateral_diffusion", "psf_wings", "saturation", "voltage_dependence",
 )  # fmt: skip
-SHOT = Shot("spot", 0, 10.0, 950.0, -40.0, -80.0)
+SHOT = Shot("spot", 0, 10.0, 950.0, -40.0, 193.15)
 
 
 def a_layout() -> Layout:
@@ -100,7 +102,7 @@ def test_edges_are_those_of_the_other_engine(word, values):
         context = SimpleNamespace(exposure=exposure, geometry=Geometry(256))
         kx, ky = nominal_shifts()
         theirs = make_theirs(word, values).shifts(EdgeShifts(kx, ky), context)
-        shot = Shot("flat", 0, 1.0, wavelength, bias, -100.0)
+        shot = Shot("flat", 0, 1.0, wavelength, bias, 173.15)
         ours = make_effect(word, values).edges(kx, ky, shot, a_layout())
         for mine, other in zip(ours, theirs, strict=True):
             # Round-off of two ways to a lattice potential.
@@ -115,7 +117,7 @@ def test_diffusion_is_that_of_the_other_engine(wavelength, bias, temperature):
     exposure = Exposure("SPOT", 0, 0.0, 1.0, wavelength, bias, temperature)
     context = SimpleNamespace(exposure=exposure, device=dict(NOMINAL))
     theirs = make_theirs("lateral_diffusion", {"var": 0.05}).spot_light(context)["variance"]
-    shot = Shot("spot", 0, 1.0, wavelength, bias, temperature)
+    shot = Shot("spot", 0, 1.0, wavelength, bias, to_kelvin(temperature))
     ours = make_effect("lateral_diffusion", {"var": 0.05}).spot_light(shot, a_layout())[0]
     assert ours == pytest.approx(theirs, rel=1e-6)
 
@@ -126,13 +128,13 @@ def test_diffusion_is_that_of_the_other_engine(wavelength, bias, temperature):
 def test_diffusion_is_the_spread_of_a_random_walk():
     """Electrons that drift from where light converts, kicked in each of 40 pieces of their path."""
     layout = a_layout()
-    shot = Shot("spot", 0, 1.0, 950.0, -40.0, -80.0)
+    shot = Shot("spot", 0, 1.0, 950.0, -40.0, 193.15)
     rng = np.random.default_rng(417)
     count, pieces = 40_000, 40
     thickness, length = layout.thickness, layout.absorption[950.0]
     # Inverse of the cumulative distribution of depths that end at the gates.
     depth = -length * np.log1p(rng.random(count) * np.expm1(-thickness / length))
-    heat = 8.617333e-5 * (shot.temperature + 273.15)
+    heat = 8.617333e-5 * shot.temperature
     field = (layout.front - shot.back_bias) / thickness
     x = np.zeros(count)
     for _ in range(pieces):
@@ -297,7 +299,7 @@ def test_flats_far_beyond_the_full_well_are_flat():
 def test_saturation_starts_at_the_level_that_flats_do_not_pass():
     levels = np.minimum(2000.0 * np.arange(5.0, 65, 5), 8.7e4)
     shots = tuple(
-        Shot("flat", n, 5.0 * (n + 1), 620.0, -60.0, -100.0, 0.0, level)
+        Shot("flat", n, 5.0 * (n + 1), 620.0, -60.0, 173.15, 0.0, level)
         for n, level in enumerate(levels)
     )
     starts = Saturation.starts(Layout((64, 64), (), shots))
@@ -325,10 +327,13 @@ def test_device_parameters_move_edges_as_the_baseline_does():
         change = 7 * SPREAD[name]
         effect = kind({name: NOMINAL[name] + change})
         assert pickle.loads(pickle.dumps(effect)) == effect
-        for condition in (Condition(950.0, -60.0, -100.0), Condition(620.0, -40.0, -100.0)):
+        for wavelength, back_bias in ((950.0, -60.0), (620.0, -40.0)):
+            condition = Condition(
+                wavelength=wavelength, back_bias=back_bias, temperature=173.15
+            )
             plain, _ = baseline.at(condition)
             moved, _ = baseline.at(condition, {name: change})
-            shot = Shot("flat", 0, 1.0, *condition)
+            shot = Shot("flat", 0, 1.0, *numbers_of(condition))
             for ours, wanted in zip(effect.edges(*plain, shot, layout), moved, strict=True):
                 np.testing.assert_allclose(ours, wanted, rtol=1e-9, atol=1e-18)
         assert np.array_equal(
@@ -344,12 +349,12 @@ def test_device_parameters_move_edges_as_the_baseline_does():
 )  # fmt: skip
 def test_device_parameters_are_linear_to_what_is_said(name, five, ten):
     baseline, kind = virtual_baseline(), _kinds()[name]
-    plain, _ = baseline.at(Condition(620.0, -60.0, -100.0))
+    plain, _ = baseline.at(Condition(wavelength=620.0, back_bias=-60.0, temperature=173.15))
     for spreads, limit in ((5, five), (10, ten)):
         found = []
         for sign in (1, -1):
             value = NOMINAL[name] + sign * spreads * SPREAD[name]
-            shot = Shot("flat", 0, 1.0, 620.0, -60.0, -100.0)
+            shot = Shot("flat", 0, 1.0, 620.0, -60.0, 173.15)
             linear = area_matrix(*kind({name: value}).edges(*plain, shot, a_layout()))
             exact = area_matrix(
                 *map(np.asarray, shifts_at({**NOMINAL, name: value}, 620, -60))

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bfsensor.device.condition import Condition
 from bfsensor.errors import FitError
 from bfsensor.fit.data import MODEL_ERROR, area_data, data_set, select
-from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.recording.tables.measured import read_measured
 
 DATA = Path(__file__).parents[1] / "data"

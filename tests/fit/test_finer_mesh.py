@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bfsensor import Device
+from bfsensor.device.condition import Condition
 from bfsensor.device.quantities import choose_priors
 from bfsensor.errors import FitError
 from bfsensor.fit import finer_mesh as finer
@@ -13,7 +14,6 @@ from bfsensor.fit.finer_mesh import Finer
 from bfsensor.fit.fit import fit_device
 from bfsensor.fit.linear_response import Linearise
 from bfsensor.fit.result import FitResult
-from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.response.edge_response import CHARGE, LEVEL, area_matrix, solve_response
 from bfsensor.table.build import build_table
 from bfsensor.table.table_plan import plan_table

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bfsensor.device.condition import Condition
 from bfsensor.device.quantities import Prior
 from bfsensor.errors import FitError
 from bfsensor.fit.data import select
 from bfsensor.fit.least_squares import LeastSquaresProblem, profile, solve
 from bfsensor.fit.predictors import make_predictors
-from bfsensor.recording.campaign.exposures import Condition
 from tests.fit.toys import MEANS, PRIORS, SPREADS, toy_data, toy_emulator
 
 TRUTH = np.array(MEANS) + np.array([0.8, -0.5, 1.2]) * SPREADS

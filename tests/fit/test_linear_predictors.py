@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from bfsensor import Device
+from bfsensor.device.condition import Condition
 from bfsensor.device.quantities import DIFFUSION, Prior, choose_priors
 from bfsensor.errors import FitError
 from bfsensor.fit.data import DataSet
 from bfsensor.fit.device_at import device_at
 from bfsensor.fit.linear_predictors import SPILL, START, make_tangents
-from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.simulate.edge_field import front_plane
 from bfsensor.simulate.well import full_well
 from bfsensor.units import VACUUM_PERMITTIVITY

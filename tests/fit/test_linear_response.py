@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from bfsensor import Device
+from bfsensor.device.condition import Condition
 from bfsensor.device.quantities import choose_priors
 from bfsensor.errors import FitError
 from bfsensor.fit.linear_response import Linearise
-from bfsensor.recording.campaign.exposures import Condition
 
 
 @pytest.mark.slow

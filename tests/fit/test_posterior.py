@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bfsensor.device.condition import Condition
 from bfsensor.device.quantities import Prior
 from bfsensor.errors import ConvergenceError, FitError
 from bfsensor.fit import posterior
@@ -17,7 +18,6 @@ from bfsensor.fit.posterior import find_posterior
 from bfsensor.fit.posterior_draws import bent_about, sample_posterior, with_draws
 from bfsensor.fit.prediction_error import Missed, measure_missed, widen
 from bfsensor.inference.profile_bounds import LEVELS, profile_bounds
-from bfsensor.recording.campaign.exposures import Condition
 
 TURN = 0.4
 """How the first number bends with the second parameter [errors a squared spread, over 5]."""

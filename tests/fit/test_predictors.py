@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bfsensor.device.condition import Condition
 from bfsensor.device.quantities import Prior
 from bfsensor.errors import FitError
 from bfsensor.fit.data import DataSet
 from bfsensor.fit.least_squares import LeastSquaresProblem, solve
 from bfsensor.fit.predictors import make_predictors
 from bfsensor.fit.spot_response import slope_weights
-from bfsensor.recording.campaign.exposures import Condition
 from tests.fit.test_least_squares import TRUTH
 from tests.fit.toys import MEANS, PRIORS, SPREADS, toy_data, toy_emulator
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from bfsensor import Device
+from bfsensor.device.condition import Condition
 from bfsensor.device.quantities import choose_priors, with_priors
 from bfsensor.fit.data import data_set
 from bfsensor.fit.fit import fit_device
 from bfsensor.fit.linear_response import Linearise
-from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.recording.tables.measured import read_measured
 
 DATA = Path(__file__).parents[1] / "data"

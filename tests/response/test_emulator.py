@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from bfsensor import Device
+from bfsensor.device.condition import Condition
 from bfsensor.device.parameters import change_parameter
 from bfsensor.errors import FitError
-from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.response.edge_response import area_matrix, solve_response
 from bfsensor.response.emulator import DeviceEmulator
 from bfsensor.response.emulator_nodes import make_node, solve_nodes

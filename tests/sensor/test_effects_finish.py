@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import bfsensor
+from bfsensor.effects.effect import Shot
 from bfsensor.effects.library import make_effect
 from bfsensor.errors import SensorError
 from tests.sensor.contract_cases import RINGS, blank, photons
@@ -62,11 +63,27 @@ def test_a_report_may_bring_its_layout(tmp_path):
     )  # fmt: skip
     sensor = bfsensor.BrighterFatterSensor(effects=path)
     assert sensor.layout.shape == (24, 64)
-    assert sensor.layout.reference == (620.0, -60.0, -100.0)
+    assert sensor.layout.reference == (620.0, -60.0, 173.15)
     assert sensor.layout.segments[0][:4] == (0, 0, 64, 24)
     own = bfsensor.BrighterFatterSensor(effects=path, layout={"shape": (8, 9)})
     assert own.layout.shape == (8, 9)
     assert own.layout.reference[1] == -50.0  # the device's
+
+
+def test_temperatures_of_options_are_in_celsius():
+    sensor = sensor_with(
+        Warm({"rate": 20.0}), conditions={"seconds": 5.0, "temperature": -80.0},
+        layout={"shape": (64, 64), "reference": (620, -50, -100)},
+    )  # fmt: skip
+    assert sensor._applied.shot.temperature == 193.15
+    assert sensor.layout.reference == (620.0, -50.0, 173.15)
+    assert "'temperature': -80.0" in repr(sensor)
+    assert "'reference': (620.0, -50.0, -100.0)" in repr(sensor)
+    given = Shot("flat", 0, 5.0, temperature=193.15)
+    assert (
+        sensor_with(Warm({"rate": 20.0}), conditions=given)._applied.shot.temperature
+        == 193.15
+    )
 
 
 def test_variants_are_known_by_their_parameters(monkeypatch):

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.diagnose.model.baseline import Baseline, read_edges
+from bfsensor.units import to_kelvin
 from validation.concealed.arrays import iterate_exposures
 from validation.concealed.card import baseline_edges, device_card
 from validation.concealed.plan import SIZES, Geometry
@@ -113,7 +114,7 @@ class VirtualSource:
             e = taken.exposure
             self.exposures.append(
                 Shot(e.sequence, e.kind.lower(), e.seconds, e.wavelength, e.back_bias,
-                     e.temperature, taken.monitor or None, e.mjd, withheld=e.withheld)
+                     to_kelvin(e.temperature), taken.monitor or None, e.mjd, withheld=e.withheld)
             )  # fmt: skip
             self._frames[e.sequence] = taken.frames
 

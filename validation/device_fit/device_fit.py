@@ -44,6 +44,7 @@ from astropy.io import ascii as text_tables
 from astropy.table import Table
 from numpy.typing import NDArray
 
+from bfsensor.device.condition import Condition
 from bfsensor.device.device import Device
 from bfsensor.device.quantities import (
     Prior,
@@ -62,7 +63,6 @@ from bfsensor.fit.prediction_error import DRAWS
 from bfsensor.fit.predictors import make_predictors
 from bfsensor.fit.result import FitResult
 from bfsensor.measure.toy_array import close_sum, predict_array
-from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.recording.tables.measured import read_measured
 from bfsensor.response.edge_response import area_matrix
 from bfsensor.simulate.well import full_well

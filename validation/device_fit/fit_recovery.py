@@ -37,11 +37,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from bfsensor import Device
+from bfsensor.device.condition import Condition
 from bfsensor.device.quantities import Prior, choose_priors, with_priors
 from bfsensor.errors import MeasurementError
 from bfsensor.files import written_whole
 from bfsensor.fit.predictors import Emulator
-from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.recording.tables.area_changes import read_area_changes
 from validation.common.run_header import commit_here
 from validation.common.write_results import replace_run

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from tqdm import tqdm
 
+from bfsensor.device.condition import Condition
 from bfsensor.device.quantities import Prior, describe
 from bfsensor.errors import MeasurementError
 from bfsensor.files import written_whole
@@ -23,7 +24,6 @@ from bfsensor.fit.least_squares import ORDERED, FitSolution, LeastSquaresProblem
 from bfsensor.fit.posterior import find_posterior
 from bfsensor.fit.prediction_error import Missed
 from bfsensor.fit.predictors import Emulator, make_predictors
-from bfsensor.recording.campaign.exposures import Condition
 
 MEASURED = 0.7
 """Posterior over prior width below which a combination has a row of its own."""

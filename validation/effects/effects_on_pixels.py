@@ -20,6 +20,7 @@ from bfsensor.diagnose.data.spot_ghosts import find_ghosts
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit, fit_baseline
 from bfsensor.diagnose.model.predictor import Predictor, used_channels
 from bfsensor.effects.effect import Effect, Layout, Segment, Shot
+from bfsensor.units import to_kelvin
 from validation.common.virtual_source import VirtualSource, virtual_baseline
 from validation.concealed.electrostatics import EdgeShifts
 from validation.concealed.plan import SIZES, Geometry
@@ -54,7 +55,7 @@ class OnPixels:
             )
         e = context.exposure
         shot = Shot(e.kind.lower(), e.sequence, e.seconds, e.wavelength, e.back_bias,
-                    e.temperature, e.hours)  # fmt: skip
+                    to_kelvin(e.temperature), e.hours)  # fmt: skip
         return shot, self._layout
 
     def device(self, device):

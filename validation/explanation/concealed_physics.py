@@ -32,10 +32,11 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bfsensor import Device
+from bfsensor.device.condition import Condition
 from bfsensor.device.parameters import change_parameter
 from bfsensor.device.parts import Provenance
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import Axes, Condition
+from bfsensor.diagnose.data.exposures import NUMBERS, Axes, numbers_of
 from bfsensor.diagnose.data.map_channels import MapChannels
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.detect.candidates import name_of
@@ -54,6 +55,7 @@ from bfsensor.diagnose.model.left_out_physics import (
 from bfsensor.diagnose.model.map_predictions import shot_at
 from bfsensor.diagnose.model.predictor import Predictor, used_channels
 from bfsensor.effects.effect import Effect, Segment, Shot
+from bfsensor.files import Cache
 from bfsensor.measure.bartlett import bartlett_matrix
 from bfsensor.response.edge_response import area_matrix
 from validation.common.run_header import commit_here
@@ -63,13 +65,13 @@ RESULTS = "validation/results/concealed_physics.ecsv"
 FIGURE = "validation/figures/concealed_physics.png"
 COMMAND = "python -m validation.explanation.concealed_physics"
 DEVICE = "itl_sta3800c"
-COLD = 173.0 - 273.15
-REFERENCE = Condition(620.0, -50.0, COLD)
+REFERENCE = Condition(wavelength=620.0, back_bias=-50.0, temperature=173.0)
 FITTED = (
-    REFERENCE, Condition(950.0, -50.0, COLD), Condition(620.0, -40.0, COLD),
-    Condition(620.0, -50.0, COLD + 10),
+    REFERENCE, dataclasses.replace(REFERENCE, wavelength=950.0),
+    dataclasses.replace(REFERENCE, back_bias=-40.0),
+    dataclasses.replace(REFERENCE, temperature=183.0),
 )  # fmt: skip
-HELD = Condition(950.0, -40.0, COLD + 10)
+HELD = Condition(wavelength=950.0, back_bias=-40.0, temperature=183.0)
 LEVELS = 15_000.0, 40_000.0, 80_000.0
 PAIRS, PIXELS = 500, 2048 * 4096
 LAGS = 4
@@ -166,7 +168,8 @@ def empty_channels(truth: Baseline, ladders: bool) -> list[Channel]:
             one = Channel("flat_cov", np.zeros(len(i)), (np.eye(len(i)),),
                           {**dict.fromkeys(("amp", "time"), np.zeros(len(i))), "i": i, "j": j,
                            "level": np.full(len(i), level),
-                           **{k: np.full(len(i), v) for k, v in condition._asdict().items()}},
+                           **{k: np.full(len(i), v)
+                              for k, v in zip(NUMBERS, numbers_of(condition), strict=True)}},
                           "adu2")  # fmt: skip
             c = _plain(truth).predict(one, _plain(truth).start).reshape(LAGS + 1, LAGS + 1)
             counts = np.full(c.shape, share * PAIRS / len(LEVELS) * PIXELS)
@@ -195,17 +198,19 @@ def empty_channels(truth: Baseline, ladders: bool) -> list[Channel]:
     return out
 
 
-_PLAIN: dict[int, tuple[Baseline, Predictor]] = {}
+_PLAIN = Cache()
 
 
 def _plain(truth: Baseline) -> Predictor:
     """Predictor of covariances alone."""
-    if id(truth) not in _PLAIN:
+
+    def make() -> Predictor:
         axes = Axes()
         axes.add(1, REFERENCE, i=0, j=0, amp=0, level=1e4, time=1.0)
         one = Channel("flat_cov", np.zeros(1), (np.eye(1),), axes.columns(), "adu2")
-        _PLAIN[id(truth)] = truth, Predictor(_measured([one], (), {}), truth)
-    return _PLAIN[id(truth)][1]
+        return Predictor(_measured([one], (), {}), truth)
+
+    return _PLAIN.get(truth, make)
 
 
 def _measured(
@@ -213,7 +218,8 @@ def _measured(
 ) -> MeasuredChannels:
     """A campaign of one amplifier, gain 1."""
     shots = tuple(
-        Shot("flat", n, 1.0, *c, 0.0, LEVELS[1]) for n, c in enumerate((*FITTED, HELD))
+        Shot("flat", n, 1.0, *numbers_of(c), 0.0, LEVELS[1])
+        for n, c in enumerate((*FITTED, HELD))
     )
     rng = np.random.default_rng(77)
     spots = sum(
@@ -233,7 +239,7 @@ def take_maps(
 ) -> tuple[list[Channel], tuple[Any, ...], dict[Any, Any]]:
     """Maps of the mean of all flats of a condition, in pixels, as they are measured."""
     layout = Predictor(_measured([], (), {}), truth).layout
-    longest = {c.key: 1.0 for c in (*FITTED, HELD)}
+    longest = dict.fromkeys((*FITTED, HELD), 1.0)
     amplifiers = [(slice(0, SIDE), slice(0, SIDE))]
     own = RESPONSE * rng.standard_normal((SIDE, SIDE))
     y, x = np.mgrid[-1 : 1 : SIDE * 1j, -1 : 1 : SIDE * 1j]

@@ -27,8 +27,8 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bfsensor import Device
+from bfsensor.device.condition import Condition
 from bfsensor.device.parameters import change_parameter, device_parameters
-from bfsensor.diagnose.data.exposures import Condition
 from bfsensor.diagnose.data.reduced_channels import measure_reduced
 from bfsensor.diagnose.diagnosis import diagnose_measured
 from bfsensor.diagnose.model.baseline import Baseline
@@ -52,7 +52,7 @@ CASES = (
 )
 """Device, published table whose errors are taken, quantity, and factor of the errors."""
 
-ANY = Condition(np.nan, np.nan, np.nan)
+ANY = Condition()
 
 
 def areas_of(

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_distribution
 
 from bfsensor import BrighterFatterSensor, DistortionTable
-from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.diagnose.model.flat_predictions import flat_covariances_of
 from bfsensor.diagnose.model.table_baseline import baseline_of_table
@@ -82,7 +82,7 @@ def baseline_of(device: str) -> Baseline:
 def predict(device: str, level: float) -> NDArray[np.float64]:
     """Closed form of the diagnosis, indexed [j, i] [e-^2]; light of 400 nm, as the flats'."""
     baseline = baseline_of(device)
-    here = Condition(400.0, np.nan, np.nan)
+    here = Condition(wavelength=400.0)
     a = baseline.flat_areas(here, None, np.array([level]))
     return flat_covariances_of(a, [level], lags=LAGS)[0]
 
@@ -90,7 +90,7 @@ def predict(device: str, level: float) -> NDArray[np.float64]:
 def predict_constant(device: str, level: float) -> NDArray[np.float64]:
     """The same with one response, that at the middle of the baseline's levels."""
     baseline = baseline_of(device)
-    a = area_matrix(*baseline.at(Condition(400.0, np.nan, np.nan))[0])
+    a = area_matrix(*baseline.at(Condition(wavelength=400.0))[0])
     return flat_covariances_of(a, [level], lags=LAGS)[0]
 
 

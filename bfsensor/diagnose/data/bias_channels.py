@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import Axes, Condition, ExposureInfo, Frame
+from bfsensor.diagnose.data.exposures import Axes, ExposureInfo, Frame, condition_of
 from bfsensor.effects.read_noise import READOUT_LAGS, near_lags
 from bfsensor.typing import FloatArray
 
@@ -53,11 +54,11 @@ class BiasChannels:
         self._long: list[list[FloatArray]] = []
         self._zeros: list[list[tuple[float, float]]] = []
         self._size = 0
-        self._condition = Condition(np.nan, np.nan, np.nan)
+        self._condition = Condition()
 
     def add(self, exposure: ExposureInfo, frames: Sequence[Frame]) -> None:
         """Add a bias frame."""
-        self._condition = Condition.of(exposure)
+        self._condition = condition_of(exposure)
         self._names = [f.name for f in frames]
         zeros = self.add_level(exposure, frames)
         for frame, zero in zip(frames, zeros, strict=True):
@@ -228,13 +229,13 @@ class DarkChannels:
         ] = []
         self._columns: list[_Columns] = []
         self._names: list[str] = []
-        self._condition = Condition(np.nan, np.nan, np.nan)
+        self._condition = Condition()
 
     def add(
         self, exposure: ExposureInfo, frames: Sequence[Frame], *, after: float = 0.0
     ) -> None:
         """Add a dark; ``after`` is the mean level [ADU] of the exposure before it."""
-        self._condition = Condition.of(exposure)
+        self._condition = condition_of(exposure)
         found = []
         lines = _Columns(exposure.exposure_time or 0.0, [], [], [])
         self._names = [f.name for f in frames]

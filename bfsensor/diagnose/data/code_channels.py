@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import Axes, Condition, Frame
+from bfsensor.diagnose.data.exposures import Axes, Frame
 from bfsensor.typing import FloatArray
 
 PERIOD = 64
@@ -115,7 +116,7 @@ class CodeChannels:
         if not self._counts:
             return []
         values, blocks, axes = [], [], Axes()
-        nothing = Condition(np.nan, np.nan, np.nan)
+        nothing = Condition()
         for amp, codes in sorted(self._counts.items()):
             counts = codes.reshape(-1, PERIOD).sum(0)
             total = counts.sum()
@@ -216,7 +217,7 @@ class CrosstalkChannels:
         if not self._sums:
             return []
         axes = Axes()
-        nothing = Condition(np.nan, np.nan, np.nan)
+        nothing = Condition()
         pairs = sorted(p for p, (_, down) in self._sums.items() if down > 0)
         values = np.array([self._sums[p][0] / self._sums[p][1] for p in pairs])
         axes.add(len(pairs), nothing, amp=[p[0] for p in pairs], other=[p[1] for p in pairs],

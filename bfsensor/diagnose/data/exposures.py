@@ -4,29 +4,45 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor.device.condition import Condition
+from bfsensor.units import to_celsius
 
-class Condition(NamedTuple):
-    """Light [nm] and operating point [V, deg C] of an exposure; nan where not known."""
+NUMBERS = ("wavelength", "back_bias", "temperature")
+"""Axes of a channel that hold the condition of its values [nm, V, K]; nan where not known."""
 
-    wavelength: float
-    back_bias: float
-    temperature: float
 
-    @classmethod
-    def of(cls, exposure: ExposureInfo) -> Condition:
-        """Condition of an exposure, rounded to what headers repeat."""
-        values = (exposure.wavelength, exposure.back_bias, exposure.temperature)
-        return cls(*(np.nan if v is None else round(float(v), 2) for v in values))
+def condition_of(exposure: ExposureInfo) -> Condition:
+    """Condition of an exposure, rounded to what headers repeat."""
+    given = exposure.wavelength, exposure.back_bias, exposure.temperature
+    return condition_at(np.nan if v is None else round(float(v), 2) for v in given)
 
-    @property
-    def key(self) -> tuple[str, ...]:
-        """As text: nan equals nan."""
-        return tuple(f"{v:g}" for v in self)
+
+def condition_at(numbers: Iterable[float]) -> Condition:
+    """Condition of :data:`NUMBERS`."""
+    wavelength, back_bias, temperature = (
+        float(v) if np.isfinite(v) else None for v in numbers
+    )
+    return Condition(wavelength=wavelength, back_bias=back_bias, temperature=temperature)
+
+
+def numbers_of(condition: Condition) -> tuple[float, float, float]:
+    """Values of :data:`NUMBERS` at a condition."""
+    wavelength, back_bias, temperature = (
+        np.nan if v is None else v
+        for v in (condition.wavelength, condition.back_bias, condition.temperature)
+    )
+    return wavelength, back_bias, temperature
+
+
+def label_of(condition: Condition) -> str:
+    """Condition in names of maps and parameters, such as '620/-60/-100' [nm, V, deg C]."""
+    wavelength, back_bias, temperature = numbers_of(condition)
+    return f"{wavelength:g}/{back_bias:g}/{to_celsius(temperature):g}"
 
 
 class Axes:
@@ -37,7 +53,8 @@ class Axes:
 
     def add(self, count: int, condition: Condition, **columns: object) -> None:
         """Add rows; numbers are repeated."""
-        for name, value in {**condition._asdict(), **columns}.items():
+        known = dict(zip(NUMBERS, numbers_of(condition), strict=True))
+        for name, value in {**known, **columns}.items():
             self._parts.setdefault(name, []).append(
                 np.broadcast_to(np.asarray(value), (count,))
             )
@@ -48,7 +65,7 @@ class Axes:
 
 
 class ExposureInfo(Protocol):
-    """What the channels ask of an exposure, temperature in deg C; None where not known."""
+    """What the channels ask of an exposure [s, nm, V, K, d]; None where not known."""
 
     @property
     def number(self) -> int: ...

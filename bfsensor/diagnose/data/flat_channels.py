@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import Axes, Condition, ExposureInfo, Frame
+from bfsensor.diagnose.data.exposures import Axes, ExposureInfo, Frame, condition_of
 from bfsensor.measure.bartlett import bartlett_matrix
 from bfsensor.measure.flat_pairs import flat_covariances
 from bfsensor.typing import FloatArray
@@ -69,7 +69,6 @@ class FlatChannels:
         self._bias, self._noise, self._start = bias, read_noise, start
         self._lamp_error, self._lags = lamp_error, lags
         self._groups: dict[tuple, _FlatGroup] = {}
-        self._conditions: dict[tuple[str, ...], Condition] = {}
         self._means: dict[str, list[tuple]] = {}
         self._ratios: dict[int, list[tuple[float, float]]] = {}
 
@@ -81,8 +80,7 @@ class FlatChannels:
         fold: str,
     ) -> None:
         """Measure one pair of flats and add it to its group."""
-        condition = Condition.of(first[0])
-        self._conditions[condition.key] = condition
+        condition = condition_of(first[0])
         time = first[0].exposure_time or 0.0
         means: list[list[tuple[float, float, int]]] = [[], []]
         for n, frames in enumerate(zip(first[1], second[1], strict=True)):
@@ -92,7 +90,7 @@ class FlatChannels:
             found = flat_covariances(
                 *images, mask=mask, lags=self._lags, unit="adu", region=name
             )
-            group = self._groups.setdefault((condition.key, time, n, fold), _FlatGroup())
+            group = self._groups.setdefault((condition, time, n, fold), _FlatGroup())
             group.covariances.append(found.covariances)
             group.counts.append(found.pairs)
             group.levels.append(found.level)
@@ -144,7 +142,7 @@ class FlatChannels:
                 blocks.append(bartlett_matrix(mean, pairs))
                 level = float(np.mean(group.levels))
                 axes.add(
-                    len(j), self._conditions[condition], amp=amp, time=time, level=level,
+                    len(j), condition, amp=amp, time=time, level=level,
                     pairs=len(group.levels), hours=float(np.mean(group.hours)), i=i, j=j,
                 )  # fmt: skip
             out.append(
@@ -200,7 +198,7 @@ class FlatChannels:
                     values.append(mean)
                     blocks.append(uneven[amp] * matrix)
                     axes.add(
-                        len(mean), self._conditions[condition], amp=amp, time=time,
+                        len(mean), condition, amp=amp, time=time,
                         level=float(np.mean(group.levels)), k=np.arange(1, len(mean) + 1),
                     )  # fmt: skip
                 if values:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bfsensor.diagnose.data.exposures import Condition, ExposureInfo, Frame
+from bfsensor.device.condition import Condition
+from bfsensor.diagnose.data.exposures import ExposureInfo, Frame, condition_of
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.flat_pairs import flat_covariances
 from bfsensor.typing import FloatArray
@@ -87,7 +88,7 @@ def group_flats(flats: Sequence[ExposureInfo]) -> list[list[ExposureInfo]]:
 
 def level_of(flat: ExposureInfo) -> tuple:
     """Condition and exposure time, as one key."""
-    return Condition.of(flat).key, flat.exposure_time
+    return condition_of(flat), flat.exposure_time
 
 
 def by_level(
@@ -218,10 +219,10 @@ def scan_unlike(
         Largest lag.
     """
     out = []
-    conditions: dict[tuple[str, ...], list[ExposureInfo]] = {}
+    conditions: dict[Condition, list[ExposureInfo]] = {}
     for flat in flats:
         if flat.exposure_time is not None:
-            conditions.setdefault(Condition.of(flat).key, []).append(flat)
+            conditions.setdefault(condition_of(flat), []).append(flat)
     for members in conditions.values():
         held: tuple[int, Sequence[FloatArray]] | None = None
         if len(members) < 2:

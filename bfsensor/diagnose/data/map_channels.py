@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import rfft2
 
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel, Common, join_common
-from bfsensor.diagnose.data.exposures import Axes, Condition
+from bfsensor.diagnose.data.exposures import Axes, label_of
 from bfsensor.diagnose.data.map_borders import Border, find_borders
 from bfsensor.diagnose.data.map_noise import BlockNoise, block_noise
 from bfsensor.diagnose.data.map_texture import map_texture, texture_noise
@@ -73,8 +74,8 @@ class MapChannels:
     ----------
     shape : tuple of int
         Rows and columns of the sensor.
-    longest : mapping of tuple to float
-        Longest exposure time [s] of the flats of each condition, by its key.
+    longest : mapping of Condition to float
+        Longest exposure time [s] of the flats of each condition.
     fold : str
         Which exposures are added.
     amplifiers : sequence of (slice, slice)
@@ -84,7 +85,7 @@ class MapChannels:
     def __init__(
         self,
         shape: tuple[int, int],
-        longest: Mapping[tuple[str, ...], float],
+        longest: Mapping[Condition, float],
         fold: str = "fit",
         amplifiers: Sequence[tuple[slice, slice]] = (),
     ) -> None:
@@ -93,7 +94,7 @@ class MapChannels:
         self.sightings: tuple[Mapping[str, Any], ...] = ()
         self._borders: dict[tuple[int, int], Border] = {}
         self._groups: list[_MapGroup] = []
-        self._sums: dict[tuple[tuple[str, ...], bool], _Sum] = {}
+        self._sums: dict[tuple[Condition, bool], _Sum] = {}
         self._closed = True
         self._total = np.zeros((0, 0), np.float32)
         self._count = np.zeros((0, 0), np.uint16)
@@ -123,7 +124,7 @@ class MapChannels:
             Mean level [ADU].
         """
         last = self._groups[-1] if self._groups else None
-        if last is None or (last.condition.key, last.time) != (condition.key, time):
+        if last is None or (last.condition, last.time) != (condition, time):
             self._close()
             self._groups.append(_MapGroup(condition, time))
             self._total = np.zeros(self._shape, np.float32)
@@ -163,7 +164,7 @@ class MapChannels:
         with np.errstate(invalid="ignore", divide="ignore"):
             self._total /= self._count
         self._total *= np.float32(weight)
-        name = group.condition.key, self._is_short(group)
+        name = group.condition, self._is_short(group)
         if name in self._sums:
             self._sums[name].image += self._total
             self._sums[name].weight += weight
@@ -184,7 +185,7 @@ class MapChannels:
         return [str(border) for border in self._borders.values()]
 
     def _is_short(self, group: _MapGroup) -> bool:
-        return group.time < SHORT * self._longest[group.condition.key]
+        return group.time < SHORT * self._longest[group.condition]
 
     def channels(self) -> list[Channel]:
         """Columns, rows, blocks and rings of the map of all light, and of what differs.
@@ -223,9 +224,9 @@ class MapChannels:
 
     def _plan(self) -> dict[str, tuple[list[_MapGroup], list[_MapGroup]]]:
         """Flats of each map, and of what it is divided by."""
-        members: dict[tuple[str, ...], list[_MapGroup]] = {}
+        members: dict[Condition, list[_MapGroup]] = {}
         for group in self._groups:
-            members.setdefault(group.condition.key, []).append(group)
+            members.setdefault(group.condition, []).append(group)
         common = max(members, key=lambda k: sum(g.pairs for g in members[k]))
         ordered = sorted(members[common], key=lambda g: g.time)
         out: dict[str, tuple[list[_MapGroup], list[_MapGroup]]] = {"all": (ordered, [])}
@@ -234,7 +235,7 @@ class MapChannels:
             out["short"] = short, [g for g in ordered if not self._is_short(g)]
         for other, own in members.items():
             if other != common:
-                out["/".join(other)] = own, ordered
+                out[label_of(other)] = own, ordered
         return out
 
     def _is_full(self, group: _MapGroup) -> bool:
@@ -263,7 +264,7 @@ class MapChannels:
     def _average(self, groups: list[_MapGroup]) -> _Map:
         """Map of all short exposures of a condition, or all long ones, or both."""
         weights = _weights(groups)
-        which = dict.fromkeys((g.condition.key, self._is_short(g)) for g in groups)
+        which = dict.fromkeys((g.condition, self._is_short(g)) for g in groups)
         sums = [self._sums[name] for name in which]
         whole = np.float32(sum(s.weight for s in sums))
         image = sums[0].image / whole

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.bias_channels import (
     BiasChannels,
     DarkChannels,
@@ -18,11 +19,12 @@ from bfsensor.diagnose.data.bias_channels import (
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.code_channels import CodeChannels, CrosstalkChannels
 from bfsensor.diagnose.data.exposures import (
-    Condition,
     ExposureInfo,
     Frame,
     assign_folds,
+    condition_of,
     is_held_out,
+    numbers_of,
 )
 from bfsensor.diagnose.data.flat_channels import FlatChannels
 from bfsensor.diagnose.data.flat_pairing import (
@@ -47,7 +49,7 @@ class Source(Protocol):
     """What exposures are taken from."""
 
     @property
-    def exposures(self) -> Sequence[Any]: ...
+    def exposures(self) -> Sequence[ExposureInfo]: ...
     @property
     def lamp_error(self) -> float: ...
     @property
@@ -214,10 +216,10 @@ def measure_channels(
     flats = FlatChannels(
         bias_images, noise, lamp_error=source.lamp_error, lags=lags, start=start
     )
-    longest: dict[tuple[str, ...], float] = {}
+    longest: dict[Condition, float] = {}
     for flat in kinds.get("flat", []):
-        key = Condition.of(flat).key
-        longest[key] = max(longest.get(key, 0.0), flat.exposure_time or 0.0)
+        condition = condition_of(flat)
+        longest[condition] = max(longest.get(condition, 0.0), flat.exposure_time or 0.0)
     amplifiers = [
         np.s_[s.y : s.y + s.rows, s.x : s.x + s.columns] for s in map(_segment, layout)
     ]
@@ -386,7 +388,7 @@ def _add_to_maps(
         for f, m in zip(frames, means, strict=True)
     ]
     maps.add_pair(
-        Condition.of(first), first.exposure_time or 0.0, departures[0], departures[1],
+        condition_of(first), first.exposure_time or 0.0, departures[0], departures[1],
         level=levels[first.number], shared=float(np.sqrt(np.mean(np.square(noise)))),
     )  # fmt: skip
     return levels
@@ -410,7 +412,14 @@ def _shots(
         hours = 0.0 if e.mjd is None else 24.0 * (e.mjd - min(times))
         level = gain * levels.get(e.number, 0.0)
         out.append(
-            Shot(e.kind, e.number, e.exposure_time or 0.0, *Condition.of(e), hours, level)
+            Shot(
+                e.kind,
+                e.number,
+                e.exposure_time or 0.0,
+                *numbers_of(condition_of(e)),
+                hours,
+                level,
+            )
         )
     return tuple(out)
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
-from bfsensor.diagnose.data.exposures import Axes, Condition
+from bfsensor.diagnose.data.exposures import Axes
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.errors import DiagnosisError
 from bfsensor.recording.tables.area_changes import AreaChangeTable
@@ -61,7 +62,7 @@ def _of_areas(table: AreaChangeTable, reach: int) -> MeasuredChannels:
     )
     axes = Axes()
     axes.add(
-        int(used.sum()), Condition(np.nan, np.nan, np.nan), i=i[used], j=j[used], amp=0,
+        int(used.sum()), Condition(), i=i[used], j=j[used], amp=0,
         level=1.0, time=0,
     )  # fmt: skip
     errors = table.errors[used]
@@ -93,7 +94,7 @@ def _of_covariances(table: CovarianceTable, reach: int) -> MeasuredChannels:
         blocks = _blocks(table.matrix[np.ix_(rows, rows)], amp, place)
     axes = Axes()
     axes.add(
-        len(rows), Condition(np.nan, np.nan, np.nan), i=table.lag_x[rows], j=table.lag_y[rows],
+        len(rows), Condition(), i=table.lag_x[rows], j=table.lag_y[rows],
         amp=amp, level=table.level[rows], time=place,
     )  # fmt: skip
     columns = axes.columns() | {

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bfsensor.diagnose.data.channels import FOLDS, Channel
-from bfsensor.diagnose.data.exposures import Axes, Condition, ExposureInfo
+from bfsensor.diagnose.data.exposures import Axes, ExposureInfo, condition_of
 from bfsensor.diagnose.data.spot_places import PlacedSpots
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.spot_fit import fit_spots
@@ -128,7 +128,7 @@ class SpotChannels:
                     variance += WING_ERROR**2
                 values.append(np.array([value]))
                 blocks.append(np.array([[max(variance, 1e-30)]]))
-                axes.add(1, Condition.of(exposure), what=what, light=light,
+                axes.add(1, condition_of(exposure), what=what, light=light,
                          flux=found["flux"][0], time=exposure.exposure_time or 0.0,
                          background=self._backgrounds[exposure.number],
                          exposure=exposure.number, hours=24.0 * (mjd - self._start))  # fmt: skip
@@ -139,7 +139,7 @@ class SpotChannels:
         """Relative scatter of the fluxes of exposures of equal light; None of too few."""
         groups: dict[tuple, list[float]] = {}
         for exposure, found, *_ in self._rows:
-            key = (Condition.of(exposure).key, exposure.exposure_time)
+            key = (condition_of(exposure), exposure.exposure_time)
             groups.setdefault(key, []).append(found["flux"][0] / (exposure.lamp or 1.0))
         square, number = 0.0, 0
         for fluxes in groups.values():

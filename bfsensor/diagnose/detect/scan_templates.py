@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.exposures import NUMBERS, condition_at, label_of
 from bfsensor.typing import FloatArray
 
 
@@ -61,9 +62,9 @@ class Group:
             np.where(c.common.tells, 1 / c.errors, 0.0) if c.common else np.zeros(len(c))
             for c, _ in members
         ])  # fmt: skip
-        columns = [self.axes[n] for n in ("wavelength", "back_bias", "temperature")]
+        columns = [self.axes[n] for n in NUMBERS]
         self.condition = np.array([
-            "/".join(f"{float(v):g}" for v in row) for row in zip(*columns, strict=True)
+            label_of(condition_at(row)) for row in zip(*columns, strict=True)
         ])  # fmt: skip
 
     def predicted(self) -> FloatArray:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor.device.condition import Condition
+from bfsensor.diagnose.data.channel_rows import rows_by_condition
 from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
-from bfsensor.diagnose.data.exposures import Condition
 from bfsensor.diagnose.fit.fitted_model import Model
 from bfsensor.diagnose.model.effect_parameters import fitted
 from bfsensor.diagnose.model.flat_predictions import flat_response, periodic_covariances
@@ -150,7 +151,7 @@ class Scene:
         out, x = [], channel.axes
         predictor = self.model.predictor
         chain = predictor.chain(self.model.fit.values[: len(predictor.names)])
-        for where, rows in conditions_of(channel):
+        for where, rows in rows_by_condition(channel).items():
             pairs = np.stack([x["amp"][rows].astype(float), x["level"][rows]], axis=1)
             flats, index = np.unique(pairs, axis=0, return_inverse=True)
             gain = self.gains[flats[:, 0].astype(int)]
@@ -160,15 +161,6 @@ class Scene:
             c = periodic_covariances(a, level, **law)
             out.append(Flats(where, rows, index.ravel(), gain, level, a, c))
         return out
-
-
-def conditions_of(channel: Channel) -> Iterator[tuple[Condition, NDArray[np.int64]]]:
-    """Conditions of a channel with their rows."""
-    columns = np.column_stack([channel.axes[n].astype(float) for n in Condition._fields])
-    kinds, index = np.unique(np.nan_to_num(columns, nan=-1e99), axis=0, return_inverse=True)
-    for n in range(len(kinds)):
-        rows = np.nonzero(index.ravel() == n)[0]
-        yield Condition(*(float(v) for v in columns[rows[0]])), rows
 
 
 def at_lags(

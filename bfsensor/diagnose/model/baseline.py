@@ -11,11 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.device.condition import Condition
+from bfsensor.diagnose.data.exposures import numbers_of
 from bfsensor.effects.effect import Effect
 from bfsensor.errors import DiagnosisError
 from bfsensor.response.edge_response import area_matrix
 from bfsensor.typing import Edges, FloatArray
+from bfsensor.units import to_kelvin
 
 Key = tuple[float, float]
 """Wavelength [nm] and back bias [V] of shifts that are held."""
@@ -61,7 +63,7 @@ class Baseline:
     warming : mapping of (wavelength, back_bias) to (dkx, dky), optional
         Change of the shifts with the temperature [pixel/e-/K], where it is known.
     temperature : float
-        At which the shifts hold [C], where there is warming.
+        At which the shifts hold [K], where there is warming.
     spots_bend : bool
         Whether spots follow the slopes, as flats do: charge then moves boundaries less and less
         while it gathers.
@@ -125,7 +127,7 @@ class Baseline:
         """
         wavelength, bias = (
             given if np.isfinite(given) else own
-            for given, own in zip(condition[:2], self.reference, strict=True)
+            for given, own in zip(numbers_of(condition)[:2], self.reference, strict=True)
         )
         return min(self.edges, key=lambda k: (_off(k[1], bias), _off(k[0], wavelength)))
 
@@ -141,10 +143,10 @@ class Baseline:
         kx, ky = self.edges[key]
         exact = all(
             not _off(given, own) >= 0.5
-            for given, own in zip(condition[:2], key, strict=True)
+            for given, own in zip(numbers_of(condition)[:2], key, strict=True)
         )
         if key in self.warming:
-            warmer = _signed(condition.temperature, self.temperature)
+            warmer = _signed(numbers_of(condition)[2], self.temperature)
             if warmer:
                 tx, ty = self.warming[key]
                 kx, ky = kx + warmer * tx, ky + warmer * ty
@@ -307,7 +309,7 @@ def read_edges(
         JSON: ``conditions`` by "wavelength_backbias" with kx and ky, and
         ``derivatives_WAVELENGTH_mBACKBIAS`` by parameter with dkx and dky, the reference's
         first, as many as there are; ``slopes`` and ``bends`` by level about ``level``,
-        ``warming`` by temperature about ``temperature``, by condition.
+        ``warming`` by temperature about ``temperature`` [C], by condition.
     card : path-like, optional
         JSON with ``spread_1sigma`` by parameter; without one nothing floats.
 
@@ -342,7 +344,7 @@ def read_edges(
             {_key(k, path): _pair(v, "dkx", "dky") for k, v in text.get(word, {}).items()}
             for word in ("slopes", "bends", "warming")
         )
-        level, temperature = (
+        level, celsius = (
             other if text.get(word) is None else float(text[word])
             for word, other in (("level", 0.0), ("temperature", np.nan))
         )
@@ -379,7 +381,7 @@ def read_edges(
     return Baseline(
         str(path), edges, derivatives, spread, reference, nominal=nominal, card=known,
         held=held, slopes=slopes, bends=bends, level=level, warming=warming,
-        temperature=temperature, spots_bend=bool(text.get("spots_bend", False)),
+        temperature=to_kelvin(celsius), spots_bend=bool(text.get("spots_bend", False)),
     )  # fmt: skip
 
 

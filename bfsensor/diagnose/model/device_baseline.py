@@ -14,12 +14,12 @@ from bfsensor.device.parameters import change_parameter, device_parameters, para
 from bfsensor.diagnose.model.baseline import Baseline, Key
 from bfsensor.diagnose.model.cached_response import SPAN, Walk, walk
 from bfsensor.diagnose.model.table_baseline import WAVELENGTHS
-from bfsensor.effects.lateral_diffusion import ZERO_CELSIUS
 from bfsensor.errors import DeviceError, DiagnosisError
 from bfsensor.files import written_whole
 from bfsensor.response.edge_response import LEVEL
 from bfsensor.simulate.edge_field import front_plane
 from bfsensor.typing import Edges
+from bfsensor.units import to_celsius
 
 CELLS, FINE = 16, 32
 """Cells a pixel of the tables whose differences are taken, and of the device's own, which has the
@@ -146,7 +146,7 @@ def baseline_of_device(
         device.name, edges, held[reference], {n: known[n] for n in chosen}, reference,
         nominal={n: parameter_value(device, n) for n in chosen}, held=held, slopes=slopes,
         bends=bends, level=LEVEL if slopes else 0.0, spots_bend=bool(slopes), warming=warmer,
-        temperature=kelvin - ZERO_CELSIUS, card=_card(device),
+        temperature=kelvin, card=_card(device),
     )  # fmt: skip
 
 
@@ -216,7 +216,7 @@ def write_edges(baseline: Baseline, path: str | os.PathLike[str]) -> None:
         },
         "level": baseline.level,
         "spots_bend": baseline.spots_bend,
-        "temperature": baseline.temperature if baseline.warming else None,
+        "temperature": to_celsius(baseline.temperature) if baseline.warming else None,
         "spread_1sigma": dict(baseline.spread),
         "nominal": dict(baseline.nominal),
         "card": dict(baseline.card),

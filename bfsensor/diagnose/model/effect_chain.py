@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import Condition
 from bfsensor.diagnose.data.flat_channels import TAIL
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.model.baseline import Baseline, level_areas
@@ -36,7 +36,7 @@ def layout_of(measured: MeasuredChannels, baseline: Baseline) -> Layout:
     return Layout(
         measured.shape, measured.segments, measured.shots, measured.gains,
         (wavelength if np.isfinite(wavelength) else 620.0, bias if np.isfinite(bias) else -60.0,
-         float(np.median(reference)) if reference else -100.0),
+         float(np.median(reference)) if reference else 173.15),
         offsets=measured.offsets, read_noise=measured.read_noise, biases=measured.biases,
         map_noise={
             name: float(sum(s.weight**2 / s.flats for s in shares))

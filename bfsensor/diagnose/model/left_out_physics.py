@@ -21,7 +21,6 @@ from bfsensor.diagnose.model.baseline import Baseline, Key
 from bfsensor.diagnose.model.cached_response import SPAN, Walk, walk
 from bfsensor.diagnose.model.device_baseline import FINE, WARMER
 from bfsensor.effects.effect import Effect
-from bfsensor.effects.lateral_diffusion import ZERO_CELSIUS
 from bfsensor.effects.simulated_physics import (
     BentResponse,
     DiffusionWidths,
@@ -243,7 +242,7 @@ def _depths(
             if there is not None and above is not None:
                 both = _less(there[0], above[0]), _less(there[1], above[1])
                 levels.append(((w, bias), both))
-    told = Moved(tuple(edges), tuple(warming), kelvin - ZERO_CELSIUS, _as_bent(levels))
+    told = Moved(tuple(edges), tuple(warming), kelvin, _as_bent(levels))
     return left_out(
         MovedEdges, "bf_chromatic", "simulated", told,
         SOURCE.format("light converts where it is absorbed, not at the back surface"),
@@ -278,7 +277,7 @@ def _diffusion(
         for bias, drift in drifts.items() for w in colours
     )  # fmt: skip
     return left_out(
-        FieldDiffusion, "lateral_diffusion", "simulated", DiffusionWidths(held, kelvin - ZERO_CELSIUS),
+        FieldDiffusion, "lateral_diffusion", "simulated", DiffusionWidths(held, kelvin),
         "Einstein's relation integrated through the device's own field",
     )  # fmt: skip
 

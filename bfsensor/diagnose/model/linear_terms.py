@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
-from numpy.typing import NDArray
 
+from bfsensor.diagnose.data.channel_rows import Rows
 from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.exposures import label_of
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.model.map_shapes import Places
 from bfsensor.typing import FloatArray
 
 MAP_ORDER = 4
 """Order of the polynomial in x and y that the light on the sensor may have."""
-
-Rows = Mapping[tuple[str, ...], NDArray[np.int64]]
-"""Values of a channel by condition."""
 
 
 def linear_columns(
@@ -31,7 +27,7 @@ def linear_columns(
     ----------
     channel : Channel
         Whose values.
-    rows : mapping
+    rows : dict
         Which of them belong to each condition.
     measured : MeasuredChannels
         The campaign, for its amplifiers.
@@ -51,12 +47,12 @@ def _mean_columns(channel: Channel, rows_of: Rows) -> dict[str, FloatArray]:
     x = channel.axes
     out = {}
     light = x["time"] * x["lamp"]
-    for key, rows in rows_of.items():
+    for condition, rows in rows_of.items():
         for amp in np.unique(x["amp"][rows]):
             here = rows[x["amp"][rows] == amp]
             column = np.zeros(len(channel))
             column[here] = light[here]
-            out[f"light {int(amp)} {'/'.join(key)}"] = column
+            out[f"light {int(amp)} {label_of(condition)}"] = column
     for amp in np.unique(x["amp"]):
         out[f"dark {int(amp)}"] = np.where(x["amp"] == amp, x["time"], 0.0)
     return out
@@ -108,10 +104,10 @@ def _map_columns(channel: Channel, measured: MeasuredChannels) -> dict[str, Floa
 def _spot_columns(channel: Channel, rows_of: Rows) -> dict[str, FloatArray]:
     x = channel.axes
     out = {}
-    for key, rows in rows_of.items():
+    for condition, rows in rows_of.items():
         for what in ("flux", "skew_x", "skew_y"):
             here = rows[x["what"][rows] == what]
             column = np.zeros(len(channel))
             column[here] = x["light"][here] if what == "flux" else 1.0
-            out[f"spot {what} {'/'.join(key)}"] = column
+            out[f"spot {what} {label_of(condition)}"] = column
     return out

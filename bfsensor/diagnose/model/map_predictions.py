@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import fft, ifft, irfft, irfft2, rfft, rfft2
 
+from bfsensor.device.condition import Condition
+from bfsensor.diagnose.data.channel_rows import condition_of_row
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.diagnose.data.exposures import numbers_of
 from bfsensor.diagnose.data.map_channels import (
     RINGS,
     MapShare,
@@ -43,7 +45,7 @@ def shot_at(
     """Exposure at a condition; what is not known is the reference's."""
     values = (
         float(own) if np.isfinite(own) else usual
-        for own, usual in zip(condition, layout.reference, strict=True)
+        for own, usual in zip(numbers_of(condition), layout.reference, strict=True)
     )
     return Shot(kind, -1, seconds, *values)
 
@@ -134,7 +136,7 @@ class MapChange:
         """Flats that effects treat alike."""
         out: dict[tuple, list[MapShare]] = {}
         for share in shares:
-            where = () if self._standing else share.condition.key
+            where = None if self._standing else share.condition
             out.setdefault((where, share.seconds if self._by_time else 0.0), []).append(
                 share
             )
@@ -264,8 +266,7 @@ def lines_of_map(effect: Effect, channel: Channel, layout: Layout) -> FloatArray
     own = np.nonzero(x["map"] == "all")[0]
     if not len(own):
         return out
-    where = Condition(*(float(x[n][own[0]]) for n in Condition._fields))
-    shot = shot_at(layout, where)
+    shot = shot_at(layout, condition_of_row(channel, own[0]))
     light, change = effect.light_map(shot, layout), area_change(effect, shot, layout)
     total = np.zeros(layout.shape)
     for part in (change, None if light is None else light - 1.0):

@@ -14,7 +14,6 @@ from bfsensor.diagnose.model.device_baseline import TABLES, baseline_of_device, 
 from bfsensor.diagnose.model.free_baseline import free_baseline
 from bfsensor.diagnose.model.left_out_physics import physics_left_out
 from bfsensor.diagnose.model.table_baseline import baseline_of_table
-from bfsensor.effects.lateral_diffusion import ZERO_CELSIUS
 from bfsensor.errors import DeviceError, DiagnosisError
 from bfsensor.recording.campaign.amplifiers import AmplifierFrame, read_exposure
 from bfsensor.recording.campaign.campaign import Campaign
@@ -65,10 +64,6 @@ class CampaignSource:
         return read_exposure(self.campaign, exposure)
 
 
-def _celsius(kelvin: float | None) -> float | None:
-    return None if kelvin is None else kelvin - ZERO_CELSIUS
-
-
 def _settled(campaign: Campaign) -> list[Exposure]:
     """Exposures with the settings of their group: readings that jitter are one condition.
 
@@ -80,8 +75,7 @@ def _settled(campaign: Campaign) -> list[Exposure]:
             for one in members:
                 settled[one.number] = replace(
                     one, wavelength=condition.wavelength, back_bias=condition.back_bias,
-                    # Recordings tell kelvin, conditions and effects degrees Celsius.
-                    temperature=_celsius(condition.temperature),
+                    temperature=condition.temperature,
                     pair=one.pair if campaign.has_manifest else None,
                 )  # fmt: skip
     return [settled[one.number] for one in campaign.exposures]

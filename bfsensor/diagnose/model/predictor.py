@@ -9,9 +9,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.data.channel_rows import Rows, condition_at, rows_by_condition
+from bfsensor.device.condition import Condition
+from bfsensor.diagnose.data.channel_rows import Rows, rows_by_condition
 from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
-from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.diagnose.data.exposures import label_of
 from bfsensor.diagnose.data.map_channels import MapShare
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.model.baseline import Baseline
@@ -99,14 +100,15 @@ class Predictor:
                 "and flats of one level cannot tell it from the gain"
             )
         exact = {
-            key: baseline.at(condition_at(c, rows[0]))[1]
+            condition: baseline.at(condition)[1]
             for c in measured.channels if c.word in ("flat_cov", "spot")
-            for key, rows in self._rows(c).items()
+            for condition in self._rows(c)
         }  # fmt: skip
-        for key, held in exact.items():
+        for condition, held in exact.items():
             if not held:
                 self.notes.append(
-                    f"baseline has no shifts at {'/'.join(key)}: the nearest condition's are taken"
+                    f"baseline has no shifts at {label_of(condition)}: the nearest condition's are "
+                    "taken"
                 )
 
         self.columns: tuple[Columns, ...] = ()
@@ -234,7 +236,7 @@ class Predictor:
         parameters : ndarray
             In the order of ``names``.
         only : str, optional
-            Predict spots of this wavelength and temperature alone, such as '620/173.15'.
+            Predict spots of this wavelength and temperature alone, such as '620/-100' [nm, C].
         """
         a = self._amps
         chain = self.chain(parameters)
@@ -387,8 +389,8 @@ class Predictor:
             only = self.spots.widths[(n - first) // 2]
             moved = self.predict(channel, step, only=only)
             out = np.zeros(len(channel))
-            for key, rows in self._rows(channel).items():
-                if width_of(key) == only:
+            for condition, rows in self._rows(channel).items():
+                if width_of(condition) == only:
                     out[rows] = (moved[rows] - here[rows]) / self.steps[n]
             return out
         ratio = self.names[n].startswith("gain") or self.names[n].endswith(" full_well")
@@ -420,9 +422,8 @@ class Predictor:
         amp = x["amp"].astype(int)
         lags = int(max(i.max(), j.max()))
         out = np.empty(len(channel))
-        for rows in self._rows(channel).values():
+        for where, rows in self._rows(channel).items():
             if channel.unit == PER_ELECTRON:
-                where = condition_at(channel, rows[0])
                 edges = self.baseline.edges_on(where, device, REDUCED_LEVEL)
                 a = area_matrix(*edges)
                 if chain is not None:
@@ -444,7 +445,6 @@ class Predictor:
             )
             own = gains[groups[:, 0].astype(int)]
             levels = own * groups[:, 1]
-            where = condition_at(channel, rows[0])
             if chain is None:
                 a = self.baseline.flat_areas(where, device, levels)
                 c = flat_covariances_of(a, levels, lags=lags) / own[:, None, None] ** 2

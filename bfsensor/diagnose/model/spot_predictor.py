@@ -9,9 +9,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.data.channel_rows import Rows, condition_at
+from bfsensor.device.condition import Condition
+from bfsensor.diagnose.data.channel_rows import Rows, condition_of_row
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.diagnose.data.exposures import label_of
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.data.spot_places import widening
 from bfsensor.diagnose.model.baseline import Baseline
@@ -39,7 +40,7 @@ class SpotPredictor:
     Attributes
     ----------
     widths : list of str
-        Wavelength and temperature of each width, such as '620/173.15'.
+        Wavelength and temperature of each width, such as '620/-100' [nm, C].
     start : list of float
         Along x and y of each: where fits begin [pixel].
     """
@@ -50,19 +51,15 @@ class SpotPredictor:
         self.start: list[float] = []
         self._slopes: Edges | None = None
         self._gained: FloatArray | None = None
-        self._conditions: dict[tuple[str, ...], Condition] = {}
-        self._kept: dict[tuple[str, ...], tuple[tuple[NDArray, ...], Found]] = {}
-        phases: dict[tuple[str, ...], list[FloatArray]] = {}
+        self._kept: dict[Condition, tuple[tuple[NDArray, ...], Found]] = {}
+        phases: dict[Condition, list[FloatArray]] = {}
         places = iter(measured.phases)
         for channel in (c for c in measured.channels if c.word == "spot"):
             for row in np.nonzero(channel.axes["what"] == "sigma_x")[0]:
-                condition = condition_at(channel, row)
-                phases.setdefault(condition.key, []).append(next(places))
-                if condition.key in self._conditions:
-                    continue
-                self._conditions[condition.key] = condition
-                if width_of(condition.key) not in self.widths:
-                    self.widths.append(width_of(condition.key))
+                condition = condition_of_row(channel, row)
+                phases.setdefault(condition, []).append(next(places))
+                if width_of(condition) not in self.widths:
+                    self.widths.append(width_of(condition))
                     self.start += [float(v) for v in channel.values[row : row + 2]]
         self._phases = {
             k: representative_phases(np.concatenate(p)) for k, p in phases.items()
@@ -87,19 +84,18 @@ class SpotPredictor:
             The campaign has no spots of that wavelength and temperature: nothing tells their width.
         """
         other = copy(self)
-        other._conditions, other._phases = dict(self._conditions), dict(self._phases)
+        other._phases = dict(self._phases)
         for condition in conditions:
-            key = condition.key
-            if key in other._conditions:
+            if condition in other._phases:
                 continue
-            width = width_of(key)
-            like = next((k for k in self._conditions if width_of(k) == width), None)
+            width = width_of(condition)
+            like = next((c for c in self._phases if width_of(c) == width), None)
             if like is None:
                 raise DiagnosisError(
                     f"spots at wavelength/temperature {width}: their width without charge is known "
                     f"at {', '.join(self.widths) or 'none'} only"
                 )
-            other._conditions[key], other._phases[key] = condition, self._phases[like]
+            other._phases[condition] = self._phases[like]
         return other
 
     def predict(
@@ -136,20 +132,21 @@ class SpotPredictor:
         # Images were put on the scale of electrons with rough gains.
         scale = float(np.mean(gains / np.array(self.measured.gains)))
         out = np.zeros(len(channel))
-        for key in self._conditions:
-            rows = rows_of.get(key, np.zeros(0, int))
-            if not len(rows) or (only is not None and width_of(key) != only):
+        for condition in self._phases:
+            rows = rows_of.get(condition, np.zeros(0, int))
+            width = width_of(condition)
+            if not len(rows) or (only is not None and width != only):
                 continue
-            n = self.widths.index(width_of(key))
-            edges, slopes = self._shifts(self._conditions[key], device)
+            n = self.widths.index(width)
+            edges, slopes = self._shifts(condition, device)
             sigma = float(sigmas[2 * n]), float(sigmas[2 * n + 1])
             fluxes = scale * x["flux"][rows]
             if chain is None or chain.leaves_spots:
                 state = (*edges, np.array(sigma), fluxes)
-                found = dict(self._unchanged(key, state, slopes))
+                found = dict(self._unchanged(condition, state, slopes))
             else:
                 found = self._changed(
-                    key, edges, slopes, sigma, fluxes, chain, _axes(x, rows)
+                    condition, edges, slopes, sigma, fluxes, chain, _axes(x, rows)
                 )
             found["flux"] = found["flux"] / scale
             for what, values in found.items():
@@ -203,24 +200,24 @@ class SpotPredictor:
 
     def _unchanged(
         self,
-        key: tuple[str, ...],
+        condition: Condition,
         state: tuple[FloatArray, ...],
         slopes: Edges | None,
     ) -> Found:
         """Spots that no effect changes, at a condition; kept while effects' parameters alone move."""
-        kept = self._kept.get(key)
+        kept = self._kept.get(condition)
         if kept is None or not all(map(np.array_equal, kept[0], state)):
             kx, ky, sigma, fluxes = state
             found = predict_spots(
-                kx, ky, sigma=(float(sigma[0]), float(sigma[1])), phases=self._phases[key],
+                kx, ky, sigma=(float(sigma[0]), float(sigma[1])), phases=self._phases[condition],
                 fluxes=fluxes, slopes=slopes,
             )  # fmt: skip
-            kept = self._kept[key] = state, found
+            kept = self._kept[condition] = state, found
         return kept[1]
 
     def _changed(
         self,
-        key: tuple[str, ...],
+        condition: Condition,
         edges: Edges,
         slopes: Edges | None,
         sigma: tuple[float, float],
@@ -229,7 +226,6 @@ class SpotPredictor:
         given: Mapping[str, float],
     ) -> Found:
         """Spots with effects, at a condition; ``given`` goes to what happens after collection."""
-        condition = self._conditions[key]
         variance, halo, axes = chain.spot_change(condition)
         wide = sigma
         if variance:
@@ -238,15 +234,16 @@ class SpotPredictor:
         edges, slopes = chain.spot_edges(edges, slopes, condition)
         return predict_spots(
             *edges, sigma=wide,
-            phases=self._phases[key], fluxes=fluxes, halo=halo, law=chain.law,
+            phases=self._phases[condition], fluxes=fluxes, halo=halo, law=chain.law,
             neighbours=self.measured.neighbours, slopes=slopes,
             change=partial(chain.spot_image, axes={**axes, **given}),
         )  # fmt: skip
 
 
-def width_of(key: tuple[str, ...]) -> str:
+def width_of(condition: Condition) -> str:
     """Wavelength and temperature of a condition: what spots have one width at."""
-    return f"{key[0]}/{key[2]}"
+    wavelength, _, temperature = label_of(condition).split("/")
+    return f"{wavelength}/{temperature}"
 
 
 def _axes(x: Mapping[str, NDArray], rows: NDArray[np.int64]) -> dict[str, float]:

@@ -15,6 +15,7 @@ from bfsensor.diagnose.plan.catalogue import Recording, make_recordings
 from bfsensor.diagnose.plan.forecast import Forecaster
 from bfsensor.diagnose.plan.planned_exposures import Forecast, Information, Planned
 from bfsensor.errors import ConvergenceError, DiagnosisError
+from bfsensor.units import to_celsius
 
 ENOUGH = 25.0
 """Expected difference of the chi-squares from which on a recording decides."""
@@ -296,11 +297,13 @@ def _levels(advice: Advice) -> str:
 
 
 def _recipe(planned: Planned, times: int) -> dict[str, Any]:
-    """What is given of planned exposures."""
+    """What is given of planned exposures, temperature in deg C."""
     usual = Planned(planned.kind, 0)
     told = {
         name: value
         for name, value in asdict(planned).items()
         if value != getattr(usual, name) and value == value
     }
+    if "temperature" in told:
+        told["temperature"] = to_celsius(told["temperature"])
     return {**told, "kind": planned.kind, "count": planned.count * times}

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.plan.planned_exposures import Planned
 from bfsensor.effects.effect import Effect, Layout
+from bfsensor.units import to_celsius
 
 PARTS = (0.1, 0.3, 0.6, 0.9)
 """Levels of a short ladder, in parts of the campaign's brightest flats or spots."""
@@ -258,7 +259,7 @@ def make_recordings(
         Recording("again", "Take the whole campaign once more", again=True),
     ]  # fmt: skip
     for wavelength in (480.0, 620.0, 750.0, 950.0):
-        if abs(wavelength - usual.wavelength) > 50:
+        if usual.wavelength is not None and abs(wavelength - usual.wavelength) > 50:
             name = f"{wavelength:g} nm"
             out += [
                 Recording(f"flats_{wavelength:g}", f"Take pairs of flats at {name}",
@@ -266,7 +267,7 @@ def make_recordings(
                 Recording(f"spots_{wavelength:g}", f"Take a ladder of spots at {name}",
                           spots(4, wavelength=wavelength)),
             ]  # fmt: skip
-    if bias == bias:
+    if bias is not None:
         for other in (bias + 20.0, bias - 10.0):
             out += [
                 Recording(f"flats_{other:g}V", f"Take pairs of flats at a back bias of {other:g} V",
@@ -274,9 +275,9 @@ def make_recordings(
                 Recording(f"spots_{other:g}V", f"Take a ladder of spots at a back bias of {other:g} V",
                           spots(4, back_bias=other)),
             ]  # fmt: skip
-    if usual.temperature == usual.temperature:
+    if usual.temperature is not None:
         warm = usual.temperature + 20.0
-        out.append(Recording("spots_warm", f"Take a ladder of spots at {warm:g} C",
+        out.append(Recording("spots_warm", f"Take a ladder of spots at {to_celsius(warm):g} C",
                              spots(4, temperature=warm)))  # fmt: skip
     return (*out, *_ruled(brightest, brightest_spot))
 

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from bfsensor.device.condition import Condition
+from bfsensor.diagnose.data.channel_rows import rows_by_condition
 from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
-from bfsensor.diagnose.data.exposures import Axes, Condition
+from bfsensor.diagnose.data.exposures import (
+    NUMBERS,
+    Axes,
+    condition_at,
+    label_of,
+    numbers_of,
+)
 from bfsensor.diagnose.data.flat_channels import TAIL
 from bfsensor.diagnose.data.map_channels import MapShare, block_side
 from bfsensor.diagnose.data.map_noise import block_noise
@@ -18,6 +27,7 @@ from bfsensor.diagnose.plan.planned_exposures import Forecast, Planned
 from bfsensor.errors import DiagnosisError
 from bfsensor.measure.bartlett import bartlett_matrix
 from bfsensor.typing import FloatArray
+from bfsensor.units import to_celsius
 
 LAMP_ERROR = 2e-4
 """Relative error of a lamp monitor where a campaign tells none."""
@@ -66,23 +76,23 @@ class Forecaster:
     def _usual(self) -> Condition:
         """Condition of most flats, or of most of what there is."""
         for words in (("flat_cov",), ("spot",), ()):
-            rows = [
-                tuple(float(c.axes[n][k]) for n in Condition._fields)
-                for c in self.fit.channels
-                for k in range(len(c))
-                if (c.word in words or not words) and np.isfinite(c.axes["wavelength"][k])
-            ]
-            if rows:
-                return Condition(*max(set(rows), key=rows.count))
-        return Condition(np.nan, np.nan, np.nan)
+            count = Counter[Condition]()
+            for channel in self.fit.channels:
+                if channel.word in words or not words:
+                    for condition, rows in rows_by_condition(channel).items():
+                        if condition.wavelength is not None:
+                            count[condition] += len(rows)
+            if count:
+                return count.most_common(1)[0][0]
+        return Condition()
 
     def condition(self, planned: Planned) -> Condition:
         """Condition of planned exposures."""
         given = planned.wavelength, planned.back_bias, planned.temperature
-        return Condition(*(
+        return condition_at(
             own if np.isnan(v) else round(float(v), 2)
-            for v, own in zip(given, self.usual, strict=True)
-        ))  # fmt: skip
+            for v, own in zip(given, numbers_of(self.usual), strict=True)
+        )
 
     def seconds(self, planned: Planned) -> float:
         """Exposure time [s] of planned flats."""
@@ -97,9 +107,7 @@ class Forecaster:
 
     def _rates(self, condition: Condition) -> FloatArray:
         """Light by amplifier [ADU/s for a lamp of 1]; nan where it was never recorded."""
-        names = [
-            self._known(f"light {a} {'/'.join(condition.key)}") for a in range(self.amps)
-        ]
+        names = [self._known(f"light {a} {label_of(condition)}") for a in range(self.amps)]
         return np.array([self.values.get(n, np.nan) for n in names])
 
     def _known(self, name: str) -> str:
@@ -119,10 +127,10 @@ class Forecaster:
         """
         makers = {"flat": self._flats, "dark": self._darks, "bias": self._biases}
         out: list[Forecast] = []
-        spots: dict[tuple[str, ...], list[Planned]] = {}
+        spots: dict[Condition, list[Planned]] = {}
         for one in planned:
             if one.kind == "spot":
-                spots.setdefault(self.condition(one).key, []).append(one)
+                spots.setdefault(self.condition(one), []).append(one)
             elif one.kind in makers:
                 out += makers[one.kind](one)
             else:
@@ -181,8 +189,8 @@ class Forecaster:
         lit = bool(np.isfinite(rate).all() and np.isfinite(seconds))
         if not lit and not np.isfinite(planned.level):
             raise DiagnosisError(
-                f"flats at {_said(condition)}: the campaign has none, so their light is not known; "
-                "give level= [e-] instead of seconds="
+                f"flats at {say_condition(condition)}: the campaign has none, so their light is not "
+                "known; give level= [e-] instead of seconds="
             )
         if lit:
             mean = self._mean(planned, condition, seconds)
@@ -194,7 +202,7 @@ class Forecaster:
             out.append(mean)
         for word in ("serial_overscan", "parallel_overscan"):
             out += self._overscan(word, planned, condition, levels, seconds if lit else 0.0)
-        if condition.key != self.usual.key and lit:
+        if condition != self.usual and lit:
             out += self._map(planned, condition, levels, seconds)
         return out
 
@@ -338,8 +346,9 @@ class Forecaster:
     def _spot_light(self, condition: Condition) -> float:
         """Electrons of a spot for a second of a lamp of 1."""
         names = [n for n in self.values if n.startswith("spot flux ")]
-        own = f"spot flux {'/'.join(condition.key)}"
-        light = [n for n in names if n.split()[2].split("/")[0] == condition.key[0]]
+        own = f"spot flux {label_of(condition)}"
+        colour = label_of(condition).split("/")[0]
+        light = [n for n in names if n.split()[2].split("/")[0] == colour]
         chosen = own if own in names else next(iter(light or names), None)
         return self.values[chosen] if chosen else np.nan
 
@@ -373,7 +382,9 @@ class Forecaster:
         return out
 
 
-def _said(condition: Condition) -> str:
-    """Condition in words."""
-    parts = [f"{name}={v:g}" for name, v in condition._asdict().items() if np.isfinite(v)]
+def say_condition(condition: Condition) -> str:
+    """Condition as it is asked for, temperature in deg C."""
+    wavelength, back_bias, temperature = numbers_of(condition)
+    told = dict(zip(NUMBERS, (wavelength, back_bias, to_celsius(temperature)), strict=True))
+    parts = [f"{name}={v:g}" for name, v in told.items() if np.isfinite(v)]
     return ", ".join(parts) or "an unknown condition"

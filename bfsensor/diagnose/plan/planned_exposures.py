@@ -29,7 +29,7 @@ class Planned:
     seconds : float
         Exposure time [s]; of flats instead of the level.
     wavelength, back_bias, temperature : float
-        [nm], [V], [C].
+        [nm], [V], [K].
     lamp : float
         Reading of the lamp monitor.
     lamp_error : float

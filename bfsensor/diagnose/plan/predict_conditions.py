@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.diagnose.data.exposures import condition_at, numbers_of
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.diagnose.model.predictor import Predictor
-from bfsensor.diagnose.plan.forecast import Forecaster
+from bfsensor.diagnose.plan.forecast import Forecaster, say_condition
 from bfsensor.diagnose.plan.planned_exposures import Forecast, Planned
 from bfsensor.errors import DiagnosisError
 from bfsensor.measure.ecsv import write_ecsv
+from bfsensor.units import to_celsius, to_kelvin
 
 SCHEMA = "bfsensor-predicted-1"
 
@@ -108,6 +109,8 @@ def _planned(given: Mapping[str, Any], where: str) -> Planned:
     needed = ("level", "seconds") if kind == "flat" else ("flux", "seconds")
     if not any(name in values for name in needed):
         raise DiagnosisError(f"{where}: {kind}s need {' or '.join(needed)}")
+    if "temperature" in values:
+        values["temperature"] = to_kelvin(values["temperature"])
     return replace(Planned(kind, count), **values)
 
 
@@ -120,14 +123,12 @@ def refuse_unheld(planned: Sequence[Planned], baseline: Baseline) -> None:
         Names the condition and those that are held.
     """
     for one in planned:
-        condition = Condition(one.wavelength, one.back_bias, one.temperature)
+        condition = condition_at((one.wavelength, one.back_bias, one.temperature))
         if not baseline.at(condition)[1]:
-            given = ", ".join(
-                f"{n}={v:g}" for n, v in condition._asdict().items() if np.isfinite(v)
-            )
             held = ", ".join(_told(*key) for key in baseline.edges)
             raise DiagnosisError(
-                f"{given}: the baseline {baseline.name} holds no boundary shifts there; it holds {held}"
+                f"{say_condition(condition)}: the baseline {baseline.name} holds no boundary shifts "
+                f"there; it holds {held}"
             )
 
 
@@ -177,8 +178,8 @@ class Prediction:
                     "amp": self.amplifiers[int(x["amp"][k])] if "amp" in x else "",
                     **{n: int(x[n][k]) if n in x else -1 for n in ("i", "j")},
                     **{n: float(x[n][k]) if n in x else np.nan
-                       for n in ("wavelength", "back_bias", "temperature", "time", "lamp",
-                                 "level", "flux")},
+                       for n in ("wavelength", "back_bias", "time", "lamp", "level", "flux")},
+                    "temperature": to_celsius(float(x["temperature"][k])),
                     "value": float(channel.values[k]), "error": float(errors[k]),
                     "noise": float(noise[k]), "unit": UNITS.get(what, channel.unit),
                 })  # fmt: skip
@@ -250,7 +251,11 @@ def predict_conditions(
     out: list[tuple[int, Forecast]] = []
     for number, one in enumerate(planned, 1):
         condition = forecaster.condition(one)
-        refuse_unheld([replace(one, **condition._asdict())], predictor.baseline)
+        wavelength, back_bias, temperature = numbers_of(condition)
+        there = replace(
+            one, wavelength=wavelength, back_bias=back_bias, temperature=temperature
+        )
+        refuse_unheld([there], predictor.baseline)
         found = [f for f in forecaster.forecasts([one]) if f.channel.word in WRITTEN]
         if not found:
             raise DiagnosisError(
@@ -259,12 +264,12 @@ def predict_conditions(
         for f in found:
             if any(n.startswith("light ") for n in f.free):
                 notes.append(
-                    f"condition {number}: the light of {condition.wavelength:g} nm is taken from "
+                    f"condition {number}: the light of {wavelength:g} nm is taken from "
                     "other voltages or temperatures"
                 )
         if one.kind == "flat" and not any(f.channel.word == "flat_mean" for f in found):
             notes.append(
-                f"condition {number}: no flat of {condition.wavelength:g} nm was recorded, so the "
+                f"condition {number}: no flat of {wavelength:g} nm was recorded, so the "
                 "mean is the level asked for, at no known exposure time"
             )
         out += [(number, f) for f in found]

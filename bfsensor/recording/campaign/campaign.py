@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor.device.condition import Condition
 from bfsensor.errors import RecordingError
 from bfsensor.recording.campaign.consistency import (
     check_keywords,
@@ -23,7 +24,6 @@ from bfsensor.recording.campaign.consistency import (
 )
 from bfsensor.recording.campaign.exposures import (
     Caution,
-    Condition,
     Exposure,
     Progress,
     SetAside,
@@ -37,7 +37,7 @@ from bfsensor.recording.raw.masks import read_masks
 from bfsensor.recording.raw.sections import AmplifierLayout
 
 __all__ = [
-    "Campaign", "Caution", "Condition", "Exposure", "SetAside", "read_campaign",
+    "Campaign", "Caution", "Exposure", "SetAside", "read_campaign",
 ]  # fmt: skip
 
 _QUANTITIES = (

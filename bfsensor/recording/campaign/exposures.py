@@ -1,4 +1,4 @@
-"""Exposures of a campaign and the conditions under which they were taken."""
+"""Exposures of a campaign, grouped by the conditions under which they were taken."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
+from bfsensor.device.condition import Condition
 
 TOLERANCES = {
     "wavelength": 1.0, "temperature": 2.0, "back_bias": 0.5, "gate_high": 0.1, "gate_low": 0.1,
@@ -106,40 +108,6 @@ class Caution:
 
     def __str__(self) -> str:
         return f"{self.message}: {self.closes}" if self.closes else self.message
-
-
-@dataclass(frozen=True)
-class Condition:
-    """Settings that several exposures share; None where not known.
-
-    Attributes
-    ----------
-    wavelength, temperature, back_bias, gate_high, gate_low : float or None
-        [nm, K, V]: the median of readings closer than the tolerances.
-    filter : str or None
-        Name of a filter.
-    """
-
-    wavelength: float | None = None
-    filter: str | None = None
-    temperature: float | None = None
-    back_bias: float | None = None
-    gate_high: float | None = None
-    gate_low: float | None = None
-
-    def __str__(self) -> str:
-        words = []
-        if self.wavelength is not None:
-            words.append(f"{self.wavelength:g} nm")
-        elif self.filter:
-            words.append(self.filter)
-        if self.back_bias is not None:
-            words.append(f"back bias {self.back_bias:g} V")
-        if self.gate_high is not None and self.gate_low is not None:
-            words.append(f"gates {self.gate_low:g}/{self.gate_high:g} V")
-        if self.temperature is not None:
-            words.append(f"{self.temperature:.4g} K")
-        return ", ".join(words) or "not known"
 
 
 def group_conditions(

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from bfsensor.device.condition import Condition
 from bfsensor.errors import DeviceError, RecordingError
-from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.recording.raw.headers import is_fits
 from bfsensor.recording.tables.area_changes import AreaChangeTable, read_area_changes
 from bfsensor.recording.tables.lsst_datasets import PhotonTransferDataset

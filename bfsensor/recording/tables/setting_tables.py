@@ -13,8 +13,8 @@ from astropy.io import ascii as text_tables
 from astropy.io.ascii import InconsistentTableError
 from astropy.table import Table
 
+from bfsensor.device.condition import Condition
 from bfsensor.errors import RecordingError
-from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.recording.tables.covariance_tables import floats
 from bfsensor.typing import FloatArray
 

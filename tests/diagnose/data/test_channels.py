@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bfsensor.diagnose.data.channels import Channel, join_channels
-from bfsensor.diagnose.data.exposures import Condition, assign_folds
+from bfsensor.diagnose.data.exposures import assign_folds, condition_of, label_of
 from bfsensor.diagnose.data.flat_channels import TAIL, mean_profile, profile
 from bfsensor.diagnose.data.flat_pairing import PairFinder, by_level, group_flats
 from bfsensor.errors import DiagnosisError
@@ -102,7 +102,7 @@ def test_pairs_are_neighbours_of_one_condition_and_time():
     assert pairs_of(shots) == ([(0, 1), (5, 6), (2, 3)], [4], [])
     shots[1].back_bias = -40.0
     assert pairs_of(shots) == ([(2, 3), (5, 6)], [4], [])
-    assert Condition.of(shots[0]).key == ("620", "-60", "nan")
+    assert label_of(condition_of(shots[0])) == "620/-60/nan"
 
 
 def test_unequal_levels_make_no_pair():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.map_borders import find_borders
 from bfsensor.diagnose.data.map_channels import MapChannels
 
@@ -47,8 +47,8 @@ def test_pixels_that_are_not_read_do_not_matter():
 
 def maps_of(rim):
     """Maps of six flats, the first row with scatter of its own."""
-    condition = Condition(620.0, -60.0, -100.0)
-    maps = MapChannels((64, 64), {condition.key: 10.0})
+    condition = Condition(wavelength=620.0, back_bias=-60.0, temperature=173.15)
+    maps = MapChannels((64, 64), {condition: 10.0})
     fixed = noise(6, (64, 64))
     fixed[0] += rim * np.sin(np.arange(64))
     for n in range(3):

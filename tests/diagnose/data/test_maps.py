@@ -5,15 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import Condition
 from bfsensor.diagnose.data.map_channels import LOW, MapChannels, block_side
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.effect import Segment
 from validation.common.virtual_source import virtual_baseline
 
-HERE, THERE = Condition(620.0, -60.0, 173.0), Condition(870.0, -60.0, 173.0)
+HERE, THERE = (
+    Condition(wavelength=w, back_bias=-60.0, temperature=173.0) for w in (620.0, 870.0)
+)
 ROWS, COLUMNS = 120, 128
 """Of four amplifiers, whose border in y cuts blocks of 8 pixels."""
 
@@ -48,7 +50,7 @@ def make_flats(seed: int) -> dict[tuple[Condition, float], np.ndarray]:
 def measure(
     flats: dict[tuple[Condition, float], np.ndarray],
 ) -> tuple[MapChannels, Channel]:
-    maps = MapChannels((ROWS, COLUMNS), {HERE.key: 16.0, THERE.key: 16.0})
+    maps = MapChannels((ROWS, COLUMNS), {HERE: 16.0, THERE: 16.0})
     for (condition, time), images in flats.items():
         for first, second in zip(images[::2], images[1::2], strict=True):
             maps.add_pair(
@@ -76,7 +78,7 @@ def test_sums_are_the_weighted_means() -> None:
         "all": [k for k in flats if k[0] == HERE],
         "short": [(HERE, 1.0), (HERE, 3.0)],
         "long": [(HERE, 8.0), (HERE, 16.0)],
-        "870/-60/173": [(THERE, 16.0)],
+        "870/-60/-100.15": [(THERE, 16.0)],
     }
     average = {
         name: np.average(
@@ -85,7 +87,7 @@ def test_sums_are_the_weighted_means() -> None:
         for name, keys in wanted.items()
     }
     average["short"] /= average.pop("long")
-    average["870/-60/173"] /= average["all"]
+    average["870/-60/-100.15"] /= average["all"]
     assert set(channel.axes["map"]) == set(average)
     for name, image in average.items():
         own = channel.axes["map"] == name
@@ -106,7 +108,7 @@ def test_levels_in_two_runs_are_one_mean() -> None:
     flats = make_flats(8822)
     maps, _ = measure(flats)
     order = [(HERE, 16.0), (HERE, 1.0), (HERE, 3.0), (HERE, 8.0), (THERE, 16.0)]
-    split = MapChannels((ROWS, COLUMNS), {HERE.key: 16.0, THERE.key: 16.0})
+    split = MapChannels((ROWS, COLUMNS), {HERE: 16.0, THERE: 16.0})
     for key, part in [
         *((k, slice(0, 4)) for k in order),
         *((k, slice(4, 8)) for k in order),

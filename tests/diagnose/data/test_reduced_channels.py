@@ -9,6 +9,7 @@ from astropy.table import Table
 from click.testing import CliRunner
 
 from bfsensor.cli.main import main
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.flat_pairing import RISE, compare_unlike, describe_unlike
 from bfsensor.diagnose.data.reduced_channels import measure_reduced
 from bfsensor.diagnose.diagnosis import diagnose_measured
@@ -29,14 +30,14 @@ AREAS = {"a10": 1.0e-7, "a01": 2.4e-7, "a20": 2.0e-8, "a02": 3.0e-8, "a11": 5.0e
 def baseline_of(areas):
     """Free areas at given values, with nothing left to float."""
     free = free_baseline()
-    edges, _ = free.at((np.nan,) * 3, areas)
+    edges, _ = free.at(Condition(), areas)
     return Baseline("known", {(620.0, -60.0): edges}, {}, {}, (620.0, -60.0))
 
 
 def area_table(tmp_path, *, seed, moved=0.0, sum_rule=True):
     """A table of a_ij to lags of 6 with errors, drawn about AREAS; a_10 moved by sigmas."""
     rng = np.random.default_rng(seed)
-    edges, _ = baseline_of(AREAS).at((np.nan,) * 3)
+    edges, _ = baseline_of(AREAS).at(Condition())
     plane = area_matrix(*edges)
     n = len(plane) // 2
     a = np.zeros((7, 7))
@@ -59,7 +60,9 @@ def area_table(tmp_path, *, seed, moved=0.0, sum_rule=True):
 @pytest.mark.parametrize("name", AREAS)
 def test_each_free_area_is_that_area_alone(name):
     """Areas are conserved, mirrored, and no other lag has any."""
-    edges, held = free_baseline().at((480.0, -60.0, 173.0), {name: 1e-7})
+    edges, held = free_baseline().at(
+        Condition(wavelength=480.0, back_bias=-60.0, temperature=173.0), {name: 1e-7}
+    )
     a = area_matrix(*edges) * 1e7
     n = len(a) // 2
     i, j = int(name[1]), int(name[2])
@@ -118,7 +121,7 @@ def test_free_areas_are_fitted_and_stay_above_0(tmp_path):
 def covariances(seed, *, gain=1.0, noise=30.0, extra=0.0, side=1000, matrix=True):
     """Covariances of 8 levels by the package's other closed form, errors after Bartlett."""
     rng = np.random.default_rng(seed)
-    edges, _ = baseline_of(AREAS).at((np.nan,) * 3)
+    edges, _ = baseline_of(AREAS).at(Condition())
     plane = area_matrix(*edges)
     n = len(plane) // 2
     levels = np.geomspace(3e3, 1.2e5, 8)
@@ -204,7 +207,7 @@ def test_unknown_voltage_does_not_hide_the_wavelength():
     baseline = Baseline("three", shifts, {}, {}, (620.0, np.nan))
     for wavelength in (410.0, 600.0, 900.0):
         near = min((400.0, 620.0, 950.0), key=lambda w: abs(w - wavelength))
-        (kx, _), _ = baseline.at((wavelength, -60.0, np.nan))
+        (kx, _), _ = baseline.at(Condition(wavelength=wavelength, back_bias=-60.0))
         assert kx[0, 0] == near
 
 

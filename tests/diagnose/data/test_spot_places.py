@@ -38,7 +38,7 @@ def measure(images, ghost=0.0):
     for number, image in enumerate(images):
         exposure = SimpleNamespace(
             number=number, kind="spot", exposure_time=10.0, wavelength=620.0, lamp=1.0,
-            back_bias=-60.0, temperature=-100.0, mjd=None,
+            back_bias=-60.0, temperature=173.15, mjd=None,
         )  # fmt: skip
         image = image + np.sqrt(image + 25.0) * rng.standard_normal(image.shape)
         last = number == len(images) - 1

@@ -6,17 +6,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import Axes, Condition
+from bfsensor.diagnose.data.exposures import Axes
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.data.spot_widths import fit_widths
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.errors import ConvergenceError
 from validation.common.virtual_source import virtual_baseline
 
-CONDITIONS = (
-    Condition(620.0, -60.0, -100.0), Condition(620.0, -40.0, -100.0),
-    Condition(620.0, -60.0, -80.0), Condition(950.0, -60.0, -100.0),
+CONDITIONS = tuple(
+    Condition(wavelength=w, back_bias=v, temperature=t) for w, v, t in (
+        (620.0, -60.0, 173.15), (620.0, -40.0, 173.15), (620.0, -60.0, 193.15),
+        (950.0, -60.0, 173.15),
+    )
 )  # fmt: skip
 ERROR = 1e-3
 PHASES = np.random.default_rng(56).uniform(-0.5, 0.5, (12, 2))
@@ -53,7 +56,7 @@ def test_one_width_moves_all_voltages() -> None:
     n = predictor.names.index("sigma_x 620/-100")
     slope = predictor.slope(channel, predictor.start, n, here)
     x = channel.axes
-    cold = x["temperature"] == -100.0
+    cold = x["temperature"] == 173.15
     own = (x["what"] == "sigma_x") & (x["wavelength"] == 620.0) & cold
     # The effect's own widening falls a little with the width.
     assert slope[own] == pytest.approx(np.ones(2), abs=0.1)
@@ -69,7 +72,7 @@ def test_one_width_moves_all_voltages() -> None:
         return float(np.square(wanted - slopes @ best).sum() / ERROR**2)
 
     assert left(x["back_bias"] == -40.0) == pytest.approx(400 * 1 / 2, rel=0.1)
-    assert left(x["temperature"] == -80.0) < 1.0
+    assert left(x["temperature"] == 193.15) < 1.0
 
 
 def test_images_without_spots_are_no_singular_matrix():

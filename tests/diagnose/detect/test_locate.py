@@ -7,12 +7,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import binom
 
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import Axes, Condition
+from bfsensor.diagnose.data.exposures import Axes
 from bfsensor.diagnose.detect.locate import FAMILY, Known, Locator
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 
-HERE = Condition(620.0, -60.0, -100.0)
+HERE = Condition(wavelength=620.0, back_bias=-60.0, temperature=173.15)
 LEVELS = 1e4, 3e4, 6e4, 9e4
 COLUMNS = 64
 

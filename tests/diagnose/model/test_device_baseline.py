@@ -1,16 +1,18 @@
 """A device whose parameters float: derivatives against tables at shifted values, kept and read."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
 
 from bfsensor import Device
+from bfsensor.device.condition import Condition
 from bfsensor.device.parameters import change_parameter, device_parameters
-from bfsensor.diagnose.data.exposures import Condition
 from bfsensor.diagnose.model import device_baseline
+from bfsensor.diagnose.model.baseline import Baseline, read_edges
 from bfsensor.diagnose.model.cached_response import Walk
-from bfsensor.diagnose.model.device_baseline import baseline_of_device
+from bfsensor.diagnose.model.device_baseline import baseline_of_device, write_edges
 from bfsensor.diagnose.model.open_baseline import find_baseline, simulate_baseline
 from bfsensor.errors import DeviceError, DiagnosisError, FitError
 from bfsensor.response.edge_response import area_matrix
@@ -18,7 +20,7 @@ from validation.common.virtual_source import virtual_baseline
 from validation.concealed.card import NOMINAL, SPREAD, shifts_at
 
 LIMITS = {"silicon.background_doping": (0.03, 0.06), "silicon.thickness": (0.3, 0.6)}
-HERE = Condition(620.0, -50.0, np.nan)
+HERE = Condition(wavelength=620.0, back_bias=-50.0)
 
 
 @pytest.mark.slow
@@ -41,8 +43,26 @@ def test_a_changed_parameter_is_predicted(tmp_path):
     assert abs(moved) > 0.003 * abs(plain[n, n])
     # Derivatives are of tables with half as many cells a pixel: 12 % off here.
     assert predicted[n, n] - plain[n, n] == pytest.approx(moved, rel=0.15)
-    assert kept.at(Condition(620.0, -60.0, np.nan))[1]
+    assert kept.at(Condition(wavelength=620.0, back_bias=-60.0))[1]
     assert kept.nominal == {"silicon.thickness": 100.0} and kept.card["pixel"] == 10.0
+
+
+def test_the_file_tells_celsius(tmp_path):
+    """Of a baseline at 173 K whose shifts grow by 1 % of themselves a kelvin."""
+    k = np.zeros((3, 3))
+    k[1, 1] = -1e-6
+    key = (620.0, -50.0)
+    made = Baseline(
+        "warm", {key: (k, k.T)}, {}, {}, key, warming={key: (0.01 * k, 0.01 * k.T)},
+        temperature=173.0,
+    )  # fmt: skip
+    write_edges(made, tmp_path / "edges.json")
+    assert json.loads((tmp_path / "edges.json").read_text())["temperature"] == -100.15
+    again = read_edges(tmp_path / "edges.json")
+    assert again.temperature == 173.0
+    for baseline in (made, again):
+        warm = baseline.at(dataclasses.replace(HERE, temperature=183.0))[0][0]
+        assert warm[1, 1] == pytest.approx(1.1 * k[1, 1], rel=1e-12)
 
 
 @pytest.mark.slow
@@ -126,7 +146,7 @@ def test_derivatives_at_every_back_bias_against_full_solutions():
     """
     device = Device.load("itl_sta3800c")
     names = ["silicon.background_doping", "silicon.thickness"]
-    there, key = Condition(620.0, -40.0, np.nan), (620.0, -40.0)
+    there, key = Condition(wavelength=620.0, back_bias=-40.0), (620.0, -40.0)
     kept = baseline_of_device(
         device, parameters=names, back_biases=[-40.0], lacks=["levels"], cells=16
     )
@@ -149,12 +169,12 @@ def test_derivatives_at_every_back_bias_against_full_solutions():
 
 def test_doping_goes_with_the_square_of_the_ratio():
     """Against full solutions of the virtual sensor at 20 V less: 0.2 %; by the ratio 27 %."""
-    baseline, there = virtual_baseline(), Condition(620.0, -40.0, np.nan)
+    baseline, there = virtual_baseline(), Condition(wavelength=620.0, back_bias=-40.0)
     plain = area_matrix(*baseline.at(there)[0])
     for name, limit in (("doping", 0.005), ("h", 0.005), ("zx", 0.01), ("thickness", 0.12)):
         half = 0.5 * SPREAD[name]
         up, down = (
-            shifts_at({**NOMINAL, name: NOMINAL[name] + by}, *there[:2]).area_changes()
+            shifts_at({**NOMINAL, name: NOMINAL[name] + by}, 620.0, -40.0).area_changes()
             for by in (half, -half)
         )
         told = area_matrix(*baseline.at(there, {name: 2 * half})[0]) - plain

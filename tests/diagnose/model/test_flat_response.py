@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.diagnose.model.flat_predictions import flat_covariances_of
 from bfsensor.diagnose.model.table_baseline import baseline_of_table
@@ -13,7 +13,7 @@ from bfsensor.files import tables_dir
 from bfsensor.table.table import DistortionTable
 from validation.sensor.sensor_flats import predict as integrate
 
-BACK = Condition(400.0, np.nan, np.nan)
+BACK = Condition(wavelength=400.0)
 """All of this light converts at the back surface, as the integration has it."""
 
 

@@ -9,7 +9,7 @@ import pytest
 from bfsensor import Device
 from bfsensor.device.parameters import change_parameter
 from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
-from bfsensor.diagnose.data.exposures import Axes, Condition
+from bfsensor.diagnose.data.exposures import Axes, condition_at
 from bfsensor.diagnose.detect.candidates import candidates_of, name_of
 from bfsensor.diagnose.model.cached_response import walk
 from bfsensor.diagnose.model.device_baseline import baseline_of_device
@@ -92,7 +92,7 @@ def test_all_of_the_holes_are_the_device_with_them(device, lacking, folder, shot
     full = baseline_of_device(
         device, back_biases=[-40.0], lacks=["levels", "depths"], cells=CELLS, keep=folder
     )
-    where = Condition(shot.wavelength, shot.back_bias, shot.temperature)
+    where = condition_at((shot.wavelength, shot.back_bias, shot.temperature))
     plain, truth = (area_matrix(*b.at(where)[0]) for b in (lacking, full))
     effect = piece(lacking, "free_holes")({"strength": 1.0})
     told = area_matrix(*effect.edges(*lacking.at(where)[0], shot, LAYOUT))
@@ -110,9 +110,8 @@ def test_all_of_the_depths_is_light_that_converts_where_it_is_absorbed(
     there = change_parameter(
         poor, "operating_point.back_bias", shot.back_bias - REFERENCE.back_bias
     )
-    kelvin = shot.temperature + 273.15
-    truth = walk(there, cells=CELLS, keep=folder).edges(shot.wavelength, kelvin)
-    where = Condition(shot.wavelength, shot.back_bias, shot.temperature)
+    truth = walk(there, cells=CELLS, keep=folder).edges(shot.wavelength, shot.temperature)
+    where = condition_at((shot.wavelength, shot.back_bias, shot.temperature))
     effect = piece(lacking, "bf_chromatic:simulated")({"strength": 1.0})
     plain = lacking.at(where)[0]
     for told, wanted in zip(effect.edges(*plain, shot, LAYOUT), truth, strict=True):

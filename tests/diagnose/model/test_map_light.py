@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.device.condition import Condition
+from bfsensor.diagnose.data.exposures import numbers_of
 from bfsensor.diagnose.data.map_channels import MapChannels
 from bfsensor.effects.effect import Layout, Shot
 from bfsensor.effects.illumination_turbulence import IlluminationTurbulence
 
-HERE = Condition(620.0, -60.0, 173.0)
+HERE = Condition(wavelength=620.0, back_bias=-60.0, temperature=173.0)
 SIDE, PAIRS, NOISE = 256, 8, 5e-3
-SHOT = Shot("flat", 0, 10.0, *HERE, 0.0, 5e4)
+SHOT = Shot("flat", 0, 10.0, *numbers_of(HERE), 0.0, 5e4)
 
 
 def map_of(seed, rms, corr=15.0):
@@ -18,7 +19,7 @@ def map_of(seed, rms, corr=15.0):
     rng = np.random.default_rng(seed)
     layout = Layout(shape=(SIDE, SIDE), segments=())
     light = IlluminationTurbulence({"rms": rms, "corr": corr})
-    maps = MapChannels((SIDE, SIDE), {HERE.key: 10.0}, "held-out")
+    maps = MapChannels((SIDE, SIDE), {HERE: 10.0}, "held-out")
     for _ in range(PAIRS):
         flats = []
         for _ in range(2):

@@ -9,6 +9,7 @@ from astropy.table import Table
 from click.testing import CliRunner
 
 from bfsensor.cli.main import main
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.reduced_channels import measure_reduced
 from bfsensor.diagnose.detect.candidate_screen import Rival
 from bfsensor.diagnose.diagnosis import diagnose_measured
@@ -32,7 +33,7 @@ from bfsensor.response.edge_response import area_matrix
 def recorded(name, *, seed, error=2.5e-9):
     """a_ij as a table of ours has them on 40,000 e-, with noise: those of the E2V recording's size."""
     baseline = baseline_of_table(name)
-    plane = baseline.areas_on((np.nan,) * 3, None, 40_000.0)
+    plane = baseline.areas_on(Condition(), None, 40_000.0)
     n = len(plane) // 2
     a = plane[n : n + 5, n : n + 5]
     rng = np.random.default_rng(seed)
@@ -85,7 +86,7 @@ def test_a_transposed_table_is_named_as_a_whole_exchange(name):
 
 def test_line_ends_at_the_other_table():
     line = with_operating_point("itl_sta3800c", "itl_sta3800c_60")
-    moved, _ = line.at((np.nan,) * 3, {BACK_BIAS: -10.0})
+    moved, _ = line.at(Condition(), {BACK_BIAS: -10.0})
     other = baseline_of_table("itl_sta3800c_60")
     np.testing.assert_allclose(
         area_matrix(*moved), area_matrix(*other.edges[other.reference]), atol=1e-16

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.data.exposures import Condition
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.model.baseline import read_edges
 from bfsensor.diagnose.model.flat_predictions import flat_covariances_of
 from bfsensor.diagnose.model.spot_predictions import grow_spots, predict_spots
@@ -93,14 +93,14 @@ def test_table_as_baseline_keeps_its_areas():
     change = table.area_changes(
         charge=middle + 100, background=middle, depth=float(table.depths[-1])
     ) / (100 * np.prod(table.pitch))
-    edges, held = baseline.at(Condition(480.0, np.nan, np.nan))
+    edges, held = baseline.at(Condition(wavelength=480.0))
     a = area_matrix(*edges)
     assert held and abs(a.sum()) < 1e-18
     n, r = len(a) // 2, table.reach
     np.testing.assert_allclose(
         a[n : n + 3, n : n + 3], change[r : r + 3, r : r + 3], rtol=4e-3
     )
-    red = area_matrix(*baseline.at(Condition(950.0, np.nan, np.nan))[0])
+    red = area_matrix(*baseline.at(Condition(wavelength=950.0))[0])
     assert abs(red[n, n]) < 0.97 * abs(a[n, n])
 
 
@@ -110,14 +110,20 @@ def test_edges_file_and_its_parameters(tmp_path):
     card.write_text(json.dumps({"spread_1sigma": {"thickness": 1.0, "h": 0.06}}))
     baseline = read_edges(path, card=card)
     assert set(baseline.parameters) == {"thickness", "h"}
-    plain, held = baseline.at(Condition(620.0, -60.0, 173.0))
+    plain, held = baseline.at(
+        Condition(wavelength=620.0, back_bias=-60.0, temperature=173.0)
+    )
     assert held
-    shifted, _ = baseline.at(Condition(620.0, -60.0, 173.0), {"h": 0.06})
+    shifted, _ = baseline.at(
+        Condition(wavelength=620.0, back_bias=-60.0, temperature=173.0), {"h": 0.06}
+    )
     truth = shifts_at({**CARD, "h": CARD["h"] + 0.06}, 620, -60)
     n = len(plain[0]) // 2
     a, b, c = (area_matrix(*e)[n, n] for e in (plain, shifted, (truth.kx, truth.ky)))
     assert b - a == pytest.approx(c - a, rel=0.02)
-    assert not baseline.at(Condition(620.0, -50.0, 173.0))[1]
+    assert not baseline.at(Condition(wavelength=620.0, back_bias=-50.0, temperature=173.0))[
+        1
+    ]
 
 
 @pytest.mark.parametrize(

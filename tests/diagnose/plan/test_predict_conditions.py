@@ -127,6 +127,18 @@ def test_errors_come_from_the_parameters_covariance(campaign, tmp_path):
         assert (np.abs(ratio - 1) < 0.2).all(), ratio
 
 
+def test_temperatures_are_asked_for_in_celsius():
+    one, other = read_conditions(["level=4e4,temperature=-80", "level=4e4"])
+    assert one.temperature == 193.15 and np.isnan(other.temperature)
+    baseline = virtual_baseline()
+    with pytest.raises(
+        DiagnosisError, match="back_bias=-10, temperature=-80: the baseline"
+    ):
+        refuse_unheld(
+            read_conditions(["level=4e4,back_bias=-10,temperature=-80"]), baseline
+        )
+
+
 def test_spots_of_other_fluxes_grow_as_recorded(campaign):
     """Predicted widths lie between those recorded at fluxes around them."""
     after = campaign[1]
@@ -137,7 +149,9 @@ def test_spots_of_other_fluxes_grow_as_recorded(campaign):
     like = next(c for c in after.fit.channels if c.word == "spot")
     x = like.axes
     own = (x["what"] == "sigma_y") & (x["wavelength"] == 620) & (x["back_bias"] == -60)
-    own &= x["temperature"] == -100
+    own &= x["temperature"] == 173.15
+    # What is written for the user is in deg C, as the campaign's headers are.
+    assert {r["temperature"] for r in told.rows()} == {-100.0}
     line = np.polyfit(x["flux"][own], like.values[own], 2)
     assert np.diff(width).min() > 0
     assert np.polyval(line, [2e5, 6e5, 1e6]) == pytest.approx(width, abs=2e-3)

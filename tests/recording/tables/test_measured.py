@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
+from bfsensor.device.condition import Condition
 from bfsensor.errors import RecordingError
-from bfsensor.recording.campaign.exposures import Condition
 from bfsensor.recording.tables.measured import read_measured
 from bfsensor.recording.tables.setting_tables import read_setting_table
 from tests.recording.tables.test_lsst_datasets import lsst_a, photon_transfer_table
