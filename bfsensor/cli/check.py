@@ -180,9 +180,9 @@ def _grouped(amplifiers: list[dict[str, Any]]) -> list[str]:
         names = members[0]["name"]
         names += f" to {members[-1]['name']}" if len(members) > 1 else ""
         gains = {f"{m['gain']:.3g}" for m in members if m["gain"] is not None}
-        said = (
-            f", gain {' '.join(sorted(gains))} e-/ADU by header" if gains else ", no gain"
-        )
+        said = ", no gain"
+        if gains:
+            said = f", gain {' '.join(sorted(gains))} e-/ADU by header or campaign.yaml"
         word = "amplifier" if len(members) == 1 else "amplifiers"
         lines.append(
             f"{len(members)} {word} ({names}): {nx} x {ny} pixels, prescan {before}, overscan "

@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from bfsensor.errors import MeasurementError
 from bfsensor.files import written_whole
 
+if TYPE_CHECKING:
+    from bfsensor.measure.flat_pairs import FlatCovariances
+    from bfsensor.recording.raw.images import AmplifierImage
+
 _FILES = click.argument(
     "files", nargs=-1, required=True, type=click.Path(path_type=Path, exists=True)
 )
-_GAIN = click.option("--gain", type=float, help="[e-/ADU]; by default from the header.")
+_GAIN = click.option(
+    "--gain", type=float,
+    help="[e-/ADU]; by default that of campaign.yaml or of the header, as check shows it.",
+)  # fmt: skip
 _OVERSCAN = click.option(
     "--overscan", default="row median", show_default=True,
-    type=click.Choice(["row median", "row mean", "median", "none"]), help="How it is taken off.",
+    type=click.Choice(["row median", "row mean", "median", "none"]),
+    help="Level of the overscan that is subtracted: of each row, or of all.",
 )  # fmt: skip
 _OUTPUT = click.option(
     "-o", "--output", type=click.Path(path_type=Path), help="ECSV to write."
@@ -28,7 +36,10 @@ _JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 @click.group()
 def measure() -> None:
-    """Measure spots or flats in FITS files: raw with overscan, or images in electrons."""
+    """Measure spots or flats in FITS files: raw with overscan, or images in electrons.
+
+    A campaign.yaml in the folder of a file is followed: its amplifiers, keywords and masks.
+    """
 
 
 @measure.command("spots")
@@ -68,18 +79,17 @@ def spots(
     """
     from bfsensor.measure.spot_fit import fit_spots
     from bfsensor.measure.spots import cut_stamps, find_spots
-    from bfsensor.recording.raw.fits_images import read_raw
 
     rows = []
+    gains: dict[str, dict[str, None]] = {}
     for path in files:
-        for amplifier in read_raw(
-            path, gain=gain, overscan=None if overscan == "none" else overscan
-        ):
+        for amplifier in _read(path, gain, overscan):
             if amplifier.unit != "electron":
                 raise MeasurementError(
-                    f"{path}: {amplifier.name}: no gain in the header, and slopes are against "
+                    f"{path}: {amplifier.name}: {amplifier.no_gain}, and slopes are against "
                     "electrons: give --gain"
                 )
+            gains.setdefault(amplifier.name, {})[_gain(amplifier)] = None
             found = find_spots(
                 amplifier.image, threshold=threshold, saturation=saturation,
                 separation=stamp, mask=amplifier.mask, stamp=stamp,
@@ -106,7 +116,34 @@ def spots(
                     "chi2_per_dof": fit.chi2 / fit.dof,
                 }
             )  # fmt: skip
-    _finish(rows, _slopes(rows), output, as_json)
+    _finish(rows, {**_gains(gains), **_slopes(rows)}, output, as_json)
+
+
+def _read(path: Path, gain: float | None, overscan: str) -> tuple[AmplifierImage, ...]:
+    """Read the amplifiers of a file, with what a campaign.yaml beside it says."""
+    from bfsensor.recording.campaign.settings import read_settings
+    from bfsensor.recording.raw.headers import scan_file
+    from bfsensor.recording.raw.images import read_images
+    from bfsensor.recording.raw.masks import read_masks
+
+    settings = read_settings(path.parent)
+    scan = scan_file(path, amplifiers=settings.amplifiers, overrides=settings.overrides)
+    return read_images(
+        scan, gain=gain, overscan=None if overscan == "none" else overscan,
+        masks=read_masks(path.parent, settings.masks, scan.amplifiers),
+    )  # fmt: skip
+
+
+def _gain(amplifier: AmplifierImage) -> str:
+    """Say which gain an amplifier was given, or why none."""
+    if amplifier.unit == "electron":
+        return f"{amplifier.gain:.6g} e-/ADU"
+    return f"not known ({amplifier.no_gain}), levels are in ADU"
+
+
+def _gains(found: Mapping[str, Mapping[str, None]]) -> dict[str, str]:
+    """Give a line for each amplifier; several gains where its files differ."""
+    return {f"{name} gain": ", ".join(words) for name, words in found.items()}
 
 
 def _slopes(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -156,57 +193,72 @@ def flats(
     Example:
       bfsensor measure flats flat_*.fits --gain 4.8 -o covariances.ecsv
     """
-    from bfsensor.measure.covariance_fit import fit_covariances
-    from bfsensor.measure.curve import CovarianceCurve
-    from bfsensor.measure.flat_pairs import flat_covariances
-    from bfsensor.recording.raw.fits_images import read_raw
-
     if len(files) % 2:
         raise MeasurementError(f"{len(files)} files do not make pairs")
-    pairs: dict[str, list[Any]] = {}
+    pairs: dict[str, list[FlatCovariances]] = {}
+    gains: dict[str, dict[str, None]] = {}
     rows = []
     for first, second in zip(files[::2], files[1::2], strict=True):
-        both = [
-            {a.name: a for a in read_raw(
-                path, gain=gain, overscan=None if overscan == "none" else overscan
-            )}
-            for path in (first, second)
-        ]  # fmt: skip
-        if set(both[0]) != set(both[1]):
+        one, other = (
+            {a.name: a for a in _read(path, gain, overscan)} for path in (first, second)
+        )
+        if set(one) != set(other):
             raise MeasurementError(
-                f"{first} and {second} hold different amplifiers: {sorted(both[0])} and "
-                f"{sorted(both[1])}"
+                f"{first} and {second} hold different amplifiers: {sorted(one)} and "
+                f"{sorted(other)}"
             )
-        for name, one in both[0].items():
-            other = both[1][name]
-            if one.image.shape != other.image.shape or one.unit != other.unit:
-                raise MeasurementError(
-                    f"{first} and {second}: {name}: {one.image.shape} pixels in {one.unit} and "
-                    f"{other.image.shape} in {other.unit} are no pair"
-                )
+        for name in one:
+            for amplifier in (one[name], other[name]):
+                gains.setdefault(name, {})[_gain(amplifier)] = None
             try:
-                pair = flat_covariances(
-                    one.image, other.image, mask=one.mask | other.mask, lags=lags,
-                    unit=one.unit, region=name,
-                )  # fmt: skip
+                pair = _measure_pair(one[name], other[name], lags)
             except MeasurementError as error:
                 raise MeasurementError(f"{first} and {second}: {name}: {error}") from None
             pairs.setdefault(name, []).append(pair)
-            for j in range(lags + 1):
-                for i in range(lags + 1):
-                    rows.append(
-                        {
-                            "first": str(first), "second": str(second), "amplifier": name,
-                            "unit": one.unit, "level": pair.level, "lag_x": i, "lag_y": j,
-                            "covariance": float(pair.covariances[j, i]),
-                            "error": float(pair.errors[j, i]),
-                        }
-                    )  # fmt: skip
-    summary: dict[str, Any] = {}
+            of = {"first": str(first), "second": str(second), "amplifier": name}
+            rows += [{**of, **row} for row in _covariance_rows(pair)]
+    _finish(rows, {**_gains(gains), **_covariances(pairs, fit)}, output, as_json)
+
+
+def _measure_pair(one: AmplifierImage, other: AmplifierImage, lags: int) -> FlatCovariances:
+    """Measure the covariances of an amplifier in two flats."""
+    from bfsensor.measure.flat_pairs import flat_covariances
+
+    if one.image.shape != other.image.shape or one.unit != other.unit:
+        raise MeasurementError(
+            f"{one.image.shape} pixels in {one.unit} and {other.image.shape} in {other.unit} "
+            "are no pair"
+        )
+    return flat_covariances(
+        one.image, other.image, mask=one.mask | other.mask, lags=lags, unit=one.unit,
+        region=one.name,
+    )  # fmt: skip
+
+
+def _covariance_rows(pair: FlatCovariances) -> list[dict[str, Any]]:
+    """Give a row for each lag of a pair."""
+    return [
+        {
+            "unit": pair.unit, "level": pair.level, "lag_x": i, "lag_y": j,
+            "covariance": float(pair.covariances[j, i]), "error": float(pair.errors[j, i]),
+        }
+        for j in range(pair.covariances.shape[0])
+        for i in range(pair.covariances.shape[1])
+    ]  # fmt: skip
+
+
+def _covariances(
+    pairs: Mapping[str, Sequence[FlatCovariances]], fit: bool | None
+) -> dict[str, str]:
+    """Give a line for each pair of each amplifier, and its fit where there are enough."""
+    from bfsensor.measure.covariance_fit import fit_covariances
+    from bfsensor.measure.curve import CovarianceCurve
+
+    out = {}
     for name, found in pairs.items():
         for measured in sorted(found, key=lambda p: p.level):
             c, e = measured.covariances, measured.errors
-            summary[f"{name} at {measured.level:.0f} {measured.unit}"] = (
+            out[f"{name} at {measured.level:.0f} {measured.unit}"] = (
                 f"C00 {c[0, 0]:.1f} +- {e[0, 0]:.1f}, C10/C00 {c[0, 1] / c[0, 0]:.5f} +- "
                 f"{e[0, 1] / c[0, 0]:.5f}, C01/C00 {c[1, 0] / c[0, 0]:.5f} +- "
                 f"{e[1, 0] / c[0, 0]:.5f}"
@@ -214,12 +266,12 @@ def flats(
         if fit or (fit is None and len(found) >= 6):
             result = fit_covariances(CovarianceCurve.from_pairs(found))
             a, da = result.a, result.a_errors
-            summary[f"{name} fit"] = (
+            out[f"{name} fit"] = (
                 f"a00 {a[0, 0]:.3e} +- {da[0, 0]:.1e}, a10 {a[0, 1]:.3e} +- {da[0, 1]:.1e}, a01 "
                 f"{a[1, 0]:.3e} +- {da[1, 0]:.1e} per electron, gain {result.gain:.4f} +- "
                 f"{result.gain_error:.4f}, chi2 {result.chi2:.1f} of {result.dof}"
             )
-    _finish(rows, summary, output, as_json)
+    return out
 
 
 def _finish(

@@ -3,7 +3,9 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+from astropy.io import fits
 from astropy.table import Table
 from click.testing import CliRunner
 
@@ -63,8 +65,6 @@ def test_questions_close_when_recordings_answer_them(campaign):
     table["wavelength"][-2:] = 950.0
     table.write(campaign / "manifest.ecsv", overwrite=True)
     for name in table["file"][-2:]:
-        from astropy.io import fits
-
         with fits.open(campaign / name, mode="update") as hdus:
             hdus[0].header["MONOWL"] = 950.0
     after = {one.question for one in open_questions(read_campaign(campaign))}
@@ -115,6 +115,51 @@ def test_recordings_of_a_camera_without_keywords(run):
     assert any("from their names only" in text for text in said)
     # The illumination changed by 13 % between the first two of bergeson's equal flats.
     assert any("unequal levels" in text for text in said) == (run == "bergeson")
+
+
+@pytest.mark.parametrize(
+    ("own", "primary", "settings", "gain"),
+    [
+        # As the practice campaigns and LSST's test stands have it.
+        ({}, {"CCDGAIN": 2.2}, "", 2.2),
+        # A nominal gain for all, a measured one for the amplifier.
+        ({"GAIN": 2.1}, {"CCDGAIN": 2.2}, "", 2.1),
+        ({"GAIN": 100, "EGAIN": 0.25}, {}, "", 0.25),
+        ({"GAIN": True}, {"GAIN": 1.5}, "", 1.5),
+        ({"GAIN": "1.6"}, {}, "", 1.6),
+        ({"GAIN": 1.5}, {}, "keywords: {gain: {value: 1.7}}", 1.7),
+        ({}, {"MINE": 1.8}, "keywords: {gain: MINE}", 1.8),
+        ({"GAIN": 1.5}, {}, "amplifiers: [{name: A, gain: 1.9}]", 1.9),
+        ({"GAIN": 0}, {}, "", None),
+        ({"GAIN": 2e4}, {}, "", None),
+        ({"GAIN": "HIGH"}, {}, "", None),
+    ],
+)
+def test_the_gain_that_check_reports_is_the_one_that_measure_applies(
+    tmp_path, own, primary, settings, gain
+):
+    rng = np.random.default_rng(8611)
+    sections = {"DATASEC": "[1:40,1:40]", "BIASSEC": "[41:60,1:40]"}
+    files = [tmp_path / f"{n}.fits" for n in range(2)]
+    for path in files:
+        data = np.round(1000 + 2 * rng.standard_normal((40, 60)))
+        data[:, :40] += rng.poisson(5000, (40, 40))
+        kind = fits.Header({"IMGTYPE": "FLAT", "EXPTIME": 1.0, **primary})
+        image = fits.ImageHDU(
+            data.astype(np.uint16), fits.Header({**sections, **own}), name="A"
+        )
+        fits.HDUList([fits.PrimaryHDU(header=kind), image]).writeto(path)
+    if settings:
+        (tmp_path / "campaign.yaml").write_text(settings)
+    (amplifier,) = json.loads(check(tmp_path, "--json").stdout)["amplifiers"]
+    assert amplifier["gain"] == gain
+    command = ["measure", "flats", *map(str, files), "--lags", "1", "--json"]
+    found = json.loads(CliRunner().invoke(main, command).stdout)
+    applied = found["summary"]["A gain"]
+    assert applied.startswith("not known (" if gain is None else f"{gain} e-/ADU")
+    # Shot noise of 1600 pixels and the biases of clipping are far below 1 %.
+    assert found["rows"][0]["level"] == pytest.approx(5000 * (gain or 1.0), rel=0.01)
+    assert found["rows"][0]["unit"] == ("adu" if gain is None else "electron")
 
 
 def test_help_shows_an_example():

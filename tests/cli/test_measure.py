@@ -113,6 +113,43 @@ def test_spots_ask_for_the_gain(tmp_path):
         del hdus[1].header["GAIN"]
     result = invoke("spots", path, "--threshold", 10)
     assert result.exit_code == 1 and "give --gain" in result.output
+    with fits.open(path, mode="update") as hdus:
+        hdus[1].header["GAIN"] = 0
+    result = invoke("spots", path, "--threshold", 10)
+    assert result.exit_code == 1
+    assert "GAIN = 0 cannot be meant (gain: 0.0001 to 10000 e-/ADU)" in result.output
+
+
+def test_a_campaign_yaml_beside_the_files_is_followed(tmp_path):
+    """Two amplifiers in one image, one of them masked in part."""
+    rng = np.random.default_rng(8612)
+    files = [tmp_path / f"{n}.fits" for n in range(2)]
+    for path in files:
+        adu = np.full((60, 120), 1000.0)
+        adu[:, :50] += rng.poisson(3000, (60, 50))
+        adu[:, 50:100] += rng.poisson(6000, (60, 50))
+        adu[:30, 50:100] = 9000.0
+        fits.PrimaryHDU(adu.astype(np.uint16)).writeto(path)
+    (tmp_path / "campaign.yaml").write_text(
+        "amplifiers:\n"
+        "- {name: L, data: '[1:50,1:60]', bias: '[101:120,1:60]', detector: '[1:50,1:60]',"
+        " gain: 2}\n"
+        "- {name: R, data: '[51:100,1:60]', bias: '[101:120,1:60]', detector: '[51:100,1:60]',"
+        " gain: 3}\n"
+        "masks: ['[51:100,1:30]']\n"
+    )
+    result = invoke("flats", *files, "--lags", 1, "--json")
+    found = json.loads(result.stdout)
+    assert [found["summary"][f"{name} gain"] for name in "LR"] == ["2 e-/ADU", "3 e-/ADU"]
+    levels = {row["amplifier"]: row["level"] for row in found["rows"]}
+    # Shot noise of 1500 pixels is 0.03 %.
+    assert levels == {
+        "L": pytest.approx(6000, rel=2e-3),
+        "R": pytest.approx(18000, rel=2e-3),
+    }
+    (tmp_path / "campaign.yaml").write_text("masks: ['[1:9]']")
+    result = invoke("flats", *files)
+    assert result.exit_code == 1 and "masks = '[1:9]' is not like" in result.output
 
 
 def test_help_shows_examples():

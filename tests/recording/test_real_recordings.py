@@ -13,7 +13,9 @@ import pytest
 
 from bfsensor.measure.bartlett import image_weights
 from bfsensor.measure.flat_pairs import flat_covariances
-from bfsensor.recording.raw.fits_images import read_bias, read_raw
+from bfsensor.recording.raw.headers import scan_file
+from bfsensor.recording.raw.images import read_images
+from bfsensor.recording.raw.keywords import translate
 from bfsensor.recording.tables.lsst_datasets import BrighterFatterKernel
 
 SHARED = Path(__file__).parents[2].parent / "shared" / "recordings"
@@ -25,19 +27,22 @@ BERGESON = SHARED / "sbig_flats" / "bergeson"
 INSIDE = np.s_[16:-16, 16:-16]
 
 
+def read_adu(path):
+    (frame,) = read_images(scan_file(path), overscan=None, gain=1.0)
+    return frame.image
+
+
 def measure_pair(first, second, bias, **options):
-    images = [
-        read_raw(p, overscan=None, bias=bias, gain=1.0)[0].image[INSIDE]
-        for p in (first, second)
-    ]
+    images = [(read_adu(p) - bias)[INSIDE] for p in (first, second)]
     return flat_covariances(*images, lags=4, box=64, unit="adu", **options)
 
 
 def test_sbig_headers():
-    (frame,) = read_raw(LANGFORD / "slitview.00000357.FLAT.FIT", overscan=None)
+    scan = scan_file(LANGFORD / "slitview.00000357.FLAT.FIT")
+    (frame,) = read_images(scan, overscan=None)
     assert frame.image.shape == (495, 657)
-    assert (frame.gain, frame.exposure_time) == (0.46, 6.0)
-    assert frame.conditions["TEMPERAT"] == pytest.approx(-5.232156846)
+    assert (frame.gain, translate(scan.cards)[0]["exposure_time"]) == (0.46, 6.0)
+    assert scan.cards["TEMPERAT"] == pytest.approx(-5.232156846)
     assert not frame.mask.any()
 
 
@@ -55,7 +60,7 @@ def test_sbig_equal_exposures_correlate_along_the_readout(folder, names, sign):
     variance; the error of one pair, 1 / sqrt(N), is used.
     """
     biases = sorted(folder.glob("*bias*")) or sorted(folder.glob("*BIAS*"))
-    bias = read_bias(biases, overscan=None)
+    bias = np.mean([read_adu(path) for path in biases], axis=0)
     found = [
         measure_pair(folder / names[a], folder / names[b], bias)
         for a, b in ((0, 1), (0, 2), (1, 2))
@@ -75,10 +80,7 @@ def test_sbig_equal_exposures_correlate_along_the_readout(folder, names, sign):
 
 def test_sbig_biases():
     """Two independent reductions of the same frames: the README's table and this code."""
-    frames = [
-        read_raw(p, overscan=None, gain=1.0)[0].image[INSIDE]
-        for p in sorted(LANGFORD.glob("*BIAS*"))
-    ]
+    frames = [read_adu(p)[INSIDE] for p in sorted(LANGFORD.glob("*BIAS*"))]
     found = [flat_covariances(a, b, lags=2, unit="adu") for a, b in pairwise(frames)]
     serial = np.mean([one.correlations[0, 1] for one in found])
     variance = np.mean([one.covariances[0, 0] for one in found])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from bfsensor.errors import RecordingError
 from bfsensor.recording.campaign.campaign import Campaign
 from bfsensor.recording.campaign.exposures import Exposure
-from bfsensor.recording.raw.headers import BROKEN
-from bfsensor.recording.raw.open_fits import open_fits
+from bfsensor.recording.raw.pixels import read_pixels
 from bfsensor.recording.raw.sections import AmplifierLayout, to_sensor
 
 
@@ -125,34 +123,21 @@ def read_exposure(campaign: Campaign, exposure: Exposure) -> tuple[AmplifierFram
 
     Notes
     -----
-    Saturated is what reaches the saturation of header or campaign.yaml, or the end of an
-    8 or 16 bit converter's range.  Files are opened, read extension by extension, and
-    closed: no more than one exposure is held, as float32 and a byte of mask for each pixel.
+    Files are opened, read extension by extension, and closed
+    (:func:`bfsensor.recording.raw.pixels.read_pixels`): no more than one exposure is held, as
+    float32 and a byte of mask for each pixel.
     """
-    masks = campaign.masks
-    frames: list[AmplifierFrame] = []
-    stored: NDArray[Any] | None = None
-    opened = -1
-    try:
-        with open_fits(exposure.path) as hdus:
-            for layout in campaign.amplifiers:
-                if layout.hdu != opened:
-                    if opened >= 0:
-                        del hdus[opened].data  # several amplifiers may share an image
-                    stored, opened = np.asarray(hdus[layout.hdu].data), layout.hdu
-                if stored is None or stored.shape != layout.stored:
-                    shape = None if stored is None else stored.shape
-                    raise RecordingError(
-                        f"{exposure.path}: {layout.name} has the shape {shape}, not "
-                        f"{layout.stored}"
-                    )
-                frames.append(_frame(exposure, layout, stored, masks.get(layout.name)))
-    except RecordingError:
-        raise
-    except BROKEN as error:
-        line = " ".join(str(error).split())[:200]
-        raise RecordingError(f"{exposure.path}: cannot be read: {line}") from None
-    return tuple(frames)
+    return tuple(
+        AmplifierFrame(
+            name=one.layout.name,
+            pixels=one.values,
+            bad=one.bad,
+            layout=one.layout,
+            saturation=one.saturation,
+            exposure=exposure.number,
+        )
+        for one in read_pixels(exposure.path, campaign.amplifiers, campaign.masks)
+    )
 
 
 def assemble(
@@ -203,24 +188,3 @@ def assemble(
         filled[place] = True
         out[place] = to_sensor(one.layout, image)
     return out
-
-
-def _frame(
-    exposure: Exposure, layout: AmplifierLayout, stored: NDArray[Any],
-    mask: NDArray[np.bool_] | None,
-) -> AmplifierFrame:  # fmt: skip
-    """Cut one amplifier out of a stored image, in readout order."""
-    raw = stored[layout.window]
-    raw = raw[:: -1 if layout.stored_flip_y else 1, :: -1 if layout.stored_flip_x else 1]
-    limit = np.inf if layout.saturation is None else layout.saturation
-    if raw.dtype.kind in "iu" and raw.dtype.itemsize <= 2:
-        limit = min(limit, float(np.iinfo(raw.dtype).max))
-    pixels = np.ascontiguousarray(raw, dtype=np.float32)
-    bad = np.zeros(pixels.shape, bool)
-    if np.isfinite(limit):
-        np.greater_equal(pixels, np.float32(limit), out=bad)
-    if raw.dtype.kind == "f":
-        bad |= ~np.isfinite(pixels)
-    if mask is not None:
-        bad[layout.data] |= mask
-    return AmplifierFrame(layout.name, pixels, bad, layout, limit, exposure.number)

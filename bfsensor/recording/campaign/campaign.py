@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from bfsensor.device.condition import Condition
 from bfsensor.errors import RecordingError
 from bfsensor.recording.campaign.consistency import (
+    check_gains,
     check_keywords,
     check_layout,
     check_pairs,
@@ -283,6 +284,7 @@ def read_campaign(
         )
     warnings += [Caution("settings", text) for text in settings.remarks]
     warnings += check_layout(amplifiers)
+    warnings += check_gains(amplifiers, entries)
     warnings += check_keywords(exposures, entries)
     warnings += check_units(exposures)
     warnings += check_pairs(exposures)

@@ -12,6 +12,7 @@ from bfsensor.recording.campaign.exposures import (
     LIT,
     Caution,
     Exposure,
+    count_of,
     group_conditions,
     named,
 )
@@ -124,6 +125,13 @@ def check_layout(amplifiers: Sequence[AmplifierLayout]) -> list[Caution]:
         found.append(
             Caution("layout", "no DETSEC", "position maps across amplifiers cannot be made")
         )
+    found += [
+        Caution(
+            "overscan", f"{one.name}: {one.bias_problem}", "its level is not subtracted"
+        )
+        for one in amplifiers
+        if one.bias_problem
+    ]
     above = [one for one in amplifiers if one.bias is not None and _bias_above(one)]
     if above:
         found.append(
@@ -146,6 +154,34 @@ def check_layout(amplifiers: Sequence[AmplifierLayout]) -> list[Caution]:
                 f"{before[0]}: BIASSEC lies before DATASEC: taken as prescan (if the file holds "
                 "the rows backwards, say so with a reversed 'data' in campaign.yaml)",
                 "prescan carries no deferred charge",
+            )
+        )
+    return found
+
+
+def check_gains(
+    amplifiers: Sequence[AmplifierLayout], entries: Sequence[Entry]
+) -> list[Caution]:
+    """Name the amplifiers whose gain is not the same in all headers; one is taken for all."""
+    found = []
+    scans = [one.scan for one in entries if not one.reason and one.scan is not None]
+    for layout in amplifiers:
+        gains = Counter(
+            one.gain for scan in scans for one in scan.amplifiers if one.name == layout.name
+        )
+        if len(gains) < 2:
+            continue
+        words = ", ".join(
+            f"{'none' if gain is None else f'{gain:.4g}'} in {count_of(count, 'file')}"
+            for gain, count in gains.most_common()
+        )
+        taken = "none" if layout.gain is None else f"{layout.gain:.4g} e-/ADU"
+        found.append(
+            Caution(
+                "gain",
+                f"{layout.name}: headers give different gains [e-/ADU]: {words}; {taken} is taken "
+                "for all",
+                "everything per electron is wrong by the ratio in the other files",
             )
         )
     return found

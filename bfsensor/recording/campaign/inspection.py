@@ -27,14 +27,11 @@ from bfsensor.recording.campaign.level_checks import (
     check_pedestals,
     check_saturation,
 )
-from bfsensor.recording.raw.fits_sections import MAD_TO_SIGMA
+from bfsensor.recording.raw.overscan import MAD_TO_SIGMA, find_overscan, mean_and_scatter
 
 BOX = 256
 """Side of the box in the middle of each amplifier from which levels and variances come: a
 pair's variance has an error of 0.6 % there."""
-
-SKIP = 2
-"""Overscan columns left out of its level: deferred charge comes out in them."""
 
 MOST_NAN = 0.1
 """Share of pixels that are not finite above which an exposure is set aside."""
@@ -162,11 +159,12 @@ def _statistics(frame: AmplifierFrame) -> FrameStatistics:
     finite = np.isfinite(image)
     share = 1.0 - float(np.count_nonzero(finite)) / image.size
     top = float(np.max(image, where=finite, initial=-np.inf))
-    over = frame.serial_overscan[:, SKIP:]
+    place = find_overscan(frame.layout)
+    over = frame.pixels[:0] if place is None else frame.pixels[place]
     over = over[np.isfinite(over)] if over.shape[1] > 2 else over[:0]
-    pedestal, noise = _mean_and_scatter(over)
+    pedestal, noise = mean_and_scatter(over)
     box = _box(frame)
-    raw, _ = _mean_and_scatter(box[np.isfinite(box)])
+    raw, _ = mean_and_scatter(box[np.isfinite(box)])
     return FrameStatistics(
         exposure=frame.exposure,
         amplifier=frame.name,
@@ -177,19 +175,6 @@ def _statistics(frame: AmplifierFrame) -> FrameStatistics:
         saturated=float(np.count_nonzero(image >= frame.saturation)) / image.size,
         top=float(np.count_nonzero(image == top)) / image.size,
     )
-
-
-def _mean_and_scatter(values: NDArray[np.float32]) -> tuple[float, float]:
-    """Mean and standard deviation of what lies within 5 sigma of the median.
-
-    Medians of whole numbers would be whole numbers.
-    """
-    if not values.size:
-        return float("nan"), float("nan")
-    middle = float(np.median(values))
-    sigma = MAD_TO_SIGMA * float(np.median(np.abs(values - middle)))
-    kept = values[np.abs(values - middle) <= 5 * max(sigma, 0.5)].astype(np.float64)
-    return float(kept.mean()), float(kept.std())
 
 
 def _box(frame: AmplifierFrame) -> NDArray[np.float32]:

@@ -35,35 +35,11 @@ def check_saturation(
     campaign: Campaign, frames: Sequence[FrameStatistics], pairs: Sequence[PairStatistics]
 ) -> list[Caution]:
     """Name pairs whose variance falls, and frames with many pixels at one highest value."""
-    found = []
-    collapsed: dict[str, list[PairStatistics]] = {}
-    same = _conditions(campaign)
-    for mine in _by_amplifier(pairs, same):
-        rising = sorted((p for p in mine if p.pixels), key=lambda p: p.level)
-        most, error = 0.0, 0.0
-        for pair in rising:
-            sigma = pair.variance * np.sqrt(2.0 / pair.pixels)
-            if pair.variance < COLLAPSE * most and most - pair.variance > 5 * np.hypot(
-                sigma, error
-            ):
-                collapsed.setdefault(pair.amplifier, []).append(pair)
-            elif pair.variance > most:
-                most, error = pair.variance, sigma
-    for name, wrong in collapsed.items():
-        lowest = min(wrong, key=lambda p: p.level)
-        found.append(
-            Caution(
-                "saturation",
-                f"{name}: the variance of {count_of(len(wrong), 'pair')} is below that of lower levels, "
-                f"from {lowest.level:.0f} ADU on: saturated",
-                "leave them out of covariances; they give the full well",
-                tuple(n for p in wrong for n in (p.first, p.second)),
-            )
-        )
     flats = {one.number: one for one in campaign.of("flat")}
-    full = sorted(
-        {f.exposure for f in frames if f.exposure in flats and f.saturated > 0.01}
-    )
+    lit = [f for f in frames if f.exposure in flats]
+    full = sorted({f.exposure for f in lit if f.saturated > 0.01})
+    heaped = sorted({f.exposure for f in lit if f.top > 0.01 and f.saturated < f.top / 2})
+    found = _check_collapse(campaign, pairs)
     if full:
         found.append(
             Caution(
@@ -74,13 +50,6 @@ def check_saturation(
                 tuple(full),
             )
         )
-    heaped = sorted(
-        {
-            f.exposure
-            for f in frames
-            if f.exposure in flats and f.top > 0.01 and f.saturated < f.top / 2
-        }
-    )
     if heaped:
         found.append(
             Caution(
@@ -90,6 +59,35 @@ def check_saturation(
                 "keywords: {saturation: {value: ADU}}",
                 "saturated pixels are not masked",
                 tuple(heaped),
+            )
+        )
+    return found
+
+
+def _check_collapse(campaign: Campaign, pairs: Sequence[PairStatistics]) -> list[Caution]:
+    """Name the pairs of each amplifier whose variance is below that of lower levels."""
+    collapsed: dict[str, list[PairStatistics]] = {}
+    for mine in _by_amplifier(pairs, _conditions(campaign)):
+        rising = sorted((p for p in mine if p.pixels), key=lambda p: p.level)
+        most, error = 0.0, 0.0
+        for pair in rising:
+            sigma = pair.variance * np.sqrt(2.0 / pair.pixels)
+            if pair.variance < COLLAPSE * most and most - pair.variance > 5 * np.hypot(
+                sigma, error
+            ):
+                collapsed.setdefault(pair.amplifier, []).append(pair)
+            elif pair.variance > most:
+                most, error = pair.variance, sigma
+    found = []
+    for name, wrong in collapsed.items():
+        lowest = min(wrong, key=lambda p: p.level)
+        found.append(
+            Caution(
+                "saturation",
+                f"{name}: the variance of {count_of(len(wrong), 'pair')} is below that of lower levels, "
+                f"from {lowest.level:.0f} ADU on: saturated",
+                "leave them out of covariances; they give the full well",
+                tuple(n for p in wrong for n in (p.first, p.second)),
             )
         )
     return found

@@ -196,7 +196,7 @@ def _read_entry(one: Entry, settings: CampaignSettings) -> None:
             one.path, amplifiers=settings.amplifiers or None, overrides=settings.overrides
         )
     except RecordingError as error:
-        one.reason = str(error)
+        one.reason = str(error).removeprefix(f"{one.path}: ")
         return
     one.scan = scan
     sha = row.get("sha256")
@@ -223,7 +223,8 @@ def _read_entry(one: Entry, settings: CampaignSettings) -> None:
             )
     one.said = {**said, "pair": row.get("pair"), "sha256": sha}
     one.disagree = tuple(disagree)
-    one.problems = (*problems, *row.get("problems", ()))
+    own = dict.fromkeys(text for wrong in scan.problems for text in wrong.values())
+    one.problems = (*problems, *own, *row.get("problems", ()))
     if one.said["kind"] is None:
         one.said["kind"] = kind_in_name(one.path.name)
         one.kind_from_name = one.said["kind"] is not None

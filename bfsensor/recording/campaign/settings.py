@@ -11,8 +11,8 @@ from typing import Any
 import yaml
 
 from bfsensor.errors import RecordingError
-from bfsensor.recording.raw.headers import AMPLIFIER_ENTRIES
-from bfsensor.recording.raw.keywords import Override, parse_overrides
+from bfsensor.recording.raw.headers import SECTION_ENTRIES
+from bfsensor.recording.raw.keywords import AMPLIFIER_UNITS, Override, parse_overrides
 
 SCHEMA = "bfsensor-campaign-1"
 NAME = "campaign.yaml"
@@ -199,7 +199,7 @@ def _excluded(path: Path, given: Mapping[str, Any]) -> dict[str, str]:
 
 def _amplifiers(path: Path, given: Any) -> tuple[Mapping[str, Any], ...]:
     """Check the list of amplifiers; their sections are checked with the files."""
-    allowed = {"name", "hdu", *AMPLIFIER_ENTRIES}
+    allowed = {"name", "hdu", *SECTION_ENTRIES, *AMPLIFIER_UNITS}
     if given is None:
         return ()
     if not isinstance(given, list) or not given:

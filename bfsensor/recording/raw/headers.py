@@ -5,34 +5,33 @@ from __future__ import annotations
 import gzip
 import hashlib
 import os
-import warnings
-import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy.io import fits
-from astropy.utils.exceptions import AstropyUserWarning
 from scipy.integrate import trapezoid
 
 from bfsensor.errors import RecordingError
-from bfsensor.recording.raw.fits_images import header_cards
-from bfsensor.recording.raw.keywords import Override, header_units, quantity
+from bfsensor.recording.raw.keywords import (
+    AMPLIFIER_UNITS,
+    Override,
+    amplifier_quantity,
+    header_units,
+)
+from bfsensor.recording.raw.open_fits import open_fits
 from bfsensor.recording.raw.sections import AmplifierLayout, layout_of
 
 SUFFIXES = (".fits", ".fit", ".fts", ".fits.fz", ".fits.gz", ".fit.gz")
-BROKEN = (
-    OSError, EOFError, ValueError, TypeError, LookupError, zlib.error, fits.VerifyError,
-)  # fmt: skip
-"""What astropy may raise on a damaged file."""
-
-AMPLIFIER_ENTRIES = {
+SECTION_ENTRIES = {
     "window": "WINDOW", "data": "DATASEC", "bias": "BIASSEC", "detector": "DETSEC",
-    "gain": "CCDGAIN", "noise": "CCDNOISE", "saturation": "SATURATE",
 }  # fmt: skip
-"""What campaign.yaml may say of an amplifier, beside name and hdu, and the card it stands for."""
+"""Sections that campaign.yaml may give for an amplifier, and the card that each stands for."""
+
+SHARED_SECTIONS = ("DATASEC", "BIASSEC", "CCDSUM")
+"""Cards that all amplifiers may have in common; a place on the sensor is each one's own."""
 
 CONDITION_TABLES = ("TEST_COND", "CCD_COND")
 _SAMPLE = 1 << 15
@@ -58,6 +57,8 @@ class FileScan:
         Digest of parts of the data, equal for equal data.
     own : tuple of mappings
         Cards of the extensions, in the order of ``amplifiers``.
+    problems : tuple of mappings
+        What is wrong with the gain, noise or saturation of each amplifier, by those words.
     spans : tuple of (int, int)
         Where data begin in the file, and their length [byte].
     """
@@ -69,6 +70,7 @@ class FileScan:
     lamp: float | None = None
     sample: str = ""
     own: tuple[Mapping[str, Any], ...] = field(default=(), repr=False)
+    problems: tuple[Mapping[str, str], ...] = ()
     spans: tuple[tuple[int, int], ...] = field(default=(), repr=False)
 
 
@@ -83,8 +85,18 @@ def is_fits(path: str | os.PathLike[str]) -> bool:
     return str(path).lower().endswith(SUFFIXES)
 
 
+def header_cards(header: fits.Header) -> dict[str, Any]:
+    """Cards with a value, by keyword; comments and history are left out."""
+    skipped = ("COMMENT", "HISTORY", "", "SIMPLE", "XTENSION", "BITPIX", "BSCALE", "BZERO")
+    return {
+        card.keyword: card.value
+        for card in header.cards
+        if card.keyword not in skipped and not isinstance(card.value, fits.card.Undefined)
+    }
+
+
 def scan_file(
-    path: Path,
+    path: str | os.PathLike[str],
     *,
     amplifiers: Sequence[Mapping[str, Any]] | None = None,
     overrides: Mapping[str, Override] | None = None,
@@ -93,7 +105,7 @@ def scan_file(
 
     Parameters
     ----------
-    path : Path
+    path : path-like
         Raw FITS: one extension for each amplifier or one image, plain or tile-compressed.
     amplifiers : sequence of mappings, optional
         What campaign.yaml says of each amplifier, before the headers.
@@ -104,24 +116,14 @@ def scan_file(
     ------
     RecordingError
         The file is truncated, damaged, holds no image or sections that leave it; names
-        the extension, not the file.
+        file and extension.
     """
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("ignore")
-        warnings.simplefilter("always", AstropyUserWarning)
+    path = Path(path)
+    with open_fits(path, as_stored=True) as hdus:
         try:
-            # A tile-compressed image is the table it is stored as: five times faster.
-            with fits.open(path, memmap=False, disable_image_compression=True) as hdus:
-                found = _scan(path, hdus, amplifiers, overrides or {})
-        except RecordingError:
-            raise
-        except BROKEN as error:
-            raise RecordingError(f"cannot be read: {_one_line(error)}") from None
-    for warning in caught:
-        text = _one_line(warning.message)
-        if any(word in text for word in ("truncated", "corrupted", "validating header")):
-            raise RecordingError(f"is truncated or damaged: {text}")
-    return found
+            return _scan(path, hdus, amplifiers, overrides or {})
+        except RecordingError as error:
+            raise RecordingError(f"{path}: {error}") from None
 
 
 def _scan(
@@ -151,24 +153,33 @@ def _scan(
         raise RecordingError(f"is truncated: {size} bytes of {sum(spans[-1])}")
     if not images:
         raise RecordingError("holds no two-dimensional image")
-    found = _given_layouts(images, given) if given else _layouts(images)
-    layouts = tuple(
-        replace(layout, **{
-            name: quantity(name, {**cards, **own}, overrides)
-            for name in ("gain", "noise", "saturation")
-        })
-        for layout, own in found
-    )  # fmt: skip
+    # A primary header without an image speaks for all extensions.
+    shared = {} if 0 in images else {card: cards.get(card) for card in SHARED_SECTIONS}
+    layouts, problems = [], []
+    for layout, own, stated in _layouts(images, given, shared):
+        found = {
+            word: amplifier_quantity(
+                word, own, cards, stated=stated.get(word), overrides=overrides
+            )
+            for word in AMPLIFIER_UNITS
+        }
+        layouts.append(
+            replace(
+                layout, gain=found["gain"][0], noise=found["noise"][0],
+                saturation=found["saturation"][0],
+            )
+        )  # fmt: skip
+        problems.append({word: wrong for word, (_, wrong) in found.items() if wrong})
     return FileScan(
-        path, cards, units, layouts, lamp, _digest(path, tuple(spans), whole=False),
-        tuple(own for _, own in found), tuple(spans),
+        path, cards, units, tuple(layouts), lamp, _digest(path, tuple(spans), whole=False),
+        tuple(images[layout.hdu][2] for layout in layouts), tuple(problems), tuple(spans),
     )  # fmt: skip
 
 
 def _image_shape(header: fits.Header) -> tuple[int, int] | None:
     """Shape of a two-dimensional image, compressed ones as they will come out."""
     z = "Z" if header.get("ZIMAGE") else ""
-    table = str(header.get("XTENSION", "")).strip() == "BINTABLE"
+    table = str(header.get("XTENSION", "IMAGE")).strip() != "IMAGE"
     if (table and not z) or header.get(f"{z}NAXIS", 0) != 2:
         return None
     return int(header[f"{z}NAXIS2"]), int(header[f"{z}NAXIS1"])
@@ -176,24 +187,17 @@ def _image_shape(header: fits.Header) -> tuple[int, int] | None:
 
 def _layouts(
     images: Mapping[int, tuple[str, tuple[int, int], dict[str, Any]]],
-) -> list[tuple[AmplifierLayout, dict[str, Any]]]:
-    """Amplifiers as the headers have them, with their cards."""
+    given: Sequence[Mapping[str, Any]] | None,
+    shared: Mapping[str, Any],
+) -> Iterator[tuple[AmplifierLayout, dict[str, Any], Mapping[str, Any]]]:
+    """Amplifiers with the cards of their extensions and what campaign.yaml says of them."""
     names = [name for name, _, _ in images.values()]
-    out = []
-    for number, (name, shape, own) in images.items():
-        label = name or "image"
-        if names.count(name) > 1:
-            label = f"{label} {number}"
-        out.append((layout_of(label, label, number, shape, own), own))
-    return out
-
-
-def _given_layouts(
-    images: Mapping[int, tuple[str, tuple[int, int], dict[str, Any]]],
-    given: Sequence[Mapping[str, Any]],
-) -> list[tuple[AmplifierLayout, dict[str, Any]]]:
-    """Amplifiers as campaign.yaml has them, with their cards."""
-    out = []
+    if not given:
+        given = [
+            {"name": f"{name or 'image'} {hdu}" if names.count(name) > 1 else name or "image",
+             "hdu": hdu}
+            for hdu, (name, _, _) in images.items()
+        ]  # fmt: skip
     for entry in given:
         name, wanted = str(entry["name"]), entry.get("hdu")
         if wanted is None:
@@ -203,12 +207,12 @@ def _given_layouts(
             there = ", ".join(str(k) for k in images)
             raise RecordingError(f"{name}: no image in HDU {wanted}; there are {there}")
         _, shape, own = images[wanted]
-        cards = {**own}
-        for word, card in AMPLIFIER_ENTRIES.items():
-            if word in entry:
-                cards[card] = entry[word]
-        out.append((layout_of(name, name, wanted, shape, cards), cards))
-    return out
+        # A card WINDOW of a camera is another thing than campaign.yaml's.
+        cards = {**shared, **own, "WINDOW": None}
+        cards |= {
+            card: entry[word] for word, card in SECTION_ENTRIES.items() if word in entry
+        }
+        yield layout_of(name, name, wanted, shape, cards), own, entry
 
 
 def _mean_current(hdu: fits.BinTableHDU, cards: Mapping[str, Any]) -> float | None:
@@ -260,7 +264,3 @@ def _digest(path: Path, spans: Sequence[tuple[int, int]], *, whole: bool) -> str
                 stream.seek(start + at)
                 digest.update(stream.read(min(_SAMPLE, length - at)))
     return digest.hexdigest()
-
-
-def _one_line(error: object) -> str:
-    return " ".join(str(error).split())[:200]

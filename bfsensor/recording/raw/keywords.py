@@ -1,14 +1,14 @@
 """What header keywords mean: the first hit wins, units and signs are made one.
 
-The table follows the keywords of NOAO, of LSST's test stands (eotest) and of LSST's cameras.
-A campaign's ``keywords:`` entry puts its own before these.
+The table follows the keywords of NOAO, of LSST's test stands (eotest), of LSST's cameras and of
+SBIG's proposal for FITS extensions.  A campaign's ``keywords:`` entry puts its own before these.
 """
 
 from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -77,12 +77,20 @@ MEANINGS: dict[str, Meaning] = {
         ("MONDIODE",), "", "", 0.0, np.inf,
         "charge loss and gain nonlinearity cannot be told apart, nor either from the lamp",
     ),
-    "gain": Meaning(("CCDGAIN", "GAIN", "E-GAIN", "EGAIN"), "", "", 0.0, 1e4),
+    # Where SBIG's EGAIN [e-/ADU] stands beside GAIN, GAIN is the camera's setting.  Beyond the
+    # limits 16 bits would span less than 7 or more than 6e8 electrons.
+    "gain": Meaning(("CCDGAIN", "EGAIN", "E-GAIN", "GAIN"), "", "", 1e-4, 1e4),
     "noise": Meaning(("CCDNOISE", "RDNOISE", "READNOIS"), "", "", 0.0, 1e5),
     "saturation": Meaning(("SATURATE", "SATLEVEL"), "", "", 0.0, np.inf),
 }  # fmt: skip
 """Section 5 of the format of campaigns; exposure time and temperature also as older cameras
 write them.  The lamp is taken as it is: only its ratios are used."""
+
+WORDS = ("kind", "test", "filter")
+"""Quantities that are words; the others are numbers."""
+
+AMPLIFIER_UNITS = {"gain": "e-/ADU", "noise": "e-", "saturation": "ADU"}
+"""Quantities that each amplifier has of its own, with the units that they are in."""
 
 TIMES = ("MJD-OBS", "MJD", "MJD-BEG")
 DATES = ("DATE-OBS", "DATE-BEG")
@@ -178,9 +186,11 @@ def parse_overrides(where: str, entries: Mapping[str, Any] | None) -> dict[str, 
         try:
             scale = float(entry.get("scale", 1.0))
         except (TypeError, ValueError):
+            scale = np.nan
+        if not np.isfinite(scale):
             raise RecordingError(
                 f"{where}: keywords: {name}: scale = {entry['scale']!r} is not a number"
-            ) from None
+            )
         out[name] = Override(words, unit, scale, entry.get("value"))
     return out
 
@@ -214,9 +224,9 @@ def translate(
     Returns
     -------
     meaning : dict of str to value
-        A key for each of :data:`MEANINGS` and 'mjd'; None where the header says nothing or
-        what cannot be meant.  Exposure time [s], wavelength [nm], temperature [K], voltages
-        [V], gain [e-/ADU], noise [e-], saturation [ADU], lamp as it is.
+        A key for 'mjd' and for each of :data:`MEANINGS` that an exposure has as a whole (not
+        :data:`AMPLIFIER_UNITS`); None where the header says nothing or what cannot be meant.
+        Exposure time [s], wavelength [nm], temperature [K], voltages [V], lamp as it is.
     problems : tuple of str
         Values that cannot be meant, and what they may be.
 
@@ -226,13 +236,15 @@ def translate(
     >>> found["kind"], found["exposure_time"], round(found["temperature"], 2)
     ('flat', 2.0, 173.15)
     """
-    given = {str(key).upper(): value for key, value in cards.items()}
-    units = {str(key).upper(): unit for key, unit in (card_units or {}).items()}
+    given = _capitals(cards)
+    units = _capitals(card_units or {})
+    found: dict[str, Any] = {}
     problems: list[str] = []
-    found = {
-        name: _quantity(name, given, units, (overrides or {}).get(name), problems)
-        for name in MEANINGS
-    }
+    for name in MEANINGS:
+        if name not in AMPLIFIER_UNITS:
+            override = (overrides or {}).get(name) or Override()
+            found[name], problem = _look_up(name, (given,), units, override)
+            problems += [problem] if problem else []
     found["kind"], word = _kind_of(found["kind"], found["test"])
     if word:
         problems.append(word)
@@ -242,18 +254,58 @@ def translate(
     return found, tuple(problems)
 
 
-def quantity(
-    name: str, cards: Mapping[str, Any], overrides: Mapping[str, Override] | None = None
-) -> Any:
-    """Give one of :data:`MEANINGS` of a header; None where it says nothing usable.
+def amplifier_quantity(
+    name: str,
+    own: Mapping[str, Any],
+    primary: Mapping[str, Any],
+    *,
+    stated: Any = None,
+    overrides: Mapping[str, Override] | None = None,
+) -> tuple[float | None, str]:
+    """Find the gain, noise or saturation of one amplifier: every reader's only way to it.
+
+    Parameters
+    ----------
+    name : str
+        One of :data:`AMPLIFIER_UNITS`.
+    own, primary : mapping of str to value
+        Cards of the amplifier's extension and of the primary header.
+    stated : object, optional
+        What campaign.yaml says of this amplifier.
+    overrides : mapping of str to Override, optional
+        The ``keywords:`` of campaign.yaml.
+
+    Returns
+    -------
+    value : float or None
+        Gain [e-/ADU], noise [e-] or saturation [ADU]; None where it is not known.
+    problem : str
+        What is wrong with the value that was found; '' where there is none or it is good.
+
+    Notes
+    -----
+    In this order: campaign.yaml's entry for the amplifier; its ``value`` for all; its keywords;
+    then those of :data:`MEANINGS`, all of them in the amplifier's extension first, where NOAO
+    and LSST keep the gain of each amplifier, then in the primary header, which may hold a
+    nominal one.  The first number decides: one that cannot be meant, such as a gain of 0, is
+    no reason to try the next keyword.  A card that holds a word or a logical value, such as
+    GAIN = 'HIGH', is a setting and says nothing.  A saturation of 0 or less, which some
+    cameras write where they know none, is not one.
 
     Examples
     --------
-    >>> quantity("gain", {"E-GAIN": 0.46})
-    0.46
+    >>> amplifier_quantity("gain", {"GAIN": 2.1}, {"CCDGAIN": 2.2})
+    (2.1, '')
+    >>> amplifier_quantity("gain", {"GAIN": 100, "EGAIN": 0.25}, {})
+    (0.25, '')
+    >>> amplifier_quantity("gain", {"GAIN": 0}, {"EGAIN": 2.0})
+    (None, 'GAIN = 0 cannot be meant (gain: 0.0001 to 10000 e-/ADU)')
     """
-    given = {str(key).upper(): value for key, value in cards.items()}
-    return _quantity(name, given, {}, (overrides or {}).get(name), [])
+    if stated is not None:
+        key = f"campaign.yaml's {name}"
+        return _checked(name, stated, key, "", Override(), MEANINGS[name])
+    override = (overrides or {}).get(name) or Override()
+    return _look_up(name, (_capitals(own), _capitals(primary)), {}, override)
 
 
 def kind_in_name(name: str) -> str | None:
@@ -268,58 +320,78 @@ def kind_in_name(name: str) -> str | None:
     return found.pop() if len(found) == 1 else None
 
 
-def _quantity(
-    name: str, given: Mapping[str, Any], units: Mapping[str, str],
-    override: Override | None, problems: list[str],
-) -> Any:  # fmt: skip
-    """Look one quantity up among cards in capitals."""
-    meaning, override = MEANINGS[name], override or Override()
+def _capitals(cards: Mapping[str, Any]) -> dict[str, Any]:
+    """Cards with their keywords in capitals."""
+    return {str(key).upper(): value for key, value in cards.items()}
+
+
+def _look_up(
+    name: str, headers: Sequence[Mapping[str, Any]], units: Mapping[str, str],
+    override: Override,
+) -> tuple[Any, str]:  # fmt: skip
+    """Look one quantity up in headers with keywords in capitals, the most specific first."""
+    meaning = MEANINGS[name]
     if override.value is not None:
         unit = override.unit or meaning.unit
-        return _checked(
-            name, override.value, "campaign.yaml", unit, override, meaning, problems
-        )
-    for keyword in (*override.keywords, *meaning.keywords):
-        key = keyword.upper()
-        if str(given.get(key, "")).strip():
-            unit = override.unit or units.get(key, "") or meaning.header_unit
-            return _checked(name, given[key], key, unit, override, meaning, problems)
-    return None
+        key = f"campaign.yaml's {name}"
+        return _checked(name, override.value, key, unit, override, meaning)
+    aside = ""
+    # campaign.yaml's keywords in every header, then the table's header by header.
+    for keywords in (override.keywords, meaning.keywords):
+        for given in headers:
+            for keyword in keywords:
+                key = keyword.upper()
+                value = given.get(key, "")
+                if not str(value).strip():
+                    continue
+                if name not in WORDS and not _is_number(value):
+                    aside = aside or f"{key} = {value!r} is not a number"
+                    continue
+                unit = override.unit or units.get(key, "") or meaning.header_unit
+                return _checked(name, value, key, unit, override, meaning)
+    return None, aside
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a card holds a number, be it between quotes; logical values are none."""
+    if isinstance(value, bool):
+        return False
+    try:
+        float(value)
+    except (TypeError, ValueError):
+        return False
+    return True
 
 
 def _checked(
-    name: str, value: Any, key: str, unit: str, override: Override, meaning: Meaning,
-    problems: list[str],
-) -> Any:  # fmt: skip
-    """Convert one value; None with a problem where it cannot be meant."""
-    if name in ("kind", "test", "filter"):
-        return str(value).strip()
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        problems.append(f"{key} = {value!r} is not a number")
-        return None
-    if name == "number":
-        return int(number) if number == int(number) else None
+    name: str, value: Any, key: str, unit: str, override: Override, meaning: Meaning
+) -> tuple[Any, str]:
+    """Convert one value; None, and what is wrong with it, where it cannot be meant."""
+    if name in WORDS:
+        return str(value).strip(), ""
+    if not _is_number(value):
+        return None, f"{key} = {value!r} is not a number"
+    number = float(value)
     if not np.isfinite(number):
-        problems.append(f"{key} = {value} is not finite")
-        return None
+        return None, f"{key} = {value} is not finite"
+    if name == "number":
+        return (int(number) if number == int(number) else None), ""
+    if name == "saturation" and number <= 0:
+        return None, ""
     if name == "wavelength" and number == 0:
-        return None  # no light, or no monochromator
+        return None, ""  # no light, or no monochromator
+    number_in_unit = number * override.scale
     if meaning.unit:
-        number_in_unit = _convert(number * override.scale, unit, meaning.unit)
+        number_in_unit = _convert(number_in_unit, unit, meaning.unit)
         if np.isnan(number_in_unit):
-            problems.append(
-                f"{key} is in {unit!r}, which does not convert to {meaning.unit}"
-            )
-            return None
-    else:
-        number_in_unit = number * override.scale
+            return None, f"{key} is in {unit!r}, which does not convert to {meaning.unit}"
     if not meaning.low <= number_in_unit <= meaning.high:
-        problems.append(f"{key} = {value} cannot be meant in {unit or 'this'}"
-                        + _other_units(name, number, meaning))  # fmt: skip
-        return None
-    return number_in_unit
+        if name in AMPLIFIER_UNITS:
+            allowed = f"{meaning.low:g} to {meaning.high:g} {AMPLIFIER_UNITS[name]}"
+            return None, f"{key} = {value} cannot be meant ({name}: {allowed})"
+        others = _other_units(name, number, meaning)
+        return None, f"{key} = {value} cannot be meant in {unit or 'this'}{others}"
+    return number_in_unit, ""
 
 
 def _other_units(name: str, number: float, meaning: Meaning) -> str:

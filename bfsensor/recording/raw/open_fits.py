@@ -13,10 +13,25 @@ from astropy.utils.exceptions import AstropyUserWarning
 
 from bfsensor.errors import RecordingError
 
+BROKEN = (
+    OSError, EOFError, ValueError, TypeError, LookupError, zlib.error, fits.VerifyError,
+)  # fmt: skip
+"""What astropy may raise on a damaged file, in its headers and in its data."""
+
 
 @contextmanager
-def open_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
+def open_fits(
+    path: str | os.PathLike[str], *, as_stored: bool = False
+) -> Iterator[fits.HDUList]:
     """Open a file, letting the harmless faults of old cameras' cards pass, but not a file cut short.
+
+    Parameters
+    ----------
+    path : path-like
+        The file, plain or in gzip.
+    as_stored : bool
+        Leave tile-compressed images as the tables that they are stored as: faster where only
+        headers are read.
 
     Raises
     ------
@@ -28,19 +43,34 @@ def open_fits(path: str | os.PathLike[str]) -> Iterator[fits.HDUList]:
         warnings.simplefilter("ignore", AstropyUserWarning)
         # What is left of a file cut short would be read without a word.
         warnings.filterwarnings(
-            "error", "(?s).*(truncated|Error validating header)", AstropyUserWarning
+            "error",
+            "(?s).*(truncated|corrupted|Error validating header)",
+            AstropyUserWarning,
         )
         try:
             # Opened here: astropy leaves a file open in whose headers it fails.
-            with open(path, "rb") as stream, fits.open(stream, memmap=False) as hdus:
+            with (
+                open(path, "rb") as stream,
+                fits.open(
+                    stream, memmap=False, disable_image_compression=as_stored
+                ) as hdus,
+            ):
                 len(hdus)  # finds all extensions, and the end
                 hdus.verify("silentfix")
                 yield hdus
         except RecordingError:
             raise
-        # Damaged headers and data end in several kinds of exception inside astropy.
-        except (
-            OSError, ValueError, TypeError, KeyError, EOFError, zlib.error, AstropyUserWarning
-        ) as error:  # fmt: skip
-            line = " ".join(str(error).split())[:200]
-            raise RecordingError(f"{path}: cannot be read: {line}") from None
+        except AstropyUserWarning as warning:
+            raise RecordingError(
+                f"{path}: is truncated or damaged: {one_line(warning)}"
+            ) from None
+        except Exception as error:
+            # The class that its decompression of tiles raises is in no public module.
+            if not isinstance(error, BROKEN) and type(error).__name__ != "CfitsioException":
+                raise
+            raise RecordingError(f"{path}: cannot be read: {one_line(error)}") from None
+
+
+def one_line(error: object) -> str:
+    """Give the text of an error without line breaks, cut at 200 characters."""
+    return " ".join(str(error).split())[:200]

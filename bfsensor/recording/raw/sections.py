@@ -98,6 +98,8 @@ class AmplifierLayout:
         Rows and columns there; not those of ``data`` where the header is wrong.
     binning : tuple of int
         In x and y.
+    bias_problem : str
+        Why BIASSEC cannot be used; '' where it can, or is not given.
     gain, noise, saturation : float or None
         [e-/ADU], [e-], [ADU], where the header or campaign.yaml says.
     """
@@ -115,6 +117,7 @@ class AmplifierLayout:
     flip_y: bool
     on_sensor: tuple[int, int] | None
     binning: tuple[int, int] = (1, 1)
+    bias_problem: str = ""
     gain: float | None = None
     noise: float | None = None
     saturation: float | None = None
@@ -165,6 +168,10 @@ def layout_of(
 ) -> AmplifierLayout:
     """Find one amplifier's place from DATASEC, BIASSEC, DETSEC and CCDSUM.
 
+    A blank section is as good as none; without DATASEC the whole image is data.  A BIASSEC that
+    cannot be used, as trimmed images still have, is kept as ``bias_problem``: without it there
+    is no level to subtract, but the data are what they are.
+
     Parameters
     ----------
     where : str
@@ -172,28 +179,22 @@ def layout_of(
     name, hdu, stored
         See :class:`AmplifierLayout`.
     cards : mapping
-        Also WINDOW, a section of the stored image, which campaign.yaml may give.
+        Also WINDOW, the amplifier's section of the stored image, from campaign.yaml.
 
     Raises
     ------
     RecordingError
-        A section that is none, or leaves the image; says so where it would fit with x and y
-        exchanged.
+        Another section that is none, or leaves the image; says so where it would fit with x and
+        y exchanged.
     """
     window = Section(slice(0, stored[0]), slice(0, stored[1]))
-    if cards.get("WINDOW"):
-        window = parse_section(cards["WINDOW"], f"{where}: window")
-        _inside(window, stored, f"{where}: window = {cards['WINDOW']!r}")
-    data, bias = window, None
-    if cards.get("DATASEC"):
-        data = parse_section(cards["DATASEC"], f"{where}: DATASEC")
-        _inside(data, stored, f"{where}: DATASEC = {cards['DATASEC']!r}")
-    if cards.get("BIASSEC"):
-        bias = parse_section(cards["BIASSEC"], f"{where}: BIASSEC")
-        _inside(bias, stored, f"{where}: BIASSEC = {cards['BIASSEC']!r}")
-    for section, card in ((data, "DATASEC"), (bias, "BIASSEC")):
-        if section is not None and not _within(section, window):
-            raise RecordingError(f"{where}: {card} leaves the amplifier's window")
+    window = _section_in("WINDOW", cards, where, stored, window) or window
+    data = _section_in("DATASEC", cards, where, stored, window) or window
+    bias, problem = None, ""
+    try:
+        bias = _section_in("BIASSEC", cards, where, stored, window)
+    except RecordingError as error:
+        problem = str(error).removeprefix(f"{where}: ")
 
     def readout(section: Section) -> Box:
         return (
@@ -205,7 +206,7 @@ def layout_of(
         name=name, hdu=hdu, stored=stored, window=(window.rows, window.columns),
         stored_flip_x=data.flip_x, stored_flip_y=data.flip_y, data=readout(data),
         bias=None if bias is None else readout(bias), origin=None, flip_x=False, flip_y=False,
-        on_sensor=None,
+        on_sensor=None, bias_problem=problem,
     )  # fmt: skip
     if not cards.get("DETSEC"):
         return layout
@@ -255,6 +256,24 @@ def _seen_from(part: slice, whole: slice, flipped: bool) -> slice:
     if flipped:
         return slice(whole.stop - part.stop, whole.stop - part.start)
     return slice(part.start - whole.start, part.stop - whole.start)
+
+
+def _section_in(
+    card: str,
+    cards: Mapping[str, Any],
+    where: str,
+    stored: tuple[int, int],
+    window: Section,
+) -> Section | None:
+    """Section of a card, which must lie in the image and in the amplifier's part of it."""
+    text = cards.get(card)
+    if not str(text or "").strip():
+        return None
+    found = parse_section(text, f"{where}: {card}")
+    _inside(found, stored, f"{where}: {card} = {text!r}")
+    if not _within(found, window):
+        raise RecordingError(f"{where}: {card} = {text!r} leaves the amplifier's window")
+    return found
 
 
 def _within(part: Section, whole: Section) -> bool:

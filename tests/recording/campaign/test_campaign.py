@@ -233,6 +233,54 @@ def test_damage_that_headers_do_not_show(copied, tmp_path):
     assert len(found.pairs()) == len(campaign.pairs()) - 1
 
 
+def test_damage_in_rice_compressed_tiles(copied):
+    path = copied / "flat_0016.fits"
+    with fits.open(path) as hdus:
+        packed = [hdus[0].copy()]
+        packed += [fits.CompImageHDU(h.data, h.header, name=h.name) for h in hdus[1:]]
+        fits.HDUList(packed).writeto(path, overwrite=True)
+    content = bytearray(path.read_bytes())
+    ((start, length), _) = scan_file(path).spans
+    content[start + length // 2 : start + length - 200] = b"\xff" * (length // 2 - 200)
+    path.write_bytes(content)
+    (aside,) = inspect_campaign(read_campaign(copied)).campaign.set_aside
+    assert aside.path == path and "cannot be read: decompression" in aside.reason
+
+
+def test_gains_that_cannot_be_meant_or_that_differ_are_named(copied):
+    for number in range(12, 24):
+        edit(copied / f"flat_00{number}.fits", CCDGAIN=0 if number < 20 else 2.0)
+    said = messages(read_campaign(copied))
+    assert said[:2] == [
+        f"{name}: headers give different gains [e-/ADU]: 2.2 in 12 files, none in 8 files, 2 in "
+        "4 files; 2.2 e-/ADU is taken for all: everything per electron is wrong by the ratio in "
+        "the other files"
+        for name in ("SEGMENT10", "SEGMENT11")
+    ]
+    assert said[2:] == [
+        "CCDGAIN = 0 cannot be meant (gain: 0.0001 to 10000 e-/ADU) (8 exposures); taken as not "
+        "known"
+    ]
+
+
+def test_an_overscan_that_cannot_be_used_is_named(copied):
+    """As trimmed images have it: the biases give the level."""
+    for path in copied.glob("*.fits"):
+        with fits.open(path, mode="update") as hdus:
+            hdus[2].header["BIASSEC"] = "[200:230,1:112]"
+    found = inspect_campaign(read_campaign(copied))
+    assert messages(found.campaign) == [
+        "SEGMENT11: BIASSEC = '[200:230,1:112]' leaves the image, 112 x 112 pixels: its level is "
+        "not subtracted"
+    ]
+    one, other = (
+        [f.level for f in found.frames if f.amplifier == name]
+        for name in ("SEGMENT10", "SEGMENT11")
+    )
+    # Noise of 2.5 ADU; the median of ten biases' levels is good to 0.05 ADU.
+    assert np.allclose(one, other, atol=5 * (2 * 40000 / GAIN / 7680) ** 0.5 + 0.3)
+
+
 def test_conditions_and_photodiode_in_extensions(tmp_path):
     """As test stands write them: voltages and a current against time in extensions."""
     t = np.linspace(0, 20, 2001)

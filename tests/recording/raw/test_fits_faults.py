@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 
 import numpy as np
 import pytest
@@ -10,10 +11,15 @@ from astropy.io import fits
 from astropy.table import MaskedColumn, Table
 
 from bfsensor.errors import RecordingError
-from bfsensor.recording.raw.fits_images import read_raw
+from bfsensor.recording.raw.headers import scan_file
+from bfsensor.recording.raw.images import read_images
 from bfsensor.recording.tables.calibration_tables import read_tables, write_tables
 
 CARDS = {"DATASEC": "[1:32,1:20]", "BIASSEC": "[33:42,1:20]"}
+
+
+def read_raw(path, **options):
+    return read_images(scan_file(path), **options)
 
 
 def frame():
@@ -123,7 +129,7 @@ def test_an_overscan_without_a_number_is_refused(tmp_path):
     data = frame()
     data[:, 32:] = np.nan
     with pytest.raises(
-        RecordingError, match=r"a\.fits: image: BIASSEC holds no finite number"
+        RecordingError, match=r"a\.fits: image: the overscan holds no finite number"
     ):
         read_raw(write(tmp_path / "a.fits", data))
 
@@ -142,19 +148,44 @@ def test_a_saturation_level_of_nothing_masks_nothing(tmp_path, plain, level):
 def test_a_logical_card_is_no_gain(tmp_path):
     (found,) = read_raw(write(tmp_path / "a.fits", frame(), GAIN=True))
     assert found.unit == "adu" and np.isnan(found.gain)
+    assert found.no_gain == "GAIN = True is not a number"
 
 
-def test_a_gain_of_nan_is_refused(tmp_path):
-    with pytest.raises(RecordingError, match=r"gain = nan e-/ADU must be above 0"):
-        read_raw(write(tmp_path / "a.fits", frame()), gain=float("nan"))
-
-
-def test_an_overscan_that_is_not_wanted_may_be_nowhere(tmp_path):
-    path = write(tmp_path / "a.fits", frame(), BIASSEC="[0:0,0:0]")
+@pytest.mark.parametrize(
+    ("section", "words"),
+    [
+        ("[0:0,0:0]", "BIASSEC = '[0:0,0:0]' begins below 1; name the overscan"),
+        ("[43:60,1:20]", r"BIASSEC = '[43:60,1:20]' leaves the image, 42 x 20 pixels"),
+        ("none", "BIASSEC = 'none' is not like '[1:512,1:2000]'"),
+    ],
+)
+def test_an_overscan_that_is_not_wanted_may_be_nowhere(tmp_path, section, words):
+    path = write(tmp_path / "a.fits", frame(), BIASSEC=section)
     (found,) = read_raw(path, overscan=None)
     np.testing.assert_array_equal(found.image, frame()[:, :32])
-    with pytest.raises(RecordingError, match=r"BIASSEC = '\[0:0,0:0\]' leaves the image"):
+    with pytest.raises(RecordingError, match=re.escape(f"a.fits: image: {words}")):
         read_raw(path)
+
+
+def test_cards_that_astropy_cannot_parse_are_no_fault_of_the_file(tmp_path, plain):
+    path = write(tmp_path / "a.fits", frame())
+    content = path.read_bytes()
+    at = content.find(b"END" + 77 * b" ")
+    broken = b"GAIN    = 2.2E+".ljust(80) + b"OTHER   = 'not closed".ljust(80)
+    end = at + len(broken)
+    path.write_bytes(content[:at] + broken + b"END".ljust(80) + content[end + 80 :])
+    (found,) = read_raw(path)
+    np.testing.assert_array_equal(found.image, plain.image)
+    assert found.no_gain == "GAIN = '2.2E+' is not a number"
+
+
+def test_a_text_table_is_no_image(tmp_path, plain):
+    """Its NAXIS is 2, too."""
+    path = write(tmp_path / "a.fits", frame(), fits.ImageHDU)
+    with fits.open(path, mode="append") as hdus:
+        hdus.append(fits.TableHDU.from_columns([fits.Column("A", "F8.2", array=[1.0])]))
+    (found,) = read_raw(path)
+    np.testing.assert_array_equal(found.image, plain.image)
 
 
 # -- files cut short -------------------------------------------------------------------

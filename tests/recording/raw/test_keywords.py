@@ -3,7 +3,12 @@
 import pytest
 
 from bfsensor.errors import RecordingError
-from bfsensor.recording.raw.keywords import kind_in_name, parse_overrides, translate
+from bfsensor.recording.raw.keywords import (
+    amplifier_quantity,
+    kind_in_name,
+    parse_overrides,
+    translate,
+)
 from bfsensor.recording.raw.sections import layout_of, parse_section
 
 
@@ -61,12 +66,74 @@ def test_units_of_overrides_and_of_comments():
         ({"VBB": -60000.0}, "back_bias", "{unit: mV}"),
         ({"EXPTIME": "long"}, "exposure_time", "EXPTIME = 'long' is not a number"),
         ({"EXPTIME": -1.0}, "exposure_time", "EXPTIME = -1.0 cannot be meant"),
+        ({"SEQNUM": "inf"}, "number", "SEQNUM = inf is not finite"),
+        ({"SEQNUM": "first"}, "number", "SEQNUM = 'first' is not a number"),
     ],
 )
 def test_what_cannot_be_meant_is_not_known(cards, name, words):
     found, problems = said({"IMGTYPE": "FLAT", **cards})
     assert found[name] is None
     assert len(problems) == 1 and words in problems[0]
+
+
+def test_a_word_where_a_number_is_meant_is_passed_over():
+    cards = {"IMGTYPE": "FLAT", "EXPTIME": "long", "DARKTIME": 2.5}
+    found, problems = said(cards)
+    assert (found["exposure_time"], problems) == (2.5, ())
+
+
+@pytest.mark.parametrize(
+    ("own", "primary", "stated", "keywords", "gain"),
+    [
+        ({}, {"CCDGAIN": 2.2}, None, {}, 2.2),
+        ({"GAIN": 2.1}, {"CCDGAIN": 2.2}, None, {}, 2.1),  # each amplifier's own
+        ({"GAIN": 2.1, "CCDGAIN": 2.3}, {}, None, {}, 2.3),
+        ({"GAIN": 100, "EGAIN": 0.25}, {}, None, {}, 0.25),  # GAIN is a camera's setting
+        ({"GAIN": True, "E-GAIN": 0.46}, {}, None, {}, 0.46),
+        ({"GAIN": "HIGH"}, {"GAIN": "1.5"}, None, {}, 1.5),
+        ({"GAIN": " "}, {"gain": 1.6}, None, {}, 1.6),
+        ({"GAIN": 2.1}, {"MINE": 1.7}, None, {"keyword": "MINE"}, 1.7),
+        ({"GAIN": 2.1}, {}, None, {"scale": 2}, 4.2),
+        ({"GAIN": 2.1}, {}, None, {"value": 1.8}, 1.8),
+        ({"GAIN": 2.1}, {"MINE": 1.7}, 1.9, {"value": 1.8, "scale": 2}, 1.9),
+        ({}, {}, None, {}, None),
+    ],
+)
+def test_which_gain_counts(own, primary, stated, keywords, gain):
+    overrides = parse_overrides("x", {"gain": keywords} if keywords else {})
+    found = amplifier_quantity("gain", own, primary, stated=stated, overrides=overrides)
+    assert found == (gain, "")
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (0, "GAIN = 0 cannot be meant (gain: 0.0001 to 10000 e-/ADU)"),
+        (-1.5, "GAIN = -1.5 cannot be meant"),
+        (2e4, "GAIN = 20000.0 cannot be meant"),
+        ("nan", "GAIN = nan is not finite"),
+        ("LOW", "GAIN = 'LOW' is not a number"),
+        (False, "GAIN = False is not a number"),
+    ],
+)
+def test_what_is_no_gain_is_not_known(value, words):
+    gain, problem = amplifier_quantity("gain", {"GAIN": value}, {})
+    assert gain is None and problem.startswith(words)
+    # An implausible number is no setting: what the primary header has is not taken for it.
+    gain, _ = amplifier_quantity("gain", {"GAIN": value}, {"EGAIN": 2.0})
+    assert gain == (2.0 if "number" in words else None)
+
+
+def test_saturation_of_nothing():
+    for value in (0, -1.0):
+        assert amplifier_quantity("saturation", {"SATURATE": value}, {}) == (None, "")
+    assert amplifier_quantity("saturation", {"SATLEVEL": 6e4}, {}) == (6e4, "")
+    assert amplifier_quantity("noise", {"RDNOISE": -3}, {}) == (
+        None, "RDNOISE = -3 cannot be meant (noise: 0 to 100000 e-)",
+    )  # fmt: skip
+    assert amplifier_quantity("gain", {}, {}, stated="much") == (
+        None, "campaign.yaml's gain = 'much' is not a number",
+    )  # fmt: skip
 
 
 def test_times():
@@ -86,6 +153,7 @@ def test_times():
         ({"exposure_time": {"unit": "V"}}, "unit 'V' does not convert to s"),
         ({"exposure_time": {"factor": 2}}, "must be a keyword"),
         ({"back_bias": {"scale": "minus"}}, "is not a number"),
+        ({"exposure_time": {"scale": float("inf")}}, "scale = inf is not a number"),
     ],
 )
 def test_wrong_overrides_are_refused(entries, words):

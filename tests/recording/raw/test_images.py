@@ -1,4 +1,4 @@
-"""Raw FITS: sections, overscan, gain and conditions, from files written here."""
+"""Raw FITS: sections, overscan, gain and saturation, from files written here."""
 
 from __future__ import annotations
 
@@ -8,11 +8,18 @@ from astropy.io import fits
 
 from bfsensor.errors import RecordingError
 from bfsensor.measure.flat_pairs import flat_covariances
-from bfsensor.recording.raw.fits_images import read_bias, read_raw
+from bfsensor.recording.raw.headers import scan_file
+from bfsensor.recording.raw.images import read_images
+from bfsensor.recording.raw.overscan import find_overscan
+from bfsensor.recording.raw.sections import layout_of
 
 NX, NY, OVER = 60, 50, 16
 LEVEL, GAIN = 900.0, 1.5
 DATASEC, BIASSEC = "[4:63,1:50]", "[64:79,1:50]"
+
+
+def read_raw(path, amplifiers=None, **options):
+    return read_images(scan_file(path, amplifiers=amplifiers), **options)
 
 
 def raw_frame(seed, *, noise=0.0, ramp=0.0, signal=20_000.0):
@@ -107,10 +114,8 @@ def test_each_extension_is_an_amplifier(tmp_path):
     )  # fmt: skip
     found = read_raw(path)
     assert [one.name for one in found] == ["SEG1", "SEG2"]
-    assert {one.exposure_time for one in found} == {12.5}
-    assert found[1].conditions["FILTER"] == "r"
     assert found[0].gain == GAIN and found[0].unit == "electron"
-    (second,) = read_raw(path, extensions=["SEG2"], gain={"SEG2": 3.0})
+    (second,) = read_raw(path, [{"name": "SEG2", "gain": 3.0}])
     np.testing.assert_allclose(second.image, 2 * found[1].image)
     unnamed = write_frame(tmp_path / "b.fits", frames, names=["", ""])
     assert [one.name for one in read_raw(unnamed)] == ["image 1", "image 2"]
@@ -118,25 +123,74 @@ def test_each_extension_is_an_amplifier(tmp_path):
 
 def test_sections_by_hand(tmp_path):
     path = write_frame(tmp_path / "a.fits", [raw_frame(56)])
-    sections = {"left": ("[4:33,1:50]", BIASSEC), "right": ("[34:63,1:50]", BIASSEC)}
-    left, right = read_raw(path, sections=sections, gain={"left": 1.0, "right": 2.0})
+    left, right = read_raw(
+        path,
+        [
+            {"name": "left", "data": "[4:33,1:50]", "bias": BIASSEC, "gain": 1.0},
+            {"name": "right", "data": "[34:63,1:50]", "bias": BIASSEC, "gain": 2.0},
+        ],
+    )
     (whole,) = read_raw(path, gain=1.0)
     np.testing.assert_allclose(np.hstack([left.image, right.image / 2]), whole.image)
 
 
-def test_a_bias_instead_of_overscan(tmp_path):
-    frames = [raw_frame(60 + k, signal=1e-9, ramp=0.3, noise=2.0) for k in range(4)]
-    paths = [
-        write_frame(tmp_path / f"bias{k}.fits", [frame], {"GAIN": GAIN})
-        for k, frame in enumerate(frames)
-    ]
-    bias = read_bias(paths, overscan=None)
-    np.testing.assert_allclose(bias["image"], np.mean(frames, 0)[:, 3 : 3 + NX])
-    flat = write_frame(tmp_path / "flat.fits", [raw_frame(65, ramp=0.3)], {"GAIN": GAIN})
-    (found,) = read_raw(flat, overscan=None, bias=bias)
-    assert found.image.mean() == pytest.approx(20_000, abs=5)
-    assert (found.overscan, found.overscan_pixels) == ("none", 0)
-    assert np.isnan(found.overscan_level)
+def test_sections_of_the_primary_header_are_those_of_all_extensions(tmp_path):
+    """But for the place on the sensor, which is each amplifier's own."""
+    frames = [raw_frame(57), raw_frame(58)]
+    sections = {"DATASEC": DATASEC, "BIASSEC": BIASSEC}
+    path = write_frame(
+        tmp_path / "a.fits", frames, {"DATASEC": None, "BIASSEC": None},
+        primary={**sections, "DETSEC": "[1:60,1:50]"}, names=["A", "B"],
+    )  # fmt: skip
+    own = write_frame(tmp_path / "b.fits", frames, names=["A", "B"])
+    for one, other in zip(read_raw(path), read_raw(own), strict=True):
+        np.testing.assert_array_equal(one.image, other.image)
+    assert {one.origin for one in scan_file(path).amplifiers} == {None}
+
+
+def test_a_reversed_data_section_is_read_in_the_order_of_readout(tmp_path):
+    """The same amplifier stored forwards and backwards gives the same image."""
+    frame = raw_frame(59, ramp=0.7)
+    (forwards,) = read_raw(write_frame(tmp_path / "a.fits", [frame]))
+    cards = {"DATASEC": "[76:17,50:1]", "BIASSEC": "[1:16,1:50]"}
+    (backwards,) = read_raw(write_frame(tmp_path / "b.fits", [frame[::-1, ::-1]], cards))
+    np.testing.assert_array_equal(backwards.image, forwards.image)
+
+
+def test_columns_after_the_image_are_overscan_where_no_card_says(tmp_path):
+    """As a campaign reads them; a blank card says as little as none."""
+    (named,) = read_raw(write_frame(tmp_path / "a.fits", [raw_frame(61)]))
+    for number, cards in enumerate(({"BIASSEC": None}, {"BIASSEC": " "})):
+        path = write_frame(tmp_path / f"{number}.fits", [raw_frame(61)], cards)
+        np.testing.assert_array_equal(read_raw(path)[0].image, named.image)
+
+
+@pytest.mark.parametrize(
+    ("bias", "columns"),
+    [
+        ("[64:79,1:50]", (65, 79)),
+        ("[65:79,1:50]", (65, 79)),  # the header leaves the first column out already
+        ("[70:79,1:50]", (69, 79)),
+        ("[1:3,1:50]", (0, 1)),  # before the image
+        ("[4:63,41:50]", (3, 63)),  # above it: no column is next to it
+    ],
+)
+def test_overscan_columns_next_to_the_image_are_left_out(bias, columns):
+    rows = "1:40" if "41" in bias else "1:50"
+    cards = {"DATASEC": f"[4:63,{rows}]", "BIASSEC": bias}
+    found = find_overscan(layout_of("x", "A", 0, (50, 79), cards))
+    assert found is not None and (found[1].start, found[1].stop) == columns
+
+
+def test_an_overscan_above_the_image_has_one_level_only(tmp_path):
+    frame = raw_frame(62)
+    frame[40:, 3:63] = LEVEL
+    cards = {"DATASEC": "[4:63,1:40]", "BIASSEC": "[4:63,41:50]"}
+    path = write_frame(tmp_path / "a.fits", [frame], cards)
+    (found,) = read_raw(path, overscan="median")
+    np.testing.assert_array_equal(found.image, frame[:40, 3:63] - LEVEL)
+    with pytest.raises(RecordingError, match="BIASSEC has the rows 41 to 50, not all of 1"):
+        read_raw(path)
 
 
 def test_saturation_and_gain_unknown(tmp_path):
@@ -148,20 +202,38 @@ def test_saturation_and_gain_unknown(tmp_path):
     assert np.argwhere(found.mask).tolist() == [[7, 7]]
     path = write_frame(tmp_path / "b.fits", [frame], {"SATURATE": 40000})
     assert np.argwhere(read_raw(path)[0].mask).tolist() == [[7, 7], [8, 8]]
+    masks = {"image": np.eye(NY, NX, dtype=bool)}
+    found = read_images(scan_file(path), masks=masks)[0].mask
+    np.testing.assert_array_equal(found, masks["image"])  # 7, 7 and 8, 8 are among them
+    found = read_images(scan_file(path), masks={"image": ~masks["image"]})[0].mask
+    assert found.sum() == NY * NX - NY + 2
+
+
+@pytest.mark.parametrize(
+    ("cards", "words"),
+    [
+        ({}, "no gain in the header"),
+        ({"GAIN": -1.0}, "GAIN = -1.0 cannot be meant (gain: 0.0001 to 10000 e-/ADU)"),
+        ({"GAIN": "HIGH"}, "GAIN = 'HIGH' is not a number"),
+    ],
+)
+def test_an_image_without_a_gain_says_why(tmp_path, cards, words):
+    path = write_frame(tmp_path / "a.fits", [raw_frame(66)], cards)
+    (found,) = read_raw(path)
+    assert (found.unit, found.no_gain) == ("adu", words) and np.isnan(found.gain)
+    (given,) = read_raw(path, gain=2.0)
+    assert (given.unit, given.no_gain, given.gain) == ("electron", "", 2.0)
+    np.testing.assert_array_equal(given.image, 2 * found.image)
 
 
 @pytest.mark.parametrize(
     ("cards", "options", "message"),
     [
         (
-            {"BIASSEC": None},
+            {"DATASEC": None, "BIASSEC": None},
             {},
-            "BIASSEC is missing; give sections, or say overscan=None and a bias",
-        ),
-        (
-            {"DATASEC": "[63:4,1:50]"},
-            {},
-            "DATASEC = '[63:4,1:50]' runs backwards; flip the image and say so yourself",
+            "no BIASSEC, and no columns after DATASEC; name the overscan in campaign.yaml "
+            "(amplifiers: bias), or choose the overscan 'none' to subtract nothing",
         ),
         (
             {"DATASEC": "[4:63,1:51]"},
@@ -175,14 +247,7 @@ def test_saturation_and_gain_unknown(tmp_path):
             "BIASSEC has the rows 2 to 50, not all of 1 to 50; "
             "overscan='median' needs no rows",
         ),
-        ({}, {"skip": 16}, "skip = 16 leaves nothing of BIASSEC"),
-        ({"GAIN": -1.0}, {}, "gain = -1 e-/ADU must be above 0"),
-        ({}, {"gain": {"C00": 1.0}}, "no gain for it among C00"),
-        (
-            {},
-            {"bias": np.zeros((3, 3))},
-            "bias of shape (3, 3) for a data section of (50, 60)",
-        ),
+        ({}, {"skip": 16}, "skip = 16 leaves nothing of the overscan"),
     ],
 )
 def test_refusals(tmp_path, cards, options, message):
@@ -193,8 +258,6 @@ def test_refusals(tmp_path, cards, options, message):
 
 
 def test_refusals_without_a_frame(tmp_path):
-    with pytest.raises(RecordingError, match="overscan = 'rows' is not one of row median"):
-        read_raw(tmp_path / "none.fits", overscan="rows")
     with pytest.raises(RecordingError, match=r"none\.fits: cannot be read"):
         read_raw(tmp_path / "none.fits")
     (tmp_path / "text.fits").write_text("no FITS")
@@ -204,7 +267,10 @@ def test_refusals_without_a_frame(tmp_path):
     with pytest.raises(RecordingError, match="holds no two-dimensional image"):
         read_raw(tmp_path / "cube.fits")
     path = write_frame(tmp_path / "a.fits", [raw_frame(67)])
-    with pytest.raises(RecordingError, match="no extension 3; it has 0 'PRIMARY'"):
-        read_raw(path, extensions=[3])
-    with pytest.raises(RecordingError, match="no bias frame was given"):
-        read_bias([])
+    with pytest.raises(RecordingError, match=r"a\.fits: A: no image in HDU 3; there are 0"):
+        read_raw(path, [{"name": "A", "hdu": 3}])
+    with pytest.raises(RecordingError, match="overscan = 'rows' is not one of row median"):
+        read_raw(path, overscan="rows")
+    for gain in (float("nan"), 0.0, float("inf")):
+        with pytest.raises(RecordingError, match=f"gain = {gain:g} e-/ADU must be above 0"):
+            read_raw(path, gain=gain)
