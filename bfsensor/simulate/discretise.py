@@ -8,6 +8,7 @@ averaged over sub-columns and the gate is met at its true distance (Shortley & W
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,10 +20,8 @@ from bfsensor.typing import FloatArray
 from bfsensor.units import VACUUM_PERMITTIVITY
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from bfsensor.device.device import Device
-    from bfsensor.device.parts import Implant
+    from bfsensor.device.parts import BuriedChannel, ChannelStop, ChannelStopDots
 
 _SAMPLES = 8
 
@@ -108,112 +107,27 @@ def discretise(device: Device, mesh: Mesh) -> Coefficients:
             f"{device.name}: edge: a periodic array of pixels has none; strips beyond the last pixel "
             "are solved by bfsensor.simulate.edge_field.solve_edge"
         )
-    surfaces = Surfaces.of(device)
-    material = device.material
-    eps_si = material.permittivity_silicon * VACUUM_PERMITTIVITY
-    eps_ox = material.permittivity_oxide * VACUUM_PERMITTIVITY
-    nz, ny, nx = mesh.shape
-    z = mesh.z
-    z_lower = np.concatenate([[z[0]], 0.5 * (z[1:] + z[:-1])])
-    z_upper = np.concatenate([0.5 * (z[1:] + z[:-1]), [z[-1]]])
-    left, right, _ = dual_widths(mesh.x, mesh.side_x, mesh.period[0])
+    section = _CrossSection.of(device, mesh)
     south_gap, north_gap, dy = dual_widths(mesh.y, mesh.side_y, mesh.period[1])
-
-    # Sub-columns right and left of every node, each standing for an equal part of half a gap.
-    steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
-    columns = []
-    for gaps, sign in ((left, -1.0), (right, 1.0)):
-        for s in steps:
-            columns.append((mesh.x + sign * 0.5 * s * gaps, 0.5 * gaps / _SAMPLES))
-
-    def distance(x: FloatArray) -> FloatArray:
-        pitch = mesh.pitch[0]
-        return pitch / 2 - np.abs(x - pitch * np.round(x / pitch))
-
-    def flux_capacity(zz: FloatArray, d: FloatArray) -> FloatArray:
-        gate, surface = surfaces.gate(d), surfaces.silicon(d)
-        return eps_ox * (np.clip(zz, gate, surface) - gate) + eps_si * np.maximum(
-            zz - surface, 0.0
-        )
-
-    def resistance(zz: FloatArray, d: FloatArray) -> FloatArray:
-        gate, surface = surfaces.gate(d), surfaces.silicon(d)
-        return (np.clip(zz, gate, surface) - gate) / eps_ox + np.maximum(
-            zz - surface, 0.0
-        ) / eps_si
-
-    d_node = distance(mesh.x)
-    inside_gate = z[:, None] <= surfaces.gate(d_node)[None, :] + 1e-9
-    conductor = inside_gate.copy()
-    conductor[-1] = True
-    free = ~conductor
-
-    cx = np.zeros((nz, nx))
-    cy = np.zeros((nz, nx))
-    cz = np.zeros((nz, nx))
-    silicon = np.zeros((nz, nx))
-    for x, width in columns:
-        d = distance(x)
-        cy += width * (
-            flux_capacity(z_upper[:, None], d) - flux_capacity(z_lower[:, None], d)
-        )
-        step = resistance(z[1:, None], d) - resistance(z[:-1, None], d)
-        # A sub-column that lies in the gate at both nodes conducts like the oxide above it.
-        cz[:-1] += width / np.maximum(step, (z[1:] - z[:-1])[:, None] / eps_si)
-        surface = surfaces.silicon(d)
-        silicon += width * (
-            np.maximum(z_upper[:, None], surface) - np.maximum(z_lower[:, None], surface)
-        )
-    for s in (np.arange(2 * _SAMPLES) + 0.5) / (2 * _SAMPLES):
-        d = distance(mesh.x + s * right)
-        share = flux_capacity(z_upper[:, None], d) - flux_capacity(z_lower[:, None], d)
-        cx += share / (2 * _SAMPLES) / np.where(right > 0, right, np.inf)
-
-    gate_links = np.zeros((nz, nx))
-    # Links down to the gate in the same column, at the true distance of its face.
-    above = free[1:] & conductor[:-1]
-    gate_height = surfaces.gate(d_node)[None, :]
-    reach = resistance(z[1:, None], d_node) - resistance(
-        np.broadcast_to(gate_height, (1, nx)), d_node
-    )
-    dx = 0.5 * (left + right)
-    gate_links[1:] += np.where(above, dx / np.maximum(reach, 1e-3 / eps_ox), 0.0)
-    # Links sideways into the gate where its face slopes.
-    for shift, gaps in ((1, right), (-1, left)):
-        neighbour = np.roll(inside_gate, -shift, axis=1)
-        meets = free & neighbour & (gaps > 0)[None, :]
-        for k, i in zip(*np.nonzero(meets), strict=True):
-            path = mesh.x[i] + shift * gaps[i] * np.linspace(0, 1, 201)
-            hit = np.nonzero(surfaces.gate(distance(path)) >= z[k] - 1e-12)[0]
-            part = max(hit[0] / 200 if len(hit) else 1.0, 0.05)
-            middle = distance(np.array([mesh.x[i] + shift * gaps[i] * part / 2]))
-            share = flux_capacity(z_upper[k], middle) - flux_capacity(z_lower[k], middle)
-            gate_links[k, i] += share[0] / (gaps[i] * part)
-    back_links = np.zeros((nz, nx))
-    back_links[-2] = np.where(free[-2], cz[-2], 0.0)
-
-    cx *= free & np.roll(free, -1, axis=1)
-    cy *= free
+    conductor, free = section.conductor, ~section.conductor
+    links = _integrate_cells(section)
+    gate_links = _vertical_gate_links(section)
+    _add_sloped_gate_links(section, gate_links)
+    back_links = np.zeros_like(gate_links)
+    back_links[-2] = np.where(free[-2], links.z[-2], 0.0)
+    # What goes to a conductor is known there: it counts in the diagonal and in the source.
+    cx = links.x * (free & np.roll(free, -1, axis=1))
+    cy = links.y * free
+    cz = links.z.copy()
     cz[:-1] *= free[1:] & free[:-1]
     cz[-1] = 0.0
     cd = gate_links + back_links
     cd[conductor] = 1.0
 
-    n_front = int(np.searchsorted(z, carrier_region(device))) + 1
-    fixed = _fixed_charge(
-        device, mesh, surfaces, columns, distance, z_lower, z_upper, silicon, dy
-    )
-    fixed[1:-1, :, 1:-1] *= free[None]
-
-    # Right-hand side: fixed charge, and what the conductors send through their links.
-    point = device.operating_point
+    source = _fixed_charge(section, links.silicon, dy)
+    source[1:-1, :, 1:-1] *= free[None]
     gate = _gate_potential(device, mesh, south_gap, north_gap)
-    source = fixed
-    source[1:-1, :, 1:-1] += dy[:, None, None] * (
-        gate[:, None, None] * gate_links[None] + point.back_bias * back_links[None]
-    )
-    source[1:-1, :, 1:-1][:, inside_gate] = (dy * gate)[:, None]
-    source[1:-1, -1, 1:-1] = dy[:, None] * point.back_bias
+    _add_conductors(source, section, gate, gate_links, back_links, dy)
 
     return Coefficients(
         mesh=mesh,
@@ -221,15 +135,182 @@ def discretise(device: Device, mesh: Mesh) -> Coefficients:
         cy=_halo_x(cy, mesh.side_x),
         cz=_halo_x(cz, mesh.side_x),
         cd=_halo_x(cd, mesh.side_x),
-        kind=np.zeros(ny + 2, np.int64),
+        kind=np.zeros(len(mesh.y) + 2, np.int64),
         north=link_factors(north_gap, dy),
         south=link_factors(south_gap, dy),
         dy=np.concatenate([[0.0], dy, [0.0]]),
-        silicon=_halo_x(silicon * free, mesh.side_x),
-        n_front=n_front,
+        silicon=_halo_x(links.silicon * free, mesh.side_x),
+        n_front=int(np.searchsorted(mesh.z, carrier_region(device))) + 1,
         conductor=np.pad(conductor, ((0, 0), (1, 1)))[None],
         source=source,
     )
+
+
+@dataclass(frozen=True)
+class _CrossSection:
+    """The x-z plane that all rows of a mesh share: cells, surfaces and permittivities.
+
+    Attributes
+    ----------
+    left, right : ndarray, shape (nx,)
+        Intervals beside every node [um].
+    z_lower, z_upper : ndarray, shape (nz,)
+        Ends of the cells [um].
+    columns : list of (ndarray, ndarray)
+        Sub-columns right and left of every node, each standing for an equal part of half a
+        gap: their places and widths [um].
+    silicon, oxide : float
+        Permittivities [e-/(V um)].
+    """
+
+    device: Device
+    mesh: Mesh
+    surfaces: Surfaces
+    left: FloatArray
+    right: FloatArray
+    z_lower: FloatArray
+    z_upper: FloatArray
+    columns: list[tuple[FloatArray, FloatArray]]
+    silicon: float
+    oxide: float
+
+    @classmethod
+    def of(cls, device: Device, mesh: Mesh) -> _CrossSection:
+        """Lay the cells of a device's mesh."""
+        z = mesh.z
+        left, right, _ = dual_widths(mesh.x, mesh.side_x, mesh.period[0])
+        middle = 0.5 * (z[1:] + z[:-1])
+        columns = [
+            (mesh.x + sign * 0.5 * s * gaps, 0.5 * gaps / _SAMPLES)
+            for gaps, sign in ((left, -1.0), (right, 1.0))
+            for s in (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+        ]
+        return cls(
+            device, mesh, Surfaces.of(device), left, right, np.concatenate([[z[0]], middle]),
+            np.concatenate([middle, [z[-1]]]), columns,
+            silicon=device.material.permittivity_silicon * VACUUM_PERMITTIVITY,
+            oxide=device.material.permittivity_oxide * VACUUM_PERMITTIVITY,
+        )  # fmt: skip
+
+    @cached_property
+    def inside_gate(self) -> NDArray[np.bool_]:
+        """Nodes in the gates, shape (nz, nx)."""
+        gate = self.surfaces.gate(self.distance(self.mesh.x))
+        return np.asarray(self.mesh.z[:, None] <= gate[None, :] + 1e-9)
+
+    @cached_property
+    def conductor(self) -> NDArray[np.bool_]:
+        """Nodes in the gates and at the back contact, shape (nz, nx)."""
+        out = self.inside_gate.copy()
+        out[-1] = True
+        return out
+
+    def distance(self, x: FloatArray) -> FloatArray:
+        """Distance from the nearest boundary between columns [um]."""
+        pitch = self.mesh.pitch[0]
+        return pitch / 2 - np.abs(x - pitch * np.round(x / pitch))
+
+    def flux_capacity(self, z: FloatArray, d: FloatArray) -> FloatArray:
+        """Integrate the permittivity from the gate up to z, at distances from the boundary."""
+        gate, surface = self.surfaces.gate(d), self.surfaces.silicon(d)
+        return self.oxide * (np.clip(z, gate, surface) - gate) + self.silicon * np.maximum(
+            z - surface, 0.0
+        )
+
+    def cell_capacity(self, d: FloatArray) -> FloatArray:
+        """Integrate the permittivity over the height of every cell."""
+        return self.flux_capacity(self.z_upper[:, None], d) - self.flux_capacity(
+            self.z_lower[:, None], d
+        )
+
+    def resistance(self, z: FloatArray, d: FloatArray) -> FloatArray:
+        """Integrate the inverse permittivity from the gate up to z."""
+        gate, surface = self.surfaces.gate(d), self.surfaces.silicon(d)
+        return (np.clip(z, gate, surface) - gate) / self.oxide + np.maximum(
+            z - surface, 0.0
+        ) / self.silicon
+
+
+@dataclass(frozen=True)
+class _Links:
+    """Links to the next node in x, to rows in y and up in z, and silicon of every node."""
+
+    x: FloatArray
+    y: FloatArray
+    z: FloatArray
+    silicon: FloatArray
+
+
+def _integrate_cells(section: _CrossSection) -> _Links:
+    """Average the permittivities over sub-columns, as if no node were a conductor."""
+    z, right = section.mesh.z, section.right
+    cx, cy, cz, silicon = np.zeros((4, *section.conductor.shape))
+    for x, width in section.columns:
+        d = section.distance(x)
+        cy += width * section.cell_capacity(d)
+        step = section.resistance(z[1:, None], d) - section.resistance(z[:-1, None], d)
+        # A sub-column that lies in the gate at both nodes conducts like the oxide above it.
+        cz[:-1] += width / np.maximum(step, (z[1:] - z[:-1])[:, None] / section.silicon)
+        surface = section.surfaces.silicon(d)
+        silicon += width * (
+            np.maximum(section.z_upper[:, None], surface)
+            - np.maximum(section.z_lower[:, None], surface)
+        )
+    for s in (np.arange(2 * _SAMPLES) + 0.5) / (2 * _SAMPLES):
+        share = section.cell_capacity(section.distance(section.mesh.x + s * right))
+        cx += share / (2 * _SAMPLES) / np.where(right > 0, right, np.inf)
+    return _Links(cx, cy, cz, silicon)
+
+
+def _vertical_gate_links(section: _CrossSection) -> FloatArray:
+    """Links down to the gate in the same column, at the true distance of its face."""
+    z, conductor = section.mesh.z, section.conductor
+    d = section.distance(section.mesh.x)
+    height = section.surfaces.gate(d)[None, :]
+    reach = section.resistance(z[1:, None], d) - section.resistance(height, d)
+    above = ~conductor[1:] & conductor[:-1]
+    dx = 0.5 * (section.left + section.right)
+    out = np.zeros(conductor.shape)
+    out[1:] += np.where(above, dx / np.maximum(reach, 1e-3 / section.oxide), 0.0)
+    return out
+
+
+def _add_sloped_gate_links(section: _CrossSection, gate_links: FloatArray) -> None:
+    """Add the links sideways into the gate where its face slopes, in place."""
+    mesh, free = section.mesh, ~section.conductor
+    for shift, gaps in ((1, section.right), (-1, section.left)):
+        neighbour = np.roll(section.inside_gate, -shift, axis=1)
+        meets = free & neighbour & (gaps > 0)[None, :]
+        for k, i in zip(*np.nonzero(meets), strict=True):
+            path = mesh.x[i] + shift * gaps[i] * np.linspace(0, 1, 201)
+            gate = section.surfaces.gate(section.distance(path))
+            hit = np.nonzero(gate >= mesh.z[k] - 1e-12)[0]
+            part = max(hit[0] / 200 if len(hit) else 1.0, 0.05)
+            middle = section.distance(np.array([mesh.x[i] + shift * gaps[i] * part / 2]))
+            share = section.flux_capacity(
+                section.z_upper[k], middle
+            ) - section.flux_capacity(section.z_lower[k], middle)
+            gate_links[k, i] += share[0] / (gaps[i] * part)
+
+
+def _add_conductors(
+    source: FloatArray,
+    section: _CrossSection,
+    gate: FloatArray,
+    gate_links: FloatArray,
+    back_links: FloatArray,
+    dy: FloatArray,
+) -> None:
+    """Add what conductors send through their links, and their potentials, in place.
+
+    ``gate``: voltage of each row [V].
+    """
+    back = section.device.operating_point.back_bias
+    source[1:-1, :, 1:-1] += dy[:, None, None] * (
+        gate[:, None, None] * gate_links[None] + back * back_links[None]
+    )
+    source[1:-1, :, 1:-1][:, section.inside_gate] = (dy * gate)[:, None]
+    source[1:-1, -1, 1:-1] = dy[:, None] * back
 
 
 def _halo_x(a: FloatArray, side: Side, *, links: bool = False) -> FloatArray:
@@ -271,54 +352,23 @@ def _gate_potential(
 
 
 def _fixed_charge(
-    device: Device,
-    mesh: Mesh,
-    surfaces: Surfaces,
-    columns: list[tuple[FloatArray, FloatArray]],
-    distance: Callable[[FloatArray], FloatArray],
-    z_lower: FloatArray,
-    z_upper: FloatArray,
-    silicon: FloatArray,
-    dy: FloatArray,
+    section: _CrossSection, silicon: FloatArray, dy: FloatArray
 ) -> FloatArray:
     """Dopants and surface charge of every node [e-], ``[y, z, x]`` with halo."""
+    device, mesh, surfaces = section.device, section.mesh, section.surfaces
     nz, ny, nx = mesh.shape
     channel, stop = device.channel, device.channel_stop
     rows = np.zeros((nz, nx))
     dots = np.zeros((nz, nx))
-
-    def dose(
-        implants: tuple[Implant, ...],
-        surface_charge: float,
-        x_surface: FloatArray,
-        weight: FloatArray,
-    ) -> FloatArray:
-        total = np.zeros((nz, nx))
-        for implant in implants:
-            total += implant.cumulative(
-                np.maximum(z_upper[:, None] - x_surface, 0.0)
-            ) - implant.cumulative(np.maximum(z_lower[:, None] - x_surface, 0.0))
-        if surface_charge:
-            # Shared between the two nodes around the surface, so that its height counts.
-            cell = np.clip(np.searchsorted(mesh.z, x_surface, side="right") - 1, 0, nz - 2)
-            part = (x_surface - mesh.z[cell]) / (mesh.z[cell + 1] - mesh.z[cell])
-            part = np.where(np.abs(part) < 1e-9, 0.0, part)
-            here = np.arange(nx)
-            np.add.at(total, (cell, here), surface_charge * (1 - part))
-            np.add.at(total, (cell + 1, here), surface_charge * part)
-        return total * weight
-
-    for x, width in columns:
-        d = distance(x)
+    for x, width in section.columns:
+        d = section.distance(x)
         surface = surfaces.silicon(d)
         in_stop = 1.0 - surfaces.ramp(d, surfaces.side_diffusion)
         in_channel = (surfaces.ramp(d, surfaces.taper) >= 1.0).astype(float)
-        rows += dose(channel.implants, channel.surface_charge, surface, width * in_channel)
-        rows += dose(stop.implants, stop.surface_charge, surface, width * in_stop)
+        rows += _dose(section, channel, surface) * (width * in_channel)
+        rows += _dose(section, stop, surface) * (width * in_stop)
         if stop.dots is not None:
-            dots += dose(
-                stop.dots.implants, stop.dots.surface_charge, surface, width * in_stop
-            )
+            dots += _dose(section, stop.dots, surface) * (width * in_stop)
 
     out = np.zeros((ny + 2, nz, nx + 2))
     background = device.silicon.background_doping
@@ -330,6 +380,31 @@ def _fixed_charge(
         share = _dot_share(device, mesh)
         out[1:-1, :, 1:-1] += dots[None] * (share * dy)[:, None, None]
     return out
+
+
+def _dose(
+    section: _CrossSection, doped: BuriedChannel | ChannelStop | ChannelStopDots,
+    surface: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """Charge of implants and surface in every cell below one place of each node [e-/um^2].
+
+    ``surface``: height of the silicon there, shape (nx,) [um].
+    """
+    z = section.mesh.z
+    total = np.zeros(section.conductor.shape)
+    for implant in doped.implants:
+        total += implant.cumulative(
+            np.maximum(section.z_upper[:, None] - surface, 0.0)
+        ) - implant.cumulative(np.maximum(section.z_lower[:, None] - surface, 0.0))
+    if doped.surface_charge:
+        # Shared between the two nodes around the surface, so that its height counts.
+        cell = np.clip(np.searchsorted(z, surface, side="right") - 1, 0, len(z) - 2)
+        part = (surface - z[cell]) / (z[cell + 1] - z[cell])
+        part = np.where(np.abs(part) < 1e-9, 0.0, part)
+        here = np.arange(len(surface))
+        np.add.at(total, (cell, here), doped.surface_charge * (1 - part))
+        np.add.at(total, (cell + 1, here), doped.surface_charge * part)
+    return total
 
 
 def _ripple(device: Device, mesh: Mesh, row: int) -> FloatArray | float:

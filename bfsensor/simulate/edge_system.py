@@ -134,12 +134,22 @@ def assemble(
     # Nodes in the oxide under the strips belong to nobody.
     held[(volume == 0) & np.isnan(held)] = bias
     free = np.isnan(held).ravel()
-    number = np.arange(nz * nx).reshape(nz, nx)
+    return System(
+        matrix=_link_nodes(across, along, to_gate),
+        charge=(charge - acceptors).ravel(),
+        held=np.nan_to_num(held).ravel(),
+        free=free,
+        acceptors=acceptors.ravel(),
+    )
+
+
+def _link_nodes(across: FloatArray, along: FloatArray, to_gate: FloatArray) -> csc_matrix:
+    """Matrix of links to the next node in x and in z, and from single nodes to a gate."""
+    number = np.arange(to_gate.size).reshape(to_gate.shape)
     one = np.concatenate([number[:, :-1].ravel(), number[:-1].ravel()])
     two = np.concatenate([number[:, 1:].ravel(), number[1:].ravel()])
     link = np.concatenate([across.ravel(), along.ravel()])
-    size = nz * nx
-    matrix = coo_matrix(
+    return coo_matrix(
         (
             np.concatenate([link, link, -link, -link, to_gate.ravel()]),
             (
@@ -147,12 +157,8 @@ def assemble(
                 np.concatenate([one, two, two, one, number.ravel()]),
             ),
         ),
-        shape=(size, size),
+        shape=(number.size, number.size),
     ).tocsc()
-    return System(
-        matrix, (charge - acceptors).ravel(), np.nan_to_num(held).ravel(), free,
-        acceptors.ravel(),
-    )  # fmt: skip
 
 
 def relax_holes(

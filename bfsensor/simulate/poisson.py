@@ -444,7 +444,6 @@ class Electrostatics:
         fixed = fermi is not None
         conserved = np.zeros(count.size) if fixed else count
         filled = count > 0
-        shift = np.zeros(count.size)
         for _ in range(_MAX_NEWTON):
             levels = fermi if fermi is not None else self._fermi_levels(phi, count)
             carrier_kernels.mobile_charge(
@@ -463,19 +462,7 @@ class Electrostatics:
             self.multigrid.set_carriers(self._stiffness)
             forcing = 0.1 if not history or history[-1].asked > 0.1 else 1e-3
             iterations = self._linear_solve(conserved, forcing)
-            shift[...] = 0.0
-            if not fixed and filled.any():
-                weighted = np.zeros((len(self._share_y), len(self._share_x)))
-                moved = np.einsum(
-                    "jki,jki->ji", self._electrons, self._step[:, : c.n_front]
-                )
-                rows, columns = self._pixels_y >= 0, self._pixels_x >= 0
-                np.add.at(
-                    weighted,
-                    (self._pixels_y[rows][:, None], self._pixels_x[columns][None, :]),
-                    moved[np.ix_(rows, columns)],
-                )
-                np.divide(weighted.ravel(), count, out=shift, where=filled)
+            shift = np.zeros(count.size) if fixed else self._common_shift(count)
             taken, asked = carrier_kernels.damped_update(
                 phi, self._step, front, c.kind, self._pixels_y, self._pixels_x, n_px, levels, filled,
                 self._fermi_h, shift, self._ni, self._kt, _DENSE,
@@ -493,6 +480,21 @@ class Electrostatics:
             f"(last step {history[-1].asked:.3g} V)",
             [step.asked for step in history],
         )
+
+    def _common_shift(self, count: FloatArray) -> FloatArray:
+        """Mean step of each pixel's electrons [V], with which its quasi-Fermi level moves."""
+        weighted = np.zeros((len(self._share_y), len(self._share_x)))
+        moved = np.einsum(
+            "jki,jki->ji", self._electrons, self._step[:, : self.coefficients.n_front]
+        )
+        rows, columns = self._pixels_y >= 0, self._pixels_x >= 0
+        np.add.at(
+            weighted,
+            (self._pixels_y[rows][:, None], self._pixels_x[columns][None, :]),
+            moved[np.ix_(rows, columns)],
+        )
+        out = np.zeros(count.size)
+        return np.divide(weighted.ravel(), count, out=out, where=count > 0)
 
     def _linear_solve(self, conserved: FloatArray, forcing: float) -> int:
         """Conjugate gradients for the Newton step; residual is consumed."""
