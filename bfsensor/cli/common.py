@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
 
 import click
 from tqdm import tqdm
+
+from bfsensor.errors import BFSensorError
+
+Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 def parse_settings(
@@ -23,6 +29,46 @@ def parse_settings(
             )
         out.append((key.strip(), text.strip()))
     return out
+
+
+settings_option = click.option(
+    "--set", "settings", multiple=True, callback=parse_settings, metavar="KEY=VALUE",
+    help="Change a value of the device, such as back_bias=-60V; repeatable.",
+)  # fmt: skip
+
+overwrite_option = click.option(
+    "--overwrite", is_flag=True, help="Replace an existing output."
+)
+
+summary_option = click.option(
+    "--json", "as_json", is_flag=True, help="Print the summary as JSON."
+)
+
+
+def device_options(command: Command) -> Command:
+    """Take a DEVICE, and values of it that are changed."""
+    return click.argument("device")(settings_option(command))
+
+
+def executor_options(command: Command) -> Command:
+    """Take where independent points are worked on, and by how many processes."""
+    workers = click.option("--workers", default=2, show_default=True,
+                           type=click.IntRange(min=1), help="Processes.")  # fmt: skip
+    executor = click.option("--executor", default="process", show_default=True,
+                            type=click.Choice(["process", "dask", "parsl"]),
+                            help="Where they run.")  # fmt: skip
+    return workers(executor(command))
+
+
+def check_targets(
+    paths: Sequence[Path], overwrite: bool, error: type[BFSensorError]
+) -> None:
+    """Refuse files that exist or have no folder, before any work."""
+    for path in paths:
+        if path.exists() and not overwrite:
+            raise error(f"{path} exists; give --overwrite to replace it")
+        if not path.parent.is_dir():
+            raise error(f"{path.parent} is not a folder")
 
 
 def load_device(name: str, settings: Sequence[tuple[str, str]]) -> Any:
@@ -51,3 +97,25 @@ class Bar:
         self._bar.update(done - self._bar.n)
         if done >= of:
             self._bar.close()
+
+
+@contextlib.contextmanager
+def progress_bar(unit: str) -> Iterator[Callable[[int, int], None]]:
+    """Give what draws a bar of finished units on stderr, from its first call on.
+
+    The bar's line ends with the block, before any message.
+    """
+    bar: Any = None
+
+    def progress(done: int, total: int) -> None:
+        nonlocal bar
+        if bar is None:  # not before the request is found good
+            bar = tqdm(total=total, unit=unit, file=sys.stderr)
+        bar.n = done
+        bar.refresh()
+
+    try:
+        yield progress
+    finally:
+        if bar is not None:
+            bar.close()

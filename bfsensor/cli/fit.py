@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from bfsensor.cli.common import Bar, load_device, parse_settings
+from bfsensor.cli.common import Bar, device_options, load_device
 from bfsensor.errors import BFSensorError, FitError, RecordingError
 
 if TYPE_CHECKING:
+    from bfsensor.device.quantities import Prior
     from bfsensor.fit.data import DataSet
     from bfsensor.fit.result import FitResult
     from bfsensor.recording.tables.measured import MeasuredTable
@@ -41,10 +43,8 @@ def parse_conditions(
 
 
 @click.command("fit")
-@click.argument("device")
+@device_options
 @click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--set", "settings", multiple=True, callback=parse_settings, metavar="KEY=VALUE",
-              help="Change a value of the device, such as gate_high=4V; repeatable.")  # fmt: skip
 @click.option(
     "--free", multiple=True, metavar="NAME[:[MEAN+-]SPREAD]",
     help="Let a quantity be free within the uncertainty that its file states, or within SPREAD, "
@@ -121,45 +121,26 @@ def fit(
       bfsensor fit itl_sta3800c itl.csv slopes.csv --free all --at itl.csv:back_bias=-60V
       bfsensor fit itl_sta3800c slopes.csv --hold itl.csv --free silicon.background_doping
     """
-    from bfsensor.device.quantities import DIFFUSION, choose_priors, with_priors
-    from bfsensor.fit.finer_mesh import FINER
+    from bfsensor.device.quantities import with_priors
     from bfsensor.fit.fit import fit_device
-    from bfsensor.fit.linear_predictors import SPILL, make_tangents
+    from bfsensor.fit.linear_predictors import make_tangents
     from bfsensor.recording.tables.measured import read_measured
 
     loaded = load_device(device, settings)
     read = [(path, read_measured(path)) for path in (*recordings, *hold)]
     sets = _data_sets(read, conditions, len(recordings), lags, errors == "scaled")
-    fitted = {data.kind for data in sets if data.fitted}
-    more = (
-        *([SPILL] if "saturation" in fitted else []),
-        *([DIFFUSION] if "diffusion" in fitted else []),
-    )
-    priors = choose_priors(loaded, free, more=more)
+    priors = _choose_priors(loaded, free, sets)
     names = [prior.name for prior in priors]
     chosen = [_resolve(name, names) for name in profiles]
     folder = output or Path(f"{loaded.name}_fit")
     known = with_priors(loaded, priors)
-    emulator = linearise = solved = None
-    if {"areas", "slopes"} & {data.kind for data in sets}:
-        if finer is None:
-            finer = FINER if cells < FINER else 0
-        moving = tuple(prior for prior in priors if prior.name not in (SPILL, DIFFUSION))
-        if curved:
-            names = [prior.name for prior in moving]
-            emulator = build_emulator(known, names, sets, cells, folder)
-        else:
-            linearise = make_linearise(known, moving, priors, sets, cells)
-        if finer:
-            solve = linearise or (lambda values, fixed=emulator: fixed)
-            linearise = make_finer(solve, known, priors, sets, finer, cells, folder)
-            emulator = None
-        if draws:
-            solved = make_solved(known, priors, sets, cells, finer, folder)
+    response = _Response.of(
+        known, priors, sets, folder, cells=cells, finer=finer, curved=curved, draws=draws
+    )
     result = fit_device(
-        known, sets, priors, emulator, linearise=linearise,
+        known, sets, priors, response.emulator, linearise=response.linearise,
         tangents=make_tangents(known, cells=min(cells, 8), progress=Bar("settings")),
-        solved=solved, draws=draws, progress=Bar("devices drawn"), profiles=chosen,
+        solved=response.solved, draws=draws, progress=Bar("devices drawn"), profiles=chosen,
         source=f"bfsensor fit of {', '.join(data.name for data in sets if data.fitted)}; "
         "errors are correlated: fit.json",
         notes=[
@@ -174,6 +155,71 @@ def fit(
     click.echo("\n".join(lines[:-1]))
     click.echo(f"{folder}: {', '.join(written)}")
     click.echo(lines[-1])
+
+
+def _choose_priors(
+    device: Any, free: tuple[str, ...], sets: Sequence[DataSet]
+) -> tuple[Prior, ...]:
+    """Priors of what is free, among it what only saturation or diffusion depends on."""
+    from bfsensor.device.quantities import DIFFUSION, choose_priors
+    from bfsensor.fit.linear_predictors import SPILL
+
+    fitted = {data.kind for data in sets if data.fitted}
+    more = (
+        *([SPILL] if "saturation" in fitted else []),
+        *([DIFFUSION] if "diffusion" in fitted else []),
+    )
+    return choose_priors(device, free, more=more)
+
+
+@dataclass(frozen=True)
+class _Response:
+    """What predicts areas and slopes, as :func:`bfsensor.fit.fit.fit_device` takes it.
+
+    Either an emulator, or what solves the device with derivatives where each round ends; and
+    what solves it without them, for the errors of the prediction.
+    """
+
+    emulator: Any = None
+    linearise: Any = None
+    solved: Any = None
+
+    @classmethod
+    def of(
+        cls,
+        device: Any,
+        priors: Sequence[Prior],
+        sets: Sequence[DataSet],
+        folder: Path,
+        *,
+        cells: int,
+        finer: int | None,
+        curved: bool,
+        draws: int,
+    ) -> _Response:
+        """Prepare it as the options state; nothing where no set is of areas or slopes."""
+        from bfsensor.device.quantities import DIFFUSION
+        from bfsensor.fit.finer_mesh import FINER
+        from bfsensor.fit.linear_predictors import SPILL
+
+        if not {"areas", "slopes"} & {data.kind for data in sets}:
+            return cls()
+        if finer is None:
+            finer = FINER if cells < FINER else 0
+        moving = tuple(prior for prior in priors if prior.name not in (SPILL, DIFFUSION))
+        emulator = linearise = solved = None
+        if curved:
+            names = [prior.name for prior in moving]
+            emulator = build_emulator(device, names, sets, cells, folder)
+        else:
+            linearise = make_linearise(device, moving, priors, sets, cells)
+        if finer:
+            solve = linearise or (lambda values, fixed=emulator: fixed)
+            linearise = make_finer(solve, device, priors, sets, finer, cells, folder)
+            emulator = None
+        if draws:
+            solved = make_solved(device, priors, sets, cells, finer, folder)
+        return cls(emulator, linearise, solved)
 
 
 def responding(sets: Sequence[DataSet]) -> tuple[Any, ...]:

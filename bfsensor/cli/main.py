@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from bfsensor.cli.check import check
-from bfsensor.cli.common import load_device, parse_settings
+from bfsensor.cli.common import load_device, settings_option
 from bfsensor.cli.diagnose import diagnose
 from bfsensor.cli.fit import fit
 from bfsensor.cli.measure import measure
@@ -124,8 +124,7 @@ def import_(cfg: Path, output: Path | None, overwrite: bool) -> None:
 
 @main.command()
 @click.argument("source")
-@click.option("--set", "settings", multiple=True, callback=parse_settings, metavar="KEY=VALUE",
-              help="Change a device quantity (repeatable).")  # fmt: skip
+@settings_option
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), help="Figure [SOURCE.png]."
 )

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
-import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 
-from bfsensor.cli.common import load_device, parse_settings
+from bfsensor.cli.common import (
+    device_options,
+    executor_options,
+    load_device,
+    progress_bar,
+    summary_option,
+)
 from bfsensor.errors import BFSensorError, SimulationError
 from bfsensor.files import written_whole
 
@@ -20,9 +25,7 @@ def _spot_path(folder: Path, key: str, number: int) -> Path:
 
 
 @click.command()
-@click.argument("device")
-@click.option("--set", "settings", multiple=True, callback=parse_settings, metavar="KEY=VALUE",
-              help="Change a value of the device, such as back_bias=-60V; repeatable.")  # fmt: skip
+@device_options
 @click.option("--spots", "count", default=8, show_default=True, type=click.IntRange(min=1),
               help="Spots, each with its own centre and electrons.")  # fmt: skip
 @click.option("--peak", default=80_000.0, show_default=True,
@@ -39,13 +42,10 @@ def _spot_path(folder: Path, key: str, number: int) -> Path:
               help="Width of the diffusion relative to Einstein's; the published simulations "
               "have 2.12.")  # fmt: skip
 @click.option("--seed", default=20170, show_default=True, help="Of all random numbers.")
-@click.option("--workers", default=2, show_default=True, type=click.IntRange(min=1),
-              help="Processes.")  # fmt: skip
-@click.option("--executor", default="process", show_default=True,
-              type=click.Choice(["process", "dask", "parsl"]), help="Where they run.")  # fmt: skip
+@executor_options
 @click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("spots"),
               show_default=True, help="Folder for the images, slopes and figure.")  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+@summary_option
 def spots(
     device: str,
     settings: list[tuple[str, str]],
@@ -75,8 +75,6 @@ def spots(
       bfsensor spots itl_sta3800c --set back_bias=-60V --set gate_high=4V -o spots_60
       bfsensor spots e2v_ccd250 --spots 2 --steps 20 --peak 150000
     """
-    from tqdm import tqdm
-
     from bfsensor.direct.spot_exposure import Spot, SpotPlan, simulate_spot
     from bfsensor.direct.transport import Transport
     from bfsensor.sweeps.executors import open_executor, run_points
@@ -88,24 +86,19 @@ def spots(
     )  # fmt: skip
     plan.check_full_well()  # before any worker starts
     output.mkdir(parents=True, exist_ok=True)
-    bar = tqdm(total=count, unit="spot", file=sys.stderr)
-
-    def progress(done: int, total: int) -> None:
-        bar.n = done
-        bar.refresh()
 
     def write(spot: Spot, path: Path) -> None:
         spot.write(path)
 
-    try:
-        with open_executor(executor, min(workers, count)) as pool:
-            made = run_points(
-                partial(simulate_spot, plan), range(count),
-                path=lambda n: _spot_path(output, plan.key, n), read=Spot.read, write=write,
-                executor=pool, progress=progress,
-            )  # fmt: skip
-    finally:
-        bar.close()
+    with (
+        progress_bar("spot") as progress,
+        open_executor(executor, min(workers, count)) as pool,
+    ):
+        made = run_points(
+            partial(simulate_spot, plan), range(count),
+            path=lambda n: _spot_path(output, plan.key, n), read=Spot.read, write=write,
+            executor=pool, progress=progress,
+        )  # fmt: skip
     _report(plan, made, output, as_json)
 
 

@@ -10,20 +10,27 @@ from typing import Any
 
 import click
 
-from bfsensor.cli.common import load_device, parse_settings
+from bfsensor.cli.common import (
+    check_targets,
+    device_options,
+    executor_options,
+    load_device,
+    overwrite_option,
+    parse_settings,
+    progress_bar,
+    summary_option,
+)
 from bfsensor.errors import SweepError
 
 
 @click.command()
-@click.argument("device")
+@device_options
 @click.option("--over", "over", multiple=True, required=True, callback=parse_settings,
               metavar="KEY=VALUES",
               help="Quantity and values: back_bias=-30V:-70V:5 (first, last, how many) or "
               "thickness=80um,100um; repeatable.")  # fmt: skip
 @click.option("--paired", is_flag=True,
               help="First values together, then second ones, ...; not all with all.")  # fmt: skip
-@click.option("--set", "settings", multiple=True, callback=parse_settings, metavar="KEY=VALUE",
-              help="Change a quantity of every point: --set gate_high=4V (repeatable).")  # fmt: skip
 @click.option("--level", default=40_000.0, show_default=True,
               help="Charge of all pixels about which the response is taken [e-].")  # fmt: skip
 @click.option("--full-pixel", default=0.0, metavar="Q",
@@ -31,18 +38,15 @@ from bfsensor.errors import SweepError
 @click.option("--cells", type=int, help="Mesh cells a pixel [16].")
 @click.option("--accuracy", type=float,
               help="Instead: mesh accuracy aimed at, as of bfsensor table.")  # fmt: skip
-@click.option("--workers", default=2, show_default=True, type=click.IntRange(min=1),
-              help="Processes.")  # fmt: skip
-@click.option("--executor", default="process", show_default=True,
-              type=click.Choice(["process", "dask", "parsl"]), help="Where they run.")  # fmt: skip
+@executor_options
 @click.option("-o", "--output", type=click.Path(path_type=Path),
               help="ECSV to write [DEVICE_sweep.ecsv].")  # fmt: skip
 @click.option("--tables", type=click.Path(path_type=Path), metavar="FOLDER",
               help="Write the table of the response about the level at every point.")  # fmt: skip
 @click.option("--plot", type=click.Path(path_type=Path), metavar="FIG",
               help="Draw a_ij against the quantity with most values (needs [plots]).")  # fmt: skip
-@click.option("--overwrite", is_flag=True, help="Replace an existing output.")
-@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+@overwrite_option
+@summary_option
 @click.pass_context
 def sweep(
     context: click.Context,
@@ -80,76 +84,66 @@ def sweep(
       bfsensor sweep e2v_ccd250 --over thickness=80um,100um --over wavelength=400nm:1000nm:13
       bfsensor sweep itl_sta3800c --paired --over gate_low=-8V,-6V --over gate_high=2V,6V
     """
-    from tqdm import tqdm
-
     from bfsensor.sweeps.axes import combine, parse_swept
     from bfsensor.sweeps.device_sweep import sweep_device
     from bfsensor.sweeps.executors import open_executor
-    from bfsensor.sweeps.points import CELLS
 
-    if cells is not None and accuracy is not None:
-        raise click.UsageError("--cells and --accuracy: give one of them")
+    mesh = _cells(cells, accuracy)
     loaded = load_device(device, settings)
     swept = [parse_swept(key, text, loaded) for key, text in over]
     count = len(combine(swept, paired=paired))
     target = output or Path(f"{loaded.name}_sweep.ecsv")
-    for path in (target, plot):
-        if path is not None and path.exists() and not overwrite:
-            raise SweepError(f"{path} exists; give --overwrite to replace it")
-        if path is not None and not path.parent.is_dir():
-            raise SweepError(f"{path.parent} is not a folder")
+    check_targets([target, *([plot] if plot else [])], overwrite, SweepError)
     work = target.with_name(target.name + ".points")
-    bar: Any = None
-
-    def progress(done: int, total: int) -> None:
-        nonlocal bar
-        if bar is None:  # not before the request is found good
-            bar = tqdm(total=total, unit="point", file=sys.stderr)
-        bar.n = done
-        bar.refresh()
-
-    try:
-        with open_executor(executor, min(workers, count + 2)) as pool:
-            made = sweep_device(
-                loaded, swept, paired=paired, level=level, full_pixel=full_pixel,
-                cells=cells if cells is not None else CELLS if accuracy is None else _cells(accuracy),
-                work=work, tables=tables, executor=pool, progress=progress,
-                command=" ".join(["bfsensor", *sys.argv[1:]]),
-            )  # fmt: skip
-    finally:
-        if bar is not None:
-            bar.close()
+    with (
+        progress_bar("point") as progress,
+        open_executor(executor, min(workers, count + 2)) as pool,
+    ):
+        made = sweep_device(
+            loaded, swept, paired=paired, level=level, full_pixel=full_pixel, cells=mesh,
+            work=work, tables=tables, executor=pool, progress=progress,
+            command=" ".join(["bfsensor", *sys.argv[1:]]),
+        )  # fmt: skip
     made.write(target, overwrite=overwrite)
     shutil.rmtree(work)
     drawn = _draw(made, plot)
-    refused = int(made.refused.sum())
-    summary: dict[str, Any] = {
-        "written": [str(target), *drawn],
-        "points": len(made.rows),
-        "refused": refused,
-        "reasons": sorted({str(r) for r in made.rows["reason"] if r}),
-        "level_e": level,
-        "cells_a_pixel": made.rows.meta["cells"],
-        "cpu_s": round(float(made.rows["cpu"].sum()), 1),
-    }
+    summary = _summarise(made, [str(target), *drawn])
     if as_json:
         click.echo(json.dumps(summary, indent=1))
     else:
         _print(made)
         click.echo(f"written: {', '.join(summary['written'])}")
-    if refused:
+    if summary["refused"]:
         click.echo(
-            f"bfsensor: {refused} of {len(made.rows)} points have no answer; see the column "
+            f"bfsensor: {summary['refused']} of {len(made.rows)} points have no answer; see the column "
             f"'reason' of {target}",
             err=True,
         )
         context.exit(1)
 
 
-def _cells(accuracy: float) -> int:
-    """Cells a pixel for an accuracy, as of tables."""
+def _summarise(made: Any, written: list[str]) -> dict[str, Any]:
+    """What was made, and at what cost."""
+    return {
+        "written": written,
+        "points": len(made.rows),
+        "refused": int(made.refused.sum()),
+        "reasons": sorted({str(r) for r in made.rows["reason"] if r}),
+        "level_e": made.rows.meta["level"],
+        "cells_a_pixel": made.rows.meta["cells"],
+        "cpu_s": round(float(made.rows["cpu"].sum()), 1),
+    }
+
+
+def _cells(cells: int | None, accuracy: float | None) -> int:
+    """Cells a pixel: as stated, or for an accuracy, as of tables."""
+    from bfsensor.sweeps.points import CELLS
     from bfsensor.table.table_plan import ACCURACIES
 
+    if cells is not None and accuracy is not None:
+        raise click.UsageError("--cells and --accuracy: give one of them")
+    if accuracy is None:
+        return CELLS if cells is None else cells
     fitting = [n for limit, n in ACCURACIES.items() if limit <= accuracy * (1 + 1e-9)]
     if not fitting:
         raise SweepError(f"accuracy = {accuracy:g} must be at least {min(ACCURACIES):g}")

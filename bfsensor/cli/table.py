@@ -7,14 +7,23 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import click
 from click.core import ParameterSource
 
-from bfsensor.cli.common import load_device, parse_settings
+from bfsensor.cli.common import (
+    check_targets,
+    device_options,
+    load_device,
+    overwrite_option,
+    parse_settings,
+    progress_bar,
+    summary_option,
+)
 from bfsensor.errors import BFSensorError, DeviceError, TableError
 from bfsensor.files import written_whole
 
@@ -33,9 +42,7 @@ def _numbers(
 
 
 @click.command()
-@click.argument("device")
-@click.option("--set", "settings", multiple=True, callback=parse_settings, metavar="KEY=VALUE",
-              help="Change a quantity: --set back_bias=-60V (repeatable).")  # fmt: skip
+@device_options
 @click.option(
     "--charges", callback=_numbers, metavar="Q,Q,...", help="Source charges [e-]."
 )
@@ -76,8 +83,8 @@ def _numbers(
 @click.option(
     "--figure/--no-figure", default=True, help="Draw the table beside it (needs [plots])."
 )
-@click.option("--overwrite", is_flag=True, help="Replace an existing output.")
-@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+@overwrite_option
+@summary_option
 @click.pass_context
 def table(
     context: click.Context,
@@ -115,72 +122,35 @@ def table(
         --image-charge half_width_y=3.8um \\
         --image-charge drift_field=0um:0.736V/um,100um:0.364V/um
     """
-    from bfsensor.table.build import build_table, peak_memory
-    from bfsensor.table.build_image_charge import default_depths
-    from bfsensor.table.galsim_format import write_galsim
+    from bfsensor.table.build import peak_memory
     from bfsensor.table.table_plan import plan_table
 
     began, cpu_began = time.perf_counter(), _cpu_seconds()
     _check_engine(context, engine, parameters)
     loaded = load_device(device, settings)
     model = _image_charge(loaded, parameters) if engine == "image_charge" else None
+    levels = _Levels(charges, backgrounds, depths)
     if galsim is not None:
-        charges = charges or (100000.0,)
-        backgrounds = (0.0,)
-        depths = depths or (95.0 / 100.0 * loaded.silicon.thickness,)
-        if len(charges) != 1 or len(depths) != 1:
-            raise TableError(
-                f"a GalSim table holds one charge and one depth, not {len(charges)} and "
-                f"{len(depths)}"
-            )
+        levels = levels.for_galsim(loaded)
         targets = [galsim.with_name(galsim.name + ending) for ending in (".cfg", ".dat")]
     else:
+        levels = levels if model is None else levels.for_image_charge(model)
         targets = [output or Path(f"{loaded.name}.fits")]
-        if model is not None:  # linear: two charges and one background hold it all
-            charges, backgrounds = charges or (0.0, 100_000.0), backgrounds or (0.0,)
-            depths = depths or default_depths(model)
-    for target in targets:
-        if target.exists() and not overwrite:
-            raise TableError(f"{target} exists; give --overwrite to replace it")
-        if not target.parent.is_dir():
-            raise TableError(f"{target.parent} is not a folder")
+    check_targets(targets, overwrite, TableError)
     plan = plan_table(
-        loaded, charges=charges, backgrounds=backgrounds, depths=depths, vertices=vertices,
-        pixels=pixels, accuracy=accuracy,
+        loaded, charges=levels.charges, backgrounds=levels.backgrounds, depths=levels.depths,
+        vertices=vertices, pixels=pixels, accuracy=accuracy,
     )  # fmt: skip
-    click.echo(
-        f"{loaded.name}: full well {plan.full_well:,.0f} e-, {len(plan.charges)} charges x "
-        f"{len(plan.backgrounds)} backgrounds x {len(plan.depths)} depths, "
-        + (f"{plan.cells} cells a pixel" if model is None else "image charges"),
-        err=True,
-    )
+    click.echo(_describe(plan, model), err=True)
     checkpoint = targets[0].with_name(targets[0].name + ".levels")
-    provenance = {"command": " ".join(["bfsensor", *sys.argv[1:]])}
-    if model is None:
-        wanted = assess if assess is not None else galsim is None
-        result = _solve(plan, workers, wanted, checkpoint, provenance)
-    else:
-        result = build_table(
-            plan, engine="image_charge", image_charge=model, provenance=provenance
-        )
-    if galsim is not None:
-        write_galsim(
-            result,
-            galsim,
-            charge=plan.charges[0],
-            depth=plan.depths[0],
-            overwrite=overwrite,
-        )
-    else:
-        result.write(targets[0], overwrite=overwrite)
+    assessed = galsim is None if assess is None else assess
+    result = _build(plan, model, workers, assessed, checkpoint)
+    _write(result, plan, galsim, targets[0], overwrite)
     if model is None:
         shutil.rmtree(checkpoint)
-    written = [str(t) for t in targets]
-    if figure:
-        drawn = _draw(result, targets[0].with_suffix(".png"))
-        written += [drawn] if drawn else []
+    drawn = _draw(result, targets[0].with_suffix(".png")) if figure else []
     summary = {
-        "written": written,
+        "written": [*map(str, targets), *drawn],
         "full_well_e": plan.full_well,
         **(_effort(plan, result) if model is None else {"engine": engine}),
         "errors": dict(result.errors),
@@ -190,9 +160,48 @@ def table(
     }
     if as_json:
         click.echo(json.dumps(summary, indent=1, default=str))
-    else:
-        for key, value in summary.items():
-            click.echo(f"{key:18} {_plain(value)}")
+        return
+    for key, value in summary.items():
+        click.echo(f"{key:18} {_plain(value)}")
+
+
+def _describe(plan: Any, model: Any) -> str:
+    """Say what will be solved, and how."""
+    how = f"{plan.cells} cells a pixel" if model is None else "image charges"
+    return (
+        f"{plan.device.name}: full well {plan.full_well:,.0f} e-, {len(plan.charges)} charges x "
+        f"{len(plan.backgrounds)} backgrounds x {len(plan.depths)} depths, {how}"
+    )
+
+
+@dataclass(frozen=True)
+class _Levels:
+    """Charges and backgrounds [e-] and depths [um] of a table; None: those of its plan."""
+
+    charges: tuple[float, ...] | None
+    backgrounds: tuple[float, ...] | None
+    depths: tuple[float, ...] | None
+
+    def for_galsim(self, device: Any) -> _Levels:
+        """One charge, no background, one depth, which is all that GalSim's format holds."""
+        charges = self.charges or (100000.0,)
+        depths = self.depths or (95.0 / 100.0 * device.silicon.thickness,)
+        if len(charges) != 1 or len(depths) != 1:
+            raise TableError(
+                f"a GalSim table holds one charge and one depth, not {len(charges)} and "
+                f"{len(depths)}"
+            )
+        return _Levels(charges, (0.0,), depths)
+
+    def for_image_charge(self, model: Any) -> _Levels:
+        """Two charges and one background, which hold all that is linear in charge."""
+        from bfsensor.table.build_image_charge import default_depths
+
+        return _Levels(
+            self.charges or (0.0, 100_000.0),
+            self.backgrounds or (0.0,),
+            self.depths or default_depths(model),
+        )
 
 
 def _check_engine(
@@ -253,33 +262,35 @@ def _image_charge(device: Any, parameters: Sequence[tuple[str, str]]) -> Any:
     )  # fmt: skip
 
 
-def _solve(
-    plan: Any, workers: int, assessed: bool, checkpoint: Path, provenance: dict[str, str]
-) -> Any:
-    """Solve a plan with a bar, on processes, so that it can be taken up again."""
-    from tqdm import tqdm
-
+def _build(plan: Any, model: Any, workers: int, assessed: bool, checkpoint: Path) -> Any:
+    """Build a plan's table; by Poisson's equation with a bar, so that it can be taken up again."""
+    from bfsensor.sweeps.executors import open_executor
     from bfsensor.table.build import build_table
 
-    bar = tqdm(
-        total=len(plan.charges) * len(plan.backgrounds), unit="level", file=sys.stderr
-    )
-
-    def progress(done: int, total: int) -> None:
-        bar.n = done
-        bar.refresh()
-
-    executor = ProcessPoolExecutor(workers) if workers > 1 else None
-    try:
+    provenance = {"command": " ".join(["bfsensor", *sys.argv[1:]])}
+    if model is not None:
+        return build_table(
+            plan, engine="image_charge", image_charge=model, provenance=provenance
+        )
+    with progress_bar("level") as progress, open_executor("process", workers) as executor:
         errors = _start_assessment(plan, executor, checkpoint) if assessed else None
         return build_table(
             plan, executor=executor, checkpoint=checkpoint, progress=progress,
             errors=errors, provenance=provenance,
         )  # fmt: skip
-    finally:
-        bar.close()  # ends its line, before any message
-        if executor is not None:
-            executor.shutdown(cancel_futures=True)
+
+
+def _write(
+    result: Any, plan: Any, galsim: Path | None, target: Path, overwrite: bool
+) -> None:
+    """Write the table, or its one level for GalSim."""
+    from bfsensor.table.galsim_format import write_galsim
+
+    if galsim is None:
+        result.write(target, overwrite=overwrite)
+        return
+    charge, depth = plan.charges[0], plan.depths[0]
+    write_galsim(result, galsim, charge=charge, depth=depth, overwrite=overwrite)
 
 
 def _effort(plan: Any, result: Any) -> dict[str, Any]:
@@ -293,7 +304,7 @@ def _effort(plan: Any, result: Any) -> dict[str, Any]:
 
 
 def _start_assessment(
-    plan: Any, executor: ProcessPoolExecutor | None, checkpoint: Path
+    plan: Any, executor: Executor | None, checkpoint: Path
 ) -> Callable[[], dict[str, float]]:
     """Begin to measure the errors of a table; the answer is kept like its levels."""
     from bfsensor.table.assess import assess
@@ -322,7 +333,7 @@ def _plain(value: Any) -> str:
     return f"{value:,.0f}" if isinstance(value, float) and value > 1000 else str(value)
 
 
-def _draw(result: Any, path: Path) -> str | None:
+def _draw(result: Any, path: Path) -> list[str]:
     """Draw a table beside it; says so and goes on where matplotlib is missing."""
     from bfsensor.plots import table as show
 
@@ -330,9 +341,9 @@ def _draw(result: Any, path: Path) -> str | None:
         figure = show.figure_for_table(result)
     except BFSensorError as error:
         click.echo(f"bfsensor: no figure: {error}", err=True)
-        return None
+        return []
     figure.savefig(path, dpi=120)
-    return str(path)
+    return [str(path)]
 
 
 def _cpu_seconds() -> float:

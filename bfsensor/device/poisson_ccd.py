@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 from bfsensor.device.device import Device
@@ -106,36 +107,47 @@ def import_poisson_ccd(path: str | os.PathLike[str]) -> Device:
         A key is missing or not a number, or the device cannot be represented.
     """
     path = Path(path)
-    data = read_configuration(path)
+    given = _Configuration(read_configuration(path))
     try:
-        return _device(path.stem, data)
+        return _device(path.stem, given)
     except DeviceError as error:
         raise DeviceError(f"{path.name}: {error}") from None
 
 
-def _device(name: str, data: dict[str, str]) -> Device:
-    """Build the device that a configuration describes."""
+@dataclass(frozen=True)
+class _Configuration:
+    """The texts of a configuration by key, as numbers and implants."""
 
-    def number(key: str, default: float | None = None) -> float:
-        if key not in data:
+    texts: dict[str, str]
+
+    def number(self, key: str, default: float | None = None) -> float:
+        """Give a number; without a default the key must be there."""
+        if key not in self.texts:
             if default is None:
                 raise DeviceError(f"{key} is missing")
             return default
         try:
-            return float(data[key])
+            return float(self.texts[key])
         except ValueError:
-            raise DeviceError(f"{key} = {data[key]!r} is not a number") from None
+            raise DeviceError(f"{key} = {self.texts[key]!r} is not a number") from None
 
-    def whole(key: str, default: float | None = None) -> int:
-        value = number(key, default)
+    def whole(self, key: str, default: float | None = None) -> int:
+        """Give a whole number."""
+        value = self.number(key, default)
         if not value.is_integer():
-            raise DeviceError(f"{key} = {data[key]!r} is not a whole number")
+            raise DeviceError(f"{key} = {self.texts[key]!r} is not a whole number")
         return int(value)
 
-    def implants(prefix: str) -> tuple[Implant, ...]:
-        count = whole(f"{prefix}Profile", 0.0)
+    def surface_charge(self, prefix: str) -> float:
+        """Charge of a surface [e-/um^2], 0 where none is stated."""
+        return self.number(f"{prefix}SurfaceCharge", 0.0) * _PER_CM2
+
+    def implants(self, prefix: str) -> tuple[Implant, ...]:
+        """Give the Gaussian implants of a region, or its one of even density."""
+        count = self.whole(f"{prefix}Profile", 0.0)
         if count == 0:
-            doping, depth = number(f"{prefix}Doping", 0.0), number(f"{prefix}Depth", 0.0)
+            doping = self.number(f"{prefix}Doping", 0.0)
+            depth = self.number(f"{prefix}Depth", 0.0)
             return (
                 (Implant("box", doping * _PER_CM2, depth=depth),)
                 if doping and depth
@@ -144,35 +156,39 @@ def _device(name: str, data: dict[str, str]) -> Device:
         return tuple(
             Implant(
                 "gaussian",
-                number(f"{prefix}Dose_{i}") * _PER_CM2,
-                number(f"{prefix}Peak_{i}"),
-                number(f"{prefix}Sigma_{i}"),
+                self.number(f"{prefix}Dose_{i}") * _PER_CM2,
+                self.number(f"{prefix}Peak_{i}"),
+                self.number(f"{prefix}Sigma_{i}"),
             )
             for i in range(count)
         )
 
-    _refuse_unknown(data)
-    if number("TreeRingAmplitude", 0.0):
-        raise DeviceError(
-            f"TreeRingAmplitude = {data['TreeRingAmplitude']}: its period lacks a factor "
-            "2 pi there; give the ripple in the device file instead"
-        )
-    if number("GateGap", 0.0):
-        raise DeviceError(
-            f"GateGap = {data['GateGap']}: gaps between gates are not modelled"
-        )
-    if number("NumberofFixedRegions", 0.0):
-        raise DeviceError(
-            f"NumberofFixedRegions = {data['NumberofFixedRegions']}: fixed regions are not "
-            "taken over; describe a guard ring as [edge] in the device file"
-        )
+
+def _refuse_unmodelled(given: _Configuration) -> None:
+    """Refuse what a device file says in another way, or cannot say."""
+    for key, why in (
+        ("TreeRingAmplitude", "its period lacks a factor 2 pi there; give the ripple in the "
+         "device file instead"),
+        ("GateGap", "gaps between gates are not modelled"),
+        ("NumberofFixedRegions", "fixed regions are not taken over; describe a guard ring as "
+         "[edge] in the device file"),
+    ):  # fmt: skip
+        if given.number(key, 0.0):
+            raise DeviceError(f"{key} = {given.texts[key]}: {why}")
+
+
+def _device(name: str, given: _Configuration) -> Device:
+    """Build the device that a configuration describes."""
+    number = given.number
+    _refuse_unknown(given.texts)
+    _refuse_unmodelled(given)
     dots = None
-    if implants("ChannelStopDot"):
+    if given.implants("ChannelStopDot"):
         dots = ChannelStopDots(
             number("ChannelStopDotCenter"),
             number("ChannelStopDotHeight"),
-            number("ChannelStopDotSurfaceCharge", 0.0) * _PER_CM2,
-            implants("ChannelStopDot"),
+            given.surface_charge("ChannelStopDot"),
+            given.implants("ChannelStopDot"),
         )
     return Device(
         name=name,
@@ -180,20 +196,18 @@ def _device(name: str, data: dict[str, str]) -> Device:
         material=PUBLISHED_MATERIAL,
         silicon=Silicon(number("SensorThickness"), number("BackgroundDoping") * _PER_CM3),
         gates=GateStack(
-            whole("NumPhases"),
-            whole("CollectingPhases"),
+            given.whole("NumPhases"),
+            given.whole("CollectingPhases"),
             number("GateOxide"),
             number("FieldOxide"),
             number("FieldOxideTaper", 0.0),
         ),
-        channel=BuriedChannel(
-            number("ChannelSurfaceCharge", 0.0) * _PER_CM2, implants("Channel")
-        ),
+        channel=BuriedChannel(given.surface_charge("Channel"), given.implants("Channel")),
         channel_stop=ChannelStop(
             number("ChannelStopWidth"),
             number("ChannelStopSideDiff", 0.0),
-            number("ChannelStopSurfaceCharge", 0.0) * _PER_CM2,
-            implants("ChannelStop"),
+            given.surface_charge("ChannelStop"),
+            given.implants("ChannelStop"),
             dots,
         ),
         operating_point=OperatingPoint(

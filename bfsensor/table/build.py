@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import resource
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import Executor, as_completed
 from pathlib import Path
 from typing import Any, Literal
@@ -144,6 +144,53 @@ def _solve_table(
     provenance: dict[str, str],
 ) -> DistortionTable:
     """Solve every level of a plan and assemble the table."""
+    levels = _solve_levels(plan, executor, checkpoint, progress)
+
+    def gather(name: str) -> FloatArray:
+        return np.array(
+            [[getattr(levels[q, b], name) for b in plan.backgrounds] for q in plan.charges]
+        )
+
+    return DistortionTable(
+        charges=np.array(plan.charges),
+        backgrounds=np.array(plan.backgrounds),
+        depths=np.array(plan.depths),
+        pitch=(plan.device.pixel.pitch_x, plan.device.pixel.pitch_y),
+        thickness=plan.device.silicon.thickness,
+        vertices=plan.vertices,
+        reach=plan.reach,
+        corners=gather("corners"),
+        horizontal=gather("horizontal"),
+        vertical=gather("vertical"),
+        errors={
+            "iteration [V]": max(level.error_volts for level in levels.values()),
+            "iteration, worst case [um2]": AREA_PER_VOLT
+            * max(level.error_volts for level in levels.values()),
+            "images removed at the corner [%]": 100
+            * max(lv.image_share for lv in levels.values()),
+            **(errors() if errors is not None else {}),
+        },
+        device_text=plan.device.to_toml(),
+        provenance={
+            "version": bfsensor.__version__,
+            "cells": str(plan.cells),
+            "refine_z": str(plan.refine_z),
+            "period": str(PERIOD),
+            **_effort(plan, levels.values()),
+            **provenance,
+        },
+        full_well=plan.full_well,
+        symmetric=True,
+    )
+
+
+def _solve_levels(
+    plan: TablePlan,
+    executor: Executor | None,
+    checkpoint: Path | None,
+    progress: Callable[[int, int], None] | None,
+) -> dict[tuple[float, float], Level]:
+    """Solve the levels of a plan that its checkpoint does not hold, by charge and background."""
     wanted = [(q, b) for b in plan.backgrounds for q in plan.charges]
     levels: dict[tuple[float, float], Level] = {}
     folder = None
@@ -177,52 +224,20 @@ def _solve_table(
             for future in futures:
                 future.cancel()
             raise
+    return levels
 
-    def gather(name: str) -> FloatArray:
-        return np.array(
-            [[getattr(levels[q, b], name) for b in plan.backgrounds] for q in plan.charges]
-        )
 
+def _effort(plan: TablePlan, levels: Collection[Level]) -> dict[str, str]:
+    """What the solver did, for the header."""
     nz, ny, nx = make_mesh(
         plan.device, pixels=(PERIOD, PERIOD), cells=plan.cells, refine_z=plan.refine_z
     ).shape
-    cost = {
+    return {
         "nodes": str(nx * ny * nz),
-        "levels cpu [s]": f"{sum(level.cpu_seconds for level in levels.values()):.1f}",
-        "newton steps": str(sum(level.newton for level in levels.values())),
-        "linear iterations": str(sum(level.linear_iterations for level in levels.values())),
+        "levels cpu [s]": f"{sum(level.cpu_seconds for level in levels):.1f}",
+        "newton steps": str(sum(level.newton for level in levels)),
+        "linear iterations": str(sum(level.linear_iterations for level in levels)),
     }
-    return DistortionTable(
-        charges=np.array(plan.charges),
-        backgrounds=np.array(plan.backgrounds),
-        depths=np.array(plan.depths),
-        pitch=(plan.device.pixel.pitch_x, plan.device.pixel.pitch_y),
-        thickness=plan.device.silicon.thickness,
-        vertices=plan.vertices,
-        reach=plan.reach,
-        corners=gather("corners"),
-        horizontal=gather("horizontal"),
-        vertical=gather("vertical"),
-        errors={
-            "iteration [V]": max(level.error_volts for level in levels.values()),
-            "iteration, worst case [um2]": AREA_PER_VOLT
-            * max(level.error_volts for level in levels.values()),
-            "images removed at the corner [%]": 100
-            * max(lv.image_share for lv in levels.values()),
-            **(errors() if errors is not None else {}),
-        },
-        device_text=plan.device.to_toml(),
-        provenance={
-            "version": bfsensor.__version__,
-            "cells": str(plan.cells),
-            "refine_z": str(plan.refine_z),
-            "period": str(PERIOD),
-            **cost,
-            **provenance,
-        },
-        full_well=plan.full_well,
-        symmetric=True,
-    )
 
 
 def peak_memory() -> float:

@@ -92,12 +92,7 @@ def build_image_charge_table(
     if vertices < 2:
         raise TableError(f"vertices = {vertices} must be at least 2 a side")
     levels = np.array(default_depths(model) if depths is None else depths, float)
-    excess = np.subtract.outer(np.array(charges, float), np.array(backgrounds, float))
-    if not excess.size or not np.any(excess) or not np.all(np.isfinite(excess)):
-        raise TableError(
-            f"charges = {list(charges)} e- and backgrounds = {list(backgrounds)} e- must be finite "
-            "and differ somewhere: where they are equal nothing moves"
-        )
+    excess = _excess(charges, backgrounds)
     largest = float(np.abs(excess).max())
     reach = pixels // 2
     lines = displace_boundaries(model, levels, charge=SMALL_CHARGE, reach=reach)
@@ -139,6 +134,17 @@ def build_image_charge_table(
         },
         symmetric=True,
     )
+
+
+def _excess(charges: Sequence[float], backgrounds: Sequence[float]) -> FloatArray:
+    """Charges over the backgrounds [e-], shape (nq, nb), of which one at least is not 0."""
+    excess = np.subtract.outer(np.array(charges, float), np.array(backgrounds, float))
+    if not excess.size or not np.any(excess) or not np.all(np.isfinite(excess)):
+        raise TableError(
+            f"charges = {list(charges)} e- and backgrounds = {list(backgrounds)} e- must be finite "
+            "and differ somewhere: where they are equal nothing moves"
+        )
+    return np.asarray(excess)
 
 
 def _beyond_first_order(

@@ -70,6 +70,26 @@ def write_galsim(
     paths = (stem.with_name(stem.name + ".cfg"), stem.with_name(stem.name + ".dat"))
     for path in paths:
         refuse_existing(path, overwrite, TableError)
+    _check_fits_galsim(table, charge, background, device)
+    if device is None:
+        device = Device.from_toml(table.device_text)
+    about = [
+        f"Distortion table of {device.name} by bfsensor, for galsim.SiliconSensor.",
+        f"Source {charge:g} e-, all other pixels {background:g} e-, depth {depth:g} um.",
+        table.provenance.get("command", ""),
+    ]
+    config = [f"# {' '.join(line.split())}" for line in about if line]
+    settings = _settings(table, device, charge - background, depth)
+    config += [f"{key} = {value}" for key, value in settings.items()]
+    outlines = _outlines(table, charge, background, depth)
+    _write_together({paths[0]: config, paths[1]: outlines})
+    return paths
+
+
+def _check_fits_galsim(
+    table: DistortionTable, charge: float, background: float, device: Device | None
+) -> None:
+    """Refuse what GalSim's format cannot hold."""
     if device is None and not table.device_text:
         raise TableError(
             "GalSim needs the device for its diffusion, and this table has none"
@@ -87,11 +107,18 @@ def write_galsim(
         raise TableError(
             f"GalSim assumes square pixels, not {table.pitch[0]:g} x {table.pitch[1]:g} um"
         )
-    if device is None:
-        device = Device.from_toml(table.device_text)
-    n = 2 * table.reach + 1
-    pitch = table.pitch[0]
-    origin = (table.reach + 1.5) * pitch
+
+
+def _origin(table: DistortionTable) -> float:
+    """Place of the source pixel's centre in x and in y [um]: a pixel is left at the border."""
+    return (table.reach + 1.5) * table.pitch[0]
+
+
+def _outlines(
+    table: DistortionTable, charge: float, background: float, depth: float
+) -> list[str]:
+    """Lines of the vertex file, pixel by pixel."""
+    pitch, origin = table.pitch[0], _origin(table)
     lines = ["X0             Y0             Theta          X              Y"]
     for i in range(-table.reach, table.reach + 1):
         for j in range(-table.reach, table.reach + 1):
@@ -101,8 +128,16 @@ def write_galsim(
                 row = (x0, y0, np.arctan2(y - y0, x - x0), x, y)
                 # Seven decimals: the customary four are 2 % of a shift four pixels away.
                 lines.append("".join(f"{value:<15.7f}" for value in row).rstrip())
-    point, gates, stop = device.operating_point, device.gates, device.channel_stop
-    settings = {
+    return lines
+
+
+def _settings(
+    table: DistortionTable, device: Device, excess: float, depth: float
+) -> dict[str, object]:
+    """Values of the configuration that GalSim reads; ``excess``: charge over the background."""
+    point, gates = device.operating_point, device.gates
+    n, pitch, origin = 2 * table.reach + 1, table.pitch[0], _origin(table)
+    return {
         "ScaleFactor": 1,
         "SensorThickness": table.thickness,
         "PixelSizeX": pitch,
@@ -110,7 +145,7 @@ def write_galsim(
         "GateOxide": gates.gate_oxide,
         "FieldOxide": gates.field_oxide,
         "FieldOxideTaper": gates.field_oxide_taper,
-        "ChannelStopWidth": stop.width,
+        "ChannelStopWidth": device.channel_stop.width,
         "NumPhases": gates.phases,
         "CollectingPhases": gates.collecting_phases,
         "Vbb": point.back_bias,
@@ -118,7 +153,7 @@ def write_galsim(
         "Vparallel_hi": point.gate_high,
         "qfh": point.hole_quasi_fermi_level,
         "CCDTemperature": point.temperature,
-        "CollectedCharge_0_0": charge - background,
+        "CollectedCharge_0_0": excess,
         "FilledPixelCoords_0_0": f"{origin} {origin}",
         "PixelBoundaryLowerLeft": f"{pitch} {pitch}",
         "PixelBoundaryUpperRight": f"{(n + 1) * pitch} {(n + 1) * pitch}",
@@ -127,15 +162,6 @@ def write_galsim(
         "NumVertices": table.vertices,
         "ElectronZ0Area": depth,
     }
-    about = [
-        f"Distortion table of {device.name} by bfsensor, for galsim.SiliconSensor.",
-        f"Source {charge:g} e-, all other pixels {background:g} e-, depth {depth:g} um.",
-        table.provenance.get("command", ""),
-    ]
-    config = [f"# {' '.join(line.split())}" for line in about if line]
-    config += [f"{key} = {value}" for key, value in settings.items()]
-    _write_together({paths[0]: config, paths[1]: lines})
-    return paths
 
 
 def _write_together(files: dict[Path, list[str]]) -> None:

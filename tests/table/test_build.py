@@ -11,10 +11,10 @@ from bfsensor.errors import DeviceError, TableError
 from bfsensor.simulate.boundaries import lowest_depth
 from bfsensor.simulate.unit_cell import solve_unit_cell
 from bfsensor.simulate.well import barrier, full_well
-from bfsensor.table import build, levels
+from bfsensor.table import build
 from bfsensor.table.assess import assess, superposition_error
 from bfsensor.table.build import build_table
-from bfsensor.table.levels import Level, solve_level
+from bfsensor.table.levels import Level, _workshop, solve_level
 from bfsensor.table.table_plan import default_depths, plan_table, storage_height
 
 
@@ -136,7 +136,7 @@ def test_a_hole_in_a_background_attracts(table):
 
 
 def test_levels_do_not_depend_on_what_was_solved_before(plan, table):
-    levels._workshop.cache_clear()
+    _workshop.cache_clear()
     alone = solve_level(plan, 8e4, 4e4)
     again = solve_level(plan, 8e4, 4e4)
     for name in ("corners", "horizontal", "vertical"):
