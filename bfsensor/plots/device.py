@@ -8,6 +8,7 @@ functions together with the figures of tables.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -34,12 +35,17 @@ from bfsensor.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
     from bfsensor.device.device import Device
 
 ELECTRON_COLOUR, HOLE_COLOUR, DOPANT_COLOUR = BLUE, RED, GREEN
 
+_GATE_COLOUR, _OXIDE_COLOUR = "#8C8C8C", "#DDDDDD"
+_GATE_DEPTH = 0.25  # um, to which gates are drawn below z = 0
+
+_REACH = 1.5  # pixels to either side of a cross section's middle
 _FAINTEST = 1e2  # carriers/um^3 below which a cross section is left white
 
 
@@ -72,75 +78,80 @@ def draw_potential_profiles(
         Matplotlib is missing.
     """
     import_matplotlib()
-    device, mesh = potential.device, potential.mesh
-    surfaces = Surfaces.of(device)
-    point = device.operating_point
+    mesh, point = potential.mesh, potential.device.operating_point
     half_x, half_y = mesh.pitch[0] / 2, mesh.pitch[1] / 2
     places = (
         (f"collecting gate, {point.gate_high:+g} V", 0.0, 0.0, half_x),
         ("channel stop", half_x, 0.0, 0.0),
         (f"barrier gate, {point.gate_low:+g} V", 0.0, half_y, half_x),
     )
-    charge = float(potential.charges[central_pixel(potential)])
+    surfaces = Surfaces.of(potential.device)
     for column, (name, x, y, distance) in enumerate(places):
         above, below = axes[0][column], axes[1][column]
         gate = float(surfaces.gate(np.array([distance]))[0])
         silicon = float(surfaces.silicon(np.array([distance]))[0])
         for ax in (above, below):
-            ax.axvspan(0.0, gate, color="#8C8C8C", linewidth=0)
-            ax.axvspan(gate, silicon, color="#DDDDDD", linewidth=0)
+            ax.axvspan(0.0, gate, color=_GATE_COLOUR, linewidth=0)
+            ax.axvspan(gate, silicon, color=_OXIDE_COLOUR, linewidth=0)
             ax.set_xlim(0.0, height)
             ax.set_xlabel("z above the gates [µm]")
         above.set_title(name)
-        above.set_ylabel("potential [V]")
-        below.set_ylabel("charge density [e/µm³]")
+        solutions = [potential, *([empty] if empty is not None and column == 0 else [])]
+        _draw_potentials(above, solutions, (x, y), gate, height)
+        _draw_densities(below, potential, (x, y), np.linspace(silicon, height, 401))
 
-        full = above.inset_axes((0.6, 0.62, 0.38, 0.3))
-        solutions = [(potential, electrons_text(charge), "-", BLACK)]
-        if empty is not None and column == 0:
-            solutions.append((empty, "empty", "--", PURPLE))
-        for solved, label, style, colour in solutions:
-            phi = solved.phi[:, _node(solved, 1, y), _node(solved, 0, x)]
-            shown = (mesh.z >= gate - 1e-9) & (mesh.z <= 1.1 * height)
-            above.plot(
-                mesh.z[shown], phi[shown], style, color=colour, linewidth=1.5, label=label
-            )
-            full.plot(mesh.z, phi, style, color=colour, linewidth=1.0)
-        shown = (mesh.z >= gate - 1e-9) & (mesh.z <= height)
-        profile = potential.phi[shown, _node(potential, 1, y), _node(potential, 0, x)]
-        top, low = float(profile.max()), float(profile.min())
-        if empty is not None and column == 0:
-            top = max(
-                top, float(empty.phi[shown, _node(empty, 1, y), _node(empty, 0, x)].max())
-            )
-        # Room above the curve for the inset.
-        above.set_ylim(low - 0.08 * (top - low), top + 0.9 * (top - low))
-        full.set_xlim(0.0, mesh.z[-1])
-        full.tick_params(labelsize=7)
-        full.set_title("to the back surface", fontsize=8, pad=3)
-        if column == 0 and empty is not None:
-            above.legend(
-                loc="upper left", bbox_to_anchor=(0.17, 1.0), fontsize=8, frameon=False
-            )
 
-        z, holes, electrons = _carrier_profiles(potential, x, y)
-        heights = np.linspace(silicon, height, 401)
-        dopants = _dopant_density(device, surfaces, x, y, heights)
-        below.fill_between(
-            heights, 0.0, dopants, color=DOPANT_COLOUR, alpha=0.25, linewidth=0
-        )
-        below.plot(heights, dopants, color=DOPANT_COLOUR, linewidth=1.3, label="dopants")
-        below.plot(z, holes, color=HOLE_COLOUR, linewidth=1.5, label="holes")
-        below.plot(z, -electrons, color=ELECTRON_COLOUR, linewidth=1.5, label="electrons")
-        below.axhline(0.0, color=BLACK, linewidth=0.6)
-        # Decades, linear within 1000: inversion layers are far denser than stored charge.
-        below.set_yscale("symlog", linthresh=1e3, linscale=0.5)
-        decades = [10.0**power for power in range(3, 8)]
-        below.set_yticks([-d for d in reversed(decades)] + [0.0, *decades])
-        below.minorticks_off()
-        largest = max(float(np.abs(a).max()) for a in (dopants, holes, electrons))
-        below.set_ylim(-2.5 * largest, 2.5 * largest)
-        below.legend(loc="lower right", fontsize=8, frameon=False)
+def _draw_potentials(
+    ax: Axes,
+    solutions: Sequence[Potential],
+    place: tuple[float, float],
+    gate: float,
+    height: float,
+) -> None:
+    """Draw the potential above a place (x, y), charged and perhaps empty, with an inset."""
+    mesh = solutions[0].mesh
+    charge = float(solutions[0].charges[central_pixel(solutions[0])])
+    styles = ((electrons_text(charge), "-", BLACK), ("empty", "--", PURPLE))
+    ax.set_ylabel("potential [V]")
+    full = ax.inset_axes((0.6, 0.62, 0.38, 0.3))
+    profiles = []
+    for solved, (label, style, colour) in zip(solutions, styles, strict=False):
+        phi = solved.phi[:, _node(solved, 1, place[1]), _node(solved, 0, place[0])]
+        shown = (mesh.z >= gate - 1e-9) & (mesh.z <= 1.1 * height)
+        ax.plot(mesh.z[shown], phi[shown], style, color=colour, linewidth=1.5, label=label)
+        full.plot(mesh.z, phi, style, color=colour, linewidth=1.0)
+        profiles.append(phi[(mesh.z >= gate - 1e-9) & (mesh.z <= height)])
+    low, top = float(profiles[0].min()), max(float(one.max()) for one in profiles)
+    # Room above the curve for the inset.
+    ax.set_ylim(low - 0.08 * (top - low), top + 0.9 * (top - low))
+    full.set_xlim(0.0, mesh.z[-1])
+    full.tick_params(labelsize=7)
+    full.set_title("to the back surface", fontsize=8, pad=3)
+    if len(solutions) > 1:
+        ax.legend(loc="upper left", bbox_to_anchor=(0.17, 1.0), fontsize=8, frameon=False)
+
+
+def _draw_densities(
+    ax: Axes, potential: Potential, place: tuple[float, float], heights: FloatArray
+) -> None:
+    """Draw dopants at the given heights [um], holes and electrons above a place (x, y)."""
+    device = potential.device
+    ax.set_ylabel("charge density [e/µm³]")
+    z, holes, electrons = _carrier_profiles(potential, *place)
+    dopants = _dopant_density(device, Surfaces.of(device), *place, heights)
+    ax.fill_between(heights, 0.0, dopants, color=DOPANT_COLOUR, alpha=0.25, linewidth=0)
+    ax.plot(heights, dopants, color=DOPANT_COLOUR, linewidth=1.3, label="dopants")
+    ax.plot(z, holes, color=HOLE_COLOUR, linewidth=1.5, label="holes")
+    ax.plot(z, -electrons, color=ELECTRON_COLOUR, linewidth=1.5, label="electrons")
+    ax.axhline(0.0, color=BLACK, linewidth=0.6)
+    # Decades, linear within 1000: inversion layers are far denser than stored charge.
+    ax.set_yscale("symlog", linthresh=1e3, linscale=0.5)
+    decades = [10.0**power for power in range(3, 8)]
+    ax.set_yticks([-d for d in reversed(decades)] + [0.0, *decades])
+    ax.minorticks_off()
+    largest = max(float(np.abs(a).max()) for a in (dopants, holes, electrons))
+    ax.set_ylim(-2.5 * largest, 2.5 * largest)
+    ax.legend(loc="lower right", fontsize=8, frameon=False)
 
 
 def draw_charge_cross_sections(
@@ -168,114 +179,172 @@ def draw_charge_cross_sections(
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LogNorm
 
-    device, mesh = potential.device, potential.mesh
-    surfaces = Surfaces.of(device)
-    point = device.operating_point
+    mesh, point = potential.mesh, potential.device.operating_point
     densities = [_density(potential, c) for c in (potential.holes, potential.electrons)]
-    maps = []
-    for density, colours in zip(densities, ("Reds", "Blues"), strict=True):
-        highest = max(float(density.max()), 10 * _FAINTEST)
-        maps.append(ScalarMappable(LogNorm(_FAINTEST, highest), colours))
+    colours = ("Reds", "Blues")
+    scales = [
+        LogNorm(_FAINTEST, max(float(density.max()), 10 * _FAINTEST))
+        for density in densities
+    ]
     axes = list(fig.subplots(3, 1))
     half_y = mesh.pitch[1] / 2
     panels = (
-        (
-            0,
-            _node(potential, 1, 0.0),
-            f"x-z at y = 0: collecting gate, {point.gate_high:+g} V",
-        ),
-        (
-            0,
-            _node(potential, 1, half_y),
-            f"x-z at y = {half_y:g} µm: barrier gate, {point.gate_low:+g} V",
-        ),
-        (1, _node(potential, 0, 0.0), "y-z at x = 0: along the channel"),
+        (0, 0.0, f"x-z at y = 0: collecting gate, {point.gate_high:+g} V"),
+        (0, half_y, f"x-z at y = {half_y:g} µm: barrier gate, {point.gate_low:+g} V"),
+        (1, 0.0, "y-z at x = 0: along the channel"),
     )
-    front = mesh.z[: potential.electrons.shape[0]]
-    extent = 1.5
-    for ax, (axis, node, title) in zip(axes, panels, strict=True):
-        across = "xy"[axis]
-        pitch = mesh.pitch[axis]
-        along, order = _unfolded_nodes(potential, axis, extent * pitch)
-
-        def section(
-            a: FloatArray,
-            axis: int = axis,
-            node: int = node,
-            order: NDArray[np.int64] = order,
-        ) -> FloatArray:
-            plane = a[:, node, :] if axis == 0 else a[:, :, node]
-            return plane[:, order]
-
-        for density, shades in zip(densities, maps, strict=True):
-            values = section(density)
-            ax.pcolormesh(
-                along, front, np.ma.masked_less(values, _FAINTEST), norm=shades.norm,
-                cmap=shades.cmap, shading="nearest", rasterized=True, zorder=1,
-            )  # fmt: skip
-        fine = np.linspace(-extent * pitch, extent * pitch, 1201)
-        if axis == 0:
-            distance = pitch / 2 - np.abs(fine - pitch * np.round(fine / pitch))
-        else:
-            distance = np.full(fine.shape, mesh.pitch[0] / 2)
-        gate, silicon = surfaces.gate(distance), surfaces.silicon(distance)
-        ax.fill_between(fine, -0.25, gate, color="#8C8C8C", linewidth=0, zorder=3)
-        ax.fill_between(fine, gate, silicon, color="#DDDDDD", linewidth=0, zorder=3)
-        ax.plot(fine, gate, color=BLACK, linewidth=0.8, zorder=4)
-        ax.plot(fine, silicon, color=BLACK, linewidth=0.8, zorder=4)
-        shown = mesh.z <= 1.2 * height
-        surface = np.interp(along, fine, silicon)
-        phi = np.ma.masked_where(
-            mesh.z[shown, None] < surface[None, :] - 1e-6, section(potential.phi)[shown]
-        )
-        inside = phi.compressed()
-        step = _round_step((inside.max() - inside.min()) / 10)
-        levels = (
-            np.arange(np.floor(inside.min() / step), np.ceil(inside.max() / step) + 1)
-            * step
-        )
-        lines = ax.contour(
-            along, mesh.z[shown], phi, levels=levels, colors="#444444", linewidths=0.6,
-            linestyles="solid", zorder=2,
-        )  # fmt: skip
-        # Labels at the top of each line, where neighbours are farthest apart.
-        segments = [line for group in lines.allsegs for line in group if len(line)]
-        tops = [line[np.argmax(line[:, 1])] for line in segments]
-        places: list[tuple[float, float]] = []
-        for a, z in sorted(map(tuple, tops), key=lambda top: -top[1]):
-            visible = (
-                abs(a) < 0.9 * extent * pitch
-                # Lines crowd at the edges of gates: no labels there.
-                and np.interp(a, fine, silicon) + 0.06 * height < z < height - 0.2
-            )
-            if visible and all(
-                abs(a - b) > 0.2 * pitch or q - z > 0.06 * height for b, q in places
-            ):
-                places.append((a, z))
-        if places:
-            ax.clabel(lines, manual=places, fontsize=7, fmt="%g V")
+    for ax, (axis, position, title) in zip(axes, panels, strict=True):
+        plane = _Plane.of(potential, axis, position)
+        for density, scale, colour in zip(densities, scales, colours, strict=True):
+            _draw_carriers(ax, plane, density, scale, colour)
+        _draw_front(ax, plane)
+        _draw_equipotentials(ax, plane, height)
         if axis == 1:
-            edges = device.gates.edges_y(pitch)
-            for m in range(-2, 3):
-                for edge in edges:
-                    ax.plot(
-                        [edge + m * pitch] * 2,
-                        [-0.25, gate[0]],
-                        color="white",
-                        linewidth=1.5,
-                        zorder=5,
-                    )
-                if abs(m) <= extent - 0.5:
-                    _write_in_gate(ax, m * pitch, gate[0], f"{point.gate_high:+g} V")
-                if abs(m + 0.5) < extent:
-                    _write_in_gate(ax, (m + 0.5) * pitch, gate[0], f"{point.gate_low:+g} V")
-        ax.set_xlim(-extent * pitch, extent * pitch)
-        ax.set_ylim(-0.25, height)
-        ax.set_xlabel(f"{across}, {'serial' if axis == 0 else 'parallel'} [µm]")
+            _draw_gates(ax, plane)
+        ax.set_xlim(-plane.extent, plane.extent)
+        ax.set_ylim(-_GATE_DEPTH, height)
+        ax.set_xlabel(f"{'xy'[axis]}, {'serial' if axis == 0 else 'parallel'} [µm]")
         ax.set_ylabel("z [µm]")
         ax.set_title(title)
-    fig.colorbar(maps[0], ax=axes, shrink=0.6, pad=0.01, label="holes [µm⁻³]")
-    fig.colorbar(maps[1], ax=axes, shrink=0.6, pad=0.01, label="electrons [µm⁻³]")
+    for scale, colour, name in zip(scales, colours, ("holes", "electrons"), strict=True):
+        shades = ScalarMappable(scale, colour)
+        fig.colorbar(shades, ax=axes, shrink=0.6, pad=0.01, label=f"{name} [µm⁻³]")
+
+
+@dataclass(frozen=True)
+class _Plane:
+    """A vertical plane through a solution, unfolded to some pixels on either side.
+
+    Attributes
+    ----------
+    axis : int
+        The plane's own: 0 for x-z, 1 for y-z.
+    node : int
+        Of the mesh along the other axis, where the plane lies.
+    along, order : ndarray
+        Places of its nodes [um], and their indices in the mesh.
+    extent : float
+        Half its width [um].
+    """
+
+    potential: Potential
+    axis: int
+    node: int
+    along: FloatArray
+    order: NDArray[np.int64]
+    extent: float
+
+    @classmethod
+    def of(cls, potential: Potential, axis: int, position: float) -> _Plane:
+        """Lay the plane at a position [um] on the other axis."""
+        extent = _REACH * potential.mesh.pitch[axis]
+        along, order = _unfolded_nodes(potential, axis, extent)
+        node = _node(potential, 1 - axis, position)
+        return cls(potential, axis, node, along, order, extent)
+
+    @property
+    def pitch(self) -> float:
+        """Pixel pitch in the plane [um]."""
+        return self.potential.mesh.pitch[self.axis]
+
+    def cut(self, values: FloatArray) -> FloatArray:
+        """Values at the plane's nodes, [z, along]."""
+        plane = values[:, self.node, :] if self.axis == 0 else values[:, :, self.node]
+        return plane[:, self.order]
+
+    def surfaces(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Fine places, and the heights of gate and silicon surface there [um]."""
+        fine = np.linspace(-self.extent, self.extent, 1201)
+        if self.axis == 0:
+            distance = self.pitch / 2 - np.abs(
+                fine - self.pitch * np.round(fine / self.pitch)
+            )
+        else:
+            distance = np.full(fine.shape, self.potential.mesh.pitch[0] / 2)
+        surfaces = Surfaces.of(self.potential.device)
+        return fine, surfaces.gate(distance), surfaces.silicon(distance)
+
+
+def _draw_carriers(
+    ax: Axes, plane: _Plane, density: FloatArray, scale: Normalize, colours: str
+) -> None:
+    """Draw a density of carriers, white where it is faint."""
+    values = plane.cut(density)
+    ax.pcolormesh(
+        plane.along, plane.potential.mesh.z[: len(density)],
+        np.ma.masked_less(values, _FAINTEST), norm=scale, cmap=colours,
+        shading="nearest", rasterized=True, zorder=1,
+    )  # fmt: skip
+
+
+def _draw_front(ax: Axes, plane: _Plane) -> None:
+    """Draw gates and oxide."""
+    fine, gate, silicon = plane.surfaces()
+    ax.fill_between(fine, -_GATE_DEPTH, gate, color=_GATE_COLOUR, linewidth=0, zorder=3)
+    ax.fill_between(fine, gate, silicon, color=_OXIDE_COLOUR, linewidth=0, zorder=3)
+    ax.plot(fine, gate, color=BLACK, linewidth=0.8, zorder=4)
+    ax.plot(fine, silicon, color=BLACK, linewidth=0.8, zorder=4)
+
+
+def _draw_equipotentials(ax: Axes, plane: _Plane, height: float) -> None:
+    """Draw lines of equal potential in the silicon, about ten, and label them."""
+    z = plane.potential.mesh.z
+    fine, _, silicon = plane.surfaces()
+    shown = z <= 1.2 * height
+    surface = np.interp(plane.along, fine, silicon)
+    phi = np.ma.masked_where(
+        z[shown, None] < surface[None, :] - 1e-6, plane.cut(plane.potential.phi)[shown]
+    )
+    inside = phi.compressed()
+    step = _round_step((inside.max() - inside.min()) / 10)
+    levels = (
+        np.arange(np.floor(inside.min() / step), np.ceil(inside.max() / step) + 1) * step
+    )
+    lines = ax.contour(
+        plane.along, z[shown], phi, levels=levels, colors="#444444", linewidths=0.6,
+        linestyles="solid", zorder=2,
+    )  # fmt: skip
+    segments = [line for group in lines.allsegs for line in group if len(line)]
+    places = _label_places(segments, plane, height)
+    if places:
+        ax.clabel(lines, manual=places, fontsize=7, fmt="%g V")
+
+
+def _label_places(
+    segments: Sequence[FloatArray], plane: _Plane, height: float
+) -> list[tuple[float, float]]:
+    """Choose places at the tops of lines, where neighbours are farthest apart."""
+    fine, _, silicon = plane.surfaces()
+    tops = [line[np.argmax(line[:, 1])] for line in segments]
+    places: list[tuple[float, float]] = []
+    for a, z in sorted(map(tuple, tops), key=lambda top: -top[1]):
+        visible = (
+            abs(a) < 0.9 * plane.extent
+            # Lines crowd at the edges of gates: no labels there.
+            and np.interp(a, fine, silicon) + 0.06 * height < z < height - 0.2
+        )
+        if visible and all(
+            abs(a - b) > 0.2 * plane.pitch or q - z > 0.06 * height for b, q in places
+        ):
+            places.append((a, z))
+    return places
+
+
+def _draw_gates(ax: Axes, plane: _Plane) -> None:
+    """Draw where the gates of a y-z plane end, and write their voltages into them."""
+    device, pitch = plane.potential.device, plane.pitch
+    point = device.operating_point
+    top = plane.surfaces()[1][0]
+    for m in range(-2, 3):
+        for edge in device.gates.edges_y(pitch):
+            ax.plot(
+                [edge + m * pitch] * 2, [-_GATE_DEPTH, top], color="white", linewidth=1.5,
+                zorder=5,
+            )  # fmt: skip
+        if abs(m) <= _REACH - 0.5:
+            _write_in_gate(ax, m * pitch, top, f"{point.gate_high:+g} V")
+        if abs(m + 0.5) < _REACH:
+            _write_in_gate(ax, (m + 0.5) * pitch, top, f"{point.gate_low:+g} V")
 
 
 def figure_for_device(device: Device) -> dict[str, Figure]:
@@ -342,7 +411,7 @@ def _diffusion_page(empty: Potential, filled: Potential) -> Figure:
 
 def _write_in_gate(ax: Axes, position: float, top: float, text: str) -> None:
     ax.text(
-        position, 0.5 * (top - 0.25), text, ha="center", va="center", fontsize=8,
+        position, 0.5 * (top - _GATE_DEPTH), text, ha="center", va="center", fontsize=8,
         color="white", zorder=6,
     )  # fmt: skip
 
