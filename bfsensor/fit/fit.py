@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -29,6 +30,9 @@ from bfsensor.typing import FloatArray
 FAR = 3.0
 """Spreads of its prior from which a fitted parameter is remarked upon."""
 
+STRAIGHT_PROFILES = (
+    "profiles are those of predictions straight in the parameters: parabolas within bounds"
+)
 
 ROUNDS = 12
 SETTLED = 0.1
@@ -99,12 +103,8 @@ def fit_device(
     ConvergenceError
         The fit does not settle.
     """
-    unknown = [name for name in profiles if name not in [prior.name for prior in priors]]
-    if unknown:
-        raise FitError(
-            f"{unknown[0]} is not free, and has no profile; free are "
-            f"{', '.join(prior.name for prior in priors)}"
-        )
+    names = tuple(prior.name for prior in priors)
+    _check_profiles(profiles, names)
     problem = LeastSquaresProblem(
         tuple(priors),
         tuple(sets),
@@ -112,17 +112,15 @@ def fit_device(
     )
     settling: list[str] = []
     if linearise is None:
-        before, found = problem.predict(problem.means), solve(problem)
+        before, tangent = problem.predict(problem.means), solve(problem)
     else:
-        problem, found, before, settling = _settle(problem, linearise)
-    tangent = found
+        problem, tangent, before, settling = _settle(problem, linearise)
     asked = solved is not None and {"areas", "slopes"} & {data.kind for data in sets}
     posterior = find_posterior(
-        problem, found, _exact(problem, solved) if solved is not None and asked else None,
+        problem, tangent, _exact(problem, solved) if solved is not None and asked else None,
         draws=draws, progress=progress,
     )  # fmt: skip
     found = posterior.solution
-    names = tuple(prior.name for prior in priors)
     ties, silent = find_ties(names, found.sensitivity)
     known = principal(found.covariance / np.outer(problem.spreads, problem.spreads))
     mesh = linearise.record(found.values) if isinstance(linearise, Finer) else {}
@@ -139,23 +137,26 @@ def fit_device(
         profiles={name: profile(problem, tangent, name) for name in profiles}, mesh=mesh,
         posterior=posterior.record,
     )  # fmt: skip
-    told = [
+    straight = bool(profiles) and not posterior.record["curved"]
+    found_out = [
         *(note for data in sets for note in data.notes),
         *_remarks(result, priors),
         posterior.words,
-        *(
-            [
-                "profiles are those of predictions straight in the parameters: parabolas within bounds"
-            ]
-            if profiles and not posterior.record["curved"]
-            else []
-        ),
+        *([STRAIGHT_PROFILES] if straight else []),
         *settling,
         *([say(mesh)] if mesh else []),
         *notes,
     ]
-    fields = {f: getattr(result, f) for f in result.__dataclass_fields__}
-    return FitResult(**(fields | {"notes": tuple(dict.fromkeys(told))}))
+    return replace(result, notes=tuple(dict.fromkeys(found_out)))
+
+
+def _check_profiles(profiles: Sequence[str], names: Sequence[str]) -> None:
+    """Refuse profiles of parameters that are not free."""
+    unknown = [name for name in profiles if name not in names]
+    if unknown:
+        raise FitError(
+            f"{unknown[0]} is not free, and has no profile; free are {', '.join(names)}"
+        )
 
 
 def _settle(

@@ -18,6 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from bfsensor.device.quantities import Prior
@@ -170,28 +171,16 @@ def _minimise(
     whole = np.array(start, float)
     if fixed is not None:
         free[fixed[0]], whole[fixed[0]] = False, fixed[1]
-    fitted = [k for k, data in enumerate(problem.sets) if data.fitted]
-    cache: dict[bytes, tuple[FloatArray, FloatArray]] = {}
+    last: dict[bytes, tuple[FloatArray, FloatArray]] = {}
 
     def both(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residuals and slopes; kept for the next call, which asks for the other of them."""
         key = x.tobytes()
-        if key not in cache:
-            cache.clear()
+        if key not in last:
+            last.clear()
             whole[free] = means[free] + x * spreads[free]
-            parts, slopes = [], []
-            for k in fitted:
-                data = problem.sets[k]
-                value, slope = problem.predictors[k](whole)
-                error = scales[k] * data.errors
-                parts.append((value - data.values) / error)
-                slopes.append(slope * spreads / error[:, None])
-            parts.append((whole - means) / spreads)
-            slopes.append(np.eye(len(means)))
-            wrong, turned = _disorder(problem, whole)
-            parts.append(wrong)
-            slopes.append(turned)
-            cache[key] = np.concatenate(parts), np.concatenate(slopes)
-        return cache[key]
+            last[key] = _residuals(problem, scales, whole)
+        return last[key]
 
     low = np.array([(prior.low - prior.mean) / prior.spread for prior in problem.priors])
     high = np.array([(prior.high - prior.mean) / prior.spread for prior in problem.priors])
@@ -208,18 +197,50 @@ def _minimise(
             raise ConvergenceError(f"the fit did not settle: {found.message}")
         x = found.x
     residual, slope = both(x)
-    whole = _ordered(problem, whole)
-    n = sum(len(problem.sets[k].values) for k in fitted)
+    return _solution(problem, scales, _ordered(problem, whole), free, residual, slope)
+
+
+def _residuals(
+    problem: LeastSquaresProblem, scales: FloatArray, values: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals of fitted numbers, priors and the order of pairs; their slopes in spreads."""
+    parts, slopes = [], []
+    for data, predictor, scale in zip(
+        problem.sets, problem.predictors, scales, strict=True
+    ):
+        if not data.fitted:
+            continue
+        value, slope = predictor(values)
+        error = scale * data.errors
+        parts.append((value - data.values) / error)
+        slopes.append(slope * problem.spreads / error[:, None])
+    parts.append((values - problem.means) / problem.spreads)
+    slopes.append(np.eye(len(values)))
+    wrong, turned = _disorder(problem, values)
+    return np.concatenate([*parts, wrong]), np.concatenate([*slopes, turned])
+
+
+def _solution(
+    problem: LeastSquaresProblem,
+    scales: FloatArray,
+    values: FloatArray,
+    free: NDArray[np.bool_],
+    residual: FloatArray,
+    slope: FloatArray,
+) -> FitSolution:
+    """Posterior of the tangent where least squares end, and what each set has to say there."""
+    spreads, p = problem.spreads, len(values)
+    n = sum(len(data.values) for data in problem.sets if data.fitted)
     # Priors count, the order of pairs does not: it only cuts intervals off.
-    told = slice(0, n + len(means))
-    normal = slope[told, free].T @ slope[told, free]
-    covariance = np.zeros((len(means), len(means)))
+    counted = slice(0, n + p)
+    normal = slope[counted, free].T @ slope[counted, free]
+    covariance = np.zeros((p, p))
     covariance[np.ix_(free, free)] = np.linalg.inv(normal) if free.any() else 0.0
     chi2, determined = np.zeros(len(problem.sets)), np.zeros(len(problem.sets))
     at = 0
     for k, data in enumerate(problem.sets):
         if not data.fitted:
-            value = problem.predictors[k](whole)[0]
+            value = problem.predictors[k](values)[0]
             chi2[k] = np.sum(((value - data.values) / data.errors) ** 2)
             continue
         rows = slice(at, at + len(data.values))
@@ -227,7 +248,7 @@ def _minimise(
         chi2[k] = scales[k] ** 2 * np.sum(residual[rows] ** 2)
         determined[k] = np.einsum("np,pq,nq->", slope[rows], covariance, slope[rows])
     return FitSolution(
-        whole, covariance * np.outer(spreads, spreads), scales, determined, chi2,
+        values, covariance * np.outer(spreads, spreads), scales, determined, chi2,
         float(residual @ residual), slope[:n],
     )  # fmt: skip
 

@@ -121,31 +121,9 @@ def sample_posterior(
         The chains do not agree.
     """
     bent = bent if bent is not None else bent_about(problem, found)
-    n, p = bent.first.shape
-    root = np.linalg.cholesky(
-        np.eye(n) + (np.zeros((n, n)) if unknown is None else unknown)
-    )
-    bent = CurvedPosterior(*(np.linalg.solve(root, part.reshape(n, -1)).reshape(part.shape)
-                  for part in (bent.residual, bent.first, bent.second)))  # fmt: skip
-    spreads, best = problem.spreads, found.values
-    off = (best - problem.means) / spreads
-    low, high = (
-        (np.array([getattr(prior, end) for prior in problem.priors]) - best) / spreads
-        for end in ("low", "high")
-    )
-
-    pairs = ordered_pairs(problem)
-
-    def height(t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Minus the logarithm of the posterior, and its slopes; infinite out of bounds."""
-        half, slopes = bent.at(t)
-        half += 0.5 * np.sum((off + t) ** 2, axis=1)
-        out = np.any((t < low) | (t > high), axis=1)
-        there = best + t * spreads
-        for lower, upper in pairs:
-            out |= there[:, lower] > there[:, upper]
-        return np.where(out, np.inf, half), slopes + off + t
-
+    bent = _whitened(bent, unknown)
+    p = bent.first.shape[1]
+    height = _make_height(problem, found.values, bent)
     rng = np.random.default_rng(seed)
     wide = np.linalg.cholesky(np.linalg.inv(bent.first.T @ bent.first + np.eye(p)))
     t = 0.5 * rng.standard_normal((chains, p)) @ wide.T
@@ -170,17 +148,57 @@ def sample_posterior(
             step = max(step * np.exp(0.3 * (np.mean(taken) - WANTED)), shortest)
         else:
             kept[:, number] = t
-    within = kept.var(axis=1, ddof=1).mean(0)
-    ratio = (
-        np.sqrt(1 + kept.mean(1).var(axis=0, ddof=1) / within) if chains > 1 else np.ones(p)
+    _check_agreement(problem, kept)
+    return np.asarray(found.values + problem.spreads * kept.reshape(-1, p))
+
+
+def _whitened(bent: CurvedPosterior, unknown: FloatArray | None) -> CurvedPosterior:
+    """Count what predictions miss with the errors: in units of both they are independent."""
+    n = len(bent.residual)
+    root = np.linalg.cholesky(
+        np.eye(n) + (np.zeros((n, n)) if unknown is None else unknown)
     )
+    return CurvedPosterior(*(np.linalg.solve(root, part.reshape(n, -1)).reshape(part.shape)
+                  for part in (bent.residual, bent.first, bent.second)))  # fmt: skip
+
+
+def _make_height(
+    problem: LeastSquaresProblem, best: FloatArray, bent: CurvedPosterior
+) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
+    """Make minus the logarithm of the posterior, by steps from the best values in spreads."""
+    spreads = problem.spreads
+    off = (best - problem.means) / spreads
+    low, high = (
+        (np.array([getattr(prior, end) for prior in problem.priors]) - best) / spreads
+        for end in ("low", "high")
+    )
+    pairs = ordered_pairs(problem)
+
+    def height(t: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Its values and slopes; infinite out of bounds."""
+        half, slopes = bent.at(t)
+        half += 0.5 * np.sum((off + t) ** 2, axis=1)
+        out = np.any((t < low) | (t > high), axis=1)
+        there = best + t * spreads
+        for lower, upper in pairs:
+            out |= there[:, lower] > there[:, upper]
+        return np.where(out, np.inf, half), slopes + off + t
+
+    return height
+
+
+def _check_agreement(problem: LeastSquaresProblem, kept: FloatArray) -> None:
+    """Refuse draws, shape (chains, steps, p), of chains that lie apart."""
+    if len(kept) == 1:
+        return
+    within = kept.var(axis=1, ddof=1).mean(0)
+    ratio = np.sqrt(1 + kept.mean(1).var(axis=0, ddof=1) / within)
     if np.max(ratio) > AGREED:
         raise ConvergenceError(
             f"draws of {problem.priors[int(np.argmax(ratio))].name} differ between chains: "
             f"{np.max(ratio):.2f} above {AGREED:g}",
             ratio.tolist(),
         )
-    return np.asarray(best + spreads * kept.reshape(-1, p))
 
 
 def _trajectory(
