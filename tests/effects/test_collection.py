@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from bfsensor.device import silicon
 from bfsensor.device.condition import Condition
-from bfsensor.diagnose.data.exposures import numbers_of
+from bfsensor.diagnose.data.exposure_info import numbers_of
 from bfsensor.diagnose.model.flat_predictions import periodic_covariances
 from bfsensor.effects.bf_long_range import shifts_of_tail
 from bfsensor.effects.device_parameter import device_parameters

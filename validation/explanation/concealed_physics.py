@@ -36,7 +36,7 @@ from bfsensor.device.condition import Condition
 from bfsensor.device.parameters import change_parameter
 from bfsensor.device.parts import Provenance
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import NUMBERS, Axes, numbers_of
+from bfsensor.diagnose.data.exposure_info import NUMBERS, Axes, numbers_of
 from bfsensor.diagnose.data.map_channels import MapChannels
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.detect.candidates import name_of

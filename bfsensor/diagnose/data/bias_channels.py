@@ -11,7 +11,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import Axes, ExposureInfo, Frame, condition_of
+from bfsensor.diagnose.data.exposure_info import Axes, ExposureInfo, Frame, condition_of
 from bfsensor.effects.read_noise import READOUT_LAGS, near_lags
 from bfsensor.typing import FloatArray
 

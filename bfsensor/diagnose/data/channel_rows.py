@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import NUMBERS, condition_at
+from bfsensor.diagnose.data.exposure_info import NUMBERS, condition_at
 
 Rows = dict[Condition, NDArray[np.int64]]
 """Which values of a channel belong to each condition."""

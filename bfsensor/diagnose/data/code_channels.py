@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import Axes, Frame
+from bfsensor.diagnose.data.exposure_info import Axes, Frame
 from bfsensor.typing import FloatArray
 
 PERIOD = 64

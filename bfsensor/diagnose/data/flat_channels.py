@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import Axes, ExposureInfo, Frame, condition_of
+from bfsensor.diagnose.data.exposure_info import Axes, ExposureInfo, Frame, condition_of
 from bfsensor.measure.bartlett import bartlett_matrix
 from bfsensor.measure.flat_pairs import flat_covariances
 from bfsensor.typing import FloatArray

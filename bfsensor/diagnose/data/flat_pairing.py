@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bfsensor.device.condition import Condition
-from bfsensor.diagnose.data.exposures import ExposureInfo, Frame, condition_of
+from bfsensor.diagnose.data.exposure_info import ExposureInfo, Frame, condition_of
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.flat_pairs import flat_covariances
 from bfsensor.typing import FloatArray

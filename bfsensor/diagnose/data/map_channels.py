@@ -13,7 +13,7 @@ from scipy.fft import rfft2
 
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel, Common, join_common
-from bfsensor.diagnose.data.exposures import Axes, label_of
+from bfsensor.diagnose.data.exposure_info import Axes, label_of
 from bfsensor.diagnose.data.map_borders import Border, find_borders
 from bfsensor.diagnose.data.map_noise import BlockNoise, block_noise
 from bfsensor.diagnose.data.map_texture import map_texture, texture_noise

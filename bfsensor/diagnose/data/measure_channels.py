@@ -18,7 +18,7 @@ from bfsensor.diagnose.data.bias_channels import (
 )
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.code_channels import CodeChannels, CrosstalkChannels
-from bfsensor.diagnose.data.exposures import (
+from bfsensor.diagnose.data.exposure_info import (
     ExposureInfo,
     Frame,
     assign_folds,

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
-from bfsensor.diagnose.data.exposures import Axes
+from bfsensor.diagnose.data.exposure_info import Axes
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.errors import DiagnosisError
 from bfsensor.recording.tables.area_changes import AreaChangeTable

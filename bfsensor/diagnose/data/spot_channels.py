@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bfsensor.diagnose.data.channels import FOLDS, Channel
-from bfsensor.diagnose.data.exposures import Axes, ExposureInfo, condition_of
+from bfsensor.diagnose.data.exposure_info import Axes, ExposureInfo, condition_of
 from bfsensor.diagnose.data.spot_places import PlacedSpots
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.spot_fit import fit_spots

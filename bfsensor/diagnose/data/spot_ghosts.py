@@ -7,7 +7,7 @@ from collections.abc import Callable, Container, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.data.exposures import ExposureInfo, Frame
+from bfsensor.diagnose.data.exposure_info import ExposureInfo, Frame
 from bfsensor.typing import FloatArray
 
 LIT = 20.0

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import NUMBERS, condition_at, label_of
+from bfsensor.diagnose.data.exposure_info import NUMBERS, condition_at, label_of
 from bfsensor.typing import FloatArray
 
 

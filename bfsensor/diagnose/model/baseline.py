@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from bfsensor.device.condition import Condition
-from bfsensor.diagnose.data.exposures import numbers_of
+from bfsensor.diagnose.data.exposure_info import numbers_of
 from bfsensor.effects.effect import Effect
 from bfsensor.errors import DiagnosisError
 from bfsensor.response.edge_response import area_matrix

@@ -6,7 +6,7 @@ import numpy as np
 
 from bfsensor.diagnose.data.channel_rows import Rows
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import label_of
+from bfsensor.diagnose.data.exposure_info import label_of
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.model.map_shapes import Places
 from bfsensor.typing import FloatArray

@@ -13,7 +13,7 @@ from scipy.fft import fft, ifft, irfft, irfft2, rfft, rfft2
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channel_rows import condition_of_row
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import numbers_of
+from bfsensor.diagnose.data.exposure_info import numbers_of
 from bfsensor.diagnose.data.map_channels import (
     RINGS,
     MapShare,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channel_rows import Rows, rows_by_condition
 from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
-from bfsensor.diagnose.data.exposures import label_of
+from bfsensor.diagnose.data.exposure_info import label_of
 from bfsensor.diagnose.data.map_channels import MapShare
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.model.baseline import Baseline

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channel_rows import Rows, condition_of_row
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import label_of
+from bfsensor.diagnose.data.exposure_info import label_of
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.data.spot_places import widening
 from bfsensor.diagnose.model.baseline import Baseline

@@ -11,7 +11,7 @@ import numpy as np
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channel_rows import rows_by_condition
 from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
-from bfsensor.diagnose.data.exposures import (
+from bfsensor.diagnose.data.exposure_info import (
     NUMBERS,
     Axes,
     condition_at,

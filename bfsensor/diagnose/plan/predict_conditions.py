@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from bfsensor.diagnose.data.exposures import condition_at, numbers_of
+from bfsensor.diagnose.data.exposure_info import condition_at, numbers_of
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.diagnose.model.predictor import Predictor

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bfsensor.diagnose.data.channels import Channel, join_channels
-from bfsensor.diagnose.data.exposures import assign_folds, condition_of, label_of
+from bfsensor.diagnose.data.exposure_info import assign_folds, condition_of, label_of
 from bfsensor.diagnose.data.flat_channels import TAIL, mean_profile, profile
 from bfsensor.diagnose.data.flat_pairing import PairFinder, by_level, group_flats
 from bfsensor.errors import DiagnosisError

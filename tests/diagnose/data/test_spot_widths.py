@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import Axes
+from bfsensor.diagnose.data.exposure_info import Axes
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.data.spot_widths import fit_widths
 from bfsensor.diagnose.model.predictor import Predictor

@@ -9,7 +9,7 @@ from scipy.stats import binom
 
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposures import Axes
+from bfsensor.diagnose.data.exposure_info import Axes
 from bfsensor.diagnose.detect.locate import FAMILY, Known, Locator
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 

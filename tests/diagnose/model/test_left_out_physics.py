@@ -9,7 +9,7 @@ import pytest
 from bfsensor import Device
 from bfsensor.device.parameters import change_parameter
 from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
-from bfsensor.diagnose.data.exposures import Axes, condition_at
+from bfsensor.diagnose.data.exposure_info import Axes, condition_at
 from bfsensor.diagnose.detect.candidates import candidates_of, name_of
 from bfsensor.diagnose.model.cached_response import walk
 from bfsensor.diagnose.model.device_baseline import baseline_of_device

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bfsensor.device.condition import Condition
-from bfsensor.diagnose.data.exposures import numbers_of
+from bfsensor.diagnose.data.exposure_info import numbers_of
 from bfsensor.diagnose.data.map_channels import MapChannels
 from bfsensor.effects.effect import Layout, Shot
 from bfsensor.effects.illumination_turbulence import IlluminationTurbulence
