@@ -108,3 +108,19 @@ def test_unfinished_tables_do_not_ship():
     assert "force-include" not in wheel
     ignored = (Path(__file__).parents[1] / ".gitignore").read_text().splitlines()
     assert "*.levels/" in ignored
+
+
+def test_tests_of_the_package_do_not_need_the_validation_scripts():
+    """Makers of recordings come through two doors; what compares with them is in tests/validation."""
+    import ast
+
+    doors = {"virtual.py", "broken_campaigns.py"}
+    apart = ("validation", "benchmarks")
+    for path in (ROOT / "tests").rglob("*.py"):
+        place = path.relative_to(ROOT / "tests")
+        if place.parts[0] in apart or str(place) in doors:
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            named = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            named += [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            assert not any(n.partition(".")[0] == "validation" for n in named), str(place)

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from bfsensor.cli.main import main
 from bfsensor.recording.campaign.campaign import read_campaign
 from bfsensor.recording.campaign.questions import open_questions
-from validation.reading.broken_campaigns import lose_biases, make_campaign, truncate
+from tests.broken_campaigns import lose_biases, make_campaign, truncate
 
 SHARED = Path(__file__).parents[3] / "shared"
 

@@ -9,19 +9,21 @@ from astropy.table import Table
 from click.testing import CliRunner
 
 from bfsensor.cli.main import main
-from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.detect.locate import Scanner, locate_mismatch, tail_probability
 from bfsensor.diagnose.detect.scans import DEVICE_SCAN
 from bfsensor.diagnose.diagnosis import diagnose, diagnose_measured
 from bfsensor.diagnose.fit.baseline_fit import fit_bounded
 from bfsensor.diagnose.report.diagnosis_result import SCHEMA
 from bfsensor.diagnose.report.html_report import write_report
-from validation.common.virtual_source import VirtualSource, virtual_baseline
-from validation.concealed.campaign import write_campaign
-from validation.concealed.library import make_effect
-from validation.concealed.plan import Size
-
-SMALL = Size(128, 4, 1, dithers=1)
+from tests.virtual import (
+    SMALL,
+    Size,
+    VirtualSource,
+    make_effect,
+    measure_virtual,
+    virtual_baseline,
+    write_campaign,
+)
 
 
 def run(seed, *effects):
@@ -140,7 +142,7 @@ def test_the_command_diagnoses_a_folder(tmp_path):
 def test_a_device_off_its_card_is_told_and_not_absorbed(tmp_path):
     """The fit takes a parameter far off its card: the pull is a finding, named and in words."""
     small = Size(128, 4, 1, dithers=1)
-    measured = measure_channels(VirtualSource(seed=8112, size=small))
+    measured = measure_virtual(seed=8112, size=small)
     predictor, fit = fit_bounded(measured, virtual_baseline())
     point = fit.values[: len(predictor.names)]
     moved = point.copy()

@@ -287,8 +287,7 @@ def _diagnosis(
     seed: int, size: str, *effects: tuple[str, dict[str, float], str]
 ) -> Product:
     """Diagnose a campaign of the virtual sensor through its files, as a user would."""
-    from validation.concealed.campaign import write_campaign
-    from validation.concealed.library import make_effect
+    from tests.virtual import make_effect, write_campaign
 
     with TemporaryDirectory() as folder:
         campaign = Path(folder) / "campaign"

@@ -13,7 +13,7 @@ RECORD = read_record()
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=() if case.quick else pytest.mark.slow)
+        pytest.param(name, marks=pytest.mark.golden if case.quick else pytest.mark.slow)
         for name, case in CASES.items()
     ],
 )

@@ -2,11 +2,9 @@
 
 import pytest
 
-from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.detect.locate import locate_mismatch
 from bfsensor.diagnose.fit.baseline_fit import fit_bounded
-from validation.common.virtual_source import VirtualSource, virtual_baseline
-from validation.concealed.library import make_effect
+from tests.virtual import make_effect, measure_virtual, virtual_baseline
 
 
 @pytest.mark.parametrize(
@@ -17,9 +15,7 @@ from validation.concealed.library import make_effect
     ],
 )
 def test_effects_of_twelve_standard_deviations_are_located(word, values, family):
-    measured = measure_channels(
-        VirtualSource(seed=777, effects=[make_effect(word, values)])
-    )
+    measured = measure_virtual(seed=777, size="S", effects=[make_effect(word, values)])
     found = locate_mismatch(fit_bounded(measured, virtual_baseline())[1], seed=1)
     assert found.detected and found.findings[0].family == family
     assert abs(found.findings[0].z) > 8

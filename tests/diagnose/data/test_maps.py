@@ -11,7 +11,7 @@ from bfsensor.diagnose.data.map_channels import LOW, MapChannels, block_side
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.effect import Segment
-from validation.common.virtual_source import virtual_baseline
+from tests.virtual import virtual_baseline
 
 HERE, THERE = (
     Condition(wavelength=w, back_bias=-60.0, temperature=173.0) for w in (620.0, 870.0)

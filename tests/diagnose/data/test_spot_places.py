@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.data.spot_channels import SpotChannels
 from bfsensor.diagnose.data.spot_places import PlacedSpots, widening
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.persistence import Persistence
-from validation.common.virtual_source import VirtualSource, virtual_baseline
-from validation.concealed.plan import Size
+from tests.virtual import Size, measure_virtual, virtual_baseline
 
 PIXELS, PITCH, SHARE = 256, 40, 0.01
 SIGMAS = (1.05, 1.12), (1.1, 1.15)
@@ -87,7 +85,7 @@ def test_of_other_pinholes_nothing_is_said():
 def test_held_out_spots_leave_ghosts_too():
     """The fourth and the ninth of ten are held out; the fifth is a faint one after a bright one."""
     size = Size(192, 2, 0, dithers=5, flat_seconds=(5.0, 20.0), spot_seconds=(1.25, 30.0))
-    measured = measure_channels(VirtualSource(seed=12, size=size))
+    measured = measure_virtual(seed=12, size=size)
     bare = Predictor(measured, virtual_baseline())
     effect = Persistence({"frac": 1e-3, "tau": 2.0})
     with_it = bare.with_effects((effect,))

@@ -13,7 +13,7 @@ from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.data.spot_widths import fit_widths
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.errors import ConvergenceError
-from validation.common.virtual_source import virtual_baseline
+from tests.virtual import virtual_baseline
 
 CONDITIONS = tuple(
     Condition(wavelength=w, back_bias=v, temperature=t) for w, v, t in (

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.detect.candidate_screen import Screen
 from bfsensor.diagnose.detect.locate import ALARM, FAMILY, locate_mismatch
 from bfsensor.diagnose.detect.matched_filters import (
@@ -19,15 +18,12 @@ from bfsensor.diagnose.fit.fitted_model import Model
 from bfsensor.effects.persistence import Persistence
 from bfsensor.effects.tearing import Tearing
 from bfsensor.effects.tree_rings import TreeRings
-from validation.common.virtual_source import VirtualSource, virtual_baseline
-from validation.concealed.plan import Size
-
-SMALL = Size(128, 4, 1, dithers=1)
+from tests.virtual import SMALL, measure_virtual, virtual_baseline
 
 
 @pytest.fixture(scope="module")
 def null():
-    measured = measure_channels(VirtualSource(seed=9137, size=SMALL))
+    measured = measure_virtual(seed=9137, size=SMALL)
     return measured, *fit_bounded(measured, virtual_baseline())
 
 

@@ -7,7 +7,6 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.detect.candidates import PULLED
 from bfsensor.diagnose.detect.locate import Finding, Mismatch, locate_mismatch
 from bfsensor.diagnose.detect.model_error import ACCURACY, counts, stands_out
@@ -25,19 +24,22 @@ from bfsensor.effects.gain_nonlinearity import GainNonlinearity
 from bfsensor.effects.interpixel_coupling import InterpixelCoupling
 from bfsensor.effects.tearing import Tearing
 from bfsensor.effects.trap_serial import TrapSerial
-from validation.common.virtual_source import VirtualSource, virtual_baseline
-from validation.concealed.electrostatics import EdgeShifts
-from validation.concealed.library import make_effect
-from validation.concealed.outside import OutsideLibrary
-from validation.concealed.plan import Geometry, Size
+from tests.virtual import (
+    SMALL,
+    EdgeShifts,
+    Geometry,
+    OutsideLibrary,
+    make_effect,
+    measure_virtual,
+    virtual_baseline,
+)
 
-SMALL = Size(128, 4, 1, dithers=1)
 KINDS = (TrapSerial, InterpixelCoupling, Tearing)
 
 
 @lru_cache(maxsize=1)
 def _null():
-    return measure_channels(VirtualSource(seed=9137, size=SMALL))
+    return measure_virtual(seed=9137, size=SMALL)
 
 
 def _changed(word, change):
@@ -163,7 +165,7 @@ class _OddInY(OutsideLibrary):
 
 
 def _campaign(*effects):
-    return measure_channels(VirtualSource(seed=9137, size=SMALL, effects=effects))
+    return measure_virtual(seed=9137, size=SMALL, effects=effects)
 
 
 def test_a_kernel_that_is_odd_in_y():

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.detect.candidate_screen import Rival, Screen, evidence
 from bfsensor.diagnose.detect.candidates import with_fitted
 from bfsensor.diagnose.detect.locate import locate_mismatch
@@ -22,17 +21,19 @@ from bfsensor.effects.gain_nonlinearity import GainNonlinearity
 from bfsensor.effects.interpixel_coupling import InterpixelCoupling
 from bfsensor.effects.tearing import Tearing
 from bfsensor.effects.trap_serial import TrapSerial
-from validation.common.virtual_source import VirtualSource, virtual_baseline
-from validation.concealed.library import make_effect
-from validation.concealed.plan import Size
+from tests.virtual import (
+    SMALL,
+    make_effect,
+    measure_virtual,
+    virtual_baseline,
+)
 
-SMALL = Size(128, 4, 1, dithers=1)
 KINDS = (ChargeLoss, GainNonlinearity, InterpixelCoupling, Tearing, TrapSerial)
 
 
 def fitted(seed, *effects):
-    source = VirtualSource(seed=seed, size=SMALL, effects=effects)
-    predictor, fit = fit_bounded(measure_channels(source), virtual_baseline())
+    channels = measure_virtual(seed=seed, size=SMALL, effects=effects)
+    predictor, fit = fit_bounded(channels, virtual_baseline())
     return predictor, fit, locate_mismatch(fit)
 
 

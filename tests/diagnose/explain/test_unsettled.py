@@ -3,23 +3,24 @@
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.data.ptc_turnoff import below, find_turn_off
 from bfsensor.diagnose.diagnosis import diagnose_measured
 from bfsensor.diagnose.fit import baseline_fit as mismatch
 from bfsensor.diagnose.fit.baseline_fit import UNSETTLED
-from validation.common.virtual_source import VirtualSource, virtual_baseline
-from validation.concealed.library import make_effect
-from validation.concealed.plan import Size
+from tests.virtual import (
+    SMALL,
+    make_effect,
+    measure_virtual,
+    virtual_baseline,
+)
 
-SMALL = Size(128, 4, 1, dithers=1)
 FULL = 5e4
 
 
 @pytest.fixture(scope="module")
 def saturated():
     effect = make_effect("saturation", {"full_well": FULL}, "")
-    return measure_channels(VirtualSource(seed=5177, size=SMALL, effects=[effect]))
+    return measure_virtual(seed=5177, size=SMALL, effects=[effect])
 
 
 @pytest.mark.slow

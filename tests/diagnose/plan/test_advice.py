@@ -19,11 +19,16 @@ from bfsensor.diagnose.plan.gaps import ALWAYS, NEEDS, find_untested
 from bfsensor.diagnose.plan.planned_exposures import Forecast, Information, Planned
 from bfsensor.effects.charge_loss import ChargeLoss
 from bfsensor.effects.gain_nonlinearity import GainNonlinearity
-from validation.common.virtual_source import VirtualSource, virtual_baseline
-from validation.concealed.library import KNOWN, make_effect
-from validation.concealed.plan import Size
+from tests.virtual import (
+    KNOWN,
+    SMALL,
+    Size,
+    VirtualSource,
+    make_effect,
+    measure_virtual,
+    virtual_baseline,
+)
 
-SMALL = Size(128, 4, 1, dithers=1)
 SEED = 7101
 BINNED = Size(128, 2, 0, dithers=0, flat_seconds=(3.0, 9.0, 18.0, 27.0))
 """The recipe of binned flats: 16 exposures of 6,000 to 54,000 e- in each pixel."""
@@ -80,10 +85,10 @@ def held_against(measured, effect):
 @pytest.fixture(scope="module")
 def tied():
     """A campaign with charge loss, which a curved response explains as well."""
-    source = VirtualSource(
+    channels = measure_virtual(
         seed=SEED, size=SMALL, effects=[make_effect("charge_loss", {"q": 1.5e-7})]
     )
-    predictor, fit = fit_bounded(measure_channels(source), virtual_baseline())
+    predictor, fit = fit_bounded(channels, virtual_baseline())
     mismatch = locate_mismatch(fit)
     return attribute(predictor, fit, mismatch, kinds=(ChargeLoss, GainNonlinearity))
 

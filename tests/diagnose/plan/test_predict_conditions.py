@@ -14,11 +14,8 @@ from bfsensor.diagnose.plan.predict_conditions import (
 )
 from bfsensor.effects.library import make_effect as candidate
 from bfsensor.errors import DiagnosisError
-from validation.common.virtual_source import VirtualSource, virtual_baseline
-from validation.concealed.library import make_effect
-from validation.concealed.plan import Size
+from tests.virtual import SMALL, VirtualSource, make_effect, virtual_baseline
 
-SMALL = Size(128, 4, 1, dithers=1)
 LAMP_ERROR = 2e-4
 
 

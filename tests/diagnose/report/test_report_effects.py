@@ -8,7 +8,6 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.detect.locate import locate_mismatch
 from bfsensor.diagnose.explain.attribution import FAILS
 from bfsensor.diagnose.explain.stepwise import attribute
@@ -20,11 +19,14 @@ from bfsensor.diagnose.report.html_report import write_report
 from bfsensor.effects.charge_loss import ChargeLoss
 from bfsensor.effects.gain_nonlinearity import GainNonlinearity
 from bfsensor.plots import residuals as show
-from validation.common.virtual_source import VirtualSource, virtual_baseline
-from validation.concealed.library import EFFECTS, make_effect
-from validation.concealed.plan import Size
+from tests.virtual import (
+    EFFECTS,
+    SMALL,
+    make_effect,
+    measure_virtual,
+    virtual_baseline,
+)
 
-SMALL = Size(128, 4, 1, dithers=1)
 VOID = {"meta", "img", "link", "br", "hr"}
 
 
@@ -56,10 +58,9 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def explained():
-    source = VirtualSource(
+    measured = measure_virtual(
         seed=7101, size=SMALL, effects=[make_effect("charge_loss", {"q": 1.5e-7})]
     )
-    measured = measure_channels(source)
     predictor, fit = fit_bounded(measured, virtual_baseline())
     mismatch = locate_mismatch(fit)
     found = attribute(predictor, fit, mismatch, kinds=(ChargeLoss, GainNonlinearity))

@@ -16,7 +16,7 @@ from bfsensor.recording.campaign.campaign import read_campaign
 from bfsensor.recording.campaign.inspection import inspect_campaign
 from bfsensor.recording.campaign.level_checks import measure_gains
 from bfsensor.recording.raw.headers import scan_file
-from validation.reading.broken_campaigns import (
+from tests.broken_campaigns import (
     BREAKAGES,
     GAIN,
     LADDER,

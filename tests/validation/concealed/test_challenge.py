@@ -11,7 +11,7 @@ import time
 import pytest
 from click.testing import CliRunner
 
-from tests.concealed.reports import report, truth
+from tests.validation.concealed.reports import report, truth
 from validation.concealed.__main__ import main
 from validation.concealed.campaign import seal, write_campaign
 from validation.concealed.library import make_effect

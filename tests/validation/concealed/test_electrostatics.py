@@ -20,7 +20,7 @@ from validation.concealed import (
 from validation.concealed.card import NOMINAL, SPREAD, baseline_edges, shifts_at
 from validation.concealed.electrostatics import ELECTRON, SILICON, edge_shifts
 
-SHARED = Path(__file__).parents[2].parent / "shared"
+SHARED = Path(__file__).parents[3].parent / "shared"
 PRACTICE = SHARED / "practice" / "practice_a" / "baseline_edges.json"
 
 

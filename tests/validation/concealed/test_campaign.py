@@ -18,7 +18,7 @@ from validation.concealed.campaign import truth_matches, write_campaign
 from validation.concealed.library import EFFECTS, draw_effects, make_effect
 from validation.concealed.plan import SIZES, Geometry, Size, exposures_of
 
-PRACTICE = Path(__file__).parents[2].parent / "shared" / "practice"
+PRACTICE = Path(__file__).parents[3].parent / "shared" / "practice"
 TINY = Size(64, 1, 1, dithers=1, flat_seconds=(1.0, 60.0), spot_seconds=(30.0,))
 
 

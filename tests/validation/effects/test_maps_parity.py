@@ -6,7 +6,7 @@ import pytest
 from bfsensor.diagnose.detect.candidate_screen import Screen
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.library import LIBRARY
-from tests.effects.parity import SMALL, disagreements
+from tests.validation.effects.parity import SMALL, disagreements
 from validation.common.virtual_source import VirtualSource, virtual_baseline
 from validation.effects.effect_parity import (
     ENGINES,

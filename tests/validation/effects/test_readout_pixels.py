@@ -9,8 +9,8 @@ from bfsensor.effects.dark_hot import HotColumns
 from bfsensor.effects.effect import Effect, Layout, Segment, Shot
 from bfsensor.effects.library import LIBRARY, make_effect
 from bfsensor.effects.transfer import behind_flat, late_shares
-from tests.effects.parity import RANDOM
-from tests.effects.test_readout_parity import KINDS, NAMES
+from tests.validation.effects.parity import RANDOM
+from tests.validation.effects.test_readout_parity import KINDS, NAMES
 from validation.concealed.plan import Exposure as Taken
 from validation.concealed.plan import Geometry
 from validation.concealed.readout import Context, Electronics

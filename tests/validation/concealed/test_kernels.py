@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.concealed.twins import covariances, exposure, flat_power, image_twins
+from tests.validation.concealed.twins import covariances, exposure, flat_power, image_twins
 from validation.concealed.card import NOMINAL, shifts_at
 from validation.concealed.collect import Response, collect
 from validation.concealed.electrostatics import EdgeShifts

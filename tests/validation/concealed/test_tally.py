@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tests.concealed.reports import found, interval, report, truth
+from tests.validation.concealed.reports import found, interval, report, truth
 from validation.concealed.misses import print_misses
 from validation.concealed.score import score_campaign
 from validation.concealed.tally import (

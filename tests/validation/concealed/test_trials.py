@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from tests.concealed.reports import report
+from tests.validation.concealed.reports import report
 from validation.challenge import concealed_trials as trials
 from validation.challenge import trial_amplitudes as amplitudes
 from validation.challenge.trial_amplitudes import Amplitudes, headroom, strongest

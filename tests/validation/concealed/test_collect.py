@@ -5,7 +5,7 @@ import pytest
 from scipy.special import erf
 
 import validation.concealed.collect as collect_module
-from tests.concealed.twins import covariances, electrons, flat_power, image
+from tests.validation.concealed.twins import covariances, electrons, flat_power, image
 from validation.concealed.card import NOMINAL, shifts_at
 from validation.concealed.collect import (
     Response,

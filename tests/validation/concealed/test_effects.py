@@ -7,7 +7,7 @@ effect itself makes of the noise.
 import numpy as np
 import pytest
 
-from tests.concealed.twins import (
+from tests.validation.concealed.twins import (
     electrons,
     exposure,
     image_twins,

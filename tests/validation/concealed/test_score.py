@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tests.concealed.reports import found, interval, report, truth
+from tests.validation.concealed.reports import found, interval, report, truth
 from validation.concealed.card import NOMINAL
 from validation.concealed.conventions import expected_location, reading_of
 from validation.concealed.library import EFFECTS

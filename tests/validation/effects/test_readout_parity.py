@@ -3,7 +3,7 @@
 import pytest
 
 from bfsensor.effects.library import LIBRARY
-from tests.effects.parity import SMALL, disagreements
+from tests.validation.effects.parity import SMALL, disagreements
 from validation.concealed.library import make_effect
 from validation.effects.effect_parity import ENGINES, PLACES, effect_at
 from validation.effects.effects_on_pixels import compare
