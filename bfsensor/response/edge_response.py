@@ -215,25 +215,16 @@ def solve_response(
     middle = time.process_time()
     tangent = Tangent(solver, potential, Tangent(unit_solver, unit))
     changes = [tangent.change(*c, tolerance=tolerance) for c in changed]
-    shape = (len(changes), *kx.shape)
-    dkx, dky = np.zeros(shape), np.zeros(shape)
+    dkx, dky = np.zeros((2, len(changes), *kx.shape))
     if changes:
         deeper = np.array([
             (np.array(response_depths(d)) - depths) / step for d, step in changed
         ])  # fmt: skip
         columns, rows = boundary_changes(potential, lines, feet, changes, deeper)
         for n, change in enumerate(changes):
-            size = _SHIFT / max(np.abs(columns[n]).max(), np.abs(rows[n]).max(), 1e-30)
-            further = replace(
-                lines,
-                columns=lines.columns + size * columns[n],
-                rows=lines.rows + size * rows[n],
-            )
-            x, y = edges.mean(edges.moved(further))
-            dkx[n], dky[n] = (x - kx) / size, (y - ky) / size
+            by_lines = edges.line_change(lines, columns[n], rows[n], (kx, ky))
             by_images = edges.image_change(unit, change, *changed[n], moved)
-            dkx[n] += by_images[0]
-            dky[n] += by_images[1]
+            dkx[n], dky[n] = by_lines[0] + by_images[0], by_lines[1] + by_images[1]
     return EdgeResponse(
         depths, kx, ky, dkx, dky, (middle - began, time.process_time() - middle)
     )
@@ -264,6 +255,19 @@ class _Edges:
     def mean(self, moved: tuple[FloatArray, ...]) -> Edges:
         """Mean shifts, images taken off."""
         return self._mean(self.images.taken_off(moved)[0])
+
+    def line_change(
+        self, lines: PixelBoundaries, columns: FloatArray, rows: FloatArray, here: Edges
+    ) -> Edges:
+        """Change of the shifts ``here`` because the boundary lines move at these rates."""
+        size = _SHIFT / max(np.abs(columns).max(), np.abs(rows).max(), 1e-30)
+        further = replace(
+            lines,
+            columns=lines.columns + size * columns,
+            rows=lines.rows + size * rows,
+        )
+        x, y = self.mean(self.moved(further))
+        return (x - here[0]) / size, (y - here[1]) / size
 
     def image_change(
         self,

@@ -118,39 +118,55 @@ def factor_table(
     g1 = g1 / scale
     flat = means.reshape(len(g1), -1)
     if linear or len(g1) == 1:
-        g1 = np.ones_like(g1)
-        g2 = np.zeros_like(g1)
-        k1 = _small_charge(table, sides)
-        k2 = None
+        # The smallest charge on the lowest background speaks for all.
+        modes = _Modes(np.ones_like(g1), np.zeros_like(g1), [s[0, 0] for s in sides], None)
     else:
-        rest = flat - np.outer(g1, _project(flat, g1, weight))
-        g2 = _leading(rest, weight)
-        g2 = g2 / np.sqrt(np.average(g2**2, weights=weight))
-        # The second mode is what the first cannot say where charge and background are 0.
-        basis = np.stack([g1, g2], 1)
-        k1, k2 = [], []
-        for s in sides:
-            data = s.reshape(len(g1), -1)
-            both = _project(data, basis, weight)
-            alone = _project(data, g1, weight)
-            near = np.broadcast_to(
-                _is_near(s.shape[3:5])[None, :, :, None, None], s.shape[2:]
-            ).ravel()
-            k1.append(np.where(near, both[0], alone).reshape(s.shape[2:]))
-            k2.append(np.where(near, both[1], 0.0).reshape(s.shape[2:]))
-    residual = _residual(flat, weight, g1, g2, k1, k2, lengths)
+        modes = _split(sides, flat, g1, weight)
+    residual = _residual(flat, weight, modes, lengths)
     response = _grid(
-        table, g1.reshape(levels), g2.reshape(levels), linear=linear, background=background,
-        bend=bend,
+        table, modes.g1.reshape(levels), modes.g2.reshape(levels), linear=linear,
+        background=background, bend=bend,
     )  # fmt: skip
     z = table.depths[-1:] if top else table.depths
     heights = z
     if len(z) > 1:
         # A layer where light without wavelengths converts; above it nothing changes.
         heights = np.geomspace(z[0], min(z[-1], table.thickness - 1.0), _LAYERS)
-    layers = [None if k is None else _to_layers(z, heights, k) for k in (k1, k2)]
-    assert layers[0] is not None
-    return EffectiveCharge(layers[0], layers[1], heights, points, response, residual)
+    first = _to_layers(z, heights, modes.k1)
+    second = None if modes.k2 is None else _to_layers(z, heights, modes.k2)
+    return EffectiveCharge(first, second, heights, points, response, residual)
+
+
+@dataclass(frozen=True)
+class _Modes:
+    """Amplitudes of both modes by level, and their patterns by side; no second of a linear table."""
+
+    g1: FloatArray
+    g2: FloatArray
+    k1: list[FloatArray]
+    k2: list[FloatArray] | None
+
+
+def _split(
+    sides: list[FloatArray], flat: FloatArray, g1: FloatArray, weight: FloatArray
+) -> _Modes:
+    """Add to the far response a second mode, of the nearest edges, that it leaves over."""
+    rest = flat - np.outer(g1, _project(flat, g1, weight))
+    g2 = _leading(rest, weight)
+    g2 = g2 / np.sqrt(np.average(g2**2, weights=weight))
+    # The second mode is what the first cannot say where charge and background are 0.
+    basis = np.stack([g1, g2], 1)
+    k1, k2 = [], []
+    for s in sides:
+        data = s.reshape(len(g1), -1)
+        both = _project(data, basis, weight)
+        alone = _project(data, g1, weight)
+        near = np.broadcast_to(
+            _is_near(s.shape[3:5])[None, :, :, None, None], s.shape[2:]
+        ).ravel()
+        k1.append(np.where(near, both[0], alone).reshape(s.shape[2:]))
+        k2.append(np.where(near, both[1], 0.0).reshape(s.shape[2:]))
+    return _Modes(g1, g2, k1, k2)
 
 
 def _to_layers(
@@ -203,27 +219,18 @@ def _at_zero(table: DistortionTable, g: FloatArray) -> float:
     return float(wq @ g @ wb)
 
 
-def _small_charge(table: DistortionTable, sides: list[FloatArray]) -> list[FloatArray]:
-    """Response of the smallest charge on the lowest background."""
-    return [s[0, 0] for s in sides]
-
-
 def _residual(
-    flat: FloatArray,
-    weight: FloatArray,
-    g1: FloatArray,
-    g2: FloatArray,
-    k1: list[FloatArray],
-    k2: list[FloatArray] | None,
-    lengths: FloatArray,
+    flat: FloatArray, weight: FloatArray, modes: _Modes, lengths: FloatArray
 ) -> float:
+    """Largest error of the modes at the table's levels, relative to each level's largest shift."""
+
     def mean(k: list[FloatArray]) -> FloatArray:
         parts = [(s[..., n] @ lengths).reshape(s.shape[0], -1) for n, s in enumerate(k)]
         return np.concatenate(parts, -1).ravel()
 
-    model = np.outer(g1, mean(k1))
-    if k2 is not None:
-        model += np.outer(g2, mean(k2))
+    model = np.outer(modes.g1, mean(modes.k1))
+    if modes.k2 is not None:
+        model += np.outer(modes.g2, mean(modes.k2))
     size = np.abs(flat).max(1)
     good = (weight > 0) & (size > 0)
     return float((np.abs(flat - model).max(1)[good] / size[good]).max())

@@ -102,23 +102,9 @@ def iterate_flat(
         A view of the image as it is; of the last all charge is collected, and effects at the
         end of an exposure have not acted.
     """
+    _check_request(shape, level, step, border)
     ny, nx = shape
-    if not (level > 0 and np.isfinite(level)):
-        raise SensorError(f"level = {level} e- must be a finite number above 0 e-")
-    if not (step > 0 and np.isfinite(step)):
-        raise SensorError(f"step = {step} e- must be a finite number above 0 e-")
-    if min(ny, nx) < 1 or border < 0:
-        raise SensorError(f"shape = {shape} and border = {border} must not be negative")
-    light = np.ones((ny + 2 * border, nx + 2 * border))
-    if illumination is not None:
-        given = np.asarray(illumination, float)
-        if given.shape != (ny, nx):
-            raise SensorError(
-                f"illumination has the shape {given.shape}, the flat {(ny, nx)}"
-            )
-        if not np.all(given >= 0):
-            raise SensorError("illumination must not be negative or nan")
-        light = np.pad(given, border, mode="edge")
+    light = _light(shape, illumination, border)
     seed = galsim.BaseDeviate(rng).raw()
     generator = np.random.Generator(np.random.SFC64(seed))
     law = Law()
@@ -155,6 +141,32 @@ def iterate_flat(
         flat = whole[inside]
         flat.setOrigin(1, 1)
         yield flat
+
+
+def _check_request(shape: tuple[int, int], level: float, step: float, border: int) -> None:
+    """Refuse flats that cannot be."""
+    if not (level > 0 and np.isfinite(level)):
+        raise SensorError(f"level = {level} e- must be a finite number above 0 e-")
+    if not (step > 0 and np.isfinite(step)):
+        raise SensorError(f"step = {step} e- must be a finite number above 0 e-")
+    if min(shape) < 1 or border < 0:
+        raise SensorError(f"shape = {shape} and border = {border} must not be negative")
+
+
+def _light(
+    shape: tuple[int, int], illumination: FloatArray | None, border: int
+) -> FloatArray:
+    """Relative light on a flat with its border; nearest pixels outside, 1 by default."""
+    if illumination is None:
+        return np.ones((shape[0] + 2 * border, shape[1] + 2 * border))
+    given = np.asarray(illumination, float)
+    if given.shape != tuple(shape):
+        raise SensorError(
+            f"illumination has the shape {given.shape}, the flat {tuple(shape)}"
+        )
+    if not np.all(given >= 0):
+        raise SensorError("illumination must not be negative or nan")
+    return np.pad(given, border, mode="edge")
 
 
 def _light_of_effects(

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 
@@ -113,24 +113,14 @@ def sweep_device(
     >>> bool(abs(sweep.a[1, 0, 0]) < abs(sweep.a[0, 0, 0]))  # red light converts lower
     True
     """
-    if not (
-        np.isfinite(level) and level >= 0 and np.isfinite(full_pixel) and full_pixel >= 0
-    ):
-        raise SweepError(
-            f"level = {level:g} e- and full pixel = {full_pixel:g} e- must be finite, from 0 e-"
-        )
-    if cells < 8 or cells % 2:
-        raise SweepError(
-            f"cells = {cells} must be an even number of at least 8 cells a pixel"
-        )
+    _check_request(level, full_pixel, cells)
     places = combine(swept, paired=paired)
     made = [_device_at(device, swept, place) for place in places]
-    keep = tables is not None
 
     def plan(made: Device) -> SweepPoint:
         # What is known about a value does not change the answer, and a swept value is new.
         text = dataclasses.replace(made, provenance={}).to_toml()
-        return SweepPoint(text, level, full_pixel, cells, keep)
+        return SweepPoint(text, level, full_pixel, cells, tables is not None)
 
     base = plan(device)
     finer = SweepPoint(base.device_text, level, 0.0, partner_cells(cells))
@@ -146,7 +136,6 @@ def sweep_device(
         ),
         strict=True,
     ))  # fmt: skip
-    coarse, fine = (solved[p].a[-1] for p in (base, finer))
     rows = []
     for place, one, point in zip(places, made, wanted, strict=True):
         if isinstance(one, Device) and point is not None:
@@ -155,10 +144,8 @@ def sweep_device(
             none = np.full((LAGS, LAGS), np.nan)
             rows.append(SweepRow(none, none, np.nan, 0.0, np.nan, str(one)))
     if tables is not None:
-        tables.mkdir(parents=True, exist_ok=True)
-        for n, point in enumerate(wanted):
-            if point is not None and wanted.index(point) == n and not solved[point].reason:
-                shutil.copyfile(work / f"{point.key}.fits", tables / f"point_{n:04d}.fits")
+        _copy_tables(wanted, solved, work, tables)
+    coarse, fine = (solved[p].a[-1] for p in (base, finer))
     refused = [solved[p].reason for p in (base, finer) if solved[p].reason]
     return DeviceSweep.make(
         rows, np.abs(fine / coarse - 1), swept, places,
@@ -168,6 +155,33 @@ def sweep_device(
             "no_error": refused[0] if refused else "", "device": device.to_toml().splitlines(),
         },
     )  # fmt: skip
+
+
+def _check_request(level: float, full_pixel: float, cells: int) -> None:
+    """Refuse charges and meshes that are not allowed."""
+    if not (
+        np.isfinite(level) and level >= 0 and np.isfinite(full_pixel) and full_pixel >= 0
+    ):
+        raise SweepError(
+            f"level = {level:g} e- and full pixel = {full_pixel:g} e- must be finite, from 0 e-"
+        )
+    if cells < 8 or cells % 2:
+        raise SweepError(
+            f"cells = {cells} must be an even number of at least 8 cells a pixel"
+        )
+
+
+def _copy_tables(
+    wanted: Sequence[SweepPoint | None],
+    solved: Mapping[SweepPoint, PointResponse],
+    work: Path,
+    tables: Path,
+) -> None:
+    """Put the table of every point where it is asked for, of rows alike the first one's."""
+    tables.mkdir(parents=True, exist_ok=True)
+    for n, point in enumerate(wanted):
+        if point is not None and wanted.index(point) == n and not solved[point].reason:
+            shutil.copyfile(work / f"{point.key}.fits", tables / f"point_{n:04d}.fits")
 
 
 def _device_at(
