@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor._kernels.photons import Medium
-from bfsensor.device.device import Device
 from bfsensor.effects.effect import Layout
 from bfsensor.errors import SensorError
 from bfsensor.sensor.boundary_shifts import make_shifts
@@ -21,11 +20,15 @@ from bfsensor.sensor.drift_field import MEASURED, STEPS, solve_drift
 from bfsensor.sensor.effect_sensor import EffectSensor
 from bfsensor.sensor.image_exposure import Physics
 from bfsensor.sensor.options import (
+    check_full_well,
     check_number,
+    check_reach,
     check_table,
+    check_threads,
     check_word,
     find_table,
     load_table,
+    read_device,
 )
 from bfsensor.sensor.shift_maps import ShiftMap
 from bfsensor.sensor.silicon_sensor import check_rings
@@ -199,58 +202,42 @@ class BrighterFatterSensor(EffectSensor):
         conditions: Mapping[str, Any] | None = None,
         layout: Layout | Mapping[str, Any] | None = None,
     ) -> None:
-        self.name = str(name) if table is None else "table"
-        # Where the table came from: it is pickled by that, not by its 18 MB.
-        self._source = find_table(name) if table is None else None
-        self.table = load_table(*self._source) if self._source else check_table(table)
+        self._take_table(name, table)
         self.strength = check_number("strength", strength)
         self.rng = galsim.UniformDeviate(rng)
         self.diffusion_factor = check_number("diffusion_factor", diffusion_factor, low=0.0)
-        reach = self.table.reach
-        self.qdist = reach if qdist is None else int(qdist)
-        if not 0 <= self.qdist <= reach:
-            raise SensorError(
-                f"qdist = {qdist} must be from 0 to {reach}: the table of {self.name} holds "
-                "charge no further away"
-            )
+        self.qdist = check_reach(qdist, self.table, self.name)
         self.nrecalc = check_number("nrecalc", nrecalc, low=0.0)
         check_rings(treering_func, treering_center)
-        self.treering_func = treering_func
-        self.treering_center = treering_center
+        self.treering_func, self.treering_center = treering_func, treering_center
         self.transpose = bool(transpose)
         self.shift_map = (
             ShiftMap.read(shift_map) if isinstance(shift_map, str) else shift_map
         )
-        self.charge_response = bool(charge_response)
-        self.background = bool(background)
-        self.depth = bool(depth)
+        self.charge_response, self.background = bool(charge_response), bool(background)
+        self.depth, self.predict = bool(depth), bool(predict)
         self.red = check_word("red", red, ("lost", "kept"))
         self.absorption = check_word("absorption", absorption, ("law", "galsim"))
         self.diffusion = check_word("diffusion", diffusion, ("einstein", "measured"))
         self.beyond = check_word("beyond", beyond, ("hold", "error"))
-        self.predict = bool(predict)
         self.conversion_depth = check_number(
             "conversion_depth", conversion_depth, low=0.0, high=self.table.thickness
         )
-        self.threads = int(threads)
-        if self.threads < 1:
-            raise SensorError(f"threads = {threads} must be at least 1")
-        if not self.table.device_text:
-            raise SensorError(
-                f"the table of {self.name} holds no device, which gives drift field and "
-                "temperature"
-            )
-        self._device = Device.from_toml(self.table.device_text)
+        self.threads = check_threads(threads)
+        self._device = read_device(self.table, self.name)
         if temperature is None:
             temperature = self._device.operating_point.temperature
         self.temperature = check_number("temperature", temperature, low=77.0, high=400.0)
-        well = self.table.full_well if full_well is None else float(full_well)
-        if not (math.isnan(well) or well > 0):
-            raise SensorError(f"full_well = {full_well} must be above 0 e- (inf: none)")
-        self.full_well = math.inf if math.isnan(well) else well
+        self.full_well = check_full_well(full_well, self.table)
         self._warned = False
         self._init_effects(effects, layout, conditions, self._usual, self.transpose)
         self._init_silicon()
+
+    def _take_table(self, name: str, table: DistortionTable | None) -> None:
+        self.name = str(name) if table is None else "table"
+        # Where the table came from: it is pickled by that, not by its 18 MB.
+        self._source = find_table(name) if table is None else None
+        self.table = load_table(*self._source) if self._source else check_table(table)
 
     def _usual(self) -> dict[str, Any]:
         """What effects count from where nothing else is said."""

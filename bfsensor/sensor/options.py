@@ -6,6 +6,7 @@ import math
 from functools import lru_cache
 from pathlib import Path
 
+from bfsensor.device.device import Device
 from bfsensor.errors import SensorError, TableError
 from bfsensor.files import tables_dir
 from bfsensor.table.table import DistortionTable
@@ -47,6 +48,41 @@ def check_table(table: DistortionTable | None) -> DistortionTable:
 def _read(path: str, changed: int) -> DistortionTable:
     """Read a table once for all sensors of a process."""
     return DistortionTable.read(path)
+
+
+def read_device(table: DistortionTable, name: str) -> Device:
+    """Give the device in a table; a table without one is refused."""
+    if not table.device_text:
+        raise SensorError(
+            f"the table of {name} holds no device, which gives drift field and temperature"
+        )
+    return Device.from_toml(table.device_text)
+
+
+def check_reach(qdist: int | None, table: DistortionTable, name: str) -> int:
+    """Give how far charge acts [pixel], by default as far as the table reaches."""
+    reach = table.reach if qdist is None else int(qdist)
+    if not 0 <= reach <= table.reach:
+        raise SensorError(
+            f"qdist = {qdist} must be from 0 to {table.reach}: the table of {name} holds "
+            "charge no further away"
+        )
+    return reach
+
+
+def check_full_well(full_well: float | None, table: DistortionTable) -> float:
+    """Give the full well [e-], by default the table's; inf where there is none."""
+    well = table.full_well if full_well is None else float(full_well)
+    if not (math.isnan(well) or well > 0):
+        raise SensorError(f"full_well = {full_well} must be above 0 e- (inf: none)")
+    return math.inf if math.isnan(well) else well
+
+
+def check_threads(threads: int) -> int:
+    """Give a number of threads."""
+    if int(threads) < 1:
+        raise SensorError(f"threads = {threads} must be at least 1")
+    return int(threads)
 
 
 def check_number(
