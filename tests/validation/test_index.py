@@ -45,7 +45,10 @@ def cells(page, masked=()):
             row[6] = (
                 "stale" if row[6] else ""
             )  # by which commit may change with the history
-            yield tuple(row[:4] + row[5:6] if row[0] in masked else row)
+            if row[0] in masked:  # which of several commits is the oldest, and their dates
+                row[3:5] = [row[3].partition(" to ")[2].partition(", ")[2] or row[3]]
+                row.pop()
+            yield tuple(row)
         elif not re.fullmatch(r"\d+ of \d+ results are stale\.", line) or not masked:
             yield line
 
