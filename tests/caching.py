@@ -96,6 +96,39 @@ def keep(key: object, make: Callable[[], Made], *, made_by: Iterable[str]) -> Ma
     return made
 
 
+def keep_files(
+    into: Path, make: Callable[[], Made], *, key: object, made_by: Iterable[str]
+) -> Made:
+    """Give what ``make`` gives, which finds in a folder the files that it wrote there before.
+
+    For solvers that keep finished levels: they go on from what is there.
+
+    Parameters
+    ----------
+    into : Path
+        The folder, empty; tests may change what is in it afterwards.
+    make, key, made_by
+        As for :func:`keep`.
+    """
+    folder = cache_folder()
+    if folder is None:
+        return make()
+    digest = _digest([code_digest(*made_by).encode(), repr(key).encode()])
+    kept = folder / "made" / digest
+    if kept.is_dir():
+        shutil.copytree(kept, into, dirs_exist_ok=True)
+        os.utime(kept)
+        return make()
+    made = make()
+    beside = kept.with_name(f"{digest}.{os.getpid()}")
+    shutil.copytree(into, beside)
+    try:
+        beside.rename(kept)
+    except OSError:  # another process was first
+        shutil.rmtree(beside)
+    return made
+
+
 def remove_old(folder: Path) -> None:
     """Remove what nobody used for :data:`KEPT_DAYS`."""
     oldest = time.time() - 86400 * KEPT_DAYS

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bfsensor.errors import SweepError
 from bfsensor.plots.style import (
@@ -19,12 +21,11 @@ from bfsensor.plots.style import (
     import_matplotlib,
     new_figure,
 )
+from bfsensor.typing import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from bfsensor.sweeps.rows import DeviceSweep
 
 _SHOWN = (
     ("(0, 0)", 0, 0, BLACK, "o"),
@@ -37,14 +38,48 @@ _SHOWN = (
 _LINE_STYLES: tuple[Any, ...] = ("-", "--", "-.", ":")
 
 
+class SweepResult(Protocol):
+    """What a figure needs of a sweep, such as :class:`bfsensor.sweeps.rows.DeviceSweep`.
+
+    Attributes
+    ----------
+    rows : astropy.table.Table
+        One row a point, with the swept quantities as columns; ``meta['level']`` in electrons.
+    swept : sequence of str
+        Columns that were swept.
+    refused : ndarray of bool
+        Points without an answer.
+    a, errors : ndarray, shape (points, lags y, lags x)
+        a_ij and their numerical errors [1/e-].
+    """
+
+    rows: Any
+
+    @property
+    def swept(self) -> Sequence[str]:
+        """Columns that were swept."""
+
+    @property
+    def refused(self) -> NDArray[np.bool_]:
+        """Points without an answer."""
+
+    @property
+    def a(self) -> FloatArray:
+        """Differential responses [1/e-]."""
+
+    @property
+    def errors(self) -> FloatArray:
+        """Their numerical errors [1/e-]."""
+
+
 def draw_sweep(
-    sweep: DeviceSweep, ax: Axes, *, against: str | None = None, relative: bool = False
+    sweep: SweepResult, ax: Axes, *, against: str | None = None, relative: bool = False
 ) -> None:
     """Draw the nearest a_ij against a swept quantity.
 
     Parameters
     ----------
-    sweep : DeviceSweep
+    sweep : SweepResult
         What to draw.  Points without an answer are left out; each set of values of the other
         swept quantities has a line style of its own.
     ax : matplotlib.axes.Axes
@@ -117,12 +152,12 @@ def draw_sweep(
     ax.legend(handles=handles, fontsize=8, frameon=False, title="lag (i, j)")
 
 
-def figure_for_sweep(sweep: DeviceSweep, *, against: str | None = None) -> Figure:
+def figure_for_sweep(sweep: SweepResult, *, against: str | None = None) -> Figure:
     """Draw a sweep on one page: sizes of a_ij, and their changes.
 
     Parameters
     ----------
-    sweep : DeviceSweep
+    sweep : SweepResult
         What to draw.
     against : str, optional
         A column that was swept; by default the one with most values.

@@ -52,7 +52,7 @@ def test_a_fit_ends_at_the_device_and_the_table_of_the_finer_mesh(tmp_path, kept
     x, y = make_finer(kept)._solved(truth)[HERE]
     areas = area_matrix(x, y)[5:-1, 5:-1]
     data = area_data("mock", areas, np.full(areas.shape, 0.002 * areas[0, 1]), scaled=False)
-    exact = solving.Solved(DEVICE, FREE, (HERE,), 16, finer.REFINE_Z, kept)
+    exact = solving.FullSolutions(DEVICE, FREE, (HERE,), 16, finer.REFINE_Z, kept)
     there = exact(truth).predict(np.zeros(0), HERE)
     np.testing.assert_array_equal(there.areas, areas)
     found = fit_device(

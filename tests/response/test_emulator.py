@@ -12,6 +12,7 @@ from bfsensor.errors import FitError
 from bfsensor.response.edge_response import area_matrix, solve_response
 from bfsensor.response.emulator import DeviceEmulator
 from bfsensor.response.emulator_nodes import make_node, solve_nodes
+from tests.caching import keep_files
 
 NAMES = "silicon.thickness", "silicon.background_doping"
 MESH = {
@@ -29,7 +30,11 @@ def kept(tmp_path_factory):
 @pytest.fixture(scope="module")
 def emulator(kept):
     device = Device.load("itl_sta3800c")
-    return DeviceEmulator.build(device, NAMES, **MESH, keep=kept)
+    return keep_files(
+        kept, lambda: DeviceEmulator.build(device, NAMES, **MESH, keep=kept),
+        key=("emulator", device.to_toml(), NAMES, MESH),
+        made_by=["bfsensor.response.emulator"],
+    )  # fmt: skip
 
 
 def test_kept_solutions_are_found_whatever_is_known_of_the_device():
