@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from bfsensor.device.device import Device
     from bfsensor.direct.transport import Transport
 
-Limits = Mapping[str, tuple[float, float]]
-
 
 class ExposurePlan:
     """What plans of spots and of flats, both frozen dataclasses, have in common."""

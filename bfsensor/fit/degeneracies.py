@@ -32,24 +32,6 @@ class Combination(NamedTuple):
     weights: FloatArray
 
 
-def combinations(sensitivity: FloatArray) -> tuple[Combination, ...]:
-    """Independent combinations of the parameters, the best known first.
-
-    Parameters
-    ----------
-    sensitivity : ndarray, shape (n, p)
-        Change of each number, in its error, for one prior spread of each parameter.
-
-    Examples
-    --------
-    >>> both = combinations(np.array([[3.0, 3.0], [0.0, 0.0]]))
-    >>> [round(one.remains, 3) for one in both]
-    [0.229, 1.0]
-    """
-    information = np.eye(sensitivity.shape[1]) + sensitivity.T @ sensitivity
-    return principal(np.asarray(np.linalg.inv(information), float))
-
-
 def principal(covariance: FloatArray) -> tuple[Combination, ...]:
     """Combinations whose errors are independent, the best known first.
 
@@ -97,7 +79,7 @@ def find_ties(
     names : sequence of str
         Of the parameters.
     sensitivity : ndarray, shape (n, p)
-        As for :func:`combinations`.
+        Change of each number, in its error, for one prior spread of each parameter.
 
     Returns
     -------

@@ -142,9 +142,10 @@ class CovarianceFit:
             "i": (i.ravel(), "pixel", "lag in x, serial"),
             "j": (j.ravel(), "pixel", "lag in y, parallel"),
         }
-        for k, (name, unit) in enumerate(zip(_MATRICES, units, strict=True)):
+        errors = (self.a_errors, self.c_errors, self.noise_errors)
+        for name, unit, error in zip(_MATRICES, units, errors, strict=True):
             columns[name] = (getattr(self, name).ravel(), unit, "")
-            columns[f"{name}_error"] = (self._errors(k).ravel(), unit, "1 sigma")
+            columns[f"{name}_error"] = (error.ravel(), unit, "1 sigma")
         rows = self.matrix[: 3 * n].reshape(3, n, -1).transpose(1, 0, 2)
         columns["matrix"] = (rows, None, "rows of the covariance matrix of a, c, noise")
         meta = {name: getattr(self, name) for name in _NAMES}

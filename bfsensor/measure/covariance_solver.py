@@ -214,9 +214,8 @@ def _inverse_errors(
 
 
 def _jacobian(
-    series: Series, monomials: FloatArray, model: FloatArray,
-    level: float, gain: float,
-) -> FloatArray:  # fmt: skip
+    series: Series, monomials: FloatArray, model: FloatArray, gain: float
+) -> FloatArray:
     """Derivatives of the covariances at one level by all parameters."""
     n = len(model)
     out = np.empty((n, 3 * n + 1))
@@ -242,9 +241,7 @@ def _normal_equations(
     normal = np.zeros((len(parameters), len(parameters)))
     gradient = np.zeros(len(parameters))
     for k in range(len(curve)):
-        slopes = _jacobian(
-            series, monomials[k], model[k], curve.levels[k], float(parameters[-1])
-        )
+        slopes = _jacobian(series, monomials[k], model[k], float(parameters[-1]))
         weighted = pull[k] * (inverse[k] @ slopes)
         normal += slopes.T @ weighted
         gradient += weighted.T @ residual[k]
@@ -293,7 +290,7 @@ def find_turnoff(
             near.levels, found.parameters, powers, slopes=True
         )
         for k in range(begin, min(begin + group, len(curve))):
-            slopes = _jacobian(series, monomials[k], model[k], near.levels[k], found.gain)
+            slopes = _jacobian(series, monomials[k], model[k], found.gain)
             error = bartlett_matrix(model[k].reshape(shape), near.pairs[k])
             error = error + slopes @ found.matrix @ slopes.T
             residual = near.covariances[k].ravel() - model[k]

@@ -1,4 +1,4 @@
-"""Covariances against level: many pairs of one region, and the seed paper's slopes."""
+"""Covariances against level: many pairs of flats of one region."""
 
 from __future__ import annotations
 
@@ -9,16 +9,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2 as chi2_distribution
 
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.bartlett import bartlett_matrix
-from bfsensor.measure.ecsv import read_ecsv, same_fields, square_lags, write_ecsv
+from bfsensor.measure.ecsv import read_ecsv, same_fields, write_ecsv
 from bfsensor.measure.flat_pairs import UNITS, FlatCovariances, flat_covariances
 from bfsensor.typing import FloatArray
 
 SCHEMA = "bfsensor covariance curve"
-SCHEMA_SLOPES = "bfsensor correlation slopes"
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,166 +222,3 @@ def measure_curve(
         except MeasurementError as error:
             raise MeasurementError(f"pair {number}: {error}") from None
     return CovarianceCurve.from_pairs(found)
-
-
-@dataclass(frozen=True, eq=False)
-class CorrelationSlopes:
-    """Growth of the correlations with the level, after the seed paper.
-
-    Attributes
-    ----------
-    slopes, slope_errors : ndarray, shape (lags + 1, lags + 1)
-        [1/unit], indexed [j, i]; (0, 0) is the slope of C_00 / level.
-    intercepts, intercept_errors : ndarray, shape (lags + 1, lags + 1)
-        Correlation at zero level; (0, 0) is C_00 / level there, the inverse of the gain.
-    chi2 : ndarray, shape (lags + 1, lags + 1)
-        Chi-square of each line, for ``dof`` degrees of freedom.
-    dof : int
-        Pairs less two.
-    level_range : tuple of float
-        Lowest and highest level used [unit].
-    unit, region : str
-        As in the curve.
-    """
-
-    slopes: FloatArray
-    slope_errors: FloatArray
-    intercepts: FloatArray
-    intercept_errors: FloatArray
-    chi2: FloatArray
-    dof: int
-    level_range: tuple[float, float]
-    unit: str = "electron"
-    region: str = ""
-
-    def __eq__(self, other: object) -> bool:
-        return same_fields(self, other)
-
-    __hash__ = None  # type: ignore[assignment]
-
-    def correlations_at(self, level: float) -> tuple[FloatArray, ...]:
-        """Give the correlations at a level with their zero-level part taken off, and errors.
-
-        The paper quotes them at 80,000 electrons and calls them covariances.
-        """
-        return self.slopes * level, self.slope_errors * level
-
-    @property
-    def p_values(self) -> FloatArray:
-        """Chance of a chi-square as large, for each lag; small where a line does not fit."""
-        return np.asarray(chi2_distribution.sf(self.chi2, self.dof))
-
-    def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write as ECSV, a row for each lag (beside, then renamed)."""
-        j, i = np.indices(self.slopes.shape)
-        names = ("slopes", "slope_errors", "intercepts", "intercept_errors", "chi2")
-        columns: dict[str, tuple[Any, str | None, str]] = {
-            "i": (i.ravel(), "pixel", "lag in x, serial"),
-            "j": (j.ravel(), "pixel", "lag in y, parallel"),
-        }
-        for name in names:
-            unit = f"1 / {self.unit}" if name.startswith("slope") else None
-            columns[name] = (getattr(self, name).ravel(), unit, "")
-        meta = {n: getattr(self, n) for n in ("dof", "level_range", "unit", "region")}
-        write_ecsv(path, SCHEMA_SLOPES, columns, meta, overwrite=overwrite)
-
-    @classmethod
-    def read(cls, path: str | os.PathLike[str]) -> CorrelationSlopes:
-        """Read what :meth:`write` wrote; names the file and what is missing in it."""
-        names = ("slopes", "slope_errors", "intercepts", "intercept_errors", "chi2")
-        columns, meta = read_ecsv(
-            path,
-            SCHEMA_SLOPES,
-            ("i", "j", *names),
-            ("dof", "level_range", "unit", "region"),
-        )
-        low, high = meta.pop("level_range")
-        return cls(**square_lags(path, columns), level_range=(low, high), **meta)
-
-
-def fit_correlation_slopes(
-    curve: CovarianceCurve, *, level_range: tuple[float, float] | None = None
-) -> CorrelationSlopes:
-    r"""Fit lines to the correlations against the level, as the seed paper did.
-
-    At each level C_ij is divided by the measured variance; a weighted line in the level
-    gives the intercept at zero, which is noise that the readout correlates, and the slope,
-    which is the brighter-fatter effect.  For the lag (0, 0), where that ratio is one, the
-    line is through C_00 / level instead.
-
-    Parameters
-    ----------
-    curve : CovarianceCurve
-        At least three levels.
-    level_range : tuple of float, optional
-        Lowest and highest level to use [unit]; all by default.
-
-    Returns
-    -------
-    CorrelationSlopes
-
-    Raises
-    ------
-    MeasurementError
-        Fewer than three pairs in the range, or one of level or variance 0 or below.
-
-    Notes
-    -----
-    The line is an approximation:
-
-    .. math::
-        C_{ij} / C_{00} = a_{ij} \mu \left[1 + \mu\left(\tfrac{2}{3}
-        \frac{(a \otimes a)_{ij}}{a_{ij}} - a_{00}\right) + \dots\right],
-
-    so the slope departs from a_ij by some mu a_00 of it, C_00 / level bends too and puts its
-    intercept low, 1 % for a_00 mu = -0.03 to -0.25, and noise
-    n_ij that does not grow with the signal adds n_ij / C_00, which falls as 1 / mu and is
-    no intercept.  :func:`~bfsensor.measure.covariance_fit.fit_covariances` has neither
-    fault.  The gain drops out of the ratio: slopes [1/ADU] divided by the gain [e-/ADU] are
-    per electron.
-
-    References
-    ----------
-    Lage, Bradshaw & Tyson 2017, JINST 12, C03091, section 2.2 (the words exchanged:
-    their covariance is our correlation); Antilogus et al. 2014.
-    """
-    low, high = level_range or (curve.levels[0], curve.levels[-1])
-    inside = (curve.levels >= low) & (curve.levels <= high)
-    if inside.sum() < 3:
-        raise MeasurementError(
-            f"fewer than 3 pairs have a level from {low:g} to {high:g} {curve.unit}; a line "
-            "and its error need 3"
-        )
-    used = curve.select(inside)
-    level = used.levels[:, None, None]
-    variance = used.covariances[:, :1, :1]
-    for name, least in (("level", used.levels.min()), ("variance", variance.min())):
-        if not least > 0:
-            raise MeasurementError(
-                f"a {name} of {least:g} has no correlation: give the level_range above it"
-            )
-    ratio = used.covariances / variance
-    # Relative errors of the variance are those of C_00; they matter where C_ij ~ C_00.
-    error = np.hypot(used.errors, ratio * used.errors[:, :1, :1]) / variance
-    ratio[:, 0, 0] = used.covariances[:, 0, 0] / used.levels
-    error[:, 0, 0] = used.errors[:, 0, 0] / used.levels
-    weight = error**-2
-    total = weight.sum(0)
-    centre = (weight * level).sum(0) / total
-    spread = (weight * (level - centre) ** 2).sum(0)
-    if not np.all(spread > 0):
-        raise MeasurementError(f"all levels are {used.levels[0]:g}: no line to fit")
-    slope = (weight * (level - centre) * ratio).sum(0) / spread
-    middle = (weight * ratio).sum(0) / total
-    residual = ratio - middle - slope * (level - centre)
-    return CorrelationSlopes(
-        slopes=slope,
-        slope_errors=spread**-0.5,
-        intercepts=middle - slope * centre,
-        intercept_errors=np.sqrt(1 / total + centre**2 / spread),
-        chi2=(weight * residual**2).sum(0),
-        dof=len(used) - 2,
-        level_range=(float(used.levels[0]), float(used.levels[-1])),
-        unit=curve.unit,
-        region=curve.region,
-    )

@@ -49,14 +49,12 @@ _UNITS = {
 
 
 class MeanWidths(NamedTuple):
-    """Rms widths of a region's spots [pixel], pixel taken out, errors by noise and scatter."""
+    """Rms widths of a region's spots [pixel], pixel taken out, and their errors by noise."""
 
     sigma_x: float
     sigma_y: float
     sigma_x_error: float
     sigma_y_error: float
-    sigma_x_scatter_error: float
-    sigma_y_scatter_error: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,15 +128,9 @@ class SpotMoments:
                 )
             sigma = float(np.sqrt(mean - PIXEL_VARIANCE))
             noise = float(np.sqrt(weight**2 @ e**2)) / (2 * sigma)
-            free = 1 - float(weight @ weight)
-            scatter = (
-                float(np.sqrt(weight**2 @ (m - mean) ** 2 / free)) / (2 * sigma)
-                if free > 1e-12
-                else float("nan")
-            )
-            found.append((sigma, noise, scatter))
-        (sx, ex, kx), (sy, ey, ky) = found
-        return MeanWidths(sx, sy, ex, ey, kx, ky)
+            found.append((sigma, noise))
+        (sx, ex), (sy, ey) = found
+        return MeanWidths(sx, sy, ex, ey)
 
     def __eq__(self, other: object) -> bool:
         return same_fields(self, other)

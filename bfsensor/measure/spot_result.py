@@ -156,16 +156,6 @@ class SpotFit:
         """
         return self.flux * float(integrate_gaussian([0.0], [0.0], self.shape, 1)[0, 0, 0])
 
-    @cached_property
-    def central_signals(self) -> FloatArray:
-        """Signal of each spot's model in its central pixel as it fell [e-], shape (n,).
-
-        Without background.  Of spots strewn over a pixel the mean is below that of
-        `peaks`, by 8 % at a width of one pixel.
-        """
-        inside = integrate_gaussian(self.centre_x, self.centre_y, self.shape, 1)
-        return self.flux * inside[:, 0, 0]
-
     @property
     def peak(self) -> float:
         """Mean of `peaks` of the used spots [e-]: the abscissa of B-F slopes."""

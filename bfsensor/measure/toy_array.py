@@ -29,36 +29,6 @@ from bfsensor.measure.toy import LARGEST_RMS_AREA, MOST_DARTS, draw_darts
 from bfsensor.typing import FloatArray
 
 
-def unfold_lags(quadrant: ArrayLike) -> FloatArray:
-    """Mirror an a-matrix of lags 0 and above to lags of both signs.
-
-    Parameters
-    ----------
-    quadrant : array_like, shape (reach_y + 1, reach_x + 1)
-        ``quadrant[j, i]`` is :math:`a_{ij}`, with i the lag in x and j in y.
-
-    Returns
-    -------
-    a : ndarray, shape (2 reach_y + 1, 2 reach_x + 1)
-        With lag (0, 0) in the middle.
-
-    Raises
-    ------
-    MeasurementError
-        No array of two axes.
-
-    Examples
-    --------
-    >>> unfold_lags([[-4.0, 1.0], [1.0, 0.0]]).tolist()
-    [[0.0, 1.0, 0.0], [1.0, -4.0, 1.0], [0.0, 1.0, 0.0]]
-    """
-    q = np.asarray(quadrant, float)
-    if q.ndim != 2 or q.size == 0:
-        raise MeasurementError(f"a-matrix of shape {q.shape}: two axes of lags are needed")
-    half = np.concatenate([q[:, :0:-1], q], axis=1)
-    return np.concatenate([half[:0:-1], half])
-
-
 def close_sum(a: ArrayLike) -> FloatArray:
     """Give the area that an a-matrix lacks to the ring of pixels around it, in equal parts.
 
@@ -96,7 +66,7 @@ def _check_lags(a: ArrayLike) -> FloatArray:
     if a.ndim != 2 or a.shape[0] % 2 == 0 or a.shape[1] % 2 == 0:
         raise MeasurementError(
             f"a-matrix of shape {a.shape}: two axes of odd length are needed, with lag "
-            "(0, 0) in the middle (unfold_lags makes them of a quadrant)"
+            "(0, 0) in the middle (bfsensor.measure.bartlett.unfold makes them of a quadrant)"
         )
     if not np.all(np.isfinite(a)):
         raise MeasurementError("a-matrix must be finite")
@@ -156,7 +126,8 @@ def predict_array(a: ArrayLike, level: float, *, size: int = 64) -> FloatArray:
 
     Examples
     --------
-    >>> a = unfold_lags([[-3e-6, 0.7e-6], [0.8e-6, 0.0]])
+    >>> from bfsensor.measure.bartlett import unfold
+    >>> a = unfold([[-3e-6, 0.7e-6], [0.8e-6, 0.0]])
     >>> c = predict_array(a, 5e4)
     >>> f"{c[0, 0]:.0f} {c[0, 1]:.0f} {c[1, 0]:.0f} {c[1, 1]:.0f} {c.sum():.0f}"
     '43348 1443 1648 75 50000'
@@ -200,7 +171,8 @@ def throw_at_array(
 
     Examples
     --------
-    >>> a = unfold_lags([[-4e-3, 1e-3], [1e-3, 0.0]])
+    >>> from bfsensor.measure.bartlett import unfold
+    >>> a = unfold([[-4e-3, 1e-3], [1e-3, 0.0]])
     >>> charges = throw_at_array(a, 50.0, size=8, realisations=500, seed=7720)
     >>> bool(charges.var() < predict_array(a, 50.0)[0, 0] * 1.05 < 45.0)
     True

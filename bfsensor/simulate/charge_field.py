@@ -211,7 +211,13 @@ def _bound(model: ImageCharge, pairs: int, distance: float) -> float:
 
 @lru_cache(maxsize=64)
 def image_series(model: ImageCharge, distance: float, tolerance: float) -> ImageSeries:
-    """Choose the images that give the field within ``distance`` of the origin [um]."""
+    r"""Choose the images that give the field within ``distance`` of the origin [um].
+
+    The images :math:`|n| \le N` are rectangles in closed form; of those beyond, the terms of
+    their potential up to the third order are summed exactly with Hurwitz' zeta function.
+    N is the smallest that bounds all further terms by ``tolerance`` [V/um per electron].
+    Images: Jackson, Classical Electrodynamics, section 2.1 and problem 3.17.
+    """
     if not tolerance > 0:
         raise TableError(f"tolerance = {tolerance} V/um must be above 0 V/um")
     pairs = 0
@@ -234,69 +240,11 @@ def _sum_images(model: ImageCharge, pairs: int) -> ImageSeries:
     return ImageSeries(heights.ravel(), np.tile(signs, len(n)), terms[:2])
 
 
-def charge_field(
-    model: ImageCharge, points: ArrayLike, *, tolerance: float = TOLERANCE
-) -> FloatArray:
-    r"""Give the field of one stored electron between the planes.
-
-    The images :math:`|n| \le N` are rectangles in closed form; of those beyond, the terms of
-    their potential up to the third order are summed exactly with Hurwitz' zeta function.
-    N is the smallest that bounds all further terms by ``tolerance``.
-
-    Parameters
-    ----------
-    model : ImageCharge
-        The parameters.
-    points : array_like, shape (..., 3)
-        Positions (x, y, z) [um], the centre of the charge at x = y = 0, z above the gates
-        from plane_height to the thickness.
-    tolerance : float
-        Largest error of the series [V/um per electron].
-
-    Returns
-    -------
-    field : ndarray, shape (..., 3)
-        (Ex, Ey, Ez) [V/um per electron], without the drift field; towards the electron.  On
-        the charged rectangle Ez is the mean of its two sides.
-
-    Raises
-    ------
-    TableError
-        A point outside the planes or on the rectangle's rim, where the field is infinite.
-
-    References
-    ----------
-    Images: Jackson, Classical Electrodynamics, section 2.1 and problem 3.17.
-
-    Examples
-    --------
-    >>> model = ImageCharge(0.5, 1.4, 3.2, 1.5, 3.0)
-    >>> field = charge_field(model, [10.0, 5.0, 5.0])
-    >>> [f"{1e6 * e:.3f}" for e in field]
-    ['-0.069', '-0.032', '0.032']
-    """
-    at = np.asarray(points, float)
-    if at.shape[-1:] != (3,) or not np.all(np.isfinite(at)):
-        raise TableError(
-            f"points of the shape {at.shape} must be finite, with (x, y, z) on the last axis"
-        )
-    outside = (at[..., 2] < model.plane_height) | (at[..., 2] > model.thickness)
-    if np.any(outside):
-        raise TableError(
-            f"height {at[outside][0, 2]:g} um must be from {model.plane_height:g} to "
-            f"{model.thickness:g} um, the two planes"
-        )
-    flat = np.ascontiguousarray(at.reshape(-1, 3))
-    series = image_series(model, farthest(flat[:, :2], model), tolerance)
-    field = sum_field(model, flat, series)
-    bad = ~np.isfinite(field).all(axis=1)
-    if np.any(bad):
-        raise TableError(f"point {flat[bad][0].tolist()} um is on the rim of the charge")
-    return field.reshape(at.shape)
-
-
 def sum_field(model: ImageCharge, points: FloatArray, series: ImageSeries) -> FloatArray:
-    """Field at points (n, 3) [V/um per electron] of one series, without any check."""
+    """Field of one stored electron at points (n, 3) [V/um], towards it; nothing is checked.
+
+    Without the drift field; the centre of the charge is at x = y = 0.
+    """
     points = points - np.array([0.0, 0.0, model.plane_height])
     out = np.zeros_like(points)
     half = np.array([model.half_width_x, model.half_width_y])

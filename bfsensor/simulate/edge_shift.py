@@ -73,40 +73,6 @@ class EdgeShift:
         """Relative change of the areas of the pixels, shape (nd, n): what a flat shows."""
         return np.diff(self.shifts, axis=1) / self.pitch
 
-    def displacement(self, positions: ArrayLike, depth: float) -> FloatArray:
-        """Give the displacement [um] of small images, positive away from the edge.
-
-        Parameters
-        ----------
-        positions : array_like
-            Where the light falls, from the end of the array [um].
-        depth : float
-            Height of conversion [um], within those traced.
-
-        Returns
-        -------
-        displacement : ndarray
-            Found less true position; linear between boundaries.
-
-        Raises
-        ------
-        DeviceError
-            A depth or a position outside what was traced.
-        """
-        places = np.asarray(positions, float)
-        if not self.depths[0] <= depth <= self.depths[-1]:
-            raise DeviceError(
-                f"depth = {depth:g} um must lie from {self.depths[0]:g} to {self.depths[-1]:g} um"
-            )
-        shifts = np.array([np.interp(depth, self.depths, s) for s in self.shifts.T])
-        moved = self.distances[self.shadowed :] + shifts[self.shadowed :]
-        if places.size and not (moved[0] <= places.min() and places.max() <= moved[-1]):
-            raise DeviceError(
-                f"positions from {places.min():g} to {places.max():g} um must lie within the "
-                f"pixels, {moved[0]:.4g} to {moved[-1]:.4g} um"
-            )
-        return np.interp(places, moved, self.distances[self.shadowed :]) - places
-
 
 def trace_edge(edge: EdgeField, depths: ArrayLike) -> EdgeShift:
     """Trace the boundaries of the pixels near an edge.

@@ -152,7 +152,7 @@ def edge_shifts(
     reach : int
         Largest pixel offset.
     tolerance : float
-        As in :func:`charge_field`.
+        Largest error of the image series [V/um per electron].
 
     Returns
     -------
@@ -255,7 +255,7 @@ def displace_boundaries(
     samples : int
         Points of a line per pixel, denser towards the corners.
     tolerance : float
-        As in :func:`charge_field`.
+        Largest error of the image series [V/um per electron].
 
     Returns
     -------

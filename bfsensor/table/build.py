@@ -43,7 +43,7 @@ def build_table(
     Parameters
     ----------
     plan : TablePlan
-        From :func:`plan_table`.
+        From :func:`bfsensor.table.table_plan.plan_table`.
     engine : {'poisson', 'image_charge'}
         Poisson's equation with the device's implants, gates and carriers, minutes of CPU time;
         or charge rectangles between conducting planes, 0.3 s, linear in charge, whose

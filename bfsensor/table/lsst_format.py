@@ -16,6 +16,7 @@ from scipy.sparse import diags, identity, kron
 from scipy.sparse.linalg import spsolve
 
 from bfsensor.errors import TableError
+from bfsensor.measure.bartlett import unfold
 from bfsensor.recording.tables.lsst_datasets import BrighterFatterKernel, DistortionMatrix
 from bfsensor.table.quadrant_shifts import QuadrantShifts
 from bfsensor.typing import FloatArray
@@ -61,7 +62,7 @@ def solve_kernel(areas: ArrayLike, *, zero_sum: bool = False) -> FloatArray:
     a = np.array(areas, float)
     if a.ndim != 2 or a.shape[0] != a.shape[1] or not np.all(np.isfinite(a)):
         raise TableError(f"areas of shape {a.shape} must be (n, n) and finite")
-    whole = _tiled(a)
+    whole = unfold(a)
     n = len(whole)
     if zero_sum:
         whole[n // 2, n // 2] -= whole.sum()
@@ -69,12 +70,6 @@ def solve_kernel(areas: ArrayLike, *, zero_sum: bool = False) -> FloatArray:
     laplacian = kron(second, identity(n)) + kron(identity(n), second)
     inner = spsolve(laplacian.tocsc(), -whole.ravel()).reshape(n, n)
     return np.pad(inner, 1)
-
-
-def _tiled(quadrant: FloatArray) -> FloatArray:
-    """All four quadrants."""
-    half = np.concatenate([quadrant[:, :0:-1], quadrant], axis=1)
-    return np.concatenate([half[:0:-1], half])
 
 
 def make_kernel(
@@ -121,7 +116,7 @@ def make_kernel(
     count = _check_gains(gains)
     areas = shifts.areas
     kernel = solve_kernel(areas, zero_sum=zero_sum)
-    source = _tiled(-areas)
+    source = unfold(-areas)
     if zero_sum:
         source[len(areas) - 1, len(areas) - 1] -= source.sum()
     centre = kernel.min()
@@ -203,7 +198,7 @@ def make_distortion_matrix(
         "AMPNAMES": [list(gains)], "INPUT_RANGE": [n], "FIT_RANGE": [n], "BAD_AMPS": [[""]],
         "GAIN": [list(gains.values())], "A_MATRIX": areas[None],
         "A_MATRIX_SIGMA": nothing, "A_MATRIX_MODEL": areas[None],
-        "A_MATRIX_SUM": [_tiled(areas).sum()], "A_MATRIX_MODEL_SUM": [_tiled(areas).sum()],
+        "A_MATRIX_SUM": [unfold(areas).sum()], "A_MATRIX_MODEL_SUM": [unfold(areas).sum()],
         "MODEL_NORMALIZATION": [[1.0, 0.0]], "USED_PIXELS": np.zeros((1, n, n), bool),
         "FIT_PARAM_NAMES": [["thickness", "pixelsize"]], "FREE_FIT_PARAM_NAMES": [[""]],
         "FIT_PARAMS": [[thickness, pitch]], "FIT_PARAM_ERRORS": [[np.nan, np.nan]],

@@ -8,9 +8,7 @@ from bfsensor.errors import MeasurementError
 from bfsensor.measure.covariance_fit import CovarianceFit, fit_covariances
 from bfsensor.measure.covariance_model import model_covariances
 from bfsensor.measure.curve import (
-    CorrelationSlopes,
     CovarianceCurve,
-    fit_correlation_slopes,
 )
 from bfsensor.measure.ecsv import read_ecsv, square_lags, write_ecsv
 from bfsensor.measure.flat_pairs import FlatCovariances, flat_covariances
@@ -95,18 +93,15 @@ def test_lags_in_any_order_and_missing_ones(tmp_path):
     curve = CovarianceCurve.from_arrays(
         levels, model_covariances(levels, a, noise=np.diag([25.0, 0.0])), pixels=250_000
     )
-    for result, kind in (
-        (fit_covariances(curve), CovarianceFit),
-        (fit_correlation_slopes(curve), CorrelationSlopes),
-    ):
-        path = tmp_path / "result.ecsv"
-        result.write(path, overwrite=True)
-        lines = path.read_text().splitlines()
-        path.write_text("\n".join([*lines[:-4], *lines[:-5:-1]]) + "\n")
-        assert kind.read(path) == result
-        path.write_text("\n".join(lines[:-1]) + "\n")
-        with pytest.raises(MeasurementError, match="do not fill a square"):
-            kind.read(path)
+    result = fit_covariances(curve)
+    path = tmp_path / "result.ecsv"
+    result.write(path, overwrite=True)
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:-4], *lines[:-5:-1]]) + "\n")
+    assert CovarianceFit.read(path) == result
+    path.write_text("\n".join(lines[:-1]) + "\n")
+    with pytest.raises(MeasurementError, match="do not fill a square"):
+        CovarianceFit.read(path)
 
 
 def test_squares_keep_further_axes():

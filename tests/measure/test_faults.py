@@ -7,8 +7,8 @@ from bfsensor.errors import MeasurementError
 from bfsensor.measure.arrays import to_floats
 from bfsensor.measure.covariance_fit import fit_covariances
 from bfsensor.measure.covariance_model import model_covariances
-from bfsensor.measure.curve import CovarianceCurve, fit_correlation_slopes, measure_curve
-from bfsensor.measure.flat_pairs import flat_covariances, measure_regions
+from bfsensor.measure.curve import CovarianceCurve, measure_curve
+from bfsensor.measure.flat_pairs import flat_covariances
 from bfsensor.measure.growth import measure_growth
 from bfsensor.measure.spot_model import Shape, integrate_gaussian
 from bfsensor.measure.spot_moments import measure_moments
@@ -88,21 +88,6 @@ def test_noise_below_one_step_of_the_digits_is_not_clipped_away():
     assert found.covariances[0, 0] == pytest.approx(0.0475, rel=0.15)
 
 
-def test_regions_are_named_and_must_lie_in_the_image():
-    first, second = flats()
-    part = {"left": np.s_[:, :40], "last": np.s_[-40:, -40:]}
-    found = measure_regions(first, second, part, lags=2)
-    assert (found["left"].pixels, found["last"].pixels) == (3200, 1600)
-    for wrong in (np.s_[:, 60:120], np.s_[:, 90:100], np.s_[30:30, :]):
-        message = refusal(measure_regions, first, second, {"C07": wrong}, lags=2)
-        assert message.startswith("C07: [") and "of 80 rows or columns leaves" in message
-    bad = np.zeros(first.shape, bool)
-    bad[:, 40:] = True
-    both = {"left": np.s_[:, :40], "right": np.s_[:, 40:]}
-    message = refusal(measure_regions, first, second, both, mask=bad, lags=2)
-    assert message == "right: the mask leaves no pixel"
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -125,7 +110,6 @@ def curve(levels, noise=25.0, **changes):
 
 def test_campaigns_of_one_pair():
     one = measure_curve([flats()], lags=2)
-    assert "fewer than 3 pairs" in refusal(fit_correlation_slopes, one)
     assert "1 pairs from" in refusal(fit_covariances, one)
     assert "at least 2 levels are needed" in refusal(
         fit_covariances, one, gain=1.0, constant_a=True
@@ -145,21 +129,11 @@ def test_the_pair_that_fails_is_named():
 
 
 def test_a_pair_without_light():
-    """A bias pair fixes the noise; it has no correlation of charges."""
+    """A bias pair fixes the noise."""
     dark = curve(np.linspace(0, 8e4, 12))
-    assert "a level of 0 has no correlation" in refusal(fit_correlation_slopes, dark)
-    lit = fit_correlation_slopes(dark, level_range=(1e3, 1e5))
-    assert lit.slopes[0, 1] == pytest.approx(2e-7, rel=0.1)
     fit = fit_covariances(dark)
     np.testing.assert_allclose(fit.a, A, atol=1e-12)
     assert fit.noise[0, 0] == pytest.approx(25.0, rel=1e-6)
-
-
-def test_a_variance_below_zero_has_no_correlation():
-    c = model_covariances(np.linspace(1e3, 1e4, 5), A)
-    c[2, 0, 0] = -5.0
-    wrong = CovarianceCurve.from_arrays(np.linspace(1e3, 1e4, 5), c, pixels=1000)
-    assert "a variance of -5 has no correlation" in refusal(fit_correlation_slopes, wrong)
 
 
 def test_choices_from_a_curve():

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from bfsensor.errors import MeasurementError
+from bfsensor.measure.bartlett import unfold
 from bfsensor.measure.pixel_response import measure_response
-from bfsensor.measure.toy_array import close_sum, unfold_lags
+from bfsensor.measure.toy_array import close_sum
 
 QUADRANT = np.array([[-2e-6, 1.5e-7, 2e-8], [3e-7, 5e-8, 1e-8], [4e-8, 1e-8, 0.0]])
 
@@ -14,7 +15,7 @@ def grow(strength, *, size=13, steps=5, level=80_000, noise=0.0, seed=1):
     """Flats whose areas follow the charge of the middle of each step."""
     rng = np.random.default_rng(seed)
     a = np.zeros((size, size))
-    lags = close_sum(unfold_lags(strength * QUADRANT))
+    lags = close_sum(unfold(strength * QUADRANT))
     reach = len(lags) // 2
     a[: len(lags), : len(lags)] = lags
     a = np.roll(a, (-reach, -reach), (0, 1))

@@ -90,7 +90,8 @@ def test_errors_are_the_scatter_of_mocks():
         # Second order in the noise is 1 / 5e4; the mean is good to 0.026 of the error.
         assert abs(values.mean() - getattr(clean, name)[0]) < 0.1 * errors.mean()
     widths = found.mean_widths()
-    assert widths.sigma_x_error == pytest.approx(widths.sigma_x_scatter_error, rel=0.055)
+    scatter = found.xx.std(ddof=1) / np.sqrt(mocks) / (2 * widths.sigma_x)
+    assert widths.sigma_x_error == pytest.approx(scatter, rel=0.055)
     known = measure_moments(
         Stamps(data, variance=np.broadcast_to(mean + 36.0, data.shape)), background=40.0
     )

@@ -9,17 +9,17 @@ from scipy.signal import convolve2d
 
 from bfsensor._kernels import toy as kernels
 from bfsensor.errors import MeasurementError
+from bfsensor.measure.bartlett import unfold
 from bfsensor.measure.toy import measure_pair, predict_pair
 from bfsensor.measure.toy_array import (
     close_sum,
     measure_array,
     predict_array,
     throw_at_array,
-    unfold_lags,
 )
 
 # The shape of a real a-matrix [j, i], larger along y; its sum is closed by a ring.
-SHAPE = close_sum(unfold_lags([[-1.0, 0.12], [0.24, 0.05]]))
+SHAPE = close_sum(unfold([[-1.0, 0.12], [0.24, 0.05]]))
 
 
 def random_lags(seed, *, scale):
@@ -146,7 +146,7 @@ def test_darts_obey_the_closed_form(a, seed):
 
 
 def test_darts_know_x_from_y():
-    a = unfold_lags([[-2e-3, 1e-3]])
+    a = np.array([[1e-3, -2e-3, 1e-3]])
     charges = throw_at_array(a, 100.0, size=5, realisations=1500, seed=661)
     measured, errors = measure_array(charges, 100.0)
     assert measured[0, 1] > 8 * errors[0, 1]
@@ -172,16 +172,8 @@ def test_measured_covariances_are_sums_over_pixels():
 # -- a-matrices ----------------------------------------------------------------------------
 
 
-def test_quadrants_unfold_about_the_middle():
-    quadrant = np.arange(6.0).reshape(2, 3)
-    a = unfold_lags(quadrant)
-    assert a.shape == (3, 5)
-    for j, i in np.ndindex(3, 5):
-        assert a[j, i] == quadrant[abs(j - 1), abs(i - 2)]
-
-
 def test_the_ring_takes_what_is_missing():
-    a = unfold_lags([[-5.0, 0.5], [0.5, 0.2]])
+    a = unfold([[-5.0, 0.5], [0.5, 0.2]])
     closed = close_sum(a)
     assert closed.shape == (5, 5)
     assert closed.sum() == pytest.approx(0, abs=1e-14)
@@ -214,7 +206,6 @@ def test_the_ring_takes_what_is_missing():
             lambda: throw_at_array(SHAPE * 1e-9, 1e8, size=64, realisations=9, seed=2),
             r"4.096e\+11 darts: at most 2e\+09",
         ),
-        (lambda: unfold_lags([1.0]), r"shape \(1,\): two axes"),
         (lambda: close_sum(np.zeros((2, 3))), r"shape \(2, 3\): two axes of odd"),
         (
             lambda: measure_array(np.zeros((1, 4, 4)), 0.0),

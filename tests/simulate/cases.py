@@ -1,11 +1,32 @@
-"""Devices whose potentials are known, for the tests of the simulator."""
+"""Devices whose potentials are known, and fields, for the tests of the simulator."""
 
 from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from bfsensor.device.device import Device
 from bfsensor.device.parts import BuriedChannel, ChannelStop, GateStack, Implant
+from bfsensor.simulate.charge_field import (
+    TOLERANCE,
+    ImageCharge,
+    farthest,
+    image_series,
+    sum_field,
+)
+from bfsensor.typing import FloatArray
+
+
+def charge_field(
+    model: ImageCharge, points: ArrayLike, *, tolerance: float = TOLERANCE
+) -> FloatArray:
+    """Field of one stored electron at points (..., 3), from the series that reaches them."""
+    at = np.asarray(points, float)
+    flat = np.ascontiguousarray(at.reshape(-1, 3))
+    series = image_series(model, farthest(flat[:, :2], model), tolerance)
+    return sum_field(model, flat, series).reshape(at.shape)
 
 
 def flat_device(

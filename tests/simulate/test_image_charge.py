@@ -12,7 +12,7 @@ from scipy.integrate import quad, solve_ivp, trapezoid
 from bfsensor.errors import TableError
 from bfsensor.response.vertices import vertex_fractions
 from bfsensor.simulate import image_charge as engine
-from bfsensor.simulate.charge_field import ImageCharge, charge_field
+from bfsensor.simulate.charge_field import ImageCharge
 from bfsensor.simulate.far_field import FarField
 from bfsensor.simulate.image_charge import (
     area_changes,
@@ -21,6 +21,7 @@ from bfsensor.simulate.image_charge import (
     trace_boundaries,
 )
 from bfsensor.units import VACUUM_PERMITTIVITY
+from tests.simulate.cases import charge_field
 
 MODEL = ImageCharge(
     0.5, 1.4, 3.2, 1.5, 3.0, pitch_x=10.0, pitch_y=12.0, drift_field=((0, 0.75), (100, 0.37))

@@ -13,9 +13,7 @@ from bfsensor.measure.bartlett import bartlett_matrix
 from bfsensor.measure.covariance_fit import CovarianceFit, fit_covariances
 from bfsensor.measure.covariance_model import model_covariances
 from bfsensor.measure.curve import (
-    CorrelationSlopes,
     CovarianceCurve,
-    fit_correlation_slopes,
     measure_curve,
 )
 from validation.measurement_errors.flat_mocks import (
@@ -213,59 +211,10 @@ def test_model_of_the_fit():
     assert np.sqrt((residual**2).mean()) == pytest.approx(1.0, abs=0.15)
 
 
-def test_slopes_of_the_seed_paper():
-    """The intercept takes constant correlations off; the slope is a_ij up to the next order."""
-    levels = np.linspace(1e4, 8e4, 15)
-    true = model_covariances(levels, TRUTH.a)
-    constant = np.array([[0.0, 0.004, 0.0], [0.002, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    curve = CovarianceCurve.from_arrays(
-        levels, true + constant * true[:, :1, :1], pixels=10**8, region="C03"
-    )
-    found = fit_correlation_slopes(curve)
-    # The curvature of a_ij mu (1 + a_00 mu ...) leaves up to 6e-4 in the intercept.
-    assert found.intercepts[0, 1] == pytest.approx(0.004, abs=8e-4)
-    # And 2/3 (a x a) mu^2 bends C_00 / mu: a line through it says 1 % too little.
-    assert found.intercepts[0, 0] == pytest.approx(0.99, abs=5e-3)
-    ratio = found.slopes[0, 1] / TRUTH.a[0, 1]
-    # Stated in the docstring: at a_00 mu = 0.1 to 0.2, some ten per cent from a_ij.
-    assert 0.7 < ratio < 1.3 and abs(ratio - 1) > 0.01
-    correlations, errors = found.correlations_at(8e4)
-    assert correlations[1, 0] == pytest.approx(found.slopes[1, 0] * 8e4)
-    assert np.all(errors > 0)
-    # Without an effect nothing is left but the intercepts.
-    flat = CovarianceCurve.from_arrays(
-        levels,
-        (constant + np.eye(1, 9).reshape(3, 3)) * levels[:, None, None],
-        pixels=10**8,
-    )
-    none = fit_correlation_slopes(flat)
-    assert np.abs(none.slopes).max() < 1e-12
-    np.testing.assert_allclose(none.intercepts[0, 1], 0.004)
-    few = fit_correlation_slopes(curve, level_range=(2e4, 5e4))
-    assert few.level_range == (2e4, 5e4) and few.dof == 5
-
-
-def test_slopes_have_the_errors_they_state():
-    levels = np.linspace(5e3, 6e4, 12)
-    found = [
-        fit_correlation_slopes(scattered(4800 + k, levels=levels, pixels=250_000))
-        for k in range(80)
-    ]
-    slopes = np.array([one.slopes for one in found])
-    ratio = slopes.std(axis=0, ddof=1) / np.mean([one.slope_errors for one in found], 0)
-    # Scatter of 80 has an error of 8 %.
-    assert np.abs(ratio - 1).max() < 0.32
-
-
 def test_reading_what_was_written(tmp_path):
     curve = scattered(4900)
     fit = fit_covariances(spoiled(curve, [5], 1.1), constant_a=False)
-    slopes = fit_correlation_slopes(curve)
-    for one, kind in (
-        (curve, CovarianceCurve),
-        (fit, CovarianceFit),
-        (slopes, CorrelationSlopes),
-    ):
+    for one, kind in ((curve, CovarianceCurve), (fit, CovarianceFit)):
         path = tmp_path / f"{kind.__name__}.ecsv"
         one.write(path)
         assert kind.read(path) == one
@@ -312,10 +261,6 @@ def test_refusals():
         with pytest.raises(MeasurementError) as caught:
             fit_covariances(curve, **options)
         assert str(caught.value) == message
-    with pytest.raises(
-        MeasurementError, match="fewer than 3 pairs have a level from 1 to 2 adu"
-    ):
-        fit_correlation_slopes(curve, level_range=(1, 2))
     dark = dataclasses.replace(
         curve, covariances=np.where(curve.covariances == curve.covariances[:, :1, :1], 50.0, 0.0)
         - curve.levels[:, None, None] * 1e-3 * (np.arange(9).reshape(3, 3) == 0),
