@@ -118,11 +118,13 @@ def test_the_same_seed_gives_the_same_p(null):
 def test_the_command_diagnoses_a_folder(tmp_path):
     folder = tmp_path / "campaign"
     write_campaign(
-        folder, seed=7003, size="S", effects=[make_effect("cti_serial", {"cti": 2e-6})]
+        folder, seed=7003, size="T", effects=[make_effect("cti_serial", {"cti": 4e-6})]
     )
     out = tmp_path / "out"
     asked = ["--predict", "seconds=40,back_bias=-40", "--predict", "flux=5e5"]
-    result = CliRunner().invoke(main, ["diagnose", str(folder), "-o", str(out), *asked])
+    # What explains it is asked of the command by the golden cases.
+    words = ["diagnose", str(folder), "-o", str(out), "--locate-only", *asked]
+    result = CliRunner().invoke(main, words)
     assert result.exit_code == 0, result.output
     assert "serial overscan" in result.stdout
     report = json.loads((out / "report.json").read_text())
