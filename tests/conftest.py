@@ -29,6 +29,9 @@ def pytest_configure(config) -> None:
     before = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     if str(ROOT) not in before:
         os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), *before]))
+    # As many workers as cores: BLAS threads of each would wait for one another.
+    for library in ("OMP", "OPENBLAS", "MKL"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     folder = cache_folder()
     known = tuple(int(part) for part in version("numba").split(".")[:2]) >= NUMBA
     # Who says where compiled code lies, for kernels with bounds checked, means it.
