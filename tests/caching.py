@@ -11,6 +11,7 @@ import ast
 import hashlib
 import os
 import pickle
+import platform
 import shutil
 import time
 from collections.abc import Callable, Iterable
@@ -60,7 +61,11 @@ def code_digest(*modules: str) -> str:
             continue
         found[name] = path.read_bytes()
         waiting += _imports(path)
-    versions = [f"{name} {version(name)}".encode() for name in LIBRARIES]
+    # Last bits depend on the processor and on how many threads share a sum.
+    machine = " ".join([processor(), os.environ.get("OMP_NUM_THREADS", "")])
+    versions = [f"{name} {version(name)}".encode() for name in LIBRARIES] + [
+        machine.encode()
+    ]
     return _digest([*versions, *(found[name] for name in sorted(found))])
 
 
@@ -138,6 +143,14 @@ def remove_old(folder: Path) -> None:
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
         except OSError:  # another run removed it first
             continue
+
+
+def processor() -> str:
+    """Model of the processor."""
+    described = Path("/proc/cpuinfo")
+    lines = described.read_text().splitlines() if described.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if "model name" in line]
+    return names[0] if names else platform.processor()
 
 
 def _file_of(module: str) -> Path | None:

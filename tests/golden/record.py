@@ -12,6 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from tests.caching import processor
 from tests.golden.cases import CASES, Product
 
 RECORD = Path(__file__).with_name("golden.json")
@@ -21,15 +22,8 @@ WIDTH = " width"
 
 def machine() -> dict[str, str]:
     """Give what the last bits depend on: processor, Python, versions of libraries."""
-    processor = platform.processor()
-    described = Path("/proc/cpuinfo")
-    if described.exists():
-        names = [
-            line for line in described.read_text().splitlines() if "model name" in line
-        ]
-        processor = names[0].partition(":")[2].strip() if names else processor
     return {
-        "processor": processor,
+        "processor": processor(),
         "python": platform.python_version(),
         **{name: version(name) for name in PACKAGES},
     }
