@@ -160,7 +160,7 @@ def fit(
 def _choose_priors(
     device: Any, free: tuple[str, ...], sets: Sequence[DataSet]
 ) -> tuple[Prior, ...]:
-    """Priors of what is free, among it what only saturation or diffusion depends on."""
+    """Give the priors of all free quantities, the spill barrier and diffusion width included."""
     from bfsensor.device.quantities import DIFFUSION, choose_priors
     from bfsensor.fit.linear_predictors import SPILL
 

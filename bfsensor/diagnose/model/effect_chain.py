@@ -60,7 +60,7 @@ class EffectChain:
     baseline : Baseline
         Its shifts even patterns out.
     kept : Cache
-        Of what :class:`MapChange` makes that outlasts a change of the effects.
+        Holds results of :class:`MapChange` that stay valid when effects change.
     evening : (float, mapping of str to float)
         Gain [e-/ADU] and departures of the device's parameters from nominal by which patterns
         are evened out.

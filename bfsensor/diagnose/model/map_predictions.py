@@ -70,7 +70,7 @@ class MapChange:
     baseline : Baseline
         Its shifts even patterns out.
     kept : Cache
-        Of what outlasts a change of the effects: rows of maps, what is left of patterns, and
+        Holds what stays valid when effects change: rows of maps, what is left of patterns, and
         changes by single effects.
     evening : (float, mapping of str to float)
         Gain [e-/ADU] and departures of the device's parameters from nominal by which patterns

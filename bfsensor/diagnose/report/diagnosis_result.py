@@ -84,7 +84,7 @@ class Diagnosis:
 
     @property
     def accepted(self) -> tuple[Predictor | None, BaselineFit]:
-        """Predictor and fit of what is believed: with the effects found, or the baseline's."""
+        """Predictor and fit with the effects found, or of the baseline where none was found."""
         of = self.attribution or self
         return of.predictor, of.fit
 
@@ -150,7 +150,7 @@ class Diagnosis:
         return out
 
     def _heldout(self) -> dict[str, Any]:
-        """Chi-square over number of what was not fitted, before and after, by channel too."""
+        """Chi-square per value of the held-out recordings, before and after, in all and by channel."""
         out: dict[str, Any] = {
             "chi2dof_before": _finite(self.heldout), "chi2dof_after": None,
             "values": sum(map(len, used_channels(self.measured.channels, ("held-out",)))),
