@@ -1,4 +1,4 @@
-"""Files written whole or not at all, those that come with the package, and a cache in memory."""
+"""Files written whole or not at all, and a cache in memory."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ import os
 from collections.abc import Callable, Hashable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
-
-from bfsensor.errors import BFSensorError
 
 T = TypeVar("T")
 
@@ -56,7 +54,7 @@ class Cache:
 
 
 def refuse_existing(
-    path: str | os.PathLike[str], overwrite: bool, error: type[BFSensorError]
+    path: str | os.PathLike[str], overwrite: bool, error: type[Exception]
 ) -> None:
     """Raise the error if there is a file and it is not to be replaced."""
     if Path(path).exists() and not overwrite:
@@ -64,9 +62,7 @@ def refuse_existing(
 
 
 @contextlib.contextmanager
-def written_whole(
-    path: str | os.PathLike[str], error: type[BFSensorError]
-) -> Iterator[Path]:
+def written_whole(path: str | os.PathLike[str], error: type[Exception]) -> Iterator[Path]:
     """Give a path beside a file to write to; it is renamed once all is written.
 
     A reader finds the old file or the new one, whatever happens; processes that write the
@@ -86,7 +82,7 @@ def written_whole(
 
     Raises
     ------
-    BFSensorError
+    Exception
         The kind asked for, in place of an ``OSError``.  Any other error passes, and no
         file is left behind.
 
@@ -109,19 +105,3 @@ def written_whole(
         raise error(f"{target}: cannot be written: {fault}") from None
     finally:
         beside.unlink(missing_ok=True)
-
-
-def tables_dir() -> Path:
-    """Find the built-in devices and tables: in a wheel, or beside it in a checkout.
-
-    Returns
-    -------
-    folder : Path
-    """
-    package = Path(__file__).resolve().parent
-    for folder in (package / "tables", package.parent / "tables"):
-        if folder.is_dir():
-            return folder
-    raise BFSensorError(
-        f"the tables of bfsensor are missing beside {package}: reinstall the package"
-    )

@@ -12,7 +12,7 @@ import pytest
 
 import bfsensor
 from bfsensor.device.device import builtin_devices
-from bfsensor.files import tables_dir
+from bfsensor.device.shipped import tables_dir
 
 ROOT = Path(__file__).resolve().parents[1]
 DEVICES = [
@@ -22,7 +22,7 @@ DEVICES = [
 REPORT = """
 import json, bfsensor
 from bfsensor.device.device import Device, builtin_devices
-from bfsensor.files import tables_dir
+from bfsensor.device.shipped import tables_dir
 print(json.dumps({
     "package": bfsensor.__file__, "version": bfsensor.__version__,
     "tables": str(tables_dir()), "devices": builtin_devices(),

@@ -8,16 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bfsensor.device.written_units import INTERNAL, from_internal, to_internal
 from bfsensor.errors import DeviceError
-from bfsensor.units import (
-    BOLTZMANN,
-    INTERNAL,
-    VACUUM_PERMITTIVITY,
-    from_internal,
-    to_celsius,
-    to_internal,
-    to_kelvin,
-)
+from bfsensor.units import BOLTZMANN, VACUUM_PERMITTIVITY, to_celsius, to_kelvin
 
 WRITTEN = {
     "length": "um",

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels, measure_channels
+from bfsensor.diagnose.fit.baseline_fit import BaselineFit, fit_bounded
+from bfsensor.diagnose.model.predictor import Predictor
 from tests.caching import keep
 from validation.common.virtual_source import VirtualSource, virtual_baseline
 from validation.concealed.campaign import write_campaign
@@ -21,7 +23,7 @@ from validation.concealed.plan import Geometry, Size
 
 __all__ = [
     "EFFECTS", "KNOWN", "SMALL", "EdgeShifts", "Geometry", "OutsideLibrary", "Size", "VirtualSource",
-    "make_effect", "measure_virtual", "virtual_baseline", "write_campaign",
+    "fit_virtual", "make_effect", "measure_virtual", "virtual_baseline", "write_campaign",
 ]  # fmt: skip
 
 SMALL = Size(128, 4, 1, dithers=1)
@@ -31,6 +33,7 @@ MAKERS = (
     "bfsensor.diagnose.data.measure_channels", "validation.common.virtual_source",
     "validation.concealed.library",
 )  # fmt: skip
+FITTERS = (*MAKERS, "bfsensor.diagnose.fit.baseline_fit")
 
 
 def measure_virtual(
@@ -41,14 +44,31 @@ def measure_virtual(
     def make() -> MeasuredChannels:
         return measure_channels(VirtualSource(seed=seed, size=size, effects=effects))
 
-    # An effect that a test makes up has no name that tells all of it.
+    key = _key(seed, size, effects)
+    return make() if key is None else keep(key, make, made_by=MAKERS)
+
+
+def fit_virtual(
+    *, seed: int, size: Any = SMALL, effects: Sequence[Any] = ()
+) -> tuple[MeasuredChannels, Predictor, BaselineFit]:
+    """Channels of a campaign, and the nominal baseline fitted to them."""
+
+    def make() -> tuple[MeasuredChannels, Predictor, BaselineFit]:
+        measured = measure_virtual(seed=seed, size=size, effects=effects)
+        return measured, *fit_bounded(measured, virtual_baseline())
+
+    key = _key(seed, size, effects)
+    return make() if key is None else keep(("fit", key), make, made_by=FITTERS)
+
+
+def _key(seed: int, size: Any, effects: Sequence[Any]) -> object:
+    """What tells a campaign; None where an effect that a test makes up has no name that does."""
     if not all(
         type(effect) is EFFECTS.get(getattr(effect, "word", "")) for effect in effects
     ):
-        return make()
+        return None
     made: list[Effect] = list(effects)
-    key = (
+    return (
         seed, size,
         [(one.word, sorted(dict(one.parameters).items()), one.variant) for one in made],
     )  # fmt: skip
-    return keep(key, make, made_by=MAKERS)

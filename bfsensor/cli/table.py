@@ -228,8 +228,8 @@ _LENGTHS = (
 
 def _image_charge(device: Any, parameters: Sequence[tuple[str, str]]) -> Any:
     """Parameters of the analytic engine in a device, from texts with units."""
+    from bfsensor.device.written_units import to_internal
     from bfsensor.simulate.charge_field import ImageCharge
-    from bfsensor.units import to_internal
 
     values: dict[str, Any] = {}
     for name, text in parameters:

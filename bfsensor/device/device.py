@@ -37,9 +37,10 @@ from bfsensor.device.parts import (
     Silicon,
     Well,
 )
+from bfsensor.device.shipped import tables_dir
+from bfsensor.device.written_units import from_internal, to_internal
 from bfsensor.errors import DeviceError
-from bfsensor.files import tables_dir, written_whole
-from bfsensor.units import from_internal, to_internal
+from bfsensor.files import written_whole
 
 ORIGINS = ("measured", "published", "fitted", "guessed")
 
@@ -246,8 +247,8 @@ class Device:
         Returns
         -------
         name, kind, unit : str
-            Dotted name; a key of :data:`bfsensor.units.INTERNAL` and its written unit, both
-            empty for whole numbers.
+            Dotted name; a key of :data:`bfsensor.device.written_units.INTERNAL` and its written
+            unit, both empty for whole numbers.
 
         Raises
         ------

@@ -10,8 +10,8 @@ import numpy as np
 
 from bfsensor.device.device import Device
 from bfsensor.device.parts import Provenance
+from bfsensor.device.written_units import INTERNAL, to_internal
 from bfsensor.errors import DeviceError, FitError
-from bfsensor.units import INTERNAL, to_internal
 
 DIFFUSION = "transport.diffusion"
 """Width of the diffusion over Einstein's: no quantity of a device, yet free with widths."""

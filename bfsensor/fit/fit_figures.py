@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 from bfsensor.device.device import Device
 from bfsensor.device.quantities import Quantity, describe, quantities
+from bfsensor.device.written_units import INTERNAL
 from bfsensor.fit.result import FitResult
 from bfsensor.inference.profile_bounds import LEVELS, profile_bounds
 from bfsensor.plots import fit as show_fit
 from bfsensor.plots.style import new_figure
-from bfsensor.units import INTERNAL
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -7,8 +7,8 @@ from functools import lru_cache
 from pathlib import Path
 
 from bfsensor.device.device import Device
+from bfsensor.device.shipped import tables_dir
 from bfsensor.errors import SensorError, TableError
-from bfsensor.files import tables_dir
 from bfsensor.table.table import DistortionTable
 
 

@@ -41,7 +41,7 @@ from bfsensor.typing import FloatArray
 SAMPLES = 48
 """Points of a boundary line per pixel; areas of tables are then good to 5e-4."""
 
-_PATH_ORDER = 8
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 """Gauss-Legendre points of a panel as long as the field's scale: 1e-9 of a shift."""
 
 _RAY_STEPS = 6
@@ -83,12 +83,11 @@ def _shifts(
     panels = _panels(model, seal, depths)
     steps = np.zeros((len(depths), len(places)))
     if len(panels) > 1:
-        node, weight = np.polynomial.legendre.leggauss(_PATH_ORDER)
         length = 0.5 * np.diff(panels)
         middle = 0.5 * (panels[1:] + panels[:-1])
-        nodes = (middle[:, None] + length[:, None] * node).ravel()
+        nodes = (middle[:, None] + length[:, None] * _NODES).ravel()
         weights = (
-            (length[:, None] * weight).ravel() * model.unit_field / model.drift_at(nodes)
+            (length[:, None] * _WEIGHTS).ravel() * model.unit_field / model.drift_at(nodes)
         )
         series = image_series(model, farthest(places, model), tolerance)
         half = np.array([model.half_width_x, model.half_width_y])[:: 1 - 2 * axis]

@@ -10,8 +10,8 @@ import astropy.units as u
 import numpy as np
 
 from bfsensor.device.device import Device
+from bfsensor.device.written_units import to_internal
 from bfsensor.errors import DeviceError, SweepError
-from bfsensor.units import to_internal
 
 WAVELENGTH = "wavelength"
 """Name of the light's wavelength, which is no quantity of a device."""

@@ -96,7 +96,7 @@ def quadrant_shifts(
 
     Examples
     --------
-    >>> from bfsensor.files import tables_dir
+    >>> from bfsensor.device.shipped import tables_dir
     >>> table = DistortionTable.read(tables_dir() / "itl_sta3800c" / "table.fits")
     >>> a = quadrant_shifts(table).areas
     >>> bool(-1.4e-6 < a[0, 0] < -1.2e-6), bool(a[1, 0] > 1.5 * a[0, 1] > 0)

@@ -75,7 +75,7 @@ class DistortionTable:
 
     Examples
     --------
-    >>> from bfsensor.files import tables_dir
+    >>> from bfsensor.device.shipped import tables_dir
     >>> table = DistortionTable.read(tables_dir() / "itl_sta3800c" / "table.fits")
     >>> change = table.area_changes(charge=50000.0, depth=95.0)
     >>> bool(change[4, 4] < 0 < change[4, 5] < change[5, 4])

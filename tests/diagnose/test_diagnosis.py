@@ -11,14 +11,11 @@ from click.testing import CliRunner
 from bfsensor.cli.main import main
 from bfsensor.diagnose.detect.locate import Scanner, locate_mismatch, tail_probability
 from bfsensor.diagnose.detect.scans import DEVICE_SCAN
-from bfsensor.diagnose.diagnosis import diagnose, diagnose_measured
-from bfsensor.diagnose.fit.baseline_fit import fit_bounded
+from bfsensor.diagnose.diagnosis import diagnose_measured
 from bfsensor.diagnose.report.diagnosis_result import SCHEMA
 from bfsensor.diagnose.report.html_report import write_report
 from tests.virtual import (
-    SMALL,
-    Size,
-    VirtualSource,
+    fit_virtual,
     make_effect,
     measure_virtual,
     virtual_baseline,
@@ -27,8 +24,10 @@ from tests.virtual import (
 
 
 def run(seed, *effects):
-    source = VirtualSource(seed=seed, size=SMALL, effects=effects)
-    return diagnose(source, virtual_baseline(), campaign=f"small {seed}", explain=False)
+    measured = measure_virtual(seed=seed, effects=effects)
+    return diagnose_measured(
+        measured, virtual_baseline(), campaign=f"small {seed}", explain=False
+    )
 
 
 @pytest.fixture(scope="module")
@@ -143,9 +142,7 @@ def test_the_command_diagnoses_a_folder(tmp_path):
 
 def test_a_device_off_its_card_is_told_and_not_absorbed(tmp_path):
     """The fit takes a parameter far off its card: the pull is a finding, named and in words."""
-    small = Size(128, 4, 1, dithers=1)
-    measured = measure_virtual(seed=8112, size=small)
-    predictor, fit = fit_bounded(measured, virtual_baseline())
+    measured, predictor, fit = fit_virtual(seed=8112)
     point = fit.values[: len(predictor.names)]
     moved = point.copy()
     moved[predictor.names.index("device h")] += 8.0

@@ -18,6 +18,7 @@ from bfsensor.diagnose.model.open_baseline import (
 )
 from bfsensor.errors import MeasurementError
 from bfsensor.recording.campaign.campaign import read_campaign
+from tests.measured import measure_once
 
 OFFSET, NOISE, GAIN, SIDE = 200.0, 4.0, 2.0, 160
 
@@ -119,7 +120,8 @@ SBIG = Path(__file__).parents[2].parent / "shared" / "recordings" / "sbig_flats"
 def sbig(request):
     if not SBIG.is_dir():
         pytest.skip(f"no recordings in {SBIG}")
-    return request.param, run(SBIG / request.param)
+    measured = measure_once(CampaignSource(read_campaign(SBIG / request.param)))
+    return request.param, diagnose_measured(measured, free_baseline(), explain=False)
 
 
 def test_sbig_readout_not_brighter_fatter(sbig):

@@ -9,7 +9,7 @@ from bfsensor import BrighterFatterSensor
 from bfsensor.device.device import Device
 from bfsensor.device.parameters import parameter_value
 from bfsensor.device.quantities import quantities
-from bfsensor.files import tables_dir
+from bfsensor.device.shipped import tables_dir
 from bfsensor.fit.prediction_error import DRAWS
 from bfsensor.fit.result import FitResult
 from bfsensor.response.edge_response import CHARGE, LEVEL

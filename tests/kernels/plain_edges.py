@@ -6,7 +6,7 @@ import numpy as np
 
 from bfsensor._kernels import edges as kernel
 from bfsensor._kernels.photons import Pattern
-from bfsensor.files import tables_dir
+from bfsensor.device.shipped import tables_dir
 from bfsensor.sensor.charge_response import factor_table
 from bfsensor.sensor.edge_weights import make_edges
 from bfsensor.sensor.image_exposure import ImageExposure, Physics
@@ -112,14 +112,15 @@ def effective_charges(sensor, image):
     )
     out = []
     charges = np.arange(r.first.shape[0]) * r.charge_step
-    backgrounds = np.arange(r.first.shape[1]) * r.background_step
-    for grid in (r.first, r.second):
+    last = r.first.shape[1] - 2
+    for grid in (r.first.astype(float), r.second.astype(float)):
         found = np.zeros((ny, nx))
         for j in range(ny):
             for i in range(nx):
-                b = min(max(around[j, i] / 8, 0), r.last_background * r.background_step)
                 # Along the background first; negative charge follows the first step.
-                at_b = [np.interp(b, backgrounds, row) for row in grid.astype(float)]
+                b = min(max(around[j, i] / 8 / r.background_step, 0), r.last_background)
+                low = min(int(b), last)
+                at_b = (low + 1 - b) * grid[:, low] + (b - low) * grid[:, low + 1]
                 c = min(q[j, i], r.last_charge * r.charge_step)
                 if c < 0:
                     found[j, i] = at_b[0] + c / r.charge_step * (at_b[1] - at_b[0])

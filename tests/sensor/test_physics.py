@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from bfsensor import BrighterFatterSensor, DistortionTable, ShiftMap, SiliconSensor
+from bfsensor.device.shipped import tables_dir
 from bfsensor.device.silicon import absorption_length
 from bfsensor.errors import SensorError
-from bfsensor.files import tables_dir
 from bfsensor.sensor.drift_field import MEASURED, solve_drift
 
 ITL = DistortionTable.read(tables_dir() / "itl_sta3800c" / "table.fits")

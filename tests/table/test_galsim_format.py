@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from bfsensor.device.device import Device
+from bfsensor.device.shipped import tables_dir
 from bfsensor.errors import TableError
-from bfsensor.files import tables_dir
 from bfsensor.table.galsim_format import read_galsim, write_galsim
 from tests.table.smooth_tables import PITCH, SINGLE, make_table, parts, polygon_area
 

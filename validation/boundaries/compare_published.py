@@ -15,7 +15,7 @@ import numpy as np
 from astropy.table import Table
 
 from bfsensor.device.device import Device
-from bfsensor.files import tables_dir
+from bfsensor.device.shipped import tables_dir
 from bfsensor.table.build import build_table
 from bfsensor.table.galsim_format import read_galsim
 from bfsensor.table.table import DistortionTable

@@ -31,7 +31,7 @@ from astropy.table import Table, vstack
 from numpy.typing import NDArray
 
 from bfsensor import BrighterFatterSensor, DistortionTable
-from bfsensor.files import tables_dir
+from bfsensor.device.shipped import tables_dir
 from bfsensor.measure.correct import correct_edges, correct_kernel
 from bfsensor.recording.tables.lsst_datasets import BrighterFatterKernel, DistortionMatrix
 from bfsensor.sensor.flats import draw_flat

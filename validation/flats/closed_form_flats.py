@@ -27,10 +27,10 @@ from scipy.stats import chi2 as chi2_distribution
 
 from bfsensor import BrighterFatterSensor, DistortionTable
 from bfsensor.device.condition import Condition
+from bfsensor.device.shipped import tables_dir
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.diagnose.model.flat_predictions import flat_covariances_of
 from bfsensor.diagnose.model.table_baseline import baseline_of_table
-from bfsensor.files import tables_dir
 from bfsensor.measure.bartlett import bartlett_matrix
 from bfsensor.measure.flat_pairs import flat_covariances
 from bfsensor.response.edge_response import area_matrix

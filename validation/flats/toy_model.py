@@ -22,7 +22,7 @@ from astropy.table import Table, vstack
 from numpy.typing import NDArray
 
 from bfsensor import DistortionTable
-from bfsensor.files import tables_dir
+from bfsensor.device.shipped import tables_dir
 from bfsensor.measure.toy import (
     measure_pair,
     predict_pair,

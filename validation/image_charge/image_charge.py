@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from bfsensor.device.device import Device
-from bfsensor.files import tables_dir
+from bfsensor.device.shipped import tables_dir
 from bfsensor.simulate.charge_field import ImageCharge
 from bfsensor.simulate.image_charge import area_changes
 from bfsensor.simulate.unit_cell import solve_unit_cell

@@ -28,7 +28,7 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bfsensor.device.device import Device
-from bfsensor.files import tables_dir
+from bfsensor.device.shipped import tables_dir
 from bfsensor.fit.image_charge_fit import ImageChargeFit, fit_image_charge
 from bfsensor.fit.image_charge_problem import SCALES
 from bfsensor.recording.tables.area_changes import read_area_changes

@@ -37,9 +37,9 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from bfsensor import BrighterFatterSensor, DistortionTable, SiliconSensor
+from bfsensor.device.shipped import tables_dir
 from bfsensor.device.silicon import absorption_length
 from bfsensor.errors import MeasurementError
-from bfsensor.files import tables_dir
 from bfsensor.sensor.drift_field import solve_drift
 from validation.common.write_results import write_results
 from validation.psf_requirement.shear_bias import (

@@ -30,7 +30,7 @@ from astropy.table import Table, vstack
 
 from bfsensor import BrighterFatterSensor, DistortionTable, SiliconSensor
 from bfsensor.device.device import Device
-from bfsensor.files import tables_dir
+from bfsensor.device.shipped import tables_dir
 from bfsensor.table.build import build_table
 from bfsensor.table.galsim_format import write_galsim
 from bfsensor.table.table_plan import plan_table

@@ -107,6 +107,8 @@ class Channel:
         Which exposures they come from: 'fit', 'select' or 'held-out'.
     common : Common, optional
         Noise that values share with others before them; ``blocks`` are of what is left.
+    whitener : csr_array, shape (n, n)
+        Inverse roots of the blocks: what :meth:`whiten` multiplies by.
 
     Examples
     --------
@@ -122,7 +124,7 @@ class Channel:
     unit: str
     fold: str = "fit"
     common: Common | None = None
-    _whitener: csr_array = field(init=False, repr=False)
+    whitener: csr_array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.word not in WORDS:
@@ -151,7 +153,7 @@ class Channel:
             )
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "axes", MappingProxyType(axes))
-        object.__setattr__(self, "_whitener", self._invert())
+        object.__setattr__(self, "whitener", self._invert())
 
     def _invert(self) -> csr_array:
         """Inverse roots of the blocks as one sparse matrix."""
@@ -200,7 +202,7 @@ class Channel:
         given = np.asarray(residuals, float)
         if self.common is not None:
             given = given - self.common.told(given)
-        return np.asarray(self._whitener @ given)
+        return np.asarray(self.whitener @ given)
 
     def unwhiten(self, white: ArrayLike) -> FloatArray:
         """Undo :meth:`whiten`: residuals in ``unit``, shape (n,)."""

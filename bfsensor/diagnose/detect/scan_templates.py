@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import block_diag, csr_array
 
-from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.channels import Channel, Common, join_common
 from bfsensor.diagnose.data.exposure_info import NUMBERS, condition_at, label_of
 from bfsensor.typing import FloatArray
+
+TOGETHER = 300_000
+"""Numbers of the patterns that are whitened at a time: about 10 MB while they are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +62,7 @@ class Group:
         self.axes = {n: np.concatenate([c.axes[n] for c, _ in members]) for n in names}
         self.size = sum(len(c) for c, _ in members)
         self.rows = np.concatenate([s + np.arange(len(c)) for c, s in members])
-        # Inverse errors of values that tell of others, and 0.
-        self._alone = np.concatenate([
-            np.where(c.common.tells, 1 / c.errors, 0.0) if c.common else np.zeros(len(c))
-            for c, _ in members
-        ])  # fmt: skip
+        self._whitener = _Whitener([c for c, _ in members])
         columns = [self.axes[n] for n in NUMBERS]
         self.condition = np.array([
             label_of(condition_at(row)) for row in zip(*columns, strict=True)
@@ -74,30 +75,95 @@ class Group:
             for c, start in self.members
         ])  # fmt: skip
 
-    def template(
-        self, family: str, pattern: FloatArray, where: Mapping[str, object]
-    ) -> Template | None:
-        """Whiten a pattern; None if it is nothing.
+    def templates(self, patterns: Iterable[Pattern]) -> Iterator[Template]:
+        """Whiten patterns, one after another; what is nothing is left out.
 
         Of values that tell of others, others have of it what these tell: nothing of their own.
         """
-        if not pattern[self._alone == 0].any():
-            whole = pattern * self._alone
-        else:
-            parts, start = [], 0
-            for channel, _ in self.members:
-                parts.append(channel.whiten(pattern[start : start + len(channel)]))
-                start += len(channel)
-            whole = np.concatenate(parts)
-        used = np.nonzero(np.abs(whole) > 1e-12 * max(np.abs(whole).max(), 1e-300))[0]
-        if len(used) == 0 or not np.isfinite(whole).all():
-            return None
-        told = dict(where)
-        weights = whole[used] ** 2
+        some: list[_Sparse] = []
+        held = 0
+        for family, pattern, where in patterns:
+            rows = np.nonzero(pattern)[0]
+            some.append(_Sparse(family, where, rows, pattern[rows]))
+            held += len(rows)
+            if held > TOGETHER:
+                yield from self._whitened(some)
+                some, held = [], 0
+        yield from self._whitened(some)
+
+    def _whitened(self, patterns: list[_Sparse]) -> Iterator[Template]:
         flux = "flux" if self.word == "spot" else "level"
-        if "level" in told and flux in self.axes:
-            told["level"] = middle(self.axes[flux][used].astype(float), weights)
-        return Template(family, self.word, self.rows[used], whole[used], told)
+        for one, (rows, weights) in zip(
+            patterns, self._whitener.whiten(patterns), strict=True
+        ):
+            size = np.abs(weights)
+            used = size > 1e-12 * size.max(initial=0.0)
+            if not used.any() or not np.isfinite(weights).all():
+                continue
+            rows, weights = rows[used], weights[used]
+            told = dict(one.where)
+            if "level" in told and flux in self.axes:
+                told["level"] = middle(self.axes[flux][rows].astype(float), weights**2)
+            yield Template(one.family, self.word, self.rows[rows], weights, told)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sparse:
+    """A pattern by what is not 0 of it."""
+
+    family: str
+    where: Mapping[str, object]
+    rows: NDArray[np.int64]
+    values: FloatArray
+
+
+class _Whitener:
+    """Channels one after another, whitened as :meth:`Channel.whiten` does.
+
+    By products of sparse matrices: a pattern of a few values costs what these few cost.
+    """
+
+    def __init__(self, channels: Sequence[Channel]) -> None:
+        # Transposed, for patterns are rows.
+        self._whiten = csr_array(block_diag([c.whitener.T for c in channels], format="csr"))
+        size = self._whiten.shape[0]
+        self._gather = self._spread = None
+        # Inverse errors of values that tell of others, and 0.
+        self._alone = np.zeros(size)
+        if any(c.common for c in channels):
+            common = join_common([c.common or Common.none(len(c)) for c in channels])
+            self._gather, self._spread = common.gather.T.tocsr(), common.spread.T.tocsr()
+            errors = np.concatenate([c.errors for c in channels])
+            self._alone = np.where(common.tells, 1 / errors, 0.0)
+
+    def whiten(
+        self, patterns: list[_Sparse]
+    ) -> Iterator[tuple[NDArray[np.int64], FloatArray]]:
+        """Give, of each pattern, which values it has whitened, ascending, and these."""
+        alone = [bool(self._alone[p.rows].all()) for p in patterns]
+        rest = [p for p, own in zip(patterns, alone, strict=True) if not own]
+        whole = self._product(rest)
+        ends = iter(pairwise(whole.indptr))
+        for pattern, own in zip(patterns, alone, strict=True):
+            if own:
+                yield pattern.rows, pattern.values * self._alone[pattern.rows]
+            else:
+                here = slice(*next(ends))
+                yield whole.indices[here], whole.data[here]
+
+    def _product(self, patterns: list[_Sparse]) -> csr_array:
+        starts = np.cumsum([0, *(len(p.rows) for p in patterns)])
+        rows = np.concatenate([np.zeros(0, np.int64), *(p.rows for p in patterns)])
+        values = np.concatenate([np.zeros(0), *(p.values for p in patterns)])
+        out = csr_array((values, rows, starts), shape=(len(patterns), len(self._alone)))
+        if self._gather is not None:
+            told = out @ self._gather
+            told.sort_indices()  # sums in the order of values, as of dense patterns
+            out = out - told @ self._spread
+            out.sort_indices()
+        out = out @ self._whiten
+        out.sort_indices()
+        return out
 
 
 Pattern = tuple[str, FloatArray, dict[str, object]]

@@ -42,10 +42,7 @@ def make_templates(fit: BaselineFit) -> Iterator[Template]:
     }  # fmt: skip
     for word, members in by_word.items():
         group = Group(word, members, fit.residuals)
-        for family, pattern, where in makers[word](group):
-            template = group.template(family, pattern, where)
-            if template is not None:
-                yield template
+        yield from group.templates(makers[word](group))
     yield from _device(fit)
 
 

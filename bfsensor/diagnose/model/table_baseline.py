@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from bfsensor.device.device import Device
+from bfsensor.device.shipped import tables_dir
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.errors import BFSensorError, DiagnosisError
-from bfsensor.files import tables_dir
 from bfsensor.response.edge_response import conversion_weights
 from bfsensor.response.vertices import vertex_fractions
 from bfsensor.table.galsim_format import read_galsim
@@ -69,18 +69,20 @@ def baseline_of_table(given: str | os.PathLike[str]) -> Baseline:
     slopes: dict[tuple[float, float], Edges] = {}
     bends: dict[tuple[float, float], Edges] = {}
     low, high = (part * float(table.backgrounds[-1]) for part in SPAN)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    one_level = (
+        len(table.charges) == 1 or high + CHARGE > table.charges[-1] or not high > low
+    )
+    levels = [float(table.backgrounds[0])] if one_level else [low, middle, high]
+    by_depth = [edges_by_depth(table, background=level) for level in levels]
     for wavelength in WAVELENGTHS:
         key = wavelength, float(bias)
-        if len(table.charges) == 1 or high + CHARGE > table.charges[-1] or not high > low:
-            lowest = float(table.backgrounds[0])
-            edges[key] = edges_at(table, wavelength, temperature, background=lowest)
+        weights = conversion_weights(table.depths, table.thickness, wavelength, temperature)
+        at = [_seen(by, weights) for by in by_depth]
+        edges[key] = at[len(at) // 2]
+        if one_level:
             continue
-        middle, half = 0.5 * (low + high), 0.5 * (high - low)
-        one, mean, two = (
-            edges_at(table, wavelength, temperature, background=b)
-            for b in (low, middle, high)
-        )
-        edges[key] = mean
+        one, mean, two = at
         slopes[key] = (two[0] - one[0]) / (2 * half), (two[1] - one[1]) / (2 * half)
         bends[key] = (
             (two[0] + one[0] - 2 * mean[0]) / (2 * half**2),
@@ -94,7 +96,7 @@ def baseline_of_table(given: str | os.PathLike[str]) -> Baseline:
         (620.0, float(bias)),
         slopes=slopes,
         bends=bends,
-        level=0.5 * (low + high),
+        level=middle,
     )
 
 
@@ -202,7 +204,12 @@ def edges_at(
         With a ring of pixels around the table's whose outer edges do not move.
     """
     weights = conversion_weights(table.depths, table.thickness, wavelength, temperature)
-    kx, ky = edges_by_depth(table, background=background)
+    return _seen(edges_by_depth(table, background=background), weights)
+
+
+def _seen(by_depth: Edges, weights: FloatArray) -> Edges:
+    """Mean shifts of edges over conversion depths."""
+    kx, ky = by_depth
     return np.tensordot(weights, kx, 1), np.tensordot(weights, ky, 1)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from bfsensor.device.condition import Condition
+from bfsensor.device.written_units import to_internal
 from bfsensor.errors import DeviceError, RecordingError
 from bfsensor.recording.raw.headers import is_fits
 from bfsensor.recording.tables.area_changes import AreaChangeTable, read_area_changes
@@ -21,7 +22,6 @@ from bfsensor.recording.tables.setting_tables import (
     read_setting_table,
     read_text,
 )
-from bfsensor.units import to_internal
 
 CONDITIONS = {
     "back_bias": ("potential", 1.0),

@@ -3,8 +3,7 @@
 import pytest
 
 from bfsensor.diagnose.detect.locate import locate_mismatch
-from bfsensor.diagnose.fit.baseline_fit import fit_bounded
-from tests.virtual import make_effect, measure_virtual, virtual_baseline
+from tests.virtual import fit_virtual, make_effect
 
 
 @pytest.mark.parametrize(
@@ -15,7 +14,7 @@ from tests.virtual import make_effect, measure_virtual, virtual_baseline
     ],
 )
 def test_effects_of_twelve_standard_deviations_are_located(word, values, family):
-    measured = measure_virtual(seed=777, size="S", effects=[make_effect(word, values)])
-    found = locate_mismatch(fit_bounded(measured, virtual_baseline())[1], seed=1)
+    fit = fit_virtual(seed=777, size="S", effects=[make_effect(word, values)])[2]
+    found = locate_mismatch(fit, seed=1)
     assert found.detected and found.findings[0].family == family
     assert abs(found.findings[0].z) > 8

@@ -18,13 +18,12 @@ from bfsensor.diagnose.fit.fitted_model import Model
 from bfsensor.effects.persistence import Persistence
 from bfsensor.effects.tearing import Tearing
 from bfsensor.effects.tree_rings import TreeRings
-from tests.virtual import SMALL, measure_virtual, virtual_baseline
+from tests.virtual import fit_virtual, virtual_baseline
 
 
 @pytest.fixture(scope="module")
 def null():
-    measured = measure_virtual(seed=9137, size=SMALL)
-    return measured, *fit_bounded(measured, virtual_baseline())
+    return fit_virtual(seed=9137)
 
 
 def with_change(null, effect, length):

@@ -29,6 +29,7 @@ from tests.virtual import (
     EdgeShifts,
     Geometry,
     OutsideLibrary,
+    fit_virtual,
     make_effect,
     measure_virtual,
     virtual_baseline,
@@ -39,7 +40,13 @@ KINDS = (TrapSerial, InterpixelCoupling, Tearing)
 
 @lru_cache(maxsize=1)
 def _null():
-    return measure_virtual(seed=9137, size=SMALL)
+    return fit_virtual(seed=9137)[0]
+
+
+@lru_cache(maxsize=1)
+def _null_located():
+    _, predictor, fit = fit_virtual(seed=9137)
+    return Model(predictor, fit), locate_mismatch(fit)
 
 
 def _changed(word, change):
@@ -70,7 +77,8 @@ def _one(found, part):
 
 
 def test_of_nothing_there_is_no_free_form():
-    found, mismatch = _explained(_null())
+    model, mismatch = _null_located()
+    found = explain_outside(model, mismatch)
     assert found is None and not mismatch.detected
 
 
@@ -260,7 +268,7 @@ def test_a_remainder_counts_against_what_is_explained_in_its_channel(word, count
 
 
 def test_families_compete_on_what_stands_out_alone():
-    model, mismatch = _located(_null())
+    model, mismatch = _null_located()
     quiet = replace(mismatch, findings=())
     assert compete(Scene(model), quiet) == []
 
@@ -282,7 +290,7 @@ def test_the_process_is_orthogonal_to_what_the_fit_floats():
     inside = model.fit.basis.T @ choice.template
     assert np.linalg.norm(inside) < 1e-6 * np.linalg.norm(choice.template)
     # The parameters stay where they are without what is foreign, and as well known.
-    null, _ = _located(_null())
+    null, _ = _null_located()
     after = model.with_columns(Columns(choice.terms))
     assert after.fit.total < model.fit.total - 50
     own = len(model.predictor.names)
@@ -293,7 +301,7 @@ def test_the_process_is_orthogonal_to_what_the_fit_floats():
 
 def test_the_process_leaves_to_parameters_what_is_theirs():
     # What a gain and a device parameter other by five of their errors do to covariances.
-    null, _ = _located(_null())
+    null, _ = _null_located()
     point = null.fit.values[: len(null.predictor.names)].copy()
     for name in ("gain 0", null.predictor.names[null.predictor.prior_rows[0]]):
         row = null.predictor.names.index(name)

@@ -13,7 +13,6 @@ from bfsensor.diagnose.detect.locate import locate_mismatch
 from bfsensor.diagnose.explain.attribution import class_probabilities, tied_classes
 from bfsensor.diagnose.explain.location import place_effects
 from bfsensor.diagnose.explain.stepwise import attribute
-from bfsensor.diagnose.fit.baseline_fit import fit_bounded
 from bfsensor.diagnose.fit.fitted_model import Model
 from bfsensor.diagnose.fit.local_likelihood import valley_of
 from bfsensor.effects.charge_loss import ChargeLoss
@@ -21,19 +20,13 @@ from bfsensor.effects.gain_nonlinearity import GainNonlinearity
 from bfsensor.effects.interpixel_coupling import InterpixelCoupling
 from bfsensor.effects.tearing import Tearing
 from bfsensor.effects.trap_serial import TrapSerial
-from tests.virtual import (
-    SMALL,
-    make_effect,
-    measure_virtual,
-    virtual_baseline,
-)
+from tests.virtual import fit_virtual, make_effect
 
 KINDS = (ChargeLoss, GainNonlinearity, InterpixelCoupling, Tearing, TrapSerial)
 
 
 def fitted(seed, *effects):
-    channels = measure_virtual(seed=seed, size=SMALL, effects=effects)
-    predictor, fit = fit_bounded(channels, virtual_baseline())
+    _, predictor, fit = fit_virtual(seed=seed, effects=effects)
     return predictor, fit, locate_mismatch(fit)
 
 

@@ -7,29 +7,22 @@ import numpy as np
 import pytest
 
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.measure_channels import measure_channels
-from bfsensor.diagnose.detect.locate import locate_mismatch
-from bfsensor.diagnose.explain.stepwise import attribute
-from bfsensor.diagnose.fit.baseline_fit import fit_bounded
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.diagnose.plan.advice import ENOUGH, plan
 from bfsensor.diagnose.plan.catalogue import RULES, make_recordings
 from bfsensor.diagnose.plan.forecast import Forecaster
 from bfsensor.diagnose.plan.gaps import ALWAYS, NEEDS, find_untested
 from bfsensor.diagnose.plan.planned_exposures import Forecast, Information, Planned
-from bfsensor.effects.charge_loss import ChargeLoss
-from bfsensor.effects.gain_nonlinearity import GainNonlinearity
+from tests.diagnose.conftest import TIED_SEED
+from tests.measured import measure_once
 from tests.virtual import (
     KNOWN,
-    SMALL,
     Size,
     VirtualSource,
     make_effect,
-    measure_virtual,
     virtual_baseline,
 )
 
-SEED = 7101
 BINNED = Size(128, 2, 0, dithers=0, flat_seconds=(3.0, 9.0, 18.0, 27.0))
 """The recipe of binned flats: 16 exposures of 6,000 to 54,000 e- in each pixel."""
 
@@ -80,17 +73,6 @@ def held_against(measured, effect):
             square += left @ left
             number += len(left) - len(light)
     return square, number
-
-
-@pytest.fixture(scope="module")
-def tied():
-    """A campaign with charge loss, which a curved response explains as well."""
-    channels = measure_virtual(
-        seed=SEED, size=SMALL, effects=[make_effect("charge_loss", {"q": 1.5e-7})]
-    )
-    predictor, fit = fit_bounded(channels, virtual_baseline())
-    mismatch = locate_mismatch(fit)
-    return attribute(predictor, fit, mismatch, kinds=(ChargeLoss, GainNonlinearity))
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +148,7 @@ def test_the_advised_recording_breaks_the_tie(tied, planned):
     for truth in truths:
         # The same chip.  Variance over mean of binned pixels is no gain: it is known by now.
         measured = replace(
-            measure_channels(binned_source(SEED, truth)), gains=tuple(tied.fit.values[:2])
+            measure_once(binned_source(TIED_SEED, truth)), gains=tuple(tied.fit.values[:2])
         )
         square = {}
         for word, effect in rivals.items():

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.fit.baseline_fit import fit_bounded
 from bfsensor.diagnose.fit.fitted_model import Model
 from bfsensor.diagnose.plan.predict_conditions import (
@@ -14,6 +13,7 @@ from bfsensor.diagnose.plan.predict_conditions import (
 )
 from bfsensor.effects.library import make_effect as candidate
 from bfsensor.errors import DiagnosisError
+from tests.measured import measure_once
 from tests.virtual import SMALL, VirtualSource, make_effect, virtual_baseline
 
 LAMP_ERROR = 2e-4
@@ -29,11 +29,11 @@ def campaign():
         withheld=True,
     )
     kept, late = source.part(withheld=False), source.part(withheld=True)
-    measured = measure_channels(kept)
+    measured = measure_once(kept)
     predictor, fit = fit_bounded(measured, virtual_baseline())
     before = Model(predictor, fit)
     after = before.with_effects([candidate("gain_nonlinearity", {"c2": -0.01, "c3": 1e-3})])
-    return before, after, late, measure_channels(late)
+    return before, after, late, measure_once(late)
 
 
 def written(model, late, folder):

@@ -10,21 +10,14 @@ import pytest
 
 from bfsensor.diagnose.detect.locate import locate_mismatch
 from bfsensor.diagnose.explain.attribution import FAILS
-from bfsensor.diagnose.explain.stepwise import attribute
-from bfsensor.diagnose.fit.baseline_fit import fit_bounded, held_out
+from bfsensor.diagnose.fit.baseline_fit import held_out
 from bfsensor.diagnose.plan.advice import plan
 from bfsensor.diagnose.report.class_words import CLASS_WORDS
 from bfsensor.diagnose.report.diagnosis_result import Diagnosis
 from bfsensor.diagnose.report.html_report import write_report
-from bfsensor.effects.charge_loss import ChargeLoss
-from bfsensor.effects.gain_nonlinearity import GainNonlinearity
 from bfsensor.plots import residuals as show
 from tests.virtual import (
     EFFECTS,
-    SMALL,
-    make_effect,
-    measure_virtual,
-    virtual_baseline,
 )
 
 VOID = {"meta", "img", "link", "br", "hr"}
@@ -57,17 +50,12 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def explained():
-    measured = measure_virtual(
-        seed=7101, size=SMALL, effects=[make_effect("charge_loss", {"q": 1.5e-7})]
-    )
-    predictor, fit = fit_bounded(measured, virtual_baseline())
-    mismatch = locate_mismatch(fit)
-    found = attribute(predictor, fit, mismatch, kinds=(ChargeLoss, GainNonlinearity))
+def explained(fitted_loss, tied):
+    measured, predictor, fit = fitted_loss
     return Diagnosis(
         campaign="a <small> campaign", baseline="virtual", measured=measured, fit=fit,
-        mismatch=mismatch, heldout=held_out(predictor, fit, measured), attribution=found,
-        plan=plan(found), predictor=predictor, notes=("a note",),
+        mismatch=locate_mismatch(fit), heldout=held_out(predictor, fit, measured), attribution=tied,
+        plan=plan(tied), predictor=predictor, notes=("a note",),
     )  # fmt: skip
 
 

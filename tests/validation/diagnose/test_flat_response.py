@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from bfsensor.device.condition import Condition
+from bfsensor.device.shipped import tables_dir
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.diagnose.model.flat_predictions import flat_covariances_of
 from bfsensor.diagnose.model.table_baseline import baseline_of_table
-from bfsensor.files import tables_dir
 from bfsensor.table.table import DistortionTable
 from validation.sensor.sensor_flats import predict as integrate
 

@@ -185,8 +185,11 @@ def test_spots_follow_the_levels_whatever_reaches_farther(lacking, folder):
         poor, back_biases=[-40.0], lacks=["depths"], cells=CELLS, keep=folder
     )
     axes = Axes()
-    for flux in (5e4, 5e5):
-        axes.add(1, REFERENCE, what="sigma_x", light=flux, flux=flux, time=1.0, hours=0.0)
+    for number, flux in enumerate((5e4, 5e5)):
+        axes.add(
+            1, REFERENCE, what="sigma_x", light=flux, flux=flux, time=1.0, hours=0.0,
+            exposure=number,
+        )  # fmt: skip
     channel = Channel("spot", np.ones(2), (np.eye(2),), axes.columns(), "")
     measured = _measured([channel], (), {})
     far = BrighterFatterLongRange({

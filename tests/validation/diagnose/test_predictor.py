@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from bfsensor.device.condition import Condition
+from bfsensor.device.shipped import tables_dir
 from bfsensor.diagnose.model.baseline import read_edges
 from bfsensor.diagnose.model.flat_predictions import flat_covariances_of
 from bfsensor.diagnose.model.spot_predictions import grow_spots, predict_spots
 from bfsensor.diagnose.model.table_baseline import baseline_of_table
 from bfsensor.errors import DiagnosisError
-from bfsensor.files import tables_dir
 from bfsensor.measure.covariance_model import model_covariances
 from bfsensor.measure.growth import measure_growth
 from bfsensor.response.edge_response import area_matrix

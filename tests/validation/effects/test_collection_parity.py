@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.model.predictor import Predictor, used_channels
 from bfsensor.effects.device_parameter import device_parameters
 from bfsensor.effects.library import make_effect
+from tests.measured import measure_once
 from validation.common.virtual_source import VirtualSource, virtual_baseline
 from validation.concealed.card import NOMINAL, SPREAD
 from validation.concealed.library import make_effect as make_theirs
@@ -125,7 +125,7 @@ def truth(seed: int, size: Size | str, predictor: Predictor) -> np.ndarray:
 
 def chi_squares(seed: int, size: Size | str, effect, own) -> dict[str, tuple[float, int]]:
     """Of each channel at the true parameters, those that are linear fitted."""
-    measured = measure_channels(VirtualSource(seed=seed, size=size, effects=[own]))
+    measured = measure_once(VirtualSource(seed=seed, size=size, effects=[own]))
     predictor = Predictor(measured, virtual_baseline(), [effect] if effect else [])
     point = truth(seed, size, predictor)
     out: dict[str, tuple[float, int]] = {}
@@ -182,7 +182,7 @@ def check_device_parameter(
     scattered = VirtualSensor(Geometry(pixels, 2), seed=SEED).device[name]
     own = make_theirs("device_parameter", {name: scattered + spreads * SPREAD[name]}, name)
     null, fit = null_campaign(SEED, size)
-    other = measure_channels(VirtualSource(seed=SEED, size=size, effects=[own]))
+    other = measure_once(VirtualSource(seed=SEED, size=size, effects=[own]))
     before, bare, after = (
         residuals(fit, m, e, used_channels(other.channels, FOLDS))
         for m, e in ((null, ()), (other, ()), (other, (effect,)))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bfsensor import BrighterFatterSensor, DistortionTable
-from bfsensor.files import tables_dir
+from bfsensor.device.shipped import tables_dir
 from bfsensor.measure.covariance_fit import fit_covariances
 from bfsensor.measure.curve import measure_curve
 from bfsensor.sensor.flats import draw_flat
