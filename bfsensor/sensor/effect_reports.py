@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from bfsensor.effects.effect import STAGES, Effect, Layout, Segment, Shot
-from bfsensor.effects.library import LIBRARY, make_effect
 from bfsensor.errors import EffectError, SensorError
 from bfsensor.units import to_celsius, to_kelvin
 
@@ -93,6 +92,9 @@ def _read_report(path: str) -> dict[str, Any]:
 
 def _make(entry: Any, where: str) -> Effect:
     """Make the effect of an entry; a variant that is not named is known by its parameters."""
+    # Not at the top: 31 classes and scipy's filters, which sensors without effects do not need.
+    from bfsensor.effects.library import LIBRARY, make_effect
+
     if not isinstance(entry, Mapping) or not isinstance(entry.get("class"), str):
         raise SensorError(f"{where} must be an effect, or have a 'class', not {entry!r}")
     word = entry["class"]
