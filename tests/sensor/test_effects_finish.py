@@ -90,7 +90,6 @@ def test_variants_are_known_by_their_parameters(monkeypatch):
     class Hot(Warm):
         variant = "hot"
 
-    monkeypatch.setattr("bfsensor.sensor.effect_reports.LIBRARY", (Hot,))
     monkeypatch.setattr("bfsensor.effects.library.LIBRARY", (Hot,))
     block = {"class": "dark_hot", "parameters": {"rate": 3.0}}
     sensor = sensor_with(block, conditions={"seconds": 1.0})
