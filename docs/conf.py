@@ -1,0 +1,104 @@
+"""Settings of the documentation: ``sphinx-build -W docs build/docs`` from a checkout."""
+
+import inspect
+import re
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from bfsensor import __version__
+
+project = "bfsensor"
+author = "The bfsensor developers"
+copyright = "The bfsensor developers, BSD 3-clause licence"
+version = release = __version__
+
+extensions = [
+    "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.mathjax", "numpydoc", "myst_parser",
+    "sphinx_click", "sphinx_gallery.gen_gallery",
+]  # fmt: skip
+exclude_patterns = [
+    "README.in.md",
+    "examples/*",
+    "gallery/**/*.ipynb",
+    "sg_execution_times.rst",
+    "**/sg_execution_times.rst",
+]
+myst_heading_anchors = 3
+numpydoc_show_class_members = False
+autosummary_generate = True
+html_theme = "pydata_sphinx_theme"
+html_title = "bfsensor"
+html_theme_options = {"show_prev_next": False, "secondary_sidebar_items": ["page-toc"]}
+sphinx_gallery_conf = {
+    "examples_dirs": "examples",
+    "gallery_dirs": "gallery",
+    "filename_pattern": r"\.py$",
+    "abort_on_example_error": True,
+    "min_reported_time": 1e9,
+    "show_memory": False,
+}
+
+
+def write_effects(app: object) -> None:
+    """Write the page of effect classes from the library itself."""
+    from bfsensor.diagnose.report.class_words import CLASS_WORDS
+    from bfsensor.effects.library import LIBRARY
+
+    lines = [
+        "# Classes of effects",
+        "",
+        "What a diagnosis looks for, and what `BrighterFatterSensor(effects=...)` draws. Ranges are",
+        "those in which a diagnosis seeks an effect.",
+        "",
+    ]
+    words = dict.fromkeys(kind.word for kind in LIBRARY)
+    for word in words:
+        lines += [f"## {word}", "", CLASS_WORDS[word].capitalize() + ".", ""]
+        for kind in (k for k in LIBRARY if k.word == word):
+            if kind.variant:
+                lines += [f"**{kind.variant}**", ""]
+            lines += [inspect.getdoc(kind) or "", ""]
+            if kind.parameters:
+                lines += ["| parameter | unit | from | to |", "|---|---|---|---|"]
+                lines += [
+                    f"| {p.name} | {p.unit} | {p.low:g} | {p.high:g} |"
+                    for p in kind.parameters
+                ]
+                lines += [""]
+    text = "\n".join(lines).replace("``", "`")
+    Path(__file__).with_name("concepts").joinpath("effects.md").write_text(text)
+
+
+def write_validation(app: object) -> None:
+    """Copy the pages of the claims, whose links to files that are no pages become names."""
+    pages = Path(__file__).with_name("validation")
+    pages.mkdir(exist_ok=True)
+    claims = Path(__file__).resolve().parents[1] / "validation"
+    for path in [claims / "README.md", *sorted(claims.glob("*/README.md"))]:
+        text = path.read_text()
+        text = re.sub(r"\]\((\w+)/README\.md\)", r"](\1.md)", text)
+        text = re.sub(r"\[([^]]+)\]\((?!https?:|\w+\.md)[^)]+\)", r"`\1`", text)
+        name = "index" if path.parent == claims else path.parent.name
+        (pages / f"{name}.md").write_text(text)
+    folders = sorted(p.stem for p in pages.glob("*.md") if p.stem != "index")
+    tree = "\n".join(["```{toctree}", ":hidden:", "", *folders, "```", ""])
+    with (pages / "index.md").open("a") as page:
+        page.write("\n" + tree)
+
+
+def link_pages(app: object, name: str, source: list[str]) -> None:
+    """Turn links to the checkout's files, which a reader of the repository follows, into the site's."""
+    text = re.sub(
+        r"\]\(\.\./\.\./validation/(\w+)/README\.md\)", r"](../validation/\1.md)", source[0]
+    )
+    text = text.replace("](../../validation/README.md)", "](../validation/index.md)")
+    source[0] = re.sub(r"(?<!!)\[([^]]+)\]\(\.\./\.\./[^)]+\)", r"`\1`", text)
+
+
+def setup(app: object) -> None:
+    """Pages that the package and its results write."""
+    app.connect("builder-inited", write_effects)  # type: ignore[attr-defined]
+    app.connect("builder-inited", write_validation)  # type: ignore[attr-defined]
+    app.connect("source-read", link_pages)  # type: ignore[attr-defined]
