@@ -71,6 +71,35 @@ def write_effects(app: object) -> None:
     Path(__file__).with_name("concepts").joinpath("effects.md").write_text(text)
 
 
+ROOMS = {
+    "device": "Devices", "simulate": "Simulation", "response": "Response of pixel edges",
+    "table": "Distortion tables", "sensor": "Sensors for GalSim", "sweeps": "Sweeps",
+    "direct": "Direct simulation", "measure": "Measurement", "recording": "Recordings",
+    "effects": "Effects", "fit": "Fits of devices", "diagnose": "Diagnosis", "errors": "Errors",
+}  # fmt: skip
+
+
+def write_api(app: object) -> None:
+    """Write the page of the public names that stand at the top of the package."""
+    import bfsensor
+
+    by_room: dict[str, list[str]] = {}
+    for name in bfsensor.__all__:
+        if not name.startswith("__"):
+            module = getattr(bfsensor, name).__module__
+            by_room.setdefault(module.split(".")[1], []).append(name)
+    lines = ["# Python", "", "Names load what they need when they are first used.", ""]
+    for room, title in ROOMS.items():
+        names = sorted(by_room.pop(room, []))
+        if names:
+            lines += [f"## {title}", "", "```{eval-rst}", ".. currentmodule:: bfsensor"]
+            lines += [".. autosummary::", "   :toctree: generated", ""]
+            lines += [f"   {name}" for name in names] + ["```", ""]
+    if by_room:
+        raise ValueError(f"rooms without a title: {sorted(by_room)}")
+    Path(__file__).with_name("reference").joinpath("api.md").write_text("\n".join(lines))
+
+
 def write_validation(app: object) -> None:
     """Copy the pages of the claims, whose links to files that are no pages become names."""
     pages = Path(__file__).with_name("validation")
@@ -99,6 +128,8 @@ def link_pages(app: object, name: str, source: list[str]) -> None:
 
 def setup(app: object) -> None:
     """Pages that the package and its results write."""
+    # Before autosummary reads which names there are.
+    app.connect("builder-inited", write_api, priority=100)  # type: ignore[attr-defined]
     app.connect("builder-inited", write_effects)  # type: ignore[attr-defined]
     app.connect("builder-inited", write_validation)  # type: ignore[attr-defined]
     app.connect("source-read", link_pages)  # type: ignore[attr-defined]
