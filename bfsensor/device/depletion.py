@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.device.surfaces import Surfaces
+from bfsensor.device.written_units import from_internal
 from bfsensor.errors import DeviceError, TableError
 from bfsensor.typing import FloatArray
 from bfsensor.units import VACUUM_PERMITTIVITY
@@ -180,12 +181,12 @@ def _reason(device: Device, found: Depletion) -> str:
         where = f"below {found.lowest:.3g} um"
     # To be given below the estimate by what it may be off, not to be refused elsewhere.
     wanted = np.floor(found.full_depletion_voltage) - 1
+    doping = from_internal(float(f"{silicon.background_doping:.3g}"), "density", "cm-3")
     return (
         f"back_bias = '{device.operating_point.back_bias:g} V' does not deplete the silicon "
-        f"{where}: {silicon.thickness:g} um with background_doping = "
-        f"'{silicon.background_doping * 1e12:.3g} cm-3' are fully depleted at about "
-        f"{found.full_depletion_voltage:.1f} V (give back_bias = '{wanted:g} V' or lower, or less "
-        "thickness or background_doping)"
+        f"{where}: thickness = '{silicon.thickness:g} um' with background_doping = '{doping}' "
+        f"is fully depleted at about {found.full_depletion_voltage:.1f} V (give back_bias = "
+        f"'{wanted:g} V' or lower, or less thickness or background_doping)"
     )
 
 
@@ -244,7 +245,9 @@ def _front_potential(device: Device, low: float) -> float:
     filled = (potential <= floor) & (columns.moment < 0)
     potential = np.where(filled, floor, potential)
     resistance = across_oxide + below / silicon
-    return float(_share(potential, filled, resistance, silicon, device).mean())
+    # Holes at a surface without implants hold their column as well.
+    held_fast = filled | (resistance <= 0)
+    return float(_share(potential, held_fast, resistance, silicon, device).mean())
 
 
 @dataclass(frozen=True)

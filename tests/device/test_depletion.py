@@ -123,6 +123,17 @@ def test_undoped_silicon_needs_only_a_potential_below_the_front():
     check_depleted(device.with_value("back_bias", "0 V"))
 
 
+def test_holes_hold_the_surface_under_a_negative_gate():
+    # Gates at -20 V, holes at 0 V: 1e17 cm-3 of them lie kT ln(p / n_i) below that.
+    device = with_values(
+        flat_device(), hole_quasi_fermi_level="0 V", gate_low="-20 V", gate_high="-19.999 V"
+    )
+    density = device.material.intrinsic_density(173.0)
+    level = -device.material.thermal_voltage(173.0) * np.log(1e5 / density)
+    assert -1.0 < level < -0.3
+    assert find_depletion(device).front_potential == pytest.approx(level, abs=1e-6)
+
+
 @pytest.mark.parametrize(
     ("name", "values"),
     [
@@ -177,7 +188,7 @@ def test_tables_of_undepleted_devices_are_refused_within_a_second(
     )  # 0.02 s measured; a full well takes more than 1 s
     message = str(caught.value)
     assert message.startswith(f"{device.name}: back_bias = '{bias} V' does not deplete")
-    assert f"{thick} um with background_doping = '{doping} cm-3'" in message
+    assert f"thickness = '{thick} um' with background_doping = '{doping} cm-3'" in message
     stated = float(message.partition("fully depleted at about ")[2].split()[0])
     # The estimate's 1 V at 18 V of drop in the bulk, and as much of higher ones.
     assert stated == pytest.approx(-needed, abs=1.0 + 0.01 * needed)
