@@ -15,6 +15,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from bfsensor.device.depletion import check_depleted
 from bfsensor.direct import light
 from bfsensor.direct.build_up import build_up
 from bfsensor.errors import DeviceError, SimulationError
@@ -84,7 +85,10 @@ class ExposurePlan:
             )
 
     def _check(self, **limits: tuple[float, float]) -> None:
-        """Refuse values that cannot be; those of both kinds of plan after the given ones."""
+        """Refuse values that cannot be, and devices that are not fully depleted.
+
+        Values of both kinds of plan come after the given ones.
+        """
         limits |= {
             "steps": (1, 100_000),
             "pixels": (3, 63),
@@ -104,6 +108,7 @@ class ExposurePlan:
             raise DeviceError(
                 f"{self.KIND}: pixels = {self.pixels} must be odd: one is in the middle"
             )
+        check_depleted(self.device)
 
 
 @lru_cache(maxsize=16)

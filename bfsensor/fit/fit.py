@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from bfsensor.device.depletion import check_depleted
 from bfsensor.device.device import Device
 from bfsensor.device.quantities import DIFFUSION, Prior
 from bfsensor.errors import BFSensorError, FitError
 from bfsensor.fit.data import UNITS, DataSet
 from bfsensor.fit.degeneracies import find_ties, principal
-from bfsensor.fit.device_at import fitted_device
+from bfsensor.fit.device_at import device_at, fitted_device
 from bfsensor.fit.finer_mesh import Finer, say
 from bfsensor.fit.least_squares import (
     FEWEST,
@@ -100,11 +101,15 @@ def fit_device(
     ------
     FitError
         Nothing to fit, or nothing that predicts it.
+    DeviceError
+        The device as given is not fully depleted at a condition of the measurements.
     ConvergenceError
         The fit does not settle.
     """
     names = tuple(prior.name for prior in priors)
     _check_profiles(profiles, names)
+    for condition in dict.fromkeys(c for data in sets for c in data.conditions):
+        check_depleted(device_at(device, condition))
     problem = LeastSquaresProblem(
         tuple(priors),
         tuple(sets),

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 
 import bfsensor
 from bfsensor.device.condition import Condition
+from bfsensor.device.depletion import check_depleted
 from bfsensor.device.device import Device
 from bfsensor.device.parameters import change_parameter, device_parameters, parameter_value
 from bfsensor.errors import ConvergenceError, DeviceError, FitError
@@ -129,12 +130,14 @@ class DeviceEmulator:
         FitError
             A parameter without uncertainty, or one that cannot be moved to either side.
         DeviceError, ConvergenceError
-            There is no solution at the device itself.
+            The device is not fully depleted at a condition, or there is no solution there.
         """
         spreads = _spreads(device, parameters)
         points = list(dict.fromkeys(_point(c) for c in conditions))
         if not points:
             raise FitError("an emulator needs a condition; Condition() is the device's own")
+        for point in points:
+            check_depleted(_operated(device, point))
         nodes: list[Node] = []
         for number, point in enumerate(points):
             here = _operated(device, point)

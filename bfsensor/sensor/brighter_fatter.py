@@ -37,6 +37,11 @@ from bfsensor.typing import FloatArray
 
 _WAVELENGTHS = np.arange(250.0, 1451.0, 1.0)  # nm
 _TRANSPARENT = 1e30  # um; length of light that is not absorbed
+_COVERED = 0.9
+"""Part of the thickness up to which a table must hold depths, or a sensor warns.
+
+With the shifts of 95, 80 and 30 um in place of those of 100 um, area changes are wrong by up to
+0.03, 0.6 and 17 % at the nearest lags and by 2, 7 and 17 % at (2, 2) (the tables of ITL and E2V)."""
 
 
 class BrighterFatterSensor(EffectSensor):
@@ -98,7 +103,8 @@ class BrighterFatterSensor(EffectSensor):
         Electrons at which a pixel spills along its column; by default the table's, inf:
         never.
     beyond : {'hold', 'error'}
-        More charge than the table and no full well: hold the last level (one warning, see
+        More charge than the table and no full well, or a table that ends below nine tenths of the
+        thickness: hold the last level or depth (one warning each, for charge see
         :attr:`diagnostics`), or refuse.
     predict : bool
         Use the charge expected in the middle of a block instead of that at its start.
@@ -229,6 +235,7 @@ class BrighterFatterSensor(EffectSensor):
             temperature = self._device.operating_point.temperature
         self.temperature = check_number("temperature", temperature, low=77.0, high=400.0)
         self.full_well = check_full_well(full_well, self.table)
+        self._check_depths()
         self._warned = False
         self._init_effects(effects, layout, conditions, self._usual, self.transpose)
         self._init_silicon()
@@ -373,6 +380,25 @@ class BrighterFatterSensor(EffectSensor):
             self._exposure, self._last_image = kept, last
             raise
         return added
+
+    def _check_depths(self) -> None:
+        """Warn of light far above the table's last depth, or refuse with beyond='error'."""
+        last = float(self.table.depths[-1])
+        if last >= _COVERED * self.table.thickness:
+            return
+        text = (
+            f"light converts up to {self.table.thickness:g} um above the gates; the table of "
+            f"{self.name} ends at {last:g} um"
+        )
+        if self.beyond == "error":
+            raise SensorError(
+                f"{text}: make one with the depth {self.table.thickness:g} um"
+            )
+        warnings.warn(
+            f"{text}, whose shifts are used above it (beyond='error' refuses)",
+            galsim.GalSimWarning,
+            stacklevel=3,
+        )
 
     def _warn_beyond(self) -> None:
         assert self._exposure is not None

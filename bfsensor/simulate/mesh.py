@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor.device.surfaces import Surfaces
 from bfsensor.errors import DeviceError
 from bfsensor.typing import FloatArray
 
@@ -19,12 +20,6 @@ if TYPE_CHECKING:
     from bfsensor.device.device import Device
 
 Side = Literal["mirror", "periodic"]
-
-SILICON_CONSUMED = 4.0 / 9.0
-"""Share of a grown oxide that lies below the silicon surface it was grown from.
-
-Molar volumes of Si and SiO2 give 0.44 (Deal & Grove 1965, J. Appl. Phys. 36, 3770);
-4/9 puts the gate of the published ITL device at its 0.5 um above the field-oxide top."""
 
 FINE_ABOVE = 0.4
 """Planes are at their finest up to this far above the highest silicon surface [um]."""
@@ -264,52 +259,3 @@ def _z_nodes(device: Device, refine: int) -> FloatArray:
     for _ in range(refine):
         out = _halve(out)
     return out
-
-
-@dataclass(frozen=True)
-class Surfaces:
-    """Heights of gate and silicon in the channel and in the channel stop [um].
-
-    The field oxide has its top at z = 0; a share :data:`SILICON_CONSUMED` of what it is
-    thicker than the gate oxide lies below the silicon surface of the channel.
-    """
-
-    gate_channel: float
-    silicon_channel: float
-    silicon_stop: float
-    stop_half_width: float
-    taper: float
-    side_diffusion: float
-
-    @classmethod
-    def of(cls, device: Device) -> Surfaces:
-        """Take the surfaces from a device."""
-        gates, stop = device.gates, device.channel_stop
-        gate = (1.0 - SILICON_CONSUMED) * (gates.field_oxide - gates.gate_oxide)
-        gate = max(gate, 0.0)
-        return cls(
-            gate,
-            gate + gates.gate_oxide,
-            gates.field_oxide,
-            stop.width / 2,
-            gates.field_oxide_taper,
-            stop.side_diffusion,
-        )
-
-    def ramp(self, distance: FloatArray, width: float) -> FloatArray:
-        """Rise from 0 in the channel stop to 1 in the channel, against distance from the edge."""
-        beyond = distance - self.stop_half_width
-        if width <= 0:
-            # A node on the edge is in the stop whatever its last digit.
-            return np.where(beyond > 1e-9, 1.0, 0.0)
-        return np.clip(beyond / width, 0.0, 1.0)
-
-    def gate(self, distance: FloatArray) -> FloatArray:
-        """Height of the gate's lower face [um]."""
-        return self.gate_channel * self.ramp(distance, self.taper)
-
-    def silicon(self, distance: FloatArray) -> FloatArray:
-        """Height of the silicon surface [um]."""
-        return self.silicon_stop + (self.silicon_channel - self.silicon_stop) * self.ramp(
-            distance, self.taper
-        )

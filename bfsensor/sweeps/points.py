@@ -12,6 +12,7 @@ import numpy as np
 
 import bfsensor
 from bfsensor.device import silicon
+from bfsensor.device.depletion import check_depleted
 from bfsensor.device.device import Device
 from bfsensor.errors import BFSensorError, SweepError
 from bfsensor.files import written_whole
@@ -205,6 +206,7 @@ def solve_point(point: SweepPoint) -> PointResponse:
 
 def _solve(point: SweepPoint, began: float) -> PointResponse:
     device = Device.from_toml(point.device_text)
+    check_depleted(device)
     well = full_well(device, cells=min(point.cells, 16))
     top = max(point.level + STEP, point.full_pixel)
     if top > well:

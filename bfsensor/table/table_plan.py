@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import bfsensor
+from bfsensor.device.depletion import check_depleted
 from bfsensor.errors import TableError
 from bfsensor.response.periodic_images import PERIOD
 from bfsensor.simulate.boundaries import SPLIT_HEIGHT
@@ -141,6 +142,8 @@ def plan_table(
     ------
     TableError
         Something does not fit; says the limit.
+    DeviceError
+        The back bias does not fully deplete the device.
     """
     if not device.is_mirror_symmetric:
         raise TableError(
@@ -157,6 +160,7 @@ def plan_table(
     if not fitting:
         raise TableError(f"accuracy = {accuracy:g} must be at least {min(ACCURACIES):g}")
     cells = min(fitting)
+    check_depleted(device, depths or ())
     well = full_well(device)
     if charges is None:
         charges = (0.0, *(_round(f * well) for f in CHARGE_FRACTIONS))

@@ -10,8 +10,9 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from bfsensor import Device
+from bfsensor.device.condition import Condition
 from bfsensor.device.quantities import choose_priors, quantities, with_priors
-from bfsensor.errors import FitError
+from bfsensor.errors import DeviceError, FitError
 from bfsensor.fit.degeneracies import find_ties, principal
 from bfsensor.fit.fit import fit_device
 from bfsensor.fit.result import WELL_KNOWN, FitResult
@@ -42,6 +43,15 @@ def test_result_is_written_and_read_back_equal(tmp_path):
     other["value"][0] += 1e-12
     (tmp_path / "other.json").write_text(json.dumps(other))
     assert FitResult.read(tmp_path / "other.json") != result
+
+
+def test_a_device_that_is_not_depleted_where_it_was_measured_is_refused_first():
+    emulator = toy_emulator()
+    data = toy_data(emulator, TRUTH, 12, condition=Condition(back_bias=-5.0))
+    with pytest.raises(
+        DeviceError, match=r"back_bias = '-5 V' does not deplete the silicon"
+    ):
+        fit_device(with_priors(DEVICE, PRIORS), [data], PRIORS, None)
 
 
 def test_fitted_device_has_values_uncertainties_and_origin():

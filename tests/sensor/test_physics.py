@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 
 import galsim
@@ -296,6 +297,27 @@ def test_a_bright_star_never_aborts_unless_asked():
     with pytest.raises(SensorError, match=r"the table of itl_sta3800c ends at 174017 e-"):
         strict.accumulate(photons, image)
     assert np.all(image.array == 7)
+
+
+@pytest.mark.parametrize("depths", [1, 5, 6])
+def test_a_table_that_ends_below_the_light_says_so_once(depths):
+    kept = slice(6 - depths, 6) if depths == 1 else slice(depths)
+    low = dataclasses.replace(
+        ITL, depths=ITL.depths[kept],
+        **{n: getattr(ITL, n)[:, :, kept] for n in ("corners", "horizontal", "vertical")},
+    )  # fmt: skip
+    said = (
+        rf"up to 100 um above the gates; the table of table ends at {low.depths[-1]:g} um"
+    )
+    with pytest.warns(galsim.GalSimWarning, match=said) as caught:
+        instrument = BrighterFatterSensor(table=low)
+    assert [issubclass(w.category, UserWarning) for w in caught] == [True]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        instrument.accumulate(bright_star(2000), galsim.ImageF(21, 21))
+        BrighterFatterSensor(table=ITL, beyond="error")
+    with pytest.raises(SensorError, match="make one with the depth 100 um"):
+        BrighterFatterSensor(table=low, beyond="error")
 
 
 def growth(photons, **options):
