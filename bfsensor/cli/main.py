@@ -17,6 +17,7 @@ from bfsensor.cli.measure import measure
 from bfsensor.cli.spots import spots
 from bfsensor.cli.sweep import sweep
 from bfsensor.cli.table import table
+from bfsensor.cli.warm import warm
 from bfsensor.errors import BFSensorError
 
 
@@ -171,6 +172,7 @@ main.add_command(measure)
 main.add_command(check)
 main.add_command(diagnose)
 main.add_command(fit)
+main.add_command(warm)
 
 
 if __name__ == "__main__":
