@@ -11,6 +11,7 @@ import click
 
 from bfsensor.cli.check import check
 from bfsensor.cli.common import load_device, settings_option
+from bfsensor.cli.device import device
 from bfsensor.cli.diagnose import diagnose
 from bfsensor.cli.fit import fit
 from bfsensor.cli.measure import measure
@@ -64,13 +65,13 @@ def devices(as_json: bool) -> None:
 
     rows = []
     for name in builtin_devices():
-        device = Device.load(name)
-        point = device.operating_point
+        loaded = Device.load(name)
+        point = loaded.operating_point
         rows.append(
             {
                 "name": name,
-                "pitch [um]": device.pixel.pitch_x,
-                "thickness [um]": device.silicon.thickness,
+                "pitch [um]": loaded.pixel.pitch_x,
+                "thickness [um]": loaded.silicon.thickness,
                 "gates low/high [V]": f"{point.gate_low:g}/{point.gate_high:g}",
                 "back bias [V]": point.back_bias,
                 "temperature [K]": point.temperature,
@@ -92,35 +93,6 @@ def _print_table(rows: Sequence[dict[str, Any]]) -> None:
     click.echo("  ".join(n.ljust(w) for n, w in zip(names, widths, strict=True)).rstrip())
     for row in cells:
         click.echo("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip())
-
-
-@main.group()
-def device() -> None:
-    """Make and check device files."""
-
-
-@device.command("import")
-@click.argument("cfg", type=click.Path(path_type=Path))
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), help="Device file [FILE.toml]."
-)
-@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-def import_(cfg: Path, output: Path | None, overwrite: bool) -> None:
-    """Turn a Poisson_CCD or GalSim configuration CFG into a device file.
-
-    \b
-    Example:
-      bfsensor device import lsst_itl_50_8.cfg -o itl.toml
-    """
-    from bfsensor.device.poisson_ccd import import_poisson_ccd
-    from bfsensor.errors import DeviceError
-
-    result = import_poisson_ccd(cfg)
-    target = output or cfg.with_suffix(".toml")
-    if target.exists() and not overwrite:
-        raise DeviceError(f"{target} exists; give --overwrite to replace it")
-    result.write(target)
-    click.echo(f"{target}: {result.name}")
 
 
 @main.command()
@@ -165,6 +137,7 @@ def show(source: str, settings: list[tuple[str, str]], output: Path | None) -> N
         click.echo(str(where))
 
 
+main.add_command(device)
 main.add_command(table)
 main.add_command(sweep)
 main.add_command(spots)
