@@ -13,6 +13,7 @@ from bfsensor.cli.check import check
 from bfsensor.cli.common import load_device, settings_option
 from bfsensor.cli.device import device
 from bfsensor.cli.diagnose import diagnose
+from bfsensor.cli.export import export
 from bfsensor.cli.fit import fit
 from bfsensor.cli.measure import measure
 from bfsensor.cli.spots import spots
@@ -145,6 +146,7 @@ main.add_command(measure)
 main.add_command(check)
 main.add_command(diagnose)
 main.add_command(fit)
+main.add_command(export)
 main.add_command(warm)
 
 
