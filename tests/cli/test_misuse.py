@@ -37,7 +37,7 @@ def test_a_device_file_is_no_table(tmp_path, there):
 
 @pytest.mark.parametrize("name", ["lsst_itl_50_8", STEM, f"{STEM}.cfg", f"{STEM}.dat"])
 def test_a_table_of_galsim_is_for_the_other_sensor(name):
-    with pytest.raises(SensorError, match="of GalSim's: bfsensor.SiliconSensor takes it"):
+    with pytest.raises(SensorError, match=r"of GalSim's: bfsensor\.SiliconSensor takes it"):
         BrighterFatterSensor(name)
 
 
@@ -54,7 +54,9 @@ def test_our_table_is_for_our_sensor(name):
 
 
 def test_names_that_are_nearly_right_are_asked_about():
-    with pytest.raises(SensorError, match=r"; did you mean e2v_ccd250 or .*e2v_ccd250_70\?$"):
+    with pytest.raises(
+        SensorError, match=r"; did you mean e2v_ccd250 or .*e2v_ccd250_70\?$"
+    ):
         BrighterFatterSensor("e2v")
     with pytest.raises(OSError, match=r"; did you mean lsst_e2v_50_32.*\?$"):
         SiliconSensor("lsst_e2v_50_33")
