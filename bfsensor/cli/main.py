@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +12,7 @@ from typing import Any
 import click
 
 from bfsensor.cli.check import check
-from bfsensor.cli.common import load_device, settings_option
+from bfsensor.cli.common import LOG, load_device, settings_option, start_log
 from bfsensor.cli.device import device
 from bfsensor.cli.diagnose import diagnose
 from bfsensor.cli.export import export
@@ -22,6 +24,22 @@ from bfsensor.cli.table import table
 from bfsensor.cli.warm import warm
 from bfsensor.errors import BFSensorError
 
+_EPILOG = """\b
+Results go to stdout and files, messages and progress to stderr: a bar on a terminal, elsewhere
+a line every 30 s at most. Python programs find the messages under logging's name 'bfsensor'.
+
+\b
+Most commands take --json and print the same results for a program to read.
+
+\b
+Status: 0 done, whatever was found; 1 an error, one line on stderr says which; 2 a wrong option or
+argument; 130 interrupted.
+
+\b
+Shell completion: eval "$(_BFSENSOR_COMPLETE=bash_source bfsensor)" in ~/.bashrc; zsh_source for
+zsh in ~/.zshrc; for fish: _BFSENSOR_COMPLETE=fish_source bfsensor | source
+"""
+
 
 class _Commands(click.Group):
     """Turns the package's errors into one line on stderr and exit status 1."""
@@ -30,9 +48,11 @@ class _Commands(click.Group):
         try:
             return super().invoke(ctx)
         except BFSensorError as error:
+            LOG.debug("where it happened:", exc_info=True)
             click.echo(f"bfsensor: {error}", err=True)
             ctx.exit(1)
         except OSError as error:
+            LOG.debug("where it happened:", exc_info=True)
             where = f"{error.filename}: " if error.filename else ""
             click.echo(f"bfsensor: {where}{error.strerror or error}", err=True)
             ctx.exit(1)
@@ -47,10 +67,39 @@ class _Commands(click.Group):
 @click.group(
     cls=_Commands,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog=_EPILOG,
 )
 @click.version_option(package_name="bfsensor")
-def main() -> None:
+@click.option("-v", "--verbose", is_flag=True,
+              help="Say more on stderr: versions, seconds, where an error happened.")  # fmt: skip
+@click.option("-q", "--quiet", is_flag=True, help="Say nothing on stderr but errors.")
+@click.pass_context
+def main(context: click.Context, verbose: bool, quiet: bool) -> None:
     """Device physics of thick CCDs: from a device file to distorted pixel boundaries."""
+    if verbose and quiet:
+        raise click.UsageError("--verbose and --quiet exclude one another")
+    start_log(verbose, quiet)
+    if verbose:
+        began, cpu_began = time.perf_counter(), time.process_time()
+        LOG.debug("%s", _versions())
+        context.call_on_close(
+            lambda: LOG.debug(
+                "%.1f s, of them %.1f s of CPU in this process",
+                time.perf_counter() - began,
+                time.process_time() - cpu_began,
+            )
+        )
+
+
+def _versions() -> str:
+    """Name what results depend on, without importing it."""
+    from importlib.metadata import version
+
+    from bfsensor import __version__
+
+    own = [f"bfsensor {__version__}", f"python {sys.version.split()[0]}"]
+    names = ("numpy", "scipy", "numba", "galsim", "astropy")
+    return ", ".join([*own, *(f"{name} {version(name)}" for name in names)])
 
 
 @main.command()
