@@ -1,1 +1,3 @@
 """Compiled loops on plain arrays; imports numpy and numba only."""
+
+from bfsensor._kernels import notice as _notice  # noqa: F401  the log says when numba compiles

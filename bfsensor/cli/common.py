@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -81,41 +83,71 @@ def load_device(name: str, settings: Sequence[tuple[str, str]]) -> Any:
     return device
 
 
+LOG = logging.getLogger("bfsensor")
+
+
+class _ToStderr(logging.Handler):
+    """Writes messages as the errors of the commands are written."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write one message on today's stderr."""
+        click.echo(f"bfsensor: {self.format(record)}", err=True)
+
+
+def start_log(verbose: bool, quiet: bool) -> None:
+    """Let the package's messages reach stderr: all, those of progress, or errors only."""
+    LOG.setLevel(logging.DEBUG if verbose else logging.ERROR if quiet else logging.INFO)
+    if not any(isinstance(one, _ToStderr) for one in LOG.handlers):
+        LOG.addHandler(_ToStderr())
+
+
+EVERY = 30.0
+"""Seconds between two lines of progress where stderr is no terminal: a log stays readable."""
+
+
 class Bar:
-    """A bar on stderr that the readers may call with what is done and what there is."""
+    """Progress on stderr, called with what is done and what there is.
+
+    A bar on a terminal; elsewhere a line at most each :data:`EVERY` seconds, so that a short
+    command says nothing.  Silent with ``bfsensor -q``.
+    """
 
     def __init__(self, word: str) -> None:
         self._word = word
         self._bar: Any = None
+        self._began = self._said = time.monotonic()
 
     def __call__(self, done: int, of: int) -> None:
         """Move to what is done."""
-        if self._bar is None:
-            self._bar = tqdm(
-                total=of, desc=self._word, leave=False, disable=not sys.stderr.isatty()
-            )
-        self._bar.update(done - self._bar.n)
+        if not LOG.isEnabledFor(logging.INFO):
+            return
+        if sys.stderr.isatty():
+            self._draw(done, of)
+            return
+        now = time.monotonic()
+        if now - self._said >= EVERY:
+            self._said = now
+            LOG.info("%s: %d of %d, %.0f s", self._word, done, of, now - self._began)
+
+    def _draw(self, done: int, of: int) -> None:
+        if self._bar is None:  # not before the request is found good
+            self._bar = tqdm(total=of, desc=self._word, leave=False)
+        self._bar.n = done
+        self._bar.refresh()
         if done >= of:
+            self.close()
+
+    def close(self) -> None:
+        """End the bar's line, before any message."""
+        if self._bar is not None:
             self._bar.close()
 
 
 @contextlib.contextmanager
 def progress_bar(unit: str) -> Iterator[Callable[[int, int], None]]:
-    """Give what draws a bar of finished units on stderr, from its first call on.
-
-    The bar's line ends with the block, before any message.
-    """
-    bar: Any = None
-
-    def progress(done: int, total: int) -> None:
-        nonlocal bar
-        if bar is None:  # not before the request is found good
-            bar = tqdm(total=total, unit=unit, file=sys.stderr)
-        bar.n = done
-        bar.refresh()
-
+    """Give a :class:`Bar` whose line ends with the block."""
+    bar = Bar(unit)
     try:
-        yield progress
+        yield bar
     finally:
-        if bar is not None:
-            bar.close()
+        bar.close()

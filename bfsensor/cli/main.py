@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,14 +12,33 @@ from typing import Any
 import click
 
 from bfsensor.cli.check import check
-from bfsensor.cli.common import load_device, settings_option
+from bfsensor.cli.common import LOG, load_device, settings_option, start_log
+from bfsensor.cli.device import device
 from bfsensor.cli.diagnose import diagnose
+from bfsensor.cli.export import export
 from bfsensor.cli.fit import fit
 from bfsensor.cli.measure import measure
 from bfsensor.cli.spots import spots
 from bfsensor.cli.sweep import sweep
 from bfsensor.cli.table import table
+from bfsensor.cli.warm import warm
 from bfsensor.errors import BFSensorError
+
+_EPILOG = """\b
+Results go to stdout and files, messages and progress to stderr: a bar on a terminal, elsewhere
+a line every 30 s at most. Python programs find the messages under logging's name 'bfsensor'.
+
+\b
+Most commands take --json and print the same results for a program to read.
+
+\b
+Status: 0 done, whatever was found; 1 an error, one line on stderr says which; 2 a wrong option or
+argument; 130 interrupted.
+
+\b
+Shell completion: eval "$(_BFSENSOR_COMPLETE=bash_source bfsensor)" in ~/.bashrc; zsh_source for
+zsh in ~/.zshrc; for fish: _BFSENSOR_COMPLETE=fish_source bfsensor | source
+"""
 
 
 class _Commands(click.Group):
@@ -27,9 +48,11 @@ class _Commands(click.Group):
         try:
             return super().invoke(ctx)
         except BFSensorError as error:
+            LOG.debug("where it happened:", exc_info=True)
             click.echo(f"bfsensor: {error}", err=True)
             ctx.exit(1)
         except OSError as error:
+            LOG.debug("where it happened:", exc_info=True)
             where = f"{error.filename}: " if error.filename else ""
             click.echo(f"bfsensor: {where}{error.strerror or error}", err=True)
             ctx.exit(1)
@@ -44,10 +67,39 @@ class _Commands(click.Group):
 @click.group(
     cls=_Commands,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog=_EPILOG,
 )
 @click.version_option(package_name="bfsensor")
-def main() -> None:
+@click.option("-v", "--verbose", is_flag=True,
+              help="Say more on stderr: versions, seconds, where an error happened.")  # fmt: skip
+@click.option("-q", "--quiet", is_flag=True, help="Say nothing on stderr but errors.")
+@click.pass_context
+def main(context: click.Context, verbose: bool, quiet: bool) -> None:
     """Device physics of thick CCDs: from a device file to distorted pixel boundaries."""
+    if verbose and quiet:
+        raise click.UsageError("--verbose and --quiet exclude one another")
+    start_log(verbose, quiet)
+    if verbose:
+        began, cpu_began = time.perf_counter(), time.process_time()
+        LOG.debug("%s", _versions())
+        context.call_on_close(
+            lambda: LOG.debug(
+                "%.1f s, of them %.1f s of CPU in this process",
+                time.perf_counter() - began,
+                time.process_time() - cpu_began,
+            )
+        )
+
+
+def _versions() -> str:
+    """Name what results depend on, without importing it."""
+    from importlib.metadata import version
+
+    from bfsensor import __version__
+
+    own = [f"bfsensor {__version__}", f"python {sys.version.split()[0]}"]
+    names = ("numpy", "scipy", "numba", "galsim", "astropy")
+    return ", ".join([*own, *(f"{name} {version(name)}" for name in names)])
 
 
 @main.command()
@@ -63,13 +115,13 @@ def devices(as_json: bool) -> None:
 
     rows = []
     for name in builtin_devices():
-        device = Device.load(name)
-        point = device.operating_point
+        loaded = Device.load(name)
+        point = loaded.operating_point
         rows.append(
             {
                 "name": name,
-                "pitch [um]": device.pixel.pitch_x,
-                "thickness [um]": device.silicon.thickness,
+                "pitch [um]": loaded.pixel.pitch_x,
+                "thickness [um]": loaded.silicon.thickness,
                 "gates low/high [V]": f"{point.gate_low:g}/{point.gate_high:g}",
                 "back bias [V]": point.back_bias,
                 "temperature [K]": point.temperature,
@@ -91,35 +143,6 @@ def _print_table(rows: Sequence[dict[str, Any]]) -> None:
     click.echo("  ".join(n.ljust(w) for n, w in zip(names, widths, strict=True)).rstrip())
     for row in cells:
         click.echo("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip())
-
-
-@main.group()
-def device() -> None:
-    """Make and check device files."""
-
-
-@device.command("import")
-@click.argument("cfg", type=click.Path(path_type=Path))
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), help="Device file [FILE.toml]."
-)
-@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-def import_(cfg: Path, output: Path | None, overwrite: bool) -> None:
-    """Turn a Poisson_CCD or GalSim configuration CFG into a device file.
-
-    \b
-    Example:
-      bfsensor device import lsst_itl_50_8.cfg -o itl.toml
-    """
-    from bfsensor.device.poisson_ccd import import_poisson_ccd
-    from bfsensor.errors import DeviceError
-
-    result = import_poisson_ccd(cfg)
-    target = output or cfg.with_suffix(".toml")
-    if target.exists() and not overwrite:
-        raise DeviceError(f"{target} exists; give --overwrite to replace it")
-    result.write(target)
-    click.echo(f"{target}: {result.name}")
 
 
 @main.command()
@@ -164,6 +187,7 @@ def show(source: str, settings: list[tuple[str, str]], output: Path | None) -> N
         click.echo(str(where))
 
 
+main.add_command(device)
 main.add_command(table)
 main.add_command(sweep)
 main.add_command(spots)
@@ -171,6 +195,8 @@ main.add_command(measure)
 main.add_command(check)
 main.add_command(diagnose)
 main.add_command(fit)
+main.add_command(export)
+main.add_command(warm)
 
 
 if __name__ == "__main__":

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from bfsensor.errors import MeasurementError
+from bfsensor.errors import BFSensorError, MeasurementError
 from bfsensor.files import written_whole
 
 if TYPE_CHECKING:
+    from bfsensor.measure.covariance_fit import CovarianceFit
+    from bfsensor.measure.curve import CovarianceCurve
     from bfsensor.measure.flat_pairs import FlatCovariances
     from bfsensor.recording.raw.images import AmplifierImage
 
@@ -27,6 +30,40 @@ _OVERSCAN = click.option(
     "--overscan", default="row median", show_default=True,
     type=click.Choice(["row median", "row mean", "median", "none"]),
     help="Level of the overscan that is subtracted: of each row, or of all.",
+)  # fmt: skip
+_SECTION_ENTRIES = ("name", "hdu", "window", "data", "bias", "detector")
+
+
+def _sections(
+    ctx: click.Context, param: click.Parameter, values: Sequence[str]
+) -> tuple[dict[str, Any], ...]:
+    """Entries of amplifiers, as campaign.yaml has them."""
+    out: list[dict[str, Any]] = []
+    for number, text in enumerate(values):
+        parts = re.findall(r"(\w+)=(\[[^\]]*\]|[^,\[\]]+)(?:,|$)", text)
+        entry: dict[str, Any] = dict(parts)
+        whole = ",".join(f"{key}={value}" for key, value in parts) == text
+        if not whole or set(entry) - set(_SECTION_ENTRIES) or "data" not in entry:
+            raise click.BadParameter(
+                f"{text!r} is not of the form data=[1:512,1:2000],bias=[513:576,1:2000], with "
+                f"data and of {', '.join(_SECTION_ENTRIES)} only"
+            )
+        if "hdu" in entry:
+            if not entry["hdu"].isdecimal():
+                raise click.BadParameter(f"{text!r}: hdu = {entry['hdu']!r} is no number")
+            entry["hdu"] = int(entry["hdu"])
+        out.append({"name": str(number + 1) if len(values) > 1 else "image", **entry})
+    names = [entry["name"] for entry in out]
+    if len(set(names)) < len(names):
+        raise click.BadParameter(f"names of amplifiers {names} must differ")
+    return tuple(out)
+
+
+_SECTIONS = click.option(
+    "--sections", multiple=True, callback=_sections, metavar="KEY=[X1:X2,Y1:Y2],...",
+    help="Where an amplifier's data and overscan lie, as FITS sections, before headers and "
+    "campaign.yaml: data=[1:512,1:2000],bias=[513:576,1:2000]; also name, hdu, window, detector; "
+    "repeat it for each amplifier.",
 )  # fmt: skip
 _OUTPUT = click.option(
     "-o", "--output", type=click.Path(path_type=Path), help="ECSV to write."
@@ -54,6 +91,7 @@ def measure() -> None:
               help="Of the pixels: 'equal', as published, for slopes.")  # fmt: skip
 @_GAIN
 @_OVERSCAN
+@_SECTIONS
 @_OUTPUT
 @_JSON
 def spots(
@@ -64,6 +102,7 @@ def spots(
     weights: str,
     gain: float | None,
     overscan: str,
+    sections: tuple[dict[str, Any], ...],
     output: Path | None,
     as_json: bool,
 ) -> None:
@@ -83,7 +122,7 @@ def spots(
     rows = []
     gains: dict[str, dict[str, None]] = {}
     for path in files:
-        for amplifier in _read(path, gain, overscan):
+        for amplifier in _read(path, gain, overscan, sections):
             if amplifier.unit != "electron":
                 raise MeasurementError(
                     f"{path}: {amplifier.name}: {amplifier.no_gain}, and slopes are against "
@@ -119,7 +158,9 @@ def spots(
     _finish(rows, {**_gains(gains), **_slopes(rows)}, output, as_json)
 
 
-def _read(path: Path, gain: float | None, overscan: str) -> tuple[AmplifierImage, ...]:
+def _read(
+    path: Path, gain: float | None, overscan: str, sections: tuple[dict[str, Any], ...]
+) -> tuple[AmplifierImage, ...]:
     """Read the amplifiers of a file, with what a campaign.yaml beside it says."""
     from bfsensor.recording.campaign.settings import read_settings
     from bfsensor.recording.raw.headers import scan_file
@@ -127,7 +168,9 @@ def _read(path: Path, gain: float | None, overscan: str) -> tuple[AmplifierImage
     from bfsensor.recording.raw.masks import read_masks
 
     settings = read_settings(path.parent)
-    scan = scan_file(path, amplifiers=settings.amplifiers, overrides=settings.overrides)
+    scan = scan_file(
+        path, amplifiers=sections or settings.amplifiers, overrides=settings.overrides
+    )
     return read_images(
         scan, gain=gain, overscan=None if overscan == "none" else overscan,
         masks=read_masks(path.parent, settings.masks, scan.amplifiers),
@@ -176,7 +219,11 @@ def _slopes(rows: list[dict[str, Any]]) -> dict[str, Any]:
               help="Fit a, b, gain and noise [with six pairs or more].")  # fmt: skip
 @_GAIN
 @_OVERSCAN
+@_SECTIONS
 @_OUTPUT
+@click.option("--figure", type=click.Path(path_type=Path), metavar="FILE",
+              help="Draw the photon transfer curve: variance and correlations of neighbours against "
+              "the level, .png or .pdf (needs [plots]).")  # fmt: skip
 @_JSON
 def flats(
     files: Sequence[Path],
@@ -184,15 +231,20 @@ def flats(
     fit: bool | None,
     gain: float | None,
     overscan: str,
+    sections: tuple[dict[str, Any], ...],
     output: Path | None,
+    figure: Path | None,
     as_json: bool,
 ) -> None:
     """Measure the covariances of pairs of flats: files 1 and 2, 3 and 4, ...
 
     \b
-    Example:
-      bfsensor measure flats flat_*.fits --gain 4.8 -o covariances.ecsv
+    Examples:
+      bfsensor measure flats flat_*.fits --gain 4.8 -o covariances.ecsv --figure ptc.png
+      bfsensor measure flats flat_*.fits --sections 'data=[1:512,1:2000],bias=[513:576,1:2000]'
     """
+    from bfsensor.measure.curve import CovarianceCurve
+
     if len(files) % 2:
         raise MeasurementError(f"{len(files)} files do not make pairs")
     pairs: dict[str, list[FlatCovariances]] = {}
@@ -200,7 +252,8 @@ def flats(
     rows = []
     for first, second in zip(files[::2], files[1::2], strict=True):
         one, other = (
-            {a.name: a for a in _read(path, gain, overscan)} for path in (first, second)
+            {a.name: a for a in _read(path, gain, overscan, sections)}
+            for path in (first, second)
         )
         if set(one) != set(other):
             raise MeasurementError(
@@ -217,7 +270,12 @@ def flats(
             pairs.setdefault(name, []).append(pair)
             of = {"first": str(first), "second": str(second), "amplifier": name}
             rows += [{**of, **row} for row in _covariance_rows(pair)]
-    _finish(rows, {**_gains(gains), **_covariances(pairs, fit)}, output, as_json)
+    fits = _fits(pairs, fit)
+    summary = {**_gains(gains), **_covariances(pairs, fits)}
+    if figure is not None:
+        curves = {name: CovarianceCurve.from_pairs(found) for name, found in pairs.items()}
+        summary["figure"] = _draw(curves, fits, figure)
+    _finish(rows, summary, output, as_json)
 
 
 def _measure_pair(one: AmplifierImage, other: AmplifierImage, lags: int) -> FlatCovariances:
@@ -247,13 +305,41 @@ def _covariance_rows(pair: FlatCovariances) -> list[dict[str, Any]]:
     ]  # fmt: skip
 
 
-def _covariances(
+def _fits(
     pairs: Mapping[str, Sequence[FlatCovariances]], fit: bool | None
-) -> dict[str, str]:
-    """Give a line for each pair of each amplifier, and its fit where there are enough."""
+) -> dict[str, CovarianceFit]:
+    """Fit the amplifiers that have enough pairs, or all, or none."""
     from bfsensor.measure.covariance_fit import fit_covariances
     from bfsensor.measure.curve import CovarianceCurve
 
+    return {
+        name: fit_covariances(CovarianceCurve.from_pairs(found))
+        for name, found in pairs.items()
+        if fit or (fit is None and len(found) >= 6)
+    }
+
+
+def _draw(
+    curves: Mapping[str, CovarianceCurve], fits: Mapping[str, CovarianceFit], target: Path
+) -> str:
+    """Draw the photon transfer curve; says where, or why not."""
+    from bfsensor.plots.photon_transfer import figure_for_photon_transfer
+
+    try:
+        drawn = figure_for_photon_transfer(curves, fits)
+        drawn.savefig(target, dpi=120)
+    except (
+        BFSensorError,
+        ValueError,
+    ) as error:  # no matplotlib; an ending it does not know
+        raise MeasurementError(f"{target}: no figure: {error}") from None
+    return str(target)
+
+
+def _covariances(
+    pairs: Mapping[str, Sequence[FlatCovariances]], fits: Mapping[str, CovarianceFit]
+) -> dict[str, str]:
+    """Give a line for each pair of each amplifier, and for its fit."""
     out = {}
     for name, found in pairs.items():
         for measured in sorted(found, key=lambda p: p.level):
@@ -263,8 +349,8 @@ def _covariances(
                 f"{e[0, 1] / c[0, 0]:.5f}, C01/C00 {c[1, 0] / c[0, 0]:.5f} +- "
                 f"{e[1, 0] / c[0, 0]:.5f}"
             )
-        if fit or (fit is None and len(found) >= 6):
-            result = fit_covariances(CovarianceCurve.from_pairs(found))
+        if name in fits:
+            result = fits[name]
             a, da = result.a, result.a_errors
             out[f"{name} fit"] = (
                 f"a00 {a[0, 0]:.3e} +- {da[0, 0]:.1e}, a10 {a[0, 1]:.3e} +- {da[0, 1]:.1e}, a01 "

@@ -44,12 +44,17 @@ def _numbers(
 @click.command()
 @device_options
 @click.option(
-    "--charges", callback=_numbers, metavar="Q,Q,...", help="Source charges [e-]."
+    "--charges",
+    callback=_numbers,
+    metavar="Q,Q,...",
+    help="Source charges [e-] [0 and 3, 15, 35, 55, 75, 90 % of the full well].",
 )
 @click.option("--backgrounds", callback=_numbers, metavar="B,B,...",
-              help="Uniform charges of all other pixels [e-].")  # fmt: skip
+              help="Uniform charges of all other pixels [e-] [0, 25, 50, 80 % of the full "
+              "well].")  # fmt: skip
 @click.option("--depths", callback=_numbers, metavar="Z,Z,...",
-              help="Conversion depths [um above the gates].")  # fmt: skip
+              help="Conversion depths [um above the gates] [the stored charge's height; 2 and 4 um into "
+              "the silicon; 1, 2 and 4 pixel pitches; the thickness].")  # fmt: skip
 @click.option(
     "--vertices", default=32, show_default=True, help="Vertices a side between corners."
 )

@@ -37,7 +37,7 @@ from bfsensor.device.parts import (
     Silicon,
     Well,
 )
-from bfsensor.device.shipped import tables_dir
+from bfsensor.device.shipped import did_you_mean, tables_dir
 from bfsensor.device.written_units import from_internal, to_internal
 from bfsensor.errors import DeviceError
 from bfsensor.files import written_whole
@@ -136,7 +136,7 @@ class Device:
             return cls.from_toml(path)
         raise DeviceError(
             f"{text!r} is neither a built-in device ({', '.join(builtin_devices())}) "
-            "nor a .toml file"
+            f"nor a .toml file{did_you_mean(text, builtin_devices())}"
         )
 
     @classmethod

@@ -7,7 +7,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from bfsensor.device.device import Device
-from bfsensor.device.shipped import tables_dir
+from bfsensor.device.shipped import did_you_mean, tables_dir
 from bfsensor.errors import SensorError, TableError
 from bfsensor.table.table import DistortionTable
 
@@ -15,17 +15,40 @@ from bfsensor.table.table import DistortionTable
 def find_table(name: str) -> tuple[str, int]:
     """Find a built-in table or a file, and when it was changed."""
     folder = tables_dir()
-    if str(name).endswith((".fits", ".fits.gz")) or Path(name).is_file():
-        path = Path(name)
-    else:
+    path = Path(name)
+    others = path.suffix in (".toml", ".cfg", ".dat")
+    if not str(name).endswith((".fits", ".fits.gz")) and (others or not path.is_file()):
         path = folder / str(name) / "table.fits"
         if not path.is_file():
+            _refuse_other_files(str(name))
             known = sorted(p.parent.name for p in folder.glob("*/table.fits"))
             raise SensorError(
                 f"name = {str(name)!r} is neither a built-in table ({', '.join(known)}) nor "
-                "a .fits file"
+                f"a .fits file{did_you_mean(str(name), known)}"
             )
     return str(path.resolve()), path.stat().st_mtime_ns if path.exists() else 0
+
+
+def _refuse_other_files(name: str) -> None:
+    """Say where a device file or a table of GalSim's belongs, given as a table of ours."""
+    if name.endswith(".toml"):
+        raise SensorError(
+            f"{name} is a device file, a sensor needs its distortion table: run `bfsensor table "
+            f"{name}` and give the .fits file that it writes"
+        )
+    stem = name.removesuffix(".cfg").removesuffix(".dat")
+    if Path(f"{stem}.cfg").is_file() or (galsim_folder() / f"{stem}.cfg").is_file():
+        raise SensorError(
+            f"{name} is a table of GalSim's: bfsensor.SiliconSensor takes it, "
+            "BrighterFatterSensor takes tables made by `bfsensor table`"
+        )
+
+
+def galsim_folder() -> Path:
+    """Find the folder of the tables that come with GalSim."""
+    import galsim
+
+    return Path(galsim.meta_data.share_dir) / "sensors"
 
 
 def load_table(path: str, changed: int) -> DistortionTable:

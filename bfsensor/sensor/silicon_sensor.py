@@ -13,11 +13,13 @@ import numpy as np
 from bfsensor._kernels.charge import Response
 from bfsensor._kernels.photons import Medium
 from bfsensor._kernels.shifts import Edges
+from bfsensor.device.shipped import did_you_mean, tables_dir
 from bfsensor.errors import SensorError, TableError
 from bfsensor.sensor.base import EngineSensor, read_numbers
 from bfsensor.sensor.drift_field import MEASURED, STEPS
 from bfsensor.sensor.edge_weights import make_edges, transpose_sides
 from bfsensor.sensor.image_exposure import Physics
+from bfsensor.sensor.options import galsim_folder
 from bfsensor.table.galsim_format import read_sides
 from bfsensor.typing import FloatArray
 
@@ -237,13 +239,24 @@ def check_rings(function: Any, centre: Any) -> None:
 
 def _find(name: str) -> tuple[str, str]:
     """Find the two files of a stem, here or among those of GalSim."""
-    shipped = os.path.join(galsim.meta_data.share_dir, "sensors", name)
+    shipped = str(galsim_folder() / name)
     for stem in (name, shipped):
         if os.path.isfile(stem + ".cfg"):
             if not os.path.isfile(stem + ".dat"):
                 raise OSError(f"cannot find the vertex file {stem}.dat")
             return stem + ".cfg", stem + ".dat"
-    raise OSError(f"cannot find {name}.cfg, here or as {shipped}.cfg")
+    if (
+        name.endswith((".fits", ".fits.gz"))
+        or (tables_dir() / name / "table.fits").is_file()
+    ):
+        raise OSError(
+            f"{name} is a table of bfsensor's: BrighterFatterSensor takes it, SiliconSensor takes "
+            "the stem of GalSim's .cfg and .dat files"
+        )
+    known = sorted(path.stem for path in galsim_folder().glob("*.cfg"))
+    raise OSError(
+        f"cannot find {name}.cfg, here or as {shipped}.cfg{did_you_mean(name, known)}"
+    )
 
 
 def _defaults(config: dict[str, Any], path: str) -> dict[str, Any]:

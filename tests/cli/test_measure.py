@@ -177,3 +177,73 @@ def test_faults_name_file_and_amplifier(tmp_path):
     result = invoke("spots", write(tmp_path / "flat_top.fits", image), "--threshold", 1e4)
     assert result.exit_code == 1 and len(result.output.splitlines()) == 1
     assert "flat_top.fits: AMP1: only" in result.output
+
+
+def test_sections_stand_for_missing_cards(tmp_path):
+    rng = np.random.default_rng(8613)
+    files = [tmp_path / f"{n}.fits" for n in range(2)]
+    for path in files:
+        adu = np.full((80, 140), 1000.0)
+        adu[:, :100] += rng.poisson(4000, (80, 100))
+        adu[:, 100:] += rng.normal(0, 3, (80, 40))
+        fits.PrimaryHDU(adu.round().astype(np.uint16)).writeto(path)
+    result = invoke("flats", *files, "--lags", 1)
+    assert result.exit_code == 1 and "--sections" in result.output
+    whole = "data=[1:100,1:80],bias=[101:140,1:80]"
+    found = json.loads(
+        invoke("flats", *files, "--lags", 1, "--sections", whole, "--json").stdout
+    )
+    # 8000 pixels in each of two flats: the mean is known to 63 / sqrt(16000) = 0.5 ADU.
+    assert {row["amplifier"] for row in found["rows"]} == {"image"}
+    assert found["rows"][0]["level"] == pytest.approx(4000, abs=4)
+    halves = (
+        "name=L,hdu=0,data=[1:50,1:80],bias=[101:140,1:80],detector=[1:50,1:80]",
+        "name=R,data=[51:100,1:80],bias=[101:140,1:80],detector=[51:100,1:80]",
+    )
+    given = [part for text in halves for part in ("--sections", text)]
+    found = json.loads(invoke("flats", *files, "--lags", 1, *given, "--json").stdout)
+    assert {row["amplifier"] for row in found["rows"]} == {"L", "R"}
+    for text, message in (
+        ("bias=[1:2,1:3]", "is not of the form data="),
+        ("data=[1:2,1:3],gian=2", "is not of the form data="),
+        ("data=1:2,1:3", "is not of the form data="),
+        ("data=[1:2,1:3],hdu=a", "hdu = 'a' is no number"),
+    ):
+        result = invoke("flats", *files, "--sections", text)
+        assert result.exit_code == 2 and message in result.output, result.output
+
+
+def test_the_photon_transfer_figure_shows_the_pairs_and_their_fit():
+    from bfsensor.measure.covariance_fit import fit_covariances
+    from bfsensor.measure.curve import measure_curve
+    from bfsensor.plots.photon_transfer import figure_for_photon_transfer
+
+    rng = np.random.default_rng(8614)
+    levels = np.linspace(2e3, 6e4, 7)
+    curve = measure_curve([rng.poisson(mu, (2, 90, 90)) for mu in levels], lags=2)
+    fit = fit_covariances(curve)
+    figure = figure_for_photon_transfer({"A": curve}, {"A": fit})
+    above, below = figure.axes
+    shown = above.containers[0].lines[0].get_xydata()
+    np.testing.assert_allclose(shown[:, 0] * 1e3, curve.levels)
+    np.testing.assert_allclose(shown[:, 1], curve.covariances[:, 0, 0] / curve.levels)
+    line = above.lines[-1].get_xydata()[-1]
+    assert line[1] == pytest.approx(fit.model(curve.levels[-1])[0, 0, 0] / curve.levels[-1])
+    ratios = [one.lines[0].get_ydata() / 100 for one in below.containers]
+    for ratio, (j, i) in zip(ratios, ((0, 1), (1, 0)), strict=True):
+        expected = curve.covariances[:, j, i] / curve.covariances[:, 0, 0]
+        np.testing.assert_allclose(ratio, expected)
+
+
+def test_flats_draw_a_figure(tmp_path):
+    rng = np.random.default_rng(8615)
+    files = [
+        write(tmp_path / f"{n}.fits", rng.poisson(5e3, (60, 60)).astype(float))
+        for n in range(2)
+    ]
+    result = invoke("flats", *files, "--lags", 1, "--figure", tmp_path / "ptc.png")
+    assert result.exit_code == 0, result.output
+    assert f"figure: {tmp_path / 'ptc.png'}" in result.output
+    assert (tmp_path / "ptc.png").read_bytes().startswith(b"\x89PNG")
+    result = invoke("flats", *files, "--lags", 1, "--figure", tmp_path / "ptc.nothing")
+    assert result.exit_code == 1 and "ptc.nothing: no figure: " in result.output

@@ -122,7 +122,7 @@ def read_manifest(
         if name in MEANINGS and table[column].unit is not None
     }
     scales = {
-        name: Override(unit=one.unit, scale=one.scale)
+        name: Override(unit=one.unit, scale=one.scale, values=one.values)
         for name, one in (overrides or {}).items()
         if MEANINGS[name].keywords[0] not in units
     }
@@ -229,7 +229,10 @@ def _read_entry(one: Entry, settings: CampaignSettings) -> None:
         one.said["kind"] = kind_in_name(one.path.name)
         one.kind_from_name = one.said["kind"] is not None
     if one.said["kind"] is None:
-        one.reason = "neither header, manifest nor name says what kind of exposure it is"
+        one.reason = next(
+            (text for text in one.problems if "as a kind of exposure" in text),
+            "neither header, manifest nor name says what kind of exposure it is",
+        )
     elif one.said["kind"] in ("bias", "dark"):
         one.said.update(dict.fromkeys(("wavelength", "filter", "lamp")))
 

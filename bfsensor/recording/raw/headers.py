@@ -17,6 +17,7 @@ from scipy.integrate import trapezoid
 from bfsensor.errors import RecordingError
 from bfsensor.recording.raw.keywords import (
     AMPLIFIER_UNITS,
+    MEANINGS,
     Override,
     amplifier_quantity,
     header_units,
@@ -152,6 +153,14 @@ def _scan(
     if spans and not compressed and size < sum(spans[-1]):
         raise RecordingError(f"is truncated: {size} bytes of {sum(spans[-1])}")
     if not images:
+        cubes = [shape for hdu in hdus if (shape := _cube_shape(hdu.header)) is not None]
+        if cubes:
+            count, ny, nx = cubes[0]
+            raise RecordingError(
+                f"holds a cube of {count} images of {nx} x {ny} pixels: a file is one exposure; "
+                "write each plane as a file of its own with its own header, in Python "
+                "fits.writeto(f'flat_{k:03}.fits', cube[k], header)"
+            )
         raise RecordingError("holds no two-dimensional image")
     # A primary header without an image speaks for all extensions.
     shared = {} if 0 in images else {card: cards.get(card) for card in SHARED_SECTIONS}
@@ -170,10 +179,33 @@ def _scan(
             )
         )  # fmt: skip
         problems.append({word: wrong for word, (_, wrong) in found.items() if wrong})
+    _refuse_several([images[layout.hdu][2] for layout in layouts])
     return FileScan(
         path, cards, units, tuple(layouts), lamp, _digest(path, tuple(spans), whole=False),
         tuple(images[layout.hdu][2] for layout in layouts), tuple(problems), tuple(spans),
     )  # fmt: skip
+
+
+def _cube_shape(header: fits.Header) -> tuple[int, int, int] | None:
+    """Planes, rows and columns of a cube; None for anything else."""
+    z = "Z" if header.get("ZIMAGE") else ""
+    if header.get(f"{z}NAXIS", 0) != 3:
+        return None
+    planes, ny, nx = (int(header[f"{z}NAXIS{axis}"]) for axis in (3, 2, 1))
+    return planes, ny, nx
+
+
+def _refuse_several(images: Sequence[Mapping[str, Any]]) -> None:
+    """Refuse a file whose images are exposures: amplifiers share one kind and time."""
+    for keyword in (*MEANINGS["kind"].keywords, "EXPTIME", "EXPOSURE"):
+        values = {cards[keyword] for cards in images if keyword in cards}
+        if len(values) > 1:
+            words = ", ".join(sorted(map(str, values))[:3])
+            raise RecordingError(
+                f"holds several exposures: {keyword} differs among its {len(images)} images "
+                f"({words}); a file is one exposure, its extensions are amplifiers; write each "
+                "as a file of its own, in Python fits.writeto(name, hdu.data, hdu.header)"
+            )
 
 
 def _image_shape(header: fits.Header) -> tuple[int, int] | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import astropy.units as u
@@ -125,12 +125,15 @@ class Override:
         These numbers are multiplied by it, such as -1 for a sign.
     value : object
         The same for every exposure, whatever headers say; None for what they say.
+    values : tuple of (str, str)
+        Words of headers, in small letters, and the words that they stand for.
     """
 
     keywords: tuple[str, ...] = ()
     unit: str = ""
     scale: float = 1.0
     value: Any = None
+    values: tuple[tuple[str, str], ...] = field(default=(), repr=False)
 
 
 def parse_overrides(where: str, entries: Mapping[str, Any] | None) -> dict[str, Override]:
@@ -142,7 +145,8 @@ def parse_overrides(where: str, entries: Mapping[str, Any] | None) -> dict[str, 
         Named in errors.
     entries : mapping
         By quantity: a keyword, a list of them, or a mapping with ``keyword``, ``unit``,
-        ``scale`` or ``value``.
+        ``scale`` or ``value``; of kind, test and filter, ``values``: a mapping of the words of
+        headers to those that they stand for, ``{offset: bias, flatfield: flat}``.
 
     Returns
     -------
@@ -169,11 +173,11 @@ def parse_overrides(where: str, entries: Mapping[str, Any] | None) -> dict[str, 
         if isinstance(entry, str | list):
             entry = {"keyword": entry}
         if not isinstance(entry, Mapping) or set(entry) - {
-            "keyword", "unit", "scale", "value"
+            "keyword", "unit", "scale", "value", "values"
         }:  # fmt: skip
             raise RecordingError(
                 f"{where}: keywords: {name} = {entry!r} must be a keyword, a list of them, or "
-                "a mapping with keyword, unit, scale, value"
+                "a mapping with keyword, unit, scale, value, values"
             )
         words = entry.get("keyword", ())
         words = (words,) if isinstance(words, str) else tuple(str(w) for w in words)
@@ -191,8 +195,32 @@ def parse_overrides(where: str, entries: Mapping[str, Any] | None) -> dict[str, 
             raise RecordingError(
                 f"{where}: keywords: {name}: scale = {entry['scale']!r} is not a number"
             )
-        out[name] = Override(words, unit, scale, entry.get("value"))
+        values = _word_map(where, name, entry.get("values"))
+        out[name] = Override(words, unit, scale, entry.get("value"), values)
     return out
+
+
+def _word_map(where: str, name: str, given: Any) -> tuple[tuple[str, str], ...]:
+    """Check the ``values`` of a quantity: words of headers to words that are understood."""
+    if given is None:
+        return ()
+    if name not in WORDS or not isinstance(given, Mapping):
+        raise RecordingError(
+            f"{where}: keywords: {name}: values = {given!r} must be a mapping such as "
+            f"{{offset: bias}}, and of {', '.join(WORDS)} only"
+        )
+    for word in given.values() if name == "kind" else ():
+        if str(word).lower() not in KINDS:
+            raise RecordingError(
+                f"{where}: keywords: kind: values: {word!r} is not understood; "
+                f"{_known_kinds()}"
+            )
+    return tuple((str(key).strip().lower(), str(word)) for key, word in given.items())
+
+
+def _known_kinds() -> str:
+    """Name the words for kinds of exposures that are understood."""
+    return f"these are, in any case: {', '.join(KINDS)}"
 
 
 def header_units(header: fits.Header) -> dict[str, str]:
@@ -245,9 +273,10 @@ def translate(
             override = (overrides or {}).get(name) or Override()
             found[name], problem = _look_up(name, (given,), units, override)
             problems += [problem] if problem else []
-    found["kind"], word = _kind_of(found["kind"], found["test"])
-    if word:
-        problems.append(word)
+    said = found["kind"]
+    found["kind"], understood = _kind_of(said, found["test"])
+    if not understood:
+        problems.append(_not_a_kind(str(said), given, (overrides or {}).get("kind")))
     if found["kind"] in ("bias", "dark"):
         found.update(dict.fromkeys(("wavelength", "filter", "lamp")))
     found["mjd"] = _mjd_of(given)
@@ -368,7 +397,8 @@ def _checked(
 ) -> tuple[Any, str]:
     """Convert one value; None, and what is wrong with it, where it cannot be meant."""
     if name in WORDS:
-        return str(value).strip(), ""
+        text = str(value).strip()
+        return dict(override.values).get(text.lower(), text), ""
     if not _is_number(value):
         return None, f"{key} = {value!r} is not a number"
     number = float(value)
@@ -424,17 +454,26 @@ def _convert(number: float, unit: str, wanted: str) -> float:
         return float("nan")
 
 
-def _kind_of(kind: str | None, test: str | None) -> tuple[str | None, str]:
-    """Kind of an exposure and a problem: the test says more than 'flat' or 'object' do."""
+def _kind_of(kind: str | None, test: str | None) -> tuple[str | None, bool]:
+    """Kind of an exposure, and whether it was understood: the test may say more than 'flat'."""
     said = KINDS.get((kind or "").lower())
     more = KINDS.get((test or "").lower())
     if said in (None, "light", "flat") and more in _SAYS_MORE:
-        return more, ""
+        return more, True
     if said == "light" and more in ("flat", "dark", "bias"):
-        return more, ""
-    if kind and said is None:
-        return None, f"kind {kind!r} is not known"
-    return said, ""
+        return more, True
+    return said, said is not None or not kind
+
+
+def _not_a_kind(said: str, given: Mapping[str, Any], override: Override | None) -> str:
+    """Say which word of the header was not understood as a kind, and how to explain it."""
+    keywords = (*(override.keywords if override else ()), *MEANINGS["kind"].keywords)
+    capitals = (keyword.upper() for keyword in keywords)
+    key = next((key for key in capitals if str(given.get(key, "")).strip()), "kind")
+    return (
+        f"{key} = {said!r} is not understood as a kind of exposure; {_known_kinds()}; say which it "
+        f"is in campaign.yaml: keywords: {{kind: {{keyword: {key}, values: {{{said}: flat}}}}}}"
+    )
 
 
 def _mjd_of(given: Mapping[str, Any]) -> float | None:

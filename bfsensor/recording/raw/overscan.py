@@ -104,8 +104,8 @@ def subtract_overscan(
     if box is None:
         what = layout.bias_problem or "no BIASSEC, and no columns after DATASEC"
         raise RecordingError(
-            f"{where}: {what}; name the overscan in campaign.yaml (amplifiers: bias), or choose "
-            "the overscan 'none' to subtract nothing"
+            f"{where}: {what}; name the overscan in campaign.yaml (amplifiers: bias) or by "
+            "`bfsensor measure --sections`, or choose the overscan 'none' to subtract nothing"
         )
     rows, columns = box
     over = np.asarray(values[rows, columns], float)

@@ -206,6 +206,13 @@ def find_reduced(path: str | os.PathLike[str]) -> tuple[Reduced, ...]:
     path = Path(path)
     if path.is_file():
         found = _read_known(path)
+        if found is None and is_fits(path.name):
+            raise RecordingError(
+                f"{path}: one FITS file is no campaign: give its folder, which needs flats of "
+                "equal exposure time in pairs at several levels, and bias frames or an overscan, "
+                "of one sensor, each exposure a file of its own; of reduced recordings FITS "
+                "files hold LSST's photon transfer datasets only"
+            )
         if found is None:
             raise RecordingError(
                 f"{path}: no covariances, a_ij, spots, profile or photon transfer dataset"

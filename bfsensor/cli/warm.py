@@ -1,0 +1,87 @@
+"""``bfsensor warm``: compile kernels ahead of use."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import click
+
+# CPU seconds with an empty cache, on the machine of the notice in bfsensor._kernels.notice:
+# images 33 (32 bits) + 9 (64 bits), areas 8, threads 25, tables 5 of their own and a table of 4.
+_SENSORS, _THREADS, _TABLES = 50, 25, 10
+
+
+@click.command("warm")
+@click.option("--threads", is_flag=True,
+              help=f"Also what sensors use with threads=2 and more, about {_THREADS} s.")  # fmt: skip
+@click.option("--tables", is_flag=True,
+              help=f"Also what 'bfsensor table' uses, about {_TABLES} s.")  # fmt: skip
+def warm(threads: bool, tables: bool) -> None:
+    """Compile the kernels of the sensors now, so that the first image does not wait.
+
+    Kernels are compiled on first use and kept on disk, for this processor and version, in the
+    folder that is printed (numba's NUMBA_CACHE_DIR moves it).  What is there is not compiled
+    again.  Covers images of 32 and 64 bits and pixel areas, with and without tree rings.
+
+    \b
+    Examples:
+      bfsensor warm
+      bfsensor warm --threads --tables
+    """
+    from numba.core import event
+
+    from bfsensor._kernels import shoot
+    from bfsensor._kernels.notice import notice
+
+    seconds = _SENSORS + _THREADS * threads + _TABLES * tables
+    click.echo(
+        f"compiling what is not compiled yet, at most about {seconds} s, once", err=True
+    )
+    notice.given = True  # said just now
+    began = time.perf_counter()
+    with event.install_recorder("numba:compile") as recorder:
+        _use_sensors(threads)
+        if tables:
+            _use_tables()
+    kernels = {
+        one.data["dispatcher"].py_func.__qualname__
+        for _, one in recorder.buffer
+        if one.is_start
+    }
+    took = time.perf_counter() - began
+    done = f"compiled {len(kernels)} kernels" if kernels else "all was compiled before"
+    click.echo(f"{done}, {took:.0f} s; kept in {shoot.shoot.stats.cache_path}")
+
+
+def _use_sensors(threads: bool) -> None:
+    """Draw a few electrons in every way that has kernels of its own."""
+    import galsim
+    import numpy as np
+
+    from bfsensor.sensor.brighter_fatter import BrighterFatterSensor
+
+    rings = galsim.LookupTable([0.0, 100.0], [0.0, 0.01], interpolant="linear")
+    options: list[dict[str, Any]] = [{}, {"treering_func": rings}]
+    options += [{"threads": 2}] if threads else []
+    for kind in (np.float32, np.float64):
+        for given in options:
+            sensor = BrighterFatterSensor(rng=galsim.BaseDeviate(7321), **given)
+            image = galsim.Image(9, 9, dtype=kind)
+            photons = galsim.PhotonArray(10, x=np.full(10, 5.0), y=np.full(10, 5.0), flux=1)
+            sensor.accumulate(photons, image)
+            sensor.accumulate(photons, image, resume=True, recalc=True)
+            sensor.calculate_pixel_areas(image)
+
+
+def _use_tables() -> None:
+    """Solve one coarse level of a table."""
+    from bfsensor.device.device import Device
+    from bfsensor.table.build import build_table
+    from bfsensor.table.table_plan import plan_table
+
+    plan = plan_table(
+        Device.load("itl_sta3800c"), charges=(5e4,), backgrounds=(0.0,), depths=(95.0,),
+        vertices=8, pixels=5, accuracy=0.05,
+    )  # fmt: skip
+    build_table(plan)
