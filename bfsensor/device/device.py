@@ -287,6 +287,11 @@ def _from_text(text: str) -> Device:
 def builtin_devices() -> tuple[str, ...]:
     """Names of the devices that come with the package.
 
+    Returns
+    -------
+    names : tuple of str
+        In alphabetical order, as :meth:`Device.load` takes them.
+
     Examples
     --------
     >>> "itl_sta3800c" in builtin_devices()
