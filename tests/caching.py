@@ -164,14 +164,40 @@ def _file_of(module: str) -> Path | None:
 
 
 def _imports(path: Path) -> list[str]:
-    """Modules that a file names in imports; of ``from a import b`` both ``a`` and ``a.b``."""
+    """Modules that a file names in imports that run; of ``from a import b`` both ``a`` and ``a.b``.
+
+    Packages name the modules of their public names under ``TYPE_CHECKING``: of ``from a import b``
+    such a module counts as well, of the package itself it does not.
+    """
     names: list[str] = []
-    for node in ast.walk(ast.parse(path.read_bytes())):
+    waiting: list[ast.AST] = [ast.parse(path.read_bytes())]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            continue
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            given = {alias.name for alias in node.names}
+            names += [node.module, *(f"{node.module}.{name}" for name in given)]
+            names += [m for name, m in _public_names(node.module).items() if name in given]
+        waiting += ast.iter_child_nodes(node)
     return [name for name in names if name.partition(".")[0] in OURS]
+
+
+def _public_names(package: str) -> dict[str, str]:
+    """Module of each public name that a package imports when it is first used."""
+    path = _file_of(package)
+    if path is None or path.name != "__init__.py":
+        return {}
+    return {
+        alias.name: node.module
+        for block in ast.parse(path.read_bytes()).body
+        if isinstance(block, ast.If)
+        for node in block.body
+        if isinstance(node, ast.ImportFrom) and node.module
+        for alias in node.names
+    }
 
 
 def _digest(parts: Iterable[bytes]) -> str:

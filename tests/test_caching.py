@@ -45,6 +45,21 @@ def test_it_is_made_again_where_code_that_it_uses_changed(checkout):
     assert made(count) == 1
 
 
+def test_public_names_count_as_the_modules_that_they_are_of(checkout):
+    """A package shows all its modules to type checkers, and imports those that are asked for."""
+    (checkout / "__init__.py").write_text(
+        "if TYPE_CHECKING:\n"
+        "    from bfsensor.two import g\n    from bfsensor.three import h\n"
+    )
+    (checkout / "one.py").write_text("from bfsensor import g\n")
+    count = []
+    assert made(count) == 1
+    (checkout / "three.py").write_text("h = 2\n")
+    assert made(count) == 1
+    (checkout / "two.py").write_text("g = 2\n")
+    assert made(count) == 2
+
+
 def test_a_damaged_file_is_made_again_and_no_folder_keeps_nothing(checkout, monkeypatch):
     count = []
     made(count)

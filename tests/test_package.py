@@ -75,6 +75,9 @@ def test_tables_of_a_wheel(tmp_path):
     report = json.loads(python(REPORT, cwd=elsewhere, path=target))
     assert report["version"] == bfsensor.__version__
     assert Path(report["package"]).is_relative_to(target)
+    assert (
+        target / "bfsensor" / "py.typed"
+    ).is_file()  # so that type checkers read its types
     assert Path(report["tables"]).is_relative_to(target)
     assert report["devices"] == report["loaded"] == DEVICES
 

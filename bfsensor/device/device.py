@@ -38,6 +38,12 @@ from bfsensor.device.parts import (
     Well,
 )
 from bfsensor.device.shipped import did_you_mean, tables_dir
+from bfsensor.device.summary import (
+    device_rows,
+    device_title,
+    format_summary,
+    summary_to_html,
+)
 from bfsensor.device.written_units import from_internal, to_internal
 from bfsensor.errors import DeviceError
 from bfsensor.files import written_whole
@@ -91,6 +97,8 @@ class Device:
     >>> device = Device.load("itl_sta3800c").with_value("back_bias", "-60 V")
     >>> device.operating_point.back_bias
     -60.0
+    >>> device
+    <Device itl_sta3800c, 100 um of silicon, back bias -60 V, gates -8/2 V>
     """
 
     name: str
@@ -111,6 +119,20 @@ class Device:
 
     def __reduce__(self) -> tuple[Any, tuple[str]]:
         return _from_text, (self.to_toml(),)
+
+    def __repr__(self) -> str:
+        return f"<Device {device_title(self.name, self.silicon, self.operating_point)}>"
+
+    def __str__(self) -> str:
+        return format_summary(f"Device {self.name}", self._rows())
+
+    def _repr_html_(self) -> str:
+        return summary_to_html(f"Device {self.name}", self._rows())
+
+    def _rows(self) -> list[tuple[str, str]]:
+        parts = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        del parts["name"]
+        return device_rows(**parts)
 
     @property
     def is_mirror_symmetric(self) -> bool:
@@ -286,6 +308,11 @@ def _from_text(text: str) -> Device:
 
 def builtin_devices() -> tuple[str, ...]:
     """Names of the devices that come with the package.
+
+    Returns
+    -------
+    names : tuple of str
+        In alphabetical order, as :meth:`Device.load` takes them.
 
     Examples
     --------

@@ -16,6 +16,16 @@ UNUSED = ("well.spill_barrier",)
 def device_parameters(device: Device) -> dict[str, float]:
     """Quantities of a device whose file states an uncertainty, with it [internal units].
 
+    Parameters
+    ----------
+    device : Device
+        The device.
+
+    Returns
+    -------
+    uncertainties : dict of str to float
+        By dotted name.
+
     Examples
     --------
     >>> device_parameters(Device.load("itl_sta3800c"))["silicon.thickness"]
@@ -31,6 +41,20 @@ def device_parameters(device: Device) -> dict[str, float]:
 def change_parameter(device: Device, key: str, by: float) -> Device:
     """Give a copy with one quantity, also of an implant, changed by so much [internal units].
 
+    Parameters
+    ----------
+    device : Device
+        The device, which stays as it is.
+    key : str
+        Dotted name, as :func:`device_parameters` gives it.
+    by : float
+        What is added to the value [internal unit].
+
+    Returns
+    -------
+    Device
+        Without what was known about the old value.
+
     Raises
     ------
     FitError
@@ -44,6 +68,17 @@ def change_parameter(device: Device, key: str, by: float) -> Device:
 
 def parameter_value(device: Device, key: str) -> float:
     """Give one quantity, also of an implant [internal units].
+
+    Parameters
+    ----------
+    device : Device
+        The device.
+    key : str
+        Dotted name, as :func:`device_parameters` gives it.
+
+    Returns
+    -------
+    value : float
 
     Raises
     ------

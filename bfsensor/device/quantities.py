@@ -148,6 +148,10 @@ def choose_priors(
     more : tuple of str
         Free besides, if the device states an uncertainty.
 
+    Returns
+    -------
+    priors : tuple of Prior
+
     Raises
     ------
     FitError
@@ -232,7 +236,19 @@ def _resolve(name: str, known: dict[str, Quantity]) -> str:
 
 
 def with_priors(device: Device, priors: tuple[Prior, ...]) -> Device:
-    """Give the device with the priors' spreads as its uncertainties."""
+    """Give the device with the priors' spreads as its uncertainties.
+
+    Parameters
+    ----------
+    device : Device
+        The device, which stays as it is.
+    priors : tuple of Prior
+        As :func:`choose_priors` gives them.
+
+    Returns
+    -------
+    Device
+    """
     known = dict(device.provenance)
     for prior in priors:
         if prior.name != DIFFUSION:

@@ -51,6 +51,10 @@ def diagnose(
         Called with (exposures done, exposures in all).
     explain : bool
         Look for what explains a mismatch, beyond where it is.
+
+    Returns
+    -------
+    Diagnosis
     """
     measured = measure_channels(source, progress=progress)
     return diagnose_measured(
@@ -67,7 +71,20 @@ def diagnose_measured(
     notes: Sequence[str] = (),
     explain: bool = True,
 ) -> Diagnosis:
-    """Hold channels that are measured already against a baseline; see :func:`diagnose`."""
+    """Hold channels that are measured already against a baseline; see :func:`diagnose`.
+
+    Parameters
+    ----------
+    measured : MeasuredChannels
+        From :func:`bfsensor.diagnose.measure_channels` or
+        :func:`bfsensor.diagnose.measure_reduced`.
+    baseline, campaign, seed, notes, explain
+        As for :func:`diagnose`.
+
+    Returns
+    -------
+    Diagnosis
+    """
     predictor, fit = fit_bounded(measured, baseline)
     more = _of_free(measured, baseline, fit)
     if explain:

@@ -17,13 +17,13 @@ REACH = 4.0
 
 
 class IlluminationTurbulence(Effect):
-    r"""Light of flats varies from frame to frame, Gaussian, correlated by
-    :math:`\mathrm{rms}^2 e^{-r^2 / 2\,\mathrm{corr}^2}`.
+    r"""Light of flats that varies from frame to frame, correlated over a length.
 
+    It is Gaussian with the correlation :math:`\mathrm{rms}^2 e^{-r^2 / 2\,\mathrm{corr}^2}`.
     Pairs do not take it out: covariances grow with the square of the level, alike at all near
     lags but for what the means of boxes take.  Means of amplifiers scatter.  Maps gain a noise
     of which their own errors know: they are measured on the same pairs.
-    """  # noqa: D205
+    """
 
     word = "illumination_turbulence"
     stage = "light"

@@ -89,6 +89,10 @@ def make_effect(word: str, values: Mapping[str, float], variant: str = "") -> Ef
     values : mapping of str to float
         All parameters.
 
+    Returns
+    -------
+    Effect
+
     Raises
     ------
     EffectError

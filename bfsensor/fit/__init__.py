@@ -1,1 +1,46 @@
-"""Device parameters from measurements."""
+"""Device parameters with errors from measured a_ij, slopes of spots, saturation and widths."""
+
+from typing import TYPE_CHECKING
+
+from bfsensor._lazy import lazy_names
+
+if TYPE_CHECKING:
+    from bfsensor.fit.data import DataSet, area_data, data_set, select
+    from bfsensor.fit.degeneracies import Combination
+    from bfsensor.fit.device_at import fitted_device
+    from bfsensor.fit.fit import fit_device
+    from bfsensor.fit.fit_figures import figure_for_fit
+    from bfsensor.fit.image_charge_fit import ImageChargeFit, fit_image_charge
+    from bfsensor.fit.posterior_draws import CurvedPosterior, sample_posterior
+    from bfsensor.fit.result import FitResult, FittedSet
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "data": ["DataSet", "area_data", "data_set", "select"],
+            "degeneracies": ["Combination"],
+            "device_at": ["fitted_device"],
+            "fit": ["fit_device"],
+            "fit_figures": ["figure_for_fit"],
+            "image_charge_fit": ["ImageChargeFit", "fit_image_charge"],
+            "posterior_draws": ["CurvedPosterior", "sample_posterior"],
+            "result": ["FitResult", "FittedSet"],
+        },
+    )
+
+__all__ = [
+    "Combination",
+    "CurvedPosterior",
+    "DataSet",
+    "FitResult",
+    "FittedSet",
+    "ImageChargeFit",
+    "area_data",
+    "data_set",
+    "figure_for_fit",
+    "fit_device",
+    "fit_image_charge",
+    "fitted_device",
+    "sample_posterior",
+    "select",
+]

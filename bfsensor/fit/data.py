@@ -134,6 +134,10 @@ def area_data(
     fitted, scaled : bool
         As in :class:`DataSet`.
 
+    Returns
+    -------
+    DataSet
+
     Examples
     --------
     >>> a = np.array([[-1e-6, 1e-7], [2e-7, 5e-8]])
@@ -178,6 +182,10 @@ def data_set(
         [name of the file].
     lags, fitted, scaled
         As for :func:`area_data`.
+
+    Returns
+    -------
+    DataSet
     """
     table = measured.table
     called = name or table.path.stem
@@ -197,7 +205,21 @@ def data_set(
 
 
 def select(data: DataSet, keep: Sequence[bool] | NDArray[np.bool_], name: str) -> DataSet:
-    """Give some of the numbers as a data set of their own."""
+    """Give some of the numbers as a data set of their own.
+
+    Parameters
+    ----------
+    data : DataSet
+        The numbers.
+    keep : sequence of bool
+        Of each number, whether it is kept.
+    name : str
+        Of the new data set.
+
+    Returns
+    -------
+    DataSet
+    """
     at = np.flatnonzero(keep)
     return DataSet(
         name, data.kind, data.values[at], data.errors[at],

@@ -75,6 +75,21 @@ def fitted_device(
 
     Uncertainties stand alone in a device file: what of them parameters share is in the result of
     the fit only.
+
+    Parameters
+    ----------
+    device : Device
+        The device that was fitted.
+    priors : sequence of Prior
+        Of the free parameters.
+    values, errors : ndarray
+        Of the same parameters, in their order [internal units].
+    source : str
+        What the device file says of where the values come from.
+
+    Returns
+    -------
+    Device
     """
     out = device_at(device, Condition(), priors, values)
     known = dict(out.provenance)

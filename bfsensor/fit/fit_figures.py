@@ -19,6 +19,15 @@ if TYPE_CHECKING:
 def figure_for_fit(result: FitResult) -> Figure:
     """Draw data before and after with pulls, parameters against priors, profiles.
 
+    Parameters
+    ----------
+    result : FitResult
+        The fit.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
     Raises
     ------
     BFSensorError

@@ -58,6 +58,10 @@ def solve_within(
     low, high : ndarray, shape (p,)
         Ends, infinite where there are none; 0 lies between them.
 
+    Returns
+    -------
+    BoundedSolution
+
     Examples
     --------
     >>> import numpy as np

@@ -132,7 +132,19 @@ def conversion_weights(
 
 
 def area_matrix(kx: FloatArray, ky: FloatArray) -> FloatArray:
-    """Change of the areas per electron [1/e-], from the shifts of right and upper edges."""
+    """Change of the areas per electron [1/e-], from the shifts of right and upper edges.
+
+    Parameters
+    ----------
+    kx, ky : ndarray
+        Shifts of the right and of the upper edge of each pixel per electron, in fractions of the
+        pixel pitch, [row, column].
+
+    Returns
+    -------
+    areas : ndarray
+        Relative change of each pixel's area.
+    """
     return kx - np.roll(kx, 1, -1) + ky - np.roll(ky, 1, -2)
 
 

@@ -1,7 +1,32 @@
-"""Sensors for GalSim: distortion tables applied in photon shooting."""
+"""Sensors for GalSim that apply distortion tables to photons, and flats drawn from areas."""
 
-from bfsensor.sensor.brighter_fatter import BrighterFatterSensor
-from bfsensor.sensor.shift_maps import ShiftMap
-from bfsensor.sensor.silicon_sensor import SiliconSensor
+from typing import TYPE_CHECKING
 
-__all__ = ["BrighterFatterSensor", "ShiftMap", "SiliconSensor"]
+from bfsensor._lazy import lazy_names
+
+if TYPE_CHECKING:
+    from bfsensor.sensor.brighter_fatter import BrighterFatterSensor
+    from bfsensor.sensor.effect_reports import read_effects
+    from bfsensor.sensor.flats import draw_flat, iterate_flat
+    from bfsensor.sensor.shift_maps import ShiftMap
+    from bfsensor.sensor.silicon_sensor import SiliconSensor
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "brighter_fatter": ["BrighterFatterSensor"],
+            "effect_reports": ["read_effects"],
+            "flats": ["draw_flat", "iterate_flat"],
+            "shift_maps": ["ShiftMap"],
+            "silicon_sensor": ["SiliconSensor"],
+        },
+    )
+
+__all__ = [
+    "BrighterFatterSensor",
+    "ShiftMap",
+    "SiliconSensor",
+    "draw_flat",
+    "iterate_flat",
+    "read_effects",
+]

@@ -96,6 +96,11 @@ def iterate_flat(
 ) -> Iterator[galsim.Image]:
     """Draw a flat as :func:`draw_flat` does, giving the image after every step.
 
+    Parameters
+    ----------
+    sensor, shape, level, step, rng, illumination, border, dtype
+        As for :func:`draw_flat`.
+
     Yields
     ------
     galsim.Image

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import resource
+import sys
 from collections.abc import Callable, Collection
 from concurrent.futures import Executor, as_completed
 from pathlib import Path
@@ -241,7 +241,13 @@ def _effort(plan: TablePlan, levels: Collection[Level]) -> dict[str, str]:
 
 
 def peak_memory() -> float:
-    """Largest resident memory of this process and its finished children [GB]."""
+    """Largest resident memory of this process and its finished children [GB], nan on Windows."""
+    if sys.platform == "win32":
+        return float("nan")
+    # Not at the top: Windows has no such module.
+    import resource
+
     own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-    return max(own, children) / 1e6
+    # Linux counts in kB, macOS in bytes.
+    return max(own, children) / (1e9 if sys.platform == "darwin" else 1e6)

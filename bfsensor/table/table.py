@@ -8,6 +8,7 @@ source pixel for levels of all three.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from bfsensor.device.shipped import did_you_mean, tables_dir
 from bfsensor.errors import TableError
 from bfsensor.response.vertices import Displacements, nominal_positions, vertex_fractions
 from bfsensor.table.interpolation import polynomial_weights, spline_weights
@@ -75,8 +77,9 @@ class DistortionTable:
 
     Examples
     --------
-    >>> from bfsensor.device.shipped import tables_dir
-    >>> table = DistortionTable.read(tables_dir() / "itl_sta3800c" / "table.fits")
+    >>> table = DistortionTable.load("itl_sta3800c")
+    >>> table
+    <DistortionTable of itl_sta3800c, 7 charges, 4 backgrounds, 7 depths, 9 x 9 pixels>
     >>> change = table.area_changes(charge=50000.0, depth=95.0)
     >>> bool(change[4, 4] < 0 < change[4, 5] < change[5, 4])
     True
@@ -196,6 +199,67 @@ class DistortionTable:
         return True
 
     __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        named = re.search(r'^name = "(.*)"$', self.device_text, re.MULTILINE)
+        side = 2 * self.reach + 1
+        return (
+            f"<DistortionTable{f' of {named[1]}' if named else ''}, {len(self.charges)} "
+            f"charges, {len(self.backgrounds)} backgrounds, {len(self.depths)} depths, "
+            f"{side} x {side} pixels>"
+        )
+
+    def __str__(self) -> str:
+        from bfsensor.device.summary import format_summary
+
+        return format_summary("DistortionTable", self._rows())
+
+    def _repr_html_(self) -> str:
+        from bfsensor.device.summary import summary_to_html
+
+        return summary_to_html("DistortionTable", self._rows())
+
+    def _rows(self) -> list[tuple[str, str]]:
+        """Say what is in the table, how wrong it may be and how it was made."""
+        side = 2 * self.reach + 1
+        well = "not known" if np.isnan(self.full_well) else f"{self.full_well:,.0f} e-"
+        rows = [
+            ("device", self._device_words()),
+            (
+                "pixels",
+                f"{side} x {side} of {self.pitch[0]:g} x {self.pitch[1]:g} um, "
+                f"{self.vertices} vertices a side"
+                f"{', mirror-symmetric' if self.symmetric else ''}",
+            ),
+            ("charges", ", ".join(f"{q:,.0f}" for q in self.charges) + " e- in the source"),
+            (
+                "backgrounds",
+                ", ".join(f"{b:,.0f}" for b in self.backgrounds) + " e- in all others",
+            ),
+            ("depths", ", ".join(f"{d:.4g}" for d in self.depths) + " um above the gates"),
+            ("full well", well),
+        ]
+        for name, value in self.errors.items():
+            plain, _, unit = name.partition(" [")
+            said = "unknown" if np.isnan(value) else f"{value:.2g} {unit.rstrip(']')}"
+            rows.append((f"error, {plain}", said.rstrip()))
+        made = ", ".join(f"{k} {v}" for k, v in self.provenance.items())
+        return [*rows, ("made by", made)] if made else rows
+
+    def _device_words(self) -> str:
+        """Name the device with its voltages."""
+        # Not at the top: astropy, which reads units, is slow to load.
+        from bfsensor.device.device import Device
+        from bfsensor.device.summary import device_title
+        from bfsensor.errors import DeviceError
+
+        if not self.device_text:
+            return f"not known, {self.thickness:g} um thick"
+        try:
+            device = Device.from_toml(self.device_text)
+        except DeviceError as error:
+            return f"cannot be read: {error}"
+        return device_title(device.name, device.silicon, device.operating_point)
 
     def __reduce__(self) -> tuple[Any, ...]:
         values = {name: getattr(self, name) for name in self.__dataclass_fields__}
@@ -374,6 +438,38 @@ class DistortionTable:
         from bfsensor.table.fits_format import write_table
 
         write_table(self, path, overwrite=overwrite)
+
+    @classmethod
+    def load(cls, name: str) -> DistortionTable:
+        """Read the table that comes with the package for a built-in device.
+
+        Parameters
+        ----------
+        name : str
+            Of the device, such as 'e2v_ccd250'.
+
+        Returns
+        -------
+        DistortionTable
+
+        Raises
+        ------
+        TableError
+            No table of that name; lists all, and the one that was probably meant.
+
+        Examples
+        --------
+        >>> DistortionTable.load("e2v_ccd250").thickness
+        100.0
+        """
+        folder = tables_dir()
+        known = sorted(path.parent.name for path in folder.glob("*/table.fits"))
+        if name not in known:
+            raise TableError(
+                f"{name!r} is not a table of bfsensor ({', '.join(known)})"
+                f"{did_you_mean(str(name), known)}; files are read by DistortionTable.read"
+            )
+        return cls.read(folder / name / "table.fits")
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> DistortionTable:

@@ -272,6 +272,20 @@ def test_devices_tables_and_new_modules_count(checkout):
     assert checkout.changed(begin) == (["bfsensor/new.py"], begin)
 
 
+def test_public_names_count_as_the_modules_that_they_are_of(checkout):
+    names = "from bfsensor.{0} import {1}"
+    shown = "if TYPE_CHECKING:\n    {}\n    {}\nelse:\n    lists = {}\n"
+    both = names.format("far", "g"), names.format("aside", "y")
+    checkout("bfsensor/room/__init__.py", shown.format(*both, 1))
+    checkout("validation/run.py", "from bfsensor.room import g\nx = g('device_a')\n")
+    begin = checkout.commit()
+    checkout("bfsensor/aside.py", "y = 2\n")
+    checkout("bfsensor/room/__init__.py", shown.format(*both, 2))
+    assert checkout.changed(begin) == ([], "")
+    checkout("bfsensor/far.py", FAR.replace("1", "2"))
+    assert checkout.changed(begin) == (["bfsensor/far.py"], begin)
+
+
 def test_of_a_clone_without_the_commit_nothing_is_said(checkout, tmp_path):
     result = Result("a.ecsv", [Run("python -m validation.run", "0123abc")])
     for history in (History(checkout.root), History(tmp_path / "..")):

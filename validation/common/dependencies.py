@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import hashlib
-import importlib
 import re
 import subprocess
 import tomllib
@@ -63,6 +62,8 @@ def _needed(path: str, root: Path) -> tuple[str, ...]:
         return ()
     tree = ast.parse((root / path).read_text())
     found = {f for name in _imports(tree, root) if (f := module_file(name, root))}
+    # Packages of bfsensor only list names, which are imported when they are first used.
+    found = {f for f in found if not re.fullmatch(r"bfsensor/(.*/)?__init__\.py", f)}
     if not path.startswith("bfsensor/"):
         texts = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)}
         for table in (root / "tables").glob("*/table.fits"):
@@ -106,12 +107,23 @@ def _origin(module: str, name: str, root: Path) -> str:
     """Module that a name comes from: a module itself, or where the package takes it from."""
     if module_file(f"{module}.{name}", root):
         return f"{module}.{name}"
-    if module == "bfsensor":
-        # Public names are imported when they are first used; the list of them is no dependency.
-        return str(
-            getattr(getattr(importlib.import_module(module), name), "__module__", module)
-        )
-    return module
+    return _public_names(module, root).get(name, module)
+
+
+@cache
+def _public_names(module: str, root: Path) -> dict[str, str]:
+    """Module of each public name of a package of bfsensor: its imports under ``TYPE_CHECKING``."""
+    file = module_file(module, root) or ""
+    if not re.fullmatch(r"bfsensor/(.*/)?__init__\.py", file):
+        return {}
+    return {
+        alias.name: node.module
+        for block in ast.parse((root / file).read_text()).body
+        if isinstance(block, ast.If)
+        for node in block.body
+        if isinstance(node, ast.ImportFrom) and node.module
+        for alias in node.names
+    }
 
 
 # -- whether code is the same ------------------------------------------------------------------

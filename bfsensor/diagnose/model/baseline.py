@@ -313,6 +313,10 @@ def read_edges(
     card : path-like, optional
         JSON with ``spread_1sigma`` by parameter; without one nothing floats.
 
+    Returns
+    -------
+    Baseline
+
     Raises
     ------
     DiagnosisError

@@ -122,6 +122,10 @@ def find_baseline(
     card : path-like, optional
         Device card with the spread of the parameters, for edge displacements.
 
+    Returns
+    -------
+    Baseline
+
     Raises
     ------
     DiagnosisError
@@ -165,6 +169,10 @@ def simulate_baseline(
         Whether shifts follow the temperature, which recordings at several ask for.
     progress : callable, optional
         Called with (tables made, tables in all).
+
+    Returns
+    -------
+    Baseline
 
     Raises
     ------

@@ -46,6 +46,10 @@ def baseline_of_table(given: str | os.PathLike[str]) -> Baseline:
     given : str or path-like
         File, stem (a path, or the name of one of GalSim's own), or device.
 
+    Returns
+    -------
+    Baseline
+
     Raises
     ------
     DiagnosisError

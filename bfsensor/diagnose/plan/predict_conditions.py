@@ -51,6 +51,10 @@ def read_conditions(texts: Sequence[str]) -> list[Planned]:
     texts : sequence of str
         Texts, or paths of ECSV files with a row for each condition and the same names as columns.
 
+    Returns
+    -------
+    planned : list of Planned
+
     Raises
     ------
     DiagnosisError
@@ -239,6 +243,10 @@ def predict_conditions(
         The accepted model: baseline and effects found.
     planned : sequence of Planned
         From :func:`read_conditions`.
+
+    Returns
+    -------
+    Prediction
 
     Raises
     ------

@@ -97,6 +97,10 @@ def read_settings(folder: Path) -> CampaignSettings:
     folder : Path
         The campaign.
 
+    Returns
+    -------
+    CampaignSettings
+
     Raises
     ------
     RecordingError

@@ -113,6 +113,10 @@ def scan_file(
     overrides : mapping of str to Override, optional
         Keywords that campaign.yaml puts before the table's.
 
+    Returns
+    -------
+    FileScan
+
     Raises
     ------
     RecordingError

@@ -66,6 +66,10 @@ def read_area_changes(
         [1/e-]; by default those of the published ITL and E2V tables as they are kept here.
         A table with the axes the other way is read by exchanging the first two.
 
+    Returns
+    -------
+    AreaChangeTable
+
     Raises
     ------
     RecordingError

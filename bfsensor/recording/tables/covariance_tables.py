@@ -183,6 +183,17 @@ def from_photon_transfer(dataset: PhotonTransferDataset, path: Path) -> Covarian
     Errors are its weights', or where it has none those of white noise, C_00 / sqrt(n) for n
     pixels and sqrt(2) times that at lag (0, 0).
 
+    Parameters
+    ----------
+    dataset : PhotonTransferDataset
+        As its ``read`` gives it.
+    path : Path
+        Its file, which messages and the table name.
+
+    Returns
+    -------
+    CovarianceTable
+
     Raises
     ------
     RecordingError

@@ -119,6 +119,10 @@ def read_measured(path: str | os.PathLike[str]) -> MeasuredTable:
         (:func:`~bfsensor.recording.tables.setting_tables.read_setting_table`).  The header of an ECSV
         file may have an entry ``conditions`` with the keys of :func:`parse_condition`.
 
+    Returns
+    -------
+    MeasuredTable
+
     Raises
     ------
     RecordingError

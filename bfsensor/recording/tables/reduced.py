@@ -112,6 +112,10 @@ def read_spots(path: str | os.PathLike[str]) -> SpotTable:
         With a flux or peak [e-] and sigma_x and sigma_y [pixel] or T [pixel^2]; a column
         NAME_error (or NAME_err, NAME_sigma) is an error.
 
+    Returns
+    -------
+    SpotTable
+
     Raises
     ------
     RecordingError
@@ -154,6 +158,10 @@ def read_profile(path: str | os.PathLike[str], *, unit: str = "") -> RadialProfi
         Numbers in columns, or ECSV with the columns radius, value, error.
     unit : str
         Of the value, such as 'percent'.
+
+    Returns
+    -------
+    RadialProfile
 
     Raises
     ------

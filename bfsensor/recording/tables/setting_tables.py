@@ -99,6 +99,10 @@ def read_setting_table(path: str | os.PathLike[str]) -> SettingTable:
         With the columns of one of :data:`KINDS` and, where known, of :data:`SETTINGS`; slopes
         with ``axis``, 'x' or 'y'.
 
+    Returns
+    -------
+    SettingTable
+
     Raises
     ------
     RecordingError
