@@ -41,7 +41,7 @@ sphinx_gallery_conf = {
 }
 
 
-def write_effects(app: object) -> None:
+def write_effects() -> None:
     """Write the page of effect classes from the library itself."""
     from bfsensor.diagnose.report.class_words import CLASS_WORDS
     from bfsensor.effects.library import LIBRARY
@@ -79,7 +79,7 @@ ROOMS = {
 }  # fmt: skip
 
 
-def write_api(app: object) -> None:
+def write_api() -> None:
     """Write the page of the public names that stand at the top of the package."""
     import bfsensor
 
@@ -100,7 +100,7 @@ def write_api(app: object) -> None:
     Path(__file__).with_name("reference").joinpath("api.md").write_text("\n".join(lines))
 
 
-def write_validation(app: object) -> None:
+def write_validation() -> None:
     """Copy the pages of the claims, whose links to files that are no pages become names."""
     pages = Path(__file__).with_name("validation")
     pages.mkdir(exist_ok=True)
@@ -126,10 +126,12 @@ def link_pages(app: object, name: str, source: list[str]) -> None:
     source[0] = re.sub(r"(?<!!)\[([^]]+)\]\(\.\./\.\./[^)]+\)", r"`\1`", text)
 
 
+# Written before Sphinx looks which pages there are.
+write_api()
+write_effects()
+write_validation()
+
+
 def setup(app: object) -> None:
-    """Pages that the package and its results write."""
-    # Before autosummary reads which names there are.
-    app.connect("builder-inited", write_api, priority=100)  # type: ignore[attr-defined]
-    app.connect("builder-inited", write_effects)  # type: ignore[attr-defined]
-    app.connect("builder-inited", write_validation)  # type: ignore[attr-defined]
+    """Links of the repository become the site's."""
     app.connect("source-read", link_pages)  # type: ignore[attr-defined]

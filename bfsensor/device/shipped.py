@@ -34,7 +34,7 @@ def did_you_mean(given: str, known: Iterable[str]) -> str:
     '; did you mean itl_sta3800c?'
     """
     known = list(known)
-    close = difflib.get_close_matches(given, known, 3)
+    close = difflib.get_close_matches(given.lower(), known, 3)
     # A part of a name, such as 'e2v', is not like the whole by difflib's measure.
     close = close or [name for name in known if given and given.lower() in name]
     return f"; did you mean {' or '.join(close)}?" if close else ""

@@ -239,10 +239,13 @@ class DistortionTable:
             ("depths", ", ".join(f"{d:.4g}" for d in self.depths) + " um above the gates"),
             ("full well", well),
         ]
+        errors = []
         for name, value in self.errors.items():
             plain, _, unit = name.partition(" [")
             said = "unknown" if np.isnan(value) else f"{value:.2g} {unit.rstrip(']')}"
-            rows.append((f"error, {plain}", said.rstrip()))
+            errors.append(f"{plain} {said}".rstrip())
+        if errors:
+            rows.append(("errors", "; ".join(errors)))
         made = ", ".join(f"{k} {v}" for k, v in self.provenance.items())
         return [*rows, ("made by", made)] if made else rows
 

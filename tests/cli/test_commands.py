@@ -150,7 +150,7 @@ def test_show(run, tmp_path, tiny):
         (
             ("table", "sta3800"),
             f"'sta3800' is neither a built-in device ({', '.join(builtin_devices())}) nor "
-            "a .toml file; did you mean 'itl_sta3800c'?",
+            "a .toml file; did you mean itl_sta3800c or itl_sta3800c_60?",
         ),
         (
             (*TINY, "--set", "back_bais=-60V"),

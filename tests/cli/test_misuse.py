@@ -122,7 +122,7 @@ def test_words_for_kinds_are_named_and_mapped(run, tmp_path):
     )
     result = run("check", tmp_path)
     assert result.exit_code == 0, result.output
-    assert "2 exposures (1 bias, 1 flat)" in result.stdout
+    assert "2 exposures (1 flat, 1 bias)" in result.stdout
     for values, message in (
         ("{offset: bais}", "values: 'bais' is not understood"),
         ("[offset]", "values = ['offset'] must be a mapping such as {offset: bias}"),

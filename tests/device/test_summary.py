@@ -64,7 +64,7 @@ def test_a_table_says_its_levels_its_errors_and_how_it_was_made():
         assert f"{charge:,.0f}" in text
     for name, value in table.errors.items():
         plain, _, unit = name.rstrip("]").partition(" [")
-        assert f"error, {plain} {value:.2g} {unit}".rstrip() in text
+        assert f"{plain} {value:.2g} {unit}".rstrip() in text
     unknown = dataclasses.replace(table, device_text="", full_well=float("nan"), errors={})
     text = " ".join(str(unknown).split())
     assert "device not known, 100 um thick" in text and "full well not known" in text
@@ -87,9 +87,9 @@ def test_long_summaries_say_how_much_is_left_out():
     [("e2v", "e2v_ccd250"), ("E2V_CCD25O", "e2v_ccd250"), ("itl_sta3800", "itl_sta3800c")],
 )
 def test_wrong_names_are_answered_with_the_one_that_was_meant(given, meant):
-    with pytest.raises(TableError, match=rf"{given}' is not a table.*mean '{meant}'\?"):
+    with pytest.raises(TableError, match=rf"{given}' is not a table.*mean {meant}"):
         DistortionTable.load(given)
-    with pytest.raises(DeviceError, match=rf"{given}' is neither.*mean '{meant}'\?"):
+    with pytest.raises(DeviceError, match=rf"{given}' is neither.*mean {meant}"):
         Device.load(given)
 
 

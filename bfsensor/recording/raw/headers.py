@@ -157,7 +157,7 @@ def _scan(
     if spans and not compressed and size < sum(spans[-1]):
         raise RecordingError(f"is truncated: {size} bytes of {sum(spans[-1])}")
     if not images:
-        cubes = [shape for hdu in hdus if (shape := _cube_shape(hdu.header)) is not None]
+        cubes = [cube for hdu in hdus if (cube := _cube_shape(hdu.header)) is not None]
         if cubes:
             count, ny, nx = cubes[0]
             raise RecordingError(

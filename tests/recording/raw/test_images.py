@@ -233,7 +233,8 @@ def test_an_image_without_a_gain_says_why(tmp_path, cards, words):
             {"DATASEC": None, "BIASSEC": None},
             {},
             "no BIASSEC, and no columns after DATASEC; name the overscan in campaign.yaml "
-            "(amplifiers: bias), or choose the overscan 'none' to subtract nothing",
+            "(amplifiers: bias) or by `bfsensor measure --sections`, or choose the overscan "
+            "'none' to subtract nothing",
         ),
         (
             {"DATASEC": "[4:63,1:51]"},
@@ -264,7 +265,7 @@ def test_refusals_without_a_frame(tmp_path):
     with pytest.raises(RecordingError, match=r"text\.fits: cannot be read"):
         read_raw(tmp_path / "text.fits")
     fits.PrimaryHDU(np.zeros((2, 3, 4))).writeto(tmp_path / "cube.fits")
-    with pytest.raises(RecordingError, match="holds no two-dimensional image"):
+    with pytest.raises(RecordingError, match="holds a cube of 2 images of 4 x 3 pixels"):
         read_raw(tmp_path / "cube.fits")
     path = write_frame(tmp_path / "a.fits", [raw_frame(67)])
     with pytest.raises(RecordingError, match=r"a\.fits: A: no image in HDU 3; there are 0"):
