@@ -24,9 +24,8 @@ SURE = 5.0
 """Deviation [sigma] from which a column counts as hot."""
 
 SOURCE = (
-    "Widenhorn et al. 2002, Proc. SPIE 4669, 193 (diffusion and depletion dark current, the latter "
-    "differs by pixel; from memory), Widenhorn et al. 2010, J. Appl. Phys. 107 (222 to 291 K); "
-    "ranges assumed"
+    "Widenhorn et al. 2002, Proc. SPIE 4669, 193; Widenhorn et al. 2010, J. Appl. Phys. 107 "
+    "(222 to 291 K); ranges assumed"
 )
 
 

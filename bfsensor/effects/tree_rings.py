@@ -28,8 +28,8 @@ class _Rings(Effect):
     from_sightings = True
     bends = True
     source = (
-        "Plazas, Bernstein & Sheldon 2014, PASP 126, 750 (DECam: rings in flats and in positions "
-        "of stars, from memory); Baumer, Davis & Roodman 2017, PASP 129, 084502; range assumed"
+        "Plazas, Bernstein & Sheldon 2014, PASP 126, 750 (DECam); Baumer, Davis & Roodman 2017, "
+        "PASP 129, 084502; range assumed"
     )
     standing = True
 
