@@ -225,7 +225,7 @@ def _front_potential(device: Device, low: float) -> float:
     material, doping = device.material, device.silicon.background_doping
     silicon = material.permittivity_silicon * VACUUM_PERMITTIVITY
     oxide = material.permittivity_oxide * VACUUM_PERMITTIVITY
-    columns = _Columns.of(device)
+    columns = _PixelColumns.of(device)
     below = np.maximum(low - columns.surface, 0.0)
     held = device.silicon.thickness - columns.surface if doping <= 0 else below
     point = device.operating_point
@@ -251,7 +251,7 @@ def _front_potential(device: Device, low: float) -> float:
 
 
 @dataclass(frozen=True)
-class _Columns:
+class _PixelColumns:
     """Columns of a pixel, arrays ``[y, x]``: gate voltage, oxide, silicon surface, dose, moment."""
 
     gate: FloatArray
@@ -261,7 +261,7 @@ class _Columns:
     moment: FloatArray
 
     @classmethod
-    def of(cls, device: Device) -> _Columns:
+    def of(cls, device: Device) -> _PixelColumns:
         """Cut a pixel into columns, its stop at x = 0."""
         surfaces, stop, pixel = Surfaces.of(device), device.channel_stop, device.pixel
         middles = (np.arange(_COLUMNS) + 0.5) / _COLUMNS
