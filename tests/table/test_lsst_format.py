@@ -176,7 +176,12 @@ def test_exchanged_axes_are_noticed(tmp_path):
         # [i][j]: of the upper edges those further up lie along the second axis.
         np.testing.assert_array_equal(flat, side.T)
         assert not np.allclose(flat, side, rtol=0.05, atol=0)
-        band = np.array(raw[f"{name}_BY_FILTER"][0]).reshape(1, 8, 8)
+        band = np.array(raw[f"{name}_BY_FILTER"][0])
+        assert band.shape == (
+            1,
+            8,
+            8,
+        )  # as LSST's reader wants it, which takes a row a filter
         np.testing.assert_array_equal(band[0], side.T)
     flat = np.array(raw["A_MATRIX"][0]).reshape(8, 8)
     assert flat[0, 1] == shifts.areas[1, 0] > flat[1, 0] == shifts.areas[0, 1]

@@ -150,10 +150,13 @@ class CalibrationTable:
         """Put columns back as the pipelines have them."""
         table = Table()
         for name, array in self.columns.items():
-            flat = array
+            held = array
             if name in self.MATRICES and array.size:
-                flat = array.swapaxes(-1, -2).reshape(len(array), -1)
-            table[name] = flat
+                held = array.swapaxes(-1, -2)
+                # The pipelines keep the filters' matrices as they are and flatten all others.
+                if self.MATRICES[name][0] != "filters":
+                    held = held.reshape(len(array), -1)
+            table[name] = held
             if name in self.UNITS:
                 table[name].unit = self.UNITS[name]
         table.meta = dict(self.meta)

@@ -230,6 +230,9 @@ def test_distortion_matrix(tmp_path, filters):
     for ending in ("fits", "ecsv"):
         found.write(tmp_path / f"again.{ending}")
         assert DistortionMatrix.read(tmp_path / f"again.{ending}") == found
+        written = Table.read(tmp_path / f"again.{ending}")
+        for name in set(table.colnames) & set(DistortionMatrix.MATRICES):
+            np.testing.assert_array_equal(written[name], table[name])
 
 
 def broken(tmp_path, change):
