@@ -28,9 +28,18 @@ exclude_patterns = [
 myst_heading_anchors = 3
 numpydoc_show_class_members = False
 autosummary_generate = True
+toc_object_entries_show_parents = "hide"
+autodoc_typehints = "none"  # the parameters' types stand in their table
+templates_path = ["_templates"]
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 html_theme = "pydata_sphinx_theme"
 html_title = "bfsensor"
-html_theme_options = {"show_prev_next": False, "secondary_sidebar_items": ["page-toc"]}
+html_theme_options = {
+    "show_prev_next": False,
+    "secondary_sidebar_items": ["page-toc"],
+    "header_links_before_dropdown": 6,
+}
 sphinx_gallery_conf = {
     "examples_dirs": "examples",
     "gallery_dirs": "gallery",
@@ -39,6 +48,25 @@ sphinx_gallery_conf = {
     "min_reported_time": 1e9,
     "show_memory": False,
 }
+
+
+def own_methods(module: str, name: str) -> list[str]:
+    """Public methods of a class that this package defines: not those of GalSim or of tuples."""
+    import bfsensor
+
+    kind = getattr(sys.modules[module], name, None) or getattr(bfsensor, name)
+    return sorted(
+        word
+        for word, member in inspect.getmembers(kind, callable)
+        if not word.startswith("_")
+        and getattr(member, "__module__", "").startswith("bfsensor")
+        and inspect.getdoc(member)
+        and not inspect.isclass(member)
+    )
+
+
+autosummary_context = {"own_methods": own_methods}
+suppress_warnings = ["config.cache"]  # of that function, which cannot be pickled
 
 
 def write_effects() -> None:

@@ -1,4 +1,4 @@
-"""Draw the wide picture of README.md: ``python docs/overview.py``, from a checkout."""
+"""Draw the pictures of README.md and of the Start pages: ``python docs/overview.py``."""
 
 from pathlib import Path
 
@@ -112,7 +112,7 @@ def draw_diagnosis(ax: Axes) -> None:
 
 
 def main() -> None:
-    """Write docs/figures/overview.png."""
+    """Write docs/figures/overview.png, and each of its parts by its name."""
     mpl.rcParams.update(
         {
             "font.size": 11,
@@ -122,10 +122,18 @@ def main() -> None:
         }
     )
     figure, axes = plt.subplots(1, 3, figsize=(15, 4.6), constrained_layout=True)
-    draw_boundaries(axes[0])
-    draw_growth(axes[1])
-    draw_diagnosis(axes[2])
-    figure.savefig(Path(__file__).parent / "figures" / "overview.png", dpi=110)
+    folder = Path(__file__).parent / "figures"
+    parts = {
+        "boundaries": draw_boundaries,
+        "growth": draw_growth,
+        "diagnosis": draw_diagnosis,
+    }
+    for (name, draw), ax in zip(parts.items(), axes, strict=True):
+        draw(ax)
+        alone, panel = plt.subplots(figsize=(6, 4.6), constrained_layout=True)
+        draw(panel)
+        alone.savefig(folder / f"{name}.png", dpi=110)
+    figure.savefig(folder / "overview.png", dpi=110)
 
 
 if __name__ == "__main__":

@@ -9,19 +9,32 @@ import tempfile
 from pathlib import Path
 
 import galsim
+import matplotlib.pyplot as plt
 
-from bfsensor import DistortionTable
-from bfsensor.device.shipped import tables_dir
-from bfsensor.table.galsim_format import write_galsim
+from bfsensor import DistortionTable, write_galsim
 
-table = DistortionTable.read(tables_dir() / "itl_sta3800c" / "table.fits")
+table = DistortionTable.load("itl_sta3800c")
 stem = Path(tempfile.mkdtemp()) / "itl"
 write_galsim(table, stem, charge=80e3, depth=95.0)
-sensor = galsim.SiliconSensor(name=str(stem))
-image = galsim.Gaussian(sigma=0.3, flux=1e5).drawImage(
-    nx=21, ny=21, scale=0.2, method="phot", sensor=sensor, rng=galsim.BaseDeviate(5)
-)
 
 # %%
-# All but photons that fall beside the stamp are collected.
-assert 0.99 < image.array.sum() / 1e5 < 1.01
+# The same photons with the effect and (almost) without it: the core loses what its neighbours gain.
+star = galsim.Gaussian(sigma=0.3, flux=1e6)
+images = [
+    star.drawImage(
+        nx=15, ny=15, scale=0.2, method="phot", rng=galsim.BaseDeviate(5),
+        sensor=galsim.SiliconSensor(name=str(stem), strength=strength),
+    ).array
+    for strength in (1.0, 1e-6)  # GalSim divides by it: not 0
+]  # fmt: skip
+change = images[0] - images[1]
+plt.imshow(change, origin="lower", cmap="RdBu_r", vmin=-900, vmax=900)
+plt.xlabel("x [pixel]")
+plt.ylabel("y [pixel]")
+plt.colorbar(label="electrons gained by the brighter-fatter effect")
+
+# %%
+# The width grows; nothing is lost in the middle of the image.
+widths = [galsim.hsm.FindAdaptiveMom(galsim.Image(i)).moments_sigma for i in images]
+assert 1.005 < widths[0] / widths[1] < 1.03
+assert abs(change.sum()) < 1e-3 * images[0].sum()
