@@ -93,7 +93,7 @@ def test_flats_give_covariances(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["flats", "{0}"], "1 files do not make pairs"),
+        (["flats", "{0}"], "1 files are no pairs"),
         (["spots", "{0}", "--threshold", "1e9"], "no spot above 1e+09"),
         (["flats", "{1}", "{1}"], "text.fits"),
     ],

@@ -1,4 +1,4 @@
-"""What was given in the wrong place: each message says where it belongs."""
+"""Inputs given to the wrong function or command: each error names the right one."""
 
 from __future__ import annotations
 
