@@ -41,8 +41,8 @@ class AmpCrosstalk(Effect):
         return [f + c * (total - f) for f in frames]
 
     def amp_cross(self, axes: Axes, layout: Layout) -> FloatArray:
-        # The channel is a ratio of ADU: c, in electrons, times the gain of the aggressor over that of
-        # the victim in ADU/e-.
+        # The channel is a ratio of ADU, victim over aggressor, while c is a ratio of electrons: the
+        # gains [e-/ADU] enter the other way up.
         gains = np.asarray(layout.gains if layout.gains else np.ones(len(layout.segments)))
         ratio = gains[axes["amp"].astype(int)] / gains[axes["other"].astype(int)]
         return np.where(axes["what"] == "crosstalk", self["c"] * ratio, 0.0)

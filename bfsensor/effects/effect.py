@@ -288,6 +288,12 @@ class Effect:
 
     A subclass overrides only the methods of what it changes; the others change nothing.
 
+    Arguments have the same meaning in all methods: ``shot`` is the exposure with its conditions,
+    ``layout`` the sensor and campaign, ``axes`` the axes of a channel by name (arrays of one entry
+    for each value), ``amp`` the number of an amplifier, ``rng`` the source of random numbers.
+    Images are in electrons and are not changed in place; a method that changes nothing returns its
+    input.
+
     Parameters
     ----------
     values : mapping of str to float

@@ -33,18 +33,17 @@ def test_new_is_the_other_device_under_its_own_name(run, tmp_path):
     assert run("device", "new", "b.toml", "--from", "my_ccd.toml").exit_code == 0
     assert Device.load(tmp_path / "b.toml").name == "b"
     result = run("device", "new", "b.toml", "--from", "my_ccd.toml")
-    assert (result.exit_code, result.stderr) == (
-        1, "bfsensor: b.toml exists; give --overwrite to replace it\n",
-    )  # fmt: skip
+    assert result.exit_code == 1
+    assert "b.toml" in result.stderr and "--overwrite" in result.stderr
 
 
 def test_new_refuses_what_is_no_device_file(run, tmp_path):
     result = run("device", "new", "my_ccd", "--from", "e2v_ccd250")
     assert result.exit_code == 1
-    assert result.stderr == "bfsensor: my_ccd: the name of a device file ends in .toml\n"
+    assert result.stderr.startswith("bfsensor: my_ccd: ") and ".toml" in result.stderr
     result = run("device", "new", "my_ccd.toml", "--from", "e2v_ccd25")
     assert result.exit_code == 1
-    assert "did you mean e2v_ccd250" in result.stderr
+    assert "'e2v_ccd25'" in result.stderr and "e2v_ccd250" in result.stderr
     assert list(tmp_path.iterdir()) == []
     assert run("device", "new", "my_ccd.toml").exit_code == 2
 
