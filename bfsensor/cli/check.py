@@ -1,4 +1,4 @@
-"""``bfsensor check``: what a folder of recordings holds, and what it leaves open."""
+"""``bfsensor check``: list the exposures in a folder, and the questions they cannot answer."""
 
 from __future__ import annotations
 
@@ -11,17 +11,19 @@ import click
 from bfsensor.cli.common import Bar
 
 
-@click.command("check")
+@click.command("check", short_help="List the exposures in a folder.")
 @click.argument("campaign", type=click.Path(path_type=Path))
 @click.option("--headers", is_flag=True,
-              help="Headers only: fast, but blind to saturation, gain and NaN.")  # fmt: skip
+              help="Read headers only: faster, but saturated pixels, NaN and wrong gains "
+              "go unnoticed.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON for a program to read.")
 def check(campaign: Path, headers: bool, as_json: bool) -> None:
-    """Say what CAMPAIGN, a folder of recordings, holds, and which questions it leaves open.
+    """List the exposures in the folder CAMPAIGN, and the questions they cannot answer.
 
-    Prints kinds, settings, levels and pairs; the files set aside, each with its reason;
-    warnings; and what is missing for which question.  Nothing is written.  The status is 0
-    when the folder could be read, whatever was found in it.
+    Prints the kinds of exposures with settings, levels [ADU] and flat pairs; the files that are
+    not used, each with the reason; warnings; and for each open question the exposures to take.
+    CAMPAIGN may also be a table of reduced recordings.  Nothing is written.  The exit status is
+    0 if the folder could be read, whatever was found in it.
 
     \b
     Examples:
@@ -79,7 +81,7 @@ def _has_images(campaign: Path) -> bool:
 
 
 def _conditions(found: Any, levels: dict[int, dict[str, float]]) -> list[dict[str, Any]]:
-    """A row for each kind and setting."""
+    """List a row for each kind of exposure and each setting."""
     rows = []
     for kind in found.kinds():
         for condition, members in found.conditions(kind).items():
@@ -113,7 +115,7 @@ def _amplifier(one: Any) -> dict[str, Any]:
 
 
 def _print(report: dict[str, Any]) -> None:
-    """Print the report as a short table."""
+    """Print the report as text, a line for each setting, file and question."""
     from bfsensor.recording.campaign.exposures import count_of
 
     count = sum(report["kinds"].values())
@@ -157,7 +159,7 @@ def _print(report: dict[str, Any]) -> None:
         for line in lines:
             click.echo(f"  {line}")
     if not report["pixels_read"]:
-        click.echo("pixels were not looked at: --headers")
+        click.echo("pixels were not read: --headers")
 
 
 def _closing(one: dict[str, Any]) -> str:
@@ -165,7 +167,7 @@ def _closing(one: dict[str, Any]) -> str:
 
 
 def _grouped(amplifiers: list[dict[str, Any]]) -> list[str]:
-    """A line for the amplifiers of one size."""
+    """Give one line for all amplifiers of equal size."""
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for one in amplifiers:
         key = (
@@ -196,7 +198,7 @@ def _reduced(one: Any) -> dict[str, Any]:
 
 
 def _print_reduced(reduced: Any, as_json: bool) -> None:
-    """Print what a folder or file of reduced recordings holds."""
+    """Print the contents of a folder or file of reduced recordings."""
     rows = [_reduced(one) for one in reduced]
     if as_json:
         click.echo(json.dumps({"reduced": rows}, indent=1))

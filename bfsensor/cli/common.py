@@ -1,4 +1,4 @@
-"""What several commands share."""
+"""Options, checks, messages and progress bars that several commands share."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 def parse_settings(
     ctx: click.Context, param: click.Parameter, values: Sequence[str]
 ) -> list[tuple[str, str]]:
-    """Split ``KEY=VALUE`` options."""
+    """Split options of the form ``KEY=VALUE`` into pairs; refuse any other form."""
     out = []
     for value in values:
         key, sign, text = value.partition("=")
@@ -35,11 +35,11 @@ def parse_settings(
 
 settings_option = click.option(
     "--set", "settings", multiple=True, callback=parse_settings, metavar="KEY=VALUE",
-    help="Change a value of the device, such as back_bias=-60V; repeatable.",
+    help="Change one quantity of the device, with its unit: --set back_bias=-60V. Repeatable.",
 )  # fmt: skip
 
 overwrite_option = click.option(
-    "--overwrite", is_flag=True, help="Replace an existing output."
+    "--overwrite", is_flag=True, help="Replace the output file if it exists."
 )
 
 summary_option = click.option(
@@ -48,24 +48,26 @@ summary_option = click.option(
 
 
 def device_options(command: Command) -> Command:
-    """Take a DEVICE, and values of it that are changed."""
+    """Add the argument DEVICE and the option --set to a command."""
     return click.argument("device")(settings_option(command))
 
 
 def executor_options(command: Command) -> Command:
-    """Take where independent points are worked on, and by how many processes."""
+    """Add the options --workers and --executor to a command with independent points."""
     workers = click.option("--workers", default=2, show_default=True,
-                           type=click.IntRange(min=1), help="Processes.")  # fmt: skip
+                           type=click.IntRange(min=1),
+                           help="Processes that work at the same time.")  # fmt: skip
     executor = click.option("--executor", default="process", show_default=True,
                             type=click.Choice(["process", "dask", "parsl"]),
-                            help="Where they run.")  # fmt: skip
+                            help="Library that runs the processes on this machine; dask "
+                            "and parsl must be installed.")  # fmt: skip
     return workers(executor(command))
 
 
 def check_targets(
     paths: Sequence[Path], overwrite: bool, error: type[BFSensorError]
 ) -> None:
-    """Refuse files that exist or have no folder, before any work."""
+    """Refuse outputs that exist, unless overwritten, or whose folder does not; before any work."""
     for path in paths:
         if path.exists() and not overwrite:
             raise error(f"{path} exists; give --overwrite to replace it")
@@ -74,7 +76,7 @@ def check_targets(
 
 
 def load_device(name: str, settings: Sequence[tuple[str, str]]) -> Any:
-    """Load a device and change its values."""
+    """Load a device by name or path, with the quantities of ``--set`` changed."""
     from bfsensor.device.device import Device
 
     device = Device.load(name)
@@ -87,29 +89,31 @@ LOG = logging.getLogger("bfsensor")
 
 
 class _ToStderr(logging.Handler):
-    """Writes messages as the errors of the commands are written."""
+    """Log handler that prints a message like the commands' errors: ``bfsensor: ...`` on stderr."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write one message on today's stderr."""
+        """Write one message on the present stderr, which tests replace."""
         click.echo(f"bfsensor: {self.format(record)}", err=True)
 
 
 def start_log(verbose: bool, quiet: bool) -> None:
-    """Let the package's messages reach stderr: all, those of progress, or errors only."""
+    """Send the package's messages to stderr: all (verbose), progress, or only errors (quiet)."""
     LOG.setLevel(logging.DEBUG if verbose else logging.ERROR if quiet else logging.INFO)
     if not any(isinstance(one, _ToStderr) for one in LOG.handlers):
         LOG.addHandler(_ToStderr())
 
 
 EVERY = 30.0
-"""Seconds between two lines of progress where stderr is no terminal: a log stays readable."""
+"""Shortest time between two lines of progress where stderr is no terminal [s].
+
+Chosen: twice as large, the log of an hour's run has 60 lines of progress instead of 120."""
 
 
 class Bar:
-    """Progress on stderr, called with what is done and what there is.
+    """Progress on stderr, called with the number of finished items and of all items.
 
-    A bar on a terminal; elsewhere a line at most each :data:`EVERY` seconds, so that a short
-    command says nothing.  Silent with ``bfsensor -q``.
+    A bar on a terminal; elsewhere a line every :data:`EVERY` seconds at most, so that a command
+    that ends sooner prints none.  Silent with ``bfsensor -q``.
     """
 
     def __init__(self, word: str) -> None:
@@ -118,7 +122,7 @@ class Bar:
         self._began = self._said = time.monotonic()
 
     def __call__(self, done: int, of: int) -> None:
-        """Move to what is done."""
+        """Show that ``done`` of ``of`` items are finished."""
         if not LOG.isEnabledFor(logging.INFO):
             return
         if sys.stderr.isatty():
@@ -130,7 +134,7 @@ class Bar:
             LOG.info("%s: %d of %d, %.0f s", self._word, done, of, now - self._began)
 
     def _draw(self, done: int, of: int) -> None:
-        if self._bar is None:  # not before the request is found good
+        if self._bar is None:  # only now: a refused request shows no empty bar
             self._bar = tqdm(total=of, desc=self._word, leave=False)
         self._bar.n = done
         self._bar.refresh()
@@ -138,14 +142,14 @@ class Bar:
             self.close()
 
     def close(self) -> None:
-        """End the bar's line, before any message."""
+        """Remove the bar, so that the next message begins on a line of its own."""
         if self._bar is not None:
             self._bar.close()
 
 
 @contextlib.contextmanager
 def progress_bar(unit: str) -> Iterator[Callable[[int, int], None]]:
-    """Give a :class:`Bar` whose line ends with the block."""
+    """Yield a :class:`Bar` that is closed at the end of the block."""
     bar = Bar(unit)
     try:
         yield bar

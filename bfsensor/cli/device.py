@@ -1,11 +1,11 @@
-"""``bfsensor device``: make, look at and check device files."""
+"""``bfsensor device``: make, print and check device files."""
 
 from __future__ import annotations
 
 import json
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,17 +20,24 @@ if TYPE_CHECKING:
 
 @click.group()
 def device() -> None:
-    """Make, look at and check device files."""
+    """Make, print and check device files.
+
+    A device file (.toml) states the geometry, doping and voltages of a sensor, with units.
+
+    \b
+    Example:
+      bfsensor device new my_ccd.toml --from e2v_ccd250
+      bfsensor device check my_ccd.toml
+    """
 
 
-@device.command("import")
+@device.command("import", short_help="Convert a Poisson_CCD configuration.")
 @click.argument("cfg", type=click.Path(path_type=Path))
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), help="Device file [FILE.toml]."
-)
-@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
+@click.option("-o", "--output", type=click.Path(path_type=Path),
+              help="Device file to write.  [default: CFG with the ending .toml]")  # fmt: skip
+@overwrite_option
 def import_(cfg: Path, output: Path | None, overwrite: bool) -> None:
-    """Turn a Poisson_CCD or GalSim configuration CFG into a device file.
+    """Convert CFG, a configuration of Poisson_CCD or GalSim, to a device file.
 
     \b
     Example:
@@ -50,16 +57,16 @@ def _refuse_existing(target: Path, overwrite: bool) -> None:
         raise DeviceError(f"{target} exists; give --overwrite to replace it")
 
 
-@device.command("new")
+@device.command("new", short_help="Write a copy of a device file.")
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("--from", "origin", metavar="DEVICE", required=True,
-              help="Device to begin with: a name of 'bfsensor devices', or a .toml file.")  # fmt: skip
+              help="Device to copy: a name of 'bfsensor devices', or a .toml file.")  # fmt: skip
 @overwrite_option
 def new(file: Path, origin: str, overwrite: bool) -> None:
-    """Write a device FILE (.toml) that begins as a copy of another, comments included.
+    """Write a device FILE (.toml) as a copy of another device, comments included.
 
-    The device is named as the file.  Edit its values, 'bfsensor device check' them, and make
-    its distortion table by 'bfsensor table FILE'.
+    The new device has the name of the file.  Edit its values, check them with 'bfsensor device
+    check FILE', and compute its distortion table with 'bfsensor table FILE'.
 
     \b
     Example:
@@ -89,52 +96,87 @@ def new(file: Path, origin: str, overwrite: bool) -> None:
     click.echo(f"{file}: a copy of {origin}; edit it, then: bfsensor device check {file}")
 
 
-@device.command("show")
+@device.command("show", short_help="Print every value of a device.")
 @click.argument("name", metavar="DEVICE")
 @settings_option
 @click.option("--json", "as_json", is_flag=True, help="Print JSON for a program to read.")
 def show(name: str, settings: list[tuple[str, str]], as_json: bool) -> None:
-    """Print a DEVICE (name or .toml): every value with its unit, uncertainty and origin.
+    """Print every value of a DEVICE with its unit, uncertainty and origin.
+
+    DEVICE is a .toml file, or a name of 'bfsensor devices'.
 
     \b
     Examples:
       bfsensor device show e2v_ccd250
       bfsensor device show my_ccd.toml --set back_bias=-60V
     """
-    _print(load_device(name, settings), (), as_json)
+    _print(load_device(name, settings), {}, as_json)
 
 
-@device.command("check")
+@device.command("check", short_help="Print a device with warnings.")
 @click.argument("file", metavar="DEVICE")
 @settings_option
 @click.option("--json", "as_json", is_flag=True, help="Print JSON for a program to read.")
 def check(file: str, settings: list[tuple[str, str]], as_json: bool) -> None:
-    """Read a DEVICE (.toml or name), print it with units, and warn of what is doubtful.
+    """Check the values of a DEVICE, and print them with its depletion and warnings.
 
-    Unknown entries, missing units and values out of range are errors (status 1), each with
-    its place and what is allowed.  Warnings leave the status at 0.  Nothing is solved.
+    DEVICE is a .toml file, or a name of 'bfsensor devices'.  An unknown entry, a missing unit or
+    a value out of range is an error (exit status 1) that names the entry and what is allowed.
+    Warnings, of guessed values for example, leave the status at 0.  The full-depletion voltage
+    [V] and the depleted thickness [um] are estimates; no field is solved.
 
     \b
     Example:
       bfsensor device check my_ccd.toml
     """
     loaded = load_device(file, settings)
-    _print(loaded, [line for warn in _WARNINGS for line in warn(loaded)], as_json)
+    warnings = [line for warn in _WARNINGS for line in warn(loaded)]
+    _print(loaded, _depletion(loaded), as_json, warnings)
 
 
-def _print(device: Device, warnings: Any, as_json: bool) -> None:
-    """Print a device and its warnings."""
+def _depletion(device: Device) -> dict[str, str]:
+    """Estimated full-depletion voltage and depleted thickness, as text with units."""
+    from bfsensor.device.depletion import find_depletion
+
+    found = find_depletion(device)
+    return {
+        "full_depletion_voltage": f"{found.full_depletion_voltage:.1f} V",
+        "depleted_thickness": f"{found.depth:.1f} um",
+        "depleted_from": f"{found.lowest:.1f} um",
+        "depleted_to": f"{found.highest:.1f} um",
+    }
+
+
+def _print(
+    device: Device,
+    depletion: Mapping[str, str],
+    as_json: bool,
+    warnings: Sequence[str] = (),
+) -> None:
+    """Print a device, its depletion where given, and its warnings."""
     if as_json:
-        values = tomllib.loads(device.to_toml())
-        click.echo(json.dumps({"device": values, "warnings": list(warnings)}, indent=1))
+        found = {"device": tomllib.loads(device.to_toml()), "warnings": list(warnings)}
+        click.echo(
+            json.dumps(found | ({"depletion": depletion} if depletion else {}), indent=1)
+        )
         return
     click.echo(device_text(device))
+    if depletion:
+        bias = f"{device.operating_point.back_bias:g} V"
+        click.echo(
+            f"\n[depletion]  estimated at back_bias = {bias}, heights above the gates"
+        )
+        for line in _block(depletion):
+            click.echo(line)
     for line in warnings:
         click.echo(f"warning: {line}")
 
 
 def device_text(device: Device) -> str:
-    """Give a device as text: a block for each section, a line for each value."""
+    """Give a device as text: a block for each section, a line for each value.
+
+    Unlike ``str(device)``, a summary, it has every value of the file, each with its origin.
+    """
     entries = tomllib.loads(device.to_toml())
     lines = [str(entries.pop("name"))]
     for section, values in entries.items():
@@ -143,7 +185,7 @@ def device_text(device: Device) -> str:
 
 
 def _block(values: Mapping[str, Any], indent: str = "  ") -> Iterator[str]:
-    """Lines of a section and of the sections in it."""
+    """Lines of a section and of the sections in it, names aligned."""
     width = max((len(key) for key in values), default=0)
     for key, value in values.items():
         if isinstance(value, list) or (isinstance(value, dict) and "value" not in value):
@@ -161,16 +203,16 @@ def _block(values: Mapping[str, Any], indent: str = "  ") -> Iterator[str]:
 
 
 def _guessed(device: Device) -> Iterator[str]:
-    """Values that nobody measured, published or fitted."""
+    """Warn of values whose stated origin is 'guessed'."""
     names = [key for key, known in device.provenance.items() if known.origin == "guessed"]
     if names:
         yield (
-            f"guessed, not measured: {', '.join(sorted(names))}; 'bfsensor fit' lets these move"
+            f"guessed, not measured: {', '.join(sorted(names))}; 'bfsensor fit' fits these by default"
         )
 
 
 def _unsourced(device: Device) -> Iterator[str]:
-    """Values that decide the effect and of which the file does not say where they are from."""
+    """Warn of pixel, silicon and operating-point values whose origin the file does not state."""
     names = [
         key
         for key in device.quantities
@@ -185,17 +227,27 @@ def _unsourced(device: Device) -> Iterator[str]:
 
 
 def _taken_name(device: Device) -> Iterator[str]:
-    """A name that a built-in device with other values has."""
+    """Warn of the name of a built-in device on a device with other values."""
     from bfsensor.device.device import Device, builtin_devices
 
     if device.name in builtin_devices():
         shipped = Device.load(device.name)
         if shipped.physics != device.physics:
             yield (
-                f"name = '{device.name}' is that of a built-in device with other values: give "
-                "this one its own"
+                f"name = '{device.name}' is that of a built-in device with other values: change the "
+                "name"
             )
 
 
-_WARNINGS = (_guessed, _unsourced, _taken_name)
-"""What 'device check' warns of, in the order of the lines: each takes a device, gives lines."""
+def _undepleted(device: Device) -> Iterator[str]:
+    """Warn of silicon that the back bias does not deplete, which every simulation refuses."""
+    from bfsensor.device.depletion import check_depleted
+
+    try:
+        check_depleted(device)
+    except DeviceError as error:
+        yield str(error).removeprefix(f"{device.name}: ")
+
+
+_WARNINGS = (_undepleted, _guessed, _unsourced, _taken_name)
+"""Checks of 'device check', in the order of its lines: each takes a device and yields warnings."""

@@ -1,4 +1,4 @@
-"""``bfsensor diagnose``: recordings against what the simulation predicts."""
+"""``bfsensor diagnose``: compare recordings with a simulated baseline and explain the difference."""
 
 from __future__ import annotations
 
@@ -10,40 +10,44 @@ import click
 from bfsensor.cli.common import Bar
 
 
-@click.command("diagnose")
+@click.command("diagnose", short_help="Compare recordings with a baseline.")
 @click.argument("campaign", type=click.Path(path_type=Path))
 @click.option("--baseline", metavar="FILE|STEM|DEVICE",
-              help="What predicts: edge displacements (.json), a table (.fits), a GalSim stem, a "
-              "built-in device, or 'none' for a sensor of which nothing is known (white noise and "
-              "near a_ij that float); by default the one campaign.yaml names.")  # fmt: skip
+              help="Model that predicts the recordings: edge displacements (.json), a table "
+              "(.fits), a GalSim stem, a built-in device, or 'none' for an unknown sensor, whose "
+              "nearest a_ij are then fitted.  [default: that of campaign.yaml]")  # fmt: skip
 @click.option(
     "--float",
     "floating",
     metavar="NAME",
     multiple=True,
-    help="Let a quantity of a DEVICE baseline float within its stated uncertainty, such as "
-    "silicon.thickness; 'all' for every one. The device is simulated anew, 5 s for each.",
+    help="Fit this quantity of a baseline device, such as silicon.thickness, within its stated "
+    "uncertainty; repeatable; 'all' for every one. The device is simulated again, about 5 s each.",
 )
 @click.option(
     "--towards", metavar="TABLE|DEVICE",
-    help="The same device at another back bias: the operating point of the baseline may be off "
-    "its card on the line to that one.",
+    help="The baseline's device at another operating point. The fit may then move the operating "
+    "point of the baseline on the straight line between the two; not with --float.",
 )  # fmt: skip
 @click.option("-o", "--output", type=click.Path(path_type=Path),
-              help="Folder for report.json, report.html and figures [CAMPAIGN_diagnosis].")  # fmt: skip
+              help="Folder for report.json, report.html and figures.  [default: "
+              "CAMPAIGN_diagnosis]")  # fmt: skip
 @click.option(
-    "--seed", default=1, show_default=True, help="Of the draws that p-values come from."
+    "--seed",
+    default=1,
+    show_default=True,
+    help="Seed of the simulated noise from which p-values are computed.",
 )
 @click.option(
     "--explain/--locate-only", default=True,
-    help="Look for the effects that explain a mismatch, or only for where it is.",
+    help="Search for effects that explain a mismatch, or only find the channels and places where "
+    "it is.  [default: --explain]",
 )  # fmt: skip
 @click.option(
     "--predict", "asked", metavar="CONDITIONS", multiple=True,
-    help="Write predicted.ecsv: what the accepted model expects of exposures that were not taken. "
-    "Flats by level [e-] or seconds, spots by flux [e-]; wavelength [nm], back_bias [V], "
-    "temperature [C] and lamp where they differ from the campaign's; several times, or an ECSV "
-    "file with these columns.",
+    help="Predict exposures that were not taken, to predicted.ecsv; repeatable. CONDITIONS are "
+    "level [e-] or seconds [s] of flats, flux [e-] of spots, and wavelength [nm], back_bias [V], "
+    "temperature [C] or lamp where they differ from the campaign; or an ECSV file of them.",
 )  # fmt: skip
 @click.option(
     "--json", "as_json", is_flag=True, help="Print report.json instead of a summary."
@@ -59,14 +63,15 @@ def diagnose(
     asked: tuple[str, ...],
     as_json: bool,
 ) -> None:
-    """Hold the recordings of CAMPAIGN against a baseline; say what is left, and where.
+    """Compare the recordings of CAMPAIGN with a baseline, and explain the difference.
 
-    CAMPAIGN is a folder of raw exposures, or a reduced recording: a table of measured a_ij or
-    of covariances (ECSV, LSST's photon transfer dataset), diagnosed as one channel.
+    CAMPAIGN is a folder of raw exposures, or one table of measured a_ij or covariances (ECSV, or
+    LSST's photon transfer dataset).
 
-    Everything that may honestly float is fitted: gains, noise, lamp, pixel response, the
-    device's parameters within their card's spread.  What remains is sought in all channels
-    at one false-alarm rate.  The status is 0 when the diagnosis was made, whatever it says.
+    First the quantities that no baseline knows are fitted: gains, noise, lamp, pixel response, and
+    quantities of the device within their stated uncertainty.  The residuals of all channels are
+    then tested at one false-alarm rate, and effects are sought that explain them.  The exit
+    status is 0 if a diagnosis was made, whatever its result.
 
     \b
     Examples:

@@ -1,4 +1,4 @@
-"""``bfsensor fit``: device parameters from measurements."""
+"""``bfsensor fit``: fit the quantities of a device to measurements, with priors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def parse_conditions(
     ctx: click.Context, param: click.Parameter, values: Sequence[str]
 ) -> list[tuple[str, dict[str, str]]]:
-    """Split ``[FILE:]KEY=VALUE,...`` options."""
+    """Split options ``[FILE:]KEY=VALUE,...`` into the file, empty for all, and its settings."""
     out = []
     for text in values:
         file, colon, rest = text.rpartition(":")
@@ -42,50 +42,52 @@ def parse_conditions(
     return out
 
 
-@click.command("fit")
+@click.command("fit", short_help="Fit a device to measurements.")
 @device_options
 @click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--free", multiple=True, metavar="NAME[:[MEAN+-]SPREAD]",
-    help="Let a quantity be free within the uncertainty that its file states, or within SPREAD, "
-    "of the file's value or of MEAN: silicon.thickness, back_bias:5V, 'thickness:98 um+-2 um'; "
-    "'all' for all with an uncertainty; repeatable. By default those whose origin is 'guessed'.",
+    help="Fit this quantity; repeatable. Its prior is the file's value and uncertainty, unless "
+    "given as back_bias:5V or 'thickness:98um+-2um'; 'all' is every quantity with an uncertainty.  "
+    "[default: those of origin 'guessed']",
 )  # fmt: skip
 @click.option(
     "--at", "conditions", multiple=True, callback=parse_conditions,
     metavar="[FILE:]KEY=VALUE,...",
-    help="Condition of one recording, or of all: back_bias, gate_high, gate_low, wavelength, "
-    "temperature with units, sigma of spots in pixels. What is stated is not free there; what is "
-    "not, is the device's.",
+    help="State the conditions of one recording, or of all: back_bias, gate_high, gate_low, "
+    "wavelength, temperature (with units), sigma (of spots, in pixels). Stated quantities are not "
+    "fitted for that recording.  [default: the device's]",
 )  # fmt: skip
 @click.option("--hold", multiple=True, type=click.Path(path_type=Path), metavar="FILE",
-              help="Do not fit these recordings: hold them against the fit; repeatable.")  # fmt: skip
+              help="Recording that is not fitted but compared with the fit; repeatable.")  # fmt: skip
 @click.option("--lags", default=4, show_default=True, type=click.IntRange(1, 8),
-              help="Largest lag of a_ij.")  # fmt: skip
+              help="Largest lag of a_ij that is fitted, in pixels.")  # fmt: skip
 @click.option("--errors", default="scaled", show_default=True,
               type=click.Choice(["scaled", "stated"]),
-              help="Estimate a scale of each recording's errors, or take them as they are.")  # fmt: skip
+              help="'scaled' multiplies the errors of each recording by a fitted factor; 'stated' "
+              "takes them as they are.")  # fmt: skip
 @click.option("--profile", "profiles", multiple=True, metavar="NAME",
-              help="Profile likelihood of a free quantity; repeatable.")  # fmt: skip
-@click.option("--cells", default=16, show_default=True, help="Mesh cells a pixel.")
+              help="Also compute the profile likelihood of this fitted quantity; "
+              "repeatable.")  # fmt: skip
+@click.option("--cells", default=16, show_default=True, help="Mesh cells per pixel.")
 @click.option(
     "--finer", type=click.IntRange(min=0),
-    help="Cells a pixel of a finer mesh, on which a_ij and slopes are solved besides, 8 CPU s a "
-    "condition and round on 48; derivatives stay on --cells. 0: none. [48 where --cells is below]",
+    help="Cells per pixel of a finer mesh for the values of a_ij and slopes (not their derivatives), "
+    "about 8 CPU s per condition and round at 48; 0 switches it off.  [default: 48, or 0 if --cells "
+    "is 48 or more]",
 )  # fmt: skip
 @click.option(
     "--curved", is_flag=True,
-    help="Fit with an emulator to second order about the device (2 solutions for each free "
-    "quantity, kept in the folder) instead of solving it anew where each round ends. Errors are then "
-    "those of draws, and profiles bend: without it both are those of the tangent.",
+    help="Predict with a second-order emulator of the device instead of linear predictions that "
+    "are renewed in each round. Errors then come from posterior draws and need not be Gaussian.",
 )  # fmt: skip
 @click.option(
     "--draws", default=12, show_default=True, type=click.IntRange(min=0),
-    help="Devices drawn from the posterior that are solved on the finer mesh: what predictions miss "
-    "there counts in the errors.",
+    help="Number of devices drawn from the posterior and solved in full; the error of the "
+    "predictions there is added to the errors of the fit. 0 skips this.",
 )  # fmt: skip
 @click.option("-o", "--output", type=click.Path(path_type=Path),
-              help="Folder for fit.json, device.toml and fit.png [DEVICE_fit].")  # fmt: skip
+              help="Folder for fit.json, device.toml and fit.png.  [default: DEVICE_fit]")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print fit.json instead of a table.")
 def fit(
     device: str,
@@ -104,16 +106,25 @@ def fit(
     output: Path | None,
     as_json: bool,
 ) -> None:
-    """Fit a DEVICE (name or .toml) to RECORDINGS.
+    """Fit quantities of a DEVICE, such as doping or thickness, to RECORDINGS.
 
-    RECORDINGS: measured a_ij (columns i_serial, j_parallel, cov_per_e, err_per_e; or LSST's
-    photon transfer dataset), B-F slopes (axis, slope, slope_error), saturation levels
-    (saturation, saturation_error), diffusion widths (diffusion, diffusion_error), the last three
-    with back_bias, gate_high, gate_low by row; comma-separated or ECSV, whose header may
-    have an entry 'conditions'.
+    DEVICE is a .toml file or a name of 'bfsensor devices'.  Its values and uncertainties are the
+    means and standard deviations of Gaussian priors.
 
-    Values of the device file are priors, Gaussian of its uncertainties.  A scale of each
-    recording's errors is estimated.  The last line gives chi2/n with the errors as stated.
+    RECORDINGS are comma-separated or ECSV tables of one of these kinds, with these columns:
+
+    \b
+      a_ij [1/e-]              i_serial, j_parallel, cov_per_e, err_per_e
+                               (or LSST's photon transfer dataset, FITS)
+      B-F slopes [% / 50 ke-]  axis, slope, slope_error
+      saturation levels [e-]   saturation, saturation_error
+      diffusion widths [um]    diffusion, diffusion_error
+
+    The last three may have columns back_bias, gate_high and gate_low, the voltages of each row;
+    the header of an ECSV table may state them for all rows in an entry 'conditions'.
+
+    Prints a table of the fitted quantities; the last line is chi2 per number, with the errors as
+    stated.
 
     \b
     Examples:
@@ -160,7 +171,7 @@ def fit(
 def _choose_priors(
     device: Any, free: tuple[str, ...], sets: Sequence[DataSet]
 ) -> tuple[Prior, ...]:
-    """Give the priors of all free quantities, the spill barrier and diffusion width included."""
+    """Give the priors of the free quantities; saturation adds the spill barrier, widths diffusion."""
     from bfsensor.device.quantities import DIFFUSION, choose_priors
     from bfsensor.fit.linear_predictors import SPILL
 
@@ -174,10 +185,11 @@ def _choose_priors(
 
 @dataclass(frozen=True)
 class _Response:
-    """What predicts areas and slopes, as :func:`bfsensor.fit.fit.fit_device` takes it.
+    """Functions that predict areas and slopes, as :func:`bfsensor.fit.fit.fit_device` takes them.
 
-    Either an emulator, or what solves the device with derivatives where each round ends; and
-    what solves it without them, for the errors of the prediction.
+    Either ``emulator``, or ``linearise``, which solves the device and its derivatives at the
+    values where a round ends; and ``solved``, which solves it without derivatives and gives the
+    error of the predictions.
     """
 
     emulator: Any = None
@@ -197,7 +209,7 @@ class _Response:
         curved: bool,
         draws: int,
     ) -> _Response:
-        """Prepare it as the options state; nothing where no set is of areas or slopes."""
+        """Choose the functions by the options; none if no data set holds areas or slopes."""
         from bfsensor.device.quantities import DIFFUSION
         from bfsensor.fit.finer_mesh import FINER
         from bfsensor.fit.linear_predictors import SPILL
@@ -223,7 +235,7 @@ class _Response:
 
 
 def responding(sets: Sequence[DataSet]) -> tuple[Any, ...]:
-    """Conditions of all areas and slopes, which the response of flats predicts."""
+    """Conditions of all area and slope data, each once; both follow from the edge response."""
     return tuple(
         dict.fromkeys(
             condition
@@ -237,7 +249,7 @@ def responding(sets: Sequence[DataSet]) -> tuple[Any, ...]:
 def build_emulator(
     device: Any, parameters: list[str], sets: Sequence[DataSet], cells: int, folder: Path
 ) -> Any:
-    """Build the emulator of a device at the conditions of all areas and slopes."""
+    """Build, or read from the folder, the emulator of a device at the conditions of the data."""
     from bfsensor.response.emulator import DeviceEmulator
 
     return DeviceEmulator.build(
@@ -253,7 +265,7 @@ def make_linearise(
     sets: Sequence[DataSet],
     cells: int,
 ) -> Any:
-    """Make what solves the device with derivatives, by the values of all free parameters."""
+    """Make the function that solves the device and its derivatives at given parameter values."""
     from bfsensor.fit.linear_response import Linearise
 
     solve = Linearise(device, tuple(moving), responding(sets), cells, Bar("solutions"))
@@ -270,7 +282,7 @@ def make_finer(
     cells: int,
     folder: Path,
 ) -> Any:
-    """Carry what solves the device to a finer mesh."""
+    """Wrap a function that solves the device so that its values are those of a finer mesh."""
     from bfsensor.fit.finer_mesh import Finer
 
     return Finer(
@@ -287,7 +299,7 @@ def make_solved(
     finer: int,
     folder: Path,
 ) -> Any:
-    """Make what solves the device without derivatives, on the finer mesh if there is one."""
+    """Make the function that solves the device without derivatives, on the finer mesh if any."""
     from bfsensor.fit.finer_mesh import REFINE_Z
     from bfsensor.fit.full_solutions import FullSolutions
     from bfsensor.response.edge_response import REFINE_Z as OWN
@@ -305,13 +317,13 @@ def _data_sets(
     lags: int,
     scaled: bool,
 ) -> list[DataSet]:
-    """Data sets of what was read, with the conditions that the options state."""
+    """Make data sets of the tables, with the conditions that ``--at`` states."""
     from bfsensor.fit.data import data_set
 
     for file, _ in conditions:
         if file and not any(file in (str(path), path.name, path.stem) for path, _ in read):
             raise FitError(
-                f"--at {file}: no such recording; given are "
+                f"--at {file}: not one of the given recordings "
                 f"{', '.join(path.name for path, _ in read)}"
             )
     out = []
@@ -327,15 +339,17 @@ def _data_sets(
 
 
 def _resolve(name: str, names: Sequence[str]) -> str:
-    """Name of a free parameter from the end of it."""
+    """Full name of a free parameter from its full name or its last part; refuses others."""
     ends = [one for one in names if one == name or one.endswith(f".{name}")]
     if len(ends) != 1:
-        raise FitError(f"--profile {name}: not one of the free {', '.join(names)}")
+        raise FitError(
+            f"--profile {name}: not one fitted quantity; fitted are {', '.join(names)}"
+        )
     return ends[0]
 
 
 def _write(result: FitResult, folder: Path) -> list[str]:
-    """Write the result, the fitted device and the figure; says so where that cannot be drawn."""
+    """Write the result, the fitted device and the figure; without matplotlib no figure."""
     from bfsensor.device.device import Device
     from bfsensor.fit.fit_figures import figure_for_fit
 

@@ -25,15 +25,20 @@ from bfsensor.cli.warm import warm
 from bfsensor.errors import BFSensorError
 
 _EPILOG = """\b
-Results go to stdout and files, messages and progress to stderr: a bar on a terminal, elsewhere
-a line every 30 s at most. Python programs find the messages under logging's name 'bfsensor'.
+Results go to stdout and to files; messages and progress go to stderr, progress as a bar on a
+terminal and elsewhere as at most one line every 30 s. Python programs get the messages from the
+logger 'bfsensor'.
 
 \b
-Most commands take --json and print the same results for a program to read.
+Most commands take --json and then print the same results as JSON.
 
 \b
-Status: 0 done, whatever was found; 1 an error, one line on stderr says which; 2 a wrong option or
-argument; 130 interrupted.
+Example, from a built-in device to its distortion table and a figure of it:
+  bfsensor table itl_sta3800c -o itl.fits
+
+\b
+Exit status: 0 done, whatever the results are; 1 an error, described by one line on stderr; 2 a
+wrong option or argument; 130 interrupted.
 
 \b
 Shell completion: eval "$(_BFSENSOR_COMPLETE=bash_source bfsensor)" in ~/.bashrc; zsh_source for
@@ -42,7 +47,11 @@ zsh in ~/.zshrc; for fish: _BFSENSOR_COMPLETE=fish_source bfsensor | source
 
 
 class _Commands(click.Group):
-    """Turns the package's errors into one line on stderr and exit status 1."""
+    """Group of commands whose errors end as one line on stderr and an exit status.
+
+    An error of the package or of a file: 1.  An interruption from the keyboard: 130.  A closed
+    pipe, as of ``| head``: no line, and click's status 1.
+    """
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -51,6 +60,8 @@ class _Commands(click.Group):
             LOG.debug("where it happened:", exc_info=True)
             click.echo(f"bfsensor: {error}", err=True)
             ctx.exit(1)
+        except BrokenPipeError:
+            raise  # click ends quietly, without flushing to the reader that is gone
         except OSError as error:
             LOG.debug("where it happened:", exc_info=True)
             where = f"{error.filename}: " if error.filename else ""
@@ -71,11 +82,15 @@ class _Commands(click.Group):
 )
 @click.version_option(package_name="bfsensor")
 @click.option("-v", "--verbose", is_flag=True,
-              help="Say more on stderr: versions, seconds, where an error happened.")  # fmt: skip
-@click.option("-q", "--quiet", is_flag=True, help="Say nothing on stderr but errors.")
+              help="Print versions, seconds used and tracebacks of errors to stderr.")  # fmt: skip
+@click.option("-q", "--quiet", is_flag=True, help="Print only errors to stderr.")
 @click.pass_context
 def main(context: click.Context, verbose: bool, quiet: bool) -> None:
-    """Device physics of thick CCDs: from a device file to distorted pixel boundaries."""
+    """Simulate the brighter-fatter effect of thick CCDs, and measure and diagnose it.
+
+    A device file states a sensor's geometry, doping and voltages; from it the commands compute
+    how stored charge moves pixel boundaries, and compare that with recordings.
+    """
     if verbose and quiet:
         raise click.UsageError("--verbose and --quiet exclude one another")
     start_log(verbose, quiet)
@@ -92,7 +107,7 @@ def main(context: click.Context, verbose: bool, quiet: bool) -> None:
 
 
 def _versions() -> str:
-    """Name what results depend on, without importing it."""
+    """Name the versions that results depend on, without importing the packages."""
     from importlib.metadata import version
 
     from bfsensor import __version__
@@ -102,10 +117,10 @@ def _versions() -> str:
     return ", ".join([*own, *(f"{name} {version(name)}" for name in names)])
 
 
-@main.command()
+@main.command(short_help="List the built-in devices.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON for a program to read.")
 def devices(as_json: bool) -> None:
-    """List the built-in devices.
+    """List the built-in devices with pixel pitch, thickness and operating point.
 
     \b
     Example:
@@ -145,19 +160,21 @@ def _print_table(rows: Sequence[dict[str, Any]]) -> None:
         click.echo("  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip())
 
 
-@main.command()
+@main.command(short_help="Draw a distortion table or a device.")
 @click.argument("source")
 @settings_option
-@click.option(
-    "-o", "--output", type=click.Path(path_type=Path), help="Figure [SOURCE.png]."
-)
+@click.option("-o", "--output", type=click.Path(path_type=Path),
+              help="Figure to write, .png or .pdf.  [default: SOURCE.png]")  # fmt: skip
 def show(source: str, settings: list[tuple[str, str]], output: Path | None) -> None:
-    """Draw a table (.fits, GalSim stem) or a DEVICE (name or .toml).
+    """Draw figures of SOURCE: a distortion table or a device.
 
-    A table: distorted pixel boundaries with their areas, the response against charge,
-    background and depth.  A device, four figures, each with its name before the suffix:
-    potentials and carriers (profiles, sections), drift paths (paths), and electrons that
-    drift, that diffuse, and that a full pixel repels (diffusion).
+    SOURCE is a table (.fits, or the stem of GalSim's .cfg and .dat) or a device (.toml, or a name
+    of 'bfsensor devices').
+
+    A table gives one figure: distorted pixel boundaries with their areas, and the response
+    against charge, background and conversion depth.  A device is solved first and gives four,
+    with a word before the suffix: potentials and carrier densities (profiles, sections), drift
+    paths (paths), and electrons that drift, diffuse and are repelled by a full pixel (diffusion).
 
     \b
     Examples:

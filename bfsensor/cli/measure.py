@@ -1,4 +1,4 @@
-"""``bfsensor measure``: spot sizes with their slopes, covariances of flat pairs."""
+"""``bfsensor measure``: spot sizes with B-F slopes, and covariances of flat pairs, from FITS files."""
 
 from __future__ import annotations
 
@@ -22,14 +22,17 @@ if TYPE_CHECKING:
 _FILES = click.argument(
     "files", nargs=-1, required=True, type=click.Path(path_type=Path, exists=True)
 )
+"""Argument of one file or more; -1 is click's definition of any number."""
+
 _GAIN = click.option(
     "--gain", type=float,
-    help="[e-/ADU]; by default that of campaign.yaml or of the header, as check shows it.",
+    help="Gain of all amplifiers [e-/ADU].  [default: that of campaign.yaml or of the "
+    "header, as 'bfsensor check' shows it]",
 )  # fmt: skip
 _OVERSCAN = click.option(
     "--overscan", default="row median", show_default=True,
     type=click.Choice(["row median", "row mean", "median", "none"]),
-    help="Level of the overscan that is subtracted: of each row, or of all.",
+    help="Level subtracted: median or mean of each row's overscan, or median of all of it.",
 )  # fmt: skip
 _SECTION_ENTRIES = ("name", "hdu", "window", "data", "bias", "detector")
 
@@ -37,7 +40,7 @@ _SECTION_ENTRIES = ("name", "hdu", "window", "data", "bias", "detector")
 def _sections(
     ctx: click.Context, param: click.Parameter, values: Sequence[str]
 ) -> tuple[dict[str, Any], ...]:
-    """Entries of amplifiers, as campaign.yaml has them."""
+    """Parse ``--sections`` into entries of amplifiers like those of campaign.yaml."""
     out: list[dict[str, Any]] = []
     for number, text in enumerate(values):
         parts = re.findall(r"(\w+)=(\[[^\]]*\]|[^,\[\]]+)(?:,|$)", text)
@@ -61,34 +64,48 @@ def _sections(
 
 _SECTIONS = click.option(
     "--sections", multiple=True, callback=_sections, metavar="KEY=[X1:X2,Y1:Y2],...",
-    help="Where an amplifier's data and overscan lie, as FITS sections, before headers and "
-    "campaign.yaml: data=[1:512,1:2000],bias=[513:576,1:2000]; also name, hdu, window, detector; "
-    "repeat it for each amplifier.",
+    help="FITS sections of an amplifier's data and overscan, such as "
+    "data=[1:512,1:2000],bias=[513:576,1:2000]; also name, hdu, window, detector. Repeat it for each "
+    "amplifier.  [default: campaign.yaml or headers]",
 )  # fmt: skip
 _OUTPUT = click.option(
-    "-o", "--output", type=click.Path(path_type=Path), help="ECSV to write."
+    "-o", "--output", type=click.Path(path_type=Path),
+    help="ECSV file to write, replaced if it exists.  [default: none]",
+)  # fmt: skip
+_JSON = click.option(
+    "--json", "as_json", is_flag=True, help="Print rows and summary as JSON."
 )
-_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 
-@click.group()
+@click.group(short_help="Measure spots or flats in FITS files.")
 def measure() -> None:
-    """Measure spots or flats in FITS files: raw with overscan, or images in electrons.
+    """Measure spots or flats in FITS files: raw ones with overscan, or images in electrons.
 
-    A campaign.yaml in the folder of a file is followed: its amplifiers, keywords and masks.
+    The amplifiers, keywords and masks that a campaign.yaml in the folder of a file states are used.
+
+    \b
+    Example:
+      bfsensor measure flats flat_*.fits --gain 4.8 -o covariances.ecsv
     """
 
 
-@measure.command("spots")
+@measure.command("spots", short_help="Fit sizes and slopes of spots.")
 @_FILES
 @click.option("--threshold", type=float, required=True,
               help="Least signal of a spot's brightest pixel [e-].")  # fmt: skip
 @click.option("--saturation", type=float, default=float("inf"),
-              help="Spots that reach it are left out [e-].")  # fmt: skip
-@click.option("--stamp", default=9, show_default=True, help="Side of the stamps [pixel].")
+              help="Leave out spots with a pixel at or above this signal [e-].  [default: "
+              "no limit]")  # fmt: skip
+@click.option(
+    "--stamp",
+    default=9,
+    show_default=True,
+    help="Side of the square postage stamps [pixel], odd.",
+)
 @click.option("--weights", default="equal", show_default=True,
               type=click.Choice(["equal", "noise"]),
-              help="Of the pixels: 'equal', as published, for slopes.")  # fmt: skip
+              help="Weights of the pixels: 'equal', as published, for B-F slopes; 'noise', the "
+              "inverse variance, has the smallest errors for Gaussian spots.")  # fmt: skip
 @_GAIN
 @_OVERSCAN
 @_SECTIONS
@@ -106,11 +123,11 @@ def spots(
     output: Path | None,
     as_json: bool,
 ) -> None:
-    """Fit the size of the spots in each amplifier of each file, and the B-F slopes.
+    """Fit the size of the spots in each amplifier of each of FILES, and their B-F slopes.
 
-    Every amplifier of a file is a region: one (sigma_x, sigma_y) for all its spots, with a
-    free peak, centre and background for each.  With five files or more the slope of
-    sigma against the peak is fitted over the linear range that is found.
+    All spots of one amplifier in one file share one (sigma_x, sigma_y) [pixel]; each has its own
+    peak [e-], centre and background.  With five files or more of different peaks, the B-F slope
+    (change of sigma with the peak [% per 50,000 e-]) is fitted over its linear range.
 
     \b
     Example:
@@ -143,7 +160,7 @@ def spots(
                 fit = fit_spots(stamps, weights=weights)
             except MeasurementError as error:
                 raise MeasurementError(f"{path}: {amplifier.name}: {error}") from None
-            # One spot has no scatter.
+            # Scatter among spots also holds for shapes that are not Gaussian, but takes two spots.
             errors = fit.scatter_covariance if fit.used.sum() > 1 else fit.covariance
             rows.append(
                 {
@@ -161,7 +178,7 @@ def spots(
 def _read(
     path: Path, gain: float | None, overscan: str, sections: tuple[dict[str, Any], ...]
 ) -> tuple[AmplifierImage, ...]:
-    """Read the amplifiers of a file, with what a campaign.yaml beside it says."""
+    """Read the amplifiers of a file with the settings of a campaign.yaml beside it."""
     from bfsensor.recording.campaign.settings import read_settings
     from bfsensor.recording.raw.headers import scan_file
     from bfsensor.recording.raw.images import read_images
@@ -178,19 +195,19 @@ def _read(
 
 
 def _gain(amplifier: AmplifierImage) -> str:
-    """Say which gain an amplifier was given, or why none."""
+    """Text of the gain of an amplifier [e-/ADU], or of the reason that it is not known."""
     if amplifier.unit == "electron":
         return f"{amplifier.gain:.6g} e-/ADU"
     return f"not known ({amplifier.no_gain}), levels are in ADU"
 
 
 def _gains(found: Mapping[str, Mapping[str, None]]) -> dict[str, str]:
-    """Give a line for each amplifier; several gains where its files differ."""
+    """Gain of each amplifier for the summary; several where its files differ."""
     return {f"{name} gain": ", ".join(words) for name, words in found.items()}
 
 
 def _slopes(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """B-F slopes of each amplifier that has five levels or more."""
+    """B-F slopes [% per 50,000 e-] of each amplifier that has five files or more."""
     from bfsensor.measure.slopes import bf_slopes
 
     out: dict[str, Any] = {}
@@ -212,18 +229,19 @@ def _slopes(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return out
 
 
-@measure.command("flats")
+@measure.command("flats", short_help="Measure covariances of flats.")
 @_FILES
 @click.option("--lags", default=8, show_default=True, help="Largest lag [pixel].")
 @click.option("--fit/--no-fit", default=None,
-              help="Fit a, b, gain and noise [with six pairs or more].")  # fmt: skip
+              help="Fit a_ij, b_ij, gain and noise to the covariances.  [default: --fit for "
+              "amplifiers with six pairs or more]")  # fmt: skip
 @_GAIN
 @_OVERSCAN
 @_SECTIONS
 @_OUTPUT
 @click.option("--figure", type=click.Path(path_type=Path), metavar="FILE",
-              help="Draw the photon transfer curve: variance and correlations of neighbours against "
-              "the level, .png or .pdf (needs [plots]).")  # fmt: skip
+              help="Draw the photon transfer curve, variance and nearest correlations against the "
+              "level, to a .png or .pdf; needs bfsensor[plots].  [default: none]")  # fmt: skip
 @_JSON
 def flats(
     files: Sequence[Path],
@@ -236,7 +254,11 @@ def flats(
     figure: Path | None,
     as_json: bool,
 ) -> None:
-    """Measure the covariances of pairs of flats: files 1 and 2, 3 and 4, ...
+    """Measure the pixel covariances of pairs of flats: FILES 1 and 2, 3 and 4, and so on.
+
+    The two flats of a pair have equal exposures.  Prints variances and nearest correlations of each
+    pair and amplifier; OUTPUT has the covariance of every lag with its error [e-^2, or ADU^2
+    without a gain].
 
     \b
     Examples:
@@ -246,7 +268,9 @@ def flats(
     from bfsensor.measure.curve import CovarianceCurve
 
     if len(files) % 2:
-        raise MeasurementError(f"{len(files)} files do not make pairs")
+        raise MeasurementError(
+            f"{len(files)} files are no pairs of flats: give an even number, files 1 and 2 a pair"
+        )
     pairs: dict[str, list[FlatCovariances]] = {}
     gains: dict[str, dict[str, None]] = {}
     rows = []
@@ -279,7 +303,7 @@ def flats(
 
 
 def _measure_pair(one: AmplifierImage, other: AmplifierImage, lags: int) -> FlatCovariances:
-    """Measure the covariances of an amplifier in two flats."""
+    """Measure the covariances of one amplifier in a pair of flats; refuses unlike images."""
     from bfsensor.measure.flat_pairs import flat_covariances
 
     if one.image.shape != other.image.shape or one.unit != other.unit:
@@ -294,7 +318,7 @@ def _measure_pair(one: AmplifierImage, other: AmplifierImage, lags: int) -> Flat
 
 
 def _covariance_rows(pair: FlatCovariances) -> list[dict[str, Any]]:
-    """Give a row for each lag of a pair."""
+    """List a row of the output for each lag of a pair."""
     return [
         {
             "unit": pair.unit, "level": pair.level, "lag_x": i, "lag_y": j,
@@ -308,7 +332,7 @@ def _covariance_rows(pair: FlatCovariances) -> list[dict[str, Any]]:
 def _fits(
     pairs: Mapping[str, Sequence[FlatCovariances]], fit: bool | None
 ) -> dict[str, CovarianceFit]:
-    """Fit the amplifiers that have enough pairs, or all, or none."""
+    """Fit all amplifiers (True), none (False), or those with six pairs or more (None)."""
     from bfsensor.measure.covariance_fit import fit_covariances
     from bfsensor.measure.curve import CovarianceCurve
 
@@ -322,7 +346,7 @@ def _fits(
 def _draw(
     curves: Mapping[str, CovarianceCurve], fits: Mapping[str, CovarianceFit], target: Path
 ) -> str:
-    """Draw the photon transfer curve; says where, or why not."""
+    """Draw the photon transfer curve to a file and return its path."""
     from bfsensor.plots.photon_transfer import figure_for_photon_transfer
 
     try:
@@ -339,7 +363,7 @@ def _draw(
 def _covariances(
     pairs: Mapping[str, Sequence[FlatCovariances]], fits: Mapping[str, CovarianceFit]
 ) -> dict[str, str]:
-    """Give a line for each pair of each amplifier, and for its fit."""
+    """Summary of each pair of each amplifier, and of its fit."""
     out = {}
     for name, found in pairs.items():
         for measured in sorted(found, key=lambda p: p.level):
@@ -363,7 +387,7 @@ def _covariances(
 def _finish(
     rows: list[dict[str, Any]], summary: dict[str, Any], output: Path | None, as_json: bool
 ) -> None:
-    """Write the rows, print the summary."""
+    """Write the rows as ECSV, print the summary."""
     if output is not None:
         from astropy.table import Table
 

@@ -1,4 +1,4 @@
-"""``bfsensor spots``: the direct simulation of spots."""
+"""``bfsensor spots``: simulate spots electron by electron, and measure their B-F slopes."""
 
 from __future__ import annotations
 
@@ -24,27 +24,46 @@ def _spot_path(folder: Path, key: str, number: int) -> Path:
     return folder / f"spot_{key}_{number:04d}.fits"
 
 
-@click.command()
+@click.command(short_help="Simulate spots electron by electron.")
 @device_options
 @click.option("--spots", "count", default=8, show_default=True, type=click.IntRange(min=1),
-              help="Spots, each with its own centre and electrons.")  # fmt: skip
+              help="Number of spots, each with its own centre and electrons; errors need "
+              "2.")  # fmt: skip
 @click.option("--peak", default=80_000.0, show_default=True,
-              help="Electrons in the brightest pixel of a centred spot.")  # fmt: skip
-@click.option("--sigma", default=10.0, show_default=True, help="Width of the spot [um].")
+              help="Electrons in the brightest pixel of a centred spot, without diffusion "
+              "[e-].")  # fmt: skip
+@click.option(
+    "--sigma", default=10.0, show_default=True, help="Gaussian sigma of the spot [um]."
+)
 @click.option("--steps", default=80, show_default=True,
-              help="Steps of charge; the field is solved again in each.")  # fmt: skip
-@click.option("--pixels", default=13, show_default=True, help="Period of the array, odd.")
-@click.option("--cells", default=8, show_default=True, help="Mesh cells a pixel.")
+              help="Equal steps in which the charge arrives; the field is solved after "
+              "each.")  # fmt: skip
+@click.option(
+    "--pixels",
+    default=13,
+    show_default=True,
+    help="Width of the simulated array [pixel], odd; it is periodic.",
+)
+@click.option("--cells", default=8, show_default=True, help="Mesh cells per pixel.")
 @click.option("--depth", type=float,
-              help="Height of conversion [um above the gates; 5 below the back].")  # fmt: skip
-@click.option("--wavelength", type=float, help="Of the light [nm], instead of a depth.")
+              help="Height above the gates at which light converts [um].  [default: 5 um below the "
+              "back surface]")  # fmt: skip
+@click.option("--wavelength", type=float,
+              help="Vacuum wavelength of the light [nm]; heights then follow its absorption. Not "
+              "with --depth.")  # fmt: skip
 @click.option("--diffusion", default=1.0, show_default=True,
-              help="Width of the diffusion relative to Einstein's; the published simulations "
-              "have 2.12.")  # fmt: skip
-@click.option("--seed", default=20170, show_default=True, help="Of all random numbers.")
+              help="Factor on the width of the diffusion; 1 is Einstein's relation, 2.12 that of "
+              "the published simulations (Lage et al. 2017).")  # fmt: skip
+@click.option(
+    "--seed",
+    default=20170,
+    show_default=True,
+    help="Seed of all random numbers; the same seed gives the same spots.",
+)
 @executor_options
 @click.option("-o", "--output", type=click.Path(path_type=Path), default=Path("spots"),
-              show_default=True, help="Folder for the images, slopes and figure.")  # fmt: skip
+              show_default=True, help="Folder for images (FITS), growth.ecsv and "
+              "growth.png.")  # fmt: skip
 @summary_option
 def spots(
     device: str,
@@ -64,11 +83,12 @@ def spots(
     output: Path,
     as_json: bool,
 ) -> None:
-    """Build up spots in a DEVICE (name or .toml), electron by electron.
+    """Simulate spots in a DEVICE electron by electron, and print their B-F slopes.
 
-    Electrons go through the field of the charge that is there, in steps; the same electrons
-    also through the empty sensor.  Every finished spot is kept in the folder: a run that was
-    interrupted goes on when the same command is given again, and more spots can be added.
+    DEVICE is a .toml file or a name of 'bfsensor devices'.  Electrons drift in the field of the
+    charge already collected, which is solved again in steps; for comparison the same electrons
+    also drift in the empty sensor.  Every finished spot is kept in the folder: repeat the command
+    to continue an interrupted run, or repeat it with more --spots to add some.
 
     \b
     Examples:
@@ -103,7 +123,7 @@ def spots(
 
 
 def _report(plan: Any, made: list[Any], output: Path, as_json: bool) -> None:
-    """Measure, print and draw."""
+    """Measure how the spots grow with charge; write, print and draw it."""
     import numpy as np
     from astropy.table import Table
 
@@ -152,7 +172,7 @@ def _report(plan: Any, made: list[Any], output: Path, as_json: bool) -> None:
 
 
 def _draw(plan: Any, made: list[Any], growth: Any, path: Path) -> None:
-    """Draw the growth and how charge builds up; says so where matplotlib is missing."""
+    """Draw the growth of the spots; without matplotlib a message on stderr."""
     from bfsensor.plots.spots import figure_for_spots
 
     try:

@@ -23,28 +23,33 @@ from bfsensor.cli.common import (
 from bfsensor.errors import SweepError
 
 
-@click.command()
+@click.command(short_help="Compute a_ij over voltages and more.")
 @device_options
 @click.option("--over", "over", multiple=True, required=True, callback=parse_settings,
               metavar="KEY=VALUES",
-              help="Quantity and values: back_bias=-30V:-70V:5 (first, last, how many) or "
-              "thickness=80um,100um; repeatable.")  # fmt: skip
+              help="Quantity to sweep and its values, as first:last:number (back_bias=-30V:-70V:5) or "
+              "as a list (thickness=80um,100um); repeatable.")  # fmt: skip
 @click.option("--paired", is_flag=True,
-              help="First values together, then second ones, ...; not all with all.")  # fmt: skip
+              help="Combine the first values of all --over, then the second ones, and so on.  "
+              "[default: every value with every other]")  # fmt: skip
 @click.option("--level", default=40_000.0, show_default=True,
-              help="Charge of all pixels about which the response is taken [e-].")  # fmt: skip
+              help="Uniform charge of all pixels at which the response is computed [e-].")  # fmt: skip
 @click.option("--full-pixel", default=0.0, metavar="Q",
-              help="Area changes around one pixel of Q electrons among empty ones too.")  # fmt: skip
-@click.option("--cells", type=int, help="Mesh cells a pixel [16].")
+              help="Also compute the area changes around one pixel of Q electrons among empty "
+              "pixels [e-]; 0 switches it off.  [default: 0]")  # fmt: skip
+@click.option("--cells", type=int, help="Mesh cells per pixel.  [default: 16]")
 @click.option("--accuracy", type=float,
-              help="Instead: mesh accuracy aimed at, as of bfsensor table.")  # fmt: skip
+              help="Choose the mesh by the relative accuracy of area changes, as 'bfsensor table' "
+              "does; not with --cells.")  # fmt: skip
 @executor_options
 @click.option("-o", "--output", type=click.Path(path_type=Path),
-              help="ECSV to write [DEVICE_sweep.ecsv].")  # fmt: skip
+              help="ECSV file to write.  [default: DEVICE_sweep.ecsv]")  # fmt: skip
 @click.option("--tables", type=click.Path(path_type=Path), metavar="FOLDER",
-              help="Write the table of the response about the level at every point.")  # fmt: skip
+              help="Also write, for every point, a distortion table of the response at "
+              "--level.")  # fmt: skip
 @click.option("--plot", type=click.Path(path_type=Path), metavar="FIG",
-              help="Draw a_ij against the quantity with most values (needs [plots]).")  # fmt: skip
+              help="Draw a_ij against the quantity with most values; needs "
+              "bfsensor[plots].")  # fmt: skip
 @overwrite_option
 @summary_option
 @click.pass_context
@@ -66,17 +71,17 @@ def sweep(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Solve a DEVICE (name or .toml) anew for every value of swept quantities.
+    """Compute a_ij of a DEVICE for every combination of the values of swept quantities.
 
-    One row a point: a_ij of the lags (0, 0) to (2, 2), the differential response about a
-    level that flats see, with its numerical error; full well; cost.  A key is any quantity of
-    the device file, or wavelength (without it light converts at the back surface).  Points
-    that are done are kept in OUTPUT.points until all are: a run that was interrupted goes on
-    when the same command is given again.
+    DEVICE is a .toml file or a name of 'bfsensor devices'.  Each point is one row of OUTPUT: a_ij
+    [1/e-] for lags (0, 0) to (2, 2) with their numerical error, the full well [e-] and the CPU
+    time.  Any quantity of the device file can be swept, and wavelength (without it light converts
+    at the back surface).  Finished points are kept in OUTPUT.points until all are done: repeat the
+    command to continue an interrupted run.
 
-    A point that the device refuses (not depleted, a full well below the level, ...) or that
-    does not converge is a row with a reason and no numbers; all others are solved, the file
-    is written, and the exit status is 1.
+    A point that the device cannot take (silicon not depleted, full well below --level, ...) or
+    that does not converge is a row with a reason and no numbers.  The other points are still
+    written, and the exit status is 1.
 
     \b
     Examples:
@@ -123,7 +128,7 @@ def sweep(
 
 
 def _summarise(made: Any, written: list[str]) -> dict[str, Any]:
-    """What was made, and at what cost."""
+    """Count the points and refusals, and name the files, mesh and CPU seconds."""
     return {
         "written": written,
         "points": len(made.rows),
@@ -136,7 +141,7 @@ def _summarise(made: Any, written: list[str]) -> dict[str, Any]:
 
 
 def _cells(cells: int | None, accuracy: float | None) -> int:
-    """Cells a pixel: as stated, or for an accuracy, as of tables."""
+    """Mesh cells per pixel: as given, or the fewest that reach the accuracy of tables."""
     from bfsensor.sweeps.points import CELLS
     from bfsensor.table.table_plan import ACCURACIES
 
@@ -151,7 +156,7 @@ def _cells(cells: int | None, accuracy: float | None) -> int:
 
 
 def _print(made: Any) -> None:
-    """Print the nearest lags of every point."""
+    """Print a_ij of the nearest lags, or the reason for a refusal, for every point."""
     shown = ("a_00", "a_10", "a_01", "a_11")
     units = [made.rows[n].unit for n in made.swept]
     heads = [f"{n} [{u}]" if u else n for n, u in zip(made.swept, units, strict=True)]

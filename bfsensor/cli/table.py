@@ -1,4 +1,4 @@
-"""``bfsensor table``: from a device to its distortion table."""
+"""``bfsensor table``: solve a device and write its distortion table."""
 
 from __future__ import annotations
 
@@ -42,52 +42,66 @@ def _numbers(
         ) from None
 
 
-@click.command()
+@click.command(short_help="Write the distortion table of a device.")
 @device_options
 @click.option(
     "--charges",
     callback=_numbers,
     metavar="Q,Q,...",
-    help="Source charges [e-] [0 and 3, 15, 35, 55, 75, 90 % of the full well].",
+    help="Charges of the source pixel [e-].  [default: 0 and 3, 15, 35, 55, 75, 90 % of the full well]",
 )
 @click.option("--backgrounds", callback=_numbers, metavar="B,B,...",
-              help="Uniform charges of all other pixels [e-] [0, 25, 50, 80 % of the full "
-              "well].")  # fmt: skip
+              help="Uniform charges of all other pixels [e-].  [default: 0, 25, 50, 80 % of the "
+              "full well]")  # fmt: skip
 @click.option("--depths", callback=_numbers, metavar="Z,Z,...",
-              help="Conversion depths [um above the gates] [the stored charge's height; 2 and 4 um into "
-              "the silicon; 1, 2 and 4 pixel pitches; the thickness].")  # fmt: skip
+              help="Heights above the gates at which light converts [um].  [default: that of the "
+              "stored charge; 2 and 4 um into the silicon; 1, 2, 4 pixel pitches; the "
+              "thickness]")  # fmt: skip
 @click.option(
-    "--vertices", default=32, show_default=True, help="Vertices a side between corners."
+    "--vertices",
+    default=32,
+    show_default=True,
+    help="Vertices on each side of a pixel's boundary, between its corners.",
 )
 @click.option(
-    "--pixels", default=9, show_default=True, help="Width of the table [pixel], odd."
+    "--pixels",
+    default=9,
+    show_default=True,
+    help="Width of the table, centred on the source pixel [pixel], odd.",
 )
 @click.option("--engine", default="poisson", show_default=True,
               type=click.Choice(["poisson", "image_charge"]),
-              help="Poisson's equation, or charge rectangles between planes: a second, "
-              "linear in charge, fitted parameters.")  # fmt: skip
+              help="'poisson' solves the non-linear Poisson equation; 'image_charge' takes an "
+              "analytic model, linear in charge, of parameters given by --image-charge.")  # fmt: skip
 @click.option("--image-charge", "parameters", multiple=True, callback=parse_settings,
               metavar="KEY=VALUE",
-              help="Parameter of the engine image_charge: --image-charge row_height=1.2um "
-              "(repeatable).")  # fmt: skip
+              help="Parameter of --engine image_charge with its unit, such as row_height=1.2um; "
+              "repeatable.")  # fmt: skip
 @click.option("--accuracy", default=0.01, show_default=True,
-              help="Mesh accuracy aimed at (measured errors go to the header). "
-              "[poisson]")  # fmt: skip
+              help="Relative accuracy of area changes that chooses the mesh: 0.05, 0.02, 0.01 or "
+              "0.005. Only for --engine poisson.")  # fmt: skip
 @click.option("--workers", type=click.IntRange(min=1), default=2, show_default=True,
-              help="Processes. [poisson]")  # fmt: skip
+              help="Processes that work at the same time. Only for --engine poisson.")  # fmt: skip
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), help="Table to write [DEVICE.fits]."
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    help="FITS table to write.  [default: DEVICE.fits]",
 )
 @click.option("--galsim", type=click.Path(path_type=Path), metavar="STEM",
-              help="Write STEM.cfg and STEM.dat for galsim.SiliconSensor instead: one "
-              "charge, no background, one depth.")  # fmt: skip
+              help="Write STEM.cfg and STEM.dat for galsim.SiliconSensor instead of FITS: one "
+              "charge (default 100000 e-), no background, one depth (default 95 % of the "
+              "thickness).")  # fmt: skip
 @click.option(
     "--assess/--no-assess",
     default=None,
-    help="Measure mesh, tracing and superposition errors for the header [poisson, whole tables].",
+    help="Measure the errors of mesh, tracing and superposition and write them to the header. Only "
+    "for --engine poisson.  [default: --assess; with --galsim --no-assess]",
 )
 @click.option(
-    "--figure/--no-figure", default=True, help="Draw the table beside it (needs [plots])."
+    "--figure/--no-figure",
+    default=True,
+    help="Draw the table as a .png beside it; needs bfsensor[plots].  [default: --figure]",
 )
 @overwrite_option
 @summary_option
@@ -112,11 +126,12 @@ def table(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Solve a DEVICE (name or .toml) and write its distortion table.
+    """Solve a DEVICE and write its distortion table.
 
-    The table holds the displacement of every vertex of the pixel boundaries against the
-    charge of a source pixel, the uniform charge of all others, and the conversion depth.
-    An interrupted run goes on where it was when the same command is given again.
+    DEVICE is a .toml file or a name of 'bfsensor devices'.  The table holds the displacement of
+    every vertex of the pixel boundaries [um] as a function of the charge of a source pixel,
+    the uniform charge of all others, and the conversion depth.  Repeat the command to continue an
+    interrupted run.
 
     \b
     Examples:
@@ -172,7 +187,7 @@ def table(
 
 
 def _describe(plan: Any, model: Any) -> str:
-    """Say what will be solved, and how."""
+    """Describe the size and the mesh of the table that will be built."""
     how = f"{plan.cells} cells a pixel" if model is None else "image charges"
     return (
         f"{plan.device.name}: full well {plan.full_well:,.0f} e-, {len(plan.charges)} charges x "
@@ -182,14 +197,14 @@ def _describe(plan: Any, model: Any) -> str:
 
 @dataclass(frozen=True)
 class _Levels:
-    """Charges and backgrounds [e-] and depths [um] of a table; None: those of its plan."""
+    """Charges and backgrounds [e-] and depths [um] of a table; None: the defaults of its plan."""
 
     charges: tuple[float, ...] | None
     backgrounds: tuple[float, ...] | None
     depths: tuple[float, ...] | None
 
     def for_galsim(self, device: Any) -> _Levels:
-        """One charge, no background, one depth, which is all that GalSim's format holds."""
+        """One charge, no background and one depth: GalSim's format holds no more."""
         charges = self.charges or (100000.0,)
         depths = self.depths or (95.0 / 100.0 * device.silicon.thickness,)
         if len(charges) != 1 or len(depths) != 1:
@@ -200,7 +215,7 @@ class _Levels:
         return _Levels(charges, (0.0,), depths)
 
     def for_image_charge(self, model: Any) -> _Levels:
-        """Two charges and one background, which hold all that is linear in charge."""
+        """Two charges and one background: enough, as this engine is linear in charge."""
         from bfsensor.table.build_image_charge import default_depths
 
         return _Levels(
@@ -213,7 +228,7 @@ class _Levels:
 def _check_engine(
     context: click.Context, engine: str, parameters: Sequence[tuple[str, str]]
 ) -> None:
-    """Refuse options of the other engine."""
+    """Refuse options that only the other engine takes."""
     if engine == "poisson":
         wrong = ["--image-charge"] if parameters else []
     else:
@@ -233,7 +248,7 @@ _LENGTHS = (
 
 
 def _image_charge(device: Any, parameters: Sequence[tuple[str, str]]) -> Any:
-    """Parameters of the analytic engine in a device, from texts with units."""
+    """Read the parameters of the image-charge model; geometry and permittivity are the device's."""
     from bfsensor.device.written_units import to_internal
     from bfsensor.simulate.charge_field import ImageCharge
 
@@ -269,7 +284,7 @@ def _image_charge(device: Any, parameters: Sequence[tuple[str, str]]) -> Any:
 
 
 def _build(plan: Any, model: Any, workers: int, assessed: bool, checkpoint: Path) -> Any:
-    """Build a plan's table; by Poisson's equation with a bar, so that it can be taken up again."""
+    """Build the table of a plan; Poisson's engine shows a bar and keeps finished levels."""
     from bfsensor.sweeps.executors import open_executor
     from bfsensor.table.build import build_table
 
@@ -289,7 +304,7 @@ def _build(plan: Any, model: Any, workers: int, assessed: bool, checkpoint: Path
 def _write(
     result: Any, plan: Any, galsim: Path | None, target: Path, overwrite: bool
 ) -> None:
-    """Write the table, or its one level for GalSim."""
+    """Write the table as FITS, or its single level in GalSim's format."""
     from bfsensor.table.galsim_format import write_galsim
 
     if galsim is None:
@@ -300,7 +315,7 @@ def _write(
 
 
 def _effort(plan: Any, result: Any) -> dict[str, Any]:
-    """What the solver did."""
+    """Mesh and iterations of the solver, for the summary."""
     return {
         "cells_a_pixel": plan.cells,
         "nodes": result.provenance.get("nodes"),
@@ -312,7 +327,7 @@ def _effort(plan: Any, result: Any) -> dict[str, Any]:
 def _start_assessment(
     plan: Any, executor: Executor | None, checkpoint: Path
 ) -> Callable[[], dict[str, float]]:
-    """Begin to measure the errors of a table; the answer is kept like its levels."""
+    """Start to measure the errors of a table; they are kept beside its finished levels."""
     from bfsensor.table.assess import assess
 
     kept = checkpoint / plan.key / "errors.json"
@@ -340,7 +355,7 @@ def _plain(value: Any) -> str:
 
 
 def _draw(result: Any, path: Path) -> list[str]:
-    """Draw a table beside it; says so and goes on where matplotlib is missing."""
+    """Draw a figure beside the table; without matplotlib a message on stderr."""
     from bfsensor.plots import table as show
 
     try:

@@ -1,4 +1,4 @@
-"""``bfsensor warm``: compile kernels ahead of use."""
+"""``bfsensor warm``: compile the kernels before the first image needs them."""
 
 from __future__ import annotations
 
@@ -7,22 +7,24 @@ from typing import Any
 
 import click
 
-# CPU seconds with an empty cache, on the machine of the notice in bfsensor._kernels.notice:
+# Measured CPU seconds with an empty cache, on the machine of the notice in bfsensor._kernels.notice:
 # images 33 (32 bits) + 9 (64 bits), areas 8, threads 25, tables 5 of their own and a table of 4.
 _SENSORS, _THREADS, _TABLES = 50, 25, 10
 
 
-@click.command("warm")
+@click.command("warm", short_help="Compile the kernels of the sensors.")
 @click.option("--threads", is_flag=True,
-              help=f"Also what sensors use with threads=2 and more, about {_THREADS} s.")  # fmt: skip
+              help=f"Also compile the kernels of sensors with threads=2 or more, about "
+              f"{_THREADS} CPU s.")  # fmt: skip
 @click.option("--tables", is_flag=True,
-              help=f"Also what 'bfsensor table' uses, about {_TABLES} s.")  # fmt: skip
+              help=f"Also compile the kernels of 'bfsensor table', about {_TABLES} CPU s.")  # fmt: skip
 def warm(threads: bool, tables: bool) -> None:
     """Compile the kernels of the sensors now, so that the first image does not wait.
 
-    Kernels are compiled on first use and kept on disk, for this processor and version, in the
-    folder that is printed (numba's NUMBA_CACHE_DIR moves it).  What is there is not compiled
-    again.  Covers images of 32 and 64 bits and pixel areas, with and without tree rings.
+    Without this command kernels are compiled on first use.  Compiled kernels are kept on disk, for
+    this processor and version, in the folder that is printed (the environment variable
+    NUMBA_CACHE_DIR changes it), and are not compiled again.  Covers images of 32 and 64 bits and
+    pixel areas, with and without tree rings.
 
     \b
     Examples:
@@ -35,9 +37,7 @@ def warm(threads: bool, tables: bool) -> None:
     from bfsensor._kernels.notice import notice
 
     seconds = _SENSORS + _THREADS * threads + _TABLES * tables
-    click.echo(
-        f"compiling what is not compiled yet, at most about {seconds} s, once", err=True
-    )
+    click.echo(f"compiling the kernels that are missing: about {seconds} s, once", err=True)
     notice.given = True  # said just now
     began = time.perf_counter()
     with event.install_recorder("numba:compile") as recorder:
@@ -55,7 +55,7 @@ def warm(threads: bool, tables: bool) -> None:
 
 
 def _use_sensors(threads: bool) -> None:
-    """Draw a few electrons in every way that has kernels of its own."""
+    """Draw ten photons with each combination of options that has kernels of its own."""
     import galsim
     import numpy as np
 
@@ -75,7 +75,7 @@ def _use_sensors(threads: bool) -> None:
 
 
 def _use_tables() -> None:
-    """Solve one coarse level of a table."""
+    """Build a coarse table of one charge, background and depth."""
     from bfsensor.device.device import Device
     from bfsensor.table.build import build_table
     from bfsensor.table.table_plan import plan_table

@@ -52,7 +52,7 @@ class Depletion:
     full_depletion_voltage : float
         Back bias at and below which all of the silicon is depleted [V].
     depth : float
-        Thickness of what is depleted between the end of the implants and the back [um].
+        Thickness of the depleted silicon, at most from the end of the implants to the back [um].
     lowest, highest : float
         Heights above the gates between which the silicon is depleted [um]: from 0 for acceptors,
         up to the back for donors.

@@ -1,4 +1,8 @@
-"""Effects that a simulation may leave out, one class each, and the library of all of them."""
+"""Effects that a simulation may leave out, one class each, and the library of all of them.
+
+Each class states its parameters with unit and plausible range, its source, and what it changes in
+images and in measured channels.
+"""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Converter bits: the weight of one bit is off, codes are skipped or too wide."""
+"""Errors of a converter's bits: one bit has a wrong weight, so that codes are skipped or too wide."""
 
 from __future__ import annotations
 
@@ -13,22 +13,44 @@ from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Seen
 from bfsensor.typing import FloatArray
 
 REMAINDERS = 64
-"""Codes whose remainders the channel counts; beyond, powers of two are told apart."""
+"""Period [codes] of the remainders that the channel ``code_hist`` counts.
+
+Defined by :data:`bfsensor.diagnose.data.code_channels.PERIOD`, which must be equal; bits of higher
+weight show only below multiples of powers of two."""
 
 LARGEST = 65536
+"""Number of codes, defined by a converter of 16 bits; higher levels are cut off."""
 
 READ_NOISE = 2.5
-"""Read noise [ADU] where it is not known: that of most converters of CCDs is set so (assumed)."""
+"""Read noise [ADU] of an amplifier whose noise is not known.
+
+Chosen, as usual for CCD controllers: twice as large, the predicted dependence of the error on the
+level practically vanishes for bit 2 and is a quarter as large for bit 3."""
 
 STEPS = 3
-"""Periods on either side of a level that its error is summed over; wider noise sees the mean."""
+"""Number of periods of the bit on either side of a level over which its mean error is summed.
+
+Derived: noise above 0.75 periods takes the mean error instead, so that the first edge left out
+lies at least 3 periods, or 4 sigma, away, where it changes the error by less than 1e-4 of delta."""
 
 
 class AdcBits(Effect):
-    """The weight of bit ``bit`` of a converter that approximates by halves is off by ``delta``.
+    """Bit ``bit`` of a successive-approximation converter weighs ``delta`` ADU too much.
 
-    With it on, all codes are ``delta`` too low: the code below is wider by as much, and as many
-    below the next multiple of 2^(bit + 1) never come.
+    Codes with this bit set are ``delta`` too low: the code just below each odd multiple of 2^bit is
+    wider by ``delta``, and ``delta`` codes below each multiple of 2^(bit + 1) never occur; the other
+    way round for a negative ``delta``.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``delta`` [ADU]: 0.2 to 2 in magnitude, either sign (0 changes nothing);
+        ``bit``: 2 to 9, whole.
+
+    Examples
+    --------
+    >>> AdcBits({"delta": 0.6, "bit": 5}).name
+    'adc_bits'
     """
 
     word = "adc_bits"
@@ -70,7 +92,7 @@ class AdcBits(Effect):
         for odd in (True, False):
             here = high & ((bit == own) if odd else (bit > own))
             change = self._width(-code[here], odd=odd)
-            # Of high bits the codes beside, which tell what is expected, have the change too.
+            # The expected frequency is a mean over the codes beside, which the error changes too.
             total = self["delta"] * (1 if odd else -1) if 2 * half > REMAINDERS else 0.0
             out[here] += (1 + change) / (1 + total / REMAINDERS) - 1
         if 2 * half <= REMAINDERS:
@@ -78,8 +100,8 @@ class AdcBits(Effect):
             out[~high] += self._width(half - place[~high], odd=True)
             out[~high] += self._width(2 * half - place[~high], odd=False)
             return out
-        # Of multiples of 64 some are odd multiples of the bit and some are even: those that the
-        # flats' codes lie at count.
+        # Some multiples of 64 are odd multiples of the bit and some even: their shares depend on
+        # the levels of the flats.
         for amp in np.unique(axes["amp"]):
             mine = axes["amp"] == amp
             bits, first = np.unique(np.where(mine & high, bit, -1), return_index=True)
@@ -88,7 +110,7 @@ class AdcBits(Effect):
             below = np.arange(1, REMAINDERS + 1)
             change = share.get(own, 0.0) * self._width(below, odd=True)
             change = change + even * self._width(below, odd=False)
-            # Shares of all: those of the others fall where one code comes more often.
+            # Frequencies are relative to their mean: where one code rises, the others fall.
             change = (1 + change) / (1 + change.mean()) - 1
             rows = mine & ~high
             out[rows] += change[REMAINDERS - code[rows] - 1]
@@ -121,14 +143,14 @@ class AdcBits(Effect):
         gains = np.array(layout.gains)
         if "amp" in axes:
             return read(axes["amp"].astype(int))
-        # Spots lie on all amplifiers.
+        # Spots lie on all amplifiers: the mean over them.
         count = len(layout.segments)
         return np.asarray(np.mean([read(np.array(n)) for n in range(count)], axis=0))
 
     def covariances(self, c: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
         if self["delta"] == 0 or not _known(layout):
             return c
-        # Whether the bit is on is a noise of its own.
+        # The error is two-valued, with the mean of `mean`: a variance of its own.
         amp = axes["amp"].astype(int)
         mean = self._light_error(axes["level"], amp, layout)
         out = c.copy()
@@ -138,23 +160,23 @@ class AdcBits(Effect):
     def _light_error(
         self, level: FloatArray, amp: NDArray[np.int64], layout: Layout
     ) -> FloatArray:
-        """Mean error of codes of pixels with light and its noise [e-]."""
+        """Mean error of the codes of pixels at a level with its shot and read noise [e-]."""
         gain, (start, noise) = np.array(layout.gains)[amp], self._zeros(layout)
         wide = np.sqrt(noise[amp] ** 2 + np.maximum(level, 0.0) / gain**2)
         return np.asarray(gain * self._error(start[amp] + level / gain, wide))
 
     def _zeros(self, layout: Layout) -> tuple[FloatArray, FloatArray]:
-        """True levels without light, and read noise, of the amplifiers [ADU]."""
+        """Levels before conversion without light, and read noise, by amplifier [ADU]."""
         zero = np.array(layout.offsets)
         noise = np.array(layout.read_noise or np.full(len(zero), READ_NOISE))
         noise = np.where(np.isfinite(noise) & (noise > 0), noise, READ_NOISE)
         return _levels(self, tuple(zero.tolist()), tuple(noise.tolist())), noise
 
     def _error(self, level: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Mean error of the codes [ADU] of levels with noise."""
+        """Mean error of the codes [ADU] of levels [ADU] with Gaussian noise ``sigma`` [ADU]."""
         delta, half = self["delta"], 2.0 ** int(self["bit"])
         period, s = 2 * half, abs(delta)
-        # One end is a jump, at the other codes that are too wide make a slope as long as delta.
+        # One end of the set bit is a jump; at the other the wide code makes a ramp of length delta.
         if delta > 0:
             ends = (half - 1 + s / 2, s), (period - 0.5, 0.0)
         else:
@@ -169,7 +191,7 @@ class AdcBits(Effect):
         return np.asarray(-delta * np.where(sigma > 0.75 * period, even, on))
 
     def _width(self, below: NDArray[np.int64], *, odd: bool) -> FloatArray:
-        """Change of the width of the n-th code below odd or even multiples of the bit [codes]."""
+        """Change of the width of the ``below``-th code below odd or even multiples of 2^bit [codes]."""
         delta, half = self["delta"], 2 ** int(self["bit"])
         if (delta > 0) == odd:
             out = np.where(below == 1, abs(delta), 0.0)
@@ -179,7 +201,7 @@ class AdcBits(Effect):
 
 
 def _known(layout: Layout) -> bool:
-    """Whether codes without light are known."""
+    """Whether the mean codes without light are known for all amplifiers."""
     return bool(layout.offsets) and bool(np.isfinite(layout.offsets).all())
 
 
@@ -187,7 +209,7 @@ def _known(layout: Layout) -> bool:
 def _levels(
     effect: AdcBits, zero: tuple[float, ...], noise: tuple[float, ...]
 ) -> FloatArray:
-    """True levels [ADU] whose mean codes, wrong as they are, are given."""
+    """Levels before conversion [ADU] whose mean codes, with this error, are ``zero``; by bisection."""
     given, spread = np.array(zero), np.array(noise)
     reach = abs(effect["delta"])
     low, high = given - reach, given + reach

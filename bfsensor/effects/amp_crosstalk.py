@@ -1,4 +1,4 @@
-"""Crosstalk: a part of each amplifier's signal is seen in the others."""
+"""Crosstalk: a fraction of each amplifier's signal appears in all others."""
 
 from __future__ import annotations
 
@@ -9,9 +9,20 @@ from bfsensor.typing import FloatArray
 
 
 class AmpCrosstalk(Effect):
-    """``c`` of every other amplifier's signal is added, at the same pixel time.
+    """The fraction ``c`` of every other amplifier's signal is added, at the same pixel time.
 
-    Flats are alike in all amplifiers: there it is a gain that light alone has, and is not told.
+    In flats all amplifiers have about the same signal: crosstalk acts as a change of gain there
+    and cannot be distinguished from it.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``c``: 1e-05 to 0.001 in magnitude, either sign (0 changes nothing).
+
+    Examples
+    --------
+    >>> AmpCrosstalk({"c": 0.0001}).name
+    'amp_crosstalk'
     """
 
     word = "amp_crosstalk"
@@ -30,7 +41,8 @@ class AmpCrosstalk(Effect):
         return [f + c * (total - f) for f in frames]
 
     def amp_cross(self, axes: Axes, layout: Layout) -> FloatArray:
-        # Of ADU in ADU: the victim's gain counts, and the aggressor's.
+        # The channel is a ratio of ADU, victim over aggressor, while c is a ratio of electrons: the
+        # gains [e-/ADU] enter the other way up.
         gains = np.asarray(layout.gains if layout.gains else np.ones(len(layout.segments)))
         ratio = gains[axes["amp"].astype(int)] / gains[axes["other"].astype(int)]
         return np.where(axes["what"] == "crosstalk", self["c"] * ratio, 0.0)

@@ -1,4 +1,4 @@
-"""Ratio of the boundary shifts in x and y that differs beyond what the card allows."""
+"""Ratio of boundary shifts in x and y outside the uncertainty of the nominal device."""
 
 from __future__ import annotations
 
@@ -7,7 +7,18 @@ from bfsensor.typing import Edges, FloatArray
 
 
 class BrighterFatterAnisotropy(Effect):
-    """Shifts in x are (1 - eps / 2) times the baseline's, those in y (1 + eps / 2) times."""
+    """Shifts in x are (1 - eps / 2) times the baseline's, those in y (1 + eps / 2) times.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``eps``: 0.02 to 0.3 in magnitude, either sign (0 changes nothing).
+
+    Examples
+    --------
+    >>> BrighterFatterAnisotropy({"eps": 0.08}).name
+    'bf_anisotropy'
+    """
 
     word = "bf_anisotropy"
     stage = "collect"

@@ -1,4 +1,4 @@
-"""Brighter-fatter strength that depends on wavelength otherwise than the baseline says."""
+"""Brighter-fatter strength whose dependence on wavelength differs from the baseline's."""
 
 from __future__ import annotations
 
@@ -6,11 +6,24 @@ from bfsensor.effects.effect import Effect, Layout, Parameter, Shot
 from bfsensor.typing import Edges, FloatArray
 
 ZERO, STEP = 620.0, 330.0
-"""Wavelength [nm] at which nothing changes, and that over which shifts change by kappa."""
+"""Wavelength [nm] at which nothing changes, and interval [nm] over which shifts change by kappa.
+
+Defined as the parameter's scale: kappa is the relative change from 620 to 950 nm."""
 
 
 class BrighterFatterChromatic(Effect):
-    """Shifts are (1 + kappa (wavelength - 620 nm) / 330 nm) times the baseline's."""
+    """Shifts are (1 + kappa (wavelength - 620 nm) / 330 nm) times the baseline's.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``kappa``: 0.01 to 0.2 in magnitude, either sign (0 changes nothing).
+
+    Examples
+    --------
+    >>> BrighterFatterChromatic({"kappa": 0.04}).name
+    'bf_chromatic'
+    """
 
     word = "bf_chromatic"
     stage = "collect"

@@ -1,4 +1,4 @@
-"""Brighter-fatter effect that is not proportional to the stored charge."""
+"""Boundary shifts that are quadratic in the stored charge."""
 
 from __future__ import annotations
 
@@ -8,8 +8,20 @@ from bfsensor.effects.effect import Effect, Law, Parameter
 class BrighterFatterNonlinear(Effect):
     """A charge Q moves boundaries by k Q (1 + b Q / 2).
 
-    Packets rise and spread as they grow, which b stands for; covariances gain a term that
-    grows with the cube of the level and has the shape in lags of the effect itself.
+    The coefficient ``b`` describes that the stored charge spreads and rises in the well as it
+    grows.  Covariances gain a term that is cubic in the level, with the same dependence on lag as
+    the linear effect.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``b`` [1/e-]: 3e-07 to 3e-06 in magnitude, either sign (0 changes
+        nothing).
+
+    Examples
+    --------
+    >>> BrighterFatterNonlinear({"b": 9e-07}).name
+    'bf_nonlinear'
     """
 
     word = "bf_nonlinear"

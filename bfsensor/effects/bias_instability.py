@@ -1,4 +1,4 @@
-"""Bias instability: the bias level moves from frame to frame, row to row, or along rows."""
+"""Bias instability: the bias level varies from frame to frame, row to row, or along rows."""
 
 from __future__ import annotations
 
@@ -16,7 +16,18 @@ SOURCE = (
 
 
 class BiasByFrame(Effect):
-    """The level of a whole frame moves by ``rms``; the overscan's level takes it off again."""
+    """The bias level of each frame varies by ``rms``; subtracting the overscan removes it.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``rms`` [e-]: 0.3 to 10 (0 changes nothing).
+
+    Examples
+    --------
+    >>> BiasByFrame({"rms": 2.0}).name
+    'bias_instability:frame'
+    """
 
     word = "bias_instability"
     variant = "frame"
@@ -36,7 +47,18 @@ class BiasByFrame(Effect):
 
 
 class BiasByRow(ReadNoise):
-    """The level moves from row to row by ``rms``, in each amplifier for itself."""
+    """The bias level of each row varies by ``rms``, independently in each amplifier.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``rms`` [e-]: 0.3 to 3 (0 changes nothing).
+
+    Examples
+    --------
+    >>> BiasByRow({"rms": 0.9}).name
+    'bias_instability:row'
+    """
 
     word = "bias_instability"
     variant = "row"
@@ -54,7 +76,7 @@ class BiasByRow(ReadNoise):
         )
 
     def in_order(self, lag: NDArray, width: NDArray) -> FloatArray:
-        # So many of a row's pixels have one of their own row so much later.
+        # Fraction of the pixels of a row whose partner, `lag` pixels later, is in the same row.
         return np.asarray(self["rms"] ** 2 * np.clip(1 - np.abs(lag) / width, 0, None))
 
     def on_frame(self, i: NDArray, j: NDArray, width: float) -> FloatArray:
@@ -62,7 +84,18 @@ class BiasByRow(ReadNoise):
 
 
 class BiasRamp(Effect):
-    """Each row begins ``amp`` too high and settles with ``length`` pixels, always alike."""
+    """Each row begins ``amp`` too high and decays exponentially over ``length`` pixels, always alike.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``amp`` [e-]: 2 to 30 (0 changes nothing); ``length`` [pixel]: 5 to 60.
+
+    Examples
+    --------
+    >>> BiasRamp({"amp": 8.0, "length": 20.0}).name
+    'bias_instability:ramp'
+    """
 
     word = "bias_instability"
     variant = "ramp"
@@ -91,14 +124,15 @@ class BiasRamp(Effect):
         return self._at(first + axes["k"] - 1)
 
     def flat_mean(self, axes: Axes, layout: Layout) -> FloatArray:
-        # The mean bias has the ramp too, over the mean of its whole overscan.
+        # The mean bias, which is subtracted, has the ramp too, above the mean of its whole overscan.
         return self._mean(axes, layout, "overscan")
 
     def _at(self, column: NDArray) -> FloatArray:
+        """Height of the ramp at columns in readout order, from 0 [e-]."""
         return np.asarray(self["amp"] * np.exp(-column / self["length"]))
 
     def _mean(self, axes: Axes, layout: Layout, part: str) -> FloatArray:
-        """Mean of the ramp over a part of the rows, by value."""
+        """Mean of the ramp over the 'image' or the 'overscan' of each value's amplifier [e-]."""
         every = []
         for s in layout.segments:
             first = s.prescan + (s.columns if part == "overscan" else 0)

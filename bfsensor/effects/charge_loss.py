@@ -1,4 +1,4 @@
-"""Charge loss: light is collected the less, the more charge is there."""
+"""Charge loss: the collection efficiency falls with the charge already collected."""
 
 from __future__ import annotations
 
@@ -6,10 +6,20 @@ from bfsensor.effects.effect import Effect, Law, Parameter
 
 
 class ChargeLoss(Effect):
-    r"""Light is collected with :math:`e^{-q Q}`, Q the charge that is there already.
+    r"""Light is collected with the efficiency :math:`e^{-q Q}`, Q the charge already in the pixel.
 
-    The mean of a flat lags behind the light, its variance falls by :math:`2 q \mu` of itself
-    and no neighbour gains: to first order the twin of a converter that bends.
+    The mean of a flat falls behind the light, its variance falls by the fraction :math:`2 q \mu`,
+    and neighbours gain nothing.  To first order a non-linear converter has the same effect.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``q`` [1/e-]: 1e-08 to 3e-07 (0 changes nothing).
+
+    Examples
+    --------
+    >>> ChargeLoss({"q": 5e-08}).name
+    'charge_loss'
     """
 
     word = "charge_loss"

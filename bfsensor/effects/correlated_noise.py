@@ -1,4 +1,4 @@
-"""Correlated noise: in time, between amplifiers, or a wave that is picked up."""
+"""Correlated read noise: in time, between amplifiers, or as a picked-up wave."""
 
 from __future__ import annotations
 
@@ -13,13 +13,29 @@ from bfsensor.effects.read_noise import ReadNoise, added
 from bfsensor.typing import FloatArray
 
 RMS = Parameter("rms", "e-", 0.5, 4.0, amplitude=True)
+"""Strength of the noise.  Range chosen; with a top twice as high its prior density falls by a
+quarter, which lowers the evidence of every detection by as much."""
 
 FREQUENCIES = 20
-"""Where fits of a wave begin: 0.01 cycles a pixel apart, the resolution of 32 lags being 0.016."""
+"""Number of frequencies from which fits of a wave begin.
+
+Derived: from periods of 5 to 60 pixel times they are 0.0096 cycles per pixel time apart, less than
+the resolution 1 / 64 = 0.016 of the 32 measured lags."""
 
 
 class NoiseInTime(ReadNoise):
-    """Each pixel's noise of ``rms`` keeps ``corr`` of that of the pixel before."""
+    """Noise of ``rms`` whose correlation with the pixel read before is ``corr``.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``rms`` [e-]: 0.5 to 4 (0 changes nothing); ``corr``: 0.3 to 0.95.
+
+    Examples
+    --------
+    >>> NoiseInTime({"rms": 1.0, "corr": 0.6}).name
+    'correlated_noise:ar1'
+    """
 
     word = "correlated_noise"
     variant = "ar1"
@@ -36,18 +52,31 @@ class NoiseInTime(ReadNoise):
         out = []
         for frame in frames:
             fresh = rms * rng.standard_normal(frame.size)
-            fresh[1:] *= np.sqrt(1 - keep**2)  # the first pixel's as wide as all others'
+            fresh[1:] *= np.sqrt(
+                1 - keep**2
+            )  # keeps the variance of all pixels but the first at rms^2
             out.append(lfilter([1.0], [1.0, -keep], fresh).reshape(frame.shape))
         return added(frames, out)
 
     def in_order(self, lag: NDArray, width: NDArray) -> FloatArray:
-        # Fits may try values at which it would not die out.
+        # Fits may try values of 1 and more, at which the correlation would not decay.
         keep = float(np.clip(self["corr"], -0.999, 0.999))
         return np.asarray(self["rms"] ** 2 * keep ** np.abs(lag))
 
 
 class CommonNoise(ReadNoise):
-    """Noise of ``rms``, white in time and the same in all amplifiers."""
+    """Noise of ``rms``, white in time and the same in all amplifiers.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``rms`` [e-]: 0.5 to 4 (0 changes nothing).
+
+    Examples
+    --------
+    >>> CommonNoise({"rms": 1.0}).name
+    'correlated_noise:common'
+    """
 
     word = "correlated_noise"
     variant = "common"
@@ -55,7 +84,7 @@ class CommonNoise(ReadNoise):
     touches = ("bias_cov", "amp_cross", "flat_cov")
     source = (
         "Common-mode noise of the outputs of one CCD: Proc. SPIE 9154, 91542S (2014), where dummy "
-        "outputs tell it; range assumed"
+        "outputs measure it; range assumed"
     )
 
     def noise(
@@ -74,10 +103,21 @@ class CommonNoise(ReadNoise):
 
 
 class Pickup(ReadNoise):
-    """A wave of ``rms`` and ``period`` in all amplifiers, its phase another in each frame.
+    """A sine wave of ``rms`` and ``period`` in all amplifiers, with a random phase in each frame.
 
-    Differences of two frames hold between nothing and twice its power: over n pairs the power
-    scatters by sqrt(1 / 2n) of itself.
+    The difference of two frames holds from 0 to 4 times its power, 2 on average, as the phases
+    differ: over n pairs the measured power scatters by sqrt(1 / 2n) of itself.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``rms`` [e-]: 0.3 to 3 (0 changes nothing); ``period`` [pixel times]: 5
+        to 60.
+
+    Examples
+    --------
+    >>> Pickup({"rms": 0.9, "period": 20.0}).name
+    'correlated_noise:pickup'
     """
 
     word = "correlated_noise"

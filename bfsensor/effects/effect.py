@@ -1,4 +1,8 @@
-"""What an effect is: parameters, what it does to pixels, and what it does to each channel."""
+"""Base class of all effects: parameters, changes of pixels, and changes of measured channels.
+
+A channel is one kind of measurement that a diagnosis compares with its prediction: means of flats
+(``flat_mean``), their covariances (``flat_cov``), maps (``flat_map``), spots and so on.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +18,7 @@ from bfsensor.errors import EffectError
 from bfsensor.typing import Edges, FloatArray
 
 STAGES = ("light", "collect", "store", "shift", "amplifier", "converter")
-"""In the order in which light becomes codes."""
+"""Stages of a readout, in the order in which light becomes codes."""
 
 Image = NDArray[Any]
 Axes = Mapping[str, NDArray]
@@ -22,25 +26,34 @@ Seen = Mapping[str, Any]
 
 
 class Parameter(NamedTuple):
-    """One number of an effect.
+    """One parameter of an effect: name, unit and plausible range.
 
-    Attributes
+    Parameters
     ----------
     name, unit : str
-        As the report has them.
+        Name and unit, as reports print them; '' without a unit.
     low, high : float
-        Ends of the range that is plausible, of the magnitude where ``signed``; fits may leave
-        it by a factor of ten, evidence is counted inside it.
+        Plausible range, of the magnitude where ``signed``.  Evidence is computed for this range;
+        fits may go beyond it: amplitudes with law "log" up to ten times ``high``, other such
+        parameters by a factor of about three, those with law "flat" by half of its width.
     neutral : float
-        Of an amplitude: the value at which nothing changes.
+        Value of an amplitude at which the effect changes nothing.
     law : str
-        "log" or "flat": how plausible values are spread; "whole": whole numbers.
+        Prior of the values inside the range: "log", uniform in the logarithm; "flat", uniform;
+        "whole", whole numbers, which are searched but not fitted.
     signed : bool
-        Either sign.
+        Whether the value may have either sign.
     amplitude : bool
-        Whether the effect is off at ``neutral``; other parameters are of its shape.
+        True for a strength, which switches the effect off at ``neutral``; False for a parameter of
+        its shape.
     step : float
-        Of derivatives; 0: after the range.
+        Step of numerical derivatives, in the unit of the parameter; 0: 2 % of the value for the
+        law "log", 1 % of the range for "flat".
+
+    Examples
+    --------
+    >>> Parameter("cti", "", 1e-7, 5e-6, amplitude=True).neutral
+    0.0
     """
 
     name: str
@@ -55,7 +68,26 @@ class Parameter(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """One amplifier's part of the sensor [pixel]; its overscans are read after it."""
+    """One amplifier's part of the sensor, in pixels.
+
+    Parameters
+    ----------
+    x, y : int
+        First column and row on the sensor, from 0.
+    columns, rows : int
+        Size of the light-sensitive part.
+    flip_x, flip_y : bool
+        Whether its last column, or row, is read first.
+    prescan : int
+        Columns that are read before each row of the image.
+    serial_overscan, parallel_overscan : int
+        Columns and rows that are read after the image.
+
+    Examples
+    --------
+    >>> Segment(0, 0, 4, 9, flip_x=True).sensor_column(np.arange(4))
+    array([3, 2, 1, 0])
+    """
 
     x: int
     y: int
@@ -68,27 +100,43 @@ class Segment(NamedTuple):
     parallel_overscan: int = 0
 
     def sensor_column(self, read: NDArray[Any]) -> NDArray[Any]:
-        """Columns of the sensor that are read as such of the amplifier, from 0."""
+        """Give the columns of the sensor at places in readout order.
+
+        Parameters
+        ----------
+        read : ndarray of int
+            Columns in the order in which the amplifier reads them, from 0, prescan not counted.
+
+        Returns
+        -------
+        columns : ndarray of int
+            Columns of the sensor, from 0.
+        """
         return self.x + (self.columns - 1 - read if self.flip_x else read)
 
 
 class Shot(NamedTuple):
-    """What an effect may know of one exposure; nan where not known.
+    """One exposure as effects see it; nan stands for a condition that is not known.
 
-    Attributes
+    Parameters
     ----------
     kind : str
         'bias', 'dark', 'flat' or 'spot'.
     number : int
-        Place in the order of time.
+        Place in the order of time; -1 for no exposure in particular, but the mean of all.
     seconds : float
         Commanded exposure time [s].
     wavelength, back_bias, temperature : float
-        [nm], [V], [K].
+        Vacuum wavelength of the light [nm], back bias [V], temperature [K].
     hours : float
-        Since the first exposure [h].
+        Time since the first exposure [h].
     level : float
         Mean charge of a pixel [e-].
+
+    Examples
+    --------
+    >>> Shot("flat", 3, 2.0, wavelength=620.0).back_bias
+    nan
     """
 
     kind: str
@@ -103,7 +151,7 @@ class Shot(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """Sensor and campaign that predictions are made for.
+    """Sensor and campaign for which an effect predicts channels.
 
     Attributes
     ----------
@@ -114,28 +162,27 @@ class Layout:
     shots : tuple of Shot
         Exposures in the order of time.
     gains : tuple of float
-        Of the amplifiers [e-/ADU].
+        Gains of the amplifiers [e-/ADU]; empty where not known.
     offsets, read_noise : tuple of float
         Mean code without light and read noise of the amplifiers [ADU]; empty, or nan, where not
         known.
     biases : tuple of int
         Numbers of the exposures that the mean bias is made of.
     map_noise : mapping of (str, str) to float
-        By fold and name of a map: its variance over that of a single flat, were all flats of it
-        alike.
-    sightings : tuple of mapping
-        What the maps were searched for as a whole, for starts: 'map', 'shape' and its numbers.
+        Variance of a map over that of a single flat, if all its flats were alike, by the name of
+        the fold (part of the exposures used for cross-validation) and of the map.
     box, lags, clip : int, int, float
-        Of the flats' covariances: side of the boxes whose means are taken off and largest lag
-        [pixel], and the deviation [sigma] from which a pixel is left out, its neighbours too.
+        Settings of the measured covariances of flats: side of the boxes whose mean is subtracted
+        [pixel], largest lag [pixel], and the deviation of a pixel [sigma] beyond which it and its
+        neighbours are excluded.
     reference : tuple of float
-        Wavelength [nm], back bias [V] and temperature [K] that a baseline is given for.
+        Wavelength [nm], back bias [V] and temperature [K] of the baseline's reference condition.
     pixel, thickness : float
-        Pitch and thickness [um].
+        Pixel pitch and thickness of the silicon [um].
     front : float
-        Mean voltage of the front side [V].
+        Mean potential of the front side [V].
     absorption : mapping of float to float
-        Absorption length [um] by wavelength [nm].
+        Absorption length [um] by wavelength [nm]; empty: that of silicon at 173 K.
     """
 
     shape: tuple[int, int]
@@ -152,6 +199,7 @@ class Layout:
     biases: tuple[int, ...] = ()
     map_noise: Mapping[tuple[str, str], float] = field(default_factory=dict)
     sightings: tuple[Seen, ...] = ()
+    """Waves and rings detected in the maps, as starts of fits: 'map', 'shape', its parameters."""
     box: int = 64
     lags: int = 4
     clip: float = 5.0
@@ -164,44 +212,56 @@ class Layout:
         return np.nan_to_num(np.array(self.read_noise) * np.array(self.gains))
 
     def of_amp(self, name: str, amp: NDArray) -> FloatArray:
-        """Give an attribute of the segments, by name, of given amplifiers."""
+        """Give an attribute of the segments for given amplifiers.
+
+        Parameters
+        ----------
+        name : str
+            Attribute of :class:`Segment`.
+        amp : ndarray of int
+            Numbers of amplifiers.
+
+        Returns
+        -------
+        values : ndarray, shape of ``amp``
+            0 for a reduced recording, which has no segments.
+        """
         if not self.segments:
-            # A reduced recording: nothing of it lies anywhere on a sensor.
+            # A reduced recording, a table of a_ij for example, has no place on a sensor.
             return np.zeros(np.shape(amp))
         every = np.array([getattr(s, name) for s in self.segments], float)
         return np.asarray(every[np.asarray(amp).astype(int)])
 
     def frame_width(self, amp: NDArray) -> FloatArray:
-        """Columns of given amplifiers' frames, prescan and overscan among them."""
+        """Columns of the frames of given amplifiers, prescan and serial overscan included."""
         names = "prescan", "columns", "serial_overscan"
         return np.asarray(np.sum([self.of_amp(n, amp) for n in names], axis=0))
 
     def backwards(self, axis: str) -> float:
-        """Share of the light that is read against an axis, 'x' or 'y'."""
+        """Fraction of the area whose pixels are read in falling order along ``axis``, 'x' or 'y'."""
         area = np.array([s.columns * s.rows for s in self.segments], float)
         flipped = np.array([getattr(s, f"flip_{axis}") for s in self.segments])
         return float((area * flipped).sum() / area.sum())
 
 
 class Law(NamedTuple):
-    """How collection departs from shifts that are proportional to the stored charge.
+    """Departure of charge collection from boundary shifts proportional to the stored charge.
 
-    Attributes
-    ----------
-    bend : float
-        b: boundaries move by k Q (1 + b Q / 2) [1/e-].
-    loss : float
-        q: light is collected with exp(-q Q) [1/e-].
-    full_well : float
-        Charge beyond which it spills along the column [e-].
+    Examples
+    --------
+    >>> Law(loss=1e-7).with_law(Law(loss=2e-7, full_well=1e5)).full_well
+    100000.0
     """
 
     bend: float = 0.0
+    """b [1/e-]: a charge Q moves boundaries by k Q (1 + b Q / 2)."""
     loss: float = 0.0
+    """q [1/e-]: light is collected with the efficiency exp(-q Q)."""
     full_well: float = np.inf
+    """Charge of a pixel above which the rest spills along its column [e-]."""
 
     def with_law(self, other: Law) -> Law:
-        """Both together."""
+        """Combine two laws: coefficients add, the lower full well holds."""
         return Law(
             self.bend + other.bend,
             self.loss + other.loss,
@@ -211,78 +271,84 @@ class Law(NamedTuple):
 
 @dataclass(frozen=True)
 class Effect:
-    """One piece of physics with its parameters; subclasses say what it does.
+    """One physical effect with values of its parameters; each subclass is one effect.
 
-    Two faces.  *On pixels*, stage by stage, in electrons: :meth:`edges`, :meth:`law`,
-    :meth:`light_map`, :meth:`displacements`, :meth:`spot_light` (they serve predictions too),
+    An effect acts in two ways.
+
+    *On pixels*, stage by stage, in electrons: :meth:`edges`, :meth:`law`, :meth:`light_map`,
+    :meth:`displacements`, :meth:`spot_light` (predictions use these five too),
     :meth:`turbulence`, :meth:`store`, :meth:`shift`, :meth:`amplify`, :meth:`noise`,
-    :meth:`convert`.  *On channels*, in closed form: :meth:`signal`, :meth:`covariances`,
-    :meth:`spot_image`, :meth:`spot_flux`, :meth:`spot_ghosts`, :meth:`pattern` and the methods
-    named after channel words, which give the change that is to be added, in electrons (or e-^2),
-    and are given the axes of the channel with 'level' in electrons; :meth:`modes` says what is
-    left to chance.  A subclass overrides what it touches and nothing else.
+    :meth:`convert`.
+
+    *On channels*, in closed form: :meth:`signal`, :meth:`covariances`, :meth:`spot_image`,
+    :meth:`spot_flux`, :meth:`spot_ghosts`, :meth:`pattern`, and the methods with the name of a
+    channel, which return the change to be added [e-, or e-^2].  These take the axes of the
+    channel, one array for each, with 'level' in electrons.  :meth:`modes` gives the random part of
+    an effect that differs from exposure to exposure.
+
+    A subclass overrides only the methods of what it changes; the others change nothing.
+
+    Arguments have the same meaning in all methods: ``shot`` is the exposure with its conditions,
+    ``layout`` the sensor and campaign, ``axes`` the axes of a channel by name (arrays of one entry
+    for each value), ``amp`` the number of an amplifier, ``rng`` the source of random numbers.
+    Images are in electrons and are not changed in place; a method that changes nothing returns its
+    input.
 
     Parameters
     ----------
     values : mapping of str to float
-        All parameters.
+        Value of every parameter that the class declares in ``parameters``, by name and in its unit.
 
     Raises
     ------
     EffectError
         A parameter is missing, unknown, or not finite.
 
-    Attributes
-    ----------
-    word, variant : str
-        Class in the taxonomy, and which kind of it where there are several.
-    stage : str
-        Of :data:`STAGES`.
-    parameters : tuple of Parameter
-    touches : tuple of str
-        Channel words that can change.
-    source : str
-        Where the law and the range come from.
-    by_time : bool
-        Whether :meth:`light_map`, :meth:`displacements` or :meth:`pattern` change with the
-        exposure time or the level.
-    standing : bool
-        Whether :meth:`light_map`, :meth:`displacements` and :meth:`pattern` are the same in all
-        flats.
-    from_sightings : bool
-        Whether :meth:`starts` are taken from waves that were sought in maps.
-    of_pixels : bool
-        Whether its predictions need the amplifiers' pixels, which reduced recordings do not tell.
-    of_levels : bool
-        Whether only the level tells it: a_ij without one are as well those of another device.
-    bends : bool
-        Whether what it changes goes with the square of its amplitude as well.
-    told_by_scatter : tuple of str
-        Channels in which :meth:`modes`, in proportion to the amplitude, tell how strong it is.
+    Examples
+    --------
+    >>> from bfsensor.effects import ChargeLoss
+    >>> effect = ChargeLoss({"q": 1e-7})
+    >>> effect.name, effect.is_neutral(), effect.scaled(0.0).is_neutral()
+    ('charge_loss', False, True)
     """
 
     values: Mapping[str, float]
 
     word: ClassVar[str] = ""
+    """Name of the class of effects in the taxonomy."""
     variant: ClassVar[str] = ""
+    """Name of the kind where the taxonomy's class has several, else ''."""
     stage: ClassVar[str] = "amplifier"
+    """Stage of :data:`STAGES` at which it acts on pixels."""
     parameters: ClassVar[tuple[Parameter, ...]] = ()
+    """Parameters with unit and plausible range."""
     touches: ClassVar[tuple[str, ...]] = ()
+    """Names of the channels that it can change."""
     source: ClassVar[str] = ""
+    """Publication of its law and of the range of its parameters, or that they are assumed."""
     by_time: ClassVar[bool] = False
+    """Whether :meth:`light_map`, :meth:`displacements` or :meth:`pattern` depend on the exposure
+    time or the level."""
     standing: ClassVar[bool] = False
+    """Whether :meth:`light_map`, :meth:`displacements` and :meth:`pattern` are equal in all flats."""
     of_pixels: ClassVar[bool] = False
+    """Whether its predictions need the amplifiers' pixels, which reduced recordings do not have."""
     of_levels: ClassVar[bool] = False
+    """Whether only recordings at several levels constrain it: a table of a_ij without levels could
+    equally be that of another device."""
     from_sightings: ClassVar[bool] = False
+    """Whether :meth:`starts` begin from waves or rings that were detected in maps."""
     bends: ClassVar[bool] = False
+    """Whether its changes have a part that is quadratic in the amplitude."""
     told_by_scatter: ClassVar[tuple[str, ...]] = ()
+    """Channels whose scatter constrains the amplitude: :meth:`modes` are proportional to it there."""
 
     def __post_init__(self) -> None:
         needed = {p.name for p in self.parameters}
         if set(self.values) != needed:
             raise EffectError(
                 f"{self.name}: parameters {', '.join(sorted(self.values)) or 'none'} given, "
-                f"{', '.join(sorted(needed))} needed"
+                f"but {', '.join(sorted(needed))} needed"
             )
         for name, value in self.values.items():
             if not np.isfinite(value):
@@ -300,24 +366,24 @@ class Effect:
 
     @property
     def name(self) -> str:
-        """Class, and variant where there are several."""
+        """Name of the class of effects, followed by ``:`` and the variant where there is one."""
         return f"{self.word}:{self.variant}" if self.variant else self.word
 
     @classmethod
     def amplitudes(cls) -> tuple[str, ...]:
-        """Names of the parameters that switch the effect off."""
+        """Names of the parameters that are strengths, each 0 effect at its neutral value."""
         return tuple(p.name for p in cls.parameters if p.amplitude)
 
     def is_neutral(self) -> bool:
-        """Whether every amplitude has its neutral value: nothing changes by a bit."""
+        """Whether every amplitude has its neutral value, so that predictions do not change by a bit."""
         return all(self[p.name] == p.neutral for p in self.parameters if p.amplitude)
 
     def with_values(self, **values: float) -> Self:
-        """Copy with some parameters changed."""
+        """Return a copy with some parameters changed, given by name."""
         return type(self)({**self.values, **values})
 
     def scaled(self, factor: float) -> Self:
-        """Copy with every amplitude's distance from neutral multiplied."""
+        """Return a copy with the distance of every amplitude from neutral multiplied by ``factor``."""
         return self.with_values(**{
             p.name: p.neutral + factor * (self[p.name] - p.neutral)
             for p in self.parameters if p.amplitude
@@ -325,18 +391,24 @@ class Effect:
 
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
-        """Give places where a fit may begin, one of which leads to the best fit.
+        """Give values from which fits begin, so many that one leads to the best fit.
 
-        By default amplitudes at the middle of their range and three places of each shape
-        parameter's range, crossed.
+        By default amplitudes are at the middle of their range, and each parameter of the shape
+        takes three values in its range, every one with every other.
 
         Parameters
         ----------
         layout : Layout
             Sensor and campaign.
         seen : sequence of mapping
-            Where the baseline fails, farthest first: 'word' of the channel, 'z', and what the
-            scan found: 'x', 'y', 'amp', 'lag', 'period' ... as far as it says.
+            Places where the residuals of the baseline are significant, most significant first:
+            'word' of the channel, significance 'z' [sigma], and as far as known 'x', 'y', 'amp',
+            'lag', 'period' and so on.
+
+        Returns
+        -------
+        starts : list of dict
+            Values of all parameters, one mapping for each start.
         """
         del layout, seen
         grids: list[dict[str, float]] = [{}]
@@ -357,44 +429,57 @@ class Effect:
     # -- light and collection: on pixels and in predictions alike
 
     def edges(self, kx: FloatArray, ky: FloatArray, shot: Shot, layout: Layout) -> Edges:
-        """Shifts of right and upper edges per electron [pixel/e-], [row dy, column dx]."""
+        """Change the boundary shifts per electron of the baseline.
+
+        Parameters
+        ----------
+        kx, ky : ndarray, shape (2 n + 1, 2 n + 1)
+            Shifts of right and of upper edges [pixel/e-], [row dy, column dx] from the charge.
+        shot, layout
+            Conditions of the exposure; sensor and campaign.
+
+        Returns
+        -------
+        kx, ky : ndarray
+            Changed shifts, which may reach farther.
+        """
         del shot, layout
         return kx, ky
 
     def level_response(
         self, shot: Shot, layout: Layout
     ) -> tuple[float, Edges, Edges] | None:
-        """Give how shifts change with the charge that is there; None: no other than the baseline's.
+        """Give the change of the shifts with the charge in all pixels.
 
         Returns
         -------
-        level : float
-            Charge at which nothing changes [e-].
-        slope, bend : tuple of ndarray
-            Change per electron [pixel/e-^2], and half the second derivative [pixel/e-^3].
+        response : tuple of (float, Edges, Edges), or None
+            Charge at which nothing changes [e-]; derivative of the shifts (kx, ky) by the charge
+            [pixel/e-^2]; half of their second derivative [pixel/e-^3].  None: as in the baseline.
         """
         del shot, layout
         return None
 
     def law(self) -> Law:
-        """How collection departs from linear shifts."""
+        """Give the departure of charge collection from shifts proportional to the charge."""
         return Law()
 
     def light_map(self, shot: Shot, layout: Layout) -> FloatArray | None:
-        """Factor on the light of an exposure, shape of the sensor; None: one."""
+        """Factor on the light of an exposure, shape (ny, nx) of the sensor; None: 1 everywhere."""
         del shot, layout
         return None
 
     def displacements(self, shot: Shot, layout: Layout) -> Edges | None:
-        """Standing displacements [pixel] of the edges between columns and between rows.
+        """Displacements of the pixel edges without any charge [pixel].
 
-        Shapes (ny, nx + 1) and (ny + 1, nx), the rim's edges too; None: they stand.
+        Of the edges between columns, shape (ny, nx + 1), towards higher columns; and between rows,
+        shape (ny + 1, nx), towards higher rows; the rim of the sensor included.  None: all are 0.
         """
         del shot, layout
         return None
 
     def spot_light(self, shot: Shot, layout: Layout) -> tuple[float, float, float]:
-        """Of spots: added variance [pixel^2], share of light in a halo, its sigma [pixel]."""
+        """Variance added to spots [pixel^2], fraction of their light in a halo, its sigma [pixel]."""
         del shot, layout
         return 0.0, 0.0, 1.0
 
@@ -403,7 +488,7 @@ class Effect:
     def turbulence(
         self, shot: Shot, layout: Layout, rng: np.random.Generator
     ) -> FloatArray | None:
-        """Factor on the light that differs from frame to frame; None: one."""
+        """Factor on the light, random in each frame, shape (ny, nx); None: 1 everywhere."""
         del shot, layout, rng
         return None
 
@@ -417,7 +502,8 @@ class Effect:
     ) -> Image:
         """Charge as it is stored [e-], shape of the sensor.
 
-        ``memory`` is kept from exposure to exposure.
+        ``memory`` holds arrays by name and is passed on from exposure to exposure; it is changed
+        in place.
         """
         del shot, layout, rng, memory
         return charge
@@ -440,24 +526,25 @@ class Effect:
         return frames
 
     def convert(self, levels: Image) -> Image:
-        """Levels as the converter's wrong steps show them [ADU], before rounding."""
+        """Levels after the errors of the analogue-to-digital converter [ADU], before rounding."""
         return levels
 
     # -- on channels: what is to be added to the prediction
 
     def pattern(self, shot: Shot, layout: Layout) -> FloatArray | None:
-        """Relative change of a flat's map that comes after collection; None: none.
+        """Relative change of the map of a flat by the readout, after collection; None: 0.
 
-        Shape of the sensor, on its axes (not in readout order); ``shot.level`` [e-] is the
-        flat's.  What :meth:`light_map` and :meth:`displacements` change is not to be given again.
+        Shape (ny, nx) on the axes of the sensor, not in readout order; ``shot.level`` [e-] is that
+        of the flat.  Changes by :meth:`light_map` and :meth:`displacements` are not included.
         """
         del shot, layout
         return None
 
     def signal(self, level: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
-        """Signal of smooth light after the amplifier [e-] against the collected charge [e-].
+        """Signal after the amplifier [e-] of uniform light that collected the charge ``level`` [e-].
 
-        One to one and smooth; also of pixels of spots' mean images.
+        A smooth, monotonic function of the level; it is applied to pixels of mean images of spots
+        too.
         """
         del axes, layout
         return level
@@ -468,12 +555,17 @@ class Effect:
         Parameters
         ----------
         c : ndarray, shape (n, ny, nx)
-            Periodic, lag (0, 0) in the corner, by flat.
+            Covariances before it, of n flats, on a periodic array with lag (0, 0) in the corner.
         axes : mapping
-            Of the flats, shape (n,): 'amp', 'level' [e-], 'time' [s], 'hours' since the first
-            exposure, conditions.
+            Axes of the flats, arrays of shape (n,): 'amp', 'level' [e-], 'time' [s], 'hours' since
+            the first exposure, and the conditions.
         layout : Layout
-            Of the sensor.
+            Sensor and campaign.
+
+        Returns
+        -------
+        covariances : ndarray, shape (n, ny, nx)
+            ``c`` is not changed.
         """
         del axes, layout
         return c
@@ -481,22 +573,22 @@ class Effect:
     def spot_image(
         self, images: FloatArray, axes: Mapping[str, float], layout: Layout
     ) -> FloatArray:
-        """Mean images of spots [e-] on the sensor's axes after this effect, shape (..., ny, nx).
+        """Mean images of spots after this effect [e-], shape (..., ny, nx), on the sensor's axes.
 
-        ``axes``: the condition, 'hours', and 'background', electrons of a pixel beside a spot over
-        the spot's flux.
+        ``axes`` holds the condition, 'hours' since the first exposure, and 'background', the
+        charge of a pixel beside a spot as a fraction of the spot's flux.
         """
         del axes, layout
         return images
 
     def spot_flux(self, axes: Axes, layout: Layout) -> FloatArray:
-        """Added to electrons of whole spots [e-], besides :meth:`spot_image`; by exposure."""
+        """Change of the flux of whole spots [e-] by exposure, besides :meth:`spot_image`."""
         return _nothing(axes)
 
     def spot_ghosts(
         self, shown: FloatArray, lit: FloatArray, layout: Layout
     ) -> FloatArray | None:
-        """Parts of the charge of spots that others show where they were.
+        """Fractions of the charge of spots that later exposures show as ghosts at their places.
 
         Parameters
         ----------
@@ -508,79 +600,82 @@ class Effect:
         Returns
         -------
         parts : ndarray, shape (n, m), or None
-            None: nothing is left.
+            Fraction of the charge of each lit exposure that each other shows; None: no ghosts.
         """
         del shown, lit, layout
         return None
 
     def modes(self, word: str, axes: Axes, layout: Layout) -> FloatArray | None:
-        """What chance adds to a channel: shapes whose strengths are independent, of variance 1.
+        """Give the random part of a channel as modes with independent strengths of variance 1.
 
-        A random effect changes values in expectation, by the other methods, and by its own
-        scatter, which is no error of measurement and ties values together.
+        A random effect changes the expectation of a channel, by the other methods, and adds scatter
+        of its own, which is no error of measurement and correlates values: their covariance is
+        ``modes @ modes.T``.
 
         Parameters
         ----------
         word : str
-            Channel.
+            Name of the channel.
         axes : mapping
-            Of its n values, and 'fold'.
+            Axes of its n values, and 'fold', the part of the exposures.
         layout : Layout
             Sensor and campaign.
 
         Returns
         -------
         modes : ndarray, shape (n, m), or None
-            In the unit of the change [e-, or e-^2, or relative in maps]; None: no chance.
+            In the unit of the channel [e-, e-^2, or relative in maps]; None: not random.
         """
         del word, axes, layout
         return None
 
     def flat_mean(self, axes: Axes, layout: Layout) -> FloatArray:
-        """Added to means of flats [e-], besides :meth:`signal`."""
+        """Change of means of flats [e-], besides :meth:`signal`."""
         return _nothing(axes)
 
     def serial_overscan(self, axes: Axes, layout: Layout) -> FloatArray:
-        """Added to the k-th pixel of the serial overscan behind flats [e-].
+        """Change of the k-th pixel of the serial overscan after flats [e-], k from 1.
 
-        The profile's zero, its last pixels, is taken off by the caller, and so is the zero of
-        the means of flats, the overscan's second half.
+        The caller subtracts the zero levels: of this profile its last pixels, of the means of
+        flats the second half of the overscan.
         """
         return _nothing(axes)
 
     def parallel_overscan(self, axes: Axes, layout: Layout) -> FloatArray:
-        """Added to the k-th row of the parallel overscan behind flats [e-]."""
+        """Change of the k-th row of the parallel overscan after flats [e-], k from 1."""
         return _nothing(axes)
 
     def bias_cov(self, axes: Axes, layout: Layout) -> FloatArray:
-        """Added to the noise's covariance at a lag in readout order [e-^2]."""
+        """Change of the covariance of the noise of biases by lag in readout order [e-^2]."""
         return _nothing(axes)
 
     def bias_level(self, axes: Axes, layout: Layout) -> FloatArray:
-        """Added to bias levels [e-], or to variances [e-^2].
+        """Change of bias levels [e-], or of their variances [e-^2].
 
-        Where 'what' is 'rows': to the variance of rows' means over that of white noise of the
-        same total; where it is 'frames': to that of frames' levels.
+        By the axis 'what': 'level', of the level; 'rows', of the variance of the means of rows
+        above that of white noise of the same total; 'frames', of the variance of the levels of
+        frames.
         """
         return _nothing(axes)
 
     def dark_map(self, axes: Axes, layout: Layout) -> FloatArray:
-        """Added to levels and columns of darks [e-]; where 'what' is 'struck', to numbers."""
+        """Change of levels and columns of darks [e-], and where 'what' is 'struck' of pixel numbers."""
         return _nothing(axes)
 
     def amp_cross(self, axes: Axes, layout: Layout) -> FloatArray:
-        """Added to shared noise [e-^2]; where 'what' is 'crosstalk', to fractions."""
+        """Change of the noise shared by two amplifiers [e-^2], or of their 'crosstalk' (fraction)."""
         return _nothing(axes)
 
     def code_hist(self, axes: Axes, layout: Layout) -> FloatArray:
-        """Added to the relative frequencies of codes.
+        """Change of the relative frequencies of codes in flats.
 
-        By remainder; where 'bit' is n > 0, of the ``-code``-th code below those that 2^n is the
-        highest power of two in, over its neighbours', 'share' being the part that those make of
-        all multiples of 64.
+        Where 'bit' is negative, of the codes with the remainder 'code' of 64.  Where 'bit' is n,
+        of the code ``-code`` below multiples of 2^n that are no multiples of 2^(n + 1), over that
+        of its neighbours; 'share' is the fraction of such multiples among all multiples of 64.
         """
         return _nothing(axes)
 
 
 def _nothing(axes: Axes) -> FloatArray:
+    """No change of any value of a channel."""
     return np.zeros(len(next(iter(axes.values()))))

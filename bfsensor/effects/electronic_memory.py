@@ -1,4 +1,4 @@
-"""Electronic memory: the amplifier has not forgotten the pixel before."""
+"""Electronic memory: a fraction of the pixel read before remains in the amplifier."""
 
 from __future__ import annotations
 
@@ -12,9 +12,19 @@ from bfsensor.typing import FloatArray
 
 
 class ElectronicMemory(Effect):
-    """``alpha`` of the pixel that was read before is added to each, in readout order.
+    """The fraction ``alpha`` of the signal of the pixel read before is added to each pixel.
 
-    The same in all columns, where charge that transfers leave behind grows with the column.
+    It is the same in all columns, whereas charge left behind by transfers grows with the column.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``alpha``: 1e-05 to 0.001 (0 changes nothing).
+
+    Examples
+    --------
+    >>> ElectronicMemory({"alpha": 0.0001}).name
+    'electronic_memory'
     """
 
     word = "electronic_memory"
@@ -36,7 +46,7 @@ class ElectronicMemory(Effect):
         return out
 
     def pattern(self, shot: Shot, layout: Layout) -> FloatArray | None:
-        # Before the first column there was no light.
+        # The pixel before the first column, of the prescan or overscan, holds no light.
         out = np.zeros(layout.shape)
         for s in layout.segments:
             column = s.x + (s.columns - 1 if s.flip_x else 0)
@@ -47,7 +57,7 @@ class ElectronicMemory(Effect):
         return level * (1.0 + self["alpha"])
 
     def covariances(self, c: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
-        # Each pixel is a mean of two, the gain being that of smooth light.
+        # Each pixel is a weighted mean of two, as the gain is that of uniform light.
         both = np.roll(c, 1, -1) + np.roll(c, -1, -1)
         part = self._share
         return np.asarray(c + part * (1 - part) * (both - 2 * c))
@@ -62,4 +72,5 @@ class ElectronicMemory(Effect):
 
     @property
     def _share(self) -> float:
+        """Fraction of a uniform signal that is of the pixel before."""
         return self["alpha"] / (1.0 + self["alpha"])

@@ -1,4 +1,4 @@
-"""Gain drift: the gain changes with time."""
+"""Gain drift: the gain changes linearly with time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,19 @@ from bfsensor.typing import FloatArray
 
 
 class GainDrift(Effect):
-    """The signal in ADU grows by ``slope`` per hour since the first exposure."""
+    """The signal in ADU grows by the fraction ``slope`` per hour since the first exposure.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``slope`` [1/h]: 0.0005 to 0.02 in magnitude, either sign (0 changes
+        nothing).
+
+    Examples
+    --------
+    >>> GainDrift({"slope": 0.003}).name
+    'gain_drift'
+    """
 
     word = "gain_drift"
     parameters = (Parameter("slope", "1/h", 5e-4, 2e-2, signed=True, amplitude=True),)

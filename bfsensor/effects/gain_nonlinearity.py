@@ -1,4 +1,4 @@
-"""Gain non-linearity: the response against signal is curved."""
+"""Gain non-linearity: the amplifier's response is a cubic polynomial of the signal."""
 
 from __future__ import annotations
 
@@ -6,11 +6,23 @@ from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Shot
 from bfsensor.typing import FloatArray
 
 SCALE = 1e5
-"""Signal [e-] that the coefficients are given at."""
+"""Signal [e-] at which c2 and c3 are defined as relative changes."""
 
 
 class GainNonlinearity(Effect):
-    """Signal S becomes S (1 + c2 S/1e5 + c3 (S/1e5)^2), S in electrons."""
+    """Signal S becomes S (1 + c2 S/1e5 + c3 (S/1e5)^2), S in electrons.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``c2``: 0.001 to 0.02 in magnitude, either sign (0 changes nothing);
+        ``c3``: 0.0003 to 0.005 in magnitude, either sign (0 changes nothing).
+
+    Examples
+    --------
+    >>> GainNonlinearity({"c2": 0.004, "c3": 0.001}).name
+    'gain_nonlinearity'
+    """
 
     word = "gain_nonlinearity"
     stage = "amplifier"
@@ -32,5 +44,6 @@ class GainNonlinearity(Effect):
         return self._bent(level)
 
     def _bent(self, signal: Image) -> Image:
+        """Signal after the polynomial [e-]."""
         x = signal / SCALE
         return signal * (1 + self["c2"] * x + self["c3"] * x * x)

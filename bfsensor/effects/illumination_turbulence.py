@@ -1,4 +1,4 @@
-"""Turbulence: the light's pattern on the sensor is another one in every flat."""
+"""Turbulence: the illumination pattern of flats differs at random from frame to frame."""
 
 from __future__ import annotations
 
@@ -13,16 +13,29 @@ from bfsensor.effects.random_covariances import scatter_of_pairs
 from bfsensor.typing import FloatArray
 
 REACH = 4.0
-"""Margin around the sensor that the pattern is made on [its width]: nothing comes round."""
+"""Margin around the sensor on which the pattern is made [sigma of the smoothing].
+
+Derived: scipy's ``gaussian_filter`` ends at 4 sigma, so that no pixel inside sees the border."""
 
 
 class IlluminationTurbulence(Effect):
-    r"""Light of flats that varies from frame to frame, correlated over a length.
+    r"""Relative variations of the light of flats, random in each frame and correlated over a length.
 
-    It is Gaussian with the correlation :math:`\mathrm{rms}^2 e^{-r^2 / 2\,\mathrm{corr}^2}`.
-    Pairs do not take it out: covariances grow with the square of the level, alike at all near
-    lags but for what the means of boxes take.  Means of amplifiers scatter.  Maps gain a noise
-    of which their own errors know: they are measured on the same pairs.
+    They are Gaussian with the covariance :math:`\mathrm{rms}^2 e^{-r^2 / 2\,\mathrm{corr}^2}` at the
+    distance r.  The difference of a pair keeps them: covariances grow with the square of the
+    level, by the same at all near lags except for the subtracted means of boxes.  Means of
+    amplifiers scatter.  The noise of maps is included in their errors, which are measured on the
+    same pairs.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``rms``: 0.0001 to 0.002 (0 changes nothing); ``corr`` [pixel]: 10 to 60.
+
+    Examples
+    --------
+    >>> IlluminationTurbulence({"rms": 0.0004, "corr": 20.0}).name
+    'illumination_turbulence'
     """
 
     word = "illumination_turbulence"
@@ -57,7 +70,7 @@ class IlluminationTurbulence(Effect):
         white = rng.standard_normal([n + 2 * margin for n in layout.shape])
         smooth = gaussian_filter(white, width, mode="constant")
         inside = smooth[margin:-margin, margin:-margin]
-        # White noise under a Gaussian of this width keeps 1 / (4 pi width^2) of its variance.
+        # A Gaussian filter leaves 1 / (4 pi width^2) of the variance of white noise: scale it to 1.
         return np.asarray(1 + self["rms"] * np.sqrt(4 * np.pi) * width * inside)
 
     def covariances(self, c: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
@@ -96,19 +109,19 @@ class IlluminationTurbulence(Effect):
         return out.reshape(len(amps), -1)
 
     def _few(self, amp: int, level: float, time: float, layout: Layout) -> float:
-        """Scatter of the pattern's power in one pair over its mean: of so many patches."""
+        """Relative scatter of the pattern's power in one pair: that of a finite number of patches."""
         del level, time
         segment = layout.segments[amp]
-        # Boxes leave no patch wider than a third of them.
+        # Subtracted means of boxes leave no patch much wider than a third of a box: an estimate.
         width = min(self["corr"], layout.box / 3)
         return float(np.sqrt(2 * np.pi * width**2 / (segment.rows * segment.columns)))
 
     def _along(self, distance: FloatArray) -> FloatArray:
-        """Correlation along one axis; of a distance it is the product of both."""
+        """Correlation at a distance along one axis; in the plane it is the product of both axes."""
         return np.asarray(np.exp(-0.5 * (distance / self["corr"]) ** 2))
 
     def _between(self, x: int, n: int, y: int, m: int) -> float:
-        """Mean correlation of two stretches of pixels."""
+        """Mean correlation of n pixels from x on with m pixels from y on, along one axis."""
         return float(
             self._along(
                 (x + np.arange(float(n)))[:, None] - (y + np.arange(float(m)))
@@ -116,11 +129,11 @@ class IlluminationTurbulence(Effect):
         )
 
     def _left(self, rows: int, columns: int, layout: Layout) -> FloatArray:
-        """What the means of boxes leave of the correlation, by lag [j, i].
+        """Correlation that is left after the means of boxes are subtracted, by lag [j, i].
 
-        Of d(p) d(q) they take the mean over q's box of the correlation with p, and over p's
-        with q, and give the mean over both; the measurement puts back the 1 / n-th part of the
-        sum over the lags that it knows.
+        From the product d(p) d(q) the subtraction removes the mean correlation of p with q's box and
+        of q with p's box, and adds that of both boxes.  The measurement corrects the bias of its
+        box means by adding the sum over the measured lags divided by the pixels of a box.
         """
         y, x = (self._taken(n, layout) for n in (rows, columns))
         out = (
@@ -134,7 +147,7 @@ class IlluminationTurbulence(Effect):
         return np.asarray(out + fold @ out @ fold * boxes / (rows * columns))
 
     def _taken(self, n: int, layout: Layout) -> FloatArray:
-        """Along one axis by lag: of the pair, of p and q's box, of q and p's, of both boxes."""
+        """Mean correlations along one axis by lag: p with q, p with q's box, q with p's, both boxes."""
         count = max(round(n / layout.box), 1)
         edges = np.round(np.linspace(0, n, count + 1)).astype(int)
         box = np.repeat(np.arange(count), np.diff(edges))

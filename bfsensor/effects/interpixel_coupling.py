@@ -1,4 +1,4 @@
-"""Interpixel coupling: each pixel gives a constant part of its signal to its neighbours."""
+"""Interpixel coupling: each pixel passes a fixed fraction of its signal to its neighbours."""
 
 from __future__ import annotations
 
@@ -11,10 +11,21 @@ from bfsensor.typing import FloatArray
 
 
 class InterpixelCoupling(Effect):
-    """``ax`` of a pixel goes to either neighbour in the row, ``ay`` to either in the column.
+    """A pixel gives the fraction ``ax`` of its signal to each neighbour in x, ``ay`` to each in y.
 
-    Linear and the same at all signals: covariances of neighbours grow with the level, not
-    with its square, and the variance per electron falls at all levels alike.
+    The coupling is linear: covariances of neighbours grow with the level, not with its square, and
+    the variance per electron falls by the same fraction at all levels.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``ax``: 0.0003 to 0.003 (0 changes nothing); ``ay``: 0.0003 to 0.003 (0
+        changes nothing).
+
+    Examples
+    --------
+    >>> InterpixelCoupling({"ax": 0.0009, "ay": 0.0009}).name
+    'interpixel_coupling'
     """
 
     word = "interpixel_coupling"
@@ -38,7 +49,7 @@ class InterpixelCoupling(Effect):
         return self._coupled(charge)
 
     def covariances(self, c: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
-        # The kernel with itself: coupled twice, for it is even.
+        # Both pixels of a product are coupled, and the kernel is even: apply it twice.
         return self._coupled(self._coupled(c))
 
     def spot_image(
@@ -47,6 +58,7 @@ class InterpixelCoupling(Effect):
         return self._coupled(images)
 
     def _coupled(self, image: Image) -> Image:
+        """Image, or periodic covariances, after the coupling of its last two axes."""
         out = image
         for axis, name in ((-1, "ax"), (-2, "ay")):
             given = np.roll(image, 1, axis) + np.roll(image, -1, axis) - 2 * image

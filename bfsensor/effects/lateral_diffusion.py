@@ -1,4 +1,4 @@
-"""More lateral diffusion of drifting electrons than the baseline has."""
+"""Lateral diffusion of drifting electrons beyond that of the baseline."""
 
 from __future__ import annotations
 
@@ -10,10 +10,21 @@ from bfsensor.units import BOLTZMANN
 
 
 class LateralDiffusion(Effect):
-    """Spots are wider by the variance ``var`` at the reference's light, voltage and temperature.
+    """Spots gain the variance ``var`` [pixel^2] at the reference wavelength, bias and temperature.
 
-    Elsewhere it goes with kT, with the path from where light converts, and inversely with the
-    voltage (Einstein's relation): a width that all conditions share is the optics'.
+    At other conditions it is proportional to kT and to the drift path, and inversely proportional
+    to the voltage (Einstein's relation).  A width that is the same at all conditions belongs to the
+    optics instead.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``var`` [pixel^2]: 0.005 to 0.2 (0 changes nothing).
+
+    Examples
+    --------
+    >>> LateralDiffusion({"var": 0.03}).name
+    'lateral_diffusion'
     """
 
     word = "lateral_diffusion"
@@ -35,15 +46,27 @@ class LateralDiffusion(Effect):
 
 
 def diffusion_variance(shot: Shot, layout: Layout) -> float:
-    """Variance of thermal spreading in the mean field of the slab, one axis [pixel^2].
+    """Variance of diffusion along one axis, in the mean field of the silicon [pixel^2].
 
-    The mean over the depths at which light converts; the doping's slope of the field changes
-    it by a few per cent, and hardly the ratio between conditions.
+    It is the mean over the depths at which light converts.  The doping's gradient of the field
+    changes it by a few per cent, and the ratio between conditions much less.
+
+    Parameters
+    ----------
+    shot : Shot
+        Wavelength, back bias and temperature.
+    layout : Layout
+        Thickness, pixel pitch, front potential and absorption lengths.
+
+    Returns
+    -------
+    variance : float
+        2 (kT / q) d L / V with the mean path d, the thickness L and the voltage V.
 
     Raises
     ------
     ZeroDivisionError
-        No voltage over the slab.
+        The back bias equals the potential of the front.
     """
     thickness = layout.thickness
     length = absorption_length(shot.wavelength, layout)
@@ -57,7 +80,11 @@ def diffusion_variance(shot: Shot, layout: Layout) -> float:
 
 
 def absorption_length(wavelength: float, layout: Layout) -> float:
-    """Absorption length [um], log-linear between the layout's own; silicon at 173 K without."""
+    """Absorption length [um] at a wavelength [nm].
+
+    It is interpolated in its logarithm between those of the layout, constant beyond their ends;
+    without any it is that of silicon at 173 K.
+    """
     if not layout.absorption:
         return float(silicon.absorption_length(wavelength, 173.0))
     known = sorted(layout.absorption)

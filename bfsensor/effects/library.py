@@ -1,4 +1,4 @@
-"""All effects: found by class word, and by variant where a class has several."""
+"""The library of all effects, and how to make one by its name in the taxonomy."""
 
 from __future__ import annotations
 
@@ -75,8 +75,8 @@ LIBRARY: tuple[type[Effect], ...] = (
     UnevenTreeRings,
     VoltageDependence,
 )
-"""Every candidate, one for each variant of a class; those of a device's parameters are made for a
-baseline, by :func:`bfsensor.effects.device_parameter.device_parameters`."""
+"""Classes of all effects, one for each variant.  Those of a device's parameters depend on the
+baseline: :func:`bfsensor.effects.device_parameter.device_parameters` makes them."""
 
 
 def make_effect(word: str, values: Mapping[str, float], variant: str = "") -> Effect:
@@ -84,19 +84,22 @@ def make_effect(word: str, values: Mapping[str, float], variant: str = "") -> Ef
 
     Parameters
     ----------
-    word, variant : str
-        Class, and which kind of it.
+    word : str
+        Name in the taxonomy.
     values : mapping of str to float
-        All parameters.
+        Values of all of its parameters, by name and in their units.
+    variant : str
+        Variant, or '' where the name has only one.
 
     Returns
     -------
-    Effect
+    effect : Effect
+        The effect; it acts by the methods of :class:`bfsensor.effects.Effect`.
 
     Raises
     ------
     EffectError
-        No such class or variant, or not its parameters.
+        There is no such effect, or its parameters are others.
 
     Examples
     --------
@@ -107,4 +110,6 @@ def make_effect(word: str, values: Mapping[str, float], variant: str = "") -> Ef
         if (kind.word, kind.variant) == (word, variant):
             return kind(values)
     known = ", ".join(sorted({f"{k.word}:{k.variant}".rstrip(":") for k in LIBRARY}))
-    raise EffectError(f"effect {word}{':' * bool(variant)}{variant}: one of {known}")
+    raise EffectError(
+        f"effect {word}{':' * bool(variant)}{variant} is not in the library, which has {known}"
+    )

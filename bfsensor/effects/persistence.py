@@ -1,4 +1,4 @@
-"""Persistence: charge that an exposure leaves behind shows in those that follow."""
+"""Persistence: charge of an exposure is trapped and appears in the exposures that follow."""
 
 from __future__ import annotations
 
@@ -13,10 +13,21 @@ from bfsensor.typing import FloatArray
 
 
 class Persistence(Effect):
-    """``frac`` exp(-k / tau) of a charge shows again in the k-th exposure after it.
+    """The fraction ``frac`` exp(-k / tau) of a charge appears in the k-th exposure after it.
 
-    Exposures are counted by their numbers: those that are missing count, but what they left is
-    not known.
+    Exposures are counted by their numbers.  Missing numbers count as exposures, but the charge that
+    they left is not known: it is a random effect.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``frac``: 1e-05 to 0.001 (0 changes nothing); ``tau`` [exposure]: 0.7 to
+        5.
+
+    Examples
+    --------
+    >>> Persistence({"frac": 0.0001, "tau": 2.0}).name
+    'persistence'
     """
 
     word = "persistence"
@@ -45,7 +56,7 @@ class Persistence(Effect):
         memory: dict[str, NDArray],
     ) -> Image:
         trapped = memory.get(self.word, np.zeros_like(charge))
-        # Released once and trapped anew: what shows again leaves nothing behind.
+        # Only the light of an exposure is trapped, not the charge that traps release into it.
         memory[self.word] = (trapped + self["frac"] * charge) * np.float32(
             np.exp(-1 / self["tau"])
         )
@@ -77,14 +88,14 @@ class Persistence(Effect):
         parts = self._after(np.subtract.outer(shown, lit))
         biases = np.array(layout.biases, float)
         if len(biases):
-            # Biases hold ghosts too, and their mean is taken off all exposures.
+            # Biases hold ghosts too, and their mean is subtracted from all exposures.
             parts = parts - self._after(np.subtract.outer(biases, lit)).mean(0)
         return np.asarray(parts)
 
     def modes(self, word: str, axes: Axes, layout: Layout) -> FloatArray | None:
         if word not in ("flat_mean", "dark_map") or not layout.shots:
             return None
-        # Of exposures that are missing the light is not known: as much as that of the others.
+        # The light of missing exposures is not known: it has the rms level of the others.
         numbers = np.array([s.number for s in layout.shots])
         lit = np.array([s.level for s in layout.shots if s.level > 0])
         gaps = [g for g in zip(numbers[:-1] + 1, numbers[1:], strict=True) if g[0] < g[1]]
@@ -101,12 +112,12 @@ class Persistence(Effect):
         ], axis=1)  # fmt: skip
 
     def _after(self, later: FloatArray) -> FloatArray:
-        """Part of a charge that shows so many exposures later."""
+        """Fraction of a charge that appears ``later`` exposures later; 0 if not later."""
         shown = self["frac"] * np.exp(-np.maximum(later, 0.0) / self["tau"])
         return np.where(later > 0, shown, 0.0)
 
     def _left_at(self, number: FloatArray, layout: Layout) -> FloatArray:
-        """Charge that earlier exposures left in these [e-]."""
+        """Charge that earlier exposures left in those with these numbers [e-]."""
         lit = [s for s in layout.shots if s.level > 0]
         later = np.subtract.outer(
             np.asarray(number, float), np.array([s.number for s in lit], float)

@@ -1,4 +1,4 @@
-"""Wings of the spots: an extended halo of their light."""
+"""Wings of spots: an extended halo of their light."""
 
 from __future__ import annotations
 
@@ -6,7 +6,20 @@ from bfsensor.effects.effect import Effect, Layout, Parameter, Shot
 
 
 class PsfWings(Effect):
-    """``frac`` of a spot's light lies in a Gaussian halo, ``sigma`` pixels wider in quadrature."""
+    """The fraction ``frac`` of the light of spots is in a wider Gaussian halo.
+
+    The halo is the spot convolved with a Gaussian of ``sigma`` pixels.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``frac``: 0.001 to 0.05 (0 changes nothing); ``sigma`` [pixel]: 3 to 8.
+
+    Examples
+    --------
+    >>> PsfWings({"frac": 0.007, "sigma": 5.0}).name
+    'psf_wings'
+    """
 
     word = "psf_wings"
     stage = "light"

@@ -1,4 +1,4 @@
-"""What chance leaves of the covariances that a random effect adds."""
+"""Scatter of the covariances of flats that a random effect adds, as modes of the channel."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from bfsensor.effects.effect import Axes, Effect, Layout
 from bfsensor.typing import FloatArray
 
 SIDE = 32
-"""Of the periodic array that covariances are asked for on."""
+"""Side of the periodic array on which effects add their covariances [pixel].
+
+Chosen: measured lags, 4 by default, must stay below half of it; twice as large gives the same values
+in four times the memory."""
 
 
 def scatter_of_pairs(
@@ -19,23 +22,28 @@ def scatter_of_pairs(
     layout: Layout,
     relative: Callable[[int, float, float], float],
 ) -> FloatArray | None:
-    """Modes of measured covariances: all lags of one amplifier's flats scatter together.
+    """Give the modes of measured covariances whose lags all scatter together.
+
+    There is one mode for each amplifier and condition: a stronger realisation of the random effect
+    raises the covariances at all lags in proportion.
 
     Parameters
     ----------
     effect : Effect
-        Adds to covariances.
+        Effect with random covariances.
     axes : mapping
-        Of the channel, shape (n,): 'amp', 'level' [e-], 'time', 'pairs', 'i', 'j', conditions.
+        Axes of the channel, arrays of shape (n,): 'amp', 'level' [e-], 'time' [s], 'pairs', lags
+        'i' and 'j' [pixel], conditions.
     layout : Layout
         Sensor and campaign.
     relative : callable
-        Scatter of what one pair adds, over its mean, by amplifier, level [e-] and time [s].
+        Function of amplifier, level [e-] and time [s] that gives the relative scatter of the
+        covariance added by the effect in one pair.
 
     Returns
     -------
     modes : ndarray, shape (n, groups), or None
-        [e-^2]; None of covariances without pairs.
+        One standard deviation of each mode [e-^2]; None if the channel has no numbers of pairs.
     """
     if "pairs" not in axes:
         return None

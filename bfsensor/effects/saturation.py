@@ -1,4 +1,4 @@
-"""Full well that is lower than the card says."""
+"""Saturation: a full well below that of the nominal device, with spilling along the columns."""
 
 from __future__ import annotations
 
@@ -11,28 +11,50 @@ from bfsensor.effects.effect import Axes, Effect, Law, Layout, Parameter, Seen
 from bfsensor.typing import FloatArray
 
 UNEVEN = 3e-3
-"""Relative scatter of a flat's light from pixel to pixel, response and shape (assumed)."""
+"""Relative scatter of a flat's charge from pixel to pixel, by response and illumination.
+
+Chosen: twice as large, flats of 1e5 e- spill partly over 1.6 times the range of levels, and
+their variance falls more slowly there."""
 
 FAR = 5.0
-"""Distance from the full well [standard deviations] beyond which nothing spills, or all is full."""
+"""Distance from the full well [standard deviations] beyond which no pixel, or every pixel, spills.
+
+Derived: a Gaussian has 3e-7 of its pixels beyond 5 standard deviations."""
 
 LAGS = 4
-"""Lags along the column at which spilled charge correlates pixels, as far as it is followed."""
+"""Largest lag along the column at which spilled charge is taken to correlate pixels [pixel].
+
+Measured with ``_near(distance, 0.95)``: the covariance at lag 4 is at most 1 % of the variance."""
 
 UNSURE = 0.1
-"""Part of what the mean of a flat near the full well lacks, of the lesser of what its variance
-keeps and loses, and of its covariances, that the assumed unevenness leaves open (assumed)."""
+"""Relative uncertainty of predictions near the full well, as :data:`UNEVEN` is not known: of the
+deficit of the mean, of the kept or the lost variance (the smaller one), and of covariances.
+
+Chosen: twice as large, flats within a per cent of the full well constrain it half as well."""
 
 ROUNDS = 200
-"""Of spilling: charge that finds no room within so many is lost."""
+"""Largest number of rounds in which excess charge moves by one pixel; after them it is lost.
+
+Chosen: charge spreads over sqrt(200) = 14 pixels; twice as large, over 20, which only matters where
+nearly all pixels of a column are full."""
 
 
 class Saturation(Effect):
-    """Charge beyond ``full_well`` spills to both neighbours in the column, half to either.
+    """Charge above ``full_well`` spills to both neighbours in the column, half to each.
 
-    Flats end at the full well and lose their noise; the brightest spots grow along y.  Within
-    a per cent of the full well, where part of a flat's pixels spill, variances depend on the
-    unevenness of the light, which is assumed: there they are good to some ten per cent.
+    The level of flats ends at the full well, where they lose their noise; the brightest spots grow
+    in y.  Within a per cent of the full well a part of the pixels spills, and variances depend on
+    the unevenness of the light (:data:`UNEVEN`): there they are uncertain by about ten per cent.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``full_well`` [e-]: 70000 to 115000 (200000 changes nothing).
+
+    Examples
+    --------
+    >>> Saturation({"full_well": 90000.0}).name
+    'saturation'
     """
 
     word = "saturation"
@@ -47,7 +69,7 @@ class Saturation(Effect):
             law="flat",
             amplitude=True,
             step=30.0,
-        ),  # a tenth of a flat's noise, over which its mean bends
+        ),  # a tenth of the noise of a flat, on which scale its mean saturates
     )
     touches = ("flat_mean", "flat_cov", "spot")
     source = (
@@ -61,12 +83,12 @@ class Saturation(Effect):
         places = list(np.linspace(7.5e4, 1.35e5, 5))
         flats = [s for s in layout.shots if s.kind == "flat" and s.seconds > 0]
         if flats:
-            # A level that light in proportion would have left far behind is the full well itself.
+            # A level far below that of proportional light is the full well itself.
             rates = np.array([s.level / s.seconds for s in flats])
             full = [
                 s.level for s, r in zip(flats, rates, strict=True) if r < 0.97 * rates.max()
             ]
-            # Levels are known as well as the gain.
+            # Levels in electrons are as uncertain as the gain: some per cent to either side.
             places = (
                 [f * float(np.median(full)) for f in (0.93, 1.0, 1.07)] if full else places
             )
@@ -88,7 +110,7 @@ class Saturation(Effect):
         return out
 
     def modes(self, word: str, axes: Axes, layout: Layout) -> FloatArray | None:
-        """What the closed forms near the full well leave open, of each flat and lag on its own."""
+        """Uncertainty of the predictions near the full well, independent for each flat and lag."""
         if word not in ("flat_mean", "flat_cov") or self.is_neutral():
             return None
         light = np.asarray(axes.get("light", axes["level"]), float)
@@ -120,8 +142,7 @@ class Saturation(Effect):
         out[distance < -FAR] = 0.0
         for n in np.nonzero((distance >= -FAR) & (distance < reach))[0]:
             _, left = _between(float(distance[n]), _unevenness(light[n], sigma[n]))
-            # Each pixel keeps what it keeps of its variance; what was spilled, and room that
-            # was filled, correlate the column.
+            # All covariances shrink like the variance; spilled charge correlates the column.
             out[n] *= left[0]
             for lag in range(1, LAGS + 1):
                 out[n, [lag, -lag], 0] += left[lag] * sigma[n] ** 2
@@ -129,12 +150,12 @@ class Saturation(Effect):
 
 
 def _unevenness(light: float, sigma: float) -> float:
-    """Of the light from pixel to pixel, in standard deviations of its noise."""
+    """Scatter of the charge from pixel to pixel in standard deviations of its noise."""
     return UNEVEN * float(light) / float(sigma)
 
 
 def _between(distance: float, uneven: float) -> tuple[float, FloatArray]:
-    """As :func:`_near`, straight between tenths of both: a fit needs slopes and no steps."""
+    """Interpolate :func:`_near` linearly between tenths of both: derivatives need no steps."""
     tenths = int(np.floor(10 * distance)), int(np.floor(10 * uneven))
     parts = 10 * distance - tenths[0], 10 * uneven - tenths[1]
     short, left = 0.0, np.zeros(LAGS + 1)
@@ -147,23 +168,24 @@ def _between(distance: float, uneven: float) -> tuple[float, FloatArray]:
 
 @lru_cache(maxsize=1024)
 def _near(distance: float, uneven: float) -> tuple[float, FloatArray]:
-    """Flats near the full well: what their mean lacks, and covariances along the column.
+    """Deficit of the mean of a flat near the full well, and covariances along the column.
 
-    A small simulation of pairs with fixed random numbers, good to 1 % of the variance.
+    Both come from a small simulation of pairs with fixed random numbers, with errors of 1 % of the
+    variance.
 
     Parameters
     ----------
     distance : float
-        Full well less mean, in standard deviations of the noise.
+        Full well minus mean [standard deviations of the noise].
     uneven : float
-        Scatter that both flats of a pair share, in the same.
+        Fixed scatter from pixel to pixel, equal in both flats of a pair [same unit].
 
     Returns
     -------
     short : float
-        Of the mean below that of the light or the full well, in standard deviations.
+        Deficit of the mean below the light or the full well, the lower of both [same unit].
     left : ndarray, shape (LAGS + 1,)
-        Covariances over the variance that the noise had.
+        Covariances by lag over the variance without saturation.
     """
     rng = np.random.default_rng(70_251)
     shape = 256, 96
@@ -176,16 +198,34 @@ def _near(distance: float, uneven: float) -> tuple[float, FloatArray]:
     left = [np.mean(after[lag:] * after[: len(after) - lag]) for lag in range(LAGS + 1)]
     own = [np.mean(before[lag:] * before[: len(after) - lag]) for lag in range(1, LAGS + 1)]
     found = np.array(left) / whole
-    # What the fixed numbers correlate by chance.
+    # Subtract the correlations that the fixed random numbers have by chance.
     found[1:] -= found[0] * np.array(own) / whole
     short = min(float((noise + pattern).mean()), distance) - float(pairs.mean())
     return short, found
 
 
 def spilled(charge: FloatArray, full_well: float) -> FloatArray:
-    """Charge after what exceeds the full well has spilled along the columns, shape (ny, nx).
+    """Spill the charge above the full well along the columns, half to each neighbour, repeatedly.
 
-    In the limit of endless sharing no order of steps matters: a pile that topples.
+    Charge that reaches the end of a column leaves.  The final state does not depend on the order of
+    the steps (an abelian sandpile).
+
+    Parameters
+    ----------
+    charge : ndarray, shape (ny, nx)
+        Charge of the pixels, in any unit; not changed.
+    full_well : float
+        Largest charge of a pixel, in the same unit.
+
+    Returns
+    -------
+    charge : ndarray, shape (ny, nx)
+        At most the full well.
+
+    Examples
+    --------
+    >>> spilled(np.array([[0.0], [4.0], [0.0]]), 2.0).ravel()
+    array([1., 2., 1.])
     """
     charge = charge.copy()
     for _ in range(ROUNDS):

@@ -1,4 +1,4 @@
-"""Shutter: exposures last longer than commanded, more on one side than on the other."""
+"""Shutter timing: exposures last longer than commanded, by an amount that varies in x."""
 
 from __future__ import annotations
 
@@ -11,9 +11,20 @@ from bfsensor.typing import FloatArray
 
 
 class ShutterTiming(Effect):
-    """Light lasts ``dt`` (1 + shade x) longer than commanded, x from -1 to 1 across the columns.
+    """Exposures last ``dt`` (1 + shade x) longer than commanded, x from -1 to 1 across the columns.
 
-    A level that is measured after the commanded time t holds the part dt / (t + dt) too much.
+    Of the level of an exposure of the commanded time t, the fraction dt / (t + dt) is additional.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``dt`` [s]: 0.005 to 0.05 in magnitude, either sign (0 changes nothing);
+        ``shade``: -0.5 to 0.5.
+
+    Examples
+    --------
+    >>> ShutterTiming({"dt": 0.02, "shade": 0.0}).name
+    'shutter_timing'
     """
 
     word = "shutter_timing"
@@ -22,7 +33,7 @@ class ShutterTiming(Effect):
         Parameter("dt", "s", 5e-3, 5e-2, signed=True, amplitude=True),
         Parameter("shade", "", -0.5, 0.5, law="flat"),
     )
-    # A shade is a gradient of the map of short exposures: the light's own shape hides it.
+    # A shade makes a gradient in maps of short exposures, which the unknown illumination hides.
     touches = ("flat_mean", "spot")
     source = (
         "Opening and closing take time, more here than there: Stetson 1989, Highlights of Astronomy "
@@ -53,5 +64,5 @@ class ShutterTiming(Effect):
         return np.asarray(axes["level"] * longer / (axes["time"] + longer))
 
     def spot_flux(self, axes: Axes, layout: Layout) -> FloatArray:
-        # Spots lie on all of the sensor: shade is nothing in their mean.
+        # Spots lie on all of the sensor: the shade cancels in their mean.
         return np.asarray(axes["flux"] * self["dt"] / (axes["time"] + self["dt"]))

@@ -1,4 +1,4 @@
-"""Physics that a simulation left out: templates are differences of its tables, with and without."""
+"""Effects of physics that a simulation left out, from simulated templates with and without it."""
 
 from __future__ import annotations
 
@@ -16,15 +16,17 @@ from bfsensor.typing import Edges, FloatArray
 
 Key = tuple[float, float]
 Held = tuple[tuple[Key, Edges], ...]
-"""Wavelength [nm] and back bias [V], and what belongs to them."""
+"""Shifts by condition: ((wavelength [nm], back bias [V]), (kx, ky))."""
 
 STRENGTH = Parameter("strength", "", -2.0, 2.0, law="flat", signed=True, amplitude=True)
-"""1: all of it, as simulated; 0: as the baseline.  Flat, so that fits stay within 4: straight lines
-mean nothing at ten times the piece."""
+"""Strength of the physics: 1 as simulated, 0 as in the baseline.
+
+Range chosen: flat, so that fits stay between -4 and 4; the linear template is not valid at ten times
+the simulated effect.  Twice as wide, evidence for an effect falls by a factor of two."""
 
 
 class QuadraticTemplate(NamedTuple):
-    """Change of the shifts with the charge about a level [e-], and half its second derivative."""
+    """Derivative of the shifts by the charge at a level [e-], and half of the second derivative."""
 
     level: float
     slopes: Held
@@ -32,7 +34,7 @@ class QuadraticTemplate(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """Change of the shifts [pixel/e-] by all of a piece, with the temperature [per K], with charge."""
+    """Change of the shifts [pixel/e-] by the physics, with its temperature [per K] and charge terms."""
 
     edges: Held
     warming: Held = ()
@@ -41,27 +43,27 @@ class Moved(NamedTuple):
 
 
 class DiffusionWidths(NamedTuple):
-    """Variance of the landing place [pixel^2] by condition, at a temperature [K]."""
+    """Variance of the landing place of electrons [pixel^2] by condition, at a temperature [K]."""
 
     held: tuple[tuple[Key, float], ...]
     temperature: float
 
 
 class Rings(NamedTuple):
-    """Amplitude of the displacements [pixel] of all of the ripple, by period [pixel]."""
+    """Amplitude of the displacements [pixel] by the simulated ripple, by its period [pixel]."""
 
     periods: FloatArray
     held: tuple[tuple[Key, FloatArray], ...]
 
 
 class Rim(NamedTuple):
-    """Displacements [pixel] of the boundaries 0, 1, ... from the edge, inwards."""
+    """Displacements [pixel], inwards, of the boundaries 0, 1, ... from the edge of the array."""
 
     held: tuple[tuple[Key, FloatArray], ...]
 
 
 class LeftOut(Effect):
-    """A piece of physics, ``strength`` of it; made by :func:`left_out` for a baseline."""
+    """Physics missing in the baseline, with ``strength``; :func:`left_out` makes the classes."""
 
     stage = "collect"
     parameters = (STRENGTH,)
@@ -79,7 +81,7 @@ class LeftOut(Effect):
 
 
 class MovedEdges(LeftOut):
-    """Shifts of a device with a piece less those without it, straight between."""
+    """Boundary shifts of the device with the physics, interpolated linearly from those without."""
 
     touches = ("flat_cov", "spot")
 
@@ -102,7 +104,7 @@ class MovedEdges(LeftOut):
 
 
 class BentResponse(LeftOut):
-    """Shifts change with the charge that is there, each lag as its table says."""
+    """Boundary shifts that change with the charge in the pixels, by a template for each lag."""
 
     touches = ("flat_cov", "spot")
 
@@ -116,7 +118,7 @@ class BentResponse(LeftOut):
 def _response(
     told: QuadraticTemplate | None, strength: float, shot: Shot
 ) -> tuple[float, Edges, Edges] | None:
-    """So much of a response by level; None of none."""
+    """Response by level times ``strength``; None without a template or at strength 0."""
     if told is None or strength == 0.0:
         return None
     (sx, sy), (bx, by) = (nearest_edges(h, shot) for h in (told.slopes, told.bends))
@@ -124,7 +126,7 @@ def _response(
 
 
 class FieldDiffusion(LeftOut):
-    """Spots are wider by what electrons diffuse in the device's own field."""
+    """Spots widened by diffusion in the simulated field of the device."""
 
     stage = "light"
     touches = ("spot",)
@@ -138,9 +140,10 @@ class FieldDiffusion(LeftOut):
 
 
 class DopingRings(LeftOut):
-    """Rings of the doping: what :class:`TreeRings` are at each light and back bias.
+    """Tree rings of the doping, with the amplitude simulated at each wavelength and back bias.
 
-    ``strength`` in units of the ripple that the template is of.
+    ``strength`` is relative to the ripple of the doping in the template; the other parameters are
+    those of :class:`TreeRings`.
     """
 
     touches = ("flat_map",)
@@ -157,6 +160,7 @@ class DopingRings(LeftOut):
 
     @classmethod
     def _size(cls, period: float, shot: Shot) -> float:
+        """Amplitude at strength 1 [pixel], for a period [pixel] and the condition of a shot."""
         told = cls.template
         return float(np.interp(period, told.periods, _nearest(told.held, shot)))
 
@@ -168,7 +172,7 @@ class DopingRings(LeftOut):
 
 
 class EdgeFieldLeftOut(LeftOut):
-    """The field at the rim of the array: pixels reach farther out, or less far."""
+    """Lateral field at the rim of the array, which displaces the outermost boundaries."""
 
     touches = ("flat_map",)
 
@@ -186,7 +190,7 @@ class EdgeFieldLeftOut(LeftOut):
 
 
 def _both_ends(inwards: FloatArray, n: int) -> FloatArray:
-    """Displacements of the edges between n pixels, towards larger numbers."""
+    """Displacements of the n + 1 edges of n pixels [pixel], positive towards larger numbers."""
     out = np.zeros(n + 1)
     reach = min(len(inwards), (n + 1) // 2)
     out[:reach] += inwards[:reach]
@@ -195,7 +199,7 @@ def _both_ends(inwards: FloatArray, n: int) -> FloatArray:
 
 
 def _nearest(held: Sequence[tuple[Key, Any]], shot: Shot) -> Any:
-    """What is held for the nearest back bias, and the nearest wavelength there."""
+    """Value held for the nearest back bias, and among those for the nearest wavelength."""
     return min(
         held,
         key=lambda s: (abs(s[0][1] - shot.back_bias), abs(s[0][0] - shot.wavelength)),
@@ -203,7 +207,18 @@ def _nearest(held: Sequence[tuple[Key, Any]], shot: Shot) -> Any:
 
 
 def ring_parameters(size: float) -> tuple[Parameter, ...]:
-    """Parameters of doping rings whose displacement is ``size`` pixels at strength 1."""
+    """Parameters of doping rings whose displacements have the amplitude ``size`` at strength 1.
+
+    Parameters
+    ----------
+    size : float
+        Amplitude [pixel], above 0; the range of the strength is that of tree rings divided by it.
+
+    Returns
+    -------
+    parameters : tuple of Parameter
+        'strength', and those of the rings' shape.
+    """
     amp, *shape = TreeRings.parameters
     strength = STRENGTH._replace(
         low=amp.low / size, high=amp.high / size, law="log", signed=False
@@ -222,26 +237,31 @@ def left_out(
     source: str,
     parameters: tuple[Parameter, ...] = (STRENGTH,),
 ) -> type[LeftOut]:
-    """Make a candidate: one class for each piece of a baseline, the same for the same template.
+    """Make a class of effects for physics missing in a baseline; the same class for equal inputs.
 
     Parameters
     ----------
     base : type
-        What the piece does: one of this module's classes.
+        Class of this module that applies the template.
     word, variant : str
-        Class word, and what tells it from others of the word.
+        Name in the taxonomy, and the variant that distinguishes it from others of this name.
     template : Moved, QuadraticTemplate, DiffusionWidths, Rings or Rim
-        As ``base`` takes it.
+        Simulated change, of the type that ``base`` takes.
     source : str
-        Where it comes from.
+        Origin of the template, for reports.
     parameters : tuple of Parameter
-        ``strength``, and of the shape.
+        'strength', and parameters of the shape.
+
+    Returns
+    -------
+    kind : type
+        Subclass of ``base``.
 
     Examples
     --------
     >>> k = np.zeros((3, 3)); k[1, 1] = -1e-6
-    >>> told = Moved((((620.0, -50.0), (k, k.T)),))
-    >>> kind = left_out(MovedEdges, "free_holes", "", told, "a test")
+    >>> template = Moved((((620.0, -50.0), (k, k.T)),))
+    >>> kind = left_out(MovedEdges, "free_holes", "", template, "a test")
     >>> shot = Shot("flat", 0, 1.0, 620.0, -50.0, 173.15)
     >>> float(kind({"strength": 0.5}).edges(k, k.T, shot, None)[0][1, 1])
     -1.5e-06

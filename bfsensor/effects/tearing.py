@@ -1,4 +1,4 @@
-"""Tearing: a field distortion at a boundary between columns."""
+"""Tearing: a field distortion beside one boundary between columns, in a random range of rows."""
 
 from __future__ import annotations
 
@@ -12,16 +12,28 @@ from bfsensor.effects.random_covariances import scatter_of_pairs
 from bfsensor.typing import Edges, FloatArray
 
 BRIDGE = 12
-"""Modes of what chance leaves of the rows that are open: 95 % of the variance."""
+"""Number of modes that describe the random rows of the tear in a map.
+
+Derived: the modes of a Brownian bridge have variances 6 / (pi k)^2; twelve hold 95 % of them."""
 
 
 class Tearing(Effect):
-    """Edges beside one column boundary stand off by ``amp`` exp(-d / length) pixels.
+    """Edges at the distance d from one column boundary are displaced by ``amp`` exp(-d / length).
 
-    ``column``: place of the boundary as a part of the sensor's width.  The tear closes at a row
-    that moves with every exposure: below the part ``open`` of the rows it never does, from there
-    to the top it is anywhere alike.  :meth:`displacements` of no exposure in particular are the
-    mean ones.
+    ``column`` is the place of the boundary as a fraction of the sensor's width.  The tear ends at a
+    row that differs at random in every exposure: uniform between the fraction ``open`` of the rows
+    and the top.  Without a number of an exposure, :meth:`displacements` are the mean ones.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``amp`` [pixel]: 0.003 to 0.2 in magnitude, either sign (0 changes
+        nothing); ``length`` [pixel]: 1 to 5; ``column``: 0 to 1; ``open``: 0 to 1.
+
+    Examples
+    --------
+    >>> Tearing({"amp": 0.02, "length": 2.0, "column": 0.5, "open": 0.5}).name
+    'tearing'
     """
 
     word = "tearing"
@@ -43,7 +55,7 @@ class Tearing(Effect):
 
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
-        """Boundaries in strips that were seen; without such, every second one."""
+        """Begin with boundaries in strips detected in maps; without any, with evenly spaced ones."""
         width = layout.shape[1]
         found = [
             s["x"] for s in seen if s["word"] == "flat_map" and "x" in s
@@ -64,12 +76,12 @@ class Tearing(Effect):
         ny, nx = layout.shape
         part = self._open(ny)
         if shot.number >= 0:
-            # One exposure's: open up to a row that its number draws.
+            # One exposure: the row at which the tear ends is drawn with its number as the seed.
             part = (part > np.random.default_rng(shot.number).random()).astype(float)
         return part[:, None] * self._torn(nx), np.zeros((ny + 1, nx))
 
     def covariances(self, c: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
-        # Flats of a pair are torn in other rows: the difference holds the tear in rows between.
+        # The tear ends at other rows in both flats of a pair: it stays in the difference in between.
         side = c.shape[-1]
         level = np.asarray(axes["level"], float)
         added = np.zeros_like(c)
@@ -79,7 +91,7 @@ class Tearing(Effect):
             columns = np.s_[segment.x : segment.x + segment.columns]
             rows = np.s_[segment.y : segment.y + segment.rows]
             area = np.diff(self._torn(layout.shape[1]))[columns] * level[own, None]
-            # Where it stands out of the noise of a difference it is left out, neighbours too.
+            # Pixels where it exceeds the clipping limit are excluded, and their neighbours.
             limit = layout.clip * np.sqrt(2 * level[own, None])
             clear = ndtr((limit - np.abs(area)) / np.sqrt(2 * level[own, None]))
             seen = np.stack([np.roll(clear, s, axis=1) for s in (-1, 0, 1)]).min(0) * area
@@ -95,7 +107,7 @@ class Tearing(Effect):
 
     def modes(self, word: str, axes: Axes, layout: Layout) -> FloatArray | None:
         if word == "flat_cov":
-            # The distance of two rows anywhere alike scatters by 0.71 of its mean.
+            # The distance of two uniform random rows has a scatter of sqrt(1/2) of its mean.
             return scatter_of_pairs(self, axes, layout, lambda *_: np.sqrt(0.5))
         ny, nx = layout.shape
         area = np.diff(self._torn(nx))
@@ -113,25 +125,25 @@ class Tearing(Effect):
         return np.stack(out, axis=1)
 
     def _torn(self, nx: int) -> FloatArray:
-        """Displacements of the edges between columns where it is open [pixel]."""
+        """Displacements of the edges between columns in rows with the tear [pixel]."""
         away = np.abs(np.arange(nx + 1.0) - self["column"] * nx)
         return np.asarray(self["amp"] * np.exp(-away / self["length"]))
 
     def _open(self, ny: int) -> FloatArray:
-        """Part of the exposures in which rows are open."""
+        """Fraction of the exposures in which each row has the tear."""
         row, never = np.arange(ny) + 0.5, self["open"] * ny
         above = np.clip((ny - row) / max(ny - never, 1.0), 0.0, 1.0)
         return np.where(row <= never, 1.0, above)
 
     def _chance(self, ny: int) -> FloatArray:
-        """Covariance of two rows' being open."""
+        """Covariance between rows of having the tear (0 or 1) in an exposure, shape (ny, ny)."""
         part = self._open(ny)
         both = np.minimum(part[:, None], part)
         return np.asarray(both - part[:, None] * part)
 
 
 def _reduced(rows: FloatArray, columns: FloatArray, axes: Axes) -> FloatArray:
-    """Columns, rows and blocks of a map that is a product; rings hold no more than its square."""
+    """Values of the channel ``flat_map`` for a map ``rows`` times ``columns``; 0 for rings."""
     what = axes["what"]
     out = np.zeros(len(what))
     column, row, block = (what == w for w in ("column", "row", "block"))
@@ -151,9 +163,11 @@ def _reduced(rows: FloatArray, columns: FloatArray, axes: Axes) -> FloatArray:
 
 
 def _running(values: FloatArray) -> FloatArray:
+    """Cumulative sums from 0: differences of two are sums over a range."""
     return np.concatenate([[0.0], np.cumsum(values)])
 
 
 def _spacing(places: FloatArray) -> float:
+    """Smallest distance between blocks, which is their side [pixel]."""
     steps = np.diff(np.unique(places))
     return float(steps.min()) if len(steps) else 1.0

@@ -1,4 +1,4 @@
-"""Charge that stays behind when packets are shifted: shares that arrive late."""
+"""Charge transfer inefficiency: the fractions of a packet that arrive several packets late."""
 
 from __future__ import annotations
 
@@ -10,26 +10,30 @@ from numpy.typing import ArrayLike, NDArray
 from bfsensor.typing import FloatArray
 
 LATEST = 6
-"""Packets by which charge may be late: beyond, of 5e-5 times 4000 transfers, is less than 2e-5."""
+"""Largest number of packets by which charge arrives late; later charge is neglected.
+
+Derived from the negative binomial of :func:`late_shares`: the neglected fraction is 2e-9 for an
+inefficiency of 5e-5 and 4000 transfers."""
 
 
 def late_shares(transfers: ArrayLike, cti: float) -> FloatArray:
-    r"""Shares of a packet that arrive 0, 1, ... packets late.
+    r"""Give the fractions of a packet that arrive 0, 1, ... packets late.
 
-    Each transfer leaves ``cti`` behind, which the next packet takes along: the number of failures
-    before n transfers have succeeded,
+    Each transfer leaves the fraction ``cti`` to the next packet.  The delay d of an electron is its
+    number of failures before n transfers have succeeded, a negative binomial:
     :math:`p_d = \binom{n + d - 1}{d} (1 - c)^n c^d`.
 
     Parameters
     ----------
     transfers : array_like, shape (...)
-        n.
+        Number n of transfers, at least 1.
     cti : float
-        c.
+        Inefficiency c of one transfer, from 0 to below 1.
 
     Returns
     -------
     shares : ndarray, shape (LATEST + 1, ...)
+        Fractions by delay; their sum is 1 up to the neglected delays.
 
     Examples
     --------
@@ -44,7 +48,22 @@ def late_shares(transfers: ArrayLike, cti: float) -> FloatArray:
 
 
 def leave_behind(frame: NDArray[Any], cti: float, axis: int) -> NDArray[Any]:
-    """Transfer a frame along an axis, its first packet once, the second twice, and so on."""
+    """Transfer a frame along an axis: its first packet once, the second twice, and so on.
+
+    Parameters
+    ----------
+    frame : ndarray
+        Charge in readout order [e-]; not changed.
+    cti : float
+        Inefficiency of one transfer; 0 returns the frame itself.
+    axis : int
+        Axis of the transfers.
+
+    Returns
+    -------
+    frame : ndarray, same shape and type
+        Charge as it is read; packets after the last one are lost.
+    """
     if cti == 0:
         return frame
     lines = np.moveaxis(frame, axis, -1).astype(float)
@@ -61,16 +80,20 @@ def behind_flat(
     before: FloatArray,
     cti: float,
 ) -> FloatArray:
-    """Part of a flat's level in the k-th packet after the last one with light.
+    """Give the fraction of a flat's level in the k-th packet after the last one with light.
 
     Parameters
     ----------
     k : ndarray
-        From 1 on.
+        Number of the packet, from 1.
     packets, before : ndarray
-        With light, and read before them without.
+        Number of packets with light, and of packets without light that are read before them.
     cti : float
-        Lost at each transfer.
+        Inefficiency of one transfer.
+
+    Returns
+    -------
+    fraction : ndarray
     """
     out = np.zeros(np.broadcast_shapes(k.shape, packets.shape))
     for late in range(1, LATEST + 1):
@@ -81,7 +104,7 @@ def behind_flat(
 
 
 def trail_covariances(c: FloatArray, share: FloatArray, axis: int) -> FloatArray:
-    """Covariances after a part ``share`` of each pixel went to the next one, to first order."""
+    """Covariances after the fraction ``share`` of each pixel moved to the next, to first order."""
     part = share.reshape(-1, *(1,) * (c.ndim - 1))
     return np.asarray(c + part * (np.roll(c, 1, axis) + np.roll(c, -1, axis) - 2 * c))
 
@@ -89,9 +112,9 @@ def trail_covariances(c: FloatArray, share: FloatArray, axis: int) -> FloatArray
 def trail_image(
     images: FloatArray, share: float, backwards: float, axis: int
 ) -> FloatArray:
-    """Images after a part ``share`` went to the pixel read next.
+    """Images after the fraction ``share`` of each pixel moved to the pixel read next.
 
-    ``backwards``: share of the images that are read against the axis.
+    ``backwards`` is the fraction of the images whose pixels are read in falling order.
     """
     later = (1 - backwards) * np.roll(images, 1, axis) + backwards * np.roll(
         images, -1, axis

@@ -1,4 +1,4 @@
-"""A trap of fixed size at the end of the serial register."""
+"""Serial trap: a trap of fixed size at the end of the serial register of one amplifier."""
 
 from __future__ import annotations
 
@@ -20,15 +20,26 @@ from bfsensor.typing import FloatArray
 
 
 class TrapSerial(Effect):
-    """A trap fills to ``size`` electrons at once and releases with ``tau`` pixel times.
+    """A trap captures up to ``size`` electrons at once and releases them over ``tau`` pixel times.
 
-    It takes them from what of a packet exceeds ``reach`` electrons: smaller packets pass it by, for
-    it lies where only larger ones spread to (0: it sees all; flats hardly tell; a sharp limit is
-    assumed, a capture that grows with the packet describes spots as well).  ``amp`` counts
-    the amplifiers from zero.  Each row meets it empty: the parallel transfer takes far longer than
-    the release.  Behind a row of light the first k-th pixel of the overscan holds
-    size (1 - exp(-1/tau)) exp(-(k-1)/tau) electrons; what it holds there is missing in the first
-    column.
+    It captures only from the charge of a packet above ``reach`` electrons: it lies where smaller
+    packets do not extend (0: it captures from all).  A sharp limit is assumed; flats hardly
+    constrain it, and a capture that grows with the packet describes spots equally well.  ``amp``
+    is the number of the amplifier, from 0.  The trap is empty at the beginning of each row, as the
+    parallel transfer takes far longer than the release.  After a row of light the k-th pixel of
+    the overscan holds size (1 - exp(-1/tau)) exp(-(k-1)/tau) electrons; the captured charge is
+    missing in the first column.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``size`` [e-]: 5 to 100 (0 changes nothing); ``tau`` [pixel times]: 0.7
+        to 4; ``amp``: 0 to 1, whole; ``reach`` [e-]: 0 to 1000.
+
+    Examples
+    --------
+    >>> TrapSerial({"size": 20.0, "tau": 2.0, "amp": 0, "reach": 500.0}).name
+    'trap_serial'
     """
 
     word = "trap_serial"
@@ -74,7 +85,7 @@ class TrapSerial(Effect):
         return -self._held(axes) / layout.of_amp("columns", axes["amp"])
 
     def serial_overscan(self, axes: Axes, layout: Layout) -> FloatArray:
-        # Full behind any light that exceeds it: the last pixel of a flat refills what it lost.
+        # Full after any light above its size: the last pixel of a flat refills what it released.
         fall = np.exp(-(axes["k"] - 1) / self["tau"])
         return -np.expm1(-1 / self["tau"]) * self._held(axes) * fall
 
@@ -84,15 +95,15 @@ class TrapSerial(Effect):
         segment = self._segment(layout)
         if segment is None or self["size"] == 0:
             return images
-        # Spots are far enough apart to find the trap as the background leaves it; measured are
-        # means of all spots.
+        # Spots are so far apart that each meets the trap as the background leaves it; the
+        # measurement is a mean over the spots of all amplifiers.
         share = (
             segment.columns
             * segment.rows
             / sum(s.columns * s.rows for s in layout.segments)
         )
         order = slice(None, None, -1 if segment.flip_x else 1)
-        # The background fills it up to where it catches what it releases.
+        # The background fills the trap until it captures as much as it releases.
         level = axes.get("background", 0.0) * images.sum((-2, -1), keepdims=True)
         level = np.maximum(
             np.broadcast_to(level, (*images.shape[:-1], 1)).reshape(-1, 1), 0.0
@@ -104,7 +115,7 @@ class TrapSerial(Effect):
         return images + share * (read - images)
 
     def _through(self, frame: Image, held: FloatArray | None = None) -> Image:
-        """Rows after the trap, first pixel first; what it holds before them is nothing by default."""
+        """Rows after the trap, first pixel first; ``held`` [e-] is in the trap before, 0 by default."""
         size, reach = self["size"], max(self["reach"], 0.0)
         out = np.empty_like(frame)
         held = np.zeros(len(frame)) if held is None else held
@@ -119,12 +130,13 @@ class TrapSerial(Effect):
         return out
 
     def _held(self, axes: Axes) -> FloatArray:
-        """Behind the light of a flat, in the trap's amplifier [e-]."""
+        """Charge in the trap after the light of a flat [e-]; 0 in other amplifiers."""
         mine = axes["amp"].astype(int) == int(self["amp"])
         reached = axes["level"] - max(self["reach"], 0.0)
         held = np.minimum(self["size"], np.maximum(reached, 0.0))
         return np.where(mine, held, 0.0)
 
     def _segment(self, layout: Layout) -> Segment | None:
+        """Amplifier of the trap; None if the sensor has no such amplifier."""
         n = int(self["amp"])
         return layout.segments[n] if n < len(layout.segments) else None

@@ -1,4 +1,4 @@
-"""Dependence of the shifts on the back bias that differs from the baseline's."""
+"""Boundary shifts whose dependence on the back bias differs from the baseline's."""
 
 from __future__ import annotations
 
@@ -6,11 +6,22 @@ from bfsensor.effects.effect import Effect, Layout, Parameter, Shot
 from bfsensor.typing import Edges, FloatArray
 
 STEP = 20.0
-"""Change of the back bias [V] over which shifts change by delta."""
+"""Interval of the back bias [V] for which delta is defined as the relative change of shifts."""
 
 
 class VoltageDependence(Effect):
-    """Shifts grow by ``delta`` of the baseline's per 20 V less back bias than the reference."""
+    """Shifts grow by ``delta`` of the baseline's for each 20 V of back bias above the reference.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``delta``: 0.02 to 0.3 in magnitude, either sign (0 changes nothing).
+
+    Examples
+    --------
+    >>> VoltageDependence({"delta": 0.08}).name
+    'voltage_dependence'
+    """
 
     word = "voltage_dependence"
     stage = "collect"

@@ -1,4 +1,4 @@
-"""Device parameters with errors from measured a_ij, slopes of spots, saturation and widths."""
+"""Fits of device parameters, with errors, to a_ij, B-F slopes, saturation and diffusion widths."""
 
 from typing import TYPE_CHECKING
 

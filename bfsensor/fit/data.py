@@ -1,4 +1,4 @@
-"""Measured numbers that a device is fitted to, as arrays with errors and conditions."""
+"""Data sets that a device is fitted to: measured numbers with errors and conditions."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from bfsensor.recording.tables.setting_tables import SettingTable
 from bfsensor.typing import FloatArray
 
 KINDS = ("areas", "slopes", "saturation", "diffusion")
+"""Kinds of data sets: a_ij, B-F slopes, saturation levels, diffusion widths."""
 
 UNITS = {
     "areas": "1 / electron",
@@ -24,44 +25,65 @@ UNITS = {
     "saturation": "electron",
     "diffusion": "um",
 }
+"""Unit of the numbers of each kind; slopes are per cent of a pixel for 50,000 e-."""
 
 LAGS = 4
-"""Largest lag that is fitted: beyond, the published a_ij are noise."""
+"""Largest lag of a_ij that is fitted by default [pixel].
+
+Chosen: beyond it the published a_ij are noise; twice as large, 56 more numbers are fitted."""
 
 ASSUMED = {"saturation": 0.02, "diffusion": 0.05}
-"""Relative errors where a table has none: an assumption, and said to be one."""
+"""Relative errors of values that have none in their table.
+
+Chosen; a note of the fit states it.  Twice as large, such values weigh a quarter as much, unless the
+scale of the set's errors is fitted, which then halves."""
 
 MODEL_ERROR = {"slopes": 0.04}
-"""Relative error of a prediction, added in quadrature.  The closed form of slopes takes the
-response of a flat of 40,000 e-; the direct simulation of spots in the ITL device has 4, -1; 5, 4;
-4, 0 % more in x, y at three settings (``validation/results/spot_slopes.ecsv``)."""
+"""Relative error of predictions of a kind, added to the measured error in quadrature.
+
+Measured (``validation/results/spot_slopes.ecsv``): the closed form of slopes takes the response of a
+flat of 40,000 e-; the direct simulation of spots in the ITL device gives slopes larger by 4, -1; 5,
+4; 4, 0 % in x, y at three settings."""
 
 
 @dataclass(frozen=True, eq=False)
 class DataSet:
-    """Numbers of one kind, measured together.
+    """Measured numbers of one kind with errors and conditions.
 
-    Attributes
+    Parameters
     ----------
     name : str
-        For tables and figures.
+        Name in tables and figures.
     kind : str
         'areas' [1/e-], 'slopes' [% of a pixel for 50,000 e-], 'saturation' [e-] or
         'diffusion' [um].
     values, errors : ndarray, shape (n,)
-        Errors as stated, with what is added for the prediction's own.
+        Values in the unit of the kind, and their standard errors, above 0, including that of the
+        prediction (:data:`MODEL_ERROR`).
     conditions : tuple of Condition, length n
-        None in a field: not stated, the device's own value holds, free or not.
+        Voltages, wavelength and temperature of each number; a field that is None was not stated,
+        and the value of the device holds, free or not.
     places : ndarray of int, shape (n, 2)
-        Lag (i, j) of areas; (0, 0) and (1, 0) for slopes in x and y.
+        Lag (i, j) of areas; (0, 0) and (1, 0) for slopes in x and y; (0, 0) for other kinds.
     fitted : bool
-        False: only held against the fit.
+        False: the numbers are only compared with the fit.
     scaled : bool
-        Whether the scale of the errors is estimated.
+        Whether a common factor on the errors is estimated.
     sigma : float
-        Width of the spots of slopes [pixel].
+        Gaussian width of the spots of slopes [pixel], 0.3 to 3.
     notes : tuple of str
-        What was assumed.
+        Assumptions about the numbers.
+
+    Raises
+    ------
+    FitError
+        The kind is unknown, arrays do not match, or values or errors are not valid.
+
+    Examples
+    --------
+    >>> DataSet("one", "saturation", np.array([1.5e5]), np.array([3e3]), (Condition(),),
+    ...         np.zeros((1, 2), int)).fitted
+    True
     """
 
     name: str
@@ -80,12 +102,12 @@ class DataSet:
             raise FitError(f"{self.name}: kind = {self.kind!r} must be one of {KINDS}")
         n = len(self.values)
         if not n:
-            raise FitError(f"{self.name}: holds nothing to fit")
+            raise FitError(f"{self.name}: no values to fit")
         shapes = self.errors.shape, len(self.conditions), self.places.shape
         if shapes != ((n,), n, (n, 2)):
             raise FitError(
-                f"{self.name}: {n} values, errors {shapes[0]}, {shapes[1]} conditions and places "
-                f"{shapes[2]} do not belong together"
+                f"{self.name}: {n} values need as many errors, conditions and places (n, 2), not "
+                f"errors {shapes[0]}, {shapes[1]} conditions and places {shapes[2]}"
             )
         if not (np.all(np.isfinite(self.values)) and np.all(np.isfinite(self.errors))):
             raise FitError(f"{self.name}: values or errors are not finite")
@@ -94,7 +116,7 @@ class DataSet:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """What each number is, for tables."""
+        """Label of each number for tables: its lag, or its axis and condition."""
         if self.kind == "areas":
             return tuple(f"({i},{j})" for i, j in self.places)
         words = [str(condition) for condition in self.conditions]
@@ -122,21 +144,28 @@ def area_data(
     Parameters
     ----------
     name : str
-        For tables and figures.
+        Name in tables and figures.
     a, errors : array_like, shape (ny, nx)
-        [j, i], from lag (0, 0) [1/e-]; nan where not measured.
+        Relative area changes per electron and their standard errors [1/e-], ``[j, i]`` from lag
+        (0, 0); nan where not measured.
     condition : Condition, optional
-        Voltages, wavelength, temperature, where stated.
+        Voltages, wavelength and temperature, as far as stated.
     independent : array_like of bool, shape (ny, nx), optional
-        False: set by a sum rule, and left out.
+        False for a value computed from others by a sum rule, which is left out.
     lags : int
-        Largest lag that is kept.
+        Largest lag that is kept [pixel], 0 or more.
     fitted, scaled : bool
         As in :class:`DataSet`.
 
     Returns
     -------
-    DataSet
+    data : DataSet
+        Kind 'areas', nearest lags first.
+
+    Raises
+    ------
+    FitError
+        Arrays are not of one shape (ny, nx), no lag is left, or errors are not above 0.
 
     Examples
     --------
@@ -148,7 +177,7 @@ def area_data(
     values, sigma = np.asarray(a, float), np.asarray(errors, float)
     if values.ndim != 2 or sigma.shape != values.shape:
         raise FitError(
-            f"{name}: a_ij {values.shape} and errors {sigma.shape} must be (ny, nx)"
+            f"{name}: a_ij {values.shape} and errors {sigma.shape} must both be (ny, nx)"
         )
     used = np.isfinite(values) & np.isfinite(sigma)
     if independent is not None:
@@ -172,20 +201,40 @@ def data_set(
     fitted: bool = True,
     scaled: bool = True,
 ) -> DataSet:
-    """Make a data set of what was read.
+    r"""Make a data set of a measured table.
 
     Parameters
     ----------
     measured : MeasuredTable
-        Table and condition; a row's own setting comes before that of the file.
+        Table and condition; the setting of a row takes precedence over that of the file.
     name : str, optional
-        [name of the file].
-    lags, fitted, scaled
-        As for :func:`area_data`.
+        Name in tables and figures; by default that of the file.
+    lags : int
+        Largest lag of a_ij that is kept [pixel].
+    fitted, scaled : bool
+        As in :class:`DataSet`.
 
     Returns
     -------
-    DataSet
+    data : DataSet
+        Of the table's kind.
+
+    Raises
+    ------
+    FitError
+        The table states no errors, and none are assumed for its kind, or no value is left.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from bfsensor.recording.tables.measured import read_measured
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "saturation.csv"
+    ...     _ = path.write_text("gate_high,saturation,saturation_error\n1,1.5e5,3e3\n")
+    ...     data = data_set(read_measured(path))
+    >>> data.kind, data.conditions[0].gate_high
+    ('saturation', 1.0)
     """
     table = measured.table
     called = name or table.path.stem
@@ -205,20 +254,32 @@ def data_set(
 
 
 def select(data: DataSet, keep: Sequence[bool] | NDArray[np.bool_], name: str) -> DataSet:
-    """Give some of the numbers as a data set of their own.
+    """Select some of the numbers as a data set of their own.
 
     Parameters
     ----------
     data : DataSet
-        The numbers.
+        Data set to select from; not changed.
     keep : sequence of bool
-        Of each number, whether it is kept.
+        Whether each number is kept; at least one.
     name : str
-        Of the new data set.
+        Name of the new data set.
 
     Returns
     -------
-    DataSet
+    data : DataSet
+        The selected numbers in their order.
+
+    Raises
+    ------
+    FitError
+        No number is kept.
+
+    Examples
+    --------
+    >>> data = area_data("two", [[-1e-6, 1e-7]], [[1e-8, 1e-8]])
+    >>> select(data, [True, False], "first").labels
+    ('(0,0)',)
     """
     at = np.flatnonzero(keep)
     return DataSet(
@@ -229,7 +290,7 @@ def select(data: DataSet, keep: Sequence[bool] | NDArray[np.bool_], name: str) -
 
 
 def _joined(own: Condition, common: Condition) -> Condition:
-    """Setting of a row, with that of the file where the row says nothing."""
+    """Condition of a row, completed by that of the file where the row states nothing."""
     fields = ("wavelength", "filter", "temperature", "back_bias", "gate_high", "gate_low")
     return Condition(
         **{
@@ -240,14 +301,16 @@ def _joined(own: Condition, common: Condition) -> Condition:
 
 
 def _errors(table: SettingTable) -> tuple[FloatArray, tuple[str, ...]]:
-    """Errors of a table's values, and what was assumed of them."""
+    """Errors of the values of a table, and notes on assumed or added ones."""
     notes = []
     errors = table.errors.copy()
     lost = ~np.isfinite(errors)
     if lost.any():
         part = ASSUMED.get(table.kind)
         if part is None:
-            raise FitError(f"{table.path}: {table.kind} without errors")
+            raise FitError(
+                f"{table.path}: {int(lost.sum())} values of {table.kind} have no errors: add them"
+            )
         errors[lost] = part * np.abs(table.values[lost])
         notes.append(f"{table.path.name}: no errors, {100 * part:g} % assumed")
     part = MODEL_ERROR.get(table.kind)

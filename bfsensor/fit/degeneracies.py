@@ -1,4 +1,4 @@
-"""What the data can tell of the parameters, and what they cannot tell apart."""
+"""Degeneracies of a fit: combinations that the data constrain, and parameters that they do not."""
 
 from __future__ import annotations
 
@@ -11,21 +11,39 @@ from bfsensor.device.quantities import describe
 from bfsensor.typing import FloatArray
 
 ALIKE = 0.9
-"""Cosine between the changes that two parameters make, in errors of the data, from which they
-are not told apart: of what one does, the other can undo all but 19 % of the square."""
+"""Cosine between the effects of two parameters on the data, in errors, from which they are reported
+as degenerate.
+
+Chosen: one parameter then undoes all but 1 - 0.9^2 = 19 % of the squared effect of the other; at 0.95
+all but 10 %, and fewer parameters are grouped."""
 
 SILENT = 0.2
-"""Information on a parameter, the others known [1 / prior variance], below which the data are
-said to be silent on it: they would take less than a tenth off its spread."""
+"""Information of the data on a parameter, the others known, below which they are reported not to
+constrain it [1 / prior variance].
+
+Chosen: with less, the posterior width is above 1 / sqrt(1.2) = 91 % of the prior's; twice as large,
+above 85 %."""
 
 PART = 0.3
-"""Weight in a combination from which a parameter is named."""
+"""Weight in a combination, of unit length, from which a parameter is named.
+
+Chosen: at most eleven parameters are named; twice as large, at most two."""
 
 
 class Combination(NamedTuple):
-    """A direction in the space of parameters, in units of their priors.
+    """Combination of parameters with a posterior error independent of the others.
 
-    ``remains``: its posterior width over its prior's; ``weights``, shape (p,), of length 1.
+    Parameters
+    ----------
+    remains : float
+        Posterior width of the combination over its prior width, about 0 to 1.
+    weights : ndarray, shape (p,)
+        Weights of the parameters in units of their prior widths, a vector of length 1.
+
+    Examples
+    --------
+    >>> Combination(0.2, np.array([0.8, -0.6])).remains
+    0.2
     """
 
     remains: float
@@ -33,12 +51,17 @@ class Combination(NamedTuple):
 
 
 def principal(covariance: FloatArray) -> tuple[Combination, ...]:
-    """Combinations whose errors are independent, the best known first.
+    """Give the combinations of parameters with independent errors, the best constrained first.
 
     Parameters
     ----------
     covariance : ndarray, shape (p, p)
-        Of the posterior, in units of the priors.
+        Posterior covariance in units of the prior widths.
+
+    Returns
+    -------
+    combinations : tuple of Combination
+        The p eigenvectors, signed so that the largest weight is positive.
 
     Examples
     --------
@@ -54,7 +77,7 @@ def principal(covariance: FloatArray) -> tuple[Combination, ...]:
 
 
 def name_combination(names: Sequence[str], weights: FloatArray) -> str:
-    """Name a combination by its larger parts.
+    """Name a combination by the parameters with weights of at least :data:`PART`.
 
     Examples
     --------
@@ -72,19 +95,21 @@ def name_combination(names: Sequence[str], weights: FloatArray) -> str:
 def find_ties(
     names: Sequence[str], sensitivity: FloatArray
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Groups of parameters that the data cannot tell apart, and those they are silent on.
+    """Find groups of degenerate parameters, and parameters that the data do not constrain.
 
     Parameters
     ----------
     names : sequence of str
-        Of the parameters.
+        Dotted names of the parameters.
     sensitivity : ndarray, shape (n, p)
-        Change of each number, in its error, for one prior spread of each parameter.
+        Change of each number, in units of its error, for one prior width of each parameter.
 
     Returns
     -------
-    ties, silent : tuple of str
-        A sentence for each group; names.
+    ties : tuple of str
+        A text for each group of parameters with nearly proportional effects on the data.
+    silent : tuple of str
+        Dotted names of parameters that the data do not constrain.
 
     Examples
     --------
@@ -92,7 +117,7 @@ def find_ties(
     >>> ties, silent = find_ties(["silicon.background_doping", "silicon.thickness", "gates.gate_oxide",
     ...                           "gates.field_oxide"], j)
     >>> ties
-    ('background doping and thickness (the other way) together: alike to 1.00',)
+    ('background doping and thickness (opposite sign): cosine of their effects 1.00',)
     >>> silent
     ('gates.field_oxide',)
     """
@@ -103,7 +128,7 @@ def find_ties(
     cosine = unit.T @ unit
     left = set(range(len(heard)))
     ties = []
-    # The most informative of what is left gathers all that are like it.
+    # Greedy groups: the best constrained parameter left gathers all with a similar effect.
     for first in np.argsort(-size[heard]).tolist():
         if first not in left:
             continue
@@ -115,10 +140,10 @@ def find_ties(
         words = [describe(names[int(heard[first])])]
         for k in like:
             if k != first:
-                turned = " (the other way)" if cosine[first, k] < 0 else ""
+                turned = " (opposite sign)" if cosine[first, k] < 0 else ""
                 words.append(describe(names[heard[k]]) + turned)
         least = min(abs(cosine[first, k]) for k in like)
         ties.append(
-            f"{', '.join(words[:-1])} and {words[-1]} together: alike to {least:.2f}"
+            f"{', '.join(words[:-1])} and {words[-1]}: cosine of their effects {least:.2f}"
         )
     return tuple(ties), silent

@@ -1,4 +1,4 @@
-"""Devices at other conditions and with other parameters."""
+"""Copies of a device with fitted parameters, at the condition of a measurement."""
 
 from __future__ import annotations
 
@@ -20,21 +20,35 @@ def device_at(
     priors: Sequence[Prior] = (),
     values: FloatArray | None = None,
 ) -> Device:
-    """Give the device with parameters of the fit, and then as a condition states.
+    """Give a device with values of free parameters, and the voltages that a condition states.
 
     Parameters
     ----------
     device : Device
-        As its file says.
+        Device to copy.
     condition : Condition
-        Voltages and temperature; None: the device's own.
-    priors, values
-        Free parameters and what they are [internal units].
+        Voltages [V] and temperature [K], which take precedence over ``values``; None in a field:
+        the device's own.
+    priors : sequence of Prior
+        Free parameters.
+    values : ndarray, shape (p,), optional
+        Their values [internal units]; by default the device's own.
+
+    Returns
+    -------
+    device : Device
+        Changed copy.
 
     Raises
     ------
     FitError
-        There is no such device.
+        No device has these values, such as a gate oxide above the field oxide.
+
+    Examples
+    --------
+    >>> device = Device.load("itl_sta3800c")
+    >>> device_at(device, Condition(back_bias=-60.0)).operating_point.back_bias
+    -60.0
     """
     known = quantities(device)
     wanted = {}
@@ -50,7 +64,7 @@ def device_at(
             wanted[f"operating_point.{key}"] = float(stated)
     out = device
     left = {name: v for name, v in wanted.items() if v != known[name].value}
-    # What needs another change first, such as thicker oxides, waits for it.
+    # Some changes are valid only after others, as of two oxides that must stay ordered: retry.
     while left:
         later, refused = {}, None
         for name, value in left.items():
@@ -59,7 +73,7 @@ def device_at(
             except BFSensorError as error:
                 later[name], refused = value, error
         if len(later) == len(left):
-            raise FitError(f"no such device: {refused}")
+            raise FitError(f"no device has these values: {refused}")
         left = later
     return out
 
@@ -73,23 +87,39 @@ def fitted_device(
 ) -> Device:
     """Give the device with fitted values, their posterior uncertainties, origin and source.
 
-    Uncertainties stand alone in a device file: what of them parameters share is in the result of
-    the fit only.
+    A device file states uncertainties without their correlations, which only the result of the
+    fit holds.
 
     Parameters
     ----------
     device : Device
         The device that was fitted.
     priors : sequence of Prior
-        Of the free parameters.
-    values, errors : ndarray
-        Of the same parameters, in their order [internal units].
+        Priors of the free parameters.
+    values, errors : ndarray, shape (p,)
+        Fitted values and their posterior errors, in the order of the priors [internal units].
     source : str
-        What the device file says of where the values come from.
+        Source that the device file states for these values.
 
     Returns
     -------
-    Device
+    device : Device
+        Named as the device with ``_fitted``; the diffusion width, no quantity of devices, is left
+        out.
+
+    Raises
+    ------
+    FitError
+        No device has these values.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> prior = Prior("silicon.thickness", 100.0, 5.0)
+    >>> device = fitted_device(
+    ...     Device.load("itl_sta3800c"), [prior], np.array([98.0]), np.array([2.0]), "an example")
+    >>> device.name, device.provenance["silicon.thickness"].uncertainty
+    ('itl_sta3800c_fitted', 2.0)
     """
     out = device_at(device, Condition(), priors, values)
     known = dict(out.provenance)

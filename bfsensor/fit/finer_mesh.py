@@ -1,9 +1,10 @@
-"""What is predicted on the mesh of a fit, carried to a finer one wherever the device is solved.
+"""Predicted shifts corrected to a finer mesh, wherever a fit solves the device.
 
-On 16 cells a pixel a_01 is 4 % (ITL) and 9 % (E2V) above that on 64, more than the errors of a fit,
-whose parameters would follow the mesh; by how much changes with the parameters (E2V, above that on
-32: 7 % at the priors, 6 % where the fit ends, 2 % at a random draw).  Derivatives on the finer mesh
-would cost some ten times as much as on the fit's own, the solution alone less than those.
+On 16 cells per pixel a_01 is 4 % (ITL) and 9 % (E2V) larger than on 64, which exceeds the errors of a
+fit and would bias its parameters.  The ratio depends on the parameters (E2V, relative to 32 cells: 7 %
+at the priors, 6 % at the fitted values, 2 % at a random draw), so that it is solved again in each
+round.  Derivatives on the finer mesh would cost about ten times those of the fit's own mesh; the
+solution alone costs less than those.
 """
 
 from __future__ import annotations
@@ -27,19 +28,28 @@ from bfsensor.response.edge_response import LEVEL
 from bfsensor.typing import FloatArray
 
 FINER = 48
-"""Cells a pixel of the finer mesh: at the nearest lags within 0.6 % (ITL) and 1.1 % (E2V) of 64,
-where 32 are within 2.2 %, in 8 CPU s and 1 GB a condition."""
+"""Cells per pixel of the finer mesh.
+
+Chosen: at the nearest lags within 0.6 % (ITL) and 1.1 % (E2V) of 64 cells, in 8 CPU s and 1 GB for
+each condition, where 32 cells are within 2.2 %; twice as large takes at least four times both."""
 
 REFINE_Z = 0
-"""Halvings in z of the finer mesh: one changes the lags by 0.1 % on 48 cells, for twice the time;
-what it does to derivatives does not matter here."""
+"""Number of halvings in z of the finer mesh.
+
+Chosen: one halving changes a_ij by 0.1 % on 48 cells and doubles the time; derivatives, which would
+need it, are not taken on this mesh."""
 
 
 @dataclass(frozen=True, eq=False)
 class FinerEmulator:
-    """An emulator whose shifts have the finer mesh's added less its own at one set of values.
+    """Emulator plus the difference of shifts between the finer and its own mesh at one point.
 
-    Derivatives are the emulator's.
+    Attributes
+    ----------
+    emulator : Emulator
+        Emulator on the mesh of the fit, which gives the derivatives too.
+    added : mapping of Condition to (ndarray, ndarray)
+        Shifts (kx, ky) on the finer mesh minus those of the emulator [pixel/e-].
     """
 
     emulator: Emulator
@@ -51,38 +61,45 @@ class FinerEmulator:
         return tuple(self.emulator.parameters)
 
     def predict(self, values: FloatArray, condition: Condition) -> LinearResponse:
-        """Response at parameters and a condition, one of those that it was made for."""
+        """Predict the response at parameters [internal units] and one of the solved conditions."""
         if condition not in self.added:
-            raise FitError(f"no response was solved at {condition}")
+            raise FitError(
+                f"no response was solved at {condition}; solved were {', '.join(map(str, self.added))}"
+            )
         found, (x, y) = self.emulator.predict(values, condition), self.added[condition]
         return LinearResponse(found.kx + x, found.ky + y, found.dkx, found.dky)
 
 
 @dataclass(frozen=True, eq=False)
 class Finer:
-    """Solves a device as another does, with its shifts, and so areas and slopes, on a finer mesh.
+    """Wrapper of ``linearise`` whose predicted shifts are those of a finer mesh.
 
-    In place of the other as ``linearise`` of :func:`~bfsensor.fit.fit.fit_device`: each round of the
-    fit then ends on the finer mesh, whatever the parameters.
+    :func:`~bfsensor.fit.fit.fit_device` takes it as ``linearise``: each round of the fit then ends at
+    the solution on the finer mesh, with derivatives of the coarser one.
 
     Attributes
     ----------
     linearise : callable
-        What solves the device at values of all free parameters.
+        Function that solves the device and its derivatives at values of all free parameters.
     device : Device
-        About which the fit is; its finer mesh, too, is moved with the parameters.
+        Nominal device of the fit; its finer mesh is distorted with the parameters too.
     priors : tuple of Prior
-        Of all free parameters, in the order of the values.
+        All free parameters, in the order of the values.
     conditions : tuple of Condition
-        All that will be asked for.
+        All conditions for which predictions are made.
     cells, coarse : int
-        Of the finer mesh and of that of the fit, a pixel; for what is written down.
+        Cells per pixel of the finer mesh, even, and of the mesh of the fit, for the record.
     keep : Path, optional
-        Folder that keeps finished solutions, by a digest of version, device, mesh and level.
+        Folder that caches finished solutions, by a digest of version, device, mesh and level.
     progress : callable, optional
         Called with (solved, in all).
     ratios : list
-        Finer over own a_ij of every call, by condition; in the order of the calls.
+        For every call, its values and the ratios of a_ij on both meshes by condition.
+
+    Raises
+    ------
+    FitError
+        The number of cells is odd, or not above that of the fit.
     """
 
     linearise: Callable[[FloatArray], Emulator]
@@ -100,12 +117,12 @@ class Finer:
     def __post_init__(self) -> None:
         if self.cells <= self.coarse or self.cells % 2:
             raise FitError(
-                f"finer = {self.cells} cells a pixel must be even and above the {self.coarse} of "
+                f"finer = {self.cells} cells per pixel must be even and above the {self.coarse} of "
                 "the fit"
             )
 
     def __call__(self, values: FloatArray) -> FinerEmulator:
-        """Solve on both meshes at values [internal units], shape (p,)."""
+        """Solve on both meshes at the values of all free parameters [internal units], shape (p,)."""
         values = np.asarray(values, float)
         emulator = self.linearise(values)
         names = [prior.name for prior in self.priors]
@@ -127,14 +144,15 @@ class Finer:
         )  # fmt: skip
 
     def record(self, values: FloatArray) -> dict[str, Any]:
-        """Give what is to be kept with a fit that ended at these values: meshes and ratios.
+        """Give the record of the meshes for a fit that ended at these values [internal units].
 
-        The ratios are those of the nearest solution, in spreads of the priors.
+        Its ratios of a_ij are those of the nearest solution, in widths of the priors, and those of
+        the first one.
 
         Raises
         ------
         FitError
-            Nothing was solved.
+            No solution was made yet.
         """
         if not self.ratios:
             raise FitError("nothing was solved on the finer mesh")
@@ -155,18 +173,18 @@ class Finer:
 
 
 TOLD = ((1, 0), (0, 1), (1, 1))
-"""Lags (i, j) whose ratios are told."""
+"""Lags (i, j) whose ratios the note states.  Chosen: the nearest; fit.json holds all."""
 
 
 def say(record: Mapping[str, Any]) -> str:
-    """Put a record in a sentence, with the ratios of its first condition."""
+    """Give the note on a record of :meth:`Finer.record`, with the ratios of its first condition."""
     one, more = record["ratios"][0], len(record["ratios"]) - 1
     lags = ", ".join(
         f"({i},{j}) {one['finer_over_own'][j][i]:.3f} ({one['at_the_priors'][j][i]:.3f})"
         for i, j in TOLD
     )
     return (
-        f"a_ij and slopes are those of {record['finer']} cells a pixel, their derivatives of "
-        f"{record['cells']}; finer over own a_ij where the fit ends (at the priors): {lags}"
+        f"a_ij and slopes are solved on {record['finer']} cells per pixel, their derivatives on "
+        f"{record['cells']}; ratio of a_ij on both meshes at the fit (at the priors): {lags}"
         + (f"; {more} more conditions in fit.json" if more else "")
     )

@@ -1,4 +1,4 @@
-"""Fit a device: priors, data and an emulator to a result."""
+"""Fit the parameters of a device to measurements with priors, by Gauss-Newton rounds."""
 
 from __future__ import annotations
 
@@ -29,18 +29,31 @@ from bfsensor.fit.result import FitResult, FittedSet
 from bfsensor.typing import FloatArray
 
 FAR = 3.0
-"""Spreads of its prior from which a fitted parameter is remarked upon."""
+"""Distance of a fitted parameter from the mean of its prior beyond which a note says so [standard
+deviations of the prior].
 
-STRAIGHT_PROFILES = (
-    "profiles are those of predictions straight in the parameters: parabolas within bounds"
-)
+Chosen: 0.3 % of correct priors are as far off; twice as large, only gross conflicts are noted."""
+
+STRAIGHT_PROFILES = "profiles are those of linear predictions: parabolas between the bounds"
+"""Note of a fit with profiles whose predictions are linear in the parameters."""
 
 ROUNDS = 12
+"""Largest number of Gauss-Newton rounds; beyond it the fit is reported as not converged.
+
+Chosen: the two shipped fits take 4 (``tables/*/fit.json``); twice as large, a fit that does not
+converge takes twice as long to say so."""
+
 SETTLED = 0.1
-"""Largest miss of a prediction by the tangent of the round before [scaled error]."""
+"""Largest error of a linear prediction at the end of its step for the fit to count as converged
+[scaled error of the number].
+
+Chosen: twice as large, a round fewer is made, and fitted numbers are off by up to 0.2 errors."""
 
 SHORTEST = 0.1
-"""Of steps, relative to that of the tangent."""
+"""Fraction of a full Gauss-Newton step below which a failing step is not halved again.
+
+Chosen: the shortest step is 1/16 of the full one, and it is taken even where the objective grows; at
+twice this value it is 1/8."""
 
 
 def fit_device(
@@ -63,48 +76,74 @@ def fit_device(
     Parameters
     ----------
     device : Device
-        Where the fit begins; what is not free stays.
+        Device about which the fit is made; its other parameters keep their values.
     sets : sequence of DataSet
-        Measured numbers; those with ``fitted=False`` are only predicted.
+        Measured numbers, at least one set; those with ``fitted=False`` are only predicted.
     priors : sequence of Prior
-        Of the free parameters.
+        Gaussian priors of the free parameters [internal units], at least one.
     emulator : Emulator or None
-        Response of the device by its parameters; they must be among the priors.
+        Boundary shifts of the device as a function of its parameters, all of which need priors;
+        None with ``linearise``, or where no set holds areas or slopes.
     linearise : callable, optional
-        What solves the device at values of its parameters with all derivatives
-        (:class:`~bfsensor.fit.linear_response.Linearise`), in place of ``emulator``; a
-        :class:`~bfsensor.fit.finer_mesh.Finer` for the values of a finer mesh, which the result tells.
+        Function that solves the device and all derivatives at values of the parameters
+        (:class:`~bfsensor.fit.linear_response.Linearise`), in place of ``emulator``.  With a
+        :class:`~bfsensor.fit.finer_mesh.Finer` predicted values are those of a finer mesh, which the
+        result records.
     tangents : mapping, optional
-        What predicts saturation and diffusion
-        (:func:`~bfsensor.fit.linear_predictors.make_tangents`).
+        Makers of linear predictors of saturation levels and diffusion widths
+        (:func:`~bfsensor.fit.linear_predictors.make_tangents`); needed only for such data.
     solved : callable, optional
-        What solves the device at values of all free parameters without derivatives
-        (:class:`~bfsensor.fit.full_solutions.FullSolutions`): what predictions miss over the
-        posterior then counts in its errors (:mod:`bfsensor.fit.prediction_error`); by default a
-        note says that it does not.
+        Function that solves the device without derivatives at values of all free parameters
+        (:class:`~bfsensor.fit.full_solutions.FullSolutions`).  With it the error of the
+        predictions, measured at draws from the posterior, is added to the errors of the fit
+        (:mod:`bfsensor.fit.prediction_error`); without it a note says that it is not.
     draws : int
-        From the posterior, at which the device is solved.
+        Number of draws from the posterior at which ``solved`` is called; 0: none.
     progress : callable, optional
-        Called with (solved, draws).
+        Called with (draws solved, draws in all).
     profiles : sequence of str
-        Parameters whose profile likelihood is wanted.
+        Free parameters of which the profile likelihood is computed, by dotted name.
     source : str
-        What is written into the fitted device file.
+        Source that the fitted device file states for its fitted values.
     notes : sequence of str
-        To be kept with the result.
+        Notes to keep with the result.
 
     Returns
     -------
-    FitResult
+    result : FitResult
+        Fitted parameters with covariance, predictions before and after, and degeneracies.
 
     Raises
     ------
     FitError
-        Nothing to fit, or nothing that predicts it.
+        There is nothing to fit, a kind of data has no predictor, or the fit moves to where the
+        device has no solution.
     DeviceError
         The device as given is not fully depleted at a condition of the measurements.
     ConvergenceError
-        The fit does not settle.
+        The least squares or the scales of the errors do not converge.
+
+    Notes
+    -----
+    A fit that has not converged after :data:`ROUNDS` rounds is returned, with a note.
+
+    Examples
+    --------
+    Areas whose shifts are proportional to one parameter, predicted by the analytic model:
+
+    >>> from bfsensor import Device
+    >>> from bfsensor.device.quantities import Prior
+    >>> from bfsensor.fit import area_data
+    >>> from bfsensor.fit.linear_response import LinearEmulator, LinearResponse
+    >>> x = 1e-7 * np.outer([1, 2, 1], [1.0, -2.0, 0.5])
+    >>> shifts = LinearResponse(x, x.T, 0.01 * x[None], 0.01 * x.T[None])
+    >>> data = area_data("made up", 1.05 * shifts.areas, 1e-10 + 0 * shifts.areas, scaled=False)
+    >>> emulator = LinearEmulator(
+    ...     ("silicon.thickness",), np.array([100.0]), {data.conditions[0]: shifts})
+    >>> prior = Prior("silicon.thickness", 100.0, 10.0)
+    >>> result = fit_device(Device.load("itl_sta3800c"), [data], [prior], emulator)
+    >>> round(float(result.value[0]), 1)
+    105.0
     """
     names = tuple(prior.name for prior in priors)
     _check_profiles(profiles, names)
@@ -160,17 +199,17 @@ def _check_profiles(profiles: Sequence[str], names: Sequence[str]) -> None:
     unknown = [name for name in profiles if name not in names]
     if unknown:
         raise FitError(
-            f"{unknown[0]} is not free, and has no profile; free are {', '.join(names)}"
+            f"{unknown[0]} has no profile, as it is not free; free are {', '.join(names)}"
         )
 
 
 def _settle(
     problem: LeastSquaresProblem, linearise: Callable[[FloatArray], Emulator]
 ) -> tuple[LeastSquaresProblem, FitSolution, list[Prediction], list[str]]:
-    """Gauss and Newton: fit, solve the device where the fit ends, fit again.
+    """Gauss-Newton rounds: fit linear predictions, solve the device at the result, fit again.
 
-    Steps that raise what is minimised, or lead to no device, are halved.  Gives the problem and its
-    solution, predictions at the priors' means, and a remark.
+    A step that raises the objective, or leads to no device, is halved (:data:`SHORTEST`).  Gives the
+    problem about the last solution, its solution, predictions at the priors' means, and a note.
     """
     values = problem.means
     now = _with_emulator(problem, linearise(values))
@@ -190,7 +229,10 @@ def _settle(
                 there, part = None, 0.5 * part
                 step = values + part * (found.values - values)
             elif there is None:
-                raise FitError("the fit leads to where the device has no solution")
+                raise FitError(
+                    "the fit moves to parameters for which the device has no solution, even at "
+                    f"{part:g} of its step: give narrower priors"
+                )
         moved = max(
             float(np.max(np.abs(other[0] - one[0]) / (scale * data.errors)))
             for data, one, other, scale in zip(
@@ -204,16 +246,19 @@ def _settle(
         )
         values, now = step, there
         if part == 1.0 and moved < SETTLED:
-            told = f"settled in {number} rounds of Gauss and Newton"
-            return now, solve(now, start=values), before, [told]
-    told = f"not settled: the last solution moved predictions by {moved:.1f} scaled errors"
-    return now, solve(now, start=values), before, [told]
+            note = f"settled in {number} rounds of Gauss-Newton"
+            return now, solve(now, start=values), before, [note]
+    note = (
+        f"not converged after {ROUNDS} rounds of Gauss-Newton: the last one moved predictions by "
+        f"{moved:.1f} scaled errors"
+    )
+    return now, solve(now, start=values), before, [note]
 
 
 def _objective(
     problem: LeastSquaresProblem, values: FloatArray, scales: FloatArray
 ) -> float:
-    """What is minimised, at given scales of the errors."""
+    """Objective at values of the parameters: chi2 with scaled errors, and that of the priors."""
     total = float(np.sum(((values - problem.means) / problem.spreads) ** 2))
     for data, scale, (found, _) in zip(
         problem.sets, scales, problem.predict(values), strict=True
@@ -226,14 +271,14 @@ def _objective(
 def _exact(
     problem: LeastSquaresProblem, solved: Callable[[FloatArray], Emulator]
 ) -> Callable[[FloatArray], list[FloatArray]]:
-    """Predictions of all sets from a solution at the values."""
+    """Make a function that predicts all sets from a solution of the device at the values."""
     return lambda values: [
         value for value, _ in _with_emulator(problem, solved(values)).predict(values)
     ]
 
 
 def _with_emulator(problem: LeastSquaresProblem, emulator: Emulator) -> LeastSquaresProblem:
-    """Give the problem with areas and slopes of another emulator."""
+    """Replace the predictors of areas and slopes by those of another emulator."""
     predictors = tuple(
         make_predictors((data,), emulator, problem.priors)[0]
         if data.kind in ("areas", "slopes")
@@ -249,7 +294,7 @@ def _sets(
     before: Sequence[Prediction],
     left: Sequence[FloatArray],
 ) -> tuple[FittedSet, ...]:
-    """Data beside what is predicted before and after."""
+    """Data sets with their predictions at the priors' means (before) and at the solution."""
     after = problem.predict(found.values)
     out = []
     for k, data in enumerate(problem.sets):
@@ -269,22 +314,27 @@ def _sets(
 
 
 def _remarks(result: FitResult, priors: Sequence[Prior]) -> list[str]:
-    """What a reader should know of the solution."""
+    """Notes on parameters far from their priors or at bounds, and on linear predictions."""
     out = []
     for k, prior in enumerate(priors):
         if abs(result.pulls[k]) > FAR:
             out.append(
-                f"{prior.name} lies {abs(result.pulls[k]):.1f} spreads from its prior: prior and "
-                "data do not agree, and the emulator is not proven there"
+                f"{prior.name} lies {abs(result.pulls[k]):.1f} standard deviations from the mean of "
+                "its prior: prior and data disagree, and predictions are not tested so far from it"
             )
         near = 1e-3 * prior.spread
         if min(result.value[k] - prior.low, prior.high - result.value[k]) < near:
-            out.append(f"{prior.name} is at the end of what can be: its error is too small")
+            out.append(
+                f"{prior.name} is at a bound, beyond which it has no meaning: its error is too small"
+            )
         if prior.name == DIFFUSION:
             out.append(
-                "diffusion over Einstein's is no quantity of a device file: not in it"
+                "the diffusion width over Einstein's is no quantity of device files: the fitted device "
+                "does not hold it"
             )
     kinds = {one.kind for one in result.sets}
     if kinds & {"saturation", "diffusion"}:
-        out.append("saturation and widths are straight in the parameters about the device")
+        out.append(
+            "saturation levels and diffusion widths are predicted linearly in the parameters"
+        )
     return out

@@ -1,4 +1,4 @@
-"""The figure of a fit."""
+"""Figure of a fit: data and predictions, parameters against priors, profile likelihoods."""
 
 from __future__ import annotations
 
@@ -17,21 +17,29 @@ if TYPE_CHECKING:
 
 
 def figure_for_fit(result: FitResult) -> Figure:
-    """Draw data before and after with pulls, parameters against priors, profiles.
+    """Draw predictions over data before and after the fit, parameters, and profiles.
 
     Parameters
     ----------
     result : FitResult
-        The fit.
+        Result of a fit, from :func:`fit_device` or read from ``fit.json``.
 
     Returns
     -------
-    matplotlib.figure.Figure
+    figure : matplotlib.figure.Figure
+        A row for each data set; pulls of the parameters beside them; below, the profiles if any.
 
     Raises
     ------
     BFSensorError
-        Matplotlib is missing.
+        Matplotlib is not installed.
+
+    Examples
+    --------
+    >>> from bfsensor.device.shipped import tables_dir
+    >>> figure = figure_for_fit(FitResult.read(tables_dir() / "itl_sta3800c_2019" / "fit.json"))
+    >>> len(figure.axes) >= 3
+    True
     """
     sets, profiles = result.sets, list(result.profiles.items())
     rows = 2 * len(sets)

@@ -1,4 +1,4 @@
-"""Responses of a device at values of its parameters, solved without derivatives."""
+"""Boundary shifts of a device at values of its parameters, solved without derivatives."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from bfsensor.response.emulator_nodes import Node, solve_nodes
 from bfsensor.typing import FloatArray
 
 Shifts = tuple[FloatArray, FloatArray]
-"""Of right and of upper edges [pixel/e-]."""
+"""Shifts (kx, ky) of right and of upper edges [pixel/e-]."""
 
 
 def solve_shifts(
@@ -32,22 +32,34 @@ def solve_shifts(
     keep: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[Condition, Shifts]:
-    """Solve for the shifts; conditions that differ in wavelength share a solution.
+    """Solve for the shifts at all conditions; those that differ in wavelength share a solution.
 
     Parameters
     ----------
     device : Device
-        Whose mesh is moved with the parameters.
-    priors, values
-        Of all free parameters [internal units].
+        Nominal device; its mesh is distorted with the parameters, not made again.
+    priors : sequence of Prior
+        Free parameters.
+    values : ndarray, shape (p,)
+        Their values [internal units].
     conditions : sequence of Condition
-        At which.
+        Conditions of the measurements.
     cells, refine_z : int
-        Of the mesh.
+        Mesh cells per pixel, even, and number of halvings in z.
     keep : Path, optional
-        Folder that keeps finished solutions, by a digest of version, device, mesh and level.
+        Folder that caches finished solutions, by a digest of version, device, mesh and level.
     progress : callable, optional
         Called with (solved, in all).
+
+    Returns
+    -------
+    shifts : dict of Condition to (ndarray, ndarray)
+        (kx, ky) [pixel/e-], [row dy, column dx].
+
+    Raises
+    ------
+    FitError
+        No device has these values.
     """
     devices: dict[Condition, tuple[Device, str]] = {}
     nodes: dict[str, Node] = {}
@@ -72,20 +84,20 @@ def solve_shifts(
 
 @dataclass(frozen=True, eq=False)
 class FullSolutions:
-    """Solves a device at values of its parameters: an emulator for these alone.
+    """Function that solves a device at values of its parameters; its emulator is valid there only.
 
     Attributes
     ----------
     device : Device
-        About which the fit is.
+        Nominal device of the fit.
     priors : tuple of Prior
-        Of all free parameters, in the order of the values.
+        All free parameters, in the order of the values.
     conditions : tuple of Condition
-        All that will be asked for.
+        All conditions for which predictions are made.
     cells, refine_z : int
-        Of the mesh.
+        Mesh cells per pixel, even, and number of halvings in z.
     keep : Path, optional
-        Folder that keeps finished solutions.
+        Folder that caches finished solutions.
     """
 
     device: Device
@@ -96,7 +108,7 @@ class FullSolutions:
     keep: Path | None = None
 
     def __call__(self, values: FloatArray) -> LinearEmulator:
-        """Solve at values [internal units], shape (p,)."""
+        """Solve at the values of all free parameters [internal units], shape (p,)."""
         shifts = solve_shifts(
             self.device, self.priors, values, self.conditions, cells=self.cells,
             refine_z=self.refine_z, keep=self.keep,

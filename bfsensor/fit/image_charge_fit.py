@@ -1,18 +1,19 @@
-r"""The analytic engine fitted to a_ij, as LSST's pipeline does.
+r"""Fit of the image-charge model to a_ij, as in LSST's pipeline.
 
 .. math:: a_{ij} = \alpha\, m_{ij}(z_q, z_{sh}, z_{sv}, a, b) + \beta
 
 with the relative area changes m of charge rectangles between conducting planes
-(:mod:`bfsensor.simulate.image_charge`), a strength :math:`\alpha` that takes up the drift field,
-and an offset :math:`\beta` common to all lags.  Both :math:`z_{sh}` and :math:`z_{sv}` stay above
-:math:`z_q`.
+(:mod:`bfsensor.simulate.image_charge`), a strength :math:`\alpha` that absorbs the drift field, and
+an offset :math:`\beta` common to all lags.  The heights :math:`z_{sh}` and :math:`z_{sv}`, at which
+the boundaries between rows and columns end, stay above the height of the charge :math:`z_q`; a and b
+are the half sides of its rectangle.
 
-The field of a charge close to its plane is that of a dipole, :math:`\alpha z_q`, and in the next
-order :math:`a^2 - b^2` and :math:`z_q^2 - (a^2 + b^2)/2` count: the dipole, the sealed heights and
-these two are told by data, while z_q, alpha, a and b one by one hardly are.  Hence the fit is made at
-one height of the charge after another, and what that costs in chi2 stands in the result.  Errors
-follow from the curvature at the minimum and hold where they are small beside their values.  An offset
-is no physics: it absorbs what the model lacks at long range.
+The field of a charge close to its plane is that of a dipole :math:`\alpha z_q`; the next order
+depends on :math:`a^2 - b^2` and :math:`z_q^2 - (a^2 + b^2)/2`.  Data constrain the dipole, the two
+heights and these two combinations, but hardly z_q, alpha, a and b separately.  Hence the fit is
+repeated at fixed heights of the charge, and the result holds chi2 at each of them.  Errors follow
+from the curvature at the minimum; they are valid where they are small relative to the values.  The
+offset has no physical meaning: it absorbs long-range differences from the model.
 """
 
 from __future__ import annotations
@@ -40,35 +41,49 @@ from bfsensor.typing import FloatArray
 
 _SCHEMA = "bfsensor-image-charge-fit-1"
 _AT_BOUND = 0.01
+"""Distance from a bound below which a parameter counts as held there [um, logarithm of the strength,
+offset in units of the largest a_ij].
+
+Chosen: twice as large, half sides within 0.02 um of half a pixel get no error."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImageChargeFit:
-    """Parameters of the analytic engine, from a_ij.
+    """Parameters of the image-charge model fitted to a_ij.
 
-    Attributes
+    Parameters
     ----------
     model : ImageCharge
-        With the fitted heights and half sides.
+        Model with the fitted heights and half sides [um].
     strength, offset : float
-        alpha, and beta [1/e-].
+        Factor alpha, and offset beta [1/e-].
     depth : float
         Conversion depth [um above the gates].
     names : tuple of str
         Free parameters, in the order of ``covariance``.
     covariance : ndarray, shape (p, p)
-        From the errors as given; um, 1 and 1/e-.
+        Covariance from the errors as given, in um, 1 and 1/e-; nan at a bound.
     a, errors, predicted : ndarray, shape (n, n)
-        Given, and by the model, ``[j, i]`` [1/e-].
+        Measured a_ij, their errors, and those of the model, ``[j, i]`` [1/e-].
     used : ndarray of bool, shape (n, n)
         Lags that were fitted.
     chi2 : float
+        Chi-square of the fitted lags with the errors as given.
     bounded : tuple of str
-        Parameters that ended at a bound: the data do not determine them, they have no error,
-        and the others theirs with these held.
+        Parameters that ended at a bound: the data do not determine them.  They have no error, and
+        the errors of the others hold with these fixed.
     profile_heights, profile_chi2 : ndarray, shape (m,)
-        Heights of the charge [um above the gates] and the least chi2 at each, up to where it is
-        100 above the best: where it hardly changes, z_q, alpha, a and b are not known one by one.
+        Heights of the charge [um above the gates] and the least chi2 at each, up to about 100
+        above the best.  Where it hardly changes, z_q, alpha, a and b are not known separately.
+
+    Examples
+    --------
+    >>> from bfsensor.simulate.image_charge import area_changes
+    >>> true = ImageCharge(0.5, 1.4, 3.2, 1.5, 3.0)
+    >>> a = area_changes(true, depth=100.0, reach=4)[4:, 4:]
+    >>> fit = fit_image_charge(a, 0.01 * abs(a), base=true)
+    >>> fit.names[0], fit.degrees_of_freedom
+    ('charge_height', 18)
     """
 
     model: ImageCharge
@@ -91,15 +106,15 @@ class ImageChargeFit:
 
     @property
     def values(self) -> dict[str, float]:
-        """Free parameters by name."""
+        """Values of the free parameters by name [um, 1, 1/e-]."""
         return {name: _value(self, name) for name in self.names}
 
     @property
     def parameter_errors(self) -> dict[str, float]:
-        """Their errors, from the errors of the a_ij as given; nan at a bound.
+        """Errors of the free parameters from the errors of a_ij as given; nan at a bound.
 
-        Where something ended at a bound, those of the height and the strength are too small:
-        the profile says what is known of them.
+        Where a parameter ended at a bound, the errors of the height and the strength are too
+        small: use the profile of chi2 instead.
         """
         return dict(
             zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True)
@@ -107,36 +122,45 @@ class ImageChargeFit:
 
     @property
     def dipole(self) -> tuple[float, float]:
-        """Strength times height of the charge above the plane, and its error [um]."""
+        """Dipole, strength times height of the charge above the plane, and its error [um]."""
         height = self.model.charge_height - self.model.plane_height
         slope = np.array([
             {"charge_height": self.strength, "strength": height}.get(n, 0.0) for n in self.names
         ])  # fmt: skip
-        known = np.nan_to_num(self.covariance)  # what is held at a bound adds nothing
+        known = np.nan_to_num(
+            self.covariance
+        )  # parameters at a bound have nan: they add no error
         return self.strength * height, float(np.sqrt(slope @ known @ slope))
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Fitted lags less free parameters."""
+        """Number of fitted lags minus that of free parameters."""
         return int(self.used.sum()) - len(self.names)
 
     @property
     def error_scale(self) -> float:
-        """Factor on all errors that would make chi2 what it should be."""
+        """Factor on all errors at which chi2 equals the degrees of freedom."""
         return float(np.sqrt(self.chi2 / self.degrees_of_freedom))
 
     @property
     def residuals(self) -> FloatArray:
-        """Given less predicted, by lag [1/e-]."""
+        """Measured minus predicted a_ij by lag [1/e-]."""
         return self.a - self.predicted
 
     @property
     def ratio(self) -> FloatArray:
-        """Predicted over given, by lag."""
+        """Predicted over measured a_ij by lag."""
         return self.predicted / self.a
 
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write an ECSV file: a row for each lag, parameters in the header.
+
+        Parameters
+        ----------
+        path : str or path-like
+            File to write.
+        overwrite : bool
+            Whether an existing file is replaced.
 
         Raises
         ------
@@ -164,12 +188,22 @@ class ImageChargeFit:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> ImageChargeFit:
-        """Read what :meth:`write` wrote.
+        """Read a file of :meth:`write`.
+
+        Parameters
+        ----------
+        path : str or path-like
+            File to read.
+
+        Returns
+        -------
+        fit : ImageChargeFit
+            Equal to the one that was written.
 
         Raises
         ------
         MeasurementError
-            Not such a file, or damaged; names it.
+            The file is missing, damaged, or of another kind.
         """
         names = ("i", "j", "a", "error", "predicted", "used")
         heads = (
@@ -198,6 +232,7 @@ class ImageChargeFit:
 
 
 def _value(fit: ImageChargeFit, name: str) -> float:
+    """Value of a free parameter, of the model or of the fit."""
     return float(getattr(fit.model if name in SHAPE else fit, name))
 
 
@@ -210,7 +245,7 @@ def fit_image_charge(
     used: ArrayLike | None = None,
     free: Sequence[str] = SCALES,
 ) -> ImageChargeFit:
-    """Fit heights, half sides, strength and offset by least squares.
+    """Fit heights, half sides, strength and offset of the image-charge model by least squares.
 
     Parameters
     ----------
@@ -218,26 +253,27 @@ def fit_image_charge(
         Relative area changes per electron and their standard errors [1/e-], ``[j, i]`` from lag
         (0, 0); nan where not measured.  LSST's pipeline fits lags up to 8.
     base : ImageCharge
-        Thickness, pitch, permittivity, plane and drift field; a uniform field of any strength
-        where ``strength`` is free.  Its heights and half sides count for nothing.
+        Model with thickness, pitch, permittivity, plane and drift field; where ``strength`` is
+        free, a uniform field of any value serves.  Its heights and half sides are not used.
     depth : float, optional
         Conversion depth [um above the gates]; by default the back surface.
     used : array_like of bool, shape (n, n), optional
-        Lags to fit; by default all that are finite.  An a_00 that was computed from the sum of
-        the others is no measurement.
+        Lags to fit; by default all finite ones.  Exclude an a_00 that was computed from the sum
+        of the others: it is no measurement.
     free : sequence of str
-        Which of :data:`SCALES` are free; a strength that is not is 1, an offset 0.
+        Which of 'strength' and 'offset' are free; by default both.  A fixed strength is 1, a fixed
+        offset 0.
 
     Returns
     -------
-    ImageChargeFit
-        The best of the fits from :data:`bfsensor.fit.image_charge_problem.STARTS`.
+    fit : ImageChargeFit
+        Best of the fits from :data:`bfsensor.fit.image_charge_problem.STARTS`.
 
     Raises
     ------
     MeasurementError
-        Arrays that are no squares of one shape, errors that are not above 0, fewer lags than
-        parameters, unknown names.
+        Arrays are not square or differ in shape, an error is not above 0, there are no more lags
+        than parameters, or a name is unknown.
 
     References
     ----------
@@ -279,7 +315,7 @@ def fit_image_charge(
     near = np.array(
         [height in heights[[0, -1]], *(np.minimum(best.x - low, high - best.x) < _AT_BOUND)]
     )
-    # What ended at a bound is held there: it has no error, and the others theirs without it.
+    # Parameters at a bound are fixed there: their curvature says nothing of their errors.
     jacobian = problem.slopes(vector, np.flatnonzero(~near).tolist())
     slopes = parameter_slopes(vector, names, strength, problem.size)[:, ~near]
     covariance = slopes @ np.linalg.pinv(jacobian.T @ jacobian) @ slopes.T
@@ -298,7 +334,7 @@ def _check(
     used: ArrayLike | None,
     free: Sequence[str],
 ) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
-    """Lags to fit and names of what is free."""
+    """Check the data; give the lags to fit and the names of the free parameters."""
     if a.ndim != 2 or a.shape[0] != a.shape[1] or errors.shape != a.shape:
         raise MeasurementError(
             f"a and errors must be squares of one shape, from lag (0, 0), not {a.shape} and "
@@ -320,7 +356,7 @@ def _check(
     names = (*SHAPE, *(name for name in SCALES if name in free))
     if lags.sum() <= len(names):
         raise MeasurementError(
-            f"{int(lags.sum())} lags do not determine {len(names)} parameters; more lags, or "
-            "less free"
+            f"{int(lags.sum())} lags do not determine {len(names)} parameters: give more lags, or "
+            "fewer names in free"
         )
     return lags, names

@@ -1,16 +1,19 @@
 r"""Least squares for the parameters of a device, with priors and a scale of the errors.
 
-Minimised is
+The objective
 
 .. math:: \sum_k \frac{1}{s_k^2} \sum_n \left(\frac{m_n(\theta) - d_n}{\sigma_n}\right)^2
           + \sum_p \left(\frac{\theta_p - \bar\theta_p}{\pi_p}\right)^2
 
-over the parameters, by Gauss and Newton within bounds.  The scale :math:`s_k` of a data set is such
-that its chi2 is what it should be for its numbers less the parameters that it determines
-(variance components by restricted likelihood):
+is minimised over the parameters :math:`\theta` by Gauss-Newton steps within bounds, with predictions
+m, data d and errors :math:`\sigma`, prior means :math:`\bar\theta` and widths :math:`\pi`.  The scale
+:math:`s_k` of the errors of data set k makes its scaled chi2 equal to its numbers minus the
+parameters that it determines (variance components by restricted likelihood):
 
 .. math:: s_k^2 = \chi^2_k / (n_k - \mathrm{tr}_k), \qquad
-          \mathrm{tr}_k = \mathrm{tr}(J_k C J_k^T) / s_k^2 .
+          \mathrm{tr}_k = \mathrm{tr}(J_k C J_k^T) / s_k^2 ,
+
+with the derivatives :math:`J_k` in units of the stated errors and the posterior covariance C.
 """
 
 from __future__ import annotations
@@ -28,34 +31,50 @@ from bfsensor.fit.predictors import DataPredictor, Prediction
 from bfsensor.typing import FloatArray
 
 FEWEST = 5.0
-"""Degrees of freedom of a data set from which its scale is estimated; 1 below."""
+"""Least number of degrees of freedom at which the scale of a data set is estimated; below it is 1.
+
+Chosen: at 5 the scale has an error of 1 / sqrt(10) = 32 %; twice as large, of 22 %."""
 
 ORDERED = (
     ("gates.gate_oxide", "gates.field_oxide"),
     ("operating_point.gate_low", "operating_point.gate_high"),
 )
-"""Pairs of which the first is not above the second in any device."""
+"""Pairs of parameters of which the first must not exceed the second."""
 
 STEEP = 1e4
-"""Of what keeps them so, a spread that they are the wrong way round [standard deviations]."""
+"""Residual for a violation of this order by one prior width [standard deviations].
+
+Chosen: at the minimum a violation is about 1e-8 prior widths times the pull of the data, and is then
+set to 0; twice as large, a quarter of that."""
 
 ROUNDS = 60
+"""Largest number of rounds of least squares with new scales of the errors.
+
+Chosen: beyond it ConvergenceError is raised; twice as large, that takes twice as long."""
+
 TOLERANCE = 1e-4
-"""Of the scales, from one round to the next."""
+"""Largest relative change of a scale from one round to the next at which scales have converged.
+
+Chosen: far below the statistical error of a scale, 1 / sqrt(2 dof)."""
 
 
 @dataclass(frozen=True, eq=False)
 class LeastSquaresProblem:
-    """Free parameters, data and what predicts them.
+    """Free parameters with priors, data sets, and their predictors.
 
     Attributes
     ----------
     priors : tuple of Prior
-        Of the p parameters.
+        Priors of the p free parameters [internal units].
     sets : tuple of DataSet
-        Fitted ones and those only held against the fit.
+        Data sets, fitted or only compared with the fit.
     predictors : tuple of DataPredictor
-        One for each set.
+        Predictor of each set.
+
+    Raises
+    ------
+    FitError
+        There is no free parameter, no fitted set, or not one predictor for each set.
     """
 
     priors: tuple[Prior, ...]
@@ -64,47 +83,48 @@ class LeastSquaresProblem:
 
     def __post_init__(self) -> None:
         if not self.priors:
-            raise FitError("no parameter is free")
+            raise FitError("no parameter is free: name at least one with a prior")
         if not any(data.fitted for data in self.sets):
-            raise FitError("no data to fit")
+            raise FitError("no data to fit: all data sets are only compared with the fit")
         if len(self.sets) != len(self.predictors):
             raise FitError(
-                f"{len(self.sets)} data sets and {len(self.predictors)} predictors"
+                f"{len(self.sets)} data sets need as many predictors, not {len(self.predictors)}"
             )
 
     @property
     def means(self) -> FloatArray:
-        """Of the priors [internal units]."""
+        """Means of the priors [internal units], shape (p,)."""
         return np.array([prior.mean for prior in self.priors])
 
     @property
     def spreads(self) -> FloatArray:
-        """Of the priors [internal units]."""
+        """Standard deviations of the priors [internal units], shape (p,)."""
         return np.array([prior.spread for prior in self.priors])
 
     def predict(self, values: FloatArray) -> list[Prediction]:
-        """Each set's prediction and its derivatives."""
+        """Predict each set, with derivatives, at values of the parameters [internal units]."""
         return [predictor(values) for predictor in self.predictors]
 
 
 @dataclass(frozen=True, eq=False)
 class FitSolution:
-    """Where the least squares are.
+    """Minimum of a least-squares problem, with the posterior of the linear predictions there.
 
     Attributes
     ----------
     values : ndarray, shape (p,)
-        [internal units].
+        Values of the parameters [internal units].
     covariance : ndarray, shape (p, p)
-        Posterior, of the tangent at the solution.
+        Posterior covariance of predictions linear about the solution.
     scales, determined : ndarray, shape (sets,)
-        Scale of each set's errors, and parameters that it determines; 1 and 0 where not fitted.
+        Scale of each set's errors, and number of parameters that it determines; 1 and 0 for sets
+        that are not fitted.
     chi2 : ndarray, shape (sets,)
-        With the errors as stated.
+        Chi-square of each set with the errors as stated.
     total : float
-        What was minimised.
+        Value of the objective.
     sensitivity : ndarray, shape (n, p)
-        Of all fitted numbers: change in scaled errors for one prior spread.
+        Change of each fitted number, in scaled errors, for one prior width of each parameter.
     """
 
     values: FloatArray
@@ -123,23 +143,28 @@ def solve(
     scales: FloatArray | None = None,
     start: FloatArray | None = None,
 ) -> FitSolution:
-    """Minimise.
+    """Minimise the objective over the parameters, and estimate the scales of the errors.
 
     Parameters
     ----------
     problem : LeastSquaresProblem
-        What is fitted.
+        Parameters, data and predictors.
     fixed : (int, float), optional
-        A parameter's number and the value [internal unit] at which it is held, for profiles.
+        Number of a parameter and the value [internal unit] at which it is fixed, for profiles.
     scales : ndarray, shape (sets,), optional
-        Of the errors, held; by default found.
+        Fixed scales of the errors; by default they are estimated.
     start : ndarray, shape (p,), optional
-        Where to begin [the priors' means].
+        Values to begin from [internal units]; by default the means of the priors.
+
+    Returns
+    -------
+    solution : FitSolution
+        Minimum with posterior covariance.
 
     Raises
     ------
     ConvergenceError
-        Least squares or scales do not settle.
+        The least squares or the scales do not converge.
     """
     known = scales is not None
     s = np.ones(len(problem.sets)) if scales is None else np.asarray(scales, float)
@@ -165,7 +190,7 @@ def _minimise(
     start: FloatArray,
     fixed: tuple[int, float] | None,
 ) -> FitSolution:
-    """Least squares at given scales of the errors, in units of the priors' spreads."""
+    """Minimise at fixed scales of the errors, with parameters in units of their prior widths."""
     means, spreads = problem.means, problem.spreads
     free = np.ones(len(means), bool)
     whole = np.array(start, float)
@@ -174,7 +199,7 @@ def _minimise(
     last: dict[bytes, tuple[FloatArray, FloatArray]] = {}
 
     def both(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals and slopes; kept for the next call, which asks for the other of them."""
+        """Residuals and slopes, cached: scipy asks for both at the same place, one after the other."""
         key = x.tobytes()
         if key not in last:
             last.clear()
@@ -186,7 +211,7 @@ def _minimise(
     high = np.array([(prior.high - prior.mean) / prior.spread for prior in problem.priors])
     x = ((whole - means) / spreads)[free]
     if free.any():
-        # The start must lie inside.
+        # scipy refuses a start on the bounds.
         room = 1e-9 * np.minimum(high - low, 1.0)[free]
         found = least_squares(
             lambda v: both(v)[0], np.clip(x, low[free] + room, high[free] - room),
@@ -194,7 +219,7 @@ def _minimise(
             xtol=1e-10, ftol=1e-12, gtol=1e-10, max_nfev=200,
         )  # fmt: skip
         if not found.success:
-            raise ConvergenceError(f"the fit did not settle: {found.message}")
+            raise ConvergenceError(f"the least squares did not converge: {found.message}")
         x = found.x
     residual, slope = both(x)
     return _solution(problem, scales, _ordered(problem, whole), free, residual, slope)
@@ -203,7 +228,7 @@ def _minimise(
 def _residuals(
     problem: LeastSquaresProblem, scales: FloatArray, values: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Residuals of fitted numbers, priors and the order of pairs; their slopes in spreads."""
+    """Residuals of fitted numbers, priors and ordered pairs, and slopes per prior width."""
     parts, slopes = [], []
     for data, predictor, scale in zip(
         problem.sets, problem.predictors, scales, strict=True
@@ -228,10 +253,10 @@ def _solution(
     residual: FloatArray,
     slope: FloatArray,
 ) -> FitSolution:
-    """Posterior of the tangent where least squares end, and what each set has to say there."""
+    """Posterior of the linear predictions at the minimum, and chi2 of each set there."""
     spreads, p = problem.spreads, len(values)
     n = sum(len(data.values) for data in problem.sets if data.fitted)
-    # Priors count, the order of pairs does not: it only cuts intervals off.
+    # The penalty of ordered pairs is a bound, no information: it is left out of the covariance.
     counted = slice(0, n + p)
     normal = slope[counted, free].T @ slope[counted, free]
     covariance = np.zeros((p, p))
@@ -254,20 +279,20 @@ def _solution(
 
 
 def ordered_pairs(problem: LeastSquaresProblem) -> list[tuple[int, int]]:
-    """Numbers of parameters of which the first is not above the second in any device."""
+    """Give the pairs of parameter numbers of which the first must not exceed the second."""
     names = [prior.name for prior in problem.priors]
     return [(names.index(a), names.index(b)) for a, b in ORDERED if {a, b} <= set(names)]
 
 
 def out_of_order(problem: LeastSquaresProblem, values: FloatArray) -> bool:
-    """Whether a pair is the wrong way round, such as a gate oxide above the field oxide."""
+    """Whether a pair violates its order, such as a gate oxide thicker than the field oxide."""
     return any(values[low] > values[high] for low, high in ordered_pairs(problem))
 
 
 def _disorder(
     problem: LeastSquaresProblem, values: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Residuals of pairs that are the wrong way round, and their slopes in spreads."""
+    """Residuals of pairs that violate their order, and their slopes per prior width."""
     pairs, spreads = ordered_pairs(problem), problem.spreads
     out, slopes = np.zeros(len(pairs)), np.zeros((len(pairs), len(values)))
     for row, (low, high) in enumerate(pairs):
@@ -279,7 +304,7 @@ def _disorder(
 
 
 def _ordered(problem: LeastSquaresProblem, values: FloatArray) -> FloatArray:
-    """Copy in which pairs that are a hair the wrong way round are equal."""
+    """Copy in which pairs that slightly violate their order are equal."""
     out = np.array(values)
     for low, high in ordered_pairs(problem):
         out[low] = min(out[low], out[high])
@@ -287,7 +312,7 @@ def _ordered(problem: LeastSquaresProblem, values: FloatArray) -> FloatArray:
 
 
 def _rescaled(problem: LeastSquaresProblem, found: FitSolution) -> FloatArray:
-    """Scales that the chi2 of each set asks for."""
+    """Scales that make the scaled chi2 of each set equal to its degrees of freedom."""
     out = found.scales.copy()
     for k, data in enumerate(problem.sets):
         dof = len(data.values) - found.determined[k]
@@ -304,24 +329,28 @@ def profile(
     points: int = 13,
     reach: float = 3.0,
 ) -> tuple[FloatArray, FloatArray]:
-    """Profile likelihood of one parameter, the scales of the errors held.
+    """Compute the profile likelihood of one parameter at fixed scales of the errors.
 
     Parameters
     ----------
-    problem, solution
-        The fit.
+    problem : LeastSquaresProblem
+        Parameters, data and predictors.
+    solution : FitSolution
+        Its minimum.
     name : str
-        Of the parameter.
+        Dotted name of a free parameter.
     points : int
-        Odd; the middle one is the solution.  More where the minimum rises less than a parabola.
+        Odd number of points, the middle one at the solution; more are added where the objective
+        rises less than a parabola.
     reach : float
-        To either side [posterior error]: until the minimum lies its square higher, as far as bounds
-        allow, which are the last points then, but at most three times as far.
+        Distance to either side [posterior errors].  The profile ends where the objective has risen
+        by its square, at a bound of the prior, or at three times this distance.
 
     Returns
     -------
     values, rise : ndarray, shape (n,)
-        FloatArray [internal unit], and by how much the minimum lies higher than at the solution.
+        Values of the parameter [internal unit], and the rise of the minimum of the objective above
+        that of the solution.
 
     Raises
     ------
@@ -335,7 +364,7 @@ def profile(
     step = reach * float(np.sqrt(solution.covariance[k, k])) / (points // 2)
     prior, best = problem.priors[k], float(solution.values[k])
     found = {best: 0.0}
-    # Outwards from the solution, each from where the last one ended.
+    # Outwards from the solution: each minimum starts from that of its neighbour.
     for side, end in ((1, prior.high), (-1, prior.low)):
         start = solution.values
         for n in range(1, 3 * (points // 2) + 1):

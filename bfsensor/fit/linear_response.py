@@ -1,4 +1,4 @@
-"""The response about one device as its solution and the linearised system have it."""
+"""Boundary shifts linear in the parameters, from one solution and its linearised system."""
 
 from __future__ import annotations
 
@@ -17,12 +17,23 @@ from bfsensor.response.edge_response import area_matrix, mixed, solve_response
 from bfsensor.typing import FloatArray
 
 STEP = 1e-4
-"""Over which a device is differentiated [spread]."""
+"""Step over which the device, not its solution, is differentiated by a parameter [prior widths].
+
+Chosen: geometry and doping change almost linearly over it; twice as large doubles the relative error
+of a one-sided difference, itself of the order of the step."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinearResponse:
-    """Shifts [pixel/e-], areas [1/e-], [j, i], and their derivatives by the parameters."""
+    """Shifts of right (kx) and upper edges (ky), and their derivatives by the parameters.
+
+    Attributes
+    ----------
+    kx, ky : ndarray, shape (2 n + 1, 2 n + 1)
+        Shifts [pixel/e-], [row dy, column dx].
+    dkx, dky : ndarray, shape (p, 2 n + 1, 2 n + 1)
+        Derivatives [pixel/e- per internal unit].
+    """
 
     kx: FloatArray
     ky: FloatArray
@@ -31,27 +42,27 @@ class LinearResponse:
 
     @property
     def areas(self) -> FloatArray:
-        """a_ij [1/e-]."""
+        """Relative area changes a_ij [1/e-], ``[j, i]`` from lag (0, 0)."""
         return _lags(area_matrix(self.kx, self.ky))
 
     @property
     def jacobian(self) -> FloatArray:
-        """Of the areas, by parameter."""
+        """Derivatives of the areas by the parameters, first axis."""
         return _lags(area_matrix(self.dkx, self.dky))
 
 
 @dataclass(frozen=True, eq=False)
 class LinearEmulator:
-    """Responses straight in the parameters about some values, by condition.
+    """Emulator that predicts linearly in the parameters, about a solution at each condition.
 
     Attributes
     ----------
     parameters : tuple of str
-        Dotted names.
+        Dotted names of the parameters.
     values : ndarray, shape (p,)
-        About which they are straight [internal units].
-    responses : dict
-        Response there, by condition.
+        Values at which the device was solved [internal units].
+    responses : dict of Condition to LinearResponse
+        Shifts and derivatives there.
     """
 
     parameters: tuple[str, ...]
@@ -59,10 +70,13 @@ class LinearEmulator:
     responses: dict[Condition, LinearResponse]
 
     def predict(self, values: FloatArray, condition: Condition) -> PredictedEdges:
-        """Response at parameters and a condition, one of those that it was made for."""
+        """Predict the response at parameters [internal units] and one of the solved conditions."""
         found = self.responses.get(condition)
         if found is None:
-            raise FitError(f"no response was solved at {condition}")
+            raise FitError(
+                f"no response was solved at {condition}; solved were "
+                f"{', '.join(map(str, self.responses))}"
+            )
         by = np.where(held(self.parameters, condition), 0.0, values - self.values)
         return LinearResponse(
             found.kx + np.tensordot(by, found.dkx, 1),
@@ -73,26 +87,27 @@ class LinearEmulator:
 
 @dataclass(frozen=True, eq=False)
 class Linearise:
-    """Solves a device at values of its parameters, with all derivatives.
+    """Function that solves a device and all derivatives at values of its parameters.
 
     Attributes
     ----------
     device : Device
-        About which the fit is; its mesh is moved with the parameters.
+        Nominal device of the fit; its mesh is distorted with the parameters, not made again.
     priors : tuple of Prior
-        Free parameters that move the response.
+        Free parameters that change the shifts.
     conditions : tuple of Condition
-        All that will be asked for.
+        All conditions for which predictions are made.
     cells : int
-        Of the mesh, a pixel.
+        Mesh cells per pixel, even.
     progress : callable, optional
         Called with (solved, in all).
 
     Notes
     -----
-    At 24 parameters some 13 CPU s a condition on 16 cells.  8 cells are too few.  There a_10 of the
-    ITL device rises as the channel stop is made narrower, and falls on 16; derivatives of the
-    E2V device are wrong by 13 % and more, on 16 by 0.3 %, against solutions of its neighbours.
+    With 24 parameters a condition takes about 13 CPU s on 16 cells.  8 cells are too few: there a_10
+    of the ITL device rises as the channel stop is made narrower, while it falls on 16; derivatives
+    of the E2V device, compared with solutions at neighbouring values, are wrong by 13 % and more on
+    8 cells, by 0.3 % on 16.
     """
 
     device: Device
@@ -102,7 +117,7 @@ class Linearise:
     progress: Callable[[int, int], None] | None = None
 
     def __call__(self, values: FloatArray) -> LinearEmulator:
-        """Solve at values [internal units], shape (p,)."""
+        """Solve at the values of the parameters [internal units], shape (p,)."""
         names = tuple(prior.name for prior in self.priors)
         responses = {}
         for condition in dict.fromkeys(self.conditions):
@@ -123,7 +138,7 @@ class Linearise:
             try:
                 changed.append((device(values + step), step[n]))
             except FitError:
-                # At the end of what can be, such as oxides of equal thickness.
+                # No device on this side, as for oxides of equal thickness: step to the other.
                 changed.append((device(values - step), -step[n]))
         here = device(values)
         found = solve_response(
@@ -138,6 +153,6 @@ class Linearise:
 
 
 def _lags(areas: FloatArray) -> FloatArray:
-    """Areas by lag from (0, 0), as far as they are complete."""
+    """Areas by lag from (0, 0); the outermost lag lacks an edge and is left out."""
     middle = areas.shape[-1] // 2
     return areas[..., middle:-1, middle:-1]

@@ -1,4 +1,4 @@
-"""The errors of a fit: of the tangent, with what it misses, or by draws where predictions bend."""
+"""Errors of a fit: Gaussian with the error of the predictions, or from draws if they are curved."""
 
 from __future__ import annotations
 
@@ -24,31 +24,35 @@ from bfsensor.fit.prediction_error import (
 from bfsensor.typing import FloatArray
 
 STRAIGHT = 1e-3
-"""Largest second derivative of predictions that count as straight [errors a squared spread]."""
+"""Largest second derivative of predictions that are treated as linear [scaled errors per squared
+prior width].
+
+Chosen: predictions then differ by at most 0.0005 errors at one prior width; twice as large, 0.001."""
 
 SHARES = {"68": 0.6827, "95": 0.95}
-"""Of the draws in central intervals."""
+"""Probability in the central intervals of the draws, defined by their names."""
 
 PREDICTED = 100
-"""Draws at which predictions are made: what the posterior leaves open of them, to 7 %."""
+"""Number of draws at which predictions are made.  Derived: their scatter is then known to
+1 / sqrt(200) = 7 %."""
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Errors of a fit.
+    """Solution of a fit with its posterior errors.
 
     Attributes
     ----------
     solution : FitSolution
-        With the covariance about its values.
+        Solution with the final covariance about its values.
     left : tuple of ndarray
-        What the posterior leaves open of each set's predictions.
+        Posterior error of each set's predictions, in the unit of the set.
     record : dict
-        What is kept with the result: how the errors were found, and what predictions miss.
+        Entry 'posterior' of ``fit.json``: how the errors were found, and the error of predictions.
     words : str
-        A sentence of it.
+        Note that describes it.
     draws : ndarray, shape (m, p), optional
-        Of the parameters [internal units], where predictions bend.
+        Draws of the parameters [internal units], if predictions are curved.
     """
 
     solution: FitSolution
@@ -67,28 +71,35 @@ def find_posterior(
     draws: int = DRAWS,
     progress: Callable[[int, int], None] | None = None,
 ) -> Posterior:
-    """Find the errors of a solution.
+    """Find the posterior errors of a solution.
 
     Parameters
     ----------
-    problem, found
-        The fit, where it ends.
+    problem : LeastSquaresProblem
+        Parameters, data and predictors.
+    found : FitSolution
+        Its solution.
     exact : callable, optional
-        Predictions of all sets from a solution at values; without it nothing is said of what
-        predictions miss.
+        Function that predicts all sets from a full solution at values of the parameters; without
+        it the errors do not include that of the predictions.
     missed : Missed, optional
-        What predictions miss, measured before, in place of ``exact``.
+        Errors of the predictions, measured before, in place of ``exact``.
     draws : int
-        At which it is asked.
+        Number of draws at which ``exact`` is called.
     progress : callable, optional
-        Called with (solved, draws).
+        Called with (draws solved, draws in all).
+
+    Returns
+    -------
+    posterior : Posterior
+        Solution with final errors.
     """
     bent = bent_about(problem, found)
     curved = bool(np.max(np.abs(bent.second)) > STRAIGHT)
     record: dict[str, Any] = {
         "tangent_error": np.sqrt(np.diag(found.covariance)).tolist(), "curved": curved
     }  # fmt: skip
-    words = "errors do not hold what predictions miss over them"
+    words = "errors do not include the error of the predictions, which was not measured"
     if missed is None and exact is not None and draws:
         missed = measure_missed(problem, found, exact, draws=draws, progress=progress)
     if missed is not None:
@@ -101,8 +112,9 @@ def find_posterior(
             for data, rms, scale in zip(problem.sets, missed.rms, found.scales, strict=True)
         ]
         words = (
-            f"errors hold what predictions miss at {len(missed.at)} devices drawn from the posterior: "
-            f"at most {', '.join(f'{one:.2g}' for one in most)} scaled errors of the sets"
+            f"errors include the error of the predictions, measured at {len(missed.at)} devices drawn "
+            f"from the posterior: at most {', '.join(f'{one:.2g}' for one in most)} scaled errors of "
+            "the sets"
         )
     if curved:
         unknown = None
@@ -114,7 +126,7 @@ def find_posterior(
         except ConvergenceError as error:
             curved, words = (
                 False,
-                f"{words}; predictions bend, but {error}: errors are too small",
+                f"{words}; predictions are not linear, but {error}: errors are too small",
             )
             record["not_drawn"] = str(error)
     if curved:
@@ -124,7 +136,7 @@ def find_posterior(
         if missed is not None:
             left = tuple(np.hypot(a, b) for a, b in zip(left, missed.rms, strict=True))
         return Posterior(
-            own, left, record, f"{words}; predictions bend: the posterior was drawn from", drawn,
+            own, left, record, f"{words}; predictions are not linear: errors are those of draws", drawn,
         )  # fmt: skip
     if missed is not None:
         wider, left = widen(problem, found, missed)
@@ -133,11 +145,11 @@ def find_posterior(
         np.sqrt(np.maximum(np.einsum("np,pq,nq->n", slope, found.covariance, slope), 0.0))
         for _, slope in problem.predict(found.values)
     )
-    return Posterior(found, left, record, f"{words}; they are those of the tangent")
+    return Posterior(found, left, record, f"{words}; they are those of linear predictions")
 
 
 def _told(draws: FloatArray) -> dict[str, Any]:
-    """Means and central intervals."""
+    """Number, means and central intervals of draws, for the record."""
     return {"draws": len(draws), "mean": np.mean(draws, axis=0).tolist()} | _intervals(
         draws
     )
@@ -146,11 +158,11 @@ def _told(draws: FloatArray) -> dict[str, Any]:
 def _combined(
     problem: LeastSquaresProblem, found: FitSolution, draws: FloatArray
 ) -> dict[str, Any]:
-    """Means and intervals of independent combinations, as far from where the fit ends.
+    """Means and intervals of the independent combinations, relative to the solution.
 
-    In units of the priors, the best known first.  Where the best known direction turns from place to
-    place, its draws lie to one side of the fitted values and are not normal: an error about those
-    tells less well than an interval.
+    In units of the prior widths, the best constrained combination first.  Where its direction
+    changes over the posterior, its draws lie to one side of the solution and are not Gaussian: an
+    interval describes them better than an error about the solution.
     """
     scaled = found.covariance / np.outer(problem.spreads, problem.spreads)
     weights = np.array([one.weights for one in principal(scaled)])
@@ -159,6 +171,7 @@ def _combined(
 
 
 def _intervals(draws: FloatArray) -> dict[str, Any]:
+    """Central intervals of the draws of each column, by their probability."""
     out = {}
     for name, share in SHARES.items():
         ends = np.quantile(draws, [(1 - share) / 2, (1 + share) / 2], axis=0)
@@ -169,7 +182,7 @@ def _intervals(draws: FloatArray) -> dict[str, Any]:
 def _left(
     problem: LeastSquaresProblem, found: FitSolution, draws: FloatArray
 ) -> tuple[FloatArray, ...]:
-    """Scatter of predictions over draws about those of the solution."""
+    """Root mean square difference of predictions at draws from those at the solution."""
     best = [value for value, _ in problem.predict(found.values)]
     some = draws[:: max(len(draws) // PREDICTED, 1)]
     off = [np.zeros((len(some), len(one))) for one in best]

@@ -1,14 +1,14 @@
-r"""The posterior of a fit whose predictions bend, by draws.
+r"""Draws from the posterior of a fit whose predictions are second order in the parameters.
 
-Where parameters that the data hardly determine move by the spreads of their priors, a_ij bend by
-more than their errors, and the combination that is measured best is another one from place to
-place: a Gaussian of the tangent at the best values is too narrow along its own best combinations.
+Where the data hardly constrain parameters, a_ij depart from linear predictions by more than their
+errors within the priors, and the best constrained combination changes over the posterior: the
+Gaussian of linear predictions at the solution is too narrow along its own best combinations.
 
-Predictions are taken to second order about the best values, which is what an emulator gives; draws
-are made by Hamiltonian steps in spreads of the priors (Neal 2011, Handbook of Markov Chain Monte
-Carlo, section 5.3), many chains at once.  Elliptical slices of a Gaussian stick in the bent tails.
-Covariances are about the best values, not the mean: what is stated with a value is how far the
-truth is from it.
+Predictions are second order about the solution, as an emulator gives them.  Draws are made by
+Hamiltonian Monte Carlo in units of the prior widths (Neal 2011, Handbook of Markov Chain Monte Carlo,
+section 5.3), with many chains at once; elliptical slice sampling moves too slowly in the curved
+tails.  Covariances are about the solution, not the mean: an error stated with a value describes how
+far the truth is from it.
 """
 
 from __future__ import annotations
@@ -23,30 +23,47 @@ from bfsensor.fit.least_squares import FitSolution, LeastSquaresProblem, ordered
 from bfsensor.typing import FloatArray
 
 CHAINS, STEPS = 16, 300
-"""Chains, and draws of each, after half as many that set the step and are left out."""
+"""Number of chains, and draws of each after half as many that adapt the step and are discarded.
+
+Chosen: 4800 draws; twice as many draws of each take twice as long, and chains that do not agree are
+refused more seldom (:data:`AGREED`)."""
 
 LENGTH = np.pi / 2
-"""Of a trajectory: a quarter turn where the data say nothing, after which it forgot its start."""
+"""Length of a trajectory [prior widths at unit speed].
+
+Derived: a quarter period of the prior, of unit width; without data its end is independent of its
+start."""
 
 WANTED = 0.85
-"""Share of the trajectories that end where they are accepted, to which the step is set."""
+"""Fraction of accepted trajectories to which the step is adapted.
+
+Chosen, above the optimum of 0.65 of Neal 2011, section 5.4: curved tails need shorter steps.  It
+cannot be twice as large; at 0.95 steps are shorter and draws take longer."""
 
 AGREED = 1.1
-"""Largest spread of all chains over that within them (Gelman and Rubin 1992), by parameter."""
+"""Largest ratio of the spread of all chains to that within them for any parameter, above which
+draws are refused (published: Gelman and Rubin 1992)."""
 
 SEED = 4409
+"""Seed of the draws.  Chosen, arbitrary: another one changes errors by the scatter of 4800 draws."""
 
 
 @dataclass(frozen=True, eq=False)
 class CurvedPosterior:
-    """Fitted numbers to second order, in errors of the data and spreads of the priors.
+    """Fitted numbers to second order in the parameters about a solution of a fit.
 
-    Attributes
+    Parameters
     ----------
     residual : ndarray, shape (n,)
-        Predicted less measured at the middle.
+        Predicted minus measured numbers at the solution [scaled errors].
     first, second : ndarray, shape (n, p) and (n, p, p)
-        Derivatives there.
+        Derivatives there [scaled errors per prior width, and per product of two].
+
+    Examples
+    --------
+    >>> straight = CurvedPosterior(np.zeros(1), np.ones((1, 1)), np.zeros((1, 1, 1)))
+    >>> straight.at(np.array([[2.0]]))
+    (array([2.]), array([[2.]]))
     """
 
     residual: FloatArray
@@ -54,7 +71,18 @@ class CurvedPosterior:
     second: FloatArray
 
     def at(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Halves of chi2, shape (chains,), and slopes at steps from the middle, (chains, p)."""
+        """Evaluate half of chi2 and its gradient at steps from the solution.
+
+        Parameters
+        ----------
+        t : ndarray, shape (chains, p)
+            Steps [prior widths].
+
+        Returns
+        -------
+        half, gradient : ndarray, shapes (chains,) and (chains, p)
+            Half of chi2 of the data, without priors, and its derivatives.
+        """
         turned = np.einsum("nij,cj->cni", self.second, t, optimize=True)
         slopes = self.first + turned
         r = self.residual + np.einsum("cni,ci->cn", self.first + 0.5 * turned, t)
@@ -62,7 +90,7 @@ class CurvedPosterior:
 
 
 def bent_about(problem: LeastSquaresProblem, found: FitSolution) -> CurvedPosterior:
-    """Second derivatives from first ones a spread to either side of the solution."""
+    """Expand the predictions to second order: derivatives one prior width to either side."""
 
     def there(values: FloatArray) -> tuple[FloatArray, FloatArray]:
         residuals, slopes = [], []
@@ -95,30 +123,52 @@ def sample_posterior(
     steps: int = STEPS,
     seed: int = SEED,
 ) -> FloatArray:
-    """Draw from the posterior, the scales of the errors held.
+    """Draw from the posterior of a fit at fixed scales of the errors.
 
     Parameters
     ----------
-    problem, found
-        The fit, where it ends.
-    bent : CurvedPosterior, optional
-        :func:`bent_about` them.
+    problem : LeastSquaresProblem
+        Parameters with priors, data and predictors.
+    found : FitSolution
+        Its solution.
     unknown : ndarray, shape (n, n), optional
-        Covariance of what the prediction of the fitted numbers misses, in their scaled errors.
+        Covariance of the error of the predictions of the n fitted numbers, in units of their scaled
+        errors; by default 0.
     chains, steps : int
-        How many, and how long.
+        Number of chains, at least 1, and of draws that are kept of each.
     seed : int
-        Of the draws.
+        Seed of all random numbers.
 
     Returns
     -------
-    draws : ndarray, shape (m, p)
-        [internal units].
+    draws : ndarray, shape (chains * steps, p)
+        Values of the parameters [internal units].
 
     Raises
     ------
     ConvergenceError
-        The chains do not agree.
+        The chains do not agree (:data:`AGREED`).
+
+    Notes
+    -----
+    Predictions to second order about the solution are computed, unless given as the keyword argument
+    of type :class:`CurvedPosterior`.
+
+    Examples
+    --------
+    One number that measures the sum of two parameters with a third of their prior widths:
+
+    >>> from bfsensor.device.quantities import Prior
+    >>> from bfsensor.fit.data import area_data
+    >>> from bfsensor.fit.least_squares import solve
+    >>> from bfsensor.fit.predictors import TangentPredictor
+    >>> priors = tuple(Prior(name, 0.0, 1.0) for name in "ab")
+    >>> data = area_data("sum", [[0.5]], [[1 / 3]], scaled=False)
+    >>> sums = TangentPredictor(np.zeros(2), np.zeros(1), np.ones((1, 2)))
+    >>> problem = LeastSquaresProblem(priors, (data,), (sums,))
+    >>> draws = sample_posterior(problem, solve(problem), steps=500)
+    >>> draws.shape, bool(0.28 < draws.sum(1).std() < 0.36)
+    ((8000, 2), True)
     """
     bent = bent if bent is not None else bent_about(problem, found)
     bent = _whitened(bent, unknown)
@@ -138,7 +188,7 @@ def sample_posterior(
         step_now = step * rng.uniform(0.8, 1.2)
         ends = _trajectory(t, slope, step_now, rng.standard_normal(t.shape), height)
         gained = now - ends[1] + ends[3]
-        # Out of bounds, or thrown far off by too long a step: infinite or not a number.
+        # Out of bounds, or diverged by too long a step: not finite, and refused.
         taken = np.log(rng.uniform(size=chains)) < np.where(
             np.isfinite(gained), gained, -np.inf
         )
@@ -153,7 +203,7 @@ def sample_posterior(
 
 
 def _whitened(bent: CurvedPosterior, unknown: FloatArray | None) -> CurvedPosterior:
-    """Count what predictions miss with the errors: in units of both they are independent."""
+    """Change units so that errors of data and predictions together are independent and 1."""
     n = len(bent.residual)
     root = np.linalg.cholesky(
         np.eye(n) + (np.zeros((n, n)) if unknown is None else unknown)
@@ -165,7 +215,7 @@ def _whitened(bent: CurvedPosterior, unknown: FloatArray | None) -> CurvedPoster
 def _make_height(
     problem: LeastSquaresProblem, best: FloatArray, bent: CurvedPosterior
 ) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
-    """Make minus the logarithm of the posterior, by steps from the best values in spreads."""
+    """Make the function minus the logarithm of the posterior, of steps in prior widths."""
     spreads = problem.spreads
     off = (best - problem.means) / spreads
     low, high = (
@@ -175,7 +225,7 @@ def _make_height(
     pairs = ordered_pairs(problem)
 
     def height(t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Its values and slopes; infinite out of bounds."""
+        """Values, infinite out of bounds, and gradients."""
         half, slopes = bent.at(t)
         half += 0.5 * np.sum((off + t) ** 2, axis=1)
         out = np.any((t < low) | (t > high), axis=1)
@@ -188,15 +238,15 @@ def _make_height(
 
 
 def _check_agreement(problem: LeastSquaresProblem, kept: FloatArray) -> None:
-    """Refuse draws, shape (chains, steps, p), of chains that lie apart."""
+    """Refuse draws, shape (chains, steps, p), if the chains do not agree."""
     if len(kept) == 1:
         return
     within = kept.var(axis=1, ddof=1).mean(0)
     ratio = np.sqrt(1 + kept.mean(1).var(axis=0, ddof=1) / within)
     if np.max(ratio) > AGREED:
         raise ConvergenceError(
-            f"draws of {problem.priors[int(np.argmax(ratio))].name} differ between chains: "
-            f"{np.max(ratio):.2f} above {AGREED:g}",
+            f"draws of {problem.priors[int(np.argmax(ratio))].name} differ between chains: their "
+            f"spread is {np.max(ratio):.2f} times that within them, above {AGREED:g}",
             ratio.tolist(),
         )
 
@@ -208,7 +258,7 @@ def _trajectory(
     speed: FloatArray,
     height: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Leapfrog: where it ends, height and slopes there, and kinetic energy that was lost."""
+    """Leapfrog steps: the end, height and gradient there, and the loss of kinetic energy."""
     begun = 0.5 * np.sum(speed**2, axis=1)
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(max(int(LENGTH / step), 1)):
@@ -220,6 +270,6 @@ def _trajectory(
 
 
 def with_draws(found: FitSolution, draws: FloatArray) -> FitSolution:
-    """Give the solution with the covariance of draws about its values."""
+    """Replace the covariance of a solution by the second moments of draws about its values."""
     off = draws - found.values
     return replace(found, covariance=off.T @ off / len(off))

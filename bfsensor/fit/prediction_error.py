@@ -1,20 +1,21 @@
-r"""What the predictions of a fit miss over its posterior, as an error of theirs.
+r"""Error of the predictions of a fit over its posterior, added to the errors of the data.
 
-A fit predicts by the tangent where it ends, or by an emulator.  The device is solved at values drawn
-from the posterior, and what predictions miss there,
+A fit predicts linearly about its solution, or by an emulator.  The device is solved at values drawn
+from the posterior; the difference from the prediction there,
 
 .. math:: m(\theta) = f(\theta) - f_\mathrm{predicted}(\theta), \qquad R = \langle m\, m^T \rangle ,
 
-is taken as an error of the prediction besides those of the data (Kaipio and Somersalo 2007, J. Comput.
-Appl. Math. 198, 493), with :math:`P` of the priors and :math:`s^2 \Sigma` of the data:
+is treated as an error besides those of the data (Kaipio and Somersalo 2007, J. Comput. Appl. Math.
+198, 493), with the covariances :math:`P` of the priors and :math:`s^2 \Sigma` of the data:
 
 .. math:: C = \left(P^{-1} + J^T V^{-1} J\right)^{-1}, \quad V = s^2 \Sigma + R, \qquad
           \mathrm{var}(f) = M - M (M + s^2 \Sigma)^{-1} M, \quad M = J P J^T + R .
 
-The mean of :math:`m` counts in :math:`R`: values stay where the posterior is largest.  Of a tangent
-over which a_ij bend by more than the data's errors this is half the cure: with the bend of the
-emulated ITL device the best two combinations of each fit have pulls of 2.3 rms without and 1.6, 1.3
-with it (50 mocks); draws of the bent posterior (:mod:`bfsensor.fit.posterior_draws`) are the whole one.
+:math:`R` includes the mean of :math:`m`: fitted values stay at the maximum of the posterior.  Where
+a_ij depart from linear predictions by more than the errors of the data, this is half of the remedy:
+for the emulated ITL device the best two combinations of each fit have pulls of 2.3 rms without, and
+1.6 and 1.3 with it (50 mocks).  Draws from the second-order posterior
+(:mod:`bfsensor.fit.posterior_draws`) are the full remedy.
 """
 
 from __future__ import annotations
@@ -30,26 +31,31 @@ from bfsensor.fit.least_squares import FitSolution, LeastSquaresProblem, out_of_
 from bfsensor.typing import FloatArray
 
 Exact = Callable[[FloatArray], Sequence[FloatArray]]
-"""Predictions of all sets at values of all parameters, from a solution there."""
+"""Function of the values of all parameters that predicts all sets from a full solution there."""
 
 DRAWS = 12
-"""At which the device is solved: each variance of what is missed is then known to 40 %."""
+"""Number of draws at which the device is solved.  Derived: each variance of the error of predictions
+is then known to sqrt(2 / 12) = 41 %."""
 
 SEED = 6203
+"""Seed of the draws.  Chosen, arbitrary: another one changes errors within their 41 %."""
+
 TRIES = 20
-"""Draws for each that is used: some lie out of bounds, or where there is no device."""
+"""Largest number of draws tried for each that is used, as some are out of bounds or no device.
+
+Chosen: a fit is refused if fewer than 5 % of draws are devices; twice as large, 2.5 %."""
 
 
 @dataclass(frozen=True, eq=False)
 class Missed:
-    """What predictions miss at values drawn from a posterior.
+    """Errors of predictions at values drawn from a posterior.
 
     Attributes
     ----------
     at : ndarray, shape (k, p)
-        FloatArray [internal units].
+        Drawn values of the parameters [internal units].
     values : tuple of ndarray, each of shape (k, n)
-        Solved less predicted, by data set.
+        Solved minus predicted numbers of each data set, in its unit.
     """
 
     at: FloatArray
@@ -57,7 +63,7 @@ class Missed:
 
     @property
     def rms(self) -> tuple[FloatArray, ...]:
-        """Of each number, by data set."""
+        """Root mean square error of each number, by data set."""
         return tuple(np.sqrt(np.mean(v**2, axis=0)) for v in self.values)
 
 
@@ -70,26 +76,33 @@ def measure_missed(
     seed: int = SEED,
     progress: Callable[[int, int], None] | None = None,
 ) -> Missed:
-    """Hold predictions against solutions over the posterior.
+    """Compare predictions with solutions at draws from the posterior.
 
     Parameters
     ----------
-    problem, found
-        The fit, where it ends.
+    problem : LeastSquaresProblem
+        Parameters, data and predictors.
+    found : FitSolution
+        Its solution.
     exact : callable
-        Predictions of all sets at values of all parameters; raises ``BFSensorError`` or
-        ``ValueError`` where there is no such device.
+        Function that predicts all sets from a full solution at values of all parameters; it raises
+        ``BFSensorError`` or ``ValueError`` where there is no such device.
     draws : int
-        How many values are drawn.
+        Number of draws to solve.
     seed : int
-        Of the draws.
+        Seed of the draws.
     progress : callable, optional
-        Called with (solved, draws).
+        Called with (draws solved, draws in all).
+
+    Returns
+    -------
+    missed : Missed
+        Drawn values and errors of the predictions.
 
     Raises
     ------
     FitError
-        There are hardly any devices over the posterior.
+        Fewer than ``draws`` of :data:`TRIES` times as many draws have a solution.
     """
     rng = np.random.default_rng(seed)
     spreads = problem.spreads
@@ -119,7 +132,8 @@ def measure_missed(
             progress(len(at), draws)
     if len(at) < draws:
         raise FitError(
-            f"only {len(at)} of {draws} devices drawn from the posterior have a solution"
+            f"only {len(at)} of {draws} devices drawn from the posterior have a solution, of "
+            f"{TRIES * draws} that were tried: give narrower priors, or no draws"
         )
     return Missed(
         np.array(at),
@@ -130,7 +144,7 @@ def measure_missed(
 def relative_errors(
     problem: LeastSquaresProblem, found: FitSolution, missed: Missed
 ) -> FloatArray:
-    """Covariance of what the predictions of all numbers miss, in scaled errors of the data."""
+    """Second moments of the errors of all predictions, in units of the data's scaled errors."""
     errors = np.concatenate([
         s * one.errors for s, one in zip(found.scales, problem.sets, strict=True)
     ])  # fmt: skip
@@ -139,7 +153,7 @@ def relative_errors(
 
 
 def fitted_numbers(problem: LeastSquaresProblem) -> NDArray[np.int64]:
-    """Which of all numbers are fitted."""
+    """Indices, among the numbers of all sets, of those that are fitted."""
     return np.flatnonzero(np.repeat(
         [one.fitted for one in problem.sets], [len(one.values) for one in problem.sets]
     ))  # fmt: skip
@@ -148,26 +162,28 @@ def fitted_numbers(problem: LeastSquaresProblem) -> NDArray[np.int64]:
 def widen(
     problem: LeastSquaresProblem, found: FitSolution, missed: Missed
 ) -> tuple[FitSolution, tuple[FloatArray, ...]]:
-    """Count what predictions miss as an error of theirs.
+    """Widen the covariance of a solution by the error of the predictions.
 
     Parameters
     ----------
-    problem, found
-        The fit, where it ends.
+    problem : LeastSquaresProblem
+        Parameters, data and predictors.
+    found : FitSolution
+        Its solution.
     missed : Missed
-        Over its posterior.
+        Errors of the predictions over its posterior.
 
     Returns
     -------
     solution : FitSolution
-        With the wider covariance, and sensitivities in the larger errors.
+        Solution with the wider covariance, and sensitivities in units of the larger errors.
     errors : tuple of ndarray
-        What the posterior leaves open of each set's predictions.
+        Posterior error of each set's predictions, in its unit.
     """
     errors = np.concatenate([
         s * one.errors for s, one in zip(found.scales, problem.sets, strict=True)
     ])  # fmt: skip
-    # All in errors of the data, and in spreads of the priors.
+    # All numbers are in units of the data's scaled errors, parameters in prior widths.
     slopes = np.concatenate([slope for _, slope in problem.predict(found.values)])
     slopes = slopes * problem.spreads / errors[:, None]
     r, f = relative_errors(problem, found, missed), fitted_numbers(problem)

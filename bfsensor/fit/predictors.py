@@ -1,4 +1,4 @@
-"""What a device with given parameters is expected to show, and how that changes with them."""
+"""Predictions of data sets from the parameters of a device, with derivatives."""
 
 from __future__ import annotations
 
@@ -20,61 +20,73 @@ Prediction = tuple[FloatArray, FloatArray]
 
 
 class PredictedEdges(Protocol):
-    """Response of a flat at one condition.
-
-    ``kx``, ``ky``: mean shifts of right and upper edges [pixel/e-], odd sides, (0, 0) in the
-    middle.  ``areas``: a_ij [1/e-], [j, i] from (0, 0).  ``dkx``, ``dky``, ``jacobian``: their
-    derivatives by the emulator's parameters, along the first axis.
-    """
+    """Boundary shifts of a flat at one condition, with derivatives by the emulator's parameters."""
 
     @property
     def kx(self) -> FloatArray:
-        """Of right edges."""
+        """Mean shifts of right edges [pixel/e-], odd sides, (0, 0) in the middle."""
 
     @property
     def ky(self) -> FloatArray:
-        """Of upper edges."""
+        """Mean shifts of upper edges [pixel/e-], odd sides, (0, 0) in the middle."""
 
     @property
     def dkx(self) -> FloatArray:
-        """By parameter."""
+        """Derivatives of ``kx``, first axis by parameter."""
 
     @property
     def dky(self) -> FloatArray:
-        """By parameter."""
+        """Derivatives of ``ky``, first axis by parameter."""
 
     @property
     def areas(self) -> FloatArray:
-        """By lag."""
+        """Relative area changes a_ij [1/e-], ``[j, i]`` from lag (0, 0)."""
 
     @property
     def jacobian(self) -> FloatArray:
-        """By parameter and lag."""
+        """Derivatives of ``areas``, first axis by parameter."""
 
 
 class Emulator(Protocol):
-    """Response of a device for any values of its parameters, in their order."""
+    """Predictor of the boundary shifts of a device as a function of its parameters."""
 
     @property
     def parameters(self) -> Sequence[str]:
-        """Dotted names."""
+        """Dotted names of the parameters, in the order of the values."""
 
     def predict(self, values: FloatArray, condition: Condition) -> PredictedEdges:
-        """Response at parameters [internal units] and a condition."""
+        """Predict the response at values of the parameters [internal units] and a condition."""
 
 
 class DataPredictor(Protocol):
-    """Prediction of one data set."""
+    """Predictor of one data set as a function of all free parameters."""
 
     def __call__(self, values: FloatArray) -> Prediction:
         """Predict at the values of all free parameters [internal units], shape (p,)."""
 
 
 def held(names: Sequence[str], condition: Condition) -> NDArray[np.bool_]:
-    """Which parameters a condition states, so that they are not free there.
+    """Find the parameters that a condition states, which are therefore not free there.
 
-    A voltage that was written down with the measurement is no parameter of its fit; one that
-    was not is the device's, with its prior.
+    A voltage that was recorded with a measurement is not a free parameter of its prediction; one
+    that was not recorded is the device's, with its prior.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Dotted names of parameters.
+    condition : Condition
+        Condition of a measurement.
+
+    Returns
+    -------
+    held : ndarray of bool, shape (p,)
+        True for parameters that the condition states.
+
+    Examples
+    --------
+    >>> held(["operating_point.back_bias", "silicon.thickness"], Condition(back_bias=-60.0))
+    array([ True, False])
     """
     return np.array([
         name.startswith("operating_point.")
@@ -84,7 +96,7 @@ def held(names: Sequence[str], condition: Condition) -> NDArray[np.bool_]:
 
 
 class _Responses:
-    """Responses of an emulator by the fit's parameters, which may be more than its own."""
+    """Emulator as a function of all parameters of a fit, which may be more than its own."""
 
     def __init__(self, emulator: Emulator, priors: Sequence[Prior]) -> None:
         names = [prior.name for prior in priors]
@@ -99,21 +111,21 @@ class _Responses:
     def predict(
         self, values: FloatArray, condition: Condition
     ) -> tuple[PredictedEdges, NDArray[np.int64]]:
-        """Response, and the fit's parameters that the jacobian's rows are of, -1 where held."""
+        """Predict; give for each row of the jacobian the number of the fit's parameter, or -1."""
         stated = held(self._names, condition)
         own = np.where(stated, self._means, values[self._at])
         return self._emulator.predict(own, condition), np.where(stated, -1, self._at)
 
 
 class AreaPredictor:
-    """a_ij as the emulator has them."""
+    """Predictor of a_ij by an emulator."""
 
     def __init__(self, data: DataSet, emulator: Emulator, priors: Sequence[Prior]) -> None:
         self._data, self._responses = data, _Responses(emulator, priors)
         self._groups = _by_condition(data)
 
     def __call__(self, values: FloatArray) -> Prediction:
-        """Predict."""
+        """Predict at the values of all free parameters [internal units], shape (p,)."""
         i, j = self._data.places.T
         found = np.zeros(len(i))
         slopes = np.zeros((len(i), len(values)))
@@ -132,7 +144,7 @@ class AreaPredictor:
 
 
 class SlopePredictor:
-    """Slopes of spots, linear in the shifts."""
+    """Predictor of B-F slopes of spots, which are linear in the shifts of an emulator."""
 
     def __init__(self, data: DataSet, emulator: Emulator, priors: Sequence[Prior]) -> None:
         self._data, self._responses = data, _Responses(emulator, priors)
@@ -140,7 +152,7 @@ class SlopePredictor:
         self._weights = slope_weights(data.sigma)
 
     def __call__(self, values: FloatArray) -> Prediction:
-        """Predict."""
+        """Predict at the values of all free parameters [internal units], shape (p,)."""
         axes = self._data.places[:, 0]
         found = np.zeros(len(axes))
         slopes = np.zeros((len(axes), len(values)))
@@ -154,7 +166,7 @@ class SlopePredictor:
 
 
 class TangentPredictor:
-    """Numbers taken as straight in the parameters about one set of values."""
+    """Predictor that is linear in the parameters about one set of their values."""
 
     def __init__(
         self,
@@ -165,11 +177,12 @@ class TangentPredictor:
         self._middle, self._values, self._slopes = middle, values, derivatives
 
     def __call__(self, values: FloatArray) -> Prediction:
-        """Predict."""
+        """Predict at the values of all free parameters [internal units], shape (p,)."""
         return self._values + self._slopes @ (values - self._middle), self._slopes
 
 
 Tangents = Callable[[DataSet, Sequence[Prior]], TangentPredictor]
+"""Function that makes the linear predictor of a data set for given priors."""
 
 
 def make_predictors(
@@ -180,26 +193,30 @@ def make_predictors(
     *,
     late: bool = False,
 ) -> tuple[DataPredictor, ...]:
-    """Make what predicts each data set.
+    """Make the predictor of each data set.
 
     Parameters
     ----------
     sets : sequence of DataSet
-        What is predicted.
+        Data sets to predict.
     emulator : Emulator or None
-        Of areas and shifts; None where only saturation and widths are.
+        Emulator of boundary shifts for areas and slopes; None if there are no such sets.
     priors : sequence of Prior
-        Of all free parameters, in the order of the fit.
+        Priors of all free parameters, in the order of the fit.
     tangents : mapping of str to callable, optional
-        What makes the predictor of the kinds that no emulator has: 'saturation', 'diffusion'.
-
+        Makers of predictors for the kinds 'saturation' and 'diffusion'.
     late : bool
-        The emulator is not there yet: areas and slopes are left open.
+        Whether the emulator is supplied later: predicting areas and slopes before is an error.
+
+    Returns
+    -------
+    predictors : tuple of DataPredictor
+        One for each set.
 
     Raises
     ------
     FitError
-        A kind for which nothing predicts.
+        There is no predictor for a kind.
     """
     out: list[DataPredictor] = []
     for data in sets:
@@ -208,22 +225,23 @@ def make_predictors(
                 out.append(_open)
                 continue
             if emulator is None:
-                raise FitError(f"{data.name}: {data.kind} need an emulator")
+                raise FitError(f"{data.name}: {data.kind} need an emulator or linearise")
             kind = AreaPredictor if data.kind == "areas" else SlopePredictor
             out.append(kind(data, emulator, priors))
         elif tangents and data.kind in tangents:
             out.append(tangents[data.kind](data, priors))
         else:
-            raise FitError(f"{data.name}: nothing predicts {data.kind}")
+            raise FitError(f"{data.name}: no predictor of {data.kind}: give tangents")
     return tuple(out)
 
 
 def _open(values: FloatArray) -> Prediction:
-    raise FitError("predicted before the device was solved")
+    """Predictor of a set whose emulator is not there yet."""
+    raise FitError("areas and slopes cannot be predicted before the device was solved")
 
 
 def _by_condition(data: DataSet) -> dict[Condition, NDArray[np.int64]]:
-    """Rows of each condition."""
+    """Numbers of a data set by their condition."""
     out: dict[Condition, list[int]] = {}
     for row, condition in enumerate(data.conditions):
         out.setdefault(condition, []).append(row)

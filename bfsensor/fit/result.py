@@ -1,4 +1,4 @@
-"""The result of a fit: parameters with errors, data before and after, what is tied."""
+"""Result of a fit: parameters with errors, data and predictions, degeneracies; its file fit.json."""
 
 from __future__ import annotations
 
@@ -22,38 +22,48 @@ from bfsensor.inference.profile_bounds import LEVELS, profile_bounds
 from bfsensor.typing import FloatArray
 
 SCHEMA = "bfsensor device fit 1"
+"""Schema in fit.json; files of another one are refused."""
 
 WELL_KNOWN = 0.5
-"""Posterior over prior width below which a combination is told on the terminal."""
+"""Ratio of posterior to prior width below which a combination of parameters is printed.
+
+Chosen: fit.json holds all combinations; twice as large, all of them are printed."""
 
 
 @dataclass(frozen=True, eq=False)
 class FittedSet:
-    """One data set beside the device before and after the fit.
+    """One data set with its predictions before and after the fit.
 
-    Attributes
+    Parameters
     ----------
     name, kind, unit : str
-        Of the data.
+        Name of the set, its kind, and the unit of its numbers.
     fitted : bool
-        False: only held against the fit.
+        False: the set was only compared with the fit.
     labels : tuple of str, length n
-        What each number is.
+        Label of each number: its lag, or its axis and condition.
     places : ndarray of int, shape (n, 2)
-        Lags (i, j) of areas, axes of slopes.
+        Lags (i, j) of areas; axis (0: x, 1: y) of slopes in the first column.
     values, errors : ndarray, shape (n,)
-        As measured, errors as stated.
+        Measured numbers and their errors as stated.
     before, after : ndarray, shape (n,)
-        At the means of the priors, which are the values of the device file unless others were
-        stated, and as fitted.
+        Predictions at the means of the priors, which are the values of the device file unless
+        others were given, and at the fitted values.
     after_error : ndarray, shape (n,)
-        What the parameters' posterior leaves open of the prediction.
+        Posterior error of the prediction.
     chi2, chi2_before : float
-        With the errors as stated.
+        Chi-square after and before the fit, with the errors as stated.
     scale, scale_error : float
-        By which errors are multiplied; nan as an error where it was held.
+        Factor on the errors and its error, nan if the factor was not fitted.
     determined : float
-        Parameters that the set determines.
+        Number of parameters that the set determines.
+
+    Examples
+    --------
+    >>> from bfsensor.device.shipped import tables_dir
+    >>> one = FitResult.read(tables_dir() / "itl_sta3800c_2019" / "fit.json").sets[0]
+    >>> one.kind, one.unit, one.pulls.shape == one.values.shape
+    ('areas', '1 / electron', True)
     """
 
     name: str
@@ -75,9 +85,9 @@ class FittedSet:
 
     @property
     def pulls(self) -> FloatArray:
-        """Predicted less measured, in scaled errors.
+        """Predicted minus measured numbers over their scaled errors, shape (n,).
 
-        Of numbers that were not fitted with the prediction's error besides.
+        For sets that were not fitted the errors include that of the prediction.
         """
         error = self.scale * self.errors
         if not self.fitted:
@@ -87,40 +97,50 @@ class FittedSet:
 
 @dataclass(frozen=True, eq=False)
 class FitResult:
-    """A device fitted to measurements.
+    """Result of fitting a device to measurements; equal results hold the same numbers.
 
-    Attributes
+    Parameters
     ----------
     device, fitted_device : str
-        Device files before and after.
+        Device files before and after the fit, as text.
     parameters : tuple of str, length p
-        Dotted names of what was free.
+        Dotted names of the free parameters.
     prior, spread : ndarray, shape (p,)
-        Gaussian priors [internal units].
+        Means and standard deviations of the Gaussian priors [internal units].
     value : ndarray, shape (p,)
-        Where the posterior is largest [internal units].
+        Fitted values, at the maximum of the posterior [internal units].
     covariance : ndarray, shape (p, p)
-        Posterior, second moments about the values.
+        Posterior second moments about the fitted values.
     sets : tuple of FittedSet
-        The data.
+        Data sets with their predictions.
     remains : ndarray, shape (p,)
-        Posterior over prior width of independent combinations, the best known first.
+        Ratio of posterior to prior width of independent combinations of the parameters, the best
+        constrained first.
     weights : ndarray, shape (p, p)
-        Of the parameters in each combination, in units of their priors; one a row.
-    ties, silent : tuple of str
-        What the data cannot tell apart, and on what they are silent.
+        Weights of the parameters in units of their prior widths, one combination a row.
+    ties : tuple of str
+        Groups of parameters whose effects on the data cannot be distinguished.
+    silent : tuple of str
+        Dotted names of parameters that the data do not constrain.
     profiles : mapping of str to (ndarray, ndarray)
-        FloatArray and rise of the minimum, for those asked for.
+        Values of a parameter [internal unit] and rise of the objective, for those asked for.
     notes : tuple of str
         Assumptions and limits.
     mesh : mapping
-        Of a fit carried to a finer mesh: cells a pixel of both, ratios of their a_ij by condition
-        ([j, i]) where the fit ends and at the priors, solutions made, version; else empty.
+        For a fit with a finer mesh: cells per pixel of both meshes, ratios of their a_ij by condition
+        (``[j, i]``) at the fit and at the priors, number of solutions, version; otherwise empty.
     posterior : mapping
-        How the errors were found: errors of the tangent alone; devices drawn and solved, and rms of
-        what predictions of each set miss there; where predictions bend, number, mean and central
-        intervals of the draws, of the parameters and ('combinations') of the combinations above, these
-        as far from ``value`` in units of their priors.
+        Origin of the errors: those of linear predictions alone; number of devices drawn and solved,
+        and the rms error of predictions of each set there; if predictions are not linear, number,
+        mean and central intervals of the draws, of the parameters [internal units] and, under
+        'combinations', of the combinations above, relative to ``value`` in prior widths.
+
+    Examples
+    --------
+    >>> from bfsensor.device.shipped import tables_dir
+    >>> result = FitResult.read(tables_dir() / "itl_sta3800c_2019" / "fit.json")
+    >>> len(result.parameters) == len(result.value) == len(result.error)
+    True
     """
 
     device: str
@@ -142,26 +162,33 @@ class FitResult:
 
     @property
     def error(self) -> FloatArray:
-        """Posterior errors of the parameters, others free [internal units]."""
+        """Posterior errors of the parameters, all others being free [internal units], shape (p,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
     def pulls(self) -> FloatArray:
-        """Shift of each parameter from its prior, in spreads of the prior."""
+        """Difference of each fitted value from its prior mean, in prior widths, shape (p,)."""
         return np.asarray((self.value - self.prior) / self.spread)
 
     @property
     def chi2(self) -> float:
-        """Of all fitted numbers with the errors as stated."""
+        """Chi-square of all fitted numbers with the errors as stated."""
         return float(sum(one.chi2 for one in self.sets if one.fitted))
 
     @property
     def n(self) -> int:
-        """How many numbers were fitted."""
+        """Number of fitted numbers."""
         return sum(len(one.values) for one in self.sets if one.fitted)
 
     def bounds(self) -> dict[str, dict[str, list[float | None]]]:
-        """68 and 95 % bounds of the profiles [internal units]; None where they do not rise."""
+        """Give the 68 and 95 % bounds of the profiled parameters.
+
+        Returns
+        -------
+        bounds : dict of str to dict
+            By parameter and '68 %' or '95 %': lower and upper bound [internal units], None where
+            the profile does not rise far enough.
+        """
         return {
             name: {
                 share: [end if np.isfinite(end) else None for end in found]
@@ -179,7 +206,13 @@ class FitResult:
     __hash__ = None  # type: ignore[assignment]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain lists and numbers, as they are written."""
+        """Give the result as lists, numbers and texts, as fit.json holds it.
+
+        Returns
+        -------
+        fields : dict
+            Fields by name, with 'schema', 'chi2', 'n' and 'profile_bounds'.
+        """
         out: dict[str, Any] = {"schema": SCHEMA, "chi2": self.chi2, "n": self.n}
         for spec in dataclasses.fields(self):
             value = getattr(self, spec.name)
@@ -195,23 +228,50 @@ class FitResult:
         return out
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write as JSON; raises FitError if that cannot be."""
+        """Write the result as JSON, replacing an existing file.
+
+        Parameters
+        ----------
+        path : str or path-like
+            File to write.
+
+        Raises
+        ------
+        FitError
+            The file cannot be written.
+        """
         text = json.dumps(self.to_dict(), indent=1)
         with written_whole(path, FitError) as beside:
             beside.write_text(text + "\n", encoding="utf-8")
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> FitResult:
-        """Read what :meth:`write` wrote; raises FitError for anything else."""
+        """Read a file of :meth:`write`.
+
+        Parameters
+        ----------
+        path : str or path-like
+            File to read.
+
+        Returns
+        -------
+        result : FitResult
+            Equal to the one that was written.
+
+        Raises
+        ------
+        FitError
+            The file is missing, damaged, or of another schema.
+        """
         try:
             data = json.loads(Path(path).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
-            raise FitError(f"{path}: not readable as a fit: {error}") from None
+            raise FitError(f"{path}: cannot be read as JSON of a fit: {error}") from None
         found = data.get("schema") if isinstance(data, dict) else None
         if found != SCHEMA:
             raise FitError(f"{path}: its schema is {found!r}, not {SCHEMA!r}")
         try:
-            # Fits written before they were carried to finer meshes, and drawn from.
+            # Files of earlier versions lack these fields.
             for later in ("mesh", "posterior"):
                 data.setdefault(later, {})
             fields = {spec.name: data[spec.name] for spec in dataclasses.fields(cls)}
@@ -222,10 +282,16 @@ class FitResult:
             }
             return cls(**_arrays(fields))
         except (KeyError, TypeError, ValueError) as error:
-            raise FitError(f"{path}: not a whole fit: {error!r}") from None
+            raise FitError(f"{path}: incomplete or damaged fit: {error!r}") from None
 
     def said(self) -> str:
-        """Write the fit as a table for a terminal; the last line gives chi2/n."""
+        """Give the result as text for a terminal.
+
+        Returns
+        -------
+        text : str
+            Parameters, data sets, combinations and notes; the last line gives chi2/n.
+        """
         return "\n".join([
             *self._parameter_lines(), *(line for one in self.sets for line in _lines(one)),
             *self._told(),
@@ -233,6 +299,7 @@ class FitResult:
         ])  # fmt: skip
 
     def _parameter_lines(self) -> list[str]:
+        """Table of the parameters: prior, fitted value with error, pull."""
         known = quantities(Device.from_toml(self.device))
         rows = [("parameter", "prior", "fitted", "pull")]
         for k, name in enumerate(self.parameters):
@@ -252,7 +319,7 @@ class FitResult:
         ]
 
     def _profile_lines(self) -> list[str]:
-        """Bounds of each profile beside those of its error."""
+        """Bounds of each profile, followed by those of a Gaussian with the posterior error."""
         known, out = quantities(Device.from_toml(self.device)), []
         for name, both in self.bounds().items():
             k = self.parameters.index(name)
@@ -270,6 +337,7 @@ class FitResult:
         return out
 
     def _told(self) -> list[str]:
+        """Well constrained combinations, profiles, degeneracies and notes."""
         drawn = self.posterior.get("combinations", {}).get("central_95")
         out = []
         for number, (part, weights) in enumerate(
@@ -282,18 +350,18 @@ class FitResult:
                     if drawn is None
                     else "; 95 % of draws from {:+.2f} to {:+.2f}".format(*drawn[number])
                 )
-                out.append(f"measured to {part:.2f} of its prior: {name}{ends}")
+                out.append(f"measured to {part:.2f} of its prior width: {name}{ends}")
         out += self._profile_lines()
-        out += [f"not told apart: {tie}" for tie in self.ties]
+        out += [f"not distinguished by the data: {tie}" for tie in self.ties]
         if self.silent:
             out.append(
-                f"the data are silent on: {', '.join(describe(n) for n in self.silent)}"
+                f"not constrained by the data: {', '.join(describe(n) for n in self.silent)}"
             )
         return out + [f"note: {note}" for note in self.notes]
 
 
 def _with_error(quantity: Quantity, value: float, error: float) -> str:
-    """Value and error with two digits of the error, in the unit of device files.
+    """Format a value and its error, to two digits of the error, in the unit of device files.
 
     Examples
     --------
@@ -317,7 +385,7 @@ def _with_error(quantity: Quantity, value: float, error: float) -> str:
 
 
 def _lines(one: FittedSet) -> list[str]:
-    """Lines of one data set: sim/meas and pull of each number."""
+    """Lines of one data set: predicted over measured before and after, and pull of each number."""
     scale = f"errors scaled by {one.scale:.2f}"
     if np.isfinite(one.scale_error):
         scale += f" +- {one.scale_error:.2f}"
@@ -343,6 +411,7 @@ def _lines(one: FittedSet) -> list[str]:
 
 
 def _plain(value: Any) -> Any:
+    """Lists and numbers for JSON."""
     if isinstance(value, np.ndarray):
         return [_plain(v) for v in value.tolist()]
     if isinstance(value, tuple | list):
@@ -361,7 +430,7 @@ _FLOATS = (
 
 
 def _arrays(fields: dict[str, Any]) -> dict[str, Any]:
-    """Fields as they were before they were written."""
+    """Arrays and tuples of the fields of a file."""
     out = dict(fields)
     for name, value in fields.items():
         if name in _TEXTS:

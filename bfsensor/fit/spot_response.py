@@ -1,14 +1,15 @@
-r"""B-F slopes of spots in closed form: linear in the shifts of the pixels' edges.
+r"""B-F slopes of spots in closed form, as a linear function of the boundary shifts.
 
-A spot of S electrons puts :math:`S f_s` into pixel s while its edges move, on average over the
-exposure by half of what they do at the end.  Light of line density :math:`g_p` at the right edge
-of pixel p goes over to it from its neighbour, in x
+A spot of S electrons puts :math:`S f_s` into pixel s while the edges of pixels move, on average over
+the exposure by half of the final shift.  Light of the line density :math:`g_p` at the right edge of
+pixel p changes from its neighbour to it, in x by
 
 .. math:: \delta_p = \tfrac12 S^2 (g_p \Delta_p - g_{p-1} \Delta_{p-1}), \qquad
     \Delta_p = \sum_s k_x(p - s) f_s,
 
-and a least squares fit of Gaussians answers to so small a change by a linear functional of it.  What
-remains is one weight for each offset of :math:`k_x` and :math:`k_y`, found once for a width.
+and the width of a least-squares fit of Gaussians is a linear functional of so small a change.  The
+slope is then a sum over offsets of :math:`k_x` and :math:`k_y` with weights that depend on the width
+of the spot only.
 """
 
 from __future__ import annotations
@@ -24,30 +25,51 @@ from bfsensor.errors import FitError
 from bfsensor.typing import FloatArray
 
 UNIT_PEAK = 50_000.0
-"""Electrons in the central pixel for which slopes are given."""
+"""Charge of the central pixel [e-] for which slopes are defined (published: Lage et al. 2017)."""
 
 SIGMA = 1.02
-"""Width of the published spots [pixel]: 10 um drawn, 2 um of Einstein's diffusion."""
+"""Gaussian sigma of the published spots [pixel].  Derived: sqrt(10^2 + 2^2) um over pixels of 10 um,
+the second term being Einstein's diffusion."""
 
 PHASES = 8
-"""Places of the spots within a pixel along each axis: slopes change by 0.1 % with 16."""
+"""Number of places of the spots within a pixel along each axis.
+
+Measured with :func:`slope_weights` and shifts that fall with the cube of the distance: 16 places
+change slopes by 0.1 %."""
 
 STAMP = 9
-"""Side of the stamp that is fitted [pixel]."""
+"""Side of the postage stamp that is fitted [pixel], as published: Lage et al. 2017, section 2.1."""
 
 
 class SlopeWeights(NamedTuple):
-    """Weights of the shifts [%], shape (2, n, n): a row for the slope in x, one for y.
+    """Weights of the boundary shifts in the B-F slopes.
 
-    ``(x * kx + y * ky).sum()`` is the slope: growth of the width in per cent of a pixel for
-    50,000 e- in the central pixel.
+    ``(x * kx + y * ky).sum((1, 2))`` are the slopes in x and y: growth of the width, in per cent of
+    a pixel, for 50,000 e- in the central pixel.
+
+    Parameters
+    ----------
+    x, y : ndarray, shape (2, n, n)
+        Weights of ``kx`` and ``ky`` [% per (pixel/e-)], for the slopes in x and in y.
     """
 
     x: FloatArray
     y: FloatArray
 
     def slopes(self, kx: FloatArray, ky: FloatArray) -> FloatArray:
-        """Slopes in x and y [%] of shifts [pixel/e-], shape (..., n, n) each."""
+        """Give the slopes in x and y for given shifts.
+
+        Parameters
+        ----------
+        kx, ky : ndarray, shape (..., m, m)
+            Shifts of right and upper edges [pixel/e-], odd sides; offsets beyond the reach of the
+            weights are ignored.
+
+        Returns
+        -------
+        slopes : ndarray, shape (2, ...)
+            Slopes [% of a pixel for 50,000 e-], first axis x and y.
+        """
         half = self.x.shape[-1] // 2
         there = kx.shape[-1] // 2
         reach = min(half, there)
@@ -63,25 +85,35 @@ class SlopeWeights(NamedTuple):
 def slope_weights(
     sigma: float = SIGMA, *, background: bool = False, reach: int = 8, phases: int = PHASES
 ) -> SlopeWeights:
-    """Find what each shift adds to the slope of spots strewn evenly over a pixel.
+    """Find the weight of each shift in the slopes of spots placed uniformly over a pixel.
 
     Parameters
     ----------
     sigma : float
-        Width in x and y with diffusion [pixel].
+        Gaussian width in x and y with diffusion [pixel], 0.3 to 3.
     background : bool
-        Whether each spot has a free background in the fit; the project's own measurement of
-        simulated spots (``measure_growth``) holds it.
+        Whether the fit of each spot has a free background;
+        :func:`bfsensor.measure.growth.measure_growth` fixes it.
     reach : int
-        Of the shifts [pixel].
+        Largest offset of the shifts [pixel].
     phases : int
-        Places along each axis.
+        Number of places along each axis.
+
+    Returns
+    -------
+    weights : SlopeWeights
+        Weights of the shifts of right and of upper edges.
+
+    Raises
+    ------
+    FitError
+        The width is out of range.
 
     Notes
     -----
-    To first order in the charge, at the shifts' own level: at 80,000 e- the central pixel holds
-    some per cent less by the effect itself.  All pixels have equal weight in the fit, and all
-    spots share one width, as in the publication.
+    Slopes are of first order in the charge, for shifts at one level: at 80,000 e- the effect itself
+    takes some per cent of the charge of the central pixel.  All pixels have equal weight in the
+    fit, and all spots share one width, as in the publication.
 
     Examples
     --------
@@ -92,7 +124,7 @@ def slope_weights(
     (True, True)
     """
     if not 0.3 <= sigma <= 3.0:
-        raise FitError(f"sigma = {sigma:g} pixels of spots must be from 0.3 to 3")
+        raise FitError(f"sigma = {sigma:g} pixels of spots must be from 0.3 to 3 pixels")
     side = STAMP + 2 * reach
     places = (np.arange(phases) + 0.5) / phases - 0.5
     lines = [_WidthLine(side, place, sigma) for place in places]
@@ -108,7 +140,7 @@ def slope_weights(
         wide = np.zeros((2, side, side))
         inner = slice(reach, side - reach)
         wide[:, inner, inner] = functional.reshape(2, STAMP, STAMP)
-        # An edge gives to the pixel before it what it takes from the one behind.
+        # Light that crosses an edge is gained by one pixel and lost by the next.
         gain_x = wide - np.roll(wide, -1, 2)
         gain_y = wide - np.roll(wide, -1, 1)
         over_x = 0.5 * gain_x * y.pixels[:, None] * x.edges
@@ -120,7 +152,7 @@ def slope_weights(
 
 
 class _WidthLine:
-    """A Gaussian along one axis: in each pixel, at each far edge, and its derivatives."""
+    """Gaussian along one axis: its integral in each pixel, value at each far edge, derivatives."""
 
     def __init__(self, side: int, place: float, sigma: float) -> None:
         t = (np.arange(side + 1) - 0.5 * side - place) / sigma
@@ -132,7 +164,7 @@ class _WidthLine:
 
 
 def _fit_columns(x: _WidthLine, y: _WidthLine, reach: int, background: bool) -> FloatArray:
-    """Change of a spot's stamp with both widths, less what its own parameters take of it."""
+    """Derivatives of a stamp by both widths, orthogonal to those by its own parameters."""
     inner = slice(reach, len(x.pixels) - reach)
 
     def plane(along_y: FloatArray, along_x: FloatArray) -> NDArray:
@@ -149,7 +181,7 @@ def _fit_columns(x: _WidthLine, y: _WidthLine, reach: int, background: bool) -> 
 
 
 def _correlate(over: FloatArray, light: FloatArray, reach: int) -> FloatArray:
-    """Sum over pixels of ``over[p] light[p - d]`` for all offsets d to the reach."""
+    """Sum over pixels p of ``over[p] light[p - d]``, for all offsets d up to the reach."""
     spectrum = np.fft.rfft2(over) * np.conj(np.fft.rfft2(light))
     whole = np.fft.irfft2(spectrum, s=light.shape)
     at = np.arange(-reach, reach + 1)

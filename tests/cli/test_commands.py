@@ -145,52 +145,29 @@ def test_show(run, tmp_path, tiny):
 
 
 @pytest.mark.parametrize(
-    ("command", "message"),
+    ("command", "named"),
     [
-        (
-            ("table", "sta3800"),
-            f"'sta3800' is neither a built-in device ({', '.join(builtin_devices())}) nor "
-            "a .toml file; did you mean itl_sta3800c or itl_sta3800c_60?",
-        ),
-        (
-            (*TINY, "--set", "back_bais=-60V"),
-            "no quantity 'back_bais' in a device; did you mean back_bias?",
-        ),
-        (
-            (*TINY, "--set", "back_bias=-60"),
-            "operating_point: back_bias: '-60' has no unit; expected one of potential, "
-            "such as V",
-        ),
-        (
-            (*TINY, "--depths", "0.3"),
-            "depth = 0.3 um must lie in the silicon of itl_sta3800c, from 0.9 um, where "
-            "charge is stored, to 100 um, the back surface",
-        ),
-        (
-            (*TINY, "--depths", "100.5"),
-            "depth = 100.5 um must lie in the silicon of itl_sta3800c, from 0.9 um, where "
-            "charge is stored, to 100 um, the back surface",
-        ),
-        ((*TINY, "--charges", "5e4,4e4"), "charges [50000.0, 40000.0] must ascend"),
-        ((*TINY, "--pixels", "6"), "pixels = 6 must be odd and from 3 to 11"),
-        ((*TINY, "--accuracy", "1e-5"), "accuracy = 1e-05 must be at least 0.005"),
-        ((*TINY, "-o", "nowhere/t.fits"), "nowhere is not a folder"),
-        (
-            (*TINY, "--galsim", "g", "--charges", "1e4,2e4"),
-            "a GalSim table holds one charge and one depth, not 2 and 1",
-        ),
-        (("show", "none.fits"), "none.fits: no such file"),
-        (
-            ("device", "import", "none.cfg"),
-            "none.cfg: cannot be read: [Errno 2] No such file or directory: 'none.cfg'",
-        ),
+        (("table", "sta3800"), ["'sta3800'", *builtin_devices(), ".toml"]),
+        ((*TINY, "--set", "back_bais=-60V"), ["'back_bais'", "back_bias?"]),
+        ((*TINY, "--set", "back_bias=-60"), ["operating_point", "back_bias", "'-60'", "V"]),
+        ((*TINY, "--depths", "0.3"), ["0.3 um", "itl_sta3800c", "0.9 um", "100 um"]),
+        ((*TINY, "--depths", "100.5"), ["100.5 um", "itl_sta3800c", "0.9 um", "100 um"]),
+        ((*TINY, "--charges", "5e4,4e4"), ["charges", "50000.0, 40000.0"]),
+        ((*TINY, "--pixels", "6"), ["pixels = 6", "odd", "3", "11"]),
+        ((*TINY, "--accuracy", "1e-5"), ["accuracy = 1e-05", "0.005"]),
+        ((*TINY, "-o", "nowhere/t.fits"), ["nowhere"]),
+        ((*TINY, "--galsim", "g", "--charges", "1e4,2e4"), ["GalSim", "2 and 1"]),
+        (("show", "none.fits"), ["none.fits"]),
+        (("device", "import", "none.cfg"), ["none.cfg"]),
     ],
-    ids=lambda v: None if isinstance(v, str) else " ".join(v[-2:]),
+    ids=lambda v: " ".join(v[-2:]),
 )
-def test_faults_are_one_line_and_status_1(run, tmp_path, command, message):
+def test_faults_are_one_line_and_status_1(run, tmp_path, command, named):
     result = run(*command)
     assert result.exit_code == 1
-    assert result.stderr == f"bfsensor: {message}\n"
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("bfsensor: ")
+    assert [one for one in named if one not in line] == []
     assert result.stdout == ""
     assert os.listdir(tmp_path) == []
 
@@ -200,19 +177,17 @@ def test_beyond_the_full_well(run, kind):
     well = full_well(Device.load("itl_sta3800c"))
     result = run(*TINY, f"--{kind}", f"{1.001 * well:.8g}")
     assert result.exit_code == 1
-    assert result.stderr == (
-        f"bfsensor: {kind[:-1]} = {1.001 * well:g} e- must be from 0 to the full well of "
-        f"itl_sta3800c, {well:.6g} e-, where the barrier along the column falls to 2.2 V\n"
-    )
+    (line,) = result.stderr.splitlines()
+    assert line.startswith(f"bfsensor: {kind[:-1]} = {1.001 * well:g} e-")
+    assert "itl_sta3800c" in line and f"{well:.6g} e-" in line and "2.2 V" in line
 
 
 def test_existing_tables_are_kept(run, tmp_path):
     (tmp_path / "itl_sta3800c.fits").write_text("precious")  # the default name
     result = run(*TINY)
     assert result.exit_code == 1
-    assert result.stderr == (
-        "bfsensor: itl_sta3800c.fits exists; give --overwrite to replace it\n"
-    )
+    (line,) = result.stderr.splitlines()
+    assert "itl_sta3800c.fits" in line and "--overwrite" in line
     assert (tmp_path / "itl_sta3800c.fits").read_text() == "precious"
 
 
@@ -220,10 +195,8 @@ def test_foreign_files_are_not_shown(run, tmp_path):
     fits.PrimaryHDU(np.ones((2, 2))).writeto(tmp_path / "image.fits")
     result = run("show", "image.fits")
     assert result.exit_code == 1
-    assert result.stderr == (
-        "bfsensor: image.fits: not a distortion table (no SCHEMA = 'bfsensor distortion "
-        "table')\n"
-    )
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("bfsensor: image.fits: ") and "SCHEMA" in line
 
 
 @pytest.mark.parametrize(
@@ -232,8 +205,8 @@ def test_foreign_files_are_not_shown(run, tmp_path):
         (("table",), "Missing argument 'DEVICE'"),
         (("tabel", "itl_sta3800c"), "No such command 'tabel'"),
         (("table", "itl_sta3800c", "--colour"), "No such option"),
-        ((*TINY, "--charges", "many"), "'many' is not a list of numbers"),
-        ((*TINY, "--set", "back_bias"), "'back_bias' is not of the form KEY=VALUE"),
+        ((*TINY, "--charges", "many"), "'many'"),
+        ((*TINY, "--set", "back_bias"), "KEY=VALUE"),
         ((*TINY, "--vertices", "few"), "'few' is not a valid integer"),
         ((*TINY, "--workers", "0"), "Invalid value for '--workers'"),
     ],
@@ -325,9 +298,8 @@ def test_a_damaged_level_is_refused_by_name(run, tmp_path):
     path.write_bytes(b"PK\x03\x04 half")
     result = run(*TINY, "-o", "t.fits")
     assert result.exit_code == 1
-    assert result.stderr.splitlines()[-1].startswith(
-        f"bfsensor: {path.relative_to(tmp_path)}: not a finished level"
-    )
+    last = result.stderr.splitlines()[-1]
+    assert last.startswith(f"bfsensor: {path.relative_to(tmp_path)}: ")
 
 
 @pytest.mark.parametrize(

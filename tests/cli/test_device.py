@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from bfsensor.cli.main import main
+from bfsensor.device.depletion import find_depletion
 from bfsensor.device.device import Device
 from bfsensor.device.shipped import tables_dir
 
@@ -32,18 +33,17 @@ def test_new_is_the_other_device_under_its_own_name(run, tmp_path):
     assert run("device", "new", "b.toml", "--from", "my_ccd.toml").exit_code == 0
     assert Device.load(tmp_path / "b.toml").name == "b"
     result = run("device", "new", "b.toml", "--from", "my_ccd.toml")
-    assert (result.exit_code, result.stderr) == (
-        1, "bfsensor: b.toml exists; give --overwrite to replace it\n",
-    )  # fmt: skip
+    assert result.exit_code == 1
+    assert "b.toml" in result.stderr and "--overwrite" in result.stderr
 
 
 def test_new_refuses_what_is_no_device_file(run, tmp_path):
     result = run("device", "new", "my_ccd", "--from", "e2v_ccd250")
     assert result.exit_code == 1
-    assert result.stderr == "bfsensor: my_ccd: the name of a device file ends in .toml\n"
+    assert result.stderr.startswith("bfsensor: my_ccd: ") and ".toml" in result.stderr
     result = run("device", "new", "my_ccd.toml", "--from", "e2v_ccd25")
     assert result.exit_code == 1
-    assert "did you mean e2v_ccd250" in result.stderr
+    assert "'e2v_ccd25'" in result.stderr and "e2v_ccd250" in result.stderr
     assert list(tmp_path.iterdir()) == []
     assert run("device", "new", "my_ccd.toml").exit_code == 2
 
@@ -69,6 +69,11 @@ def test_check_warns_and_refuses(run, tmp_path):
     warnings = [x for x in result.stdout.splitlines() if x.startswith("warning: ")]
     assert len(warnings) == 1
     assert "operating_point.hole_quasi_fermi_level" in warnings[0]
+    found = json.loads(run("device", "check", file, "--json").stdout)["depletion"]
+    estimate = find_depletion(Device.load(file))
+    assert found["full_depletion_voltage"] == f"{estimate.full_depletion_voltage:.1f} V"
+    assert found["full_depletion_voltage"] in result.stdout
+    assert f"depleted_thickness {estimate.depth:.1f} um" in " ".join(result.stdout.split())
     changed = file.read_text().replace('name = "my_ccd"', 'name = "itl_sta3800c"')
     file.write_text(changed.replace('origin = "guessed"', 'source = "a hunch"'))
     found = json.loads(run("device", "check", file, "--json").stdout)
@@ -79,6 +84,16 @@ def test_check_warns_and_refuses(run, tmp_path):
     file.write_text(changed.replace("thickness", "thikness"))
     result = run("device", "check", file)
     assert result.exit_code == 1
-    assert result.stderr == (
-        "bfsensor: my_ccd.toml: silicon: unknown key 'thikness'; did you mean 'thickness'?\n"
-    )
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("bfsensor: my_ccd.toml: silicon: ")
+    assert "'thikness'" in line and "'thickness'" in line
+
+
+def test_check_warns_of_silicon_that_is_not_depleted(run):
+    weak = run("device", "check", "e2v_ccd250", "--set", "back_bias=-5V", "--json")
+    assert weak.exit_code == 0
+    found = json.loads(weak.stdout)
+    assert float(found["depletion"]["depleted_thickness"].removesuffix(" um")) < 80
+    assert found["warnings"][0].startswith("back_bias = '-5 V'")
+    whole = json.loads(run("device", "check", "e2v_ccd250", "--json").stdout)
+    assert not any(one.startswith("back_bias") for one in whole["warnings"])

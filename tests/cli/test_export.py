@@ -54,7 +54,7 @@ def test_bfk_is_the_kernel_of_the_table(run, table):
     assert shifts.areas[0, 0] != quadrant_shifts(table, background=2e4).areas[0, 0]
     result = run("bfk", NAME, "--detector", 94, "--gain", 1.6, "-o", "bfk.fits")
     assert result.exit_code == 1
-    assert result.stderr == "bfsensor: bfk.fits exists; give --overwrite to replace it\n"
+    assert "bfk.fits" in result.stderr and "--overwrite" in result.stderr
 
 
 def test_edm_has_filters_and_the_gains_of_a_ptc(run, tmp_path, table):
@@ -80,11 +80,11 @@ def test_edm_has_filters_and_the_gains_of_a_ptc(run, tmp_path, table):
 @pytest.mark.parametrize(
     ("args", "code", "message"),
     [
-        (("bfk", NAME), 2, "give the gains of the amplifiers: either --gain or --ptc"),
-        (("bfk", NAME, "--gain", "C00=x"), 2, "'C00=x' is not a gain such as 1.65"),
-        (("bfk", NAME, "--gain", 1, "--level", 1e9), 1, "background = 1e+09 is outside"),
-        (("bfk", "itl", "--gain", 1), 1, "neither a built-in table"),
-        (("edm", NAME, "--gain", 1, "--filter", "y"), 2, "--filter y: not of the form"),
+        (("bfk", NAME), 2, "--gain or --ptc"),
+        (("bfk", NAME, "--gain", "C00=x"), 2, "'C00=x'"),
+        (("bfk", NAME, "--gain", 1, "--level", 1e9), 1, "background = 1e+09"),
+        (("bfk", "itl", "--gain", 1), 1, "'itl'"),
+        (("edm", NAME, "--gain", 1, "--filter", "y"), 2, "--filter y: "),
     ],
 )
 def test_what_export_refuses(run, tmp_path, args, code, message):

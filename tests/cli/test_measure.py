@@ -93,8 +93,8 @@ def test_flats_give_covariances(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["flats", "{0}"], "1 files do not make pairs"),
-        (["spots", "{0}", "--threshold", "1e9"], "no spot above 1e+09"),
+        (["flats", "{0}"], "1 files"),
+        (["spots", "{0}", "--threshold", "1e9"], "1e+09"),
         (["flats", "{1}", "{1}"], "text.fits"),
     ],
 )
@@ -112,12 +112,12 @@ def test_spots_ask_for_the_gain(tmp_path):
     with fits.open(path, mode="update") as hdus:
         del hdus[1].header["GAIN"]
     result = invoke("spots", path, "--threshold", 10)
-    assert result.exit_code == 1 and "give --gain" in result.output
+    assert result.exit_code == 1 and "--gain" in result.output
     with fits.open(path, mode="update") as hdus:
         hdus[1].header["GAIN"] = 0
     result = invoke("spots", path, "--threshold", 10)
     assert result.exit_code == 1
-    assert "GAIN = 0 cannot be meant (gain: 0.0001 to 10000 e-/ADU)" in result.output
+    assert "GAIN = 0 " in result.output and "0.0001 to 10000 e-/ADU" in result.output
 
 
 def test_a_campaign_yaml_beside_the_files_is_followed(tmp_path):
@@ -149,7 +149,7 @@ def test_a_campaign_yaml_beside_the_files_is_followed(tmp_path):
     }
     (tmp_path / "campaign.yaml").write_text("masks: ['[1:9]']")
     result = invoke("flats", *files)
-    assert result.exit_code == 1 and "masks = '[1:9]' is not like" in result.output
+    assert result.exit_code == 1 and "masks = '[1:9]'" in result.output
 
 
 def test_help_shows_examples():
@@ -176,7 +176,7 @@ def test_faults_name_file_and_amplifier(tmp_path):
     image[20:27, 20:27] = image[20:27, 35:42] = 5e4
     result = invoke("spots", write(tmp_path / "flat_top.fits", image), "--threshold", 1e4)
     assert result.exit_code == 1 and len(result.output.splitlines()) == 1
-    assert "flat_top.fits: AMP1: only" in result.output
+    assert "flat_top.fits: AMP1: " in result.output
 
 
 def test_sections_stand_for_missing_cards(tmp_path):
@@ -204,10 +204,10 @@ def test_sections_stand_for_missing_cards(tmp_path):
     found = json.loads(invoke("flats", *files, "--lags", 1, *given, "--json").stdout)
     assert {row["amplifier"] for row in found["rows"]} == {"L", "R"}
     for text, message in (
-        ("bias=[1:2,1:3]", "is not of the form data="),
-        ("data=[1:2,1:3],gian=2", "is not of the form data="),
-        ("data=1:2,1:3", "is not of the form data="),
-        ("data=[1:2,1:3],hdu=a", "hdu = 'a' is no number"),
+        ("bias=[1:2,1:3]", "'bias=[1:2,1:3]'"),
+        ("data=[1:2,1:3],gian=2", "gian=2"),
+        ("data=1:2,1:3", "'data=1:2,1:3'"),
+        ("data=[1:2,1:3],hdu=a", "hdu = 'a'"),
     ):
         result = invoke("flats", *files, "--sections", text)
         assert result.exit_code == 2 and message in result.output, result.output

@@ -1,4 +1,4 @@
-"""What commands say on stderr: more, less, progress, and what the main help promises."""
+"""Messages on stderr: --verbose, --quiet, progress, closed pipes, and the main help."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from click.testing import CliRunner
 
 from bfsensor.cli import common
 from bfsensor.cli.main import main
+from tests.broken_campaigns import make_campaign
 
 
 def run(*args):
@@ -74,6 +75,21 @@ def test_completion_is_what_the_help_says(shell):
     assert "_BFSENSOR_COMPLETE" in done.stdout
 
 
+@pytest.mark.parametrize(
+    "command", [("device", "show", "e2v_ccd250"), ("devices",), ("check", "CAMPAIGN")]
+)
+def test_a_closed_pipe_ends_without_a_message(tmp_path, command):
+    campaign = make_campaign(tmp_path / "run_12")
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [sys.executable, "-m", "bfsensor", *(campaign if c == "CAMPAIGN" else c for c in command)],
+        stdout=writer, stderr=subprocess.PIPE, text=True, check=False,
+    )  # fmt: skip
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
 def test_help_states_status_and_json():
     text = run("--help").stdout
-    assert "Status: 0 done" in text and "--json" in text
+    assert "130 interrupted" in text and "--json" in text

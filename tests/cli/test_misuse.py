@@ -1,4 +1,4 @@
-"""What was given in the wrong place: each message says where it belongs."""
+"""Inputs given to the wrong function or command: each error names the right one."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def test_a_device_file_is_no_table(tmp_path, there):
     file = tmp_path / "my.toml"
     if there:
         Device.load("e2v_ccd250").write(file)
-    with pytest.raises(SensorError, match=f"is a device file.*run `bfsensor table {file}`"):
+    with pytest.raises(SensorError, match=f"`bfsensor table {file}`"):
         BrighterFatterSensor(str(file))
 
 
 @pytest.mark.parametrize("name", ["lsst_itl_50_8", STEM, f"{STEM}.cfg", f"{STEM}.dat"])
 def test_a_table_of_galsim_is_for_the_other_sensor(name):
-    with pytest.raises(SensorError, match=r"of GalSim's: bfsensor\.SiliconSensor takes it"):
+    with pytest.raises(SensorError, match=r"bfsensor\.SiliconSensor"):
         BrighterFatterSensor(name)
 
 
@@ -49,7 +49,7 @@ def test_a_configuration_beside_does_not_hide_a_built_in_table(tmp_path, monkeyp
 
 @pytest.mark.parametrize("name", ["itl_sta3800c", SHIPPED])
 def test_our_table_is_for_our_sensor(name):
-    with pytest.raises(OSError, match="of bfsensor's: BrighterFatterSensor takes it"):
+    with pytest.raises(OSError, match="BrighterFatterSensor"):
         SiliconSensor(name)
 
 
@@ -80,9 +80,8 @@ def test_one_file_is_no_campaign(run, command):
     more = ("--baseline", "none") if command == "diagnose" else ()
     result = run(command, "flat.fits", *more)
     assert result.exit_code == 1
-    assert result.stderr.startswith(
-        "bfsensor: flat.fits: one FITS file is no campaign: give its folder, which needs flats"
-    )
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("bfsensor: flat.fits: ") and "folder" in line
 
 
 @pytest.mark.parametrize("command", ["check", "diagnose"])
@@ -91,16 +90,13 @@ def test_a_cube_and_several_exposures_are_to_be_split(run, tmp_path, command):
     more = ("--baseline", "none") if command == "diagnose" else ()
     result = run(command, tmp_path, *more)
     assert result.exit_code == 1
-    assert "holds a cube of 5 images of 9 x 8 pixels: a file is one exp" in result.stderr
+    assert "flats.fits" in result.stderr and "5 images of 9 x 8 pixels" in result.stderr
     frames = [fits.ImageHDU(flat().data, flat(kind).header) for kind in ("FLAT", "BIAS")]
     hdus = fits.HDUList([fits.PrimaryHDU(), *frames])
     hdus.writeto("flats.fits", overwrite=True)
     result = run(command, tmp_path, *more)
     assert result.exit_code == 1
-    assert (
-        "holds several exposures: IMAGETYP differs among its 2 images (BIAS, FLAT)"
-        in result.stderr
-    )
+    assert "IMAGETYP" in result.stderr and "(BIAS, FLAT)" in result.stderr
     # Amplifiers of one exposure are none.
     frames = [fits.ImageHDU(flat().data, flat().header, name=n) for n in ("A", "B")]
     fits.HDUList([fits.PrimaryHDU(), *frames]).writeto("flats.fits", overwrite=True)
@@ -114,7 +110,7 @@ def test_words_for_kinds_are_named_and_mapped(run, tmp_path):
     settings.write_text("keywords: {kind: {keyword: TYP}}")
     result = run("check", tmp_path)
     assert result.exit_code == 1
-    assert "TYP = 'flatfield' is not understood as a kind of exposure" in result.stderr
+    assert "TYP = 'flatfield'" in result.stderr
     assert "bias, zero, dark, flat" in result.stderr
     assert "keywords: {kind: {keyword: TYP, values: {flatfield: flat}}}" in result.stderr
     settings.write_text(
@@ -124,8 +120,8 @@ def test_words_for_kinds_are_named_and_mapped(run, tmp_path):
     assert result.exit_code == 0, result.output
     assert "2 exposures (1 flat, 1 bias)" in result.stdout
     for values, message in (
-        ("{offset: bais}", "values: 'bais' is not understood"),
-        ("[offset]", "values = ['offset'] must be a mapping such as {offset: bias}"),
+        ("{offset: bais}", "values: 'bais'"),
+        ("[offset]", "values = ['offset']"),
     ):
         settings.write_text(f"keywords: {{kind: {{keyword: TYP, values: {values}}}}}")
         result = run("check", tmp_path)

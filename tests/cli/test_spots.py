@@ -110,12 +110,12 @@ def test_a_killed_run_goes_on(finished, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--pixels", "4"], "pixels = 4 must be odd"),
-        (["--sigma", "40"], "sigma = 40 um is too wide for 13 pixels"),
-        (["--depth", "300"], "depth = 300 must be from 2 to 100"),
-        (["--diffusion", "-1"], "diffusion = -1.0 must be from 0"),
-        (["--set", "back_bias=-60"], "has no unit"),
-        (["--peak", "400000"], "peak = 400000 e- must be below the full well"),
+        (["--pixels", "4"], "pixels = 4 "),
+        (["--sigma", "40"], "sigma = 40 um"),
+        (["--depth", "300"], "depth = 300"),
+        (["--diffusion", "-1"], "diffusion = -1.0"),
+        (["--set", "back_bias=-60"], "'-60'"),
+        (["--peak", "400000"], "peak = 400000 e-"),
     ],
 )
 def test_one_clear_line_for_bad_input(tmp_path, arguments, message):

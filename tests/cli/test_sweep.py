@@ -142,11 +142,11 @@ def test_a_level_above_the_full_well_is_a_reason(tmp_path):
         (
             ["--over", "bias=-30V"],
             1,
-            "no quantity 'bias' to sweep over; there are wavelength",
+            "'bias'",
         ),
-        (["--over", "back_bias=-30"], 1, "operating_point.back_bias: '-30' has no unit"),
-        (["--over", "back_bias=-30V:-40V"], 1, "first:last:number of values"),
-        (["--over", "back_bias=-30V", "--over", "back_bias=-40V"], 1, "is given twice"),
+        (["--over", "back_bias=-30"], 1, "operating_point.back_bias: '-30'"),
+        (["--over", "back_bias=-30V:-40V"], 1, "first:last:number"),
+        (["--over", "back_bias=-30V", "--over", "back_bias=-40V"], 1, "back_bias"),
         (
             ["--paired", "--over", "back_bias=-30V", "--over", "gate_high=2V,3V"],
             1,
@@ -155,17 +155,17 @@ def test_a_level_above_the_full_well_is_a_reason(tmp_path):
         (
             ["--over", "back_bias=-30V", "--cells", "0"],
             1,
-            "cells = 0 must be an even number",
+            "cells = 0 ",
         ),
-        (["--over", "back_bias=-30V", "--accuracy", "1e-4"], 1, "must be at least 0.005"),
+        (["--over", "back_bias=-30V", "--accuracy", "1e-4"], 1, "0.005"),
         (["--over", "back_bias=-30V", "--level", "-5"], 1, "level = -5 e-"),
-        (["--over", "back_bias=-30V", "--set", "thickness=9"], 1, "has no unit"),
-        (["--over", "back_bias"], 2, "not of the form KEY=VALUE"),
-        ([], 2, "Missing option '--over'"),
+        (["--over", "back_bias=-30V", "--set", "thickness=9"], 1, "'9'"),
+        (["--over", "back_bias"], 2, "KEY=VALUE"),
+        ([], 2, "'--over'"),
         (
             ["--over", "back_bias=-30V", "--cells", "8", "--accuracy", "0.1"],
             2,
-            "give one of them",
+            "--accuracy",
         ),
     ],
 )
@@ -179,4 +179,4 @@ def test_one_clear_line_for_bad_input(tmp_path, arguments, status, message):
 
 def test_an_existing_file_is_kept(finished):
     result = invoke(*SMALL, "-o", finished[0] / "a.ecsv")
-    assert result.exit_code == 1 and "give --overwrite to replace it" in result.output
+    assert result.exit_code == 1 and "--overwrite" in result.output

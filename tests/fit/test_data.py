@@ -36,7 +36,7 @@ def test_published_slopes_and_saturation():
     assert slopes.errors[0] == pytest.approx(expected)
     wells = data_set(read_measured(DATA / "sat_data_21oct19.csv"))
     assert wells.kind == "saturation" and wells.conditions[3].gate_high == 1.5
-    assert "2 % assumed" in wells.notes[0]
+    assert "sat_data_21oct19.csv" in wells.notes[0] and "2 %" in wells.notes[0]
     np.testing.assert_allclose(wells.errors, 0.02 * wells.values)
 
 
@@ -55,9 +55,9 @@ def test_selection_and_refusals():
     assert select(data, data.places[:, 0] == 0, "column").labels == (
         "(0,0)", "(0,1)", "(0,2)",
     )  # fmt: skip
-    with pytest.raises(FitError, match="nine: errors must be above 0"):
+    with pytest.raises(FitError, match=r"nine: .*above 0"):
         area_data("nine", a, 0 * a)
-    with pytest.raises(FitError, match="holds nothing to fit"):
+    with pytest.raises(FitError, match="nine: no values"):
         area_data("nine", np.nan * a, a)
-    with pytest.raises(FitError, match=r"must be \(ny, nx\)"):
+    with pytest.raises(FitError, match=r"must both be \(ny, nx\)"):
         area_data("nine", a, a[0])

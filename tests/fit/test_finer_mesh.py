@@ -77,10 +77,7 @@ def test_a_fit_ends_at_the_device_and_the_table_of_the_finer_mesh(tmp_path, kept
     found.write(written)
     assert FitResult.read(written).mesh == found.mesh
     assert (found.mesh["cells"], found.mesh["finer"]) == (8, 16)
-    told = [
-        note for note in found.notes if "16 cells a pixel, their derivatives of 8" in note
-    ]
-    assert len(told) == 1 and f"(0,1) {ratio[1, 0]:.3f}" in told[0]
+    assert sum(f"(0,1) {ratio[1, 0]:.3f}" in note for note in found.notes) == 1
 
 
 @pytest.mark.slow
@@ -119,9 +116,7 @@ def test_values_are_the_finer_mesh_s_and_solved_once(kept, monkeypatch):
 
 @pytest.mark.parametrize("cells", [16, 8, 33])
 def test_the_finer_mesh_must_be_finer_and_even(cells):
-    with pytest.raises(
-        FitError, match=f"finer = {cells} cells a pixel must be even and above"
-    ):
+    with pytest.raises(FitError, match=f"finer = {cells} .* even and above the 16"):
         Finer(lambda values: None, DEVICE, FREE, (HERE,), cells, 16)
     nothing = Finer(lambda values: None, DEVICE, FREE, (HERE,), 32, 16)
     with pytest.raises(FitError, match="nothing was solved"):

@@ -93,13 +93,13 @@ def test_what_is_said():
 def test_damaged_results_are_refused(tmp_path):
     path = tmp_path / "fit.json"
     path.write_text("{")
-    with pytest.raises(FitError, match="not readable as a fit"):
+    with pytest.raises(FitError, match=r"fit\.json: "):
         FitResult.read(path)
     path.write_text('{"schema": "other"}')
     with pytest.raises(FitError, match="its schema is 'other'"):
         FitResult.read(path)
     path.write_text('{"schema": "bfsensor device fit 1"}')
-    with pytest.raises(FitError, match="not a whole fit: KeyError"):
+    with pytest.raises(FitError, match=r"fit\.json: .*KeyError"):
         FitResult.read(path)
 
 
@@ -149,7 +149,7 @@ def test_a_tie_of_two_is_found_where_it_is():
     tied = np.column_stack([one, -2 * one + 0.2 * other, third])
     ties, silent = find_ties(names, tied)
     assert silent == () and len(ties) == 1
-    assert ties[0].startswith("gate oxide and thickness (the other way) together")
+    assert ties[0].startswith("gate oxide and thickness (opposite sign)")
     assert find_ties(names, np.column_stack([one, other, third]))[0] == ()
     # The tied direction is worse known than either of two untied ones.
     known = principal(np.linalg.inv(np.eye(3) + tied.T @ tied))
@@ -158,12 +158,12 @@ def test_a_tie_of_two_is_found_where_it_is():
 
 
 def test_a_profile_of_what_is_held_is_refused():
-    with pytest.raises(FitError, match="gate_oxide is not free, and has no profile"):
+    with pytest.raises(FitError, match=r"gates\.gate_oxide .*free are silicon"):
         run(profiles=["gates.gate_oxide"])
 
 
 def bent(emulator, values):
-    """A truth that is not straight: shifts grow with the square of the first parameter besides."""
+    """Shifts with a term that is quadratic in the first parameter."""
     by = (values[0] - MEANS[0]) / SPREADS[0]
     return tuple((1 + 0.15 * by + 0.08 * by**2) * e for e in emulator.edges)
 
@@ -218,7 +218,7 @@ def test_a_step_to_where_there_is_no_device_is_halved():
             raise FitError("no such device")
         return emulator
 
-    with pytest.raises(FitError, match="leads to where the device has no solution"):
+    with pytest.raises(FitError, match="no solution"):
         fit_device(DEVICE, [data], PRIORS, None, linearise=nowhere)
 
 
@@ -247,14 +247,14 @@ def test_devices_drawn_from_the_posterior_widen_it():
     emulator, asked = toy_emulator(), []
 
     def solved(values):
-        """The toy with a_ij that bend with the thickness, which its tangent does not know."""
+        """The toy with a_ij quadratic in the thickness, unlike its linear predictions."""
         asked.append(values)
         bend = 0.02 * ((values[0] - MEANS[0]) / SPREADS[0]) ** 2
         return replace(emulator, edges=tuple((1 + bend) * e for e in emulator.edges))
 
     plain = run()
     assert plain.posterior["curved"] is False and "solved" not in plain.posterior
-    assert any("do not hold what predictions miss" in note for note in plain.notes)
+    assert any("do not include" in note for note in plain.notes)
     wide = run(solved=solved, draws=9)
     assert len(asked) == 9 and wide.posterior["solved"] == 9
     np.testing.assert_array_equal(wide.value, plain.value)

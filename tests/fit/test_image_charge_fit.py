@@ -20,7 +20,7 @@ def truth(reach=4, depth=100.0):
 
 
 def seconds(model):
-    """What the order after the dipole tells: a^2 - b^2, z_q^2 - (a^2 + b^2) / 2 [um^2]."""
+    """Combinations that the order after the dipole constrains: a^2 - b^2, z_q^2 - (a^2 + b^2) / 2."""
     a2, b2 = model.half_width_x**2, model.half_width_y**2
     return a2 - b2, model.charge_height**2 - 0.5 * (a2 + b2)
 

@@ -123,7 +123,7 @@ def test_refusals():
     with pytest.raises(FitError, match="lags beyond 4 are not predicted"):
         solve(problem(wide))
     saturation = replace(data, kind="saturation")
-    with pytest.raises(FitError, match="toy: nothing predicts saturation"):
+    with pytest.raises(FitError, match=r"toy: .*saturation"):
         problem(saturation)
 
 

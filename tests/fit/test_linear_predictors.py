@@ -74,5 +74,5 @@ def test_diffusion_is_einsteins_in_a_nearly_even_field():
 
 def test_a_device_that_cannot_be_is_refused():
     priors = (Prior("gates.gate_oxide", 0.1, 0.01),)
-    with pytest.raises(FitError, match=r"no such device: .*field_oxide"):
+    with pytest.raises(FitError, match=r"field_oxide"):
         device_at(DEVICE, Condition(), priors, np.array([2.0]))

@@ -23,7 +23,7 @@ def test_tangents_lead_to_neighbours_except_by_what_is_stated():
         told = here.predict(means + step, condition)
         wanted = there.predict(means + step, condition)
         change = wanted.areas - here.predict(means, condition).areas
-        # A fiftieth of a spread: what is bent is a few hundredths of what is straight.
+        # A fiftieth of a spread: the quadratic change is a few hundredths of the linear one.
         np.testing.assert_allclose(
             told.areas, wanted.areas, atol=0.03 * np.abs(change).max()
         )

