@@ -11,7 +11,8 @@ random effects :math:`u`, whose strength is in the modes :math:`M`.  A step mini
 sum of squares
 
 .. math::
-    |y - f(\theta) - L \beta - M u|^2 + |u|^2 + |\theta_\mathrm{prior}|^2 + |t - R (\theta - \theta_0)|^2
+    |y - f(\theta) - L \beta - M u|^2 + |u|^2 + |\theta_\mathrm{prior}|^2
+    + |t - R (\theta - \theta_0)|^2
 
 to first order in :math:`\theta` (Henderson's mixed-model equations).  For given :math:`M` that is
 least squares with the covariance :math:`1 + M M^T` (Woodbury's identity).  The last term is the
@@ -64,8 +65,8 @@ lets fits along flat directions run 4 rounds longer."""
 REFRESHED = 2, 4
 """Rounds, counted from 0, at whose start the modes of the random effects are computed again with
 the parameters of that round; in between they are constant, so that the chi-square of successive
-rounds can be compared.  Chosen: with 4 and 8 a fit that converges within four rounds would keep the modes of
-its starting values."""
+rounds can be compared.  Chosen: with 4 and 8 a fit that converges within four rounds would keep
+the modes of its starting values."""
 
 ANEW, AWAY = 8, 0.1
 """Largest number of times that the modes and the score of the variance parameters are linearised

@@ -1,7 +1,7 @@
-"""Amplitudes constrained by the scatter of values: REML scoring in a fit, likelihood gain before.
+r"""Amplitudes constrained by the scatter of values: REML scoring in a fit, likelihood gain before.
 
 An effect such as turbulence adds :math:`M u` to the whitened values, with unknown
-:math:`u \\sim N(0, 1)` and modes :math:`M` in proportion to its amplitude, a variance parameter.
+:math:`u \sim N(0, 1)` and modes :math:`M` in proportion to its amplitude, a variance parameter.
 Their covariance is :math:`C = 1 + M M^T`, whose inverse and determinant are worked out in the
 space of the modes (Woodbury's identity).
 """
