@@ -65,7 +65,23 @@ class Axes:
 
 
 class ExposureInfo(Protocol):
-    """Header of an exposure as the channels need it [s, nm, V, K, d]; None where not known."""
+    """Header of an exposure as the channels need it; None where a number is not known.
+
+    Attributes
+    ----------
+    number : int
+        Number of the exposure in its campaign.
+    kind : str
+        'bias', 'dark', 'flat', 'spot' or another word, which is not measured.
+    exposure_time, wavelength, back_bias, temperature : float or None
+        Exposure time [s], wavelength [nm], back bias [V], temperature [K].
+    lamp : float or None
+        Reading of the lamp monitor, in proportion to the light per second.
+    mjd : float or None
+        Time at which it was taken [d, MJD].
+    pair : int or None
+        Number of the pair that a flat belongs to.
+    """
 
     @property
     def number(self) -> int: ...
@@ -88,7 +104,23 @@ class ExposureInfo(Protocol):
 
 
 class Frame(Protocol):
-    """One amplifier's frame as the channels need it, arrays in readout order [ADU]."""
+    """One amplifier's frame as the channels need it, arrays in readout order [ADU].
+
+    Attributes
+    ----------
+    name : str
+        Name of the amplifier.
+    pixels : ndarray, shape (rows, columns)
+        The whole frame, with prescan and overscans.
+    mask : ndarray of bool, shape of ``image``
+        Pixels that are not used.
+    image, prescan, serial_overscan, parallel_overscan : ndarray
+        Parts of the frame; of size 0 where there is none.
+    flip_x, flip_y : bool
+        Whether readout runs towards smaller x or y on the sensor.
+    origin : (int, int) or None
+        Lower left corner (x, y) of the image on the sensor [pixel].
+    """
 
     @property
     def name(self) -> str: ...

@@ -146,6 +146,7 @@ def _fit(
         model = found @ basis
         return float(((flat - model) ** 2).sum()), np.asarray(found, float), model
 
+    # Half a pixel for the centre, which is hundreds of pixels away; damping after Marquardt.
     steps = np.array([0.5, 0.5, *(s or 1e-3 * point[2] for s in law.steps)])
     square, found, model = solve(point)
     damping = 1e-3
@@ -160,6 +161,7 @@ def _fit(
         normal = normal / np.outer(scale, scale) + damping * np.eye(len(steps))
         step = np.linalg.solve(normal, slopes @ (flat - model) / scale) / scale
         new = point + step
+        # No period below 2 pixels, the Nyquist limit.
         if not new[2] > 2.0:
             damping *= 8
             continue

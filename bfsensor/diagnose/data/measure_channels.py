@@ -46,7 +46,19 @@ from bfsensor.typing import FloatArray
 
 
 class Source(Protocol):
-    """A campaign that gives exposures in order of time, and reads their frames."""
+    """A campaign that gives exposures in order of time, and reads their frames.
+
+    Attributes
+    ----------
+    exposures : sequence of ExposureInfo
+        Headers of all exposures, in order of time.
+    lamp_error : float
+        Relative error of the lamp monitor, above 0.
+    shape : (int, int)
+        Rows and columns of the sensor.
+    read : callable
+        Returns the frames of an exposure, one for each amplifier, always in the same order.
+    """
 
     @property
     def exposures(self) -> Sequence[ExposureInfo]: ...
@@ -440,7 +452,17 @@ def _shots(
 
 
 def place(image: NDArray[np.floating], frame: Frame, values: FloatArray) -> None:
-    """Copy an amplifier's values, in readout order, to their place in an image of the sensor."""
+    """Copy an amplifier's values, in readout order, to their place in an image of the sensor.
+
+    Parameters
+    ----------
+    image : ndarray, shape (ny, nx)
+        Image of the sensor, changed in place.
+    frame : Frame
+        Gives the origin and the readout directions.
+    values : ndarray, shape of ``frame.image``
+        Values in readout order.
+    """
     values = values[:, ::-1] if frame.flip_x else values
     values = values[::-1] if frame.flip_y else values
     x, y = frame.origin or (0, 0)

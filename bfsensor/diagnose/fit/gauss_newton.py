@@ -141,13 +141,15 @@ class Steps:
         self.count, self._priors = len(predictor.names), len(predictor.prior_rows)
         self.effect = np.char.startswith(np.array(predictor.names, str), "effect ")
         self._shape = predictor.shapes()
-        # With effects on flats means depend on gains, as they do not without.
+        # An effect in electrons on means of flats [ADU] makes them depend on the gains, whose
+        # derivatives are then found again in each round, too.
         flats = any("flat_mean" in e.touches for e in predictor.effects)
         gains = np.char.startswith(np.array(predictor.names, str), "gain ")
         self._anew = self.effect | (gains & flats)
         self.point = predictor.start.astype(float).copy()
         self.slopes = np.zeros((self.total, self.count))
-        # Where flats fill up, what the device did to their covariances is gone.
+        # At full well covariances no longer depend on the device: derivatives of a fit without
+        # saturation do not hold.
         full = any(np.isfinite(e.law().full_well) for e in predictor.effects)
         self._borrowed = slopes is not None and not full
         self._chance = any(type(e).modes is not Effect.modes for e in predictor.effects)
