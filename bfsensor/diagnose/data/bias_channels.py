@@ -21,15 +21,16 @@ by a particle.  Chosen: Gaussian noise exceeds 6 once in 5e8 pixels; with 12, pi
 sigma would stay in the noise and not be counted."""
 
 TRACK = 20.0
-"""Deviation of a pixel of a bias [sigma] above which it has no part in the bias level.  Chosen: above
-the charge that spots leave behind, so that persistence stays in the level; with 40 tracks of 20 to
-40 sigma are in it, too."""
+"""Deviation of a pixel of a bias [sigma] above which it has no part in the bias level.  Chosen:
+above the charge that spots leave behind, so that persistence stays in the level; with 40 tracks
+of 20 to 40 sigma are in it, too."""
 
 UNEVEN = 1.25
-"""Robust scatter of a dark's columns over that expected from noise, above which their own scatter is
-taken for their error.  Chosen, to be derived: the scatter by median deviations of n columns is
-known to 1.17 / n^(1/2), so that 1.25 is 2.4 sigma for 128 columns (reached by noise in 0.8 % of
-amplifiers) and 4.8 for 512; with 1.5, columns uneven by as much as noise would be findings."""
+"""Robust scatter of a dark's columns over that expected from noise, above which their own
+scatter is taken for their error.  Chosen, to be derived: the scatter by median deviations of n
+columns is known to 1.17 / n^(1/2), so that 1.25 is 2.4 sigma for 128 columns (reached by noise
+in 0.8 % of amplifiers) and 4.8 for 512; with 1.5, columns uneven by as much as noise would be
+findings."""
 
 HOT = 10.0
 """Excess of a column of an image of spots, beyond one sigma of the noise of a pixel, above which it
@@ -37,17 +38,18 @@ is hot [sigma of a column's mean].  Chosen: spots raise a column's median by hal
 pixel; with 20, hot columns of 64 pixels must be 1.6 times as bright to be removed."""
 
 STANDS_OUT = 5.0
-"""Significance [sigma] above which a covariance of the noise, or an excess of rows or columns, enters
-the errors.  Chosen: noise exceeds 5 at one in 2e6 lags; with 10 weaker correlations are left out of
-the errors, which are then too small."""
+"""Significance [sigma] above which a covariance of the noise, or an excess of rows or columns,
+enters the errors.  Chosen: noise exceeds 5 at one in 2e6 lags; with 10 weaker correlations are
+left out of the errors, which are then too small."""
 
 FRAME_ERROR = 0.1
-"""Scatter of the bias level from frame to frame that is no finding [ADU].  Chosen, to be derived from
-quiet systems: with 0.2, scatter of the level below 0.2 ADU could hardly be found."""
+"""Scatter of the bias level from frame to frame that is no finding [ADU].  Chosen, to be derived
+from quiet systems: with 0.2, scatter of the level below 0.2 ADU could hardly be found."""
 
 LEVEL_ERROR = 0.05
 """Systematic difference between the overscan's level and the image's that is no finding [ADU].
-Chosen, to be derived from quiet systems: with 0.1, differences below 0.1 ADU could hardly be found."""
+Chosen, to be derived from quiet systems: with 0.1, differences below 0.1 ADU could hardly be
+found."""
 
 
 class BiasChannels:

@@ -20,13 +20,14 @@ lowest bits, whose codes flats of 1.25 periods width visit alike; with 128, only
 width, four times the signal, could be used."""
 
 BITS = (6, 7, 8, 9, 10)
-"""Bits by which multiples of :data:`PERIOD` are separated, 10 and higher ones together.  Chosen: each
-higher bit has half as many multiples; with twice as many bits, up to 15, the highest has one
-multiple in a converter of 16 bits."""
+"""Bits by which multiples of :data:`PERIOD` are separated, 10 and higher ones together.  Chosen:
+each higher bit has half as many multiples; with twice as many bits, up to 15, the highest has
+one multiple in a converter of 16 bits."""
 
 BELOW = (1, 2)
-"""Distances below a multiple of the codes that are counted.  Chosen: a wrong weight of a bit by up to
-2 codes widens or skips these; with (1, 2, 3, 4) errors to 4 codes are described, with more noise."""
+"""Distances below a multiple of the codes that are counted.  Chosen: a wrong weight of a bit by
+up to 2 codes widens or skips these; with (1, 2, 3, 4) errors to 4 codes are described, with more
+noise."""
 
 # A mean over one period, with half a weight at both ends: exact for any pattern of that period.
 _BOX = np.concatenate([[0.5], np.ones(PERIOD - 1), [0.5]]) / PERIOD
@@ -47,8 +48,8 @@ derived from halos: it is 0.2 ADU of 40,000; with 1e-5, crosstalk below 1e-5 cou
 
 
 PILE = 16
-"""Range of codes [ADU] within which full pixels lie.  Chosen: wider than read noise of a few ADU; with
-32 a pile must hold twice as many pixels to be recognised."""
+"""Range of codes [ADU] within which full pixels lie.  Chosen: wider than read noise of a few
+ADU; with 32 a pile must hold twice as many pixels to be recognised."""
 
 
 def _piled(counts: NDArray[np.int64], width: float) -> bool:
@@ -62,9 +63,9 @@ def _piled(counts: NDArray[np.int64], width: float) -> bool:
 
 
 TAIL = 2.75
-"""Distance from the middle of a flat's codes [sigma] beyond which its two tails are compared.  Chosen:
-0.3 % of the pixels lie in each, so that full wells up to 2.75 sigma above the mean are recognised;
-with 5.5 hardly any pixel does."""
+"""Distance from the middle of a flat's codes [sigma] beyond which its two tails are compared.
+Chosen: 0.3 % of the pixels lie in each, so that full wells up to 2.75 sigma above the mean are
+recognised; with 5.5 hardly any pixel does."""
 
 
 def _cut_off(codes: NDArray[np.float32], middle: float, width: float) -> bool:

@@ -145,8 +145,9 @@ class Frame(Protocol):
 
 
 HELD = 5
-"""One in so many exposures of a kind (other than flats) is held out, the fourth first, if there are
-at least twice as many.  Chosen: with 10, half as many are held out, of kinds with 20 or more."""
+"""One in so many exposures of a kind (other than flats) is held out, the fourth first, if there
+are at least twice as many.  Chosen, to be derived: with 10, half as many are held out, of kinds
+with 20 or more."""
 
 
 def is_held_out(place: int, count: int) -> bool:

@@ -15,12 +15,13 @@ from bfsensor.measure.flat_pairs import flat_covariances
 from bfsensor.typing import FloatArray
 
 LAGS = 4
-"""Largest lag of the covariances of flats [pixel].  Chosen: 25 lags hold most of the effect; with 8,
-81 lags are measured, those beyond 4 mostly noise, and errors take ten times the memory."""
+"""Largest lag of the covariances of flats [pixel].  Chosen: 25 lags hold most of the effect;
+with 8, 81 lags are measured, those beyond 4 mostly noise, and errors take ten times the memory."""
 
 TAIL = 8
-"""Number of last pixels of an overscan that define the zero of its profile.  Chosen: charge deferred
-by more pixels is taken for zero level; with 16, overscans up to 16 pixels deep have no profile."""
+"""Number of last pixels of an overscan that define the zero of its profile.  Chosen: charge
+deferred by more pixels is taken for zero level; with 16, overscans up to 16 pixels deep have no
+profile."""
 
 UNEVEN = 1.25
 """Variance of overscan profiles between exposures over that of white noise, above which it scales
@@ -29,7 +30,8 @@ amplitude; with 1.5, 22 %."""
 
 LAMP_UNKNOWN = 0.02
 """Relative error of the light of an exposure without a lamp monitor.  Chosen, to be derived from
-shutters and lamps: deviations from linearity below 2 % are then no findings; with 0.04, below 4 %."""
+shutters and lamps: deviations from linearity below 2 % are then no findings; with 0.04, those
+below 4 %."""
 
 
 @dataclass

@@ -17,14 +17,15 @@ Flat = tuple[ExposureInfo, Sequence[Frame]]
 """A flat with the frames of all amplifiers."""
 
 UNEQUAL = 0.05
-"""Relative difference of two levels above which flats make no pair.  The part of the fixed pattern
-that is not in proportion to the light stays in their difference, in proportion to that of the
-levels.  Chosen: ``bfsensor check`` warns above 0.02; with 0.1, up to twice as much pattern stays."""
+"""Relative difference of two levels above which flats make no pair.  The part of the fixed
+pattern that is not in proportion to the light stays in their difference, in proportion to that
+of the levels.  Chosen: ``bfsensor check`` warns above 0.02; with 0.1, up to twice as much
+pattern stays."""
 
 FAR = 2.5
-"""Distance of lags [pixel] beyond which the brighter-fatter effect is negligible for this comparison.
-Measured (validation/results/real_lags.ecsv): a_ij there are below 1.3e-8 per electron in both LSST
-sensors, so that correlations are below 1.3e-3 at 1e5 e-."""
+"""Distance of lags [pixel] beyond which the brighter-fatter effect is negligible for this
+comparison.  Measured (validation/results/real_lags.ecsv): a_ij there are below 1.3e-8 per
+electron in both LSST sensors, so that correlations are below 1.3e-3 at 1e5 e-."""
 
 RATIO = (0.45, 2.2)
 """Range of the ratio of two levels within which flats of unlike exposure are compared.  Chosen: it
@@ -32,8 +33,9 @@ holds neighbours in a series of levels by factors of two; with a factor of 4.4 t
 noise dominates, and the pattern is seen less."""
 
 RISE = 5.0
-"""Significance [sigma] of the mean correlation of the far lags above which a fixed pattern counts as
-seen.  Chosen: noise reaches 5 in 3e-7 of pairs; with 10, patterns half as strong pass unseen."""
+"""Significance [sigma] of the mean correlation of the far lags above which a fixed pattern
+counts as seen.  Chosen: noise reaches 5 in 3e-7 of pairs; with 10, patterns must be twice as
+strong to be seen."""
 
 
 @dataclass(frozen=True)

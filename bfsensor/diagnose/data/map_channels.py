@@ -29,8 +29,8 @@ BLOCKS = 16
 columns and rows; with 32, 961, whose covariance matrix is 18 times as large."""
 
 RINGS = 24
-"""Number of bins of the spatial frequency, from 0 to half a cycle per pixel.  Chosen: with 48, rings
-have half the modes, and errors of their power are 1.4 times as large."""
+"""Number of bins of the spatial frequency, from 0 to half a cycle per pixel.  Chosen: with 48,
+rings have half the modes, and errors of their power are 1.4 times as large."""
 
 FULL = 0.5
 """Relative variance times level of a flat, in units of the median of fainter ones, below which its
@@ -47,13 +47,13 @@ LONG = 4
 of a pair.  Chosen: with 8, a quarter of the modes are left to measure it."""
 
 CERTAIN = 5.0
-"""Significance [sigma] above which large-scale noise is added to the errors.  Chosen: noise exceeds 5
-in 3e-7 of maps; with 10, weaker fluctuations of the light are no part of the errors."""
+"""Significance [sigma] above which large-scale noise is added to the errors.  Chosen: noise
+exceeds 5 in 3e-7 of maps; with 10, weaker fluctuations of the light are no part of the errors."""
 
 SHORT = 0.25
-"""Part of the longest exposure time of a condition below which flats count as short: their map is
-divided by that of the longer ones, to find the shutter's pattern.  Chosen: with 0.5 more flats count
-as short, in which that pattern, in proportion to 1 / time, is weaker."""
+"""Part of the longest exposure time of a condition below which flats count as short: their map
+is divided by that of the longer ones, to find the shutter's pattern.  Chosen: with 0.5 more
+flats count as short, in which that pattern, in proportion to 1 / time, is weaker."""
 
 
 class MapShare(NamedTuple):

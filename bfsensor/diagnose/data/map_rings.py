@@ -11,17 +11,18 @@ from scipy.optimize import least_squares
 from bfsensor.typing import FloatArray
 
 HIGHEST = 0.2
-"""Highest frequency of rings that is searched [1/pixel].  Chosen: periods from 5 pixels on; with 0.4,
-from 2.5 pixels on, in twice the time."""
+"""Highest frequency of rings that is searched [1/pixel].  Chosen: periods from 5 pixels on; with
+0.4, from 2.5 pixels on, in twice the time."""
 
 ORDERS = 7
-"""Order of the polynomial in radius that the phase is fitted by.  Chosen: its derivative has up to
-six zeros, about three sways of the spacing; with 14, it also follows noise at the profile's ends."""
+"""Order of the polynomial in radius that the phase is fitted by.  Chosen: its derivative has up
+to six zeros, about three sways of the spacing; with 14, it also follows noise at the profile's
+ends."""
 
 CLEARER = 30.0
-"""Decrease of the chi-square by unevenly spaced rings, beyond that by an even change of the spacing,
-above which they are returned.  Chosen: two more parameters gain 30 by noise with probability 3e-7;
-with 60, weaker sways begin as even rings."""
+"""Decrease of the chi-square by unevenly spaced rings, beyond that by an even change of the
+spacing, above which they are returned.  Chosen, to be derived: two more parameters gain 30 by
+noise with probability 3e-7; with 60, weaker sways begin as even rings."""
 
 
 class RingLaw(NamedTuple):
@@ -35,12 +36,12 @@ class RingLaw(NamedTuple):
 
 
 EVEN = RingLaw(("period", "chirp"), (0.0, 1e-3))
-"""Rings whose frequency changes linearly with radius.  Steps are chosen small against the parameters;
-twice as large, derivatives are off by twice as much, and fits take a round more."""
+"""Rings whose frequency changes linearly with radius.  Steps are chosen small against the
+parameters; twice as large, derivatives are off by twice as much, and fits take a round more."""
 
 UNEVEN = RingLaw(("period", "sway", "length", "sway_phase"), (0.0, 1e-3, 0.3, 1e-3))
-"""Rings whose spacing varies sinusoidally with radius, over a length [pixel].  Steps are chosen like
-those of :data:`EVEN`."""
+"""Rings whose spacing varies sinusoidally with radius, over a length [pixel].  Steps are chosen
+like those of :data:`EVEN`."""
 
 
 def turns_of(

@@ -17,12 +17,12 @@ ORDER = 4
 Chosen: with 8, waves of half a side and longer are removed, too."""
 
 SHORTEST = 5.0
-"""Period [pixel] of the shortest waves that are searched.  Chosen: with 10, fringes and rings of 5 to
-10 pixels have no starting point in the data."""
+"""Period [pixel] of the shortest waves that are searched.  Chosen: with 10, fringes and rings of
+5 to 10 pixels have no starting point in the data."""
 
 LARGEST = 1024
-"""Side [pixel] of the middle part of a sensor that is searched.  Chosen: it is enough for a starting
-point; with 2048 the search takes four times as long, and weaker waves are found."""
+"""Side [pixel] of the middle part of a sensor that is searched.  Chosen: it is enough for a
+starting point; with 2048 the search takes four times as long, and weaker waves are found."""
 
 GAIN = 35.0
 """Decrease of the chi-square above which a wave is returned.  Derived: a chi-square of seven
@@ -139,7 +139,8 @@ def find_patterns(
         gain = float(
             (values**2).sum() - ((values - _model(wave, *_grid(values))[0]) ** 2).sum()
         )
-        # Chosen: windows of one wave lead to gains that agree to 5 %; two waves rarely do.
+        # Chosen, to be derived: windows of one wave lead to gains that agree to 5 %; two waves
+        # rarely do.
         like = any(abs(gain - g) < 0.05 * g for g, _ in out)
         if gain > GAIN and not like:
             out.append((gain, wave))
@@ -267,8 +268,8 @@ def _follow(values: FloatArray, start: Wave) -> Wave | None:
         wave = fitted
         if reach > max(ny, nx):
             return wave
-        # Chosen: 1.4 doubles the area; much farther the extrapolated phase may be off by half a
-        # turn and the fit lose the wave.
+        # Chosen, to be derived: 1.4 doubles the area; much farther the extrapolated phase may be off
+        # by half a turn and the fit lose the wave.
         reach, bent = 1.4 * reach, True
 
 

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
 
 COLLAPSED = 0.5
-"""Variance over that expected from fainter flats below which pixels are full.  Chosen, to be derived:
-the brighter-fatter effect takes a fifth at most at a full well of 1e5 e-; with 1 every flat with
-that effect would count as full."""
+"""Variance over that expected from fainter flats below which pixels are full.  Chosen, to be
+derived: the brighter-fatter effect takes a fifth at most at a full well of 1e5 e-; with 1 every
+flat with that effect would count as full."""
 
 WEAK = 0.4
-"""Part of the levels, the lowest, whose median of variance over level is the expected one.  Chosen:
-with 0.8 levels at full well may be among them, and make the expected variance too low."""
+"""Part of the levels, the lowest, whose median of variance over level is the expected one.
+Chosen, to be derived: with 0.8 levels at full well may be among them, and make the expected
+variance too low."""
 
 NEARLY = 0.8
 """Part of the full well that the peak of a spot may reach to be fitted.  Chosen, to be derived: the

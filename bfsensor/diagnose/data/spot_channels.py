@@ -15,30 +15,31 @@ from bfsensor.measure.spots import SpotList, cut_stamps, find_spots
 from bfsensor.typing import FloatArray
 
 STAMP = 11
-"""Side of the stamps in which spots are fitted [pixel].  Chosen: it holds a Gaussian of sigma 1.2 pixels
-to 1e-5; with 21 wings beyond a Gaussian would widen the fitted spots."""
+"""Side of the stamps in which spots are fitted [pixel].  Chosen: it holds a Gaussian of sigma
+1.2 pixels to 1e-5; with 21 wings beyond a Gaussian would widen the fitted spots."""
 
 WING = 21
-"""Side of the larger stamps whose sum is a spot's flux [pixel].  Chosen: with 41 those of neighbours 30
-pixels apart overlap."""
+"""Side of the larger stamps whose sum is a spot's flux [pixel].  Chosen: with 41 those of
+neighbours 30 pixels apart overlap."""
 
 REPEATS = 8
 """Degrees of freedom (exposures of equal light less one per group) above which the fluxes' scatter
 between exposures is their error.  Chosen: the scatter is then known to 25 %; with 16, to 18 %."""
 
 CLIP = 8.0
-"""Median deviations above which a pixel of a stamp's rim has no part in the background.  Chosen: 5.4
-sigma of Gaussian noise, exceeded by 7e-8 of pixels; with 16, faint tracks raise the background."""
+"""Median deviations above which a pixel of a stamp's rim has no part in the background.  Chosen:
+5.4 sigma of Gaussian noise, exceeded by 7e-8 of pixels; with 16, faint tracks raise the
+background."""
 
 QUIET = 2.0
-"""Smallest median deviation of a pixel that is used for that [e-].  Derived: 0.6745 of a read noise of
-3 e-, so that noiseless predictions are clipped like recordings; with 4, wings of up to 32 e- per
-pixel would count in the background."""
+"""Smallest median deviation of a pixel that is used for that [e-].  Derived: 0.6745 of a read
+noise of 3 e-, so that noiseless predictions are clipped like recordings; with 4, wings of up to
+32 e- per pixel would count in the background."""
 
 WING_ERROR = 2e-4
-"""Systematic error of the part of a spot's flux outside its stamp.  Chosen, to be derived: 0.1 e- of
-background in each of the 320 pixels, over a flux of 1.6e5 e-; with 4e-4, wings below that part
-could hardly be found."""
+"""Systematic error of the part of a spot's flux outside its stamp.  Chosen, to be derived: 0.1
+e- of background in each of the 320 pixels, over a flux of 1.6e5 e-; with 4e-4, wings below that
+part could hardly be found."""
 
 
 class SpotChannels:

@@ -16,13 +16,14 @@ deviations].  Chosen: noise never reaches 20; with 40 the outer pixels of spots 
 less persistence is seen."""
 
 CERTAIN = 5.0
-"""Significance [sigma] of the lit pixels' mean excess above which a frame holds persistence.  Chosen:
-noise exceeds 5 in 3e-7 of frames; with 10, frames with up to twice as much persistence stay in the
-mean bias and the read noise."""
+"""Significance [sigma] of the lit pixels' mean excess above which a frame holds persistence.
+Chosen: noise exceeds 5 in 3e-7 of frames; with 10, frames with up to twice as much persistence
+stay in the mean bias and the read noise."""
 
 LEAST = 4
-"""Number of biases before any spots below which all biases are used.  Chosen: two differences for the
-read noise need four; with 8, campaigns with 4 to 7 early biases use those with persistence."""
+"""Number of biases before any spots below which all biases are used.  Chosen: two differences
+for the read noise need four; with 8, campaigns with 4 to 7 early biases use those with
+persistence."""
 
 Read = Callable[[ExposureInfo], Sequence[Frame]]
 """Function that returns the frames of an exposure, one for each amplifier."""

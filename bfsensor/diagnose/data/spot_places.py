@@ -11,13 +11,13 @@ from scipy.spatial import cKDTree
 from bfsensor.typing import FloatArray
 
 NEAR = 3.0
-"""Distance up to which spots of two exposures belong to the same pinhole [pixel].  Chosen: larger than
-dithers within a pixel, smaller than half the pitch of spots; with 6, another pinhole up to 6 pixels
-away is taken for the same one where that is missing."""
+"""Distance up to which spots of two exposures belong to the same pinhole [pixel].  Chosen:
+larger than dithers within a pixel, smaller than half the pitch of spots; with 6, another pinhole
+up to 6 pixels away is taken for the same one where that is missing."""
 
 LEAST = 4
-"""Number of common pinholes below which no widening is computed.  Chosen: with 8, exposures with 4 to 7
-common pinholes are predicted without it."""
+"""Number of common pinholes below which no widening is computed.  Chosen: with 8, exposures with
+4 to 7 common pinholes are predicted without it."""
 
 
 PIXEL = 1 / 12

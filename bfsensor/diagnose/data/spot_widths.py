@@ -11,12 +11,12 @@ from bfsensor.errors import ConvergenceError
 from bfsensor.typing import FloatArray
 
 ROUNDS = 40
-"""Largest number of Gauss-Newton rounds; beyond it :class:`ConvergenceError` is raised.  Chosen: with 80
-a fit that fails takes twice the time."""
+"""Largest number of Gauss-Newton rounds; beyond it :class:`ConvergenceError` is raised.  Chosen:
+with 80 a fit that fails takes twice the time."""
 
 TOLERANCE = 1e-7
-"""Largest last step of widths and centres [pixel] at convergence.  Chosen: far below errors of measured
-widths; with 2e-7 derivatives of widths by finite differences are twice as inexact."""
+"""Largest last step of widths and centres [pixel] at convergence.  Chosen: far below errors of
+measured widths; with 2e-7 derivatives of widths by finite differences are twice as inexact."""
 
 # Profiles along an axis: integral, its derivatives by centre and by width, one.
 _INTEGRAL, _CENTRE, _WIDTH, _ONE = range(4)

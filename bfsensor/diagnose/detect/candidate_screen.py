@@ -31,8 +31,9 @@ with 4, screens take up to twice as long, and minima near a third or fourth star
 
 MANY, LIKELY = 8, 6
 """Number of starting points above which they are first ranked in one channel of those below, and
-number of those that are then compared in all channels.  Chosen: with 16 and 12 about twice as many
-predictions of all channels are made; a start that one channel ranks seventh is then kept."""
+number of those that are then compared in all channels.  Chosen, to be derived: with 16 and 12
+about twice as many predictions of all channels are made; a start that one channel ranks seventh
+is then kept."""
 
 TELLING = "code_hist", "bias_cov", "flat_map"
 """Channels that are fast to predict and separate many starting points of one effect (bits, rows,
@@ -50,10 +51,11 @@ Chosen, to be derived: with 10 (s = 0.002 % of R) candidates below the limit for
 lower in logarithmic evidence against those that are fitted."""
 
 SCATTERED = 6.0
-"""Twice the logarithm of the likelihood ratio by scatter alone, at least which an effect with random
-effects is ranked by its likelihood and not fitted by its mean change.  Chosen, to be derived: for
-one amplitude at its bound noise exceeds 6 with probability 0.7 % (half a chi-square of one degree
-of freedom); with 12 (0.03 %), more effects of weak scatter would be fitted by their means alone."""
+"""Twice the logarithm of the likelihood ratio by scatter alone, at least which an effect with
+random effects is ranked by its likelihood and not fitted by its mean change.  Chosen, to be
+derived: for one amplitude at its bound noise exceeds 6 with probability 0.7 % (half a chi-square
+of one degree of freedom); with 12 (0.03 %), more effects of weak scatter would be fitted by
+their means alone."""
 
 STEP = 0.02
 """Step of finite differences, relative to a parameter.  Chosen: a curvature as large as the slope

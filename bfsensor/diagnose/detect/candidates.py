@@ -40,8 +40,8 @@ named hypotheses about the baseline are fitted jointly.  Chosen, to be derived: 
 0.3 % of parameters are as far; with 6, exchanged axes that pull the device by less are missed."""
 
 REFITTED = 5
-"""Largest number of candidates that are fitted again jointly.  Chosen: with 10 the joint fits of one
-step take up to twice as long."""
+"""Largest number of candidates that are fitted again jointly.  Chosen, to be derived: with 10
+the joint fits of one step take up to twice as long."""
 
 
 def candidates_of(baseline: Baseline) -> tuple[type[Effect], ...]:

@@ -19,8 +19,8 @@ from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 from bfsensor.typing import FloatArray
 
 DRAWS = 500
-"""Number of draws of noise that calibrate the largest of all statistics.  Chosen: 100 of them lie in
-the tail beyond the 80 % quantile, whose scale is then good to 10 %; with 1000, to 7 %."""
+"""Number of draws of noise that calibrate the largest of all statistics.  Chosen: 100 of them
+lie in the tail beyond the 80 % quantile, whose scale is then good to 10 %; with 1000, to 7 %."""
 
 ALARM = 0.01
 """Family-wise probability, under noise alone, below which a mismatch counts as detected.  Chosen as
@@ -49,8 +49,8 @@ BLOCK = 4_000_000
 12 bytes, so that 48 MB are held twice, 100 MB, while it is made; twice as many take 200 MB."""
 
 SMALLEST = 1e-30
-"""Smallest probability that is returned.  Chosen: an exponential tail is not known farther out; with
-2e-30 reports of very clear findings would say that."""
+"""Smallest probability that is returned.  Chosen: an exponential tail is not known farther out;
+with 2e-30 reports of very clear findings would say that."""
 
 
 @dataclass(frozen=True)

@@ -16,13 +16,14 @@ OCTAVES = 4
 has four times as many; with 8, down to 1/256 of a side, there would be 87,380."""
 
 LENGTHS = 1.5, 4.0
-"""Decay lengths of a distortion beside a boundary [pixel].  Chosen: a distortion of length a has the
-part 2 (a b)^(1/2) / (a + b) of its significance in the template of length b, at least 0.97 between
-these two; with 3 and 8, one of 1.5 pixels would have 0.94, and one of 8 pixels 1 instead of 0.94."""
+"""Decay lengths of a distortion beside a boundary [pixel].  Chosen: a distortion of length a has
+the part 2 (a b)^(1/2) / (a + b) of its significance in the template of length b, at least 0.97
+between these two; with 3 and 8, one of 1.5 pixels would have 0.94, and one of 8 pixels 1 instead
+of 0.94."""
 
 REACH = 1.5
-"""Reported half-width of a boundary, in decay lengths.  Derived: it holds 1 - exp(-2 * 1.5) = 95 % of
-the square of exp(-|x| / length); twice as large, 99.8 %."""
+"""Reported half-width of a boundary, in decay lengths.  Derived: it holds 1 - exp(-2 * 1.5) = 95
+% of the square of exp(-|x| / length); twice as large, 99.8 %."""
 
 
 def own_shapes(g: Group) -> Iterator[Pattern]:

@@ -15,8 +15,8 @@ from bfsensor.diagnose.data.exposure_info import NUMBERS, condition_at, label_of
 from bfsensor.typing import FloatArray
 
 TOGETHER = 300_000
-"""Numbers in the patterns that are whitened at a time.  Chosen: they take about 10 MB; twice as many
-take 20 MB and no less time."""
+"""Numbers in the patterns that are whitened at a time.  Chosen: they take about 10 MB; twice as
+many take 20 MB and no less time."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,27 +53,27 @@ chi-square within :data:`NO_HARM`, the step is refused.  Chosen: twice as many w
 from 1/32 to 1/512, for which a linear model promises 6 to 0.4 % of the full step's gain."""
 
 MISLED = 2
-"""Lengths of a step (1 and 1/2) that are tried with derivatives borrowed from another fit; if both
-fail, the fit finds its own derivatives.  Chosen: with 4, two more predictions are spent before
-that; the point where the fit ends hardly depends on it."""
+"""Lengths of a step (1 and 1/2) that are tried with derivatives borrowed from another fit; if
+both fail, the fit finds its own derivatives.  Chosen, to be derived: with 4, two more
+predictions are spent before that; the point where the fit ends hardly depends on it."""
 
 STALLED = 4
 """Last rounds among which the chi-square must have changed by at least twice :data:`NO_HARM`;
-otherwise no further step is taken, however many errors long it would be.  Chosen: twice as large
-lets fits along flat directions run 4 rounds longer."""
+otherwise no further step is taken, however many errors long it would be.  Chosen, to be derived:
+twice as large lets fits along flat directions run 4 rounds longer."""
 
 REFRESHED = 2, 4
 """Rounds, counted from 0, at whose start the modes of the random effects are computed again with
 the parameters of that round; in between they are constant, so that the chi-square of successive
-rounds can be compared.  Chosen: with 4 and 8 a fit that converges within four rounds would keep
-the modes of its starting values."""
+rounds can be compared.  Chosen, to be derived: with 4 and 8 a fit that converges within four
+rounds would keep the modes of its starting values."""
 
 ANEW, AWAY = 8, 0.1
 """Largest number of times that the modes and the score of the variance parameters are linearised
 again after the steps have converged, and the distance [standard errors] of such a parameter from
-the last point of linearisation above which that is done.  Chosen: after twice as many times, or
-within 0.2 errors, an estimate may differ by the curvature of the restricted likelihood, of second
-order in that distance."""
+the last point of linearisation above which that is done.  Chosen, to be derived: after twice as
+many times, or within 0.2 errors, an estimate may differ by the curvature of the restricted
+likelihood, of second order in that distance."""
 
 SMALL = 0.05
 """Largest step of any parameter [standard errors] at which the fit has converged; that step is
@@ -91,9 +91,9 @@ of 1 is what noise makes of one free parameter; with 2, residuals would be proje
 model that missed the minimum by up to 1.4 errors."""
 
 POOR = 0.5
-"""Part of the promised decrease of the chi-square that a round must reach; otherwise derivatives by
-all parameters, not only by those of effects, are found again in the next round.  Chosen: with 1
-they are found in most rounds, which costs time and no accuracy."""
+"""Part of the promised decrease of the chi-square that a round must reach; otherwise derivatives
+by all parameters, not only by those of effects, are found again in the next round.  Chosen, to
+be derived: with 1 they are found in most rounds, which costs time and no accuracy."""
 
 Seen = tuple[list[FloatArray], FloatArray]
 """Predictions of each channel, and the whitened residuals of all."""
