@@ -1,1 +1,1 @@
-"""From exposures to channels: numbers with errors, and where each belongs."""
+"""Measurement of a campaign's exposures: channels of values with errors and coordinates."""

@@ -1,4 +1,4 @@
-"""Frames without light: noise in readout order, bias levels and rows, darks, tracks of particles."""
+"""Channels of biases and darks: noise covariance in readout order, bias levels, rows, dark current."""
 
 from __future__ import annotations
 
@@ -16,30 +16,55 @@ from bfsensor.effects.read_noise import READOUT_LAGS, near_lags
 from bfsensor.typing import FloatArray
 
 OUTLIER = 6.0
-"""Deviation [sigma] from which a pixel of a dark or bias counts as struck: one in 5e8 by noise."""
+"""Deviation of a pixel of a bias or dark [sigma, at least 0.3 ADU] above which it counts as struck
+by a particle.  Chosen: Gaussian noise exceeds 6 once in 5e8 pixels; with 12, pixels of 6 to 12
+sigma would stay in the noise and not be counted."""
 
 TRACK = 20.0
-"""Deviation [sigma] from which a pixel has no part in the bias level: more than ghosts of spots."""
+"""Deviation of a pixel of a bias [sigma] above which it has no part in the bias level.  Chosen:
+above the charge that spots leave behind, so that persistence stays in the level; with 40 tracks
+of 20 to 40 sigma are in it, too."""
 
 UNEVEN = 1.25
-"""Scatter of a dark's columns over that of noise from which columns count as uneven by nature:
-four standard deviations of the scatter of 128."""
+"""Robust scatter of a dark's columns over that expected from noise, above which their own
+scatter is taken for their error.  Chosen, to be derived: the scatter by median deviations of n
+columns is known to 1.17 / n^(1/2), so that 1.25 is 2.4 sigma for 128 columns (reached by noise
+in 0.8 % of amplifiers) and 4.8 for 512; with 1.5, columns uneven by as much as noise would be
+findings."""
 
 HOT = 10.0
-"""Deviation of the mean of a column of spots [its sigma] from which it is hot."""
+"""Excess of a column of an image of spots, beyond one sigma of the noise of a pixel, above which it
+is hot [sigma of a column's mean].  Chosen: spots raise a column's median by half a sigma of a
+pixel; with 20, hot columns of 64 pixels must be 1.6 times as bright to be removed."""
 
 STANDS_OUT = 5.0
-"""Deviation [sigma] from which a covariance of the noise counts in the errors of all of them."""
+"""Significance [sigma] above which a covariance of the noise, or an excess of rows or columns,
+enters the errors.  Chosen: noise exceeds 5 at one in 2e6 lags; with 10 weaker correlations are
+left out of the errors, which are then too small."""
 
 FRAME_ERROR = 0.1
-"""Scatter of the bias level from frame to frame that a quiet system may have [ADU] (assumed)."""
+"""Scatter of the bias level from frame to frame that is no finding [ADU].  Chosen, to be derived
+from quiet systems: with 0.2, scatter of the level below 0.2 ADU could hardly be found."""
 
 LEVEL_ERROR = 0.05
-"""How well the overscan's level stands for the image's in a quiet system [ADU] (assumed)."""
+"""Systematic difference between the overscan's level and the image's that is no finding [ADU].
+Chosen, to be derived from quiet systems: with 0.1, differences below 0.1 ADU could hardly be
+found."""
 
 
 class BiasChannels:
-    """Takes bias frames one by one; gives their channels, the mean bias and the read noise."""
+    """Accumulates bias frames one by one; gives their channels, the mean bias and the read noise.
+
+    Parameters
+    ----------
+    fold : str
+        Fold of the channels.
+
+    Attributes
+    ----------
+    frames : int
+        Number of frames in the mean bias.
+    """
 
     def __init__(self, fold: str = "fit") -> None:
         self._fold = fold
@@ -70,7 +95,7 @@ class BiasChannels:
         if not self._last:
             self._last = here
             return
-        # Each frame is used once: differences of frames that follow one another.
+        # Each frame is used in one difference only, so that the differences are independent.
         self._size = here[0][0].size
         flat = np.empty((len(here), self._size))
         spectra, long, rows = [], [], []
@@ -94,9 +119,10 @@ class BiasChannels:
         frames: Sequence[Frame],
         lit: Sequence[NDArray[np.bool_]] = (),
     ) -> list[float]:
-        """Add a bias frame to the levels alone; gives its zeros [ADU].
+        """Add a bias frame to the levels alone; returns each amplifier's overscan level [ADU].
 
-        What stands in pixels that were ``lit`` before is no particle's.
+        Charge in pixels that were ``lit`` before is persistence and stays in the level, however
+        far out it is.
         """
         zeros, levels = [], []
         for n, frame in enumerate(frames):
@@ -105,7 +131,7 @@ class BiasChannels:
             zeros.append(float(over.mean()) if over.size else 0.0)
             image = frame.image.astype(np.float64)
             if over.size:
-                # Tracks of particles would tell their own number, not the level.
+                # Tracks of particles would raise the level by their number.
                 struck = _struck(image, TRACK)
                 image = image[~(struck & ~lit[n]) if lit else ~struck]
                 share = image.var() / image.size + over.var() / over.size
@@ -117,24 +143,24 @@ class BiasChannels:
         return zeros
 
     def mean(self, name: str) -> FloatArray | None:
-        """Mean bias of an amplifier's whole frame, any overscan's level taken off [ADU]."""
+        """Mean bias of an amplifier's whole frame less its overscan level [ADU]; None without."""
         total = self._sum.get(name)
         return None if total is None else total / self.frames
 
     def forget_mean(self) -> None:
-        """Give up what :meth:`mean` is made of, which is large, once it is known."""
+        """Release the sums that :meth:`mean` divides, which are as large as the sensor."""
         self._sum.clear()
 
     @property
     def read_noise(self) -> dict[str, float]:
-        """Of each amplifier [ADU]; empty with fewer than two frames."""
+        """Read noise of each amplifier by name [ADU]; empty with fewer than two frames."""
         if not self._spectra:
             return {}
         variance = np.mean([[s[0] for s in one] for one in self._spectra], axis=0)
         return {n: float(np.sqrt(v)) for n, v in zip(self._names, variance, strict=True)}
 
     def channels(self) -> list[Channel]:
-        """Noise by lag in readout order, rows, levels, and what amplifiers share."""
+        """Channels 'bias_cov', 'bias_level' and, with several amplifiers, 'amp_cross'."""
         if not self._spectra:
             return []
         pairs = len(self._spectra)
@@ -155,21 +181,22 @@ class BiasChannels:
         return out
 
     def _seen(self, amp: int) -> FloatArray:
-        """Covariances of the noise at all lags, those that do not stand out set to zero."""
+        """Covariances of the noise at all lags, those below STANDS_OUT set to zero [ADU^2]."""
         c = np.mean([s[amp] for s in self._long], axis=0)
         error = c[0] / np.sqrt(self._size * len(self._long))
         return np.where(np.abs(c) > STANDS_OUT * error, c, 0.0)
 
     def _bias_levels(self) -> Channel:
-        """Rows' excess variance by pair, levels above the overscan by frame, frames' scatter."""
+        """Excess variance of rows by pair, level above the overscan by frame, scatter of frames."""
         values, blocks, axes = [], [], Axes()
         excess = np.array([[e for e, *_ in one] for one in self._rows])
-        # The scatter of a variance goes with it, where it is certain that there is more.
+        # The error of a variance is in proportion to it: where an excess is certain, it counts.
         mean = excess.mean(0)
         least = STANDS_OUT * np.array([e for _, e, _ in self._rows[0]]) / len(excess) ** 0.5
         more = np.where(mean > least, 1 + mean, 1.0)
-        # Of a wave each frame has another phase, the same in all its rows.
-        # One pair alone cannot tell that scatter: its excess is held against noise.
+        # A periodic disturbance has another phase in each frame, the same in all its rows: the
+        # excess scatters between pairs by more than rows would.  With one pair that scatter is
+        # not known, and the excess is compared with noise alone.
         apart = excess.std(0, ddof=1) if len(excess) > 1 else np.zeros(len(mean))
         apart = np.where(np.abs(mean) > least, apart, 0.0)
         for n, one in enumerate(self._rows):
@@ -212,7 +239,19 @@ class BiasChannels:
 
 
 class DarkChannels:
-    """Takes darks one by one: level against time and order, columns, struck pixels."""
+    """Accumulates darks one by one: level by time and order, columns, struck pixels.
+
+    Parameters
+    ----------
+    bias : mapping of str to ndarray
+        Mean bias of each amplifier's image less its overscan [ADU]; may lack some.
+    read_noise : mapping of str to float
+        Read noise of each amplifier [ADU]; may lack some.
+    fold : str
+        Fold of the channel.
+    biases : int
+        Number of frames in the mean bias; 0 without one.
+    """
 
     def __init__(
         self,
@@ -255,7 +294,7 @@ class DarkChannels:
             if over.size:
                 error += float(over.var()) / (over.size // 2)
             found.append((float(good.mean()), float(error), int(struck.sum()), image.size))
-            # What strikes most of a column is no particle: a hot column is told as it is.
+            # A column most of whose pixels deviate is hot, not struck: it keeps its values.
             hot = struck.mean(0) > 0.5
             kept = np.where(struck & ~hot, np.nan, image)
             lines.means.append(np.nanmean(kept, 0))
@@ -265,7 +304,7 @@ class DarkChannels:
         self._columns.append(lines)
 
     def channels(self) -> list[Channel]:
-        """Levels and struck pixels by dark; columns of the longest darks."""
+        """Channel 'dark_map': levels and struck pixels by dark, columns of the longest darks."""
         if not self._rows:
             return []
         values, blocks, axes = [], [], Axes()
@@ -279,7 +318,7 @@ class DarkChannels:
             values.append(level)
             blocks.append(np.diag(variance))
             axes.add(len(level), self._condition, what="level", x=-1, **common)
-            # A Poisson number; one is added to its variance, for none was seen of few expected.
+            # Poisson; one is added to the variance, as zero may be counted where a few are expected.
             values.append(struck)
             blocks.append(np.diag(struck + 1.0))
             axes.add(len(level), self._condition, what="struck", x=-1, **common)
@@ -290,7 +329,7 @@ class DarkChannels:
             noise = float(np.mean([c.noise[amp] for c in chosen]))
             own = np.mean([c.own[amp] for c in chosen], axis=0)
             usual = self._column_error(mean, amp, noise, len(chosen)) ** 2
-            # Charge of a hot column has a shot noise of its own.
+            # Dark current of a hot column has shot noise of its own.
             sure = STANDS_OUT * np.sqrt(2.0 / self._rows_of(amp, mean) / len(chosen))
             more = np.where(own > noise * (1 + sure), own - noise, 0.0) / len(chosen)
             values.append(mean - np.median(mean))
@@ -301,32 +340,32 @@ class DarkChannels:
                         self._fold)]  # fmt: skip
 
     def _column_error(self, mean: FloatArray, amp: int, noise: float, darks: int) -> float:
-        """Error of a column's mean: of the pixels' noise, or of what most columns do.
+        """Error of a column's mean [ADU]: from the pixels' noise, or from the columns' own scatter.
 
-        The scatter of a hundred columns is itself known to 10 % only, which would make farther
-        outliers of the farthest; it counts where columns are uneven beyond noise.
+        The scatter of a hundred columns is itself known to 10 % only, so that errors from it would
+        scatter more than those from noise; it is used only where it exceeds noise by UNEVEN.
 
         Parameters
         ----------
-        mean : ndarray
-            Of the columns [ADU].
+        mean : ndarray, shape (columns,)
+            Means of the columns [ADU].
         amp : int
-            Amplifier.
+            Index of the amplifier.
         noise : float
-            Variance of a column's mean in one dark, the mean bias's share in it [ADU^2].
+            Variance of a column's mean in one dark, with the share of the mean bias [ADU^2].
         darks : int
-            Whose mean it is.
+            Number of darks in the mean.
         """
         scatter = max(1.4826 * float(np.median(np.abs(mean - np.median(mean)))), 1e-6)
         read = self._noise.get(self._names[amp], 0.0)
         pixels = self._rows_of(amp, mean)
-        # The mean bias is the same in all darks.
+        # The mean bias is the same in all darks: its noise does not average out.
         shared = read**2 / self._biases / pixels if self._biases else 0.0
         expected = float(np.sqrt(max(noise - shared, 0.0) / darks + shared))
         return expected if scatter < UNEVEN * expected else scatter
 
     def _rows_of(self, amp: int, mean: FloatArray) -> float:
-        """Pixels of a column."""
+        """Number of pixels of a column."""
         return self._rows[0][2][amp][3] / len(mean)
 
 
@@ -336,16 +375,28 @@ class _Columns(NamedTuple):
     seconds: float
     means: list[FloatArray]
     own: list[FloatArray]
-    """Variance of each column's mean, of its own pixels [ADU^2]."""
+    """Variance of each column's mean from its own pixels [ADU^2]."""
     noise: list[float]
-    """Of all pixels [ADU^2]."""
+    """Variance of a column's mean from all pixels [ADU^2]."""
 
 
 def without_hot_columns(image: FloatArray, noise: float) -> FloatArray:
-    """Image of spots with columns that stand out as a whole put on the others' level [ADU].
+    """Image of spots [ADU] with hot columns set to the level of the others.
 
-    Spots are told from a column by its median: of columns through a row of them it is half a
-    standard deviation of the noise up.
+    A column's median separates its level from spots on it: a row of spots raises the median by
+    half a standard deviation of the noise only.
+
+    Parameters
+    ----------
+    image : ndarray, shape (ny, nx)
+        Image of one amplifier, bias subtracted [ADU].
+    noise : float
+        Read noise of a pixel [ADU].
+
+    Returns
+    -------
+    image : ndarray, shape (ny, nx)
+        The same array where no column is hot.
     """
     columns = np.nanmedian(image, axis=0)
     excess = columns - np.nanmedian(columns)
@@ -354,18 +405,22 @@ def without_hot_columns(image: FloatArray, noise: float) -> FloatArray:
 
 
 def _without_outliers(noise: FloatArray) -> FloatArray:
-    """Set struck pixels to the mean: 6 median deviations, as of a Gaussian."""
+    """Noise less its median, struck pixels set to 0."""
     return np.where(_struck(noise), 0.0, noise - np.median(noise))
 
 
 def _struck(noise: FloatArray, limit: float = OUTLIER) -> NDArray[np.bool_]:
-    """Pixels beyond so many median deviations, as of a Gaussian; a converter's steps are none."""
+    """Pixels beyond ``limit`` robust standard deviations, which are taken as 0.3 ADU at least.
+
+    The bound is about the uniform error of rounding, 12^(-1/2) ADU, so that noise below one step
+    of the converter, whose median deviation is 0, has no struck pixels.
+    """
     away = np.abs(noise - np.median(noise))
     return np.asarray(away > limit * max(1.4826 * float(np.median(away)), 0.3))
 
 
 def _autocovariance(noise: FloatArray) -> FloatArray:
-    """Covariance of pixels as they are read out, at lags up to a quarter of the frame."""
+    """Autocovariance of pixels in readout order, at lags up to a quarter of the frame [ADU^2]."""
     series = noise.ravel() - noise.mean()
     n = len(series)
     size = next_fast_len(2 * n, real=True)
@@ -375,9 +430,11 @@ def _autocovariance(noise: FloatArray) -> FloatArray:
 
 
 def _errors_in_order(c: FloatArray) -> FloatArray:
-    """Covariance matrix of covariances at the first lags of one pixel of a long series (Bartlett).
+    """Covariance matrix of sample autocovariances times the length of the series [ADU^4].
 
-    Of a wave that keeps its phase through a frame a quarter of the lags tells nearly all.
+    Bartlett's formula, cov(c_h, c_k) = sum over m of (c_m c_(m+h-k) + c_m c_(m+h+k)) / n.  The
+    sum over a quarter of the frame's lags holds nearly all of it even for a wave that keeps its
+    phase through the frame.
     """
     n = len(c)
     size = next_fast_len(2 * n + 2 * READOUT_LAGS, real=True)
@@ -390,10 +447,10 @@ def _errors_in_order(c: FloatArray) -> FloatArray:
 
 
 def _row_excess(noise: FloatArray) -> tuple[float, float, float]:
-    """Variance of the rows' means over what white noise gives, less one; its error; and that.
+    """Relative excess of the variance of rows' means over white noise; its error; that variance.
 
-    Without the share of pixels that are few lags apart: those covariances are told by themselves,
-    and what is told twice would count twice.
+    Covariances of pixels a few lags apart are left out of the excess: they are values of
+    'bias_cov', and would otherwise be counted twice.
     """
     rows, columns = noise.shape
     share = noise.var() / columns

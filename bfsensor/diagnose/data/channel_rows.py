@@ -1,4 +1,4 @@
-"""Rows of a channel, condition by condition."""
+"""Indices of a channel's values, by condition (wavelength, back bias, temperature)."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.exposure_info import NUMBERS, condition_at
 
 Rows = dict[Condition, NDArray[np.int64]]
-"""Which values of a channel belong to each condition."""
+"""Indices of a channel's values by condition."""
 
 
 def rows_by_condition(channel: Channel) -> Rows:
-    """Rows of each condition."""
+    """Group the indices of a channel's values by condition, in a fixed order."""
     columns = np.column_stack([channel.axes[n].astype(float) for n in NUMBERS])
-    # nan equals nan here.
+    # Numbers that are not known are nan, which np.unique would keep apart: nan equals nan here.
     _, first, index = np.unique(
         np.nan_to_num(columns, nan=-1e99), axis=0, return_index=True, return_inverse=True
     )
@@ -27,5 +27,5 @@ def rows_by_condition(channel: Channel) -> Rows:
 
 
 def condition_of_row(channel: Channel, row: int | np.integer) -> Condition:
-    """Condition of one row."""
+    """Condition of one value of a channel."""
     return condition_at(channel.axes[n][row] for n in NUMBERS)

@@ -1,4 +1,4 @@
-"""Channels: what recordings say, as numbers with errors and where each belongs."""
+"""Channels: measured values of one kind, the covariance of their errors, and their coordinates."""
 
 from __future__ import annotations
 
@@ -19,28 +19,40 @@ WORDS = (
     "flat_cov", "flat_mean", "flat_map", "serial_overscan", "parallel_overscan", "bias_cov",
     "bias_level", "dark_map", "spot", "amp_cross", "code_hist", "time",
 )  # fmt: skip
-"""The channels there are."""
+"""Names of all channels."""
 
 PER_ELECTRON = "1/e-"
-"""Unit of covariances that are a_ij: areas themselves, of no level, without gain or noise."""
+"""Unit of 'flat_cov' where its values are a_ij: relative area changes per electron, which have no
+signal level, gain or read noise."""
 
 FOLDS = ("fit", "select", "held-out")
+"""Parts of a campaign: fits use the first two; the second also rejects candidates, and the third is
+compared with predictions only."""
 
 
 @dataclass(frozen=True, eq=False)
 class Common:
-    """What the errors of some values tell of those of others: ``spread @ gather`` times them.
+    """Linear part of some values' errors that follows from others': ``spread @ gather`` times them.
+
+    Means of columns and rows and of blocks of the same pixels share noise.  Whitening subtracts
+    from blocks the part that columns and rows determine; the rest is independent of these.
 
     Attributes
     ----------
     spread : csr_array, shape (n, m)
-        To the values that are told of.
+        Weights of m combinations in each of n values (targets).
     gather : csr_array, shape (m, n)
-        From those that tell, which are others: of them nothing is told.
+        Weights of the n values in these combinations (sources); no value may be both a source
+        and a target.
+
+    Raises
+    ------
+    DiagnosisError
+        Shapes do not match, or a value is both a source and a target.
 
     Examples
     --------
-    The last of three values is the mean of the first two, and noise of its own:
+    The last of three values is the mean of the first two plus noise of its own:
 
     >>> both = Common(csr_array([[0.0], [0.0], [1.0]]), csr_array([[0.5, 0.5, 0.0]]))
     >>> c = Channel("flat_map", np.zeros(3), (np.eye(1),) * 3, {"x": np.arange(3)}, "", common=both)
@@ -57,11 +69,13 @@ class Common:
                 f"noise in common: {self.spread.shape} and {self.gather.shape} do not match"
             )
         if (self.gather @ self.spread).count_nonzero():
-            raise DiagnosisError("noise in common: what values tell of is told to others")
+            raise DiagnosisError(
+                "noise in common: a value is both a source and a target of shared noise"
+            )
 
     @classmethod
     def none(cls, n: int) -> Common:
-        """Nothing, of ``n`` values."""
+        """No shared noise among ``n`` values."""
         return cls(csr_array((n, 0)), csr_array((0, n)))
 
     @property
@@ -71,44 +85,50 @@ class Common:
 
     @property
     def tells(self) -> NDArray[np.bool_]:
-        """Which values tell of others."""
+        """Mask of the sources, shape (n,)."""
         out = np.zeros(self.size, bool)
         out[self.gather.indices] = True
         return out
 
     def told(self, errors: FloatArray) -> FloatArray:
-        """Parts of errors, shape (n, ...), that the others tell."""
+        """Part of residuals of shape (n, ...) that follows from their sources, same shape."""
         return np.asarray(self.spread @ (self.gather @ errors))
 
     def variance(self, own: FloatArray) -> FloatArray:
-        """Variance that is told, from what values have themselves."""
+        """Variance of that part, shape (n,), from the variances of the sources' own noise."""
         middle = (self.gather * own) @ self.gather.T
         return np.asarray((self.spread @ middle).multiply(self.spread).sum(1)).ravel()
 
 
 @dataclass(frozen=True, eq=False)
 class Channel:
-    """Numbers of one kind, the covariance of their errors, and where each belongs.
+    """Measured values of one kind, the covariance of their errors, and their coordinates.
 
     Attributes
     ----------
     word : str
-        Which channel, of :data:`WORDS`.
+        Name of the channel, one of :data:`WORDS`.
     values : ndarray, shape (n,)
-        What was measured, in ``unit``.
+        Measured values, in ``unit``; all finite.
     blocks : tuple of ndarray
-        Covariance matrices of consecutive values [unit^2]; values of different blocks are
-        independent, but for what ``common`` tells.
+        Covariance matrices of consecutive values [unit^2], positive definite; values of
+        different blocks are independent but for ``common``.
     axes : mapping of str to ndarray, shape (n,)
         Coordinates of each value: 'amp', 'level' [e- or ADU], 'i', 'j', 'wavelength' [nm], ...
     unit : str
-        Of the values.
+        Unit of the values.
     fold : str
-        Which exposures they come from: 'fit', 'select' or 'held-out'.
+        Part of the campaign that they come from: 'fit', 'select' or 'held-out'.
     common : Common, optional
-        Noise that values share with others before them; ``blocks`` are of what is left.
+        Noise shared between blocks; ``blocks`` are then covariances of the remaining noise.
     whitener : csr_array, shape (n, n)
-        Inverse roots of the blocks: what :meth:`whiten` multiplies by.
+        Block-diagonal inverse Cholesky factors of ``blocks``, which :meth:`whiten` applies.
+
+    Raises
+    ------
+    DiagnosisError
+        A name is not known, shapes do not match, a value is not finite, or a block is not
+        positive definite.
 
     Examples
     --------
@@ -156,7 +176,7 @@ class Channel:
         object.__setattr__(self, "whitener", self._invert())
 
     def _invert(self) -> csr_array:
-        """Inverse roots of the blocks as one sparse matrix."""
+        """Inverse Cholesky factors of the blocks as one sparse matrix."""
         single = np.array([len(b) == 1 for b in self.blocks], bool)
         if single.all():
             variance = np.array([b[0, 0] for b in self.blocks])
@@ -192,12 +212,16 @@ class Channel:
         return np.sqrt(variance)
 
     def whiten(self, residuals: ArrayLike) -> FloatArray:
-        """Divide by the errors: independent numbers of variance 1 where the errors are right.
+        """Whiten residuals: noise becomes independent, of variance 1, if the errors are right.
 
         Parameters
         ----------
         residuals : array_like, shape (n, ...)
-            Differences, or derivatives, in ``unit``.
+            Residuals, or derivatives of a prediction, in ``unit``.
+
+        Returns
+        -------
+        whitened : ndarray, shape (n, ...)
         """
         given = np.asarray(residuals, float)
         if self.common is not None:
@@ -205,7 +229,7 @@ class Channel:
         return np.asarray(self.whitener @ given)
 
     def unwhiten(self, white: ArrayLike) -> FloatArray:
-        """Undo :meth:`whiten`: residuals in ``unit``, shape (n,)."""
+        """Invert :meth:`whiten`: residuals in ``unit``, shape (n,)."""
         given = np.asarray(white, float)
         out, start = np.empty_like(given), 0
         for block in self.blocks:
@@ -216,7 +240,7 @@ class Channel:
 
 
 def join_channels(channels: Sequence[Channel]) -> Channel:
-    """Join channels of one word and unit; axes that not all have are left out."""
+    """Join channels of one name and unit; axes that not all of them have are left out."""
     first = channels[0]
     names = [n for n in first.axes if all(n in c.axes for c in channels)]
     return Channel(
@@ -233,7 +257,7 @@ def join_channels(channels: Sequence[Channel]) -> Channel:
 
 
 def join_common(parts: Sequence[Common]) -> Common:
-    """Noise in common of values one after another, of which these parts share none."""
+    """Join shared noise of consecutive parts that share none with one another."""
     return Common(
         csr_array(block_diag([p.spread for p in parts], format="csr")),
         csr_array(block_diag([p.gather for p in parts], format="csr")),

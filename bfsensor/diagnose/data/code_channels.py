@@ -1,4 +1,4 @@
-"""The converter: how often each code comes, by its last bits; and crosstalk of spots."""
+"""Channels of the analogue-to-digital converter (histogram of codes) and of crosstalk of spots."""
 
 from __future__ import annotations
 
@@ -15,35 +15,47 @@ from bfsensor.diagnose.data.exposure_info import Axes, Frame
 from bfsensor.typing import FloatArray
 
 PERIOD = 64
-"""Codes that a wide distribution visits alike [ADU]."""
+"""Number of remainders of a code whose frequencies are measured [ADU].  Chosen: 64 holds the six
+lowest bits, whose codes flats of 1.25 periods width visit alike; with 128, only flats of twice the
+width, four times the signal, could be used."""
 
 BITS = (6, 7, 8, 9, 10)
-"""Powers of two that multiples of :data:`PERIOD` are told apart by: 10 and beyond together."""
+"""Bits by which multiples of :data:`PERIOD` are separated, 10 and higher ones together.  Chosen:
+each higher bit has half as many multiples; with twice as many bits, up to 15, the highest has
+one multiple in a converter of 16 bits."""
 
 BELOW = (1, 2)
-"""Codes below a multiple that a wrong weight of a bit widens or skips: errors to 2 codes."""
+"""Distances below a multiple of the codes that are counted.  Chosen: a wrong weight of a bit by
+up to 2 codes widens or skips these; with (1, 2, 3, 4) errors to 4 codes are described, with more
+noise."""
 
+# A mean over one period, with half a weight at both ends: exact for any pattern of that period.
 _BOX = np.concatenate([[0.5], np.ones(PERIOD - 1), [0.5]]) / PERIOD
 SMOOTH = 2 * np.pad(_BOX, PERIOD // 2) - np.convolve(_BOX, _BOX)
-"""Weights of the codes around that tell how often one should come: of any pattern of period 64
-the mean, of a parabola its value."""
+"""Weights of neighbouring codes from which the expected count of a code follows.  Derived: a mean
+over one period removes any pattern of period 64, and twice it less its square (convolution) leaves
+a parabola unchanged."""
 
 CLEAR = 7.0
-"""Distance from an amplifier's own spots, and from its edges, over which spots of the next one
-reach that it knows nothing of [pixel], from which on others' traces are sought."""
+"""Distance [pixel] from an amplifier's own spots, and from its edges, beyond which crosstalk is
+measured.  Chosen: Gaussian spots of 1.1 pixel have fallen below 1e-8 of their peak there, also
+those beyond an edge, which are in another amplifier; with 14, spots 28 pixels apart or nearer
+leave no pixel between them."""
 
 HALO_ERROR = 5e-6
-"""Crosstalk for which unlike sides of spots' halos may be taken (assumed): 0.2 ADU of 40,000."""
+"""Crosstalk that unequal sides of spots' halos may imitate, added to the errors.  Chosen, to be
+derived from halos: it is 0.2 ADU of 40,000; with 1e-5, crosstalk below 1e-5 could not be found."""
 
 
 PILE = 16
-"""Codes that full pixels lie within: read noise, some ADU wide."""
+"""Range of codes [ADU] within which full pixels lie.  Chosen: wider than read noise of a few
+ADU; with 32 a pile must hold twice as many pixels to be recognised."""
 
 
 def _piled(counts: NDArray[np.int64], width: float) -> bool:
-    """Whether pixels pile up at one level, as where part of them are full.
+    """Whether pixels pile up at one level, as where part of them are at full well.
 
-    Twice what a Gaussian of that width has at its middle, and no chance.
+    The counts in some 16 codes must be twice a Gaussian's at its middle, and 6 sigma above that.
     """
     most = float(np.convolve(counts, np.ones(PILE), "valid").max(initial=0.0))
     expected = float(counts.sum()) * PILE / (np.sqrt(2 * np.pi) * width)
@@ -51,14 +63,17 @@ def _piled(counts: NDArray[np.int64], width: float) -> bool:
 
 
 TAIL = 2.75
-"""Widths from the middle beyond which flats' codes are few, and full ones are none."""
+"""Distance from the middle of a flat's codes [sigma] beyond which its two tails are compared.
+Chosen: 0.3 % of the pixels lie in each, so that full wells up to 2.75 sigma above the mean are
+recognised; with 5.5 hardly any pixel does."""
 
 
 def _cut_off(codes: NDArray[np.float32], middle: float, width: float) -> bool:
     """Whether the upper tail is missing beside the lower one, as where its pixels are full.
 
-    So few pile up in a flat whose mean is two or three widths below the full well that no pile
-    shows, but the codes below powers of two have lost what is piled.  Half, and no chance.
+    With a mean two or three sigma below full well too few pixels pile up for :func:`_piled`, but
+    codes near them have wrong frequencies.  The upper tail must hold less than half of the lower
+    one, at 6 sigma.
     """
     away = (codes - middle) / width
     low, high = int((away < -TAIL).sum()), int((away > TAIL).sum())
@@ -66,10 +81,15 @@ def _cut_off(codes: NDArray[np.float32], middle: float, width: float) -> bool:
 
 
 class CodeChannels:
-    """Counts codes of flats wide enough that every remainder is as likely as any other.
+    """Histogram of codes of flats that are wide enough to visit all remainders equally often.
 
     A Gaussian of width s visits the remainders of P alike to 2 exp(-2 pi^2 s^2 / P^2): with
     s = 1.25 P to 1e-13.
+
+    Parameters
+    ----------
+    fold : str
+        Fold of the channel.
     """
 
     def __init__(self, fold: str = "fit") -> None:
@@ -79,7 +99,7 @@ class CodeChannels:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Which flats were left out, in words."""
+        """Sentences on flats that were left out; empty if none was."""
         if not self._piled:
             return ()
         told = ", ".join(
@@ -98,7 +118,7 @@ class CodeChannels:
             width = 1.4826 * np.median(np.abs(codes - middle))
             if width < 1.25 * PERIOD:
                 continue
-            # Of struck pixels the distribution is another; below 0 no converter counts.
+            # Struck pixels are not distributed like the flat's; a converter has no codes below 0.
             inside = codes[np.abs(codes - middle) < 6 * width].astype(np.int64)
             counts = np.bincount(inside[inside >= 0])
             if _piled(counts, width) or _cut_off(codes, float(middle), width):
@@ -112,7 +132,7 @@ class CodeChannels:
             self._counts[amp] = total
 
     def channels(self) -> list[Channel]:
-        """Share of each remainder over the even one, less one; and codes below high powers of two."""
+        """Channel 'code_hist': relative excess of each remainder, and of codes below high bits."""
         if not self._counts:
             return []
         values, blocks, axes = [], [], Axes()
@@ -127,7 +147,7 @@ class CodeChannels:
             axes.add(n, nothing, amp=amp, code=np.arange(n), bit=-1, share=0.0)
             steps = _steps(codes)
             for bit, (low, expected, share) in steps.items():
-                # One more than expected: none may be where a flat hardly reaches.
+                # One is added, as nothing may be expected where a flat hardly reaches.
                 values.append((low - expected) / (expected + 1.0))
                 scale = np.sqrt(expected + 1.0)
                 shared = float(SMOOTH @ SMOOTH)
@@ -147,7 +167,7 @@ class CodeChannels:
 def _steps(
     codes: NDArray[np.int64],
 ) -> dict[int, tuple[NDArray[np.int64], FloatArray, float]]:
-    """Of each of :data:`BITS`: counts below its multiples, those expected, share of all multiples."""
+    """For each of :data:`BITS`: counts below its multiples, expected ones, share of all multiples."""
     multiple = np.arange(PERIOD, len(codes), PERIOD)
     # The highest power of two in each, by its lowest bit.
     bit = np.minimum(np.log2(multiple & -multiple).astype(int), BITS[-1])
@@ -162,7 +182,13 @@ def _steps(
 
 
 class CrosstalkChannels:
-    """What one amplifier's bright pixels leave in the others', read out at the same time."""
+    """Crosstalk of spots: signal in an amplifier in proportion to another's, read at the same time.
+
+    Parameters
+    ----------
+    fold : str
+        Fold of the channel.
+    """
 
     def __init__(self, fold: str = "fit") -> None:
         self._fold = fold
@@ -173,10 +199,10 @@ class CrosstalkChannels:
 
         Parameters
         ----------
-        images : sequence of ndarray
-            Of each amplifier in readout order, bias subtracted [ADU].
+        images : sequence of ndarray, shape (ny, nx)
+            Image of each amplifier in readout order, bias subtracted [ADU].
         noise : sequence of float
-            Read noise of each [ADU].
+            Read noise of each amplifier [ADU].
         """
         levels = [float(np.nanmedian(i)) for i in images]
         signals = [
@@ -213,7 +239,7 @@ class CrosstalkChannels:
                 self._sums[a, b] = up + weight * both[0], down + weight * both[1]
 
     def channels(self) -> list[Channel]:
-        """Fraction of amplifier ``amp`` seen in ``other``."""
+        """Channel 'amp_cross': fraction of the signal of ``amp`` that is seen in ``other``."""
         if not self._sums:
             return []
         axes = Axes()
@@ -229,7 +255,7 @@ class CrosstalkChannels:
 def _is_inside(
     y: NDArray[np.int64], x: NDArray[np.int64], shape: tuple[int, ...]
 ) -> NDArray[np.bool_]:
-    """Whether pixels lie clear of an image's edges."""
+    """Mask of pixels that are at least CLEAR from an image's edges."""
     ny, nx = shape
     return (y >= CLEAR) & (y < ny - CLEAR) & (x >= CLEAR) & (x < nx - CLEAR)
 
@@ -239,8 +265,8 @@ def _without_trails(
 ) -> tuple[float, float]:
     """Sums of s times rest and of s squared, both less their means at each distance in x.
 
-    What a register trails behind the victim's own spot depends on the distance from it in x, not
-    on the light in the other amplifier.
+    Charge that the serial register defers behind the victim's own spots depends on the distance
+    from them in x, not on the light in the other amplifier; the means remove it.
     """
     _, group = np.unique(aside, return_inverse=True)
     group = group.ravel()

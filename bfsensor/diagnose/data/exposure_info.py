@@ -1,5 +1,5 @@
 # ruff: noqa: D102  (protocols: the class says what its attributes are)
-"""What tells exposures apart: conditions, levels, and the fold each pair of flats goes to."""
+"""Protocols of exposures and frames, their conditions, and the fold that each is assigned to."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ NUMBERS = ("wavelength", "back_bias", "temperature")
 
 
 def condition_of(exposure: ExposureInfo) -> Condition:
-    """Condition of an exposure, rounded to what headers repeat."""
+    """Condition of an exposure, rounded to 0.01 nm, V and K so that repeated headers agree."""
     given = exposure.wavelength, exposure.back_bias, exposure.temperature
     return condition_at(np.nan if v is None else round(float(v), 2) for v in given)
 
 
 def condition_at(numbers: Iterable[float]) -> Condition:
-    """Condition of :data:`NUMBERS`."""
+    """Condition from values of :data:`NUMBERS` [nm, V, K]; nan becomes None."""
     wavelength, back_bias, temperature = (
         float(v) if np.isfinite(v) else None for v in numbers
     )
@@ -31,7 +31,7 @@ def condition_at(numbers: Iterable[float]) -> Condition:
 
 
 def numbers_of(condition: Condition) -> tuple[float, float, float]:
-    """Values of :data:`NUMBERS` at a condition."""
+    """Values of :data:`NUMBERS` at a condition [nm, V, K]; None becomes nan."""
     wavelength, back_bias, temperature = (
         np.nan if v is None else v
         for v in (condition.wavelength, condition.back_bias, condition.temperature)
@@ -46,13 +46,13 @@ def label_of(condition: Condition) -> str:
 
 
 class Axes:
-    """Columns that grow block by block."""
+    """Coordinate columns of a channel that grow block by block."""
 
     def __init__(self) -> None:
         self._parts: dict[str, list[NDArray]] = {}
 
     def add(self, count: int, condition: Condition, **columns: object) -> None:
-        """Add rows; numbers are repeated."""
+        """Add ``count`` rows at one condition; scalars are repeated."""
         known = dict(zip(NUMBERS, numbers_of(condition), strict=True))
         for name, value in {**known, **columns}.items():
             self._parts.setdefault(name, []).append(
@@ -60,12 +60,28 @@ class Axes:
             )
 
     def columns(self) -> dict[str, NDArray]:
-        """All rows."""
+        """All rows by the name of the column."""
         return {name: np.concatenate(parts) for name, parts in self._parts.items()}
 
 
 class ExposureInfo(Protocol):
-    """What the channels ask of an exposure [s, nm, V, K, d]; None where not known."""
+    """Header of an exposure as the channels need it; None where a number is not known.
+
+    Attributes
+    ----------
+    number : int
+        Number of the exposure in its campaign.
+    kind : str
+        'bias', 'dark', 'flat', 'spot' or another word, which is not measured.
+    exposure_time, wavelength, back_bias, temperature : float or None
+        Exposure time [s], wavelength [nm], back bias [V], temperature [K].
+    lamp : float or None
+        Reading of the lamp monitor, in proportion to the light per second.
+    mjd : float or None
+        Time at which it was taken [d, MJD].
+    pair : int or None
+        Number of the pair that a flat belongs to.
+    """
 
     @property
     def number(self) -> int: ...
@@ -88,7 +104,23 @@ class ExposureInfo(Protocol):
 
 
 class Frame(Protocol):
-    """What the channels ask of one amplifier's frame, in readout order [ADU]."""
+    """One amplifier's frame as the channels need it, arrays in readout order [ADU].
+
+    Attributes
+    ----------
+    name : str
+        Name of the amplifier.
+    pixels : ndarray, shape (rows, columns)
+        The whole frame, with prescan and overscans.
+    mask : ndarray of bool, shape of ``image``
+        Pixels that are not used.
+    image, prescan, serial_overscan, parallel_overscan : ndarray
+        Parts of the frame; of size 0 where there is none.
+    flip_x, flip_y : bool
+        Whether readout runs towards smaller x or y on the sensor.
+    origin : (int, int) or None
+        Lower left corner (x, y) of the image on the sensor [pixel].
+    """
 
     @property
     def name(self) -> str: ...
@@ -113,16 +145,24 @@ class Frame(Protocol):
 
 
 HELD = 5
-"""One in so many exposures of a kind is held out, the fourth first, of twice as many or more."""
+"""One in so many exposures of a kind (other than flats) is held out, the fourth first, if there
+are at least twice as many.  Chosen, to be derived: with 10, half as many are held out, of kinds
+with 20 or more."""
 
 
 def is_held_out(place: int, count: int) -> bool:
-    """Whether an exposure, or pair of them, other than flats is held out of all fits.
+    """Whether an exposure other than a flat, or a pair of biases, is held out of all fits.
 
     Parameters
     ----------
-    place, count : int
-        Its place among those of its kind, in order of time, and how many there are.
+    place : int
+        Its index among those of its kind in order of time, from 0.
+    count : int
+        Number of those of its kind.
+
+    Returns
+    -------
+    bool
 
     Examples
     --------
@@ -133,15 +173,20 @@ def is_held_out(place: int, count: int) -> bool:
 
 
 def assign_folds(pairs: Iterable[int], shift: int = 0) -> list[str]:
-    """Give each pair of one level its fold: three of five fit, one selects, one is held out.
+    """Assign pairs of flats of one level to folds: three of five fit, one selects, one is held out.
 
     Parameters
     ----------
     pairs : iterable
         The pairs, in order of time.
     shift : int
-        Where the pattern begins: another for each level, so that few pairs a level still
-        fill all folds.
+        Offset of the pattern, different for each level, so that all folds are filled even with
+        few pairs per level.
+
+    Returns
+    -------
+    folds : list of str
+        'fit', 'select' or 'held-out' for each pair; a single pair is fitted.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Flats: covariances of pairs, means against the lamp, and the overscan behind them."""
+"""Channels of flats: covariances of pairs, means against the lamp monitor, overscan profiles."""
 
 from __future__ import annotations
 
@@ -15,21 +15,28 @@ from bfsensor.measure.flat_pairs import flat_covariances
 from bfsensor.typing import FloatArray
 
 LAGS = 4
+"""Largest lag of the covariances of flats [pixel].  Chosen: 25 lags hold most of the effect;
+with 8, 81 lags are measured, those beyond 4 mostly noise, and errors take ten times the memory."""
+
 TAIL = 8
-"""Last pixels of an overscan, held for free of what was deferred: the profile's zero."""
+"""Number of last pixels of an overscan that define the zero of its profile.  Chosen: charge
+deferred by more pixels is taken for zero level; with 16, overscans up to 16 pixels deep have no
+profile."""
 
 UNEVEN = 1.25
-"""Variance of overscan profiles between exposures, over that of white noise, from which on it is
-believed."""
+"""Variance of overscan profiles between exposures over that of white noise, above which it scales
+their errors (if it is also 5 sigma above 1).  Chosen: errors may then be 12 % too small in
+amplitude; with 1.5, 22 %."""
 
 LAMP_UNKNOWN = 0.02
-"""Relative error of the light of an exposure without a lamp monitor: fluxes repeat to a few
-per cent in shuttered exposures of laboratory lamps; wide enough not to speak of linearity."""
+"""Relative error of the light of an exposure without a lamp monitor.  Chosen, to be derived from
+shutters and lamps: deviations from linearity below 2 % are then no findings; with 0.04, those
+below 4 %."""
 
 
 @dataclass
 class _FlatGroup:
-    """Sums over the pairs of one condition, exposure time, amplifier and fold."""
+    """Measurements of the pairs of one condition, exposure time, amplifier and fold."""
 
     covariances: list[FloatArray] = field(default_factory=list)
     counts: list[NDArray[np.int64]] = field(default_factory=list)
@@ -41,20 +48,20 @@ class _FlatGroup:
 
 
 class FlatChannels:
-    """Takes pairs of flats one by one and gives their channels.
+    """Accumulates pairs of flats one by one and gives their channels.
 
     Parameters
     ----------
     bias : mapping of str to ndarray
-        Mean bias of each amplifier's whole frame less its overscan [ADU]; may lack some.
+        Mean bias of each amplifier's image less its overscan [ADU]; may lack some.
     read_noise : mapping of str to float
-        Of each amplifier [ADU].
+        Read noise of each amplifier [ADU]; may lack some.
     lamp_error : float
         Relative error of the lamp monitor.
     lags : int
         Largest lag of the covariances [pixel].
     start : float
-        When the first exposure of all was taken [MJD]; nan where not known.
+        Time of the first exposure of the campaign [MJD]; nan where not known.
     """
 
     def __init__(
@@ -79,7 +86,20 @@ class FlatChannels:
         *,
         fold: str,
     ) -> None:
-        """Measure one pair of flats and add it to its group."""
+        """Measure one pair of flats of equal exposure and add it to its group.
+
+        Parameters
+        ----------
+        first, second : (ExposureInfo, sequence of Frame)
+            The two flats, with the frames of all amplifiers.
+        fold : str
+            'fit', 'select' or 'held-out'.
+
+        Raises
+        ------
+        MeasurementError
+            Covariances cannot be measured.
+        """
         condition = condition_of(first[0])
         time = first[0].exposure_time or 0.0
         means: list[list[tuple[float, float, int]]] = [[], []]
@@ -121,11 +141,11 @@ class FlatChannels:
         return image if bias is None else image - bias
 
     def _hours(self, exposure: ExposureInfo) -> float:
-        """Since the first exposure of all [h]; nan where not known."""
+        """Time since the first exposure of the campaign [h]; nan where not known."""
         return np.nan if exposure.mjd is None else 24.0 * (exposure.mjd - self._start)
 
     def channels(self) -> list[Channel]:
-        """All that was added, by fold."""
+        """Channels 'flat_cov', 'flat_mean' and overscans of all pairs, by fold."""
         return [*self._covariances(), *self._mean_levels(), *self._overscans()]
 
     def _covariances(self) -> list[Channel]:
@@ -157,7 +177,8 @@ class FlatChannels:
             values, blocks, axes = [], [], Axes()
             for exposure, condition, amplifiers in rows:
                 m, zero, pixels = np.array(amplifiers).T
-                # The effect moves charge between pixels: the noise of the sum of many is Poisson's.
+                # The brighter-fatter effect moves charge between pixels but conserves it: the sum
+                # of many has Poisson noise, although a pixel's variance is less.
                 variance = m * [self._poisson(n) for n in range(len(m))] / pixels + zero
                 known = exposure.lamp is not None
                 error = self._lamp_error if known else LAMP_UNKNOWN
@@ -176,7 +197,7 @@ class FlatChannels:
         return out
 
     def _poisson(self, amp: int) -> float:
-        """Variance of a pixel over its mean in weak flats [ADU]."""
+        """Variance of a pixel over its mean in the faintest 30 % of flats [ADU], the inverse gain."""
         level, ratio = np.array(self._ratios[amp]).T
         weak = level <= np.quantile(level, 0.3)
         return float(max(np.median(ratio[weak]), 0.0))
@@ -209,10 +230,10 @@ class FlatChannels:
         return out
 
     def _unevenness(self, name: str) -> dict[int, float]:
-        """Variance of profiles from exposure to exposure over that of white noise, by amplifier.
+        """Variance of profiles between exposures over that of white noise, by amplifier.
 
-        Rows that move together, and noise that one pixel hands on to the next, make profiles
-        scatter more than their pixels' noise says; 1 where nothing is seen of that.
+        Rows that fluctuate together, and noise correlated from pixel to pixel, make profiles
+        scatter more than white noise; 1 where no excess is significant.
         """
         seen: dict[int, list[tuple[float, int]]] = {}
         for (_, _, amp, _), group in self._groups.items():
@@ -228,7 +249,7 @@ class FlatChannels:
 
 
 def _scatter(profiles: FloatArray) -> tuple[float, int]:
-    """Squares of what profiles above their tails differ by, in their errors; and how many."""
+    """Chi-square of profiles above their tails about their mean, and its degrees of freedom."""
     values, variance = profiles[..., 0], profiles[..., 1]
     head = values.shape[1] - TAIL
     above = values[:, :head] - values[:, head:].mean(1, keepdims=True)
@@ -238,9 +259,20 @@ def _scatter(profiles: FloatArray) -> tuple[float, int]:
 
 
 def profile(strip: NDArray[np.float32], axis: int) -> FloatArray:
-    """Mean and variance of the mean of an overscan along its depth, shape (n, 2); empty if short.
+    """Profile of an overscan along its depth: mean, and variance of the mean.
 
-    ``axis`` is that along which charge would be deferred: 1 in the serial overscan.
+    Parameters
+    ----------
+    strip : ndarray, shape (ny, nx)
+        Overscan [ADU].
+    axis : int
+        Axis along which charge is deferred: 1 for a serial overscan, 0 for a parallel one.
+
+    Returns
+    -------
+    profile : ndarray, shape (n, 2)
+        Mean [ADU] and its variance [ADU^2]; n = 0 with :data:`TAIL` pixels or fewer in depth, or
+        fewer than 8 lines.
     """
     depth = strip.shape[axis] if strip.ndim == 2 else 0
     lines = strip.size // depth if depth else 0
@@ -254,12 +286,19 @@ def profile(strip: NDArray[np.float32], axis: int) -> FloatArray:
 def mean_profile(
     profiles: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Profile above its own tail, averaged over exposures, and its error matrix.
+    """Mean profile above its own tail, and the covariance of its errors.
 
     Parameters
     ----------
     profiles : ndarray, shape (exposures, n, 2)
-        From :func:`profile`.
+        Profiles from :func:`profile`, n above :data:`TAIL`.
+
+    Returns
+    -------
+    values : ndarray, shape (n - 8,)
+        Mean above the mean of the last 8 pixels [ADU].
+    covariance : ndarray, shape (n - 8, n - 8)
+        All values share the error of the tail [ADU^2].
     """
     count = len(profiles)
     mean = profiles[..., 0].mean(0)

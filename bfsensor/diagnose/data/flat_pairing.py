@@ -1,4 +1,4 @@
-"""Which flats make a pair: equal exposures that follow one another, of levels that are equal too."""
+"""Pairing of flats: successive equal exposures of equal levels; comparison of those without a pair."""
 
 from __future__ import annotations
 
@@ -14,37 +14,44 @@ from bfsensor.measure.flat_pairs import flat_covariances
 from bfsensor.typing import FloatArray
 
 Flat = tuple[ExposureInfo, Sequence[Frame]]
+"""A flat with the frames of all amplifiers."""
 
 UNEQUAL = 0.05
-"""Relative difference of two levels above which flats make no pair: what of the fixed pattern is
-not in proportion to the light stays in their difference, in proportion to that of the levels
-(`bfsensor check` warns from 0.02 on)."""
+"""Relative difference of two levels above which flats make no pair.  The part of the fixed
+pattern that is not in proportion to the light stays in their difference, in proportion to that
+of the levels.  Chosen: ``bfsensor check`` warns above 0.02; with 0.1, up to twice as much
+pattern stays."""
 
 FAR = 2.5
-"""Distance of lags [pixel] beyond which the brighter-fatter effect leaves next to nothing: below
-2e-3 of the variance at any level measured in thick CCDs."""
+"""Distance of lags [pixel] beyond which the brighter-fatter effect is negligible for this
+comparison.  Measured (validation/results/real_lags.ecsv): a_ij there are below 1.3e-8 per
+electron in both LSST sensors, so that correlations are below 1.3e-3 at 1e5 e-."""
 
 RATIO = (0.45, 2.2)
-"""Ratio of the levels of flats of unlike exposure that are held against one another."""
+"""Range of the ratio of two levels within which flats of unlike exposure are compared.  Chosen: it
+holds neighbours in a series of levels by factors of two; with a factor of 4.4 the fainter flat's
+noise dominates, and the pattern is seen less."""
 
 RISE = 5.0
-"""Deviation [sigma] of the mean of the far lags from which a pair's fixed pattern counts as seen."""
+"""Significance [sigma] of the mean correlation of the far lags above which a fixed pattern
+counts as seen.  Chosen: noise reaches 5 in 3e-7 of pairs; with 10, patterns must be twice as
+strong to be seen."""
 
 
 @dataclass(frozen=True)
 class UnlikePair:
-    """Two flats of unlike exposure, scaled to one another: to be looked at, never to be fitted.
+    """Correlations in the difference of two flats of unlike exposure: reported, never fitted.
 
     Attributes
     ----------
     first, second : int
         Numbers of the exposures.
     level : float
-        At which a linear covariance has this value [ADU].
+        Effective level of the scaled difference, to which a linear covariance belongs [ADU].
     ratio : float
-        Of the levels, the second over the first.
+        Level of the second over that of the first.
     serial, parallel, near_error : float
-        Correlation at the lags (1, 0) and (0, 1), and the error of either.
+        Correlations at the lags (1, 0) and (0, 1), and the error of either.
     far, far_error : float
         Mean correlation of the lags beyond :data:`FAR`, and its error.
     """
@@ -61,15 +68,15 @@ class UnlikePair:
 
     @property
     def rises(self) -> bool:
-        """Whether all lags rise together, as a fixed pattern makes them."""
+        """Whether the far lags are significantly positive, as a fixed pattern makes them."""
         return self.far > RISE * self.far_error
 
 
 def group_flats(flats: Sequence[ExposureInfo]) -> list[list[ExposureInfo]]:
-    """Group flats that may make pairs, in the order of their levels' first.
+    """Group flats that may make pairs, in order of time.
 
-    By their numbers of pairs where any has one; else flats of one condition and exposure time
-    that follow one another.
+    By the numbers of pairs in their headers if any flat has one (flats without are then left
+    out); otherwise successive flats of one condition and exposure time.
     """
     groups: list[list[ExposureInfo]] = []
     if any(flat.pair is not None for flat in flats):
@@ -87,14 +94,14 @@ def group_flats(flats: Sequence[ExposureInfo]) -> list[list[ExposureInfo]]:
 
 
 def level_of(flat: ExposureInfo) -> tuple:
-    """Condition and exposure time, as one key."""
+    """Condition and exposure time of a flat, as a key of its level."""
     return condition_of(flat), flat.exposure_time
 
 
 def by_level(
     groups: Sequence[Sequence[ExposureInfo]],
 ) -> list[list[Sequence[ExposureInfo]]]:
-    """Groups of one condition and exposure time together, those of one flat left out."""
+    """Collect the groups of each condition and exposure time; groups of one flat are left out."""
     levels: dict[tuple, list[Sequence[ExposureInfo]]] = {}
     for group in groups:
         if len(group) > 1:
@@ -103,21 +110,21 @@ def by_level(
 
 
 class PairFinder:
-    """Reads flats that may make pairs, two in memory at a time, and gives those that do.
+    """Reads flats of equal exposure, two in memory at a time, and yields pairs of equal level.
 
     Parameters
     ----------
     read : callable
-        Gives the frames of an exposure.
+        Returns the frames of an exposure.
     level : callable
-        Gives the mean level of frames [ADU].
+        Returns the mean level of frames [ADU].
 
     Attributes
     ----------
-    single : list
+    single : list of ExposureInfo
         Exposures that were read and found no partner.
     notes : list of str
-        Flats of equal exposure and unequal level.
+        A sentence for each two successive flats of equal exposure and unequal level.
     """
 
     def __init__(
@@ -132,7 +139,7 @@ class PairFinder:
     def pairs(
         self, groups: Iterable[Sequence[ExposureInfo]]
     ) -> Iterator[tuple[Flat, Flat]]:
-        """Pairs of neighbours whose levels agree to :data:`UNEQUAL`, each flat at most once."""
+        """Yield pairs of successive flats whose levels agree to :data:`UNEQUAL`, each flat once."""
         for group in groups:
             held: tuple[Flat, float] | None = None
             for exposure in group:
@@ -149,7 +156,8 @@ class PairFinder:
                 self.single.append(first[0])
                 self.notes.append(
                     f"flats {first[0].number}, {exposure.number}: levels of {other:.0f} and "
-                    f"{level:.0f} ADU make no pair, fixed pattern does not drop out of it"
+                    f"{level:.0f} ADU make no pair, as they differ by more than {UNEQUAL:.0%}: "
+                    "fixed pattern would not cancel in their difference"
                 )
                 held = flat, level
             if held is not None:
@@ -162,19 +170,20 @@ def compare_unlike(
     *,
     lags: int,
 ) -> UnlikePair | None:
-    """Difference two flats of unlike exposure, and see whether fixed pattern stays in it.
+    """Measure the correlations in the difference of two flats of unlike exposure.
 
     Parameters
     ----------
     first, second : (int, sequence of ndarray)
         Number of the exposure, and each amplifier's image with the bias subtracted [ADU].
     lags : int
-        Largest lag.
+        Largest lag [pixel], at least 2.
 
     Returns
     -------
     UnlikePair or None
-        Mean of the amplifiers; None where levels are too far apart or nothing can be measured.
+        Mean over the amplifiers; None if the ratio of the levels is outside :data:`RATIO` or
+        covariances cannot be measured.
     """
     means = [
         float(np.mean([np.nanmean(i) for i in images])) for _, images in (first, second)
@@ -212,11 +221,16 @@ def scan_unlike(
     Parameters
     ----------
     flats : sequence of ExposureInfo
-        Without a partner.
+        Flats without a partner.
     images : callable
-        Gives an exposure's images with the bias subtracted [ADU].
+        Returns an exposure's images with the bias subtracted [ADU].
     lags : int
-        Largest lag.
+        Largest lag [pixel], at least 2.
+
+    Returns
+    -------
+    pairs : list of UnlikePair
+        One for each two neighbours that can be compared.
     """
     out = []
     conditions: dict[Condition, list[ExposureInfo]] = {}
@@ -237,7 +251,7 @@ def scan_unlike(
 
 
 def describe_unlike(pairs: Sequence[UnlikePair]) -> list[str]:
-    """Say what flats of unlike exposure show, a line for each thing; nothing of quiet ones."""
+    """Sentences on what flats of unlike exposure show; none where nothing is significant."""
     out = []
     ordered = sorted(pairs, key=lambda p: p.level)
     rising = [p for p in ordered if p.rises]
@@ -250,8 +264,8 @@ def describe_unlike(pairs: Sequence[UnlikePair]) -> list[str]:
             f"flats of unlike exposure: in {len(rising)} of {len(pairs)} differences of neighbours "
             f"all lags rise together{above} (far lags up to {worst.far:.2g} of the variance, at "
             f"{worst.level:.0f} ADU): fixed pattern that does not scale with the light, saturation "
-            "included; not the brighter-fatter effect, which gives far lags next to nothing. No "
-            "flats of unlike exposure are used"
+            "included; not the brighter-fatter effect, which changes far lags by less than 0.2 %. "
+            "No flats of unlike exposure are used"
         )
     quiet = [p for p in ordered if not p.rises]
     for lag, values in (

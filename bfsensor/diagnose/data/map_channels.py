@@ -1,4 +1,8 @@
-"""Maps: what flats show against position, free of light's smooth shape in the prediction."""
+"""Channel 'flat_map': relative response of flats by column, row, block, ring, texture and chess.
+
+Flats over their amplifiers' means are averaged by condition and exposure time; the smooth shape of
+the light stays in the values and is a linear term of the prediction.
+"""
 
 from __future__ import annotations
 
@@ -21,40 +25,50 @@ from bfsensor.diagnose.data.map_waves import find_patterns, without_shape
 from bfsensor.typing import FloatArray
 
 BLOCKS = 16
-"""Blocks of a map along its longer side."""
+"""Number of blocks along the longer side of a map.  Chosen: 225 of 256 blocks are independent of
+columns and rows; with 32, 961, whose covariance matrix is 18 times as large."""
 
 RINGS = 24
-"""Bins of the spatial frequency, from 0 to half a cycle a pixel."""
+"""Number of bins of the spatial frequency, from 0 to half a cycle per pixel.  Chosen: with 48,
+rings have half the modes, and errors of their power are 1.4 times as large."""
 
 FULL = 0.5
-"""Part of the light's noise below which a flat's wells are full."""
+"""Relative variance times level of a flat, in units of the median of fainter ones, below which its
+wells are full.  Chosen: Poisson noise over 8 x 8 pixels keeps it at 1, full wells near 0; with 1
+every second flat would count as full."""
 
 LOW = 8
-"""Side of the boxes [pixel] that tell noise over many pixels."""
+"""Side of the boxes [pixel] whose scatter measures noise over many pixels.  Chosen: brighter-fatter
+covariances of near lags are inside of them; with 16 a quarter of the boxes are left, and the noise
+is known half as well."""
 
 LONG = 4
-"""Blocks in the shortest wave that tells noise over still more: light of its own in each flat."""
+"""Shortest wave [blocks] that counts as noise on large scales: light that differs between the flats
+of a pair.  Chosen: with 8, a quarter of the modes are left to measure it."""
 
 CERTAIN = 5.0
-"""Standard deviations by which that must be above the boxes' to count."""
+"""Significance [sigma] above which large-scale noise is added to the errors.  Chosen: noise
+exceeds 5 in 3e-7 of maps; with 10, weaker fluctuations of the light are no part of the errors."""
 
 SHORT = 0.25
-"""Part of the longest exposure time below which flats count as short."""
+"""Part of the longest exposure time of a condition below which flats count as short: their map
+is divided by that of the longer ones, to find the shutter's pattern.  Chosen: with 0.5 more
+flats count as short, in which that pattern, in proportion to 1 / time, is weaker."""
 
 
 class MapShare(NamedTuple):
-    """Part of a map that flats of one condition and exposure time make up.
+    """Contribution of flats of one condition and exposure time to a map.
 
     Attributes
     ----------
     weight : float
-        Of the flats in the map; below 0 where the map is divided by them.
+        Weight of these flats in the map; negative where the map is divided by them.
     condition : Condition
-        Of the light.
+        Condition of the flats.
     seconds, level : float
         Exposure time [s] and mean level [ADU].
     flats : int
-        How many they are.
+        Number of flats.
     """
 
     weight: float
@@ -65,10 +79,11 @@ class MapShare(NamedTuple):
 
 
 class MapChannels:
-    """Adds up flats on the sensor, each over its amplifier's mean.
+    """Averages flats on the sensor, each over its amplifier's mean.
 
-    Of large sensors few maps can be held: exposure times are weighted and added up into two
-    sums of a condition, short ones and long ones, as soon as the next begins.
+    Memory holds few maps of a large sensor: flats of one exposure time are weighted and added to
+    one of two sums per condition, of short and of long exposures, as soon as the next exposure
+    time begins.
 
     Parameters
     ----------
@@ -77,9 +92,9 @@ class MapChannels:
     longest : mapping of Condition to float
         Longest exposure time [s] of the flats of each condition.
     fold : str
-        Which exposures are added.
+        Fold of the flats that are added.
     amplifiers : sequence of (slice, slice)
-        Rows and columns of each on the sensor.
+        Rows and columns of each amplifier on the sensor.
     """
 
     def __init__(
@@ -108,18 +123,18 @@ class MapChannels:
         shared: float = 0.0,
         level: float = 0.0,
     ) -> None:
-        """Add a pair of flats, each over its amplifiers' means less one.
+        """Add a pair of flats, each over its amplifiers' means, less one.
 
         Parameters
         ----------
         condition : Condition
-            Of the light.
+            Condition of the flats.
         time : float
-            Exposure time [s]; pairs of one should follow one another.
+            Exposure time [s]; pairs of one exposure time should follow one another.
         first, second : ndarray of float32, shape of the sensor
-            nan where no amplifier reads or a pixel is bad.
+            Relative response less one; nan where no amplifier reads or a pixel is bad.
         shared : float
-            Noise that all flats share, that of the mean bias, over the mean.
+            Noise of the mean bias, which all flats share, over the mean level.
         level : float
             Mean level [ADU].
         """
@@ -135,7 +150,8 @@ class MapChannels:
             good = np.isfinite(image)
             np.add(self._total, image, out=self._total, where=good)
             self._count += good
-        # Charges repel: noise is smaller over few pixels than over many.
+        # The brighter-fatter effect makes the noise of single pixels smaller than Poisson's, with
+        # positive covariances beside it; averages over many pixels keep Poisson noise.
         noise = first - second
         noise *= np.float32(np.sqrt(0.5))
         np.nan_to_num(noise, copy=False)
@@ -152,7 +168,10 @@ class MapChannels:
         group.level += level
 
     def _close(self) -> None:
-        """Add what is open to the sum of its condition, by inverse variance of its noise."""
+        """Add the flats of the last exposure time to the sum of their condition, or drop full ones.
+
+        Weights are inverse variances of the noise.
+        """
         if self._closed:
             return
         self._closed = True
@@ -173,7 +192,7 @@ class MapChannels:
         self._total = np.zeros((0, 0), np.float32)
 
     def _keep(self, border: Border) -> None:
-        """Remember a border that was cut, as the map shows it that does so most."""
+        """Keep a border that was cut, with its largest ratio in any map."""
         name = border.axis, border.line
         self._borders[name] = max(
             border, self._borders.get(name, border), key=lambda b: b.ratio
@@ -181,17 +200,18 @@ class MapChannels:
 
     @property
     def notes(self) -> list[str]:
-        """What there is to say of the maps."""
+        """Sentences on borders that were left out of the maps."""
         return [str(border) for border in self._borders.values()]
 
     def _is_short(self, group: _MapGroup) -> bool:
         return group.time < SHORT * self._longest[group.condition]
 
     def channels(self) -> list[Channel]:
-        """Columns, rows, blocks and rings of the map of all light, and of what differs.
+        """Channel 'flat_map': the map of all flats, and ratios of maps.
 
-        'all': all flats of the commonest condition together, weighted by their light; 'short':
-        its short exposures over its long ones; other conditions over the commonest.
+        The axis 'map' is 'all' for all flats of the commonest condition, weighted by inverse
+        variance; 'short' for its short exposures over its long ones; and the condition's label
+        for those of another condition over 'all'.
         """
         self._close()
         if not self._groups:
@@ -199,7 +219,7 @@ class MapChannels:
         values, axes = [], Axes()
         blocks: list[FloatArray] = []
         common: list[Common] = []
-        # One map is held, and one that others are divided by: that of the commonest condition.
+        # At most two maps are in memory: the one at hand and the one it is divided by.
         kept: tuple[list[_MapGroup], _Map] | None = None
         for name, (groups, below) in self._plan().items():
             image = self._average(groups)
@@ -223,7 +243,7 @@ class MapChannels:
                         self.fold, join_common(common))]  # fmt: skip
 
     def _plan(self) -> dict[str, tuple[list[_MapGroup], list[_MapGroup]]]:
-        """Flats of each map, and of what it is divided by."""
+        """Flats of each map, and of the map that it is divided by, if any."""
         members: dict[Condition, list[_MapGroup]] = {}
         for group in self._groups:
             members.setdefault(group.condition, []).append(group)
@@ -239,17 +259,17 @@ class MapChannels:
         return out
 
     def _is_full(self, group: _MapGroup) -> bool:
-        """Whether flats are at the full well: without their light's noise, without its pattern.
+        """Whether flats are at full well, where noise and pattern of the light are lost.
 
-        Noise over many pixels is Poisson's whatever charges do to one another: relative
-        variance times level is one number, larger only where read noise adds to it.  Flats come
-        by rising level: those before tell the usual one.
+        Noise over many pixels is Poisson's with or without the brighter-fatter effect: relative
+        variance times level is the same at all levels, larger only where read noise adds to it.
+        Flats come by increasing level, so that those before give the usual value.
         """
         white = [g.low * g.level / g.pairs**2 for g in (*self._groups[:-1], group)]
         return len(white) > 2 and white[-1] < FULL * float(np.median(white[:-1]))
 
     def shares(self) -> dict[str, tuple[MapShare, ...]]:
-        """Of which flats each map is made."""
+        """Contributions of flats to each map, by its name."""
         out = {}
         for name, both in (self._plan() if self._groups else {}).items():
             out[name] = tuple(
@@ -262,7 +282,7 @@ class MapChannels:
         return out
 
     def _average(self, groups: list[_MapGroup]) -> _Map:
-        """Map of all short exposures of a condition, or all long ones, or both."""
+        """Mean map of all short exposures of a condition, or all long ones, or both."""
         weights = _weights(groups)
         which = dict.fromkeys((g.condition, self._is_short(g)) for g in groups)
         sums = [self._sums[name] for name in which]
@@ -270,11 +290,11 @@ class MapChannels:
         image = sums[0].image / whole
         for other in sums[1:]:
             image += other.image / whole
-        # The mean bias is the same in all; of it differences of pairs know nothing.
+        # Noise of the mean bias is the same in all flats and cancels in differences of pairs.
         common = (
             sum(w * g.shared / g.pairs for w, g in zip(weights, groups, strict=True)) ** 2
         )
-        # A mean of 2 n flats, whose single noise each pair tells.
+        # A mean of 2 n flats, whose single noise is measured by the difference of each pair.
         low = sum(
             w**2 * g.low / (2 * g.pairs**2) for w, g in zip(weights, groups, strict=True)
         )
@@ -293,7 +313,7 @@ class MapChannels:
         )  # fmt: skip
 
     def _long(self, groups: list[_MapGroup], weights: FloatArray) -> float:
-        """Noise of a mean over long waves as a pixel's variance; 0 unless certainly the larger."""
+        """Noise of a mean in long waves, as a pixel's variance; 0 unless significantly larger."""
         modes = int(_is_long(self._shape).sum())
         parts = np.array(
             [w**2 / (2 * g.pairs**2) for w, g in zip(weights, groups, strict=True)]
@@ -309,9 +329,10 @@ class MapChannels:
     def _parts(
         self, image: _Map, *, own: bool
     ) -> tuple[list[tuple[NDArray, NDArray, Mapping[str, object]]], BlockNoise]:
-        """Columns, rows, blocks, and rings and others of a map, with errors or their covariance.
+        """Columns, rows, blocks, rings, texture and chess of a map, with errors or their covariance.
 
-        ``own``: the map holds the pixels' own response, of which its neighbours tell.
+        ``own``: the map holds the response of single pixels, white like noise, whose scatter is
+        measured by differences of neighbours and counts in the errors.
         """
         ny, nx = self._shape
         single = np.sqrt(image.low)
@@ -353,7 +374,8 @@ class MapChannels:
         power = ring_power(free)
         keep = self._modes > 50
         frequency = (np.arange(RINGS) + 0.5) / (2 * RINGS)
-        # Of n modes, each exponential; in parts per million of a pixel.
+        # The power of a mode of noise is exponential, so that a mean of n has the relative error
+        # n^(-1/2); in units of 1e-6.
         out.append(
             (
                 1e6 * (power - image.power)[keep],
@@ -369,7 +391,7 @@ class MapChannels:
         told = {"what": "texture", "k": -1.0, "x": texture.dx, "y": texture.dy}
         out.append((texture.values, spread, told))
         chess, centres = map_chess(filled)
-        # Single pixels' noise is not evened out as that over many is.
+        # Noise of single pixels: that over many, divided by their ratio.
         error = np.sqrt(single**2 / image.ratio * len(chess) / max(good.sum(), 1))
         out.append(
             (chess, np.full(len(chess), error), {"what": "chess", "k": -1.0, "x": centres, "y": -1.0})
@@ -378,13 +400,13 @@ class MapChannels:
 
     @property
     def _modes(self) -> NDArray[np.int64]:
-        """Modes of each ring."""
+        """Number of modes of each ring."""
         return ring_modes(self._shape)
 
 
 @dataclass
 class _MapGroup:
-    """What the pairs of one condition and exposure time have in common."""
+    """Sums of noise measures over the pairs of one condition and exposure time."""
 
     condition: Condition
     time: float
@@ -412,11 +434,11 @@ class _Sum:
 
 @dataclass
 class _Map:
-    """A map less one, its noise over many pixels as a pixel's variance, and by ring.
+    """A map less one, its noise over many pixels as a pixel's variance (``low``), and by ring.
 
-    ``ratio``: of that variance to the one between neighbours; the effect evens the response of
-    single pixels out as it does their noise, to first order.  ``long``: what noise over
-    blocks has more.
+    ``ratio``: that variance over the one between neighbours.  The brighter-fatter effect smooths
+    the response of single pixels as it does their noise, to first order.  ``long``: excess of the
+    noise in waves of several blocks.
     """
 
     values: NDArray[np.float32]
@@ -441,7 +463,7 @@ def block_side(shape: tuple[int, int]) -> int:
 
 
 def _weights(groups: list[_MapGroup]) -> FloatArray:
-    """Of groups in their mean, by inverse variance of their noise."""
+    """Weights of groups in their mean, by inverse variance of their noise; their sum is 1."""
     weights = np.array([g.weight for g in groups])
     return np.asarray(weights / weights.sum())
 
@@ -453,7 +475,7 @@ def _blocks(image: NDArray, side: int) -> NDArray:
 
 @lru_cache(maxsize=1)
 def _ring_bins(shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """Ring of each mode, :data:`RINGS` where it is not used: rows' and columns' own are not."""
+    """Ring of each mode, RINGS where it is not used: modes of row or column means are not."""
     fy, fx = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None]
     bins = np.minimum((np.hypot(fy, fx) * 2 * RINGS).astype(np.uint8), RINGS)
     bins[0], bins[:, 0] = RINGS, RINGS
@@ -463,7 +485,7 @@ def _ring_bins(shape: tuple[int, int]) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=1)
 def _is_long(shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """Modes longer than so many blocks; rows' and columns' own are not."""
+    """Mask of the modes longer than LONG blocks, without those of row or column means."""
     fy, fx = np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1])[None]
     out = np.hypot(fy, fx) * LONG * block_side(shape) < 1
     out[0], out[:, 0] = False, False
@@ -472,7 +494,19 @@ def _is_long(shape: tuple[int, int]) -> NDArray[np.bool_]:
 
 
 def long_power(modes: NDArray, shape: tuple[int, int]) -> float:
-    """Mean power of a mode longer than :data:`LONG` blocks, of a map's transform.
+    """Mean power of a mode longer than :data:`LONG` blocks, from a map's transform.
+
+    Parameters
+    ----------
+    modes : ndarray, shape (ny, nx // 2 + 1)
+        ``scipy.fft.rfft2`` of the map.
+    shape : (int, int)
+        Shape (ny, nx) of the map.
+
+    Returns
+    -------
+    power : float
+        That of white noise is a pixel's variance; 0 if there is no such mode.
 
     Examples
     --------
@@ -489,18 +523,18 @@ def long_power(modes: NDArray, shape: tuple[int, int]) -> float:
 
 
 def ring_modes(shape: tuple[int, int]) -> NDArray[np.int64]:
-    """Modes of each ring of a map of that shape."""
+    """Number of modes of each ring of a map of some shape, shape (RINGS,)."""
     return np.bincount(_ring_bins(shape).ravel(), minlength=RINGS)[:RINGS]
 
 
 def ring_power(image: NDArray) -> FloatArray:
-    """Mean power of a mode by ring; that of white noise is a pixel's variance."""
+    """Mean power of a mode by ring, shape (RINGS,); that of white noise is a pixel's variance."""
     ny, nx = image.shape
     return spectrum_rings(rfft2(image), (ny, nx))
 
 
 def spectrum_rings(modes: NDArray, shape: tuple[int, int]) -> FloatArray:
-    """Mean power of a mode by ring, of a map's transform."""
+    """Mean power of a mode by ring, from a map's transform ``modes`` (``rfft2``)."""
     bins = _ring_bins(shape).ravel()
     power = modes.real**2
     power += modes.imag**2
@@ -510,9 +544,21 @@ def spectrum_rings(modes: NDArray, shape: tuple[int, int]) -> FloatArray:
 
 
 def map_chess(image: NDArray) -> tuple[FloatArray, FloatArray]:
-    """Half of the difference of even and odd pixels (row plus column), in strips, and their x.
+    """Amplitude of a chess pattern in vertical strips: half of even less odd pixels (row + column).
 
-    Columns and rows do not show it, nor do rings, which end at half a cycle a pixel.
+    Means of columns and rows do not show it, nor do rings, which end at half a cycle per pixel.
+
+    Parameters
+    ----------
+    image : ndarray, shape (ny, nx)
+        Map.
+
+    Returns
+    -------
+    values : ndarray, shape (strips,)
+        Half of the mean difference, in units of the map.
+    x : ndarray, shape (strips,)
+        Middle of each strip [pixel].
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Noise that means of rows, of columns and of blocks of one map have in common."""
+"""Noise that means of rows, columns and blocks share because they average the same pixels."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from bfsensor.typing import FloatArray
 
 
 class BlockNoise(NamedTuple):
-    """Errors of blocks' means beside those of columns and rows, all of the same pixels.
+    """Errors of blocks' means conditional on those of columns and rows of the same pixels.
 
     Attributes
     ----------
-    kept : ndarray of int
-        Blocks, counted by rows, that tell more than columns, rows and each other do: of R x C
-        blocks (R - 1) (C - 1).  Below, R and C also count rows and columns of blocks that the
-        rim cuts off.
+    kept : ndarray of int, shape (kept,)
+        Indices of blocks, counted by rows, that do not follow from columns, rows and the other
+        blocks: (R - 1) (C - 1) of R x C.  Below, R and C also count rows and columns of blocks
+        that the rim cuts off.
     covariance : ndarray, shape (kept, kept)
-        Of what columns and rows do not tell of them, for pixels of variance 1.
+        Covariance of the kept blocks' means given columns and rows, for pixels of variance 1.
     spread : ndarray, shape (kept, R + C)
-        What they do tell: from sums over the pixels of rows of blocks and of columns of blocks.
+        Regression of the kept blocks' means on the sums of pixels over rows of blocks and over
+        columns of blocks.
     gather : csr_array, shape (R + C, nx + ny)
-        These sums from the means of columns and, after them, of rows.
+        These sums as combinations of the means of columns and, after them, of rows.
     """
 
     kept: NDArray[np.int64]
@@ -36,7 +37,7 @@ class BlockNoise(NamedTuple):
     gather: csr_array
 
     def common(self) -> Common:
-        """Of columns, rows and kept blocks, one after another."""
+        """Shared noise of columns, rows and kept blocks, in this order."""
         lines = self.gather.shape[1]
         above = csr_array((lines, len(self.spread.T)))
         right = csr_array((self.gather.shape[0], len(self.kept)))
@@ -47,19 +48,23 @@ class BlockNoise(NamedTuple):
 
 
 def block_noise(good: NDArray[np.bool_], side: int) -> BlockNoise:
-    """Errors of blocks' means, of which those of columns and rows know the additive part.
+    """Errors of blocks' means given the means of columns and rows of the same pixels.
 
-    White noise of pixels, summed over rows and columns of blocks, is that of the sums over rows
-    and columns; what is left is the residual of a two-way table (weighted least squares of row
-    plus column effects), independent of them.  Exact where blocks are whole or lack; single bad
-    pixels are taken as evenly spread.
+    For white noise of pixels, sums over rows and over columns of blocks follow from the means of
+    rows and columns.  The rest of a block's noise is the residual of a two-way table (weighted
+    least squares of row plus column effects) and independent of them.  Exact where blocks are
+    complete or absent; single bad pixels are taken as evenly spread.
 
     Parameters
     ----------
     good : ndarray of bool, shape (ny, nx)
-        Pixels that are read; blocks that are half empty tell nothing.
+        Pixels that are read; blocks with no more than half of their pixels are left out.
     side : int
-        Of a block [pixel]; what is beyond the last whole block counts in columns and rows.
+        Side of a block [pixel]; pixels beyond the last whole block count in columns and rows.
+
+    Returns
+    -------
+    BlockNoise
 
     Examples
     --------
@@ -76,7 +81,7 @@ def block_noise(good: NDArray[np.bool_], side: int) -> BlockNoise:
     count = pixels[row, column].astype(float)
     full = np.flatnonzero((row < whole[0]) & (column < whole[1]))
     kept = full[_kept(row[full], column[full], whole)]
-    # A table of which sums over rows and over columns are known.
+    # Row and column sums of the two-way table of blocks, as linear functions of block means.
     table = np.zeros((sum(map(len, starts)), len(count)))
     table[row, np.arange(len(count))] = count
     table[len(starts[0]) + column, np.arange(len(count))] = count
@@ -92,9 +97,10 @@ def block_noise(good: NDArray[np.bool_], side: int) -> BlockNoise:
 def _kept(
     row: NDArray[np.int64], column: NDArray[np.int64], shape: tuple[int, int]
 ) -> NDArray[np.int64]:
-    """Blocks that are left when those that follow from sums over rows and columns are dropped.
+    """Indices of blocks that do not follow from the others and the sums over rows and columns.
 
-    These join all rows and columns of blocks that others join; the last ones are taken.
+    Blocks are edges of a bipartite graph of rows and columns; those of a spanning forest follow
+    from the sums and are dropped, the last ones first.
     """
     joined = DisjointSet(range(sum(shape)))
     order = np.argsort(-np.maximum(row - shape[0], column - shape[1]), kind="stable")
@@ -105,7 +111,7 @@ def _kept(
 def _gather(
     good: NDArray[np.bool_], starts: list[NDArray[np.int64]], pixels: FloatArray
 ) -> csr_array:
-    """Sums over rows of blocks and columns of blocks from the means of columns and rows."""
+    """Matrix from the means of columns and rows to sums over rows and columns of blocks."""
     ny, nx = good.shape
     of_rows, of_columns = (
         np.repeat(np.arange(len(s)), np.diff(np.append(s, n)))

@@ -1,4 +1,4 @@
-"""Rings in maps of flats, evenly spaced or not: where fits of tree rings may begin."""
+"""Detection of tree rings, evenly spaced or not, in maps of flats: starting points of their fits."""
 
 from __future__ import annotations
 
@@ -11,32 +11,62 @@ from scipy.optimize import least_squares
 from bfsensor.typing import FloatArray
 
 HIGHEST = 0.2
-"""Frequency [1/pixel] of the finest rings that are sought."""
+"""Highest frequency of rings that is searched [1/pixel].  Chosen: periods from 5 pixels on; with
+0.4, from 2.5 pixels on, in twice the time."""
 
 ORDERS = 7
-"""Of the polynomial that a phase is followed by."""
+"""Order of the polynomial in radius that the phase is fitted by.  Chosen: its derivative has up
+to six zeros, about three sways of the spacing; with 14, it also follows noise at the profile's
+ends."""
 
 CLEARER = 30.0
-"""Chi-square that uneven spacing must take beyond an even change to be told."""
+"""Decrease of the chi-square by unevenly spaced rings, beyond that by an even change of the
+spacing, above which they are returned.  Chosen, to be derived: two more parameters gain 30 by
+noise with probability 3e-7; with 60, weaker sways begin as even rings."""
 
 
 class RingLaw(NamedTuple):
-    """Phase of rings against the radius: names of its numbers, starts, and steps of derivatives."""
+    """Law of the phase against the radius: names of its parameters and steps of derivatives.
+
+    A step of 0 stands for 1e-3 of the parameter.
+    """
 
     names: tuple[str, ...]
     steps: tuple[float, ...]
 
 
 EVEN = RingLaw(("period", "chirp"), (0.0, 1e-3))
+"""Rings whose frequency changes linearly with radius.  Steps are chosen small against the
+parameters; twice as large, derivatives are off by twice as much, and fits take a round more."""
+
 UNEVEN = RingLaw(("period", "sway", "length", "sway_phase"), (0.0, 1e-3, 0.3, 1e-3))
+"""Rings whose spacing varies sinusoidally with radius, over a length [pixel].  Steps are chosen
+like those of :data:`EVEN`."""
 
 
 def turns_of(
     law: RingLaw, r: FloatArray, r0: float, p: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Phase [cycles] and its slope [1/pixel] at radii; of :data:`EVEN` or :data:`UNEVEN`.
+    r"""Phase [cycles] and its derivative [1/pixel] by the radius.
 
-    ``r0``: radius of the pixel (0, 0).
+    .. math::
+        \phi = \frac{r}{p} \Big(1 + c \frac{r - r_0}{200}\Big) \quad\text{or}\quad
+        \phi = \frac{r}{p} \Big(1 + s \sin 2 \pi (r / l + \varphi_s)\Big)
+
+    Parameters
+    ----------
+    law : RingLaw
+        :data:`EVEN` (period p, chirp c) or :data:`UNEVEN` (period, sway s, length l, sway_phase).
+    r : ndarray
+        Radii [pixel].
+    r0 : float
+        Radius of the pixel (0, 0) [pixel].
+    p : ndarray
+        Parameters of the law.
+
+    Returns
+    -------
+    turns, slope : ndarray, shape of r
     """
     if law is EVEN:
         turns = r / p[0] * (1 + p[1] * (r - r0) / 200.0)
@@ -55,24 +85,26 @@ def find_rings(
 ) -> list[tuple[float, dict[str, float]]]:
     """Fit rings to a map from circles nearby.
 
-    The profile about the centre is followed in radius, its phase free to bend, and told by a
-    frequency that changes evenly or, if that is not enough, by one that sways.
+    The mean profile about the centre is fitted in radius with a polynomial phase, which starts
+    fits of two laws: a frequency that changes linearly and, if that gains enough, one that varies
+    sinusoidally.
 
     Parameters
     ----------
     values : ndarray, shape (ny, nx)
         Map, in units of its noise.
     x, y : ndarray, shape (ny, nx)
-        Places [pixel].
+        Coordinates of its pixels [pixel].
     start : (float, float, float, float)
-        Centre [pixel], period at the pixel (0, 0) [pixel] and change of the frequency per 100
-        pixels.
+        Centre x and y [pixel], period at the pixel (0, 0) [pixel] and relative change of the
+        frequency per 100 pixels.
 
     Returns
     -------
     list of (float, dict)
-        Chi-square explained, and parameters of the tree rings: 'xc', 'yc', 'period', 'phase',
-        'amp', and 'chirp' or 'sway', 'length', 'sway_phase'.
+        Decrease of the chi-square, and parameters of the tree rings: 'xc', 'yc', 'period',
+        'phase', 'amp', and 'chirp' or 'sway', 'length', 'sway_phase'.  Both laws if the uneven
+        one gains :data:`CLEARER` more; empty if no fit succeeds.
 
     Examples
     --------
@@ -95,7 +127,7 @@ def find_rings(
             tried.append(one)
     even = max((t for t in tried if "chirp" in t[1]), key=lambda t: t[0])
     best = max(tried, key=lambda t: t[0])
-    # Fits may begin at both: what is near an even change is that.
+    # Both are starting points; without a clear gain the simpler law is enough.
     return [best, even] if best[0] > even[0] + CLEARER else [even]
 
 
@@ -108,13 +140,14 @@ def _fit(
     def solve(p: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         r, r0 = np.hypot(x - p[0], y - p[1]), float(np.hypot(p[0], p[1]))
         turns, slope = turns_of(law, r, r0, p[2:])
-        # Areas change as the slope of a displacement along the radius.
+        # Rings displace charge along the radius; areas change by the derivative of that.
         turns, rate = 2 * np.pi * turns, 2 * np.pi * slope
         basis = np.stack([(rate * np.cos(turns)).ravel(), (-rate * np.sin(turns)).ravel()])
         found = np.linalg.lstsq(basis @ basis.T, basis @ flat, rcond=None)[0]
         model = found @ basis
         return float(((flat - model) ** 2).sum()), np.asarray(found, float), model
 
+    # Half a pixel for the centre, which is hundreds of pixels away; damping after Marquardt.
     steps = np.array([0.5, 0.5, *(s or 1e-3 * point[2] for s in law.steps)])
     square, found, model = solve(point)
     damping = 1e-3
@@ -129,6 +162,7 @@ def _fit(
         normal = normal / np.outer(scale, scale) + damping * np.eye(len(steps))
         step = np.linalg.solve(normal, slopes @ (flat - model) / scale) / scale
         new = point + step
+        # No period below 2 pixels, the Nyquist limit.
         if not new[2] > 2.0:
             damping *= 8
             continue
@@ -156,7 +190,7 @@ def _fit(
 def _followed(
     values: FloatArray, r: FloatArray, r0: float
 ) -> list[tuple[RingLaw, list[float]]]:
-    """Phases of both laws along the profile of a map in radius."""
+    """Starting values of both laws, from the phase fitted along a map's mean profile in radius."""
     bins = np.floor(r - r.min()).astype(int).ravel()
     count = np.bincount(bins)
     kept = count > 3
@@ -191,7 +225,7 @@ def _followed(
             swaying.append((left, [1 / line[1], sway, float(length), phase]))
     if swaying:
         out.append((UNEVEN, min(swaying, key=lambda s: s[0])[1]))
-    # Which way phases run the fit of strength and phase settles.
+    # The sign of the period is absorbed by the linear amplitudes of sine and cosine.
     return [(law, [abs(n[0]), *n[1:]]) for law, n in out]
 
 
@@ -216,7 +250,8 @@ def _windows(
                 normal = design @ design.T
                 along = design @ target
                 gain = float(along @ np.linalg.solve(normal, along))
-                # Of what a window holds, so that small ones where rings are clear count.
+                # Ranked by the explained part of a window's variance, so that short windows in
+                # which rings are clear rank above long ones in which they are not.
                 found.append(
                     (
                         gain / float(target @ target),
@@ -243,9 +278,9 @@ def _follow(
     width: float,
     frequency: float,
 ) -> tuple[float, FloatArray, FloatArray] | None:
-    """Fit a wave in ever wider parts of a profile, its phase a polynomial of rising order.
+    """Fit a wave in ever wider parts of a profile, its phase a polynomial of increasing order.
 
-    Gives what is left, the phase [cycles] and its slope [1/pixel] at all radii.
+    Returns the chi-square, the phase [cycles] and its derivative [1/pixel] at all radii.
     """
     reach, order = 0.5 * width, 1
     far = max(place[-1] - middle, middle - place[0])

@@ -1,4 +1,4 @@
-"""Texture: a map of flats held against itself, a few pixels apart, and the errors of that."""
+"""Texture: autocovariance of a map of flats at shifts of a few pixels, and its errors."""
 
 from __future__ import annotations
 
@@ -11,25 +11,31 @@ from scipy.fft import irfft, next_fast_len, rfft, rfft2
 from bfsensor.typing import FloatArray
 
 NEAREST, FARTHEST = 4, 40
-"""Distances in x [pixel] at which a map is held against itself: nearer ones share boundaries."""
+"""Smallest and largest shift in x [pixel] of the autocovariance.  Chosen: pixels nearer than 4 are
+correlated by the brighter-fatter effect; up to 80 would double the number of values."""
 
 STRIPE = 256
-"""Rows of a map that are transformed at a time."""
+"""Number of rows of a map that are transformed at a time.  Chosen: with 512, the transforms take
+twice the memory and no less time."""
 
 CLEAR = 18.0
-"""Power over the noise's above which a mode is a pattern's: of 1e6 modes of noise none."""
+"""Power of a mode over the mean power of noise above which it belongs to a pattern.  Derived: the
+power of noise is exponential, so that of 1e6 modes exp(-18) * 1e6 = 0.015 exceed 18; with 36, more
+of a pattern's modes count as noise, and errors are larger."""
 
 STRONGEST = 4096
-"""Modes that count as a pattern's, at most; weaker ones count as noise, which errs to the safe side."""
+"""Largest number of modes that count as a pattern's; weaker ones count as noise, which makes errors
+larger.  Chosen: with 8192, errors of maps with more modes are closer to the truth, at twice the
+memory and time."""
 
 
 class Texture(NamedTuple):
-    """Mean products of a map with itself, shifted.
+    """Autocovariance of a map at shifts of a few pixels.
 
     Attributes
     ----------
     values : ndarray, shape (n,)
-        Products [1e-6].
+        Mean products [1e-6].
     dx, dy : ndarray, shape (n,)
         Shifts [pixel].
     """
@@ -40,11 +46,20 @@ class Texture(NamedTuple):
 
 
 def map_texture(image: NDArray) -> Texture:
-    """Hold a map against itself: mean products [1e-6] of pixels (dx, dy) apart, with dx and dy.
+    """Measure the autocovariance of a map: mean products of pixels (dx, dy) apart.
 
-    In the same row and from one row to the next: patterns that go with the time of readout
-    keep step along a row and start the next one with another phase.  Means of columns and of
-    rows are taken off: they are told by themselves.
+    In the same row and from one row to the next: patterns that go with the time of readout are
+    in phase along a row and start the next one with another phase.  Means of columns and of rows,
+    which are values of their own, are subtracted.
+
+    Parameters
+    ----------
+    image : ndarray, shape (ny, nx)
+        Map of relative response, 0 where nothing is read.
+
+    Returns
+    -------
+    Texture
 
     Examples
     --------
@@ -68,7 +83,7 @@ def map_texture(image: NDArray) -> Texture:
         following += irfft((modes[:-1].conj() * modes[1:]).sum(0), side)
     near, all_ = np.arange(NEAREST, reach + 1), np.arange(-reach, reach + 1)
     all_ = all_[np.abs(all_) >= NEAREST]
-    # A row's mean, taken off, leaves white noise anticorrelated by 1/nx.
+    # Subtracting a row's mean leaves white noise anticorrelated by 1 / nx.
     values = [
         same[near] / (ny * (nx - near)) + same[0] / (ny * nx**2),
         following[all_] / ((ny - 1) * (nx - np.abs(all_))),
@@ -89,16 +104,16 @@ def texture_noise(image: NDArray, texture: Texture, pixels: int) -> FloatArray:
         \mathrm{cov}(T_d, T_{d'}) = \frac{1}{N} \Big( \sigma^4 \delta_{d d'} + 4 \sigma^2
         \sum_k P_k \cos(k \cdot d) \cos(k \cdot d') \Big),
 
-    P the pattern's power in modes k, which are those far above the noise's.
+    with P the pattern's power in modes k, which are those far above the noise.
 
     Parameters
     ----------
     image : ndarray, shape (ny, nx)
         The map, without its smooth shape.
     texture : Texture
-        Of it.
+        Autocovariance of the map.
     pixels : int
-        That are read.
+        Number of pixels that are read.
 
     Returns
     -------
@@ -121,7 +136,7 @@ def texture_noise(image: NDArray, texture: Texture, pixels: int) -> FloatArray:
     variance = float(image.var(dtype=np.float64))
     modes = rfft2(image)
     power = (modes.real**2 + modes.imag**2) / (ny * nx)
-    # Means of columns and rows are not in it.
+    # Means of columns and rows are not part of a texture.
     power[0], power[:, 0] = 0.0, 0.0
     noise = float(np.median(power[1:, 1:])) / np.log(2.0)
     row, column = np.nonzero(power > CLEAR * noise)
@@ -129,13 +144,14 @@ def texture_noise(image: NDArray, texture: Texture, pixels: int) -> FloatArray:
         return np.asarray(1e6 * variance / np.sqrt(products))
     order = np.argsort(power[row, column])[::-1][:STRONGEST]
     row, column = row[order], column[order]
-    # Each stands for itself and its mirror image, but for those that have none.
+    # A mode of a real transform stands for itself and its conjugate, where there is one.
     twice = np.where((column == 0) | (2 * column == nx), 1.0, 2.0)
     strength = twice * power[row, column] / (ny * nx)
     turns = np.outer(texture.dx, column / nx) + np.outer(
         texture.dy, np.fft.fftfreq(ny)[row]
     )
-    # Round-off of strong patterns aside, noise is no less than that of the usual mode.
+    # Noise is the variance without the pattern, but no less than that of the median mode: of
+    # strong patterns the difference is lost in rounding.
     own = max(variance - float(strength.sum()), noise)
     spread = 2 * np.sqrt(own * strength) * np.cos(2 * np.pi * turns)
     spread *= (1e6 / np.sqrt(products))[:, None]

@@ -1,4 +1,4 @@
-"""Waves in maps of flats, straight or bent: where fits of rings and fringes may begin."""
+"""Detection of waves, plane or curved, in maps of flats: starting points of rings and fringes."""
 
 from __future__ import annotations
 
@@ -13,26 +13,33 @@ from bfsensor.diagnose.data.map_rings import find_rings
 from bfsensor.typing import FloatArray
 
 ORDER = 4
-"""Order of the smooth shape of the light in x and in y that maps are freed of."""
+"""Order in x and in y of the polynomial of the light's smooth shape that is removed from maps.
+Chosen: with 8, waves of half a side and longer are removed, too."""
 
 SHORTEST = 5.0
-"""Period [pixel] of the shortest waves that are sought."""
+"""Period [pixel] of the shortest waves that are searched.  Chosen: with 10, fringes and rings of
+5 to 10 pixels have no starting point in the data."""
 
 LARGEST = 1024
-"""Side [pixel] of the middle of a sensor that is searched: a start needs no more."""
+"""Side [pixel] of the middle part of a sensor that is searched.  Chosen: it is enough for a
+starting point; with 2048 the search takes four times as long, and weaker waves are found."""
 
 GAIN = 35.0
-"""Chi-square that a wave must take of a map to be told: the best of 1e4 tries of seven numbers
-takes 30 of noise."""
+"""Decrease of the chi-square above which a wave is returned.  Derived: a chi-square of seven
+parameters exceeds 30 with probability 1e-4, that is in one of 1e4 tries; 35 with 1.1e-5.  With 70,
+waves must be 1.4 times as strong to be returned."""
 
 TRIES = 3
-"""Windows that waves are followed from."""
+"""Number of windows from which waves are followed.  Chosen: with 6, weaker waves beside two strong
+ones are found, in twice the time."""
 
 CLEAR = 2.0
-"""Logarithm by which the strongest mode of a window must be less likely than the strongest of
-noise alone is, to be followed."""
+"""Minus the logarithm of the probability that the strongest mode of a window of noise is as strong,
+above which a window is followed.  Chosen: 14 % of windows of noise pass, and :data:`GAIN` decides;
+with 4, 2 % pass and weak waves are lost."""
 
 Part = tuple[slice, slice]
+"""Rows and columns of a part of a sensor."""
 
 
 @lru_cache(maxsize=8)
@@ -42,16 +49,16 @@ def smooth_shapes(n: int) -> FloatArray:
 
 
 def without_shape(image: NDArray[Any]) -> NDArray[Any]:
-    """Take a polynomial of order :data:`ORDER` in x and y off."""
+    """Subtract the least-squares polynomial of order :data:`ORDER` in x and in y."""
     q_y, q_x = (smooth_shapes(n) for n in image.shape)
     return np.asarray(image - q_y @ (q_y.T @ image @ q_x) @ q_x.T, image.dtype)
 
 
 class Wave(NamedTuple):
-    """A sine of a phase that is quadratic in place, about (x, y) [pixel].
+    """A wave whose phase is quadratic in position, about (x, y) [pixel].
 
-    ``fx``, ``fy``: cycles a pixel there; ``xx``, ``xy``, ``yy``: their slopes [1/pixel^2];
-    ``sine``, ``cosine``: its parts.
+    ``fx``, ``fy``: frequency there [cycles per pixel]; ``xx``, ``xy``, ``yy``: its derivatives
+    [cycles per pixel^2]; ``sine``, ``cosine``: amplitudes of its two parts, in units of the map.
     """
 
     x: float
@@ -65,7 +72,7 @@ class Wave(NamedTuple):
     cosine: float = 0.0
 
     def about(self, x: float, y: float) -> Wave:
-        """The same wave about another place."""
+        """The same wave, expanded about another point."""
         dx, dy = x - self.x, y - self.y
         fx = self.fx + self.xx * dx + self.xy * dy
         fy = self.fy + self.xy * dx + self.yy * dy
@@ -76,34 +83,36 @@ class Wave(NamedTuple):
 
     @property
     def amp(self) -> float:
-        """Amplitude."""
+        """Amplitude, in units of the map."""
         return float(np.hypot(self.sine, self.cosine))
 
 
 def find_patterns(
     image: NDArray[Any], name: str, amplifiers: Sequence[Part] = ()
 ) -> list[dict[str, Any]]:
-    """Find waves in a map, and the rings that those of the map of all light may be.
+    """Find waves in a map and, in the map of all flats, rings that they may belong to.
 
-    Plane waves stand out of windows' spectra; each is followed outwards, its frequency free to
-    change evenly with place, and told if it explains enough of the whole map.
+    Plane waves are sought in the spectra of windows; each is fitted in ever larger parts of the
+    map with a frequency that changes linearly with position, and returned if it explains enough
+    of the whole map.
 
     Parameters
     ----------
     image : ndarray, shape (ny, nx)
-        Map less one, nan where there is none.
+        Map of relative response less one, nan where nothing is read.
     name : str
-        Of the map.
+        Name of the map; rings are sought in 'all' only.
     amplifiers : sequence of (slice, slice)
-        Rows and columns of each: where the light is not even, levels step between them.
+        Rows and columns of each amplifier, between whose means the map may have steps.
 
     Returns
     -------
     list of dict
-        At most two waves, the clearest first: 'map', 'z', 'shape' ('wave': 'fx', 'fy', 'xx',
-        'xy', 'yy' of :class:`Wave` about the middle, pixel n / 2, 'phase' [cycles], 'amp'). Of
-        the map of all light before them the clearest 'rings' of
-        :func:`bfsensor.diagnose.data.map_rings.find_rings`.
+        At most two waves, the most significant first: 'map', 'z', 'shape' ('wave': 'fx', 'fy',
+        'xx', 'xy', 'yy' of :class:`Wave` about the middle, pixel n / 2, 'phase' [cycles], 'amp').
+        Before them, in the map of all flats, the most significant 'rings' of
+        :func:`bfsensor.diagnose.data.map_rings.find_rings`.  Empty for maps of less than 24
+        pixels on a side.
 
     Examples
     --------
@@ -130,6 +139,8 @@ def find_patterns(
         gain = float(
             (values**2).sum() - ((values - _model(wave, *_grid(values))[0]) ** 2).sum()
         )
+        # Chosen, to be derived: windows of one wave lead to gains that agree to 5 %; two waves
+        # rarely do.
         like = any(abs(gain - g) < 0.05 * g for g, _ in out)
         if gain > GAIN and not like:
             out.append((gain, wave))
@@ -163,7 +174,7 @@ def find_patterns(
             "phase": float(np.arctan2(whole.cosine, whole.sine) / (2 * np.pi)),
             **{k: getattr(whole, k) for k in ("fx", "fy", "xx", "xy", "yy")},
         })  # fmt: skip
-    # Waves of other parts of the same rings lead to other circles: the clearest count.
+    # Waves in different parts of the same rings give different circles: the best is kept.
     clearest = max(found, key=lambda f: f[0], default=(0.0, []))[1]
     return [*clearest, *told[:2]]
 
@@ -171,7 +182,7 @@ def find_patterns(
 def _middle(
     image: NDArray[Any], amplifiers: Sequence[Part]
 ) -> tuple[tuple[int, int], FloatArray]:
-    """Where the middle begins, and its deviations from a smooth shape with steps."""
+    """Corner of the middle part, and its deviations from a smooth shape with steps."""
     y, x = (max((n - LARGEST) // 2, 0) for n in image.shape)
     part = np.s_[y : y + LARGEST, x : x + LARGEST]
     values = np.asarray(image[part], float)
@@ -192,7 +203,7 @@ def _middle(
 
 
 def _plane_waves(values: FloatArray, highest: float) -> list[Wave]:
-    """Peaks of the spectra of windows of three sizes, the least likely by chance first."""
+    """Peaks in the spectra of windows of three sizes, the least probable under noise first."""
     ny, nx = values.shape
     found = []
     for part in (1, 2, 4):
@@ -209,6 +220,7 @@ def _plane_waves(values: FloatArray, highest: float) -> list[Wave]:
                 power = np.abs(np.fft.rfft2(cut)) ** 2 / (weight**2).sum()
                 power = np.where(use, power / np.median(power[use]) * np.log(2), 0.0)
                 j, i = np.unravel_index(int(np.argmax(power)), power.shape)
+                # Power of noise is exponential: the largest of n modes exceeds p with n exp(-p).
                 chance = power[j, i] - np.log(use.sum())
                 fy, fx = np.fft.fftfreq(size)[j], np.fft.rfftfreq(size)[i]
                 middle = 0.5 * (size - 1)
@@ -226,7 +238,7 @@ def _grid(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _model(wave: Wave, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Value at places, and its derivatives by all but the place, last axis."""
+    """Value of a wave at points, and its derivatives by all parameters but x and y (last axis)."""
     dx, dy = x - wave.x, y - wave.y
     phase = 2 * np.pi * (
         wave.fx * dx + wave.fy * dy
@@ -241,7 +253,7 @@ def _model(wave: Wave, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def _follow(values: FloatArray, start: Wave) -> Wave | None:
-    """Fit a wave in ever wider parts of a map around where it was seen."""
+    """Fit a wave in ever larger parts of a map around the window where it was detected."""
     ny, nx = values.shape
     reach = max(min(ny, nx) / 8, 1.0 / np.hypot(start.fx, start.fy))
     wave, bent = start, False
@@ -256,13 +268,15 @@ def _follow(values: FloatArray, start: Wave) -> Wave | None:
         wave = fitted
         if reach > max(ny, nx):
             return wave
+        # Chosen, to be derived: 1.4 doubles the area; much farther the extrapolated phase may be off
+        # by half a turn and the fit lose the wave.
         reach, bent = 1.4 * reach, True
 
 
 def _fit(
     values: FloatArray, x: FloatArray, y: FloatArray, wave: Wave, bent: bool
 ) -> Wave | None:
-    """Least squares from a wave nearby (Levenberg-Marquardt)."""
+    """Least squares from a wave nearby (Levenberg-Marquardt); None where it is singular."""
     used = np.array([True, True, bent, bent, bent, True, True])
     if not wave.amp:
         _, slopes = _model(wave, x, y)
@@ -271,6 +285,8 @@ def _fit(
         wave = wave._replace(sine=float(parts[0]), cosine=float(parts[1]))
     here, slopes = _model(wave, x, y)
     square, damping = float(((values - here) ** 2).sum()), 1e-3
+    # Damping after Marquardt, in units of the normal matrix's diagonal: a fifth of it after a step
+    # that gains, eight times after one that does not; 1e3 allows no step worth taking.
     for _ in range(12):
         design = slopes.reshape(-1, 7)[:, used]
         normal = design.T @ design
@@ -297,10 +313,10 @@ def _fit(
 
 
 def _circles(wave: Wave, far: float) -> tuple[float, float, float, float]:
-    """Circles that a bent wave is part of: its crests' curvature tells how far the centre is.
+    """Circles that a curved wave is part of; the curvature of its crests gives the centre.
 
-    ``far``: the farthest it may be [pixel].  Gives the centre, the period at the pixel (0, 0)
-    and the relative change of the frequency per 100 pixels.
+    ``far``: largest distance of the centre [pixel].  Returns the centre [pixel], the period at the
+    pixel (0, 0) [pixel] and the relative change of the frequency per 100 pixels.
     """
     frequency = float(np.hypot(wave.fx, wave.fy))
     ux, uy = wave.fx / frequency, wave.fy / frequency

@@ -1,5 +1,5 @@
 # ruff: noqa: D102  (protocol: the class says what its attributes are)
-"""From the exposures of a campaign to channels, one exposure or pair in memory at a time."""
+"""Measure all channels of a campaign from its exposures, one exposure or pair in memory at a time."""
 
 from __future__ import annotations
 
@@ -46,7 +46,19 @@ from bfsensor.typing import FloatArray
 
 
 class Source(Protocol):
-    """What exposures are taken from."""
+    """A campaign that gives exposures in order of time, and reads their frames.
+
+    Attributes
+    ----------
+    exposures : sequence of ExposureInfo
+        Headers of all exposures, in order of time.
+    lamp_error : float
+        Relative error of the lamp monitor, above 0.
+    shape : (int, int)
+        Rows and columns of the sensor.
+    read : callable
+        Returns the frames of an exposure, one for each amplifier, always in the same order.
+    """
 
     @property
     def exposures(self) -> Sequence[ExposureInfo]: ...
@@ -59,50 +71,50 @@ class Source(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class MeasuredChannels:
-    """Channels of a campaign, and what its prediction must know of it.
+    """Measured channels of a campaign, and the properties of the campaign that predictions need.
 
     Attributes
     ----------
     channels : tuple of Channel
-        Of all folds.
+        Channels of all folds.
     amplifiers : tuple of str
-        Names, in the order of the axis 'amp'.
+        Names of the amplifiers, in the order of the axis 'amp'.
     gains : tuple of float
-        Rough gains [e-/ADU] from variance over mean at low levels.
+        Rough gains from mean over variance at low levels [e-/ADU].
     read_noise : tuple of float
-        [ADU].
-    phases : tuple of ndarray
+        Read noise of each amplifier [ADU]; nan where not known.
+    phases : tuple of ndarray, shape (n, 2)
         Centres of the spots within their pixels, by exposure [pixel].
     columns : tuple of int
-        Columns of each amplifier, which charge is shifted through.
+        Number of columns of each amplifier, prescan included, that charge is shifted through.
     flips : tuple of (bool, bool)
-        Which amplifiers read backwards in x and y.
+        Whether each amplifier reads backwards in x and y.
     origins : tuple of (int, int)
-        Lower left corner (x, y) of each amplifier on the sensor.
+        Lower left corner (x, y) of each amplifier on the sensor [pixel].
+    shape : (int, int)
+        Rows and columns of the sensor; (0, 0) where nothing is known of pixels.
     notes : tuple of str
-        What could not be measured, and why.
+        Sentences on what could not be measured, and why.
     lamp_known : bool
-        Whether every flat has a reading of the lamp.
+        Whether every flat has a reading of the lamp monitor.
     counts : mapping of str to int
-        Exposures of each kind.
+        Number of exposures of each kind.
     unlike : tuple of UnlikePair
-        Flats of unlike exposure beside one another; in no channel.
+        Differences of flats of unlike exposure, which are in no channel.
     segments : tuple of Segment
-        Where each amplifier lies, and what is read before and after it.
+        Position of each amplifier, with the depths of its prescan and overscans.
     shots : tuple of Shot
-        All exposures in the order of time; levels by the rough gains.
+        All exposures in order of time, with levels [e-] by the mean of the rough gains.
     maps : mapping of (fold, map) to tuple of MapShare
-        Of which flats each map is made.
+        Contributions of flats to each map.
     neighbours : (float, float)
-        Distance of the next spots in x and y [pixel], and how many of those places hold one.
+        Pitch of the grid of spots [pixel], and part of a spot's four neighbours that exist, 0 to 1.
     offsets : tuple of float
-        Mean code of each amplifier without light, of one exposure; nan without overscan.
+        Mean overscan of each amplifier in one exposure [ADU]; nan without overscan.
     biases : tuple of int
-        Numbers of the frames that the mean bias is made of.
-    sightings : tuple of mapping
-        Waves in the maps: where fits of such patterns may begin.
+        Numbers of the exposures in the mean bias.
     placed : tuple of PlacedSpots
-        Spots of all folds, in the order of time.
+        Spots of all folds, in order of time.
     """
 
     channels: tuple[Channel, ...]
@@ -125,6 +137,8 @@ class MeasuredChannels:
     offsets: tuple[float, ...] = ()
     biases: tuple[int, ...] = ()
     sightings: tuple[Mapping[str, Any], ...] = ()
+    """Waves and rings detected in maps, as starting points of fits: see
+    :func:`bfsensor.diagnose.data.map_waves.find_patterns`."""
     placed: tuple[PlacedSpots, ...] = ()
 
 
@@ -140,26 +154,39 @@ def measure_channels(
     Parameters
     ----------
     source : Source
-        Exposures in order of time, and how each is read.
+        Campaign, with exposures in order of time.
     lags : int
-        Largest lag of the flats' covariances [pixel].
+        Largest lag of the flats' covariances [pixel], at least 1.
     progress : callable, optional
-        Called with (exposures done, exposures in all).
+        Called after each exposure with the number read and the number of all.
     ghosts : bool, or mapping of int to list of ndarray of bool
-        Whether biases and darks that hold what spots left are sought, and set apart; if not,
-        campaigns with and without an effect have the same values.  Or those that are set apart,
-        as :func:`~bfsensor.diagnose.data.spot_ghosts.find_ghosts` gives them.
+        Whether biases and darks with persistence of earlier spots are detected: such biases are
+        then used for their levels alone, such darks not at all.  With False all are used, so
+        that campaigns with and without an effect have the same values.  A mapping, as by
+        :func:`~bfsensor.diagnose.data.spot_ghosts.find_ghosts`, names these exposures.
 
     Returns
     -------
-    MeasuredChannels
-        Pairs of flats are spread over the folds; of other exposures, where there are many, one
-        in five is held out, the others are in the fold 'fit'.
+    measured : MeasuredChannels
+        Pairs of flats are spread over the folds; of ten or more other exposures of a kind one in
+        five is held out, all others are in the fold 'fit'.
 
     Raises
     ------
     MeasurementError
-        No exposure can be used, or nothing can be measured with those there are.
+        No exposure is a bias, dark, flat or image of spots, or nothing can be measured.
+
+    Examples
+    --------
+    >>> class Nothing:
+    ...     exposures, lamp_error, shape, read = (), 2e-4, (512, 512), None
+    >>> measure_channels(Nothing())
+    Traceback (most recent call last):
+    bfsensor.errors.MeasurementError: no bias, flat, dark or spots among no exposures
+
+    A campaign on disk is measured by ``measure_channels(CampaignSource(read_campaign(folder)))``,
+    with :class:`bfsensor.diagnose.model.open_baseline.CampaignSource` and
+    :func:`bfsensor.recording.campaign.campaign.read_campaign`.
     """
     exposures = list(source.exposures)
     kinds: dict[str, list[ExposureInfo]] = {}
@@ -189,7 +216,7 @@ def measure_channels(
             biases.add_level(exposure, read(exposure), haunted[exposure.number])
     quiet = [e for e in kinds.get("bias", []) if e.number not in haunted]
     for n, exposure in enumerate(quiet):
-        # Noise is measured in differences of two frames: they go together.
+        # Noise is measured in differences of two frames, which share a fold.
         held = is_held_out(n // 2, len(quiet) // 2)
         (late_biases if held else biases).add(exposure, read(exposure))
         if not held:
@@ -240,7 +267,7 @@ def measure_channels(
         lambda flat: [_good(flats, f) for f in read(flat)], lags=lags,
     )  # fmt: skip
     notes += [*finder.notes, *describe_unlike(unlike), *codes.notes, *late_codes.notes]
-    # Sums of maps are the largest that is held: they go before the spots come.
+    # Sums of maps take most memory: they are released before images of spots are read.
     found_maps, late_found_maps = maps.channels(), late_maps.channels()
     notes += [*maps.notes, *(f"held out: {n}" for n in late_maps.notes)]
     shares = {(e.fold, k): v for e in (maps, late_maps) for k, v in e.shares().items()}
@@ -345,7 +372,7 @@ def _take_pairs(
     shape: tuple[int, int],
     notes: list[str],
 ) -> dict[int, float]:
-    """Read all pairs of flats, level by level; gives the mean level of each flat [ADU]."""
+    """Read all pairs of flats, level by level; returns the mean level of each flat [ADU]."""
     levels: dict[int, float] = {}
     for members in sorted(by_level(groups), key=lambda m: m[0][0].exposure_time or 0.0):
         folds = iter(
@@ -370,7 +397,7 @@ def _add_to_maps(
     biases: BiasChannels,
     shape: tuple[int, int],
 ) -> dict[int, float]:
-    """Add a pair of flats to maps and codes; gives the mean level of either [ADU]."""
+    """Add a pair of flats to maps and codes; returns the mean level of either [ADU]."""
     levels, departures = {}, []
     for exposure, frames in pair:
         image = np.full(shape, np.nan, np.float32)
@@ -405,7 +432,7 @@ def _segment(frame: Frame) -> Segment:
 def _shots(
     exposures: Sequence[ExposureInfo], levels: Mapping[int, float], gain: float
 ) -> tuple[Shot, ...]:
-    """All exposures as effects see them; without a level unless they are flats or spots."""
+    """All exposures as effects need them; their level is 0 unless they are flats or spots."""
     times = [e.mjd for e in exposures if e.mjd is not None]
     out = []
     for e in exposures:
@@ -425,7 +452,17 @@ def _shots(
 
 
 def place(image: NDArray[np.floating], frame: Frame, values: FloatArray) -> None:
-    """Put an amplifier's values, in readout order, where they lie on the sensor."""
+    """Copy an amplifier's values, in readout order, to their place in an image of the sensor.
+
+    Parameters
+    ----------
+    image : ndarray, shape (ny, nx)
+        Image of the sensor, changed in place.
+    frame : Frame
+        Gives the origin and the readout directions.
+    values : ndarray, shape of ``frame.image``
+        Values in readout order.
+    """
     values = values[:, ::-1] if frame.flip_x else values
     values = values[::-1] if frame.flip_y else values
     x, y = frame.origin or (0, 0)
@@ -433,7 +470,7 @@ def place(image: NDArray[np.floating], frame: Frame, values: FloatArray) -> None
 
 
 def _data_section(frame: Frame, whole: FloatArray) -> FloatArray:
-    """Cut what belongs to the image out of a whole frame."""
+    """Cut the image, without prescan and overscans, out of a whole frame."""
     start = frame.prescan.shape[1] if frame.prescan.ndim == 2 else 0
     ny, nx = frame.image.shape
     return whole[:ny, start : start + nx]
@@ -457,11 +494,12 @@ def _rough_gains(channel: Channel, gains: list[list[float]]) -> None:
         if not rows.any():
             continue
         level, value = a["level"][rows], channel.values[rows]
-        # Full pixels have next to no variance.
+        # Full pixels have hardly any variance, and would make the gain too high.
         rising = value >= 0.5 * np.median(value / level) * level
         level, value = level[rising], value[rising]
-        # The slope where light begins: read noise is in the lowest of them, and pixels that
-        # repel bend the line, by a sixth of its slope at half of a full well.
+        # The slope of variance against level at level 0: read noise is an offset, and the
+        # brighter-fatter effect makes the curve quadratic, by a sixth of the slope at half of a
+        # full well.
         degree = min(2, len(set(level)) - 1)
         slope = np.polyfit(level, value, degree, w=1 / value)[-2] if degree > 0 else 0.0
         found.append(1.0 / slope if slope > 0 else float(level[0] / value[0]))

@@ -1,4 +1,4 @@
-"""Where the variance of flats collapses with the level: pixels are full, and say nothing else."""
+"""Detection of full well in flats (photon-transfer turn-off): the level where variance collapses."""
 
 from __future__ import annotations
 
@@ -12,25 +12,30 @@ from numpy.typing import NDArray
 from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
 
 COLLAPSED = 0.5
-"""Part of the variance that light at so high a level should have, below which pixels are full.
-The brighter-fatter effect takes a fifth at most at a full well of 1e5 e-."""
+"""Variance over that expected from fainter flats below which pixels are full.  Chosen, to be
+derived: the brighter-fatter effect takes a fifth at most at a full well of 1e5 e-; with 1 every
+flat with that effect would count as full."""
 
 WEAK = 0.4
-"""Part of the levels, the lowest, that tell what variance light has."""
+"""Part of the levels, the lowest, whose median of variance over level is the expected one.
+Chosen, to be derived: with 0.8 levels at full well may be among them, and make the expected
+variance too low."""
 
 NEARLY = 0.8
-"""Part of the full well that the peak of a spot may reach."""
+"""Part of the full well that the peak of a spot may reach to be fitted.  Chosen, to be derived: the
+peak is estimated as flux / (2 pi sigma_x sigma_y); with 1.6 spots with full pixels would be
+fitted."""
 
 
 class TurnOff(NamedTuple):
-    """Level of each amplifier at which flats turn off.
+    """Level of each amplifier at which the variance of flats collapses.
 
     Attributes
     ----------
     levels : dict of int to float
         Lowest level whose variance has collapsed, by amplifier [ADU].
     electrons : float
-        The lowest of them [e-], by the gain that the weak levels tell.
+        The lowest of them [e-], by the gain from the faintest levels.
     """
 
     levels: dict[int, float]
@@ -38,21 +43,26 @@ class TurnOff(NamedTuple):
 
     @property
     def said(self) -> str:
-        """One sentence for the report."""
+        """Sentence for the report."""
         lowest = min(self.levels.values())
         return (
             f"the variance of flats collapses at {lowest:.0f} ADU (near {self.electrons:.3g} e-): "
-            "the baseline is fitted to fainter flats and spots, and held against all"
+            "the baseline is fitted to fainter flats and spots, and compared with all"
         )
 
 
 def find_turn_off(channels: Sequence[Channel]) -> TurnOff | None:
-    """Find the level at which the variance of flats collapses; None where it does not.
+    """Find the level at which the variance of flats collapses.
 
     Parameters
     ----------
     channels : sequence of Channel
-        What was measured, 'flat_cov' in it.
+        Measured channels, of which 'flat_cov' is used.
+
+    Returns
+    -------
+    TurnOff or None
+        None if the variance collapses in no amplifier.
     """
     levels: dict[int, float] = {}
     electrons = np.inf
@@ -75,7 +85,7 @@ def find_turn_off(channels: Sequence[Channel]) -> TurnOff | None:
 
 
 def below(channels: Sequence[Channel], off: TurnOff) -> list[Channel]:
-    """Channels without flats and spots that reach the turn-off."""
+    """Channels without the flats and spots that reach full well."""
     return [_keep(c, _faint(c, off)) for c in channels]
 
 
@@ -84,7 +94,8 @@ def _faint(channel: Channel, off: TurnOff) -> NDArray[np.bool_]:
     keep = np.ones(len(channel), bool)
     if channel.word in ("flat_cov", "flat_mean") and "level" in x:
         ends = np.array([off.levels.get(int(a), np.inf) for a in x["amp"]])
-        # Whatever is within a few standard deviations of full is partly so.
+        # Chosen: just below full well part of the pixels are full; 3 % are a few standard
+        # deviations of a pixel at 1e4 e- and more.
         keep = x["level"] < 0.97 * ends
     elif channel.word == "spot":
         narrow = [channel.values[x["what"] == f"sigma_{d}"] for d in "xy"]
@@ -94,7 +105,7 @@ def _faint(channel: Channel, off: TurnOff) -> NDArray[np.bool_]:
 
 
 def _keep(channel: Channel, keep: NDArray[np.bool_]) -> Channel:
-    """Some values of a channel, with their errors."""
+    """Channel with the values of a mask, and the covariance of their errors."""
     if keep.all():
         return channel
     blocks, start = [], 0

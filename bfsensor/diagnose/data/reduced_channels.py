@@ -1,4 +1,4 @@
-"""Channels of recordings that others reduced: measured a_ij, and covariances of flats."""
+"""Channels of published or reduced data without pixels: measured a_ij, and covariances of flats."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ def measure_reduced(
     Parameters
     ----------
     recording : AreaChangeTable or CovarianceTable
-        From :func:`bfsensor.recording.tables.reduced.find_reduced`.
+        Table, for instance from :func:`bfsensor.recording.tables.reduced.find_reduced`.
     reach : int
-        Largest lag that the baseline predicts; further ones are left out.
+        Largest lag that the baseline predicts [pixel]; larger ones are left out.
 
     Returns
     -------
     MeasuredChannels
-        Of a_ij: unit 1/e-, no amplifier and so neither gain nor noise, (0, 0) left out where
-        it was set by the sum of the others.  Of covariances: e-^2, a gain near 1 and a noise
-        near 0 of each amplifier, which float.
+        For a_ij: unit 1/e-, no amplifier and so neither gain nor noise; (0, 0) is left out where
+        it was set by the sum of the others.  For covariances: unit e-^2; each amplifier has a
+        gain that starts at 1 and a read noise that starts at 0, both free.
 
     Raises
     ------
     DiagnosisError
-        Nothing is left within the reach.
+        No independent value lies within the reach.
     """
     if isinstance(recording, AreaChangeTable):
         return _of_areas(recording, reach)
@@ -58,7 +58,7 @@ def _of_areas(table: AreaChangeTable, reach: int) -> MeasuredChannels:
             f"{int((inside & table.independent & ~used).sum())} a_ij without an error"
         )
     notes.append(
-        "errors of a_ij are taken as independent: what they share is not in the table"
+        "errors of a_ij are taken as independent: the table holds no covariances of them"
     )
     axes = Axes()
     axes.add(
@@ -80,7 +80,7 @@ def _of_covariances(table: CovarianceTable, reach: int) -> MeasuredChannels:
     notes = list(table.warnings) + _beyond(~inside, reach)
     rows = np.flatnonzero(inside)
     names, amp = np.unique(table.amplifier[rows], return_inverse=True)
-    # One level of all amplifiers: the same place in the order of each one's levels.
+    # Amplifiers have unequal gains: levels of the same rank are one exposure level ('time').
     place = np.zeros(len(rows), np.int64)
     for n in range(len(names)):
         own = amp == n
@@ -107,7 +107,7 @@ def _of_covariances(table: CovarianceTable, reach: int) -> MeasuredChannels:
 def _blocks(
     matrix: FloatArray, amp: NDArray[np.int64], place: NDArray[np.int64]
 ) -> tuple[FloatArray, ...]:
-    """Cut an error matrix into amplifiers and levels; whole where it ties them together."""
+    """Cut an error matrix into amplifiers and levels; kept whole if it correlates them."""
     starts = np.flatnonzero(np.diff(amp, prepend=-1) | np.diff(place, prepend=-1))
     ends = np.append(starts[1:], len(amp))
     parts = [matrix[a:b, a:b] for a, b in zip(starts, ends, strict=True)]
@@ -117,15 +117,15 @@ def _blocks(
 
 def _beyond(out: NDArray[np.bool_], reach: int) -> list[str]:
     count = int(out.sum())
-    return [f"{count} values beyond lags of {reach} left out: the baseline ends there"] * (
-        count > 0
-    )
+    return [
+        f"{count} values beyond lags of {reach} left out: the baseline predicts none"
+    ] * (count > 0)
 
 
 def _measured(
     channel: Channel, names: tuple[str, ...], notes: list[str]
 ) -> MeasuredChannels:
-    """A campaign of one channel; nothing of it lies anywhere on a sensor."""
+    """Campaign of one channel without positions on a sensor."""
     n = len(names)
     return MeasuredChannels(
         channels=(channel,), amplifiers=names, gains=(1.0,) * n, read_noise=(0.0,) * n,

@@ -1,4 +1,4 @@
-"""Spots: widths, flux, asymmetry and wings against exposure time, condition by condition."""
+"""Channel 'spot': widths, flux, skewness and wings of images of spots, by exposure."""
 
 from __future__ import annotations
 
@@ -15,25 +15,50 @@ from bfsensor.measure.spots import SpotList, cut_stamps, find_spots
 from bfsensor.typing import FloatArray
 
 STAMP = 11
+"""Side of the stamps in which spots are fitted [pixel].  Chosen: it holds a Gaussian of sigma
+1.2 pixels to 1e-5; with 21 wings beyond a Gaussian would widen the fitted spots."""
+
 WING = 21
-"""Sides of the stamps [pixel] that are fitted, and that the wings are summed in."""
+"""Side of the larger stamps whose sum is a spot's flux [pixel].  Chosen: with 41 those of
+neighbours 30 pixels apart overlap."""
 
 REPEATS = 8
-"""Exposures of equal light, less one a group, from which on their fluxes' scatter is believed."""
+"""Degrees of freedom (exposures of equal light less one per group) above which the fluxes' scatter
+between exposures is their error.  Chosen: the scatter is then known to 25 %; with 16, to 18 %."""
 
 CLIP = 8.0
-"""Median deviations from which on a pixel of the rim is struck: 5.4 sigma of noise."""
+"""Median deviations above which a pixel of a stamp's rim has no part in the background.  Chosen:
+5.4 sigma of Gaussian noise, exceeded by 7e-8 of pixels; with 16, faint tracks raise the
+background."""
 
 QUIET = 2.0
-"""Least median deviation of a pixel [e-]: that of a read noise of 3 e-."""
+"""Smallest median deviation of a pixel that is used for that [e-].  Derived: 0.6745 of a read
+noise of 3 e-, so that noiseless predictions are clipped like recordings; with 4, wings of up to
+32 e- per pixel would count in the background."""
 
 WING_ERROR = 2e-4
-"""Error of the share of a spot's flux outside its stamp: backgrounds are known to about 0.1 e- a
-pixel of 320 (assumed)."""
+"""Systematic error of the part of a spot's flux outside its stamp.  Chosen, to be derived: 0.1
+e- of background in each of the 320 pixels, over a flux of 1.6e5 e-; with 4e-4, wings below that
+part could hardly be found."""
 
 
 class SpotChannels:
-    """Takes images of spots on the sensor in electrons, one by one, and gives their channel."""
+    """Measures images of spots on the sensor in electrons, one by one, and gives their channel.
+
+    Parameters
+    ----------
+    read_noise : float
+        Read noise of a pixel [e-].
+    lamp_error : float
+        Relative error of the lamp monitor.
+    start : float
+        Time of the first exposure of the campaign [MJD]; nan where not known.
+
+    Attributes
+    ----------
+    placed : list of PlacedSpots
+        Spots of all measured exposures.
+    """
 
     def __init__(
         self, *, read_noise: float, lamp_error: float, start: float = np.nan
@@ -50,11 +75,26 @@ class SpotChannels:
     def add(
         self, exposure: ExposureInfo, image: FloatArray, *, fold: str = "fit"
     ) -> str | None:
-        """Measure an exposure; gives why it could not be, or None."""
+        """Measure an exposure.
+
+        Parameters
+        ----------
+        exposure : ExposureInfo
+            Its header.
+        image : ndarray, shape (ny, nx)
+            Image on the sensor [e-]; nan where nothing is read.
+        fold : str
+            Fold of its values.
+
+        Returns
+        -------
+        reason : str or None
+            Why it could not be measured; None if it was.
+        """
         background = float(np.nanmedian(image))
         peak = float(np.nanpercentile(image, 99.9)) - background
         if peak < 10 * max(self._noise, 1.0):
-            return "no spots stand out"
+            return "no spots are ten times brighter than the noise"
         filled = np.where(np.isfinite(image), image, background)
         try:
             spots = find_spots(
@@ -62,7 +102,7 @@ class SpotChannels:
             )
             inside = _inside(spots, filled.shape, WING // 2 + 1)
             if len(inside) < 4:
-                return f"{len(inside)} spots"
+                return f"{len(inside)} spots lie inside, 4 are needed"
             stamps = cut_stamps(filled, inside, size=STAMP)
             fit = fit_spots(
                 stamps, read_noise=self._noise, weights="equal", largest_offset=1.5
@@ -71,7 +111,7 @@ class SpotChannels:
             return str(error)
         used = fit.used
         if used.sum() < 4:
-            return f"{int(used.sum())} spots are left by the fit"
+            return f"{int(used.sum())} spots could be fitted, 4 are needed"
         wide = cut_stamps(filled, inside, size=WING).electrons[used]
         values = stamp_moments(
             stamps.electrons[used], wide, fit.centre_x[used], fit.centre_y[used]
@@ -100,12 +140,12 @@ class SpotChannels:
         return None
 
     def channels(self) -> list[Channel]:
-        """Widths, fluxes, skewness and wings of each exposure."""
+        """Channels 'spot' by fold: widths, fluxes, skewness and wings of each exposure."""
         return [self._channel(fold) for fold in self._folds]
 
     @property
     def _folds(self) -> list[str]:
-        """Folds that there are, what is fitted first."""
+        """Folds of the measured exposures, 'fit' first."""
         return [f for f in FOLDS if any(row[3] == f for row in self._rows)]
 
     def _channel(self, fold: str) -> Channel:
@@ -120,8 +160,9 @@ class SpotChannels:
             for what, (value, error) in found.items():
                 variance = error**2
                 if what == "flux":
-                    # Pinholes differ: how much of that is the same in all exposures, exposures of
-                    # equal light tell; without such the error is that of as many strangers.
+                    # Pinholes differ in brightness, and the same ones are seen in all exposures:
+                    # the scatter between exposures of equal light is the error.  Without enough
+                    # of these it is the error of the mean over pinholes, which is larger.
                     scatter = error / value if repeat is None else repeat
                     variance = (value * np.hypot(scatter, self._lamp_error)) ** 2
                 if what == "wings":
@@ -136,7 +177,7 @@ class SpotChannels:
                        fold)  # fmt: skip
 
     def _flux_scatter(self) -> float | None:
-        """Relative scatter of the fluxes of exposures of equal light; None of too few."""
+        """Relative scatter of the fluxes of exposures of equal light; None with too few."""
         groups: dict[tuple, list[float]] = {}
         for exposure, found, *_ in self._rows:
             key = (condition_of(exposure), exposure.exposure_time)
@@ -158,7 +199,7 @@ class SpotChannels:
 
     @property
     def neighbours(self) -> tuple[float, float]:
-        """Distance of the next spots [pixel], and how many of the four places hold one."""
+        """Distance of the next spots [pixel], and part of the four places that hold one, 0 to 1."""
         if not self._grids:
             return np.inf, 0.0
         pitch, share = np.median(self._grids, axis=0)
@@ -166,10 +207,10 @@ class SpotChannels:
 
 
 def _grid(spots: SpotList) -> tuple[float, float]:
-    """Pitch of a square grid of spots [pixel], and share of a spot's four neighbours there are."""
+    """Pitch of a square grid of spots [pixel], and part of a spot's four neighbours that exist."""
     places = np.column_stack([spots.x, spots.y])
     tree = cKDTree(places)
-    # The nearest but itself, and of a square grid four and their diagonals.
+    # Itself, and in a square grid its four neighbours and the four on diagonals.
     away, which = tree.query(places, k=min(9, len(places)))
     pitch = float(np.median(away[:, 1]))
     step = np.abs(places[which[:, 1:]] - places[:, None])
@@ -178,7 +219,7 @@ def _grid(spots: SpotList) -> tuple[float, float]:
 
 
 def _inside(spots: SpotList, shape: tuple[int, int], border: int) -> SpotList:
-    """Spots whose wide stamps lie inside."""
+    """Spots whose wide stamps lie inside the image."""
     keep = (
         (spots.x >= border) & (spots.x < shape[1] - border)
         & (spots.y >= border) & (spots.y < shape[0] - border)
@@ -187,13 +228,14 @@ def _inside(spots: SpotList, shape: tuple[int, int], border: int) -> SpotList:
 
 
 def _clipped_mean(values: FloatArray) -> FloatArray:
-    """Mean along the last axis without what is struck or a neighbour's light.
+    """Mean along the last axis without struck pixels and neighbours' light.
 
-    Not the median: of codes, some of which are too wide, it lies a tenth of one off.
+    The median would be biased by a tenth of a code where codes of the converter have unequal
+    widths.
     """
     middle = np.median(values, axis=-1, keepdims=True)
     away = np.abs(values - middle)
-    # Of predictions, which have no noise, as much counts as in recordings.
+    # Predictions have no noise: they are clipped as recordings are.
     usual = np.maximum(np.median(away, axis=-1, keepdims=True), QUIET)
     near = away <= CLIP * usual
     return np.asarray((values * near).sum(-1) / near.sum(-1))
@@ -205,10 +247,23 @@ def stamp_moments(
     x: FloatArray,
     y: FloatArray,
 ) -> dict[str, FloatArray]:
-    """Flux, skewness along x and y, share of the flux in the wings, background, spot by spot.
+    """Flux, skewness along x and y, share of the flux in the wings, and background of each spot.
 
-    Skewness: the third power of the distance from the fitted centre, with a Gaussian weight of
-    2 pixels, over the flux.  Wings: what lies in the wide stamp outside the fitted one.
+    Parameters
+    ----------
+    stamps : ndarray, shape (n, 11, 11)
+        Images in which the spots were fitted [e-].
+    wide : ndarray, shape (n, 21, 21)
+        Larger images of the same spots [e-].
+    x, y : ndarray, shape (n,)
+        Fitted centres from the middle of the stamps [pixel].
+
+    Returns
+    -------
+    moments : dict of str to ndarray, shape (n,)
+        'skew_x', 'skew_y': mean third power of the distance from the centre, with a Gaussian
+        weight of sigma 2 pixels [pixel^3]; 'flux': sum over the wide stamp [e-]; 'background':
+        clipped mean of its rim [e- per pixel]; 'wings': part of the flux outside the small stamp.
     """
     size = stamps.shape[-1]
     step = np.arange(size) - size // 2

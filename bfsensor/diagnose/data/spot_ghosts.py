@@ -1,4 +1,4 @@
-"""Frames without light that hold what spots before them left: they tell no noise and no zero."""
+"""Detection of persistence in biases and darks: charge that earlier spots left in lit pixels."""
 
 from __future__ import annotations
 
@@ -11,38 +11,45 @@ from bfsensor.diagnose.data.exposure_info import ExposureInfo, Frame
 from bfsensor.typing import FloatArray
 
 LIT = 20.0
-"""Median deviations above the median from which on a pixel of an image of spots is lit."""
+"""Excess over the median above which a pixel of an image of spots is lit [sigma, as 1.4826 median
+deviations].  Chosen: noise never reaches 20; with 40 the outer pixels of spots are not lit, and
+less persistence is seen."""
 
 CERTAIN = 5.0
-"""Standard deviations of the lit pixels' mean above the others from which on ghosts are certain."""
+"""Significance [sigma] of the lit pixels' mean excess above which a frame holds persistence.
+Chosen: noise exceeds 5 in 3e-7 of frames; with 10, frames with up to twice as much persistence
+stay in the mean bias and the read noise."""
 
 LEAST = 4
-"""Frames of a kind that must be left: with fewer all are used."""
+"""Number of biases before any spots below which all biases are used.  Chosen: two differences
+for the read noise need four; with 8, campaigns with 4 to 7 early biases use those with
+persistence."""
 
 Read = Callable[[ExposureInfo], Sequence[Frame]]
+"""Function that returns the frames of an exposure, one for each amplifier."""
 
 
 def find_ghosts(
     exposures: Sequence[ExposureInfo], read: Read
 ) -> dict[int, list[NDArray[np.bool_]]]:
-    """Biases and darks in which pixels that spots lit before stand above the others.
+    """Find biases and darks with persistence: pixels lit by earlier spots above the others.
 
-    They are held against the last frame of their kind and exposure time before any spots, line
-    by line: neither a pattern that stands nor the level of a row counts.  Where there is none
-    before spots, or nothing would be left, none is given.
+    They are compared, row by row, with the last frame of their kind and exposure time before any
+    spots, so that neither a fixed pattern nor the level of a row counts.  None is found without
+    such a frame, or with fewer than :data:`LEAST` biases before spots.
 
     Parameters
     ----------
     exposures : sequence of ExposureInfo
-        In the order of time.
+        All exposures in order of time.
     read : callable
-        Gives the frames of an exposure, one of each amplifier.
+        Returns the frames of an exposure, one for each amplifier.
 
     Returns
     -------
     dict of int to list of ndarray of bool
-        By the exposure's number the lit pixels of each amplifier, which together deviate by more
-        than :data:`CERTAIN` of their error.
+        Lit pixels of each amplifier by the exposure's number, for exposures in which their mean
+        excess is above :data:`CERTAIN`.
     """
     spots: list[ExposureInfo] = []
     before: dict[tuple[str, float], list[ExposureInfo]] = {}
@@ -54,7 +61,7 @@ def find_ghosts(
         elif one.kind in ("bias", "dark") and not spots:
             before.setdefault(key, []).append(one)
         elif one.kind in ("bias", "dark"):
-            # The brightest shows best where light falls; of equal ones the last left most.
+            # The brightest spots define the lit pixels best; of equal ones the last left most.
             brightest = max(spots, key=lambda s: (s.exposure_time or 0.0, s.number))
             after.setdefault(key, []).append((one, brightest))
     found: dict[int, list[NDArray[np.bool_]]] = {}
@@ -74,7 +81,7 @@ def find_ghosts(
 
 
 def describe_ghosts(ghosts: Container[int], exposures: Sequence[ExposureInfo]) -> str:
-    """One line on which exposures are used how."""
+    """Sentence on which exposures hold persistence and how they are used."""
     parts = []
     for kind, words in (
         ("bias", "used for their levels alone"),
@@ -85,7 +92,7 @@ def describe_ghosts(ghosts: Container[int], exposures: Sequence[ExposureInfo]) -
         ]
         if numbers:
             parts.append(f"{kind} {', '.join(numbers)} ({words})")
-    return f"hold what spots before them left: {'; '.join(parts)}"
+    return f"persistence of earlier spots is found in: {'; '.join(parts)}"
 
 
 def _lit(image: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -98,7 +105,7 @@ def _excess(
     reference: Sequence[FloatArray],
     lit: Sequence[NDArray[np.bool_]],
 ) -> float:
-    """Mean of lit pixels above those of their rows that are not [standard deviations]."""
+    """Mean excess of lit pixels over the unlit ones of their rows [standard deviations]."""
     above, precision = 0.0, 0.0
     for frame, earlier, here in zip(frames, reference, lit, strict=True):
         if not here.any() or here.all(1).any():

@@ -1,4 +1,4 @@
-"""Where spots of each exposure lie, and how what earlier ones left widens later ones."""
+"""Positions of spots by exposure, and the widening of spots by the persistence of earlier ones."""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ from scipy.spatial import cKDTree
 from bfsensor.typing import FloatArray
 
 NEAR = 3.0
-"""Distance [pixel] up to which spots of two exposures are of the same pinhole."""
+"""Distance up to which spots of two exposures belong to the same pinhole [pixel].  Chosen:
+larger than dithers within a pixel, smaller than half the pitch of spots; with 6, another pinhole
+up to 6 pixels away is taken for the same one where that is missing."""
 
 LEAST = 4
-"""Spots of the same pinholes that are needed to say how far they moved."""
+"""Number of common pinholes below which no widening is computed.  Chosen: with 8, exposures with
+4 to 7 common pinholes are predicted without it."""
 
 
 PIXEL = 1 / 12
-"""Variance of a pixel, over which light is summed up [pixel^2]."""
+"""Variance of a uniform distribution over one pixel [pixel^2]: exact."""
 
 
 class PlacedSpots(NamedTuple):
@@ -27,13 +30,13 @@ class PlacedSpots(NamedTuple):
     Attributes
     ----------
     number : int
-        Of the exposure.
+        Number of the exposure.
     flux : float
-        Mean of a spot [e-], by rough gains.
+        Mean flux of a spot [e-], by rough gains.
     sigma : (float, float)
-        Widths along x and y [pixel].
+        Gaussian widths along x and y [pixel].
     places : ndarray, shape (n, 2)
-        Centres on the sensor [pixel].
+        Centres (x, y) on the sensor [pixel].
     """
 
     number: int
@@ -43,22 +46,24 @@ class PlacedSpots(NamedTuple):
 
 
 def widening(later: Sequence[PlacedSpots], earlier: Sequence[PlacedSpots]) -> FloatArray:
-    r"""What the variance of a spot gains for each part of its charge that is an earlier one's.
+    r"""Increase of a spot's fitted variance per part of its charge that is an earlier spot's.
 
-    A Gaussian :math:`G` is fitted by least squares, its flux, centre and variances free, to which
-    a small share of another one at a distance is added.  What it changes is that one projected
-    on :math:`G` and its derivatives, all of whose products are Gaussians of the distance.  Of
-    small distances :math:`d` and equal widths it is :math:`d^2`; means are over the pinholes.
+    A Gaussian :math:`G` is fitted by least squares, with free flux, centre and variances, to a
+    spot to which a small share of another Gaussian at a distance is added.  To first order the
+    parameters change by the projection of the second one on :math:`G` and its derivatives; all
+    their products are Gaussians of the distance.  For small distances :math:`d` and equal widths
+    the variance changes by :math:`d^2` per share.  Means are over the pinholes.
 
     Parameters
     ----------
     later, earlier : sequence of PlacedSpots
-        Of n and m exposures.
+        Spots of n and m exposures.
 
     Returns
     -------
     gained : ndarray, shape (2, n, m)
-        Along x and y [pixel^2]; 0 where too few spots are the same.
+        Derivative of the variances along x and y by the share [pixel^2]; 0 where fewer than
+        :data:`LEAST` pinholes are common.
 
     Examples
     --------
@@ -81,15 +86,16 @@ def widening(later: Sequence[PlacedSpots], earlier: Sequence[PlacedSpots]) -> Fl
                 continue
             moved = one.places[same] - other.places[which[same]]
             both = variances + np.square(other.sigma) + PIXEL
-            # The second derivative by a place is twice the derivative by a variance.
+            # A Gaussian solves the heat equation: its second derivative by position is twice its
+            # derivative by the variance.
             out[:, n, m] = 2 * np.linalg.solve(gram, _products(moved, both).mean(0))[1:]
     return out
 
 
 def _products(moved: FloatArray, both: FloatArray) -> FloatArray:
-    """Products of G and its second derivatives in x and y with a Gaussian at distances, (n, 3).
+    """Scalar products of G and its second derivatives with a Gaussian at distances, (n, 3).
 
-    ``both``: sums of their variances.
+    ``both``: sums of their variances along x and y [pixel^2].
     """
     bell = np.exp(-0.5 * (moved**2 / both).sum(1)) / (2 * np.pi * np.sqrt(both.prod()))
     bent = moved**2 / both**2 - 1 / both
@@ -97,7 +103,7 @@ def _products(moved: FloatArray, both: FloatArray) -> FloatArray:
 
 
 def _gram(alone: FloatArray, both: FloatArray) -> FloatArray:
-    """Products of G and its second derivatives with one another."""
+    """Scalar products of G and its second derivatives with one another, shape (3, 3)."""
     first, bent = alone[0], -1 / both
     out = np.empty((3, 3))
     out[0], out[1:, 0] = alone, alone[1:]

@@ -1,4 +1,4 @@
-"""Widths of noiseless spots as the channels' fit measures them, many images at once."""
+"""Gaussian widths of noiseless predicted spots, as the fit of recorded spots gives them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,12 @@ from bfsensor.errors import ConvergenceError
 from bfsensor.typing import FloatArray
 
 ROUNDS = 40
+"""Largest number of Gauss-Newton rounds; beyond it :class:`ConvergenceError` is raised.  Chosen:
+with 80 a fit that fails takes twice the time."""
+
 TOLERANCE = 1e-7
-"""Last step of widths and centres [pixel]: far below any error."""
+"""Largest last step of widths and centres [pixel] at convergence.  Chosen: far below errors of
+measured widths; with 2e-7 derivatives of widths by finite differences are twice as inexact."""
 
 # Profiles along an axis: integral, its derivatives by centre and by width, one.
 _INTEGRAL, _CENTRE, _WIDTH, _ONE = range(4)
@@ -20,10 +24,11 @@ _INTEGRAL, _CENTRE, _WIDTH, _ONE = range(4)
 _IN_Y = np.array([_INTEGRAL, _INTEGRAL, _CENTRE, _ONE, _INTEGRAL, _WIDTH])
 _IN_X = np.array([_INTEGRAL, _CENTRE, _INTEGRAL, _ONE, _WIDTH, _INTEGRAL])
 _OWN = 4
+"""Number of columns that each spot has of its own: exact, flux, x, y and background."""
 
 
 class FittedWidths(NamedTuple):
-    """Shape of each image's spots, shape (k,), and centre of each spot, (k, n) [pixel]."""
+    """Widths of each image's spots, shape (k,), and centre of each spot, shape (k, n) [pixel]."""
 
     sigma_x: FloatArray
     sigma_y: FloatArray
@@ -38,23 +43,27 @@ def fit_widths(
 ) -> FittedWidths:
     """Fit one Gaussian shape to the spots of each image, all pixels of equal weight.
 
-    What :func:`bfsensor.measure.spot_fit.fit_spots` finds with ``weights='equal'``, without
-    its search for spots that do not belong: normal equations of a product of two profiles are
-    products of sums along the axes.
+    The result is that of :func:`bfsensor.measure.spot_fit.fit_spots` with ``weights='equal'``,
+    without its rejection of outlying spots.  The model is a product of two profiles, so that
+    its normal equations are products of sums along the axes.
 
     Parameters
     ----------
     stamps : ndarray, shape (k, n, ny, nx)
         Images of n spots [e-], odd sides.
-    sigma : tuple of float
-        Where widths begin [pixel].
+    sigma : (float, float)
+        Starting widths along x and y [pixel].
     centres : ndarray, shape (n, 2)
-        Where centres begin, from the middle of the stamps [pixel].
+        Starting centres (x, y) from the middle of the stamps [pixel].
+
+    Returns
+    -------
+    FittedWidths
 
     Raises
     ------
     ConvergenceError
-        Widths or centres still move after :data:`ROUNDS` rounds, or there are no spots left.
+        Widths or centres still move after :data:`ROUNDS` rounds, or the stamps hold no spots.
 
     Examples
     --------
@@ -79,11 +88,12 @@ def fit_widths(
         score = (
             data - flux[..., None] * normal[..., 0] - background[..., None] * normal[..., 3]
         )
-        # Slopes by places and widths go with the flux.
+        # Derivatives by centres and widths are in proportion to the flux.
         scale = np.ones((count, n, 6))
         scale[..., [1, 2, 4, 5]] = flux[..., None]
         normal *= scale[..., None] * scale[..., None, :]
         score *= scale
+        # Each spot's own parameters are eliminated (Schur complement); two widths are left.
         own, cross = normal[..., :_OWN, :_OWN], normal[..., :_OWN, _OWN:]
         both = np.concatenate([cross, score[..., :_OWN, None]], axis=-1)
         try:

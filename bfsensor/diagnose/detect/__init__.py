@@ -1,1 +1,1 @@
-"""Whether and where something is left: scans and matched filters at one false-alarm rate."""
+"""Detection of what a fit leaves: scans and matched filters at one family-wise false-alarm rate."""

@@ -1,4 +1,8 @@
-"""How well each candidate explains what a fit leaves, all of the fit's parameters free."""
+"""Screening of candidate effects: gain in chi-square and evidence, the fit's parameters projected out.
+
+A candidate's template, the change of all predictions by it, is a matched filter of the residuals.
+Parameters of the fit give way to first order; the candidate itself is not linearised.
+"""
 
 from __future__ import annotations
 
@@ -22,35 +26,49 @@ from bfsensor.files import Cache
 from bfsensor.typing import FloatArray
 
 REFINED = 2
-"""Best starts of a candidate that are refined."""
+"""Number of a candidate's best starting points from which all its parameters are fitted.  Chosen:
+with 4, screens take up to twice as long, and minima near a third or fourth start are found, too."""
 
 MANY, LIKELY = 8, 6
-"""More starts than these are held against one channel first, and so many of them against all."""
+"""Number of starting points above which they are first ranked in one channel of those below, and
+number of those that are then compared in all channels.  Chosen, to be derived: with 16 and 12
+about twice as many predictions of all channels are made; a start that one channel ranks seventh
+is then kept."""
 
 TELLING = "code_hist", "bias_cov", "flat_map"
-"""Channels that are quickly predicted, and tell starts that are many apart."""
+"""Channels that are fast to predict and separate many starting points of one effect (bits, rows,
+positions in a map), in the order of preference."""
 
 ASTRAY = 0.1
-"""Part by which the best amplitude may be off the start's before the path to it is tried."""
+"""Relative change of the amplitude by the linear fit above which the template of an effect that
+is not linear in it is extrapolated quadratically.  Chosen: below it, a quadratic term of the size
+of the linear one makes an error of at most 5 % of the template; with 0.2, of 9 %."""
 
 OCCAM = 5.0
-"""Logarithm of the evidence that a parameter costs a candidate that is not fitted on, for it is
-far from the best (a third of a per cent of its range is about what data allow)."""
+"""Logarithm of the evidence subtracted from a candidate that is not fitted, whatever its number of
+parameters: ln(R / ((2 pi)^(1/2) s)) for one parameter of prior range R and error s = 0.27 % of it.
+Chosen, to be derived: with 10 (s = 0.002 % of R) candidates below the limit for a fit would rank 5
+lower in logarithmic evidence against those that are fitted."""
 
 SCATTERED = 6.0
-"""Gain of the likelihood by scatter from which a candidate that is told by it is not fitted on by
-what it changes in the mean."""
+"""Twice the logarithm of the likelihood ratio by scatter alone, at least which an effect with
+random effects is ranked by its likelihood and not fitted by its mean change.  Chosen, to be
+derived: for one amplitude at its bound noise exceeds 6 with probability 0.7 % (half a chi-square
+of one degree of freedom); with 12 (0.03 %), more effects of weak scatter would be fitted by
+their means alone."""
 
 STEP = 0.02
-"""Of derivatives, as a part of a parameter."""
+"""Step of finite differences, relative to a parameter.  Chosen: a curvature as large as the slope
+makes an error of about 1 % of the derivative; twice as large, of 2 %."""
 
 MOST_CALLS = 15
-"""Evaluations of a refinement for each of its parameters."""
+"""Largest number of function evaluations of a refinement, without those for derivatives.  Chosen:
+with 30, candidates that converge slowly rank higher, and screens take up to twice as long."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """A candidate with its best parameters.
+    """A candidate with its best parameters, and how well it explains the residuals.
 
     Attributes
     ----------
@@ -59,15 +77,15 @@ class Rival:
     gain : float
         Decrease of the chi-square, all other parameters refitted to first order.
     evidence : float
-        Logarithm of its evidence over that of no effect (Laplace), parameters spread over
-        their plausible range.
-    template : ndarray
-        What it changes, whitened, the fit's parameters projected out.
+        Natural logarithm of the Bayes factor against no effect, by Laplace's approximation,
+        with priors over the parameters' plausible ranges.
+    template : ndarray, shape (n + priors,)
+        Whitened change of all predictions, the fit's parameters projected out.
     select : float
-        Decrease of the chi-square of the fold that selects, amplitude fitted without it; nan
-        where the effect is not in that fold.
+        Decrease of the chi-square in the fold 'select' with the amplitude fitted in the other
+        folds; nan where less than 5 % of the template's square is in that fold.
     share : float
-        Part of what it changes, squared, that is in that fold.
+        Part of the template's square that is in that fold, 0 to 1.
     """
 
     effect: Effect
@@ -79,33 +97,35 @@ class Rival:
 
     @property
     def refuted(self) -> bool:
-        """Whether the fold that selects speaks against it: a loss far below the gain due there.
+        """Whether the fold 'select' rejects the candidate, at three standard deviations.
 
-        Of a gain G, of which the share s is due in that fold, noise leaves s G +- 2 (s G)^(1/2).
+        With the share s of a gain G expected there, noise gives s G +- 2 (s G)^(1/2).  The
+        candidate is rejected if the chi-square rises in that fold and is below that by 3 sigma.
         """
         due = self.share * self.gain
         return self.select < min(0.0, due - 3 * 2 * float(np.sqrt(max(due, 0.0))))
 
     @property
     def word(self) -> str:
-        """Class."""
+        """Name of the effect's class."""
         return self.effect.word
 
 
 class Screen:
-    """Judges candidates against the residuals of one fit.
+    """Compares candidates with the residuals of one fit.
 
-    To first order in what the other parameters have to give way: whatever lies in their span is
-    projected out of residuals and templates; effects themselves are not linearised.
+    The span of the fit's parameters is projected out of residuals and templates, so that these
+    parameters are refitted to first order; the candidates themselves are not linearised.
 
     Parameters
     ----------
     predictor : Predictor
-        Of the fit, effects that are in it already included.
+        Predictor of the fit, with the effects that are in it.
     fit : BaselineFit
-        Whose residuals.
+        The fit whose residuals are explained.
     seen : sequence of mapping
-        What the scans found, for those candidates whose place must be looked for.
+        Findings of the scans, from which some candidates take their starting points (place,
+        period): see :func:`bfsensor.diagnose.detect.candidates.seen_of`.
     """
 
     def __init__(
@@ -120,15 +140,15 @@ class Screen:
         select = [np.full(len(c), c.fold == "select") for c in fit.channels]
         priors = np.zeros(len(fit.left) - len(fit.residuals), bool)
         self._select = np.concatenate([*select, priors])
-        # Of starts: what they change hardly depends on the effects that there are.
+        # Templates at starting points hardly depend on the effects in the fit: cached for all fits.
         self._starts = predictor.kept.get(("starts", *fit.channels), Cache)
         self.passed_over: dict[str, str] = {}
-        """Candidates of which a start or a fit could not be worked out, and why."""
+        """Candidates that could not be predicted at a start or during a fit, with the reason."""
         self._scaled_templates: dict[Effect, FloatArray] = {}
         self._scattered: set[Effect] = set()
 
     def change(self, effect: Effect) -> FloatArray:
-        """What an effect changes: whitened, priors' rows after it, parameters projected out."""
+        """Template of an effect, shape (n + priors,): whitened, the fit's parameters projected out."""
         return self._projected(self._change(effect))
 
     def _projected(self, change: NDArray[np.floating]) -> FloatArray:
@@ -137,15 +157,15 @@ class Screen:
         return np.asarray(out - self.fit.basis @ (self.fit.basis.T @ out))
 
     def _change_of_start(self, effect: Effect) -> FloatArray:
-        """As :meth:`change`, found once for all screens of an attribution."""
+        """Template as :meth:`change` gives it, cached for all screens of an attribution."""
         change = self._starts.get(effect, lambda: self._change(effect).astype(np.float32))
         return self._projected(change)
 
     def _change(self, effect: Effect) -> FloatArray:
-        """What an effect changes, whitened."""
+        """Whitened change of all values by an effect, shape (n,)."""
         both = self.predictor.with_effects((*self.predictor.effects, effect), self.point)
         more = both.start[len(both.names) - len(fitted(effect)) :]
-        # Parameters of effects that are there already stay where the fit put them.
+        # Effects that are in the fit keep their fitted parameters.
         point = np.concatenate([self.point, more])
         out = np.zeros(len(self.fit.residuals))
         for n, (channel, start) in enumerate(
@@ -164,10 +184,19 @@ class Screen:
         return out
 
     def tried(self, kind: type[Effect]) -> list[tuple[float, Effect]]:
-        """Places where a fit of a kind of effect may begin, with their gains, greatest first.
+        """Starting points of a kind of effect at their best amplitudes, by decreasing gain.
 
-        Amplitudes are those that fit best, what changes being a multiple of them and of their
-        square; empty where nothing of it could be seen.
+        The change by the effect is linear, or quadratic, in the amplitude, which is fitted.
+
+        Parameters
+        ----------
+        kind : type
+            Class of effect.
+
+        Returns
+        -------
+        tried : list of (float, Effect)
+            Decrease of the chi-square and starting point; empty if none changes any value.
         """
         starts = [_inside(kind(v)) for v in kind.starts(self.predictor.layout, self.seen)]
         tried = []
@@ -175,23 +204,30 @@ class Screen:
             try:
                 tried.append(self._scaled(effect))
             except BFSensorError as error:
-                # So far off that what is measured cannot be worked out.
+                # So strong an effect that a channel, such as widths of spots, is not defined.
                 self.passed_over[effect.name] = str(error)
         return sorted((t for t in tried if t is not None), key=lambda t: -t[0])
 
     def shapes(self, kind: type[Effect], layout: Layout) -> list[FloatArray]:
-        """What an effect changes, of unit length, at each place where a fit of it may begin.
+        """Unit templates of a kind of effect at its starting points (matched filters).
 
-        Of many places (:data:`MANY`) only what one channel shows (:data:`TELLING`).
+        With more than :data:`MANY` starting points, templates of one channel only.
 
         Parameters
         ----------
         kind : type
-            Of effect.
+            Class of effect.
         layout : Layout
-            Which the places are those of.
+            Layout from which the starting points are taken.
+
+        Returns
+        -------
+        shapes : list of ndarray, shape (n + priors,)
+            Whitened, the fit's parameters projected out, of unit length.
         """
         starts = [_inside(kind(v)) for v in kind.starts(layout)]
+        # Templates of all channels at dozens of places take long; a template of one channel is a
+        # weaker filter, with the same false-alarm rate.
         telling = self._telling(kind) if len(starts) > MANY else None
         out = []
         for effect in starts:
@@ -212,7 +248,7 @@ class Screen:
         return out
 
     def _telling(self, kind: type[Effect]) -> tuple[Channel, int] | None:
-        """First channel that tells places of an effect apart, and where it begins."""
+        """First channel that separates starting points, and the index of its first value."""
         word = next((w for w in TELLING if w in kind.touches), "")
         return next((
             (c, int(start)) for c, start in zip(self.fit.channels, self.fit.starts, strict=False)
@@ -220,7 +256,7 @@ class Screen:
         ), None)  # fmt: skip
 
     def _told(self, effect: Effect, channel: Channel) -> FloatArray:
-        """What an effect changes in a telling channel, whitened."""
+        """Whitened change by an effect in one channel, without the other effects of the fit."""
         if channel.word == "flat_map":
             return channel.whiten(lines_of_map(effect, channel, self.predictor.layout))
         plain = self.predictor.with_effects((), self.point)
@@ -230,7 +266,7 @@ class Screen:
         return channel.whiten(change - plain.predict(channel, plain.start))
 
     def _scaled(self, effect: Effect) -> tuple[float, Effect] | None:
-        """Gain of an effect of the best amplitude; None of what cannot be seen."""
+        """Gain of an effect at its best amplitude, and that effect; None if it changes nothing."""
         template = self._change_of_start(effect)
         length = float(template @ template)
         if length <= 0:
@@ -248,20 +284,20 @@ class Screen:
             best = _inside(effect.scaled(factor))
             self._scaled_templates[best] = factor * template
             return factor**2 * length, best
-        # What it changes is f t1 + f^2 t2: both from another amplitude.
+        # With t(f) = f t1 + f^2 t2, the templates at f = 1 and 1/2 give t1 and t2.
         other = self._change_of_start(effect.scaled(0.5))
         one, two = 4 * other - template, 2 * template - 4 * other
         factor = _best_factor((one, two), self.fit.left, signed=signed)
         best = _inside(effect.scaled(factor)) if factor else effect
         template = self.change(best)
         self._scaled_templates[best] = template
-        # As it is: far from the start what it changes is another thing.
+        # From the template at the best amplitude: the quadratic law may not hold as far as that.
         return max(float(template @ (2 * self.fit.left - template)), 0.0), best
 
     def _by_scatter(
         self, effect: Effect, template: FloatArray
     ) -> tuple[float, Effect] | None:
-        """Gain of an effect as strong as scatter tells; None where it tells hardly anything."""
+        """Gain at the amplitude of greatest likelihood by scatter; None if below SCATTERED."""
         fit = self.fit
         own = scatter_of(self.predictor, fit.channels, fit.starts, effect, self.point)
         modes = np.concatenate([own, np.zeros((len(fit.left) - len(own), own.shape[1]))])
@@ -278,7 +314,7 @@ class Screen:
         return max(gain, 0.0), best
 
     def _likely(self, kind: type[Effect], starts: list[Effect]) -> list[Effect]:
-        """Those of many starts that one channel finds likeliest."""
+        """The LIKELY starting points of greatest gain in one channel; all if they are few."""
         telling = self._telling(kind)
         if len(starts) <= MANY or telling is None:
             return starts
@@ -296,14 +332,20 @@ class Screen:
     def best(
         self, tried: Sequence[tuple[float, Effect]], *, least: float = 0.0
     ) -> Rival | None:
-        """Best parameters of a kind of effect; None where nothing of it could be seen.
+        """Fit all parameters of a kind of effect from its best starting points.
 
         Parameters
         ----------
         tried : sequence of (float, Effect)
-            From :meth:`tried`.
+            Starting points from :meth:`tried`.
         least : float
-            Gain of a start below which it is not worth while to fit on from there.
+            Gain of a starting point below which it is not fitted: its evidence is then half its
+            gain less :data:`OCCAM`.
+
+        Returns
+        -------
+        rival : Rival or None
+            The fit of greatest gain; None if no starting point changes any value.
         """
         if not tried:
             return None
@@ -318,7 +360,7 @@ class Screen:
             try:
                 rivals += [self._refine(effect)] if gain >= least else []
             except BFSensorError as error:
-                # On its way the fit came to where nothing can be measured.
+                # The fit reached parameters at which a channel is not defined.
                 self.passed_over[effect.name] = str(error)
         return max(rivals, key=lambda r: r.gain, default=None)
 
@@ -329,8 +371,8 @@ class Screen:
         low, high = np.array([widened(p) for p in names]).T
         start = np.array([effect[p.name] for p in names])
         start = np.clip(start, low + 1e-9 * scales, high - 1e-9 * scales)
-        # Derivatives take 2 % of a value; of those with a step of their own, counted from where
-        # they start, that is it.
+        # least_squares steps by 2 % of a value.  A parameter with a step of its own is scaled by
+        # step / 2 % and counted from its start, so that 2 % of 1 is its own step.
         origin = np.array([
             x - s if p.step else 0.0 for p, x, s in zip(names, start, scales, strict=True)
         ])  # fmt: skip
@@ -358,11 +400,12 @@ class Screen:
         )  # fmt: skip
 
     def _select_gain(self, template: FloatArray) -> tuple[float, float]:
-        """Gain on the fold that selects, the amplitude from the others; what is due there."""
+        """Gain in the fold 'select' with the amplitude of the others, and its expected share."""
         own = self._select
         inside = float(template[own] @ template[own])
         outside = float(template[~own] @ template[~own])
-        # Of an effect that this fold hardly sees it cannot judge.
+        # Chosen, to be derived: a fold that holds less than 5 % of the template's square says
+        # nothing; with 10 % fewer candidates can be rejected.
         if inside < 0.05 * (inside + outside) or outside == 0:
             return float("nan"), 0.0
         factor = float(template[~own] @ self.fit.left[~own]) / outside
@@ -375,24 +418,32 @@ class Screen:
 def evidence(
     effect: Effect, names: Sequence[Parameter], gain: float, slopes: FloatArray
 ) -> float:
-    r"""Logarithm of the evidence of an effect over that of none, after Laplace.
+    r"""Natural logarithm of the Bayes factor of an effect against none, by Laplace's approximation.
 
     .. math::
-        \tfrac12 \Delta\chi^2 + \sum_p \ln \pi(p) + \tfrac{k}{2} \ln 2\pi - \tfrac12 \ln |J^T J|
+        \tfrac12 \Delta\chi^2 + \sum_p \ln \pi(p) + \tfrac{k}{2} \ln 2\pi
+        - \tfrac12 \ln |J^T J + W^{-2}|
 
-    with priors flat in the parameter or in its logarithm over the plausible range; beyond it they
-    fall off as a Gaussian of the logarithm of a width of a factor of two.
+    with priors :math:`\pi` flat in the parameter, or in its logarithm, over the plausible range.
+    Beyond it they fall off as a Gaussian: of the logarithm, with a width of a factor of two, or
+    of a quarter of the range.  :math:`W` is diagonal with 0.3 of each prior's range (a flat
+    prior's standard deviation is 12^(-1/2) = 0.29 of it), so that no posterior is wider than its
+    prior.
 
     Parameters
     ----------
     effect : Effect
         With its best parameters.
     names : sequence of Parameter
-        Those that were fitted.
+        The k parameters that were fitted.
     gain : float
-        Decrease of the chi-square.
+        Decrease of the chi-square, :math:`\Delta\chi^2`.
     slopes : ndarray, shape (n, k)
-        Derivatives of the whitened prediction.
+        Derivatives :math:`J` of the whitened prediction.
+
+    Returns
+    -------
+    evidence : float
     """
     out = 0.5 * gain
     for p in effect.parameters:
@@ -416,7 +467,7 @@ def evidence(
             beyond = 4 * out_by / (p.high - p.low)
             widths[n] = 0.3 * (p.high - p.low)
         prior -= 0.5 * beyond**2
-    # No wider than the prior: of what the data leave open the prior is all there is.
+    # A direction that the data do not constrain is as wide as its prior and costs no evidence.
     matrix = matrix + np.diag(1.0 / widths**2)
     sign, logarithm = np.linalg.slogdet(matrix)
     del sign
@@ -424,7 +475,7 @@ def evidence(
 
 
 def _scale(effect: Effect, p: Parameter) -> float:
-    """Size of a parameter for the minimiser."""
+    """Unit in which the minimiser varies a parameter."""
     if p.step:
         return p.step / STEP
     if p.law != "log":
@@ -433,7 +484,7 @@ def _scale(effect: Effect, p: Parameter) -> float:
 
 
 def _inside(effect: Effect) -> Effect:
-    """Copy with all parameters inside the range of fits."""
+    """Copy with all parameters clipped to the range of fits."""
     values = {}
     for p in fitted(effect):
         low, high = widened(p)
@@ -447,7 +498,7 @@ def _best_factor(
     *,
     signed: bool,
 ) -> float:
-    """Factor f of f t1 + f^2 t2 that explains most of what is left; 0 if none does."""
+    """Factor f for which the template f t1 + f^2 t2 gains most; 0 if none gains."""
     one, two = parts
     p = 2 * float(one @ left), 2 * float(two @ left) - float(one @ one)
     q = -2 * float(one @ two), -float(two @ two)

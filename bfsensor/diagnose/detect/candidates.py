@@ -1,4 +1,4 @@
-"""Candidates for what a fit leaves: which there are, which are concerned, which explain most."""
+"""Candidate effects: which exist, which touch the deviating channels, and their ranking."""
 
 from __future__ import annotations
 
@@ -23,21 +23,29 @@ from bfsensor.effects.library import LIBRARY
 from bfsensor.errors import ConvergenceError
 
 CLOSE = 40.0
-"""Difference in gain from the best up to which rivals are fitted again with all parameters."""
+"""Difference in chi-square gain from the best candidate, below which a candidate is fitted again
+jointly with all parameters; at least 2 % of the best gain.  Chosen, to be derived from the error
+that screening makes by its linearisation of the other parameters: with 80, and 4 %, more
+candidates are fitted jointly, up to five in all."""
 
 HOPELESS, FAR = 3.0, 0.05
-"""Gain of a candidate's best start below which it is not fitted on, and as a part of the best of
-all starts: a fit of its shape makes it a few times as much, not twenty times."""
+"""Chi-square gain of a candidate's best starting point below which its shape is not fitted, and
+the same as a part of the best gain of all candidates.  Chosen, to be derived: a fit of the shape
+is taken to raise a gain by less than a factor of 20; with 6 and 0.1 fewer candidates are fitted,
+and one whose gain a fit raises tenfold could be missed."""
 
 PULLED = 3.0
-"""Distance of a device parameter from its card, in its spread, that is far."""
+"""Distance of a device parameter from its nominal value, in units of its prior's width, above which
+named hypotheses about the baseline are fitted jointly.  Chosen, to be derived: by chance at most
+0.3 % of parameters are as far; with 6, exchanged axes that pull the device by less are missed."""
 
 REFITTED = 5
-"""Most rivals that are."""
+"""Largest number of candidates that are fitted again jointly.  Chosen, to be derived: with 10
+the joint fits of one step take up to twice as long."""
 
 
 def candidates_of(baseline: Baseline) -> tuple[type[Effect], ...]:
-    """Candidates for what a baseline leaves out: the library, and its card's parameters."""
+    """All candidates for a baseline: the library of effects, and the device's own parameters."""
     own = device_parameters(
         baseline.derivatives_by_condition(), baseline.spread, baseline.nominal
     )
@@ -47,32 +55,36 @@ def candidates_of(baseline: Baseline) -> tuple[type[Effect], ...]:
 def tellable(
     kinds: Sequence[type[Effect]], predictor: Predictor, channels: Sequence[Channel]
 ) -> list[type[Effect]]:
-    """Candidates that the recordings can tell: reduced ones lack pixels, a_ij alone the level."""
+    """Candidates that these recordings can constrain.
+
+    Reduced recordings have no pixels, a_ij alone no signal level: effects that need them are
+    left out.
+    """
     pixels = bool(predictor.layout.segments)
     levels = any(c.unit != PER_ELECTRON for c in channels)
     return [k for k in kinds if (pixels or not k.of_pixels) and (levels or not k.of_levels)]
 
 
 def name_of(kind: type[Effect]) -> str:
-    """Class, and variant where there are several."""
+    """Name of a class of effect, with its variant where there are several: 'word:variant'."""
     return f"{kind.word}:{kind.variant}" if kind.variant else kind.word
 
 
 def concerned(kinds: Sequence[type[Effect]], *seen: Mismatch) -> list[type[Effect]]:
-    """Candidates that touch any channel in which something stands out."""
+    """Candidates that change any channel in which a finding was made."""
     words = {f.word for mismatch in seen for f in mismatch.findings}
     words |= set(DEVICE_SEEN) if DEVICE in words else set()
     return [k for k in kinds if words & set(k.touches)]
 
 
 def further(kinds: Sequence[type[Effect]], effects: Sequence[Effect]) -> list[type[Effect]]:
-    """Candidates that are not there already."""
+    """Candidates that are not yet in the model."""
     there = {e.name for e in effects}
     return [k for k in kinds if name_of(k) not in there]
 
 
 def rank(screen: Screen, kinds: Sequence[type[Effect]]) -> list[Rival]:
-    """Best of each kind, greatest evidence first."""
+    """Best fit of each kind of effect, by decreasing evidence."""
     starts = [screen.tried(kind) for kind in kinds]
     best = max((t[0][0] for t in starts if t), default=0.0)
     least = max(HOPELESS, FAR * best)
@@ -83,10 +95,25 @@ def rank(screen: Screen, kinds: Sequence[type[Effect]]) -> list[Rival]:
 def with_hypotheses(
     model: Model, kinds: Sequence[type[Effect]], ranking: Sequence[Rival]
 ) -> list[Rival]:
-    """Fit named hypotheses anew, where device parameters have been pulled far off the card.
+    """Fit named hypotheses about the baseline jointly, if a device parameter is far from nominal.
 
-    Parameters that imitate a mistake in the baseline hide it from a fit that is linear about
-    them: exchanged axes are then exchanged back.  In the full fit they return to the card.
+    Device parameters that imitate a mistake in the baseline, such as exchanged axes, hide it from
+    a screen that is linear about their fitted values.  In a joint fit with the hypothesis they
+    return to their nominal values.
+
+    Parameters
+    ----------
+    model : Model
+        The fit so far.
+    kinds : sequence of type
+        Candidates.
+    ranking : sequence of Rival
+        Their ranking by the screen.
+
+    Returns
+    -------
+    ranking : list of Rival
+        With the named hypotheses as fitted jointly, by decreasing evidence.
     """
     pulled = any(abs(v) > PULLED for v in model.fit.pulls.values())
     named = [k for k in kinds if k in NAMED] if pulled else []
@@ -104,7 +131,21 @@ def with_hypotheses(
 
 
 def refine(model: Model, ranking: Sequence[Rival]) -> list[Rival]:
-    """Fit the closest of a ranking again with all parameters, beyond the first order."""
+    """Fit the candidates closest to the best again, jointly with all parameters.
+
+    Parameters
+    ----------
+    model : Model
+        The fit so far.
+    ranking : sequence of Rival
+        Ranking by the screen, not empty.
+
+    Returns
+    -------
+    ranking : list of Rival
+        With gains and evidences of the joint fits, by decreasing evidence; a candidate whose
+        joint fit does not converge keeps those of the screen.
+    """
     best = max(r.gain for r in ranking)
     out = []
     close = [r for r in ranking if best - r.gain < max(CLOSE, 0.02 * best)][:REFITTED]
@@ -128,16 +169,21 @@ def refine(model: Model, ranking: Sequence[Rival]) -> list[Rival]:
 
 
 def with_fitted(ranking: Sequence[Rival], effect: Effect, gain: float) -> list[Rival]:
-    """Give an effect that was fitted the gain of its fit, where the search for it ended lower.
+    """Give an effect in a ranking the gain of its joint fit, if the screen found a smaller one.
 
     Parameters
     ----------
     ranking : sequence of Rival
-        Candidates in its place.
+        Candidates, the effect among them.
     effect : Effect
-        As fitted.
+        With its fitted parameters.
     gain : float
-        Decrease of the chi-square by it.
+        Decrease of the chi-square by its joint fit.
+
+    Returns
+    -------
+    ranking : list of Rival
+        By decreasing evidence.
     """
     out = [
         replace(r, effect=effect, gain=gain, evidence=r.evidence + 0.5 * (gain - r.gain))
@@ -151,7 +197,24 @@ def with_fitted(ranking: Sequence[Rival], effect: Effect, gain: float) -> list[R
 def threshold(
     screen: Screen, ranking: Sequence[Rival], *, seed: int, draws: int = 400
 ) -> float:
-    """Gain that noise alone gives the best of all candidates once in a hundred times."""
+    """Chi-square gain that the best of all candidates reaches by noise with probability ALARM.
+
+    Parameters
+    ----------
+    screen : Screen
+        Of the fit.
+    ranking : sequence of Rival
+        Candidates with their templates.
+    seed : int
+        Seed of the draws.
+    draws : int
+        Number of draws of noise, a multiple of 50.
+
+    Returns
+    -------
+    gain : float
+        Infinite without any template.
+    """
     templates = np.array([
         r.template / np.sqrt(r.template @ r.template)
         for r in ranking if r.template @ r.template > 0
@@ -164,11 +227,12 @@ def threshold(
     for _ in range(draws // 50):
         noise = rng.standard_normal((50, templates.shape[1]))
         largest.append(((noise @ templates.T) ** 2).max(1))
-    # Shapes that are fitted follow the noise: each takes about one of it more.
+    # Templates are fixed in the draws.  Each fitted shape parameter gains 1 on average by
+    # following the noise (a chi-square of one degree of freedom); 2 is one more in its tail.
     return float(np.quantile(np.concatenate(largest), 1 - ALARM)) + 2.0 * extra
 
 
 def seen_of(mismatch: Mismatch) -> list[dict[str, Any]]:
-    """What the scans found, farthest first, as effects take it."""
+    """Findings of the scans, largest deviate first, as mappings that effects take starts from."""
     parts = [*mismatch.parts, *mismatch.findings[:200]]
     return [{**p.where, "word": p.word, "z": p.z, "family": p.family} for p in parts]

@@ -1,4 +1,4 @@
-"""What is left, how unlikely that is, and where: chi-square and scans with one false-alarm rate."""
+"""Detection and location of a mismatch: chi-squares and scans with one family-wise error rate."""
 
 from __future__ import annotations
 
@@ -19,45 +19,55 @@ from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 from bfsensor.typing import FloatArray
 
 DRAWS = 500
-"""Draws of the noise that calibrate the family of all statistics."""
+"""Number of draws of noise that calibrate the largest of all statistics.  Chosen: 100 of them
+lie in the tail beyond the 80 % quantile, whose scale is then good to 10 %; with 1000, to 7 %."""
 
 ALARM = 0.01
-"""Family-wise probability below which a mismatch is called detected."""
+"""Family-wise probability, under noise alone, below which a mismatch counts as detected.  Chosen as
+the false-alarm rate that reports state; with 0.02 two in a hundred campaigns without any effect
+would alarm (checked by ``python -m validation.location.diagnose_nulls``)."""
 
 FAMILY = "effect of the library"
-"""Of findings by the library's own shapes: see :mod:`bfsensor.diagnose.detect.matched_filters`."""
+"""Family of findings by matched filters: see :mod:`bfsensor.diagnose.detect.matched_filters`."""
 
 HOPELESS = 2.3
-"""Deviate below which a lone statistic is not below :data:`ALARM`: one-sided p = 0.0107."""
+"""Deviate [standard deviations] below which no statistic can be a finding.  Derived: a single
+Gaussian statistic there has the one-sided probability 0.0107, above :data:`ALARM`, and in
+a family of several it is larger."""
 
 PARTS = 12
-"""Most templates that a mismatch is taken apart into."""
+"""Largest number of templates that a mismatch is decomposed into.  Chosen: twice as many would list
+more of a mismatch that has more than 12 significant parts; detection does not depend on it."""
 
 FAINT = 0.2
-"""Deviate, relative to the farthest, below which a part counts as what a template's shape,
-chosen of a few, has left over."""
+"""Deviate of a part, relative to the largest, below which the decomposition ends.  Chosen, to be
+derived: a template of a wrong shape, picked among a few, leaves such a part over; with 0.4, a
+second effect of a third of the first one's deviate would not be listed as a part."""
 
 BLOCK = 4_000_000
-"""Numbers of the templates that are put together at a time: 100 MB while they are."""
+"""Numbers in the templates that are combined into one sparse matrix.  Chosen: value and index take
+12 bytes, so that 48 MB are held twice, 100 MB, while it is made; twice as many take 200 MB."""
 
 SMALLEST = 1e-30
-"""Least probability that is told apart from zero: no tail is known farther out."""
+"""Smallest probability that is returned.  Chosen: an exponential tail is not known farther out;
+with 2e-30 reports of very clear findings would say that."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One statistic that stands out.
+    """One statistic that noise does not explain.
 
     Attributes
     ----------
     family, word : str
-        Scan, or 'chi-square'; channel.
+        Name of the scan, or 'chi-square'; name of the channel.
     z : float
-        Standard deviations of the template; of a chi-square, as of a Gaussian of its p-value.
+        Amplitude of the template over its standard error; for a chi-square, the equivalent
+        Gaussian deviate.
     p_value : float
-        Family-wise: that noise gives any statistic as far out.
+        Family-wise probability that noise gives any remaining statistic as extreme, 0 to 1.
     where : dict
-        What the template stands for.
+        Place that the template stands for: 'lags', 'level', 'x', 'y', 'amp', ...
     """
 
     family: str
@@ -69,16 +79,16 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """A shape that an effect of the library makes.
+    """A matched filter: the template of an effect of the library.
 
     Attributes
     ----------
     effect, word : str
-        Its name, and the channel that it shows in most.
+        Name of the effect, and of the channel in which most of the template's square lies.
     weights : ndarray of float32, shape (n + priors,)
-        Whitened, priors' rows last, what the fit's parameters span taken off; of unit length.
+        Whitened template of unit length, the fit's parameters projected out.
     signed : bool
-        Whether its opposite may be as well.
+        Whether the effect's amplitude may be negative: the statistic is then two-sided.
     """
 
     effect: str
@@ -89,21 +99,23 @@ class Known:
 
 @dataclass(frozen=True, eq=False)
 class Mismatch:
-    """All that a baseline leaves.
+    """Comparison of a fit's residuals with noise.
 
     Attributes
     ----------
     p_value : float
-        Family-wise, of the farthest statistic.
+        Family-wise probability of the most extreme statistic, 0 to 1.
     p_chi2, p_scans : float
         The same of the chi-squares alone and of the scans alone.
     findings : tuple of Finding
-        Statistics below :data:`ALARM`, step-down, farthest first.
+        Statistics with a family-wise probability below :data:`ALARM` by the step-down procedure,
+        most extreme first.
     chi2 : dict of str to (float, float)
         Chi-square and degrees of freedom by channel.
     parts : tuple of Finding
-        The few templates that together make up what the scans find: each the farthest of what
-        those before it leave.  The findings also hold their shadows.
+        Decomposition of the scans' findings by matching pursuit: each part is the most extreme
+        template of the residuals that those before it leave.  The findings also hold templates
+        that are merely correlated with these.
     """
 
     p_value: float
@@ -115,7 +127,7 @@ class Mismatch:
 
     @property
     def detected(self) -> bool:
-        """Whether anything stands out."""
+        """Whether noise alone gives anything as extreme with a probability below ALARM."""
         return self.p_value < ALARM
 
 
@@ -125,7 +137,14 @@ class Scanner:
     Parameters
     ----------
     fit : BaselineFit
-        Whose residuals; its parameters are projected out of every template.
+        The fit whose residuals are scanned; its parameters are projected out of every template.
+
+    Attributes
+    ----------
+    templates : list of Template
+        All templates whose norm the fit's parameters leave.
+    words : list of str
+        Names of the channels.
     """
 
     def __init__(self, fit: BaselineFit) -> None:
@@ -137,8 +156,9 @@ class Scanner:
             within = block @ fit.basis[: len(fit.residuals)]
             raw = np.asarray((block * block).sum(1)).ravel()
             left = raw - (within**2).sum(1)
-            # What the parameters take up to a ten-thousandth is no template; those of the device
-            # are held by their card alone.
+            # A template of which the fit's parameters absorb all but 1e-4 (squared) has no power
+            # left.  Along device parameters the prior alone leaves a part, which is small where
+            # data constrain them: there the limit is that of rounding.
             device = np.array([t.word == DEVICE for t in some])
             keep = left > np.where(device, 1e-9, 1e-4) * raw
             kept = block if keep.all() else block[keep]
@@ -156,7 +176,7 @@ class Scanner:
         self._dof = np.array([max(counts[w][1], 1e-9) for w in self.words])
 
     def templates_z(self, residuals: FloatArray) -> FloatArray:
-        """Of residuals (..., n): the templates' amplitudes over their errors."""
+        """Amplitudes of all templates over their errors, from residuals of shape (..., n)."""
         return np.asarray(self._product(residuals.T).T / self._norm)
 
     def _product(self, residuals: FloatArray) -> FloatArray:
@@ -164,7 +184,7 @@ class Scanner:
         return np.concatenate([block @ residuals for block in self._blocks])
 
     def correlations(self, n: int) -> FloatArray:
-        """Of the amplitude of template ``n`` with those of all."""
+        """Correlation of the amplitude of template ``n`` with those of all templates, under noise."""
         template = self.templates[n]
         shape = np.zeros(len(self.fit.residuals))
         shape[template.rows] = template.weights
@@ -173,7 +193,11 @@ class Scanner:
         return np.asarray(product / (self._norm * self._norm[n]))
 
     def chi2_z(self, residuals: FloatArray) -> FloatArray:
-        """Of residuals (..., n): Gaussian deviates of each word's chi-square (Wilson & Hilferty)."""
+        """Gaussian deviates of each channel's chi-square, from residuals of shape (..., n).
+
+        Wilson & Hilferty 1931, PNAS 17, 684: the cube root of a chi-square over its d degrees
+        of freedom is nearly Gaussian, with mean 1 - 2 / (9 d) and variance 2 / (9 d).
+        """
         squares = np.stack([(residuals[..., m] ** 2).sum(-1) for m in self._masks], axis=-1)
         d = self._dof
         return np.asarray((np.cbrt(squares / d) - (1 - 2 / (9 * d))) / np.sqrt(2 / (9 * d)))
@@ -182,10 +206,10 @@ class Scanner:
 def _stacked(
     templates: Iterable[Template], size: int
 ) -> Iterator[tuple[csr_array, list[Template]]]:
-    """Templates as rows of sparse matrices of about :data:`BLOCK` numbers each.
+    """Combine templates into sparse matrices, a template per row, of about BLOCK numbers each.
 
-    Maps of large sensors have tens of thousands of templates of thousands of rows: what makes
-    a template is let go before the next are made.
+    Maps of large sensors have tens of thousands of templates of thousands of values: the memory
+    of one block is released before the next is made.
     """
     some: list[Template] = []
     held = 0
@@ -207,7 +231,7 @@ def _as_matrix(some: list[Template], size: int) -> csr_array:
 
 
 def _viewed(some: list[Template], matrix: csr_array) -> list[Template]:
-    """Templates whose numbers are the matrix's own."""
+    """Templates that share the memory of a matrix."""
     parts = [slice(a, b) for a, b in pairwise(matrix.indptr)]
     return [
         replace(t, rows=matrix.indices[p], weights=matrix.data[p])
@@ -216,25 +240,31 @@ def _viewed(some: list[Template], matrix: csr_array) -> list[Template]:
 
 
 class Locator:
-    """Judges residuals against noise that is drawn once.
+    """Compares statistics of residuals with those of noise, which is drawn once.
 
     The noise is drawn through the fit's own linear model.  Statistics are the chi-squares
-    (one-sided), the templates (two-sided) and, with :meth:`with_library`, the shapes of known
-    effects.  So that thousands of templates of one channel do not hide another's few, deviates
-    are put on the scale of the largest that noise gives in the same family, the chi-squares, one
-    channel's templates or one effect's shapes: the logarithm of its tail's probability.  The
-    largest of all then gives family-wise p-values, step-down (Westfall & Young 1993): what has
-    been found no longer hides what is next.  Beyond the draws an exponential tail of the largest
-    deviates is taken.
+    (one-sided), the templates (two-sided) and, with :meth:`with_library`, matched filters of
+    known effects.  In a channel with thousands of templates the largest of them is farther out by
+    noise than in one with a few.  Each deviate z is therefore put on the scale of the largest in
+    its family (the chi-squares, one channel's templates, or one effect's filters): (z - z_0) / s,
+    minus the logarithm of the probability of a tail exp(-(z - z_0) / s) up to a constant, with z_0
+    the 80 % quantile of the largest and s their mean excess over it.  The largest of all then
+    gives family-wise p-values by the step-down procedure: each finding is compared with the
+    largest of the statistics that remain.  Beyond the draws an exponential tail of the largest is
+    assumed, which lies above a Gaussian's.
 
     Parameters
     ----------
     fit : BaselineFit
-        Residuals and what was fitted.
+        Residuals, and the linear model through which noise is drawn.
     seed : int
-        Of the draws.
+        Seed of the draws.
     draws : int
-        How many.
+        Number of draws, at least some tens.
+
+    References
+    ----------
+    Westfall & Young 1993, Resampling-Based Multiple Testing (step-down maximum).
     """
 
     def __init__(self, fit: BaselineFit, *, seed: int = 1, draws: int = DRAWS) -> None:
@@ -243,7 +273,7 @@ class Locator:
         self._chi = len(self.scanner.words)
         self._seed, self._count = seed, draws
         rng = np.random.default_rng(seed)
-        # One row a statistic, chi-squares first.
+        # One row per statistic, chi-squares first.
         self._drawn = np.empty((self._chi + len(self.scanner.templates), draws), np.float32)
         for start in range(0, draws, 50):
             noise = fit.draw(rng, min(50, draws - start))
@@ -259,7 +289,7 @@ class Locator:
         self._maxima = [p.max(0).astype(float) for p in parts]
 
     def with_library(self, library: Sequence[Known]) -> Locator:
-        """Copy that judges shapes of known effects as well, by the same draws."""
+        """Copy that includes matched filters of known effects, with the same draws of noise."""
         out = copy.copy(self)
         if not library:
             return out
@@ -283,10 +313,13 @@ class Locator:
         return out
 
     def alarms(self) -> dict[str, float]:
-        """Deviate from which a statistic alone is an alarm, by family.
+        """Deviate above which a single statistic raises an alarm, by family.
 
-        Families are the chi-squares, the templates of each channel, by its word, and the shapes
-        of each effect.
+        Returns
+        -------
+        alarms : dict of str to float
+            Deviates [standard deviations] of 'chi-square', of the templates of each channel by
+            its name, and of the filters of each effect by its name.
         """
         maxima = np.max(self._maxima, axis=0)
         rank = float(brentq(
@@ -298,13 +331,17 @@ class Locator:
         return {n: float(self._zero[k] + rank * self._scale[k]) for n, k in first.items()}
 
     def locate(self, residuals: FloatArray | None = None) -> Mismatch:
-        """Find what of residuals noise does not explain.
+        """Find the statistics of residuals that noise does not explain.
 
         Parameters
         ----------
         residuals : ndarray, shape (n + priors,), optional
-            Whitened, what was fitted taken off, by default the fit's; priors' rows are needed
-            for shapes of effects only.
+            Whitened residuals, the fit's parameters projected out; by default the fit's own.
+            The rows of the priors are needed for matched filters only.
+
+        Returns
+        -------
+        Mismatch
         """
         fit = self.scanner.fit
         given = residuals
@@ -337,11 +374,12 @@ class Locator:
         )
 
     def _pursue(self, signed: FloatArray) -> list[Finding]:
-        """Take the farthest template, take off what it explains, and so on (matching pursuit)."""
+        """Decompose by orthogonal matching pursuit: the largest template, subtracted, and so on."""
         z = signed.copy()
         scans = slice(self._chi, self._chi + len(z))
         critical = float(np.quantile(self._maxima[1], 1 - 2 * ALARM))
-        # What is left of each template's variance, and directions taken so far.
+        # Variance that each template has outside of those taken.  Chosen, to be derived: one with
+        # less than 2 % left is the same shape; with 4 %, fewer neighbours of a part could be parts.
         free = np.ones(len(z))
         taken: list[FloatArray] = []
         parts: list[Finding] = []
@@ -379,19 +417,20 @@ class Locator:
         ranks: FloatArray,
         signed: FloatArray,
     ) -> list[Finding]:
-        """Farthest first, each held against those that are left."""
-        # Below HOPELESS a single statistic would not be found, whatever the family's size.
+        """Findings by the step-down procedure, each compared with the largest of those remaining."""
+        # Statistics below HOPELESS cannot be findings: they are left out of the sorting.
         ranks = np.where(observed > HOPELESS, ranks, -np.inf)
         count = int((observed > HOPELESS).sum())
         order = np.argsort(-ranks, kind="stable")
         rest = self._drawn[np.sort(order[count:])].max(0, initial=-np.inf)
-        # Of what is left after each: maxima from the least to the farthest.
+        # For each statistic in turn, the draws' maxima over it and all that are less extreme.
         left = np.maximum.accumulate(
             np.concatenate([rest[None], self._drawn[order[:count]][::-1]])
         )[:0:-1]
         findings: list[Finding] = []
         largest = 0.0
         for n, maxima in zip(order[:count], left, strict=True):
+            # Step-down p-values do not decrease (Westfall & Young).
             p = max(largest, tail_probability(float(ranks[n]), maxima.astype(float)))
             if p >= ALARM:
                 break
@@ -415,7 +454,11 @@ class Locator:
 def _ranked(
     drawn: NDArray[np.float32], families: Iterable[NDArray[np.int64]]
 ) -> tuple[FloatArray, FloatArray]:
-    """Put drawn deviates, in place, on the scale of their family's largest; zero and scale."""
+    """Put drawn deviates, in place, on the scale of their family's largest; its zero and scale.
+
+    Chosen, to be derived: the tail begins at the 80 % quantile, with 100 of 500 draws; a tail from
+    the 60 % quantile has twice as many draws but is less exponential.
+    """
     zero, scale = np.zeros(len(drawn)), np.ones(len(drawn))
     for rows in families:
         largest = drawn[rows].max(0)
@@ -427,12 +470,48 @@ def _ranked(
 
 
 def locate_mismatch(fit: BaselineFit, *, seed: int = 1, draws: int = DRAWS) -> Mismatch:
-    """Find what of a fit's residuals noise does not explain: :class:`Locator`, once."""
+    """Find the statistics of a fit's residuals that noise does not explain.
+
+    Parameters
+    ----------
+    fit : BaselineFit
+        The fit.
+    seed : int
+        Seed of the draws of noise.
+    draws : int
+        Number of draws.
+
+    Returns
+    -------
+    Mismatch
+    """
     return Locator(fit, seed=seed, draws=draws).locate()
 
 
 def tail_probability(value: float, maxima: FloatArray) -> float:
-    """Probability that a maximum is as large, from drawn ones; beyond them by an exponential tail."""
+    """Probability that a maximum reaches a value, from drawn maxima.
+
+    From ten draws beyond the value on it is their fraction, ``(k + 1) / (n + 1)``; farther out
+    an exponential tail is fitted to the excesses over the 80 % quantile.
+
+    Parameters
+    ----------
+    value : float
+        Observed maximum.
+    maxima : ndarray, shape (n,)
+        Maxima of n draws of noise; n at least some tens.
+
+    Returns
+    -------
+    probability : float
+        Between :data:`SMALLEST` and 1.
+
+    Examples
+    --------
+    >>> maxima = np.random.default_rng(7).exponential(size=500)
+    >>> 0.005 < tail_probability(5.0, maxima) < 0.010, tail_probability(0.0, maxima)
+    (True, 1.0)
+    """
     above = int((maxima >= value).sum())
     if above >= 10:
         return (above + 1) / (len(maxima) + 1)

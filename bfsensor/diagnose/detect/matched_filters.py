@@ -1,8 +1,9 @@
-"""Whether an effect of the library stands out where the scans, made for no effect, see nothing.
+"""Matched filters of the library's effects, beside the scans that assume no effect.
 
-Thousands of shapes are scanned; a few hundred are the library's own, and an effect that shows in
-many places at once is found by its own shape long before any scan sees a part of it.  Both are
-held against the same draws of noise, each effect's shapes a family.
+An effect that changes many values a little is detected by its own template long before any scan,
+which sums a few of these values, sees a part of it.  The statistic is the projection of whitened
+residuals on a unit template, of unit variance under noise.  Scans (thousands of templates) and
+filters (a few hundred) are compared with the same draws of noise, each effect's filters a family.
 """
 
 from __future__ import annotations
@@ -29,10 +30,14 @@ from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.effect import Effect
 
 LOOKED = 1e4
-"""Waves that maps are searched for; starts that such sightings give are charged with all."""
+"""Number of independent waves that maps are searched for; the p-value of an effect that starts at a
+detected fringe is multiplied by it (Bonferroni's correction).  Chosen, to be derived from the size
+of the maps: with 2e4 such an effect needs 1.4 more in chi-square (2 ln 2) for the same p-value."""
 
 SURE = 1e-4
-"""Probability by the scans alone below which no other shape is asked."""
+"""Family-wise probability by the scans alone below which matched filters are not evaluated, to save
+time: the p-value is then doubled (Bonferroni's correction for scans and filters).  Chosen: with
+2e-4, campaigns between 1e-4 and 2e-4, detected in any case, would report the doubled value, too."""
 
 
 def locate_effects(
@@ -42,25 +47,29 @@ def locate_effects(
     *,
     seed: int = 1,
 ) -> Mismatch:
-    """Find what noise does not explain, by scans and by the library's own shapes together.
+    """Find what noise does not explain, by scans and by matched filters of the library together.
 
-    Shapes are those at the places where fits of the effects begin, whatever the data.  Effects
-    that begin at waves that were seen in maps are fitted, and charged for all waves that might
-    have been (:data:`LOOKED`): noise hardly ever makes one of them the smallest probability.
+    Filters are the templates at the starting points of the effects, which do not depend on the
+    data.  Effects that start at fringes detected in maps do depend on them: they are fitted, and
+    their p-value is multiplied by the number of waves searched for (:data:`LOOKED`).
 
     Parameters
     ----------
     predictor, fit : Predictor, BaselineFit
         The baseline, fitted.
     kinds : sequence of type, optional
-        Candidates; by default all of the baseline.  Effects that are there are none.
+        Candidates; by default all of the baseline.  Effects that are in the fit are left out.
     seed : int
-        Of the draws of noise.
+        Seed of the draws of noise.
+
+    Returns
+    -------
+    Mismatch
     """
     locator = Locator(fit, seed=seed)
     mismatch = locator.locate()
     if mismatch.p_value < SURE:
-        # Of two families; which of them is the closer one is known here.
+        # Bonferroni's bound for the smaller of two families' p-values.
         return replace(mismatch, p_value=2 * mismatch.p_value)
     kinds = _candidates(predictor, fit, kinds)
     screen = Screen(predictor, fit, seen_of(mismatch))
@@ -69,7 +78,7 @@ def locate_effects(
 
 
 def alarms_of(predictor: Predictor, fit: BaselineFit, *, seed: int = 1) -> dict[str, float]:
-    """Deviates from which :func:`locate_effects` alarms, by family: :meth:`Locator.alarms`."""
+    """Deviates above which :func:`locate_effects` alarms, by family: :meth:`Locator.alarms`."""
     screen = Screen(predictor, fit)
     shapes = known_shapes(screen, _candidates(predictor, fit))
     return Locator(fit, seed=seed).with_library(shapes).alarms()
@@ -78,7 +87,7 @@ def alarms_of(predictor: Predictor, fit: BaselineFit, *, seed: int = 1) -> dict[
 def _candidates(
     predictor: Predictor, fit: BaselineFit, kinds: Sequence[type[Effect]] | None = None
 ) -> Sequence[type[Effect]]:
-    """Effects that are sought: those that these channels can tell, and are not there yet."""
+    """Effects that these channels can constrain and that are not in the fit yet."""
     if kinds is None:
         kinds = candidates_of(predictor.baseline)
     kinds = tellable(kinds, predictor, fit.channels)
@@ -86,7 +95,7 @@ def _candidates(
 
 
 def known_shapes(screen: Screen, kinds: Sequence[type[Effect]]) -> list[Known]:
-    """Shapes of effects at all places where their fits begin, whatever the data show."""
+    """Matched filters of effects at all their starting points, which do not depend on the data."""
     unseen = replace(screen.predictor.layout, sightings=())
     out = []
     for kind in kinds:
@@ -100,12 +109,12 @@ def known_shapes(screen: Screen, kinds: Sequence[type[Effect]]) -> list[Known]:
 def _with_sighted(
     screen: Screen, kinds: Sequence[type[Effect]], mismatch: Mismatch
 ) -> Mismatch:
-    """What effects say that begin at waves that were seen in maps."""
+    """Add effects that start at fringes detected in maps, their p-values corrected for the search."""
     if not screen.predictor.layout.sightings:
         return mismatch
     for kind in (k for k in kinds if k.from_sightings):
         rival = screen.best(screen.tried(kind)[:1])
-        # Beyond plausible ranges a shape may follow anything.
+        # Negative evidence: parameters far outside their plausible ranges can follow any noise.
         if rival is None or rival.refuted or rival.evidence < 0:
             continue
         p = float(chi2.sf(rival.gain, max(len(fitted(rival.effect)), 1)))
@@ -126,12 +135,12 @@ def _with_sighted(
 
 
 def trials_of(kind: type[Effect], screen: Screen) -> float:
-    """Places at which a kind that begins at sighted waves is tried."""
+    """Number of independent trials of a kind of effect that starts at detected fringes."""
     return max(len(kind.starts(screen.predictor.layout, screen.seen)), 1) * LOOKED
 
 
 def _channel_of(fit: BaselineFit, shape: NDArray[np.floating]) -> str:
-    """Channel in which a shape shows most."""
+    """Name of the channel that holds most of a template's square."""
     squares = shape[: len(fit.residuals)] ** 2
     return max(
         dict.fromkeys(c.word for c in fit.channels),

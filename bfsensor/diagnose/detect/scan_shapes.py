@@ -1,4 +1,4 @@
-"""Shapes that scans seek as a whole: the effect itself, and boundaries between columns or rows."""
+"""Templates of extended shapes for scans: covariances as predicted, boundaries, rims, combs, boxes."""
 
 from __future__ import annotations
 
@@ -12,19 +12,25 @@ from bfsensor.diagnose.model.map_shapes import Places
 from bfsensor.typing import FloatArray
 
 OCTAVES = 4
-"""Sizes of boxes, from half a side on."""
+"""Number of sizes of boxes: 1/2, 1/4, 1/8 and 1/16 of a side, 340 boxes.  Chosen: each further size
+has four times as many; with 8, down to 1/256 of a side, there would be 87,380."""
 
 LENGTHS = 1.5, 4.0
-"""Reaches of a distortion by a boundary [pixel]."""
+"""Decay lengths of a distortion beside a boundary [pixel].  Chosen: a distortion of length a has
+the part 2 (a b)^(1/2) / (a + b) of its significance in the template of length b, at least 0.97
+between these two; with 3 and 8, one of 1.5 pixels would have 0.94, and one of 8 pixels 1 instead
+of 0.94."""
 
 REACH = 1.5
-"""Of these lengths, to either side: 95 % of the distortion's square."""
+"""Reported half-width of a boundary, in decay lengths.  Derived: it holds 1 - exp(-2 * 1.5) = 95
+% of the square of exp(-|x| / length); twice as large, 99.8 %."""
 
 
 def own_shapes(g: Group) -> Iterator[Pattern]:
-    """Covariances as the effect gives them, stronger or weaker: by flux, condition and level.
+    """Covariances in the predicted shape of the brighter-fatter effect, by flux and condition.
 
-    One template for what single lags hold in small parts each.
+    One template sums the small deviations of all lags if the effect is stronger or weaker than
+    predicted as a whole.
     """
     x = g.axes
     shape = _own_shape(g)
@@ -35,7 +41,7 @@ def own_shapes(g: Group) -> Iterator[Pattern]:
         "set": "own shape",
     }
     for p in (0, 1, 2):
-        # The covariances themselves go with the square of the level.
+        # The predicted covariances go with the square of the level: hence power + 2.
         unit = (level / level.max()) ** p
         yield "own shape x power", shape * unit, {**where, "power": p + 2}
     for condition in dict.fromkeys(g.condition):
@@ -46,7 +52,7 @@ def own_shapes(g: Group) -> Iterator[Pattern]:
 
 
 def _own_shape(g: Group) -> FloatArray:
-    """Covariances due to the effect, as predicted; what neighbours gain the variance lacks."""
+    """Predicted covariances; the variance lacks what all lags gain (the areas' sum rule)."""
     x = g.axes
     i, j = x["i"].astype(int), x["j"].astype(int)
     weight = np.where(i > 0, 2.0, 1.0) * np.where(j > 0, 2.0, 1.0)
@@ -68,18 +74,26 @@ def boundaries(
     where: Mapping[str, object],
     axis: str,
 ) -> Iterator[Pattern]:
-    """Edges displaced by a boundary, exponentially less with distance: wide here, narrow there.
+    """Patterns of a boundary that displaces pixel edges: columns wider on one side, narrower beyond.
+
+    The response of a column at the distance x from the boundary goes with
+    ``sign(x) exp(-|x| / length)``.
 
     Parameters
     ----------
-    rows : ndarray of bool
+    rows : ndarray of bool, shape (n,)
         Values that are columns (or rows) of one map.
-    place : ndarray
-        Which column (or row) each is.
+    place : ndarray, shape (n,)
+        Index of each value's column (or row).
     where : mapping
-        What the map is.
+        Description of the map, with 'what'.
     axis : str
-        'x' of columns, 'y' of rows.
+        'x' for columns, 'y' for rows.
+
+    Yields
+    ------
+    pattern : tuple of (str, ndarray, dict)
+        Name of the scan, pattern of shape (n,), and place.
     """
     count = int(place[rows].max()) + 1
     for length in LENGTHS:
@@ -99,7 +113,7 @@ def boundaries(
 def frames(
     x: Mapping[str, NDArray], here: NDArray[np.bool_]
 ) -> Iterator[tuple[str, FloatArray, dict[str, object]]]:
-    """All four rims of a map together, and columns beside every n-th boundary from the rim."""
+    """Patterns of all four rims of a map together, and of columns beside every n-th boundary."""
     sides = []
     for what, axis in (("column", "x"), ("row", "y")):
         rows = here & (x["what"] == what)
@@ -126,7 +140,7 @@ def frames(
 def boxes(
     x: Mapping[str, NDArray], here: NDArray[np.bool_], name: str
 ) -> Iterator[tuple[str, FloatArray, dict[str, object]]]:
-    """Halves, quarters and so on of a map, with what columns and rows have of them."""
+    """Boxes of a half, a quarter and so on of a map, as its blocks, columns and rows show them."""
     sides = [
         int(x[axis][here & (x["what"] == what)].max(initial=-1)) + 1
         for what, axis in (("row", "y"), ("column", "x"))

@@ -1,4 +1,4 @@
-"""Templates of scans: a shape in the residuals of one channel, whitened like them."""
+"""Templates of scans: patterns in one channel's values, whitened like its residuals."""
 
 from __future__ import annotations
 
@@ -15,25 +15,26 @@ from bfsensor.diagnose.data.exposure_info import NUMBERS, condition_at, label_of
 from bfsensor.typing import FloatArray
 
 TOGETHER = 300_000
-"""Numbers of the patterns that are whitened at a time: about 10 MB while they are."""
+"""Numbers in the patterns that are whitened at a time.  Chosen: they take about 10 MB; twice as
+many take 20 MB and no less time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """A shape sought in the whitened residuals.
+    """A pattern sought in the whitened residuals.
 
     Attributes
     ----------
     family : str
-        Scan it belongs to.
+        Name of the scan it belongs to.
     word : str
-        Channel.
-    rows : ndarray of int
-        Residuals it covers.
-    weights : ndarray
-        At those rows, whitened like them.
+        Name of the channel.
+    rows : ndarray of int, shape (k,)
+        Indices of the residuals it covers.
+    weights : ndarray, shape (k,)
+        Its values there, whitened like the residuals.
     where : mapping
-        What it stands for: 'lags', 'level', 'x', 'y', 'amp', 'condition', 'exposure', 'k', ...
+        Its place: 'lags', 'level', 'x', 'y', 'amp', 'condition', 'exposure', 'k', ...
     """
 
     family: str
@@ -52,7 +53,7 @@ def middle(values: FloatArray, weights: FloatArray) -> tuple[float, float]:
 
 
 class Group:
-    """Channels of one word as one table."""
+    """All channels of one name (folds, conditions) as one table."""
 
     def __init__(
         self, word: str, members: list[tuple[Channel, int]], residuals: FloatArray
@@ -69,17 +70,14 @@ class Group:
         ])  # fmt: skip
 
     def predicted(self) -> FloatArray:
-        """What the fit predicts, in the units of the channel."""
+        """Prediction of the fit for all values, in the unit of the channel."""
         return np.concatenate([
             c.values - c.unwhiten(self._residuals[start : start + len(c)])
             for c, start in self.members
         ])  # fmt: skip
 
     def templates(self, patterns: Iterable[Pattern]) -> Iterator[Template]:
-        """Whiten patterns, one after another; what is nothing is left out.
-
-        Of values that tell of others, others have of it what these tell: nothing of their own.
-        """
+        """Whiten patterns, one after another; those that are zero or not finite are left out."""
         some: list[_Sparse] = []
         held = 0
         for family, pattern, where in patterns:
@@ -109,7 +107,7 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class _Sparse:
-    """A pattern by what is not 0 of it."""
+    """A pattern by its values that are not 0."""
 
     family: str
     where: Mapping[str, object]
@@ -120,15 +118,15 @@ class _Sparse:
 class _Whitener:
     """Channels one after another, whitened as :meth:`Channel.whiten` does.
 
-    By products of sparse matrices: a pattern of a few values costs what these few cost.
+    Sparse matrices make the cost of a pattern that of its values that are not 0.
     """
 
     def __init__(self, channels: Sequence[Channel]) -> None:
-        # Transposed, for patterns are rows.
+        # Transposed, because patterns are rows.
         self._whiten = csr_array(block_diag([c.whitener.T for c in channels], format="csr"))
         size = self._whiten.shape[0]
         self._gather = self._spread = None
-        # Inverse errors of values that tell of others, and 0.
+        # Inverse errors of values from which noise in common is estimated, 0 for all others.
         self._alone = np.zeros(size)
         if any(c.common for c in channels):
             common = join_common([c.common or Common.none(len(c)) for c in channels])
@@ -139,7 +137,7 @@ class _Whitener:
     def whiten(
         self, patterns: list[_Sparse]
     ) -> Iterator[tuple[NDArray[np.int64], FloatArray]]:
-        """Give, of each pattern, which values it has whitened, ascending, and these."""
+        """Yield indices, ascending, and whitened values of each pattern where they are not 0."""
         alone = [bool(self._alone[p.rows].all()) for p in patterns]
         rest = [p for p, own in zip(patterns, alone, strict=True) if not own]
         whole = self._product(rest)

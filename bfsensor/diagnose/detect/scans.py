@@ -1,4 +1,4 @@
-"""Template-free scans of what the baseline leaves: where, and how unlikely by chance."""
+"""Scans of residuals that assume no effect: patterns by lag, level, amplifier, column, time, ..."""
 
 from __future__ import annotations
 
@@ -13,23 +13,37 @@ from bfsensor.diagnose.detect.scan_templates import Group, Pattern, Template
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 
 POWERS = (0, 1, 2, 3)
-"""Powers of the level that covariances and means may go with."""
+"""Powers of the signal level with which covariances are scanned.  Chosen: noise is constant, shot
+noise goes with the first, the brighter-fatter effect with the second and, next, third power; twice
+as many powers are nearly degenerate with these and raise the deviate of an alarm slightly."""
 
 OCTAVES = 4
-"""Sizes of strips, from the whole side on."""
+"""Number of widths of strips: 1/4, 1/8, 1/16 and 1/32 of a side, each at steps of half a width.
+Chosen: each further width has twice as many strips; with 8, strips of 1/512 of a side are narrower
+than the columns of most maps."""
 
 DEVICE, DEVICE_SCAN = "device", "device parameter off its card"
-"""Word and family of the scan of the device's parameters, which have no channel of their own."""
+"""Name that stands for a channel, and family, of the scan of the device's parameters."""
 
 DEVICE_SEEN = "flat_cov", "spot"
-"""Channels that they are seen in."""
+"""Channels that the device's parameters change."""
 
 
 def make_templates(fit: BaselineFit) -> Iterator[Template]:
     """Make all templates that the channels of a fit allow, one after another.
 
-    Every template is a pattern in the units of its channel, spread over all folds that the fit
-    holds: a flux power of one lag, a step in time, a strip.
+    Every template is a pattern in the unit of its channel over all folds of the fit: a power of
+    the flux at one lag, a step in time, a strip of columns.
+
+    Parameters
+    ----------
+    fit : BaselineFit
+        Gives the channels, and the predicted covariances.
+
+    Yields
+    ------
+    template : Template
+        Whitened.
     """
     by_word: dict[str, list[tuple[Channel, int]]] = {}
     for channel, start in zip(fit.channels, fit.starts, strict=False):
@@ -47,10 +61,10 @@ def make_templates(fit: BaselineFit) -> Iterator[Template]:
 
 
 def _device(fit: BaselineFit) -> Iterator[Template]:
-    """Pulls of the device's parameters from its card: what each changes.
+    """Yield the derivatives of all values by each device parameter, as templates.
 
-    The fit gives way along them, held by their spread: what is left along one in the data is its
-    pull, of which noise and scatter as wide as the spread leave a known part.
+    The fit moves these parameters against their priors.  A device far from nominal therefore
+    leaves residuals along the derivative, in proportion to the pull, and noise a known amount.
     """
     for n, name in enumerate(fit.names[: fit.slopes.shape[1]]):
         if name.startswith("device "):
@@ -61,7 +75,7 @@ def _device(fit: BaselineFit) -> Iterator[Template]:
 
 
 def _areas(g: Group) -> Iterator[Pattern]:
-    """Of a_ij, which know no level: single lags, and lags together."""
+    """Single lags and sets of lags, for reduced a_ij, which have no signal level."""
     i, j = g.axes["i"].astype(int), g.axes["j"].astype(int)
     for a, b in zip(i.tolist(), j.tolist(), strict=True):
         yield "lags", np.where((i == a) & (j == b), 1.0, 0.0), {"lags": [(a, b)]}
@@ -73,7 +87,7 @@ def _areas(g: Group) -> Iterator[Pattern]:
 def _lags_together(
     i: NDArray[np.int64], j: NDArray[np.int64]
 ) -> dict[str, NDArray[np.bool_]]:
-    """Rows, columns and rings of lags."""
+    """Masks of sets of lags, by name: rows, columns, near and far ones."""
     radius = np.hypot(i, j)
     return {
         "row of lags": (j == 0) & (i > 0), "column of lags": (i == 0) & (j > 0),
@@ -83,7 +97,7 @@ def _lags_together(
 
 
 def _covariances(g: Group) -> Iterator[Pattern]:
-    """Lag by power of the level, by single level, by amplifier, by condition."""
+    """Patterns of single lags and sets of lags by power of the level, level, amplifier, condition."""
     if g.members[0][0].unit == PER_ELECTRON:
         yield from _areas(g)
         return
@@ -123,7 +137,7 @@ def _covariances(g: Group) -> Iterator[Pattern]:
 
 
 def _means(g: Group) -> Iterator[Pattern]:
-    """Powers of the level, single exposures and steps and slopes in time, by amplifier."""
+    """Patterns of means by power of the level, exposure, steps and slopes in time, by amplifier."""
     x = g.axes
     level = x["level"].astype(float)
     unit = level / level.max()
@@ -156,7 +170,7 @@ def _means(g: Group) -> Iterator[Pattern]:
 
 
 def _maps(g: Group) -> Iterator[Pattern]:
-    """Patterns of columns and rows, which blocks follow; boxes; rings and finer ones."""
+    """Patterns of maps: columns, rows, boxes, rings, texture and chess patterns."""
     yield from _lines(g)
     x = g.axes
     for name in dict.fromkeys(x["map"]):
@@ -173,7 +187,7 @@ def _maps(g: Group) -> Iterator[Pattern]:
 
 
 def _lines(g: Group) -> Iterator[Pattern]:
-    """Strips, steps, edges and waves in columns and rows."""
+    """Strips, edges, boundaries and waves in columns and rows."""
     x = g.axes
     for name in dict.fromkeys(x["map"]):
         here = x["map"] == name
@@ -217,7 +231,7 @@ def _lines(g: Group) -> Iterator[Pattern]:
 def _fine_patterns(
     x: Mapping[str, NDArray], here: NDArray[np.bool_], name: str
 ) -> Iterator[Pattern]:
-    """Waves of the texture along x, in the same and in the next row; chess patterns."""
+    """Waves in the covariance of the texture along x, in the same and the next row; chess patterns."""
     dx = x["x"].astype(float)
     for dy in (0, 1):
         rows = here & (x["what"] == "texture") & (x["y"] == dy)
@@ -242,7 +256,7 @@ def _fine_patterns(
 
 
 def _overscan(g: Group) -> Iterator[Pattern]:
-    """First pixels and tails by power of the level, single levels, amplifiers."""
+    """Patterns of overscans: single pixels and exponential tails by level and amplifier."""
     x = g.axes
     k, level = x["k"].astype(float), x["level"].astype(float)
     unit = level / level.max()
@@ -268,7 +282,7 @@ def _overscan(g: Group) -> Iterator[Pattern]:
 
 
 def _noise(g: Group) -> Iterator[Pattern]:
-    """Single lags in readout order, tails, waves."""
+    """Patterns of noise covariances in readout order: single lags, tails, waves, by amplifier."""
     x = g.axes
     lag = x["lag"].astype(float)
     for name, here in _amplifiers(x):
@@ -289,6 +303,7 @@ def _noise(g: Group) -> Iterator[Pattern]:
 
 
 def _levels(g: Group) -> Iterator[Pattern]:
+    """Patterns of bias levels by amplifier and exposure."""
     x = g.axes
     for what in dict.fromkeys(x["what"]):
         for name, here in _amplifiers(x):
@@ -301,6 +316,7 @@ def _levels(g: Group) -> Iterator[Pattern]:
 
 
 def _darks(g: Group) -> Iterator[Pattern]:
+    """Patterns of darks: current after light, struck pixels, single columns."""
     x = g.axes
     after = x["after"].astype(float)
     for name, here in _amplifiers(x):
@@ -322,7 +338,7 @@ def _darks(g: Group) -> Iterator[Pattern]:
 
 
 def _spots(g: Group) -> Iterator[Pattern]:
-    """Widths, asymmetry, wings and flux by power of the light, by condition, in time."""
+    """Patterns of spots' widths, wings and fluxes by power of the flux, condition and exposure."""
     x = g.axes
     flux = x["flux"].astype(float)
     unit = flux / flux.max()
@@ -348,7 +364,7 @@ def _spots(g: Group) -> Iterator[Pattern]:
 
 
 def _codes(g: Group) -> Iterator[Pattern]:
-    """Bits, single codes, by amplifier."""
+    """Patterns of the histogram of converter codes: bits, single codes, codes below high bits."""
     x = g.axes
     code, multiple = x["code"].astype(int), x["bit"].astype(int)
     for name, amp in _amplifiers(x):
@@ -374,6 +390,7 @@ def _codes(g: Group) -> Iterator[Pattern]:
 
 
 def _single(g: Group) -> Iterator[Pattern]:
+    """Every value alone: crosstalk of each pair of amplifiers."""
     x = g.axes
     for n in range(g.size):
         yield "amplifiers", np.eye(g.size)[n], {
@@ -382,7 +399,7 @@ def _single(g: Group) -> Iterator[Pattern]:
 
 
 def _amplifiers(x: Mapping[str, NDArray]) -> list[tuple[object, NDArray[np.bool_]]]:
-    """All amplifiers together, and each alone."""
+    """Masks of all amplifiers together, and of each alone."""
     amps = np.unique(x["amp"])
     out: list[tuple[object, NDArray[np.bool_]]] = [("all", np.ones(len(x["amp"]), bool))]
     return out + ([(int(a), x["amp"] == a) for a in amps] if len(amps) > 1 else [])

@@ -1,4 +1,4 @@
-"""The baseline fitted with all that may float, and what is left of the channels."""
+"""Joint fit of all channels by the baseline with its free parameters, and its residuals."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from bfsensor.errors import ConvergenceError
 from bfsensor.typing import FloatArray
 
 UNSETTLED = (
-    "the recordings are so unlike the baseline that its parameters did not settle: what is left is "
-    "of the best that was found"
+    "the recordings are so unlike the baseline that its parameters did not settle: the residuals "
+    "are those of the best point that was found"
 )
-"""Note of fits whose free steps led away."""
+"""Note of a fit without effects whose full steps did not converge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,33 +31,34 @@ class BaselineFit:
     Attributes
     ----------
     channels : tuple of Channel
-        What was fitted.
+        The channels that were fitted.
     names : tuple of str
-        Non-linear parameters, then linear ones, then strengths of what effects leave to chance.
-    values, errors : ndarray
-        Of the parameters.
+        Non-linear parameters, then linear ones, then random effects ('chance 0', ...).
+    values, errors : ndarray, shape (p,)
+        Values of the parameters and their linear standard errors.
     residuals : ndarray, shape (n,)
-        Whitened, all channels one after another.
-    basis : ndarray, shape (n + priors, p)
-        Orthonormal columns that the parameters span, priors' rows last: noise in them is
-        fitted away.
+        Whitened residuals of all channels, one after another.
+    basis : ndarray, shape (n + priors, rank)
+        Orthonormal columns that the parameters span, rows of the priors last: the fit absorbs
+        noise along them.
     starts : ndarray of int, shape (channels + 1,)
-        Where each channel's residuals begin.
+        Index at which each channel's residuals begin.
     pulls : dict of str to float
-        Device parameters in units of their spread.
+        Departures of device parameters from nominal, in units of their prior's width.
     covariance : ndarray, shape (p, p)
-        Of the parameters, in the order of ``names``.
+        Covariance of the parameters, in the order of ``names``.
     slopes : ndarray, shape (n, non-linear parameters)
-        Whitened derivatives.
+        Whitened derivatives of the predictions.
     left : ndarray, shape (n + priors,)
-        Residuals with those of the priors after them, what the basis spans taken off.
+        Residuals with those of the priors after them, orthogonal to ``basis``.
     chance : float
-        Logarithm by which what effects leave to chance widens the errors of all values together
-        (of the determinant of their covariance).
+        Logarithm of the determinant of the covariance 1 + M M^T of errors and random effects;
+        0 without random effects.
     scores : int
-        Rows at the end of ``left`` and of ``basis`` that stand for what scatter tells.
+        Number of rows at the end of ``left`` and of ``basis`` that belong to the score of
+        variance parameters.
     notes : tuple of str
-        What the prediction had to assume.
+        Assumptions of the prediction, and conditions of the fit, in words.
     """
 
     channels: tuple[Channel, ...]
@@ -76,7 +77,7 @@ class BaselineFit:
     notes: tuple[str, ...] = ()
 
     def of(self, word: str) -> NDArray[np.bool_]:
-        """Which residuals belong to a channel word."""
+        """Mask of the residuals that belong to channels of one name, shape (n,)."""
         out = np.zeros(len(self.residuals), bool)
         for channel, start in zip(self.channels, self.starts, strict=False):
             if channel.word == word:
@@ -84,9 +85,10 @@ class BaselineFit:
         return out
 
     def chi2(self) -> dict[str, tuple[float, float]]:
-        """Chi-square and degrees of freedom of each channel word.
+        """Chi-square and degrees of freedom by name of the channel.
 
-        The parameters' degrees are shared out as the basis lies in the channels.
+        Each channel's degrees of freedom are its number of values less their leverage, the
+        diagonal of ``basis @ basis.T``.
         """
         leverage = (self.basis[: len(self.residuals)] ** 2).sum(1)
         out = {}
@@ -100,16 +102,20 @@ class BaselineFit:
 
     @property
     def total(self) -> float:
-        """Chi-square of the residuals and of the priors; wider errors cost their logarithm."""
+        """Chi-square of residuals and priors, plus the log determinant of the random effects.
+
+        Minus twice the logarithm of the likelihood, up to a constant; the score's rows are
+        left out.
+        """
         left = self.left[: len(self.left) - self.scores]
         return float(left @ left) + self.chance
 
     def draw(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """Residuals that noise alone leaves, shape (count, n), the fit linear about its end."""
+        """Draw residuals of pure noise after a linear fit, shape (count, n)."""
         return self.draw_all(rng, count)[:, : len(self.residuals)]
 
     def draw_all(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """As :meth:`draw`, those of the priors after them."""
+        """Draw as :meth:`draw`, with the rows of the priors, shape (count, n + priors)."""
         noise = rng.standard_normal((count, len(self.basis)))
         noise -= (noise @ self.basis) @ self.basis.T
         return noise
@@ -118,27 +124,31 @@ class BaselineFit:
 def fit_baseline(
     predictor: Predictor, channels: Sequence[Channel], *, like: BaselineFit | None = None
 ) -> BaselineFit:
-    """Fit the baseline to channels: Gauss-Newton, device parameters held by their spread.
+    """Fit the baseline to channels by Gauss-Newton, with Gaussian priors on device parameters.
 
-    Recordings that are nothing like the baseline may lead such steps ever farther away.  Without
-    effects the fit is then made again by steps that may do no harm, and ends where they end:
-    what is left is large, and told; ``notes`` say so.  Where flats are full, their variance being
-    gone, what is below that alone is fitted, and all held against it.
+    For recordings that are very unlike the baseline full steps may diverge.  Without effects the
+    fit is then repeated with steps that never raise the chi-square, and ends where they end; its
+    residuals are large and ``notes`` say why.  If flats reach full well, where their variance
+    collapses, only fainter flats are fitted, and all are compared with that fit.
 
     Parameters
     ----------
     predictor : Predictor
-        Predicts them.
+        Predicts the channels; its ``start`` is the first point.
     channels : sequence of Channel
-        What to fit.
+        Values to fit.
     like : BaselineFit, optional
-        A fit of the same channels by the same baseline, with other effects: its derivatives,
-        which hardly change, are taken over.
+        A fit of the same channels by the same baseline with other effects, whose derivatives,
+        which hardly change, are used first.
+
+    Returns
+    -------
+    BaselineFit
 
     Raises
     ------
     ConvergenceError
-        The parameters still move after :data:`ROUNDS` rounds.
+        The parameters still move after :data:`bfsensor.diagnose.fit.gauss_newton.ROUNDS` rounds.
     """
     slopes = None if like is None else like.slopes
     steps = Steps(predictor, channels, slopes)
@@ -165,7 +175,7 @@ def fit_baseline(
 def _fit_faint(
     predictor: Predictor, channels: Sequence[Channel], off: TurnOff
 ) -> FloatArray | None:
-    """Parameters of what is below the turn-off; None where they do not settle either."""
+    """Non-linear parameters fitted below the turn-off; None if that does not converge either."""
     faint = Steps(predictor, below(channels, off))
     try:
         faint.go()
@@ -175,9 +185,10 @@ def _fit_faint(
 
 
 def _as_fit(steps: Steps, *notes: str) -> BaselineFit:
-    """What the steps have come to."""
+    """Result of an iteration that has ended."""
     predictor, solved, count = steps.predictor, steps.solved, steps.count
     chance = steps.modes.shape[1]
+    # Linear columns were scaled to unit length in the solver.
     unit = np.concatenate([np.ones(count), steps.scales, np.ones(chance)])
     values = np.concatenate([steps.point, solved.solution[count:] / unit[count:]])
     return BaselineFit(
@@ -202,16 +213,35 @@ def _as_fit(steps: Steps, *notes: str) -> BaselineFit:
 
 
 FITTED = ("fit", "select")
-"""Folds that a fit of the baseline uses; the third, 'held-out', is kept for a check."""
+"""Folds of the campaign that a fit uses; the third, 'held-out', is compared with its prediction."""
 
 
 def fit_bounded(
     measured: MeasuredChannels, baseline: Baseline
 ) -> tuple[Predictor, BaselineFit]:
-    """Fit the baseline; parameters that come out below their bound are held at it, worst first.
+    """Fit the baseline with some device parameters bounded below by their nominal values.
 
-    What is held is no parameter any more: of the noise in its direction the residuals keep the
-    forbidden half, which the scans, two-sided, judge rightly.
+    Parameters of ``baseline.not_below`` that come out below nominal are fixed there, the most
+    negative first, and the fit is repeated.  A fixed parameter no longer absorbs noise: half of
+    the noise in its direction stays in the residuals, and the scans, which are two-sided, count it.
+
+    Parameters
+    ----------
+    measured : MeasuredChannels
+        The campaign.
+    baseline : Baseline
+        Nominal device with its free parameters.
+
+    Returns
+    -------
+    predictor : Predictor
+        Of the baseline without the fixed parameters.
+    fit : BaselineFit
+
+    Raises
+    ------
+    ConvergenceError
+        A fit does not converge.
     """
     while True:
         predictor = Predictor(measured, baseline)
@@ -223,7 +253,7 @@ def fit_bounded(
 
 
 def held_out(predictor: Predictor, fit: BaselineFit, measured: MeasuredChannels) -> float:
-    """Chi-square over number of the values that were not fitted, all parameters as fitted."""
+    """Chi-square per value of the held-out fold at the fitted parameters; nan without values."""
     values = dict(zip(fit.names, fit.values, strict=True))
     point = fit.values[: len(predictor.names)]
     square, number = 0.0, 0

@@ -1,4 +1,4 @@
-"""A baseline with effects and columns, fitted; and what it makes of recordings not fitted."""
+"""A fitted model (baseline, effects, linear terms), and its chi-square of held-out recordings."""
 
 from __future__ import annotations
 
@@ -14,28 +14,36 @@ from bfsensor.typing import FloatArray
 
 
 class Model:
-    """The baseline with some effects, and columns of other models, fitted."""
+    """The baseline with some effects and further linear terms, fitted to channels.
+
+    Parameters
+    ----------
+    predictor : Predictor
+        Predicts the channels, with the effects.
+    fit : BaselineFit
+        Its fit.
+    """
 
     def __init__(self, predictor: Predictor, fit: BaselineFit) -> None:
         self.predictor, self.fit = predictor, fit
 
     @property
     def effects(self) -> tuple[Effect, ...]:
-        """Effects with their fitted parameters."""
+        """The effects with their fitted parameters."""
         return self.predictor.effects_at(self.fit.values[: len(self.predictor.names)])
 
     def with_effects(self, effects: Sequence[Effect]) -> Model:
-        """Fit again, with these effects."""
+        """Fit again with these effects in place of the present ones, from the present values."""
         predictor = self.predictor.with_effects(effects, self.fit.values)
         return Model(predictor, fit_baseline(predictor, self.fit.channels, like=self.fit))
 
     def with_columns(self, columns: Columns) -> Model:
-        """Fit again, with further linear parameters."""
+        """Fit again with further linear parameters, from the present values."""
         predictor = self.predictor.with_columns(columns, self.fit.values)
         return Model(predictor, fit_baseline(predictor, self.fit.channels, like=self.fit))
 
     def errors(self, n: int) -> dict[str, float]:
-        """Standard errors of the parameters of the n-th effect."""
+        """Linear standard errors of the parameters of the n-th effect, by name, in their units."""
         start = f"effect {n} "
         return {
             name.split()[-1]: float(e)
@@ -44,7 +52,10 @@ class Model:
         }
 
     def left(self, channel: Channel) -> FloatArray:
-        """Residuals of a channel over errors and chance, fitted or not, all parameters as fitted."""
+        """Whitened residuals of a channel, fitted or held out, at the fitted parameters.
+
+        They are whitened by the covariance 1 + M M^T of errors and random effects, shape (n,).
+        """
         values = dict(zip(self.fit.names, self.fit.values, strict=True))
         point = self.fit.values[: len(self.predictor.names)]
         predicted = self.predictor.predict(channel, point)
@@ -55,17 +66,23 @@ class Model:
         if not modes.shape[1]:
             return left
         shapes, sizes, _ = np.linalg.svd(channel.whiten(modes), full_matrices=False)
+        # (1 + M M^T)^(-1/2) = 1 - U (1 - (1 + s^2)^(-1/2)) U^T with M = U s V^T.
         wider = 1 - 1 / np.sqrt(1 + sizes**2)
         return np.asarray(left - shapes @ (wider * (shapes.T @ left)))
 
 
 def compare_held_out(before: Model, after: Model) -> dict[str, tuple[float, float, int]]:
-    """Chi-squares of what was not fitted, by channel, by one model and by another.
+    """Chi-squares of the held-out fold by two models, by channel.
+
+    Parameters
+    ----------
+    before, after : Model
+        Two fits of the same measured channels.
 
     Returns
     -------
     dict of str to (float, float, int)
-        Before, after, and number of values.
+        By name of the channel: chi-square before, after, and number of values.
     """
     out: dict[str, tuple[float, float, int]] = {}
     for channel in used_channels(before.predictor.measured.channels, ("held-out",)):

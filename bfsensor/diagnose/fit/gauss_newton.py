@@ -1,4 +1,29 @@
-"""Steps of the joint fit: what is left at a point, derivatives there, and how far to go."""
+r"""Gauss-Newton solver of the joint fit of device, gains, linear terms, effects, random effects.
+
+The whitened values :math:`y` of all channels are modelled as
+
+.. math::
+    y = f(\theta) + L \beta + M(\theta) u + \epsilon, \qquad
+    \epsilon \sim N(0, 1), \quad u \sim N(0, 1),
+
+with non-linear parameters :math:`\theta` (device, gains, effects), linear ones :math:`\beta` and
+random effects :math:`u`, whose strength is in the modes :math:`M`.  A step minimises the penalised
+sum of squares
+
+.. math::
+    |y - f(\theta) - L \beta - M u|^2 + |u|^2 + |\theta_\mathrm{prior}|^2
+    + |t - R (\theta - \theta_0)|^2
+
+to first order in :math:`\theta` (Henderson's mixed-model equations).  For given :math:`M` that is
+least squares with the covariance :math:`1 + M M^T` (Woodbury's identity).  The last term is the
+score of the restricted likelihood for parameters that enter through :math:`M`
+(:mod:`bfsensor.diagnose.fit.random_effects`).
+
+References
+----------
+Henderson 1975, Biometrics 31, 423 (mixed-model equations); Golub & Pereyra 1973, SIAM J. Numer.
+Anal. 10, 413 (linear parameters projected out).
+"""
 
 from __future__ import annotations
 
@@ -17,61 +42,90 @@ from bfsensor.inference.bounded_lsq import SINGULAR, BoundedSolution, solve_with
 from bfsensor.typing import FloatArray
 
 ROUNDS = 20
-"""Of steps that were taken, before a fit is given up."""
+"""Largest number of Gauss-Newton rounds.  If parameters still move after them, :meth:`Steps.go`,
+and :meth:`Steps.go_carefully` with effects, raise :class:`ConvergenceError`; without effects the
+latter ends where it is.  Chosen: twice as many doubles the time that a fit which does not converge
+takes, and changes no fit that converges within 20."""
 
 HALVINGS = 5
-"""Of a step that does harm, before it is given up and the fit taken for arrived."""
+"""Lengths at which a step is tried, each half of the one before: 1 to 1/16.  If none keeps the
+chi-square within :data:`NO_HARM`, the step is refused.  Chosen: twice as many would try lengths
+from 1/32 to 1/512, for which a linear model promises 6 to 0.4 % of the full step's gain."""
 
 MISLED = 2
-"""Halvings of a step by another fit's derivatives after which a fit finds its own."""
+"""Lengths of a step (1 and 1/2) that are tried with derivatives borrowed from another fit; if
+both fail, the fit finds its own derivatives.  Chosen, to be derived: with 4, two more
+predictions are spent before that; the point where the fit ends hardly depends on it."""
 
 STALLED = 4
-"""Rounds without gain after which a fit with effects has arrived, whatever their steps."""
+"""Last rounds among which the chi-square must have changed by at least twice :data:`NO_HARM`;
+otherwise no further step is taken, however many errors long it would be.  Chosen, to be derived:
+twice as large lets fits along flat directions run 4 rounds longer."""
 
 REFRESHED = 2, 4
-"""Rounds in which what is left to chance is taken as strong as the effects then are."""
+"""Rounds, counted from 0, at whose start the modes of the random effects are computed again with
+the parameters of that round; in between they are constant, so that the chi-square of successive
+rounds can be compared.  Chosen, to be derived: with 4 and 8 a fit that converges within four
+rounds would keep the modes of its starting values."""
 
 ANEW, AWAY = 8, 0.1
-"""Times that what is left to chance is taken anew where scatter tells its strength, and distance
-[errors] of such parameters from where it was taken last from which on it is."""
+"""Largest number of times that the modes and the score of the variance parameters are linearised
+again after the steps have converged, and the distance [standard errors] of such a parameter from
+the last point of linearisation above which that is done.  Chosen, to be derived: after twice as
+many times, or within 0.2 errors, an estimate may differ by the curvature of the restricted
+likelihood, of second order in that distance."""
 
 SMALL = 0.05
-"""Largest step of a parameter [of its error] at which the fit has arrived."""
+"""Largest step of any parameter [standard errors] at which the fit has converged; that step is
+taken, too.  Chosen: for a single parameter it lowers the chi-square by 0.0025, with 0.1 by 0.01."""
 
 NO_HARM = 0.01
-"""Rise of the chi-square that is none."""
+"""Rise of the chi-square up to which a step is accepted.  Chosen: it moves a parameter by 0.1 of
+its error (the square root); twice as large, by 0.14."""
 
 IDLE = 1.0
-"""Gain of a chi-square by derivatives alone that is not worth a step: the parameters count as
-fitted, and what is left is orthogonal to their columns."""
+"""Decrease of the chi-square promised by the derivatives below which parameters count as fitted
+although the last step was refused: the residuals returned are then orthogonal to their columns.
+Also the promised decrease above which :data:`POOR` is tested.  Chosen, to be derived: a decrease
+of 1 is what noise makes of one free parameter; with 2, residuals would be projected on a linear
+model that missed the minimum by up to 1.4 errors."""
 
 POOR = 0.5
-"""Part of the gain that derivatives promised below which they are another point's: found anew."""
+"""Part of the promised decrease of the chi-square that a round must reach; otherwise derivatives
+by all parameters, not only by those of effects, are found again in the next round.  Chosen, to
+be derived: with 1 they are found in most rounds, which costs time and no accuracy."""
 
 Seen = tuple[list[FloatArray], FloatArray]
+"""Predictions of each channel, and the whitened residuals of all."""
 
 
 class Steps:
-    """Least squares around a point, which :meth:`go` and :meth:`go_carefully` move.
+    """Gauss-Newton iteration around a point, which :meth:`go` and :meth:`go_carefully` move.
 
     Parameters
     ----------
     predictor : Predictor
-        Predicts the channels.
+        Predicts the channels; its ``start`` is the first point.
     channels : sequence of Channel
-        What to fit.
-    slopes : ndarray, shape (values, plain parameters), optional
-        Derivatives of another fit, of all parameters that are no effect's.
+        Values to fit.
+    slopes : ndarray, shape (values, parameters), optional
+        Whitened derivatives of another fit of the same channels, of which those by parameters
+        other than effects' are used until they mislead; they hardly depend on the effects.
 
     Attributes
     ----------
-    point : ndarray
+    point : ndarray, shape (p,)
         Non-linear parameters.
     solved : BoundedSolution
-        The last solution: non-linear parameters, linear ones, strengths of what is left to
-        chance.
-    slopes : ndarray, shape (values, non-linear parameters)
-        Whitened derivatives.
+        The last solution: steps of the non-linear parameters, linear parameters, random effects.
+    slopes : ndarray, shape (values, p)
+        Whitened derivatives of the predictions.
+    modes : ndarray, shape (values, m)
+        Whitened modes :math:`M` of the random effects.
+    score : Score
+        Score of the variance parameters.
+    history : list of float
+        Largest step of each round [standard errors].
     """
 
     def __init__(
@@ -87,13 +141,15 @@ class Steps:
         self.count, self._priors = len(predictor.names), len(predictor.prior_rows)
         self.effect = np.char.startswith(np.array(predictor.names, str), "effect ")
         self._shape = predictor.shapes()
-        # With effects on flats means depend on gains, as they do not without.
+        # An effect in electrons on means of flats [ADU] makes them depend on the gains, whose
+        # derivatives are then found again in each round, too.
         flats = any("flat_mean" in e.touches for e in predictor.effects)
         gains = np.char.startswith(np.array(predictor.names, str), "gain ")
         self._anew = self.effect | (gains & flats)
         self.point = predictor.start.astype(float).copy()
         self.slopes = np.zeros((self.total, self.count))
-        # Where flats fill up, what the device did to their covariances is gone.
+        # At full well covariances no longer depend on the device: derivatives of a fit without
+        # saturation do not hold.
         full = any(np.isfinite(e.law().full_well) for e in predictor.effects)
         self._borrowed = slopes is not None and not full
         self._chance = any(type(e).modes is not Effect.modes for e in predictor.effects)
@@ -112,7 +168,7 @@ class Steps:
             for name, column in self.predictor.linear(channel).items():
                 whole = columns.setdefault(name, np.zeros(self.total))
                 whole[start : start + len(channel)] += channel.whiten(column)
-        # A parameter that no value depends on is none.
+        # A column of zeros would make the QR decomposition below singular.
         columns = {k: v for k, v in columns.items() if np.abs(v).max() > 0}
         self.columns = tuple(columns)
         linear = np.array(list(columns.values())).T.reshape(self.total, len(columns))
@@ -120,7 +176,7 @@ class Steps:
         self._linear = linear / self.scales
 
     def update_chance(self) -> None:
-        """Take what effects leave to chance as strong as they are at the point."""
+        """Compute the modes of the random effects, and the score, at the point."""
         found = [self.predictor.modes(c, self.point) for c in self.channels]
         found = [
             c.whiten(m) if m.shape[1] else m
@@ -128,7 +184,9 @@ class Steps:
         ]
         some = any(m.shape[1] for m in found)
         self.modes = block_diag(*found) if some else np.zeros((self.total, 0))
-        # Orthonormal columns of linear parameters and of chance, whose priors' rows are the last.
+        # QR of [[L, M], [0, 1]], the rows below being the priors of u: with Q1 the upper rows of
+        # its orthonormal columns, 1 - Q1 Q1^T = C^-1 - C^-1 L (L^T C^-1 L)^-1 L^T C^-1 of
+        # C = 1 + M M^T, by Woodbury's identity, without inverting C (n x n).
         chance = self.modes.shape[1]
         both = np.zeros((self.total + chance, self._linear.shape[1] + chance))
         both[: self.total] = np.concatenate([self._linear, self.modes], axis=1)
@@ -140,7 +198,7 @@ class Steps:
         self._update_score()
 
     def _update_score(self) -> None:
-        """Take what scatter tells about parameters as it does at the point."""
+        """Linearise the score of the variance parameters at the point."""
         self.score = no_score(self.point)
         if len(self._scored):
             self.score = score_of(
@@ -149,7 +207,12 @@ class Steps:
             )  # fmt: skip
 
     def _reach(self, point: FloatArray) -> FloatArray:
-        """Smallest and largest steps; where scatter tells, half or twice what it was taken at."""
+        """Smallest and largest steps, shape (2, p).
+
+        Variance parameters stay between half and twice the value at which their score was
+        linearised: their information goes with the inverse square of the value, so that the
+        linear score says nothing farther away.
+        """
         ends = np.array(self.predictor.reach(point), float)
         own = self._scored[(self.score.rows[:, self._scored] != 0).any(0)]
         there = self.predictor.reach(self.score.origin)[:, own]
@@ -161,16 +224,16 @@ class Steps:
         return ends
 
     def _behind(self) -> bool:
-        """Whether what scatter tells was found far from here."""
+        """Whether a variance parameter has moved by more than AWAY since its score was found."""
         errors = self.solved.errors[self._scored]
         away = np.abs(self.point - self.score.origin)[self._scored]
         return bool((away > AWAY * errors).any())
 
     def residuals(self, point: FloatArray) -> Seen:
-        """Predictions, and what they leave of the values, whitened; the last ones are kept."""
+        """Predictions and whitened residuals at a point; those of the last point are cached."""
         if self._last is not None and np.array_equal(self._last[0], point):
             return self._last[1]
-        # Far from what pixels can do numbers overflow: such points are none.
+        # Far outside physical ranges predictions overflow: such a point is refused below.
         with np.errstate(over="ignore", invalid="ignore"):
             predicted = [self.predictor.predict(c, point) for c in self.channels]
         if not all(np.isfinite(p).all() for p in predicted):
@@ -184,7 +247,7 @@ class Steps:
         return self._last[1]
 
     def square(self, residuals: FloatArray, point: FloatArray) -> float:
-        """Chi-square with the linear parameters at their best, priors included."""
+        """Chi-square with linear parameters and random effects at their best, priors included."""
         given = self._span.T @ residuals
         held = point[self.predictor.prior_rows]
         told = self.score.left(point)
@@ -199,7 +262,7 @@ class Steps:
         *,
         forgiving: bool = False,
     ) -> None:
-        """Find derivatives by some parameters; forgiving keeps old ones where there are no new."""
+        """Find derivatives by some parameters; ``forgiving`` keeps old ones where that fails."""
         for n in map(int, np.flatnonzero(which)):
             for channel, start, here in zip(
                 self.channels, self.starts, predicted, strict=False
@@ -214,7 +277,7 @@ class Steps:
                             f"the derivative by {self.predictor.names[n]}"
                         )
                 except ConvergenceError:
-                    # At the end of where spots have a shape.
+                    # At the edge of the range in which widths of spots can be computed.
                     if not forgiving:
                         raise
                     continue
@@ -223,9 +286,10 @@ class Steps:
     def problem(
         self, residuals: FloatArray, point: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Columns of all parameters and what they should make.
+        """Design matrix and target of one linear step.
 
-        Rows of values, of priors, of chance and of what scatter tells.
+        Rows: whitened values, priors of device parameters, priors of random effects, score.
+        Columns: non-linear parameters, linear ones, random effects.
         """
         plainly, chance = self.count + self._linear.shape[1], self.modes.shape[1]
         rows = self.predictor.prior_rows
@@ -247,7 +311,7 @@ class Steps:
         point: FloatArray,
         held: NDArray[np.bool_] | None = None,
     ) -> BoundedSolution:
-        """Best step of all parameters, some of the non-linear ones held."""
+        """Best step of all parameters within their reach, some non-linear ones held."""
         design, target = self.problem(residuals, point)
         ends = np.repeat([[-np.inf], [np.inf]], design.shape[1], axis=1)
         ends[:, : self.count] = self._reach(point)
@@ -261,15 +325,16 @@ class Steps:
         point: FloatArray,
         held: NDArray[np.bool_] | None = None,
     ) -> BoundedSolution:
-        """Solve for the non-linear parameters alone, what the others take projected out.
+        """Solve for the non-linear parameters alone, all others projected out.
 
-        With hundreds of columns of chance that is a small problem in place of a large one; of the
-        solution only that part is told, and no basis.
+        With hundreds of random effects that is a small problem in place of a large one (variable
+        projection).  The solution returned holds the non-linear parameters only, and its basis
+        is that of the projected problem.
         """
         if not self._apart:
             return self.solve(residuals, point, held)
         rows = self.predictor.prior_rows
-        # Rows of chance come before those of priors.
+        # Unlike in problem(), rows of random effects come before those of the device's priors.
         first = len(self._whole)
         last = first + self._priors
         design = np.zeros((last + len(self.score.target), self.count + 1))
@@ -281,7 +346,7 @@ class Steps:
         ends = self._reach(point)
         if held is not None:
             ends[:, held] = 0.0
-        # A column that is projected out but for rounding is none.
+        # A column of which the projection leaves rounding errors alone would get a random step.
         norms = np.sqrt((self.slopes**2).sum(0) + (self.score.rows**2).sum(0))
         norms[rows] = np.hypot(norms[rows], 1.0)
         gone = np.sqrt((design[:, :-1] ** 2).sum(0)) < SINGULAR * norms
@@ -289,20 +354,23 @@ class Steps:
         return solve_within(design[:, :-1], design[:, -1], *ends)
 
     def _step(self, solved: BoundedSolution) -> float:
-        """Move the point; gives the largest move over errors."""
+        """Move the point by a full step; returns the largest step [standard errors]."""
         self._note(solved)
         self.point = self.point + solved.solution[: self.count]
         return self.history[-1]
 
     def _note(self, solved: BoundedSolution) -> None:
-        """Keep a solution, and how far it wants to go."""
+        """Store a solution and its largest step [standard errors]."""
         self.solved = solved
         step, errors = solved.solution[: self.count], solved.errors[: self.count]
         moved = np.abs(step) / np.maximum(errors, 1e-300)
         self.history.append(float(np.max(moved, where=errors > 0, initial=0.0)))
 
     def go(self) -> None:
-        """Full steps, with the derivatives of the second round for all later ones.
+        """Take full steps, with derivatives found in the first two rounds.
+
+        Derivatives by parameters of effects are found in every round; all others hardly change
+        (a chord method), and the residuals, which decide where the iteration ends, are exact.
 
         Raises
         ------
@@ -320,11 +388,12 @@ class Steps:
         raise self._unsettled()
 
     def go_carefully(self) -> None:
-        """Take steps that do no harm, those of effects with derivatives of each round.
+        """Take steps that do not raise the chi-square, with effects' derivatives of each round.
 
-        A step that does harm is first mended: where it put all else, effects' amplitudes are
-        brought to their best, for they follow along curved valleys.  Then it is halved, at last
-        given up.  Without effects a fit that does not settle ends where it is.
+        A step that raises it is first corrected: the effects' amplitudes are refitted at the new
+        shapes, because minima along curved directions have correlated amplitudes and shapes.
+        Then it is halved, up to :data:`HALVINGS` lengths.  A fit without effects that does not
+        converge ends where it is.
 
         Raises
         ------
@@ -350,13 +419,13 @@ class Steps:
             promised = here - float(solved.left @ solved.left)
             if stalled or not self._gainful(solved, here):
                 if self._borrowed:
-                    # Derivatives of a fit without these effects lead nowhere: their own are found.
+                    # Derivatives borrowed from a fit without these effects gave no gain: find own.
                     self._borrowed = False
                     self.differentiate(~self.effect, self.point, predicted, forgiving=True)
                     solved = self._solve(residuals, self.point)
                     if self._gainful(solved, here):
                         continue
-                # What effects stop, all others may still do.
+                # With the effects' parameters held the others may still lower the chi-square.
                 if own or not self._gainful(
                     self._solve(residuals, self.point, self.effect), here
                 ):
@@ -380,7 +449,13 @@ class Steps:
         self._end()
 
     def _end(self) -> None:
-        """End here: of what steps would still gain, told is none but what counts for nothing."""
+        """Store the solution at a point where no step lowers the chi-square any more.
+
+        The linear model may still promise a decrease that no step delivers; residuals with that
+        decrease taken off would claim a fit that was not reached.  So parameters are held at the
+        point in the last solution, unless freeing them (all, else all but effects') promises less
+        than :data:`IDLE`.
+        """
         residuals = self.residuals(self.point)[1]
         nothing, everything = np.zeros(self.count, bool), np.ones(self.count, bool)
         told = self.solve(residuals, self.point, everything)
@@ -393,9 +468,10 @@ class Steps:
         self.solved = told
 
     def stay(self, point: FloatArray) -> None:
-        """End at a point that other values told, whatever is left here.
+        """End at a point that a fit of other values found, whatever the residuals are here.
 
-        Derivatives count in the errors only: what is left is none of these parameters'.
+        Derivatives enter the errors only: the non-linear parameters are held, and nothing of
+        the residuals is attributed to them.
         """
         self.point = point.copy()
         predicted, residuals = self.residuals(self.point)
@@ -404,7 +480,7 @@ class Steps:
         self.solved = self.solve(residuals, self.point, everything)
 
     def _gainful(self, solved: BoundedSolution, least: float) -> bool:
-        """Go as far as a step does no harm; False: nowhere."""
+        """Move by the largest tried length of a step that does no harm; False if none does not."""
         start, step = self.point, solved.solution[: self.count]
         self._note(solved)
         if self.history[-1] < SMALL:
@@ -418,17 +494,17 @@ class Steps:
                         self.point = tried
                         return True
             except ConvergenceError:
-                # So far off that spots have no shape any more: a step that does harm.
+                # Nothing can be predicted there: the same as a rise of the chi-square.
                 continue
             if self._borrowed and halved + 1 == MISLED:
                 return False
         return False
 
     def _tries(self, there: FloatArray) -> Iterator[FloatArray]:
-        """Give a point, and after it the best ones near it.
+        """Yield a point, then the same point with the effects' amplitudes refitted.
 
-        First all but amplitudes held: a full well has to follow the gain to one part in 1e5.
-        Then the shapes of effects held.
+        First all but amplitudes are held: a full well has to follow the gain to one part in 1e5.
+        Then only the shapes of effects are held.
         """
         yield there
         amplitudes = self.effect & ~self._shape
@@ -445,6 +521,6 @@ class Steps:
     def _unsettled(self) -> ConvergenceError:
         steps = ", ".join(f"{h:.2g}" for h in self.history)
         return ConvergenceError(
-            f"the baseline's parameters still move by {self.history[-1]:.2g} of their errors after "
-            f"{ROUNDS} rounds (steps {steps})"
+            f"the fit did not converge: after {ROUNDS} rounds its parameters still move by up to "
+            f"{self.history[-1]:.2g} standard errors, {SMALL} allowed (rounds: {steps})"
         )

@@ -1,4 +1,8 @@
-"""Intervals of effects' parameters by the chi-square itself, where it is no parabola."""
+"""Likelihood profiles: intervals of an effect's parameters where the chi-square is no parabola.
+
+The ends of an interval of ``w`` standard deviations are where the smallest chi-square with the
+parameter held has risen by ``w^2`` (Wilks' theorem for one parameter).
+"""
 
 from __future__ import annotations
 
@@ -17,40 +21,53 @@ from bfsensor.errors import ConvergenceError
 from bfsensor.typing import FloatArray
 
 POINTS = 7
-"""Values of a parameter that are held, at most, on one side."""
+"""Largest number of values on one side, the best among them, at which a parameter is held while
+going outwards; up to two more are added at each width.  Chosen, to be derived: with 14, ends that
+are reported as open because six steps did not reach them would be searched for by thirteen, at
+twice the predictions."""
 
 LONGEST = 3.0
-"""Stretch of a step over the last one."""
+"""Largest factor between successive steps (the smallest is 0.3).  Chosen: six steps that grow by 3
+reach 364 times the first; with 6, 9331 times, and the profile's curve between them is less
+certain."""
 
 NARROW = 0.8
-"""Difference of the roots on both sides of where a width is crossed that needs no value between."""
+"""Difference of the roots of the rise [standard deviations] between two neighbouring values that
+bracket an end, below which no value is added between them.  Chosen: with 1.6 ends rest on an
+interpolation over up to twice the distance."""
 
 SEEN = 0.05
-"""Rise of the chi-square's root along a step below which nothing tells how far to go next."""
+"""Increase of the root of the rise along a step [standard deviations] below which the next step is
+not extrapolated from it but is :data:`LONGEST` times as long.  Chosen: profiles are good to a
+chi-square of 0.02, a root of 0.14, so that a smaller increase may be numerical; with 0.1, more
+steps grow by the full factor."""
 
 
 LOWER = 0.2
-"""Chi-square by which a profile must be lower than the fit for the fit to go on there."""
+"""Difference by which the lowest chi-square on a profile must be below the fit's for the fit to be
+continued from there; it must then gain half of it.  Chosen: a fit that is 0.2 too high ended up to
+0.45 errors from its minimum; with 0.4, 0.63 errors."""
 
 RESTARTS = 4
-"""Of a fit that profiles found lower places of."""
+"""Largest number of times that a fit is continued from a lower point of a profile.  Chosen: twice
+as many doubles the time of a fit that never settles."""
 
 
 @dataclass(frozen=True)
 class Profile:
-    """How the chi-square rises with one parameter, all others at their best.
+    """Likelihood profile: the rise of the chi-square with one parameter, all others refitted.
 
     Attributes
     ----------
     values : ndarray, shape (n,)
-        Of the parameter, rising; the best is among them.
+        Values of the parameter, in its unit, increasing; the best is among them.
     rises : ndarray, shape (n,)
-        Of the chi-square above its lowest.
+        Rise of the chi-square above its smallest value, at least 0.
     logarithmic : bool
-        Whether the root of the rise is straighter in the logarithm of the parameter's distance
-        from ``neutral``.
+        Whether ends are interpolated in the logarithm of the parameter's distance from
+        ``neutral``, in which the root of the rise is closer to linear.
     neutral : float
-        Of the parameter.
+        Value at which the parameter has no effect; used if ``logarithmic``.
     """
 
     values: FloatArray
@@ -59,9 +76,19 @@ class Profile:
     neutral: float = 0.0
 
     def interval(self, width: float) -> tuple[float, float, bool, bool]:
-        """Ends where the chi-square has risen by the square of ``width``, and whether it does.
+        """Ends where the chi-square has risen by the square of ``width``.
 
-        An end at which it has not is the last value that there is.
+        Parameters
+        ----------
+        width : float
+            Half-width in standard deviations, above 0: 1 for 68 %, 1.96 for 95 %.
+
+        Returns
+        -------
+        low, high : float
+            Ends, in the parameter's unit; an open end is the last value of the profile.
+        low_closed, high_closed : bool
+            Whether the chi-square rises that far on that side; False says that the end is open.
 
         Examples
         --------
@@ -84,12 +111,13 @@ class Profile:
 
 
 def _crossing(place: FloatArray, roots: FloatArray, width: float) -> tuple[float, bool]:
-    """Place, going out from the first, at which a root first comes to a width."""
+    """Place, going out from the first, at which a root first reaches a width, and whether it does."""
     beyond = np.nonzero(roots >= width)[0]
     if not len(beyond) or len(place) < 2:
         return float(place[-1]), False
     last = int(beyond[0])
-    # Two more points give the curve its slope there.
+    # A monotone cubic (PCHIP), since a polynomial through a bracket may overshoot and cross twice;
+    # it takes its slope at the bracket from one more point on either side.
     own = slice(0, min(last + 2, len(place)))
     order = np.argsort(place[own])
     curve = PchipInterpolator(place[own][order], roots[own][order] - width)
@@ -99,7 +127,7 @@ def _crossing(place: FloatArray, roots: FloatArray, width: float) -> tuple[float
 
 
 class Scale(NamedTuple):
-    """On what scale a parameter goes: its own, or the logarithm of its distance from neutral."""
+    """Scale along which a parameter is varied: its own, or the log of its distance from neutral."""
 
     logarithmic: bool
     neutral: float
@@ -107,23 +135,23 @@ class Scale(NamedTuple):
 
     @classmethod
     def of(cls, p: Parameter, value: float) -> Scale:
-        """Of a parameter whose best value is given."""
+        """Choose the scale of a parameter with a best value."""
         away = value - p.neutral
         logarithmic = p.law == "log" and not p.signed and away > 0
         return cls(logarithmic, p.neutral if logarithmic else 0.0, 1e-3 * min(p.low, away))
 
     def place(self, value: float) -> float:
-        """Of a value; what is nearest to neutral is one."""
+        """Place of a value on this scale; distances from neutral below ``least`` count as that."""
         if not self.logarithmic:
             return value
         return float(np.log(max(value - self.neutral, self.least)))
 
     def value(self, place: float) -> float:
-        """Of a place."""
+        """Value at a place on this scale."""
         return self.neutral + float(np.exp(place)) if self.logarithmic else place
 
     def first(self, value: float, told: float, p: Parameter) -> float:
-        """First step, to the end that a linear error tells; of none, a part of the range."""
+        """First step: to the end by the linear error; without one, a part of the range."""
         step = abs(self.place(told) - self.place(value))
         if np.isfinite(step) and step > 0:
             return min(step, 1.0) if self.logarithmic else step
@@ -131,7 +159,7 @@ class Scale(NamedTuple):
 
 
 class _Side:
-    """Goes out from the best value on one side until the chi-square has risen enough."""
+    """One side of a profile: values outwards from the best until the chi-square has risen enough."""
 
     def __init__(self, valley: Valley, k: int, scale: Scale, end: float) -> None:
         self._valley, self._k, self._scale = valley, k, scale
@@ -140,7 +168,7 @@ class _Side:
         self.places, self.held = [best], [Held(valley.square, valley.best, valley.slopes)]
 
     def go(self, first: float, widths: Sequence[float]) -> None:
-        """Hold the parameter at values ever farther out, then near where widths are crossed."""
+        """Hold the parameter at values outwards, then at some that bracket each width closely."""
         step = first
         while len(self.places) < POINTS:
             roots = self._roots()
@@ -151,7 +179,7 @@ class _Side:
                 last = self.places[-1] - self.places[-2]
                 rate = (roots[-1] - roots[-2]) / abs(last)
                 if roots[-1] - roots[-2] > SEEN:
-                    # A little beyond: what is crossed is told best from both sides.
+                    # 5 % beyond the width, so that the end is bracketed and not extrapolated.
                     step = (1.05 * wanted - roots[-1]) / rate
                     step = float(np.clip(step, 0.3 * abs(last), LONGEST * abs(last)))
                 else:
@@ -166,7 +194,7 @@ class _Side:
         return place + out * min(step, abs(self._end - place))
 
     def _add(self, place: float, at: int) -> bool:
-        """Hold the parameter at a place; False where there is none, or nothing is predicted."""
+        """Hold the parameter at a place; False if it is held there, or nothing can be predicted."""
         if any(abs(place - p) < 1e-12 * (1 + abs(p)) for p in self.places):
             return False
         value = self._scale.value(place)
@@ -180,7 +208,7 @@ class _Side:
         return True
 
     def _nearest(self, place: float) -> Held:
-        """Where the others may begin: as they were nearby, gone on as far as told."""
+        """Starting point at a place: the other parameters inter- or extrapolated from neighbours."""
         order = np.argsort(np.abs(np.array(self.places) - place))
         first = self.held[int(order[0])]
         if len(order) < 2:
@@ -196,7 +224,7 @@ class _Side:
         return [float(np.sqrt(max(h.square - least, 0.0))) for h in self.held]
 
     def _close_in(self, width: float) -> None:
-        """Halve what brackets a width until it is narrow."""
+        """Narrow the bracket of a width below NARROW, by at most two further values."""
         for _ in range(2):
             roots = self._roots()
             at = next((n for n, r in enumerate(roots) if r >= width), 0)
@@ -211,10 +239,26 @@ class _Side:
 def settle(
     model: Model, n: int, widths: Sequence[float]
 ) -> tuple[Model, dict[str, Profile]]:
-    """Profiles as of :func:`find_profiles`, and the fit gone on from where they are lower.
+    """Profiles as by :func:`find_profiles`, the fit continued where a profile is lower than it.
 
-    Along a bent valley a fit goes by steps that gain ever less and may end before its lowest
-    place; profiles, which follow the valley, come by it.
+    Along a curved minimum Gauss-Newton steps gain ever less, and a fit may stop before the
+    lowest point; a profile follows the curve and passes it.
+
+    Parameters
+    ----------
+    model : Model
+        Fitted, with effects.
+    n : int
+        Index of the effect in ``model.effects``.
+    widths : sequence of float
+        Half-widths of the intervals [standard deviations], increasing.
+
+    Returns
+    -------
+    model : Model
+        The same, or the one fitted again from a lower point.
+    profiles : dict of str to Profile
+        Profiles of that model by the name of the parameter.
     """
     for _ in range(RESTARTS):
         if type(model.effects[n]).modes is not Effect.modes:
@@ -238,27 +282,27 @@ def settle(
 
 
 def find_profiles(model: Model, n: int, widths: Sequence[float]) -> dict[str, Profile]:
-    """Profiles of one effect's parameters of which linear errors tell a wrong interval.
+    """Profiles of those parameters of one effect for which linear intervals are wrong.
 
-    Of each parameter the chi-square at the ends of its intervals is found first, all others
-    following linearly: where it is as the errors say, they are believed.  Of effects that leave
-    something to chance they are believed too: how much that is goes with the parameters, and
-    a chi-square that holds it is no profile (of turbulence's rms it missed the truth in two of two
-    trials, of which errors held one).
+    For each parameter the chi-square at the ends of its linear intervals is evaluated first, all
+    others moved linearly: if it has risen as a parabola does, the linear errors stand.  They also
+    stand for effects with random effects: their variances change with the parameters, and the
+    chi-square at constant variances is no likelihood (for the rms of turbulence its interval
+    missed the truth in two of two trials, the linear one in one of them).
 
     Parameters
     ----------
     model : Model
-        With effects.
+        Fitted, with effects.
     n : int
-        Which of them.
+        Index of the effect in ``model.effects``.
     widths : sequence of float
-        Roots of the rises of the chi-square that intervals end at, rising.
+        Half-widths of the intervals [standard deviations], increasing.
 
     Returns
     -------
     dict of str to Profile
-        By parameter.
+        Profiles by the name of the parameter; empty if linear intervals stand for all.
     """
     if type(model.effects[n]).modes is not Effect.modes:
         return {}
@@ -266,7 +310,7 @@ def find_profiles(model: Model, n: int, widths: Sequence[float]) -> dict[str, Pr
 
 
 def profiles_in(valley: Valley, widths: Sequence[float]) -> dict[str, Profile]:
-    """As :func:`find_profiles`, of a valley."""
+    """Profiles as by :func:`find_profiles`, from a chi-square that is given as a function."""
     out = {}
     for k, p in enumerate(valley.parameters):
         error = float(valley.errors[k])

@@ -1,4 +1,8 @@
-"""The chi-square about a fit as a function of one effect's parameters."""
+"""The chi-square near a fit as a function of one effect's parameters, all others refitted.
+
+The effect's parameters are not linearised; all other parameters follow to first order: their
+columns are projected out of the residuals.
+"""
 
 from __future__ import annotations
 
@@ -17,18 +21,23 @@ from bfsensor.inference.bounded_lsq import solve_within, span
 from bfsensor.typing import FloatArray
 
 BENT = 0.5
-"""Part by which the rise of the chi-square at the ends of an interval may differ from that of a
-parabola: an end is then off by a fifth of its distance, or two fifths where it rises less."""
+"""Relative deviation of the rise of the chi-square at the ends of linear intervals from a
+parabola's, above which the likelihood profile is computed.  An end is then off by 1 - 1.5^(-1/2) =
+18 % of its distance, or 0.5^(-1/2) - 1 = 41 % where it rises less.  Chosen, to be derived: with 1.0
+every chi-square that rises to at most twice the parabola's, or not at all, would pass for one."""
 
 TURNS = 4
-"""Of fits of the other parameters at a value that is held."""
+"""Largest number of Gauss-Newton rounds of the effect's other parameters while one is held.
+Chosen: with fewer than needed the profile lies above the true one and intervals are too narrow; 8
+cost up to twice the predictions where it does not converge."""
 
 DONE = 0.02
-"""Gain of the chi-square that such a fit still expects when it ends: 1 % of an error."""
+"""Decrease of the chi-square that the linear model still promises when such a fit ends.  Chosen:
+it moves an end at a rise of 1 by 0.02 / 2 = 1 % of the error; twice as large, by 2 %."""
 
 
 class Held(NamedTuple):
-    """Chi-square with all that may move at its best, and the effect's parameters there."""
+    """Smallest chi-square with one parameter held, the effect's parameters and derivatives there."""
 
     square: float
     values: FloatArray
@@ -36,26 +45,33 @@ class Held(NamedTuple):
 
 
 class Valley:
-    """The chi-square about a fit as a function of one effect's parameters.
+    """The chi-square near a fit as a function of one effect's parameters.
 
     Parameters
     ----------
     parameters : sequence of Parameter
-        That were fitted.
+        Fitted parameters of the effect.
     best : ndarray, shape (p,)
-        Where the fit put them.
+        Their values in the fit.
     left : callable
-        What is left with them as given, everything else at its best; it may raise
-        :class:`ConvergenceError`.
+        Gives the whitened residuals, shape (n,), at values of shape (p,), all other parameters
+        projected out; it may raise :class:`ConvergenceError`.
     slopes : ndarray, shape (n, p)
-        Derivatives of the prediction at the best, what everything else takes of them taken off.
+        Derivatives of the whitened prediction at ``best``, projected likewise.
     steps : ndarray, shape (p,)
-        Of derivatives.
+        Steps of finite differences.
 
     Attributes
     ----------
+    square : float
+        Chi-square at ``best``.
+    covariance : ndarray, shape (p, p)
+        Linear covariance of the parameters at ``best``.
+    errors : ndarray, shape (p,)
+        Linear standard errors.
     lowest : Held
-        Of all points that were come to; the best, where the fit found it.
+        The point of the smallest chi-square of all that were evaluated by :meth:`hold`, or
+        ``best``.  A point lower than ``best`` means that the fit ended early.
     """
 
     def __init__(
@@ -76,7 +92,7 @@ class Valley:
         self.lowest = Held(self.square, best, slopes)
 
     def along(self, k: int, value: float) -> FloatArray:
-        """All parameters with one at a value, the others moved linearly with it."""
+        """All parameters with the k-th at a value, the others moved along their covariance with it."""
         variance = self.covariance[k, k]
         rate = self.covariance[:, k] / variance if variance > 0 else 0.0
         values = self.best + rate * (value - self.best[k])
@@ -84,12 +100,15 @@ class Valley:
         return self.inside(values)
 
     def inside(self, values: FloatArray) -> FloatArray:
-        """Values no farther than their ranges."""
+        """Values clipped to the ranges of fits."""
         low, high = np.array([widened(p) for p in self.parameters]).T
         return np.clip(values, low, high)
 
     def is_parabola(self, k: int, error: float) -> bool:
-        """Whether the chi-square at the ends of linear intervals has risen as they say."""
+        """Whether the chi-square rises by 1 and 1.96^2 at the ends of the linear intervals.
+
+        It may differ by half of that; False where an end is outside the range of fits.
+        """
         if not (np.isfinite(error) and error > 0):
             return False
         p, best = self.parameters[k], float(self.best[k])
@@ -103,7 +122,10 @@ class Valley:
         return True
 
     def _rise(self, k: int, value: float) -> float:
-        """Rise of the chi-square at a value of one parameter, the others moved linearly."""
+        """Rise of the chi-square at a value of one parameter, the others moved linearly.
+
+        Infinite where nothing can be predicted.
+        """
         own = np.arange(len(self.best)) != k
         try:
             left = self.left(self.along(k, value))
@@ -114,15 +136,33 @@ class Valley:
         return float(left @ left) - self.square
 
     def hold(self, k: int, value: float, near: Held) -> Held:
-        """Fit the effect's other parameters with one held, from a point nearby.
+        """Fit the effect's other parameters with the k-th held, from a point nearby.
 
-        Derivatives are those of that point, mended by each step (Broyden), found anew where a
-        step does harm.
+        Derivatives are those of that point, updated after each step (Broyden's rank-one update),
+        and computed by finite differences once a step raises the chi-square.
+
+        Parameters
+        ----------
+        k : int
+            Parameter that is held.
+        value : float
+            Its value, in its unit.
+        near : Held
+            Point from which the others begin.
+
+        Returns
+        -------
+        held : Held
+            Point of the smallest chi-square found in :data:`TURNS` rounds.
 
         Raises
         ------
         ConvergenceError
-            Nothing can be predicted there.
+            Nothing can be predicted at the first point.
+
+        References
+        ----------
+        Broyden 1965, Math. Comp. 19, 577.
         """
         own = np.flatnonzero(np.arange(len(self.best)) != k)
         values = near.values.copy()
@@ -139,7 +179,8 @@ class Valley:
                 break
             moved = self._tried(values, own, step)
             if moved is not None and float(moved @ moved) < square:
-                # What the step did mends the slopes along it.
+                # Broyden: the residuals that this step left correct the slopes along it, in units
+                # of errors, so that the update does not depend on the parameters' units.
                 wrong = (left - moved) - slopes[:, own] @ step
                 unit = step / self._unit[own] ** 2
                 slopes[:, own] += np.outer(wrong, unit) / float(step @ unit)
@@ -168,7 +209,7 @@ class Valley:
     def _slopes_at(
         self, values: FloatArray, left: FloatArray, own: NDArray[np.int64]
     ) -> FloatArray:
-        """Derivatives of the prediction by some parameters."""
+        """Derivatives of the prediction by some parameters, shape (n, len(own))."""
         out = np.zeros((len(left), len(own)))
         for column, n in enumerate(own):
             moved = values.copy()
@@ -181,18 +222,23 @@ class Valley:
 
 
 def valley_of(model: Model, n: int) -> Valley:
-    """Give the valley about a fit, of one of its effects.
+    """Make the chi-square near a fit a function of the parameters of one of its effects.
 
-    The effect is predicted anew at each value; everything else that was fitted follows to
-    first order, for that is nearly linear over a few errors.  What other effects leave to chance
-    stays as strong as in the fit.
+    The effect is predicted again at each value; all other fitted parameters follow to first
+    order, as they are nearly linear over a few errors.  Random effects of other effects keep the
+    variances of the fit.
 
     Parameters
     ----------
     model : Model
-        With effects.
+        Fitted, with effects.
     n : int
-        Which of them.
+        Index of the effect in ``model.effects``.
+
+    Returns
+    -------
+    near : object
+        The chi-square as a function of ``model.effects[n]``'s fitted parameters.
     """
     predictor, fit, effect = model.predictor, model.fit, model.effects[n]
     point = fit.values[: len(predictor.names)].copy()
@@ -203,7 +249,7 @@ def valley_of(model: Model, n: int) -> Valley:
     design, target = around.problem(around.residuals(point)[1], point)
     used = (design**2).sum(0) > 0
     used[rows] = False
-    # Of another effect at the end of its range nothing moves.
+    # A parameter of another effect at the end of its range cannot follow.
     low, high = predictor.reach(point)
     used[: len(point)] &= (low < 0) & (high > 0)
     others = span(design[:, used])
@@ -236,9 +282,31 @@ def valley_of(model: Model, n: int) -> Valley:
 
 
 def linear_interval(value: float, width: float, p: Parameter) -> tuple[float, float]:
-    """Ends of an interval by a standard error, or a multiple of it.
+    """Ends of the interval ``value`` +- ``width``, or of the log-normal one.
 
-    Of positive parameters that are badly known the logarithm is taken for Gaussian.
+    For a positive parameter on a logarithmic scale with a relative error above 15 % the logarithm
+    is taken for Gaussian: a symmetric interval would come near, or cross, its neutral value.
+
+    Parameters
+    ----------
+    value : float
+        Best value, in the parameter's unit.
+    width : float
+        Standard error, or a multiple of it, in the same unit.
+    p : Parameter
+        Its law, sign and neutral value decide the scale.
+
+    Returns
+    -------
+    low, high : float
+
+    Examples
+    --------
+    >>> p = Parameter("sigma", "um", 0.1, 10.0)
+    >>> linear_interval(2.0, 0.2, p)
+    (1.8, 2.2)
+    >>> [round(v, 3) for v in linear_interval(2.0, 2.0, p)]
+    [0.736, 5.437]
     """
     away = value - p.neutral if p.law == "log" else value
     if p.law == "log" and not p.signed and away > 0 and width > 0.15 * away:

@@ -1,4 +1,10 @@
-"""Effects that are told by how far values scatter: their score in a fit, their gain before one."""
+r"""Amplitudes constrained by the scatter of values: REML scoring in a fit, likelihood gain before.
+
+An effect such as turbulence adds :math:`M u` to the whitened values, with unknown
+:math:`u \sim N(0, 1)` and modes :math:`M` in proportion to its amplitude, a variance parameter.
+Their covariance is :math:`C = 1 + M M^T`, whose inverse and determinant are worked out in the
+space of the modes (Woodbury's identity).
+"""
 
 from __future__ import annotations
 
@@ -14,23 +20,33 @@ from bfsensor.effects.effect import Effect
 from bfsensor.typing import FloatArray
 
 FACTORS = np.geomspace(0.05, 20.0, 61)
-"""On an amplitude, of which the likeliest is taken where a fit begins."""
+"""Factors on a starting amplitude among which the one of greatest likelihood is taken.  Chosen: 61
+of them from 1/20 to 20 are 10 % apart; a range twice as wide would begin fits of amplitudes that
+are more than twenty times off their starting values, too, and the steps be 13 %."""
 
 SURE = 1e-8
-"""Of the largest information: directions that hold less hold none."""
+"""Eigenvalue of the information matrix, relative to the largest, below which a combination of
+variance parameters counts as unconstrained.  Chosen, to be derived for parameters in units of their
+errors: eigenvalues are those in the parameters' own units, so that an error of 1e4 times another's
+number (pixels beside a relative rms) counts as unconstrained, and of 7e3 times with 2e-8.  Measured
+in the case ``diagnosis/turbulence`` of tests.golden: eigenvalues of 4e8 and 9e-5, so that scatter
+constrains one combination of rms and correlation length."""
 
 
 class Score(NamedTuple):
-    """Rows of a least-squares problem that stand for what the scatter of values tells.
+    r"""Fisher scoring of variance parameters, as rows of a least-squares problem.
+
+    Minimising :math:`|t - R (\theta - \theta_0)|^2` gives the scoring step
+    :math:`\theta - \theta_0 = I^{-1} S`, as :math:`R^T R = I` and :math:`R^T t = S`.
 
     Attributes
     ----------
     origin : ndarray, shape (p,)
-        Parameters at which it was found.
+        Parameters :math:`\theta_0` at which score and information were found.
     rows : ndarray, shape (k, p)
-        Whose squares are Fisher's information.
+        Root :math:`R` of Fisher's information; columns of other parameters are 0.
     target : ndarray, shape (k,)
-        What steps of the parameters from the origin should make of the rows.
+        :math:`t`, the score in units of that root.
     """
 
     origin: FloatArray
@@ -38,17 +54,17 @@ class Score(NamedTuple):
     target: FloatArray
 
     def left(self, point: FloatArray) -> FloatArray:
-        """What a point leaves of the target."""
+        """Residuals of the score's rows at a point, shape (k,)."""
         return np.asarray(self.target - self.rows @ (point - self.origin))
 
 
 def no_score(point: FloatArray) -> Score:
-    """Of a fit without such effects."""
+    """Empty score, for a fit without variance parameters."""
     return Score(point, np.zeros((0, len(point))), np.zeros(0))
 
 
 def scored(predictor: Predictor) -> dict[int, tuple[str, ...]]:
-    """Parameters that the scatter of some channels tells, by place, and those channels."""
+    """Variance parameters by their index in ``predictor.names``, with the channels they enter."""
     out = {}
     for n, name in enumerate(predictor.names):
         if name.startswith("effect "):
@@ -68,19 +84,21 @@ def score_of(
     span: FloatArray,
     residuals: FloatArray,
 ) -> Score:
-    r"""Score and information that a scatter holds, linear parameters being unknown.
+    r"""Score and Fisher information of the restricted likelihood (REML) by variance parameters.
 
-    Of values :math:`r` whose covariance is :math:`1 + M M^T`, what linear parameters span
-    projected out by :math:`P`, the restricted likelihood has by a parameter :math:`a`
+    Residuals :math:`r` have the covariance :math:`C = 1 + M M^T`; linear parameters with columns
+    :math:`L` are unknown.  With the subscript for a derivative by a parameter :math:`a`,
 
     .. math::
-        S_a = (P r)^T M_a M^T (P r) - \mathrm{tr}\,P M_a M^T, \quad
-        I_{ab} = \tfrac12 \mathrm{tr}\,P C_a P C_b, \quad C_a = M_a M^T + M M_a^T
+        S_a &= (P r)^T M_a M^T (P r) - \mathrm{tr}\,P M_a M^T, \qquad
+        I_{ab} = \tfrac12 \mathrm{tr}\,P C_a P C_b, \\
+        C_a &= M_a M^T + M M_a^T, \qquad
+        P = C^{-1} - C^{-1} L (L^T C^{-1} L)^{-1} L^T C^{-1}.
 
     Parameters
     ----------
     predictor : Predictor
-        Of the values.
+        Gives the modes at a point.
     channels : sequence of Channel
         All of them, in the order of the rows of ``modes``.
     point : ndarray, shape (p,)
@@ -90,7 +108,12 @@ def score_of(
     span : ndarray, shape (n, q)
         With which :math:`P = 1 - {}` ``span @ span.T``.
     residuals : ndarray, shape (n,)
-        Whitened.
+        Whitened residuals :math:`r`.
+
+    Returns
+    -------
+    score : Score
+        Empty where no variance parameter changes any mode.
 
     References
     ----------
@@ -160,22 +183,28 @@ def _slope(
 def likeliest(
     modes: FloatArray, left: FloatArray, one: FloatArray, two: FloatArray
 ) -> tuple[float, float]:
-    """Gain of the likelihood by an effect that changes values and their scatter, and its factor.
+    r"""Likelihood gain of an effect that changes means and scatter, maximised over its amplitude.
+
+    With a factor :math:`f` on the amplitude the residuals :math:`r` have the mean
+    :math:`f t_1 + f^2 t_2` and the covariance :math:`C = 1 + f^2 M M^T`, and
+
+    .. math::
+        2 \ln \frac{p(r \mid f)}{p(r \mid 0)}
+        = r^T r - (r - f t_1 - f^2 t_2)^T C^{-1} (r - f t_1 - f^2 t_2) - \ln |C|.
 
     Parameters
     ----------
     modes : ndarray, shape (n, m)
-        What it leaves to chance, whitened, a fit's parameters projected out.
+        :math:`M`, whitened, a fit's parameters projected out.
     left : ndarray, shape (n,)
-        What the fit leaves.
+        Residuals :math:`r` of the fit.
     one, two : ndarray, shape (n,)
-        A factor f on its amplitude changes the values by ``f one + f^2 two``, and makes f times
-        the modes.
+        :math:`t_1` and :math:`t_2`, whitened and projected likewise.
 
     Returns
     -------
     gain, factor : float
-        Twice the logarithm of the likelihood over that without the effect, at the best of
+        Twice the logarithm of the likelihood ratio, and :math:`f`, at the best of
         :data:`FACTORS`.
 
     Examples
@@ -207,18 +236,25 @@ def scatter_of(
     effect: Effect,
     values: FloatArray,
 ) -> FloatArray:
-    """What an effect leaves to chance in the channels that tell it, whitened, of all values.
+    """Whitened modes of one effect in the channels whose scatter constrains it.
 
     Parameters
     ----------
     predictor : Predictor
-        With the effect as its last one.
-    channels, starts
-        All channels and where their values begin.
+        Predicts the channels; its effects are replaced by ``effect`` alone.
+    channels : sequence of Channel
+        All channels.
+    starts : ndarray of int, shape (channels + 1,)
+        Index at which the values of each channel begin, and the number of all.
     effect : Effect
-        Told by scatter.
-    values : ndarray
-        Of all non-linear parameters.
+        With a variance parameter (``told_by_scatter`` not empty).
+    values : ndarray, shape (p,)
+        Non-linear parameters of ``predictor``.
+
+    Returns
+    -------
+    modes : ndarray, shape (n, m)
+        Rows of all values; zero in channels whose scatter does not constrain the effect.
     """
     total = int(starts[-1])
     parts = [np.zeros((total, 0))]

@@ -1,4 +1,4 @@
-"""Rows of biases: what their means tell beyond the covariances of near pixels."""
+"""Rows of biases: the variance of their means beyond the covariances of near pixels."""
 
 import numpy as np
 import pytest
@@ -23,14 +23,14 @@ def test_excess_of_white_noise_is_none_and_scatters_as_said(white):
     assert found[:, 2].mean() == pytest.approx(16.0 / COLUMNS, rel=0.01)
 
 
-def test_excess_tells_nothing_that_near_pixels_tell(white):
+def test_excess_is_independent_of_covariances_of_near_pixels(white):
     near = np.array([
         sum((f[:, k:] * f[:, :-k]).mean() for k in range(1, READOUT_LAGS + 1)) for f in white
     ])  # fmt: skip
     excess = np.array([_row_excess(f)[0] for f in white])
     whole = np.array([f.mean(1).var(ddof=1) for f in white])
     assert abs(np.corrcoef(near, excess)[0, 1]) < 4 / FRAMES**0.5
-    # The variance of the means alone would tell it twice.
+    # The variance of the means itself is correlated with them, and would count them twice.
     assert np.corrcoef(near, whole)[0, 1] > 0.4
 
 

@@ -49,10 +49,10 @@ def test_channels_pickle_and_join():
     [
         ({"word": "flats"}, "'flats' is not one of"),
         ({"fold": "train"}, "'train' is not one of fit, select, held-out"),
-        ({"values": np.zeros(3)}, "do not match"),
+        ({"values": np.zeros(3)}, r"flat_cov: \(3,\) .* blocks of 4"),
         ({"values": np.array([0, 1, np.nan, 2.0])}, "1 values are not finite"),
         ({"blocks": (np.zeros((3, 3)), np.eye(1))}, "not positive definite"),
-        ({"axes": {"i": np.arange(3)}}, "axis i has the shape"),
+        ({"axes": {"i": np.arange(3)}}, r"axis i .*\(3,\).*\(4,\)"),
     ],
 )
 def test_refuses_what_does_not_fit(change, message):
@@ -110,7 +110,7 @@ def test_unequal_levels_make_no_pair():
     shots = [Shot(n, 30, level=v) for n, v in enumerate((5843.0, 6624.0, 6349.0))]
     found, single, (note,) = pairs_of(shots)
     assert found == [(1, 2)] and single == [0]
-    assert "flats 0, 1: levels of 5843 and 6624 ADU make no pair" in note
+    assert all(f" {word} " in note for word in ("0, 1: levels of", "5843", "6624"))
 
 
 def test_numbers_of_pairs_count_where_there_are_any():

@@ -13,7 +13,7 @@ ROWS, COLUMNS, NOISE, BIASES, DARKS = 64, 128, 3.0, 10, 4
 
 
 HOT = 17
-"""Which column is."""
+"""Column that is made hot."""
 
 
 def columns(
@@ -63,7 +63,7 @@ def test_uneven_columns_are_held_against_their_own_scatter() -> None:
 
 
 def test_a_hot_column_has_the_noise_of_its_own_charge() -> None:
-    """Of 400 e- in each of its pixels; errors of all others stay as they are."""
+    """Each of its pixels holds 400 e- of dark current; errors of all others stay as they are."""
     rng = np.random.default_rng(2720)
     values, whitened = np.array([columns(rng, hot=400.0) for _ in range(60)]).swapaxes(0, 1)
     assert np.square(np.delete(whitened, HOT, axis=1)).mean() == pytest.approx(1.0, abs=0.1)

@@ -1,4 +1,4 @@
-"""Rims and combs: what no single column or row tells is seen as a whole."""
+"""Rims and combs: patterns that are significant as a whole but in no single column or row."""
 
 import pytest
 

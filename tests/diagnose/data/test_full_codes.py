@@ -31,7 +31,7 @@ def test_a_flat_whose_bright_pixels_are_full_is_left_out(away):
 
 def test_flats_below_the_full_well_are_counted():
     assert counted(flat())
-    # Of 3.5 widths eight pixels are full: they tell nothing.
+    # Beyond 3.5 widths eight pixels are full, too few to matter.
     assert counted(np.minimum(flat(), 43_000 + np.rint(3.5 * WIDTH)))
 
 

@@ -62,8 +62,7 @@ def test_maps_leave_it_out_and_say_so():
     usual, plain = maps_of(0.0)
     cut, channel = maps_of(0.05)
     assert usual.notes == []
-    assert len(cut.notes) == 1
-    assert cut.notes[0].startswith("row 0, at the rim, scatters")
+    assert len(cut.notes) == 1 and "row 0," in cut.notes[0]
     row = (channel.axes["what"] == "row") & (channel.axes["y"] == 0)
     block = (channel.axes["what"] == "block") & (channel.axes["y"] < 4)
     assert channel.values[row] == 0.0

@@ -34,7 +34,7 @@ def test_rings_are_followed_and_a_fit_may_begin_there(effect):
     assert ((true - said) ** 2).sum() < 0.05 * (true**2).sum()
 
 
-def test_even_rings_are_not_told_as_uneven_ones():
+def test_even_rings_are_not_taken_for_uneven_ones():
     assert all("chirp" in s for s in sightings(EVEN))
 
 
@@ -44,7 +44,7 @@ def test_noise_has_no_rings():
 
 @pytest.mark.parametrize("seed", [1, 3])
 def test_rings_are_followed_from_whichever_wave_leads_to_them(seed):
-    """Of rings whose spacing sways, the clearest wave may lie where they are straight."""
+    """The clearest wave may lie in a part of uneven rings where they are evenly spaced."""
     rng = np.random.default_rng(seed)
     effect = UnevenTreeRings(
         PLACE | {"sway": 0.15, "length": 467.5, "sway_phase": 0.0, "phase": 0.25}

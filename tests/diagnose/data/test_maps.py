@@ -17,7 +17,7 @@ HERE, THERE = (
     Condition(wavelength=w, back_bias=-60.0, temperature=173.0) for w in (620.0, 870.0)
 )
 ROWS, COLUMNS = 120, 128
-"""Of four amplifiers, whose border in y cuts blocks of 8 pixels."""
+"""Size of a sensor of four amplifiers, whose border in y cuts blocks of 8 pixels."""
 
 SEGMENTS = tuple(
     Segment(x, y, COLUMNS // 2, ROWS // 2, x > 0, y > 0, 8, 16, 8)
@@ -64,7 +64,7 @@ def measure(
 
 
 def test_sums_are_the_weighted_means() -> None:
-    """Of maps that are all held at once, in double precision."""
+    """They equal weighted means of maps that are all held at once, in double precision."""
     flats = make_flats(8821)
     maps, channel = measure(flats)
     means, weights = {}, {}

@@ -16,7 +16,7 @@ from tests.virtual import Size, measure_virtual, virtual_baseline
 
 PIXELS, PITCH, SHARE = 256, 40, 0.01
 SIGMAS = (1.05, 1.12), (1.1, 1.15)
-"""Of later and of earlier spots along x and y [pixel]."""
+"""Widths of later and of earlier spots along x and y [pixel]."""
 
 
 def draw(places, flux, sigma):
@@ -46,7 +46,7 @@ def measure(images, ghost=0.0):
 
 @pytest.fixture(scope="module")
 def places():
-    """Of two exposures: pinholes of the second moved by up to half a pixel, and all by .3."""
+    """Places of spots in two exposures: in the second each moved by up to .5, and all by .3."""
     grid = np.arange(30.0, PIXELS - 29, PITCH)
     first = np.array([(x, y) for y in grid for x in grid])
     moved = np.random.default_rng(3).uniform(-0.5, 0.5, first.shape)

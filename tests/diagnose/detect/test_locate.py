@@ -1,4 +1,4 @@
-"""What is left of a fit: families of statistics, parts, and false alarms."""
+"""Scans of a fit's residuals: families of statistics, decomposition into parts, false alarms."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def columns() -> Channel:
 
 
 def crosstalk() -> Channel:
-    """One number."""
+    """Crosstalk of one pair of amplifiers: a channel of one value."""
     axes = Axes()
     axes.add(1, HERE, amp=0, other=1, what="crosstalk")
     return Channel("amp_cross", np.zeros(1), (np.array([[1e-10]]),), axes.columns(), "")
@@ -121,7 +121,7 @@ def test_a_deviate_at_a_familys_alarm_is_one(judge: Locator) -> None:
         assert (judge.locate(part * alarms["amp_cross"] * unit).p_value < 0.01) == alarmed
 
 
-def test_parts_are_what_was_put_in_and_no_shadow(judge: Locator) -> None:
+def test_parts_are_what_was_put_in_and_no_correlated_template(judge: Locator) -> None:
     fit = judge.scanner.fit
     x = fit.channels[0].axes
     lag = np.where((x["i"] == 2) & (x["j"] == 1), x["level"].astype(float) ** 2, 0.0)
@@ -135,7 +135,7 @@ def test_parts_are_what_was_put_in_and_no_shadow(judge: Locator) -> None:
     assert "amp" not in parts["flat_cov"].where
     low, high = parts["flat_map"].where["x"]
     assert low < 20 < high and high - low <= 14
-    # The findings hold shadows: single columns, other powers, each amplifier.
+    # The findings hold correlated templates: single columns, other powers, each amplifier.
     assert len(found.findings) > 10
 
 

@@ -1,4 +1,4 @@
-"""The library's own shapes beside the scans: faint effects that show in many places, and nothing."""
+"""Matched filters beside the scans: faint effects that change many values, and campaigns of none."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ def null():
 
 
 def with_change(null, effect, length):
-    """The null's channels with what an effect changes, of a length in standard deviations."""
+    """Fit of the null's channels with an effect added, at a projected SNR of ``length``."""
     measured, predictor, fit = null
     screen = Screen(predictor, fit)
     bare = screen._change(effect)

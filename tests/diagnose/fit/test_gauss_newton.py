@@ -1,4 +1,4 @@
-"""Steps of a fit where amplitudes follow shapes along a curved valley."""
+"""Gauss-Newton steps along a curved minimum, where amplitudes follow shapes; random effects."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PLACES = np.linspace(0.0, 6.0, 40)
 
 
 def light(frac, sigma):
-    """Of a halo, seen over a window that it outgrows, and what that adds to a width."""
+    """Profile of a halo of Gaussian width ``sigma`` over a window of 6."""
     return frac * np.exp(-0.5 * (PLACES / sigma) ** 2) / sigma
 
 
@@ -65,7 +65,7 @@ def channel(truth, seed=3):
 
 
 @pytest.mark.parametrize("start", [(0.05, 0.5), (0.002, 1.0), (0.3, 20.0), (0.0, 2.0)])
-def test_the_valley_is_followed_to_its_end(start):
+def test_a_curved_minimum_is_followed_to_its_end(start):
     one = channel((0.02, 3.0))
     steps = Steps(Halo(start), [one])
     steps.go_carefully()
@@ -75,7 +75,7 @@ def test_the_valley_is_followed_to_its_end(start):
         design = np.array([1e4 * light(1.0, sigma), np.ones(len(PLACES))]).T
         best = min(best, float(np.linalg.lstsq(design, one.values, rcond=None)[1][0]))
     assert steps.solved.left @ steps.solved.left == pytest.approx(best, abs=0.05)
-    # What is told is what the point gives.
+    # The chi-square returned is that of the point, not one that a linear model promises.
     left = one.values - 1e4 * light(*steps.point)
     left = left - left.mean()
     assert left @ left == pytest.approx(
@@ -83,7 +83,7 @@ def test_the_valley_is_followed_to_its_end(start):
     )
 
 
-def test_harm_is_not_told_as_gain():
+def test_a_step_that_does_harm_is_not_reported_as_gain():
     """Derivatives of the wrong sign: nothing gains, and the fit stays where it was."""
     halo = Halo((0.01, 3.0))
     forward = halo.slope
@@ -100,7 +100,7 @@ def test_harm_is_not_told_as_gain():
 
 
 class Chance(Halo):
-    """Of an effect that leaves much to chance, and a width that is held by a prior."""
+    """An effect with more random effects than values, and a width with a prior."""
 
     prior_rows = np.array([1])
     steps = np.array([1e-3, 1e-3])
@@ -117,7 +117,7 @@ class Chance(Halo):
 
 @pytest.mark.parametrize("held", [None, np.array([False, True]), np.array([True, True])])
 @pytest.mark.parametrize("start", [(0.02, 3.0), (0.0, 2.0), (0.4, 3.0)])
-def test_what_is_left_to_chance_is_projected_out(start, held):
+def test_random_effects_are_projected_out(start, held):
     """Steps, errors and chi-squares of the small problem are those of the whole one."""
     steps = Steps(Chance(start), [channel((0.02, 3.0))])
     predicted, residuals = steps.residuals(steps.point)
@@ -129,7 +129,7 @@ def test_what_is_left_to_chance_is_projected_out(start, held):
     assert small.left @ small.left == pytest.approx(whole.left @ whole.left, rel=1e-10)
 
 
-def test_it_is_told_whole_at_the_end():
+def test_the_last_solution_holds_all_parameters():
     steps = Steps(Chance((0.02, 3.0)), [channel((0.02, 3.0))])
     steps.go_carefully()
     assert len(steps.solved.solution) == 2 + 1 + 3 * len(PLACES)

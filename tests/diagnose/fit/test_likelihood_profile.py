@@ -1,4 +1,4 @@
-"""Intervals by the chi-square itself: exact where it is a parabola, told where it is none."""
+"""Intervals by likelihood profiles: none where the chi-square is a parabola, else exact ends."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WIDTHS = 1.0, 1.96
 
 
 def valley(left, best, parameters=(AMP, SHAPE)):
-    """Of residuals in closed form, derivatives from both sides."""
+    """Chi-square near a point of residuals in closed form, with central derivatives."""
     best, h = np.array(best, float), 1e-6
     slopes = np.stack(
         [(left(best - h * d) - left(best + h * d)) / (2 * h) for d in np.eye(len(best))], 1
@@ -64,10 +64,10 @@ def test_a_bent_case_has_its_exact_profile(width):
     # A twentieth of the interval: 1 % of the rise is given away, the rest is interpolation.
     for end in (low, high):
         assert np.sqrt(exact_rise(end)) == pytest.approx(width, rel=0.05), end
-    # The parabola's ends would be far off: it is no case without a bend.
+    # The parabola's ends would be far off: the profile is needed here.
     error = valley(bent, [2.0, 2.0]).errors[1]
     assert abs(exact_rise(2.0 + 1.96 * error) / 1.96**2 - 1) > 0.3
-    # The amplitude follows the same valley: its ends are those of the best shape there.
+    # The amplitude follows the same curve: its ends are those of the best shape there.
     k = np.arange(1.0, 7.0)
     shapes = np.linspace(0.3, 12.0, 20_001)[:, None]
     amp = found["amp"].interval(width)[1]
@@ -83,8 +83,8 @@ def test_a_parameter_that_does_not_matter_has_the_whole_range():
     assert "amp" not in told
 
 
-def test_what_flattens_on_one_side_is_told_as_one_sided():
-    """A wide halo is as well a wider one: nothing tells how wide."""
+def test_a_chi_square_that_flattens_on_one_side_has_one_open_end():
+    """A wide halo fits as well as a wider one: the width has no upper end."""
 
     def left(p):
         return np.array([5.0 * (np.tanh(p[0]) - np.tanh(1.5)), 0.1])
@@ -121,7 +121,7 @@ def test_a_place_that_the_fit_missed_is_in_the_interval_with_its_value():
     )
 
 
-def test_found_tells_profiles_and_open_ends():
+def test_intervals_of_a_found_effect_use_profiles_and_state_open_ends():
     effect = PsfWings({"frac": 0.01, "sigma": 5.0})
     errors = {"frac": 0.001, "sigma": 1.0}
     x = np.linspace(3.0, 24.0, 43)
@@ -141,7 +141,7 @@ def test_found_tells_profiles_and_open_ends():
 
 
 class Fitted:
-    """A fit of :func:`bent` in closed form, that steps do not move: it stays where it is put."""
+    """A fit in closed form that steps do not move: it stays where it is put."""
 
     def __init__(self, values, refused=()):
         self.values, self.refused = np.array(values, float), refused

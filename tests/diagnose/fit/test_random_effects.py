@@ -1,4 +1,4 @@
-"""Amplitudes that the scatter of values tells, fitted by scores."""
+"""Variance parameters: amplitudes constrained by the scatter of values, fitted by REML scoring."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_errors_are_those_of_the_scatter():
     assert np.std(pulls) == pytest.approx(1.0, abs=0.25)
 
 
-def test_what_no_channel_tells_stays(monkeypatch):
+def test_an_amplitude_that_no_channel_constrains_stays(monkeypatch):
     monkeypatch.setattr(IlluminationTurbulence, "told_by_scatter", ())
     steps = Steps(Shaken(3e-4), [channel(1e-3, 0)])
     steps.go_carefully()
