@@ -201,7 +201,7 @@ def find_origin(pattern, x, y, part):
 
 
 @numba.njit(cache=True, inline="always")
-def _ring_shift(rings, last, at):
+def ring_shift(rings, last, at):
     """Shift at a radius in steps of the rings, and its change over the step there.
 
     Rings are lines between their radii, and end with 0 and 0: beyond nothing moves.
@@ -240,11 +240,11 @@ def _ring_origins(pattern, thickness, z, alike, x, y, to, count, factor, radius,
     for m in range(np.uint64(count)):
         r = radius[m]
         size = factor[m]
-        shift, change = _ring_shift(rings, last, r * per_step)
+        shift, change = ring_shift(rings, last, r * per_step)
         s = abs(r - size * shift / (1.0 + size * change * per_step))
-        shift, change = _ring_shift(rings, last, s * per_step)
+        shift, change = ring_shift(rings, last, s * per_step)
         s = abs(s - (s + size * shift - r) / (1.0 + size * change * per_step))
-        shift, change = _ring_shift(rings, last, s * per_step)
+        shift, change = ring_shift(rings, last, s * per_step)
         off = abs(s + size * shift - r)
         origin[m] = s
         factor[m] = off

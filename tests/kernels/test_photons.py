@@ -376,7 +376,7 @@ def test_origins_under_small_shifts_take_four_steps():
 @pytest.mark.parametrize("coloured", [False, True])
 @pytest.mark.parametrize("amplitude", [0.3, 6.0])
 def test_origins_under_rings_are_found(amplitude, coloured):
-    """Solved along the radius, by secants where the rings are so steep that pixels nearly vanish.
+    """Solved along the radius, by secants where rings are so steep that pixels nearly vanish.
 
     Every place is that of its origin and the rings' shift there: below the gates none, at the
     rings' centre, next to it, and beyond the last ring too.
