@@ -8,7 +8,10 @@ inner loop runs along the row.
 import numba
 import numpy as np
 
-from bfsensor._kernels.photons import fixed_shift
+from bfsensor._kernels.photons import _at, fixed_shift, ring_shift
+
+GAUSS = 0.5 - 0.5 / np.sqrt(3.0)
+"""Place of the first of Gauss's two points of a unit interval; exact for cubic polynomials."""
 
 
 @numba.njit(cache=True, fastmath={"contract"}, _nrt=False)
@@ -245,3 +248,56 @@ def convolved_areas(
                 value = values[k - 1]
                 for i in range(nx):
                     out[j, left + i] += value * np.float64(row[i]) * np.float64(row[i])
+
+
+@numba.njit(cache=True, inline="always")
+def _mean_shift(pattern, factor, last, per_step, x, y, along_x, along_y):
+    """Mean shift (x, y) by rings of the side from (x, y) to (x + along_x, y + along_y)."""
+    dx = 0.0
+    dy = 0.0
+    for t in (GAUSS, 1.0 - GAUSS):
+        rx = x + t * along_x - pattern.ring_x
+        ry = y + t * along_y - pattern.ring_y
+        r = np.sqrt(rx * rx + ry * ry)
+        shift, _ = ring_shift(pattern.rings, last, r * per_step)
+        size = 0.5 * factor * shift / r
+        dx += size * rx
+        dy += size * ry
+    return dx, dy
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def times_ring_areas(pattern, out):
+    """Multiply areas by those that rings give the pixels, at full height.
+
+    The area of a pixel under shifts ``p`` that change little across it is ``(1 + dxx) (1 + dyy) -
+    dxy dyx`` with the differences of the mean shifts of opposite sides.  The rings' centre must
+    not be in the image: there the shift has no direction.
+    """
+    ny, nx = out.shape
+    last = np.float64(pattern.rings.size - 2)
+    per_step = 1.0 / pattern.ring_step
+    factor = _at(pattern.ring_factor, np.float64(pattern.ring_factor.size - 1))
+    bottom = np.empty((2, nx))
+    top = np.empty((2, nx))
+    sides = np.empty((2, nx + 1))
+    for i in range(nx):
+        top[0, i], top[1, i] = _mean_shift(
+            pattern, factor, last, per_step, float(i), 0.0, 1.0, 0.0
+        )
+    for j in range(ny):
+        bottom[:] = top
+        for i in range(nx):
+            top[0, i], top[1, i] = _mean_shift(
+                pattern, factor, last, per_step, float(i), j + 1.0, 1.0, 0.0
+            )
+        for i in range(nx + 1):
+            sides[0, i], sides[1, i] = _mean_shift(
+                pattern, factor, last, per_step, float(i), float(j), 0.0, 1.0
+            )
+        for i in range(nx):
+            dxx = sides[0, i + 1] - sides[0, i]
+            dyx = sides[1, i + 1] - sides[1, i]
+            dxy = top[0, i] - bottom[0, i]
+            dyy = top[1, i] - bottom[1, i]
+            out[j, i] *= (1.0 + dxx) * (1.0 + dyy) - dxy * dyx

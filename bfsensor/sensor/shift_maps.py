@@ -221,7 +221,8 @@ def sample_rings(function: Any) -> tuple[FloatArray, float]:
     Returns
     -------
     values : ndarray
-        Shift [pixel] at radii ``n step``; beyond the last nothing moves.
+        Shift [pixel] at radii ``n step``.  The last two are 0: beyond the function's end nothing
+        moves, and within a step of it shifts fall to that.
     step : float
         [pixel]
     """
@@ -230,8 +231,8 @@ def sample_rings(function: Any) -> tuple[FloatArray, float]:
     step = float(max(steps.min() / _FINER, x[-1] / 4e6))
     count = int(np.ceil(x[-1] / step))
     radius = np.linspace(0.0, x[-1], count + 1)
-    values = np.zeros(count + 1)
-    inside = radius >= x[0]
+    values = np.zeros(count + 3)
+    inside = np.flatnonzero(radius >= x[0])
     values[inside] = function(np.clip(radius[inside], x[0], x[-1]))
     return values, float(x[-1] / count)
 

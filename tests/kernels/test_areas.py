@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bfsensor._kernels.areas import pixel_areas
+from bfsensor._kernels.areas import pixel_areas, times_ring_areas
 from tests.kernels.plain_edges import (
     IMAGES,
     NO_PATTERN,
@@ -181,3 +181,58 @@ def test_without_flux_no_charge_is_looked_at():
     sensor = silicon_sensor()
     found, _ = find_areas(sensor, make_image("random"), flux=False)
     assert np.array_equal(found, np.ones((18, 20)))
+
+
+def make_far_rings():
+    """Half a pixel a period of 25, about a centre beside the image: areas change by an eighth."""
+    radius = np.arange(1500) * 0.125
+    rings = np.append(0.5 * np.cos(2 * np.pi * radius / 25.0), [0.0, 0.0])
+    return NO_PATTERN._replace(
+        rings=rings,
+        ring_step=0.125,
+        ring_x=-60.3,
+        ring_y=-45.8,
+        ring_factor=np.array([0.0, 1.0]),
+    )
+
+
+@pytest.mark.parametrize("make", [silicon_sensor, table_sensor])
+def test_areas_under_rings_and_charge_are_those_that_light_meets(make):
+    """Light that lands within the charge's boundaries came from there, shifted by the rings."""
+    sensor, pattern = make(), make_far_rings()
+    image = make_image("random", (9, 10))
+    found, lows = find_areas(sensor, image)
+    without = found.copy()
+    times_ring_areas(pattern, found)
+    vertical, horizontal = sides_of(sensor, image, lows)
+    added = []
+    for sides, nominal in zip(
+        (vertical, horizontal),
+        draw_sides(sensor, (0 * vertical, 0 * horizontal)),
+        strict=True,
+    ):
+        added.append(sides.copy())
+        for index in np.ndindex(sides.shape[:3]):
+            added[-1][index] += plain_shift(pattern, *nominal[index], 1.0)
+            sides[index] += plain_shift(pattern, *sides[index], 1.0)
+    expected = plain_areas((vertical, horizontal), image.shape)
+    # The product takes the rings' mean stretch of a pixel for that at its sides, which differs by
+    # half its change across a pixel, 0.5 (2 pi / 25)^2 / 2 = 0.016; sides move by 0.02 (some by
+    # 0.1), those across from one another alike but for a part.
+    apart = np.abs(found - expected)
+    assert apart.max() < 2e-3 and np.sqrt(np.mean(apart**2)) < 6e-4
+    # Shifts that are added, both at the nominal place, are several times further off.
+    other = plain_areas(added, image.shape)
+    assert np.sqrt(np.mean((other - expected) ** 2)) > 5 * np.sqrt(np.mean(apart**2))
+    assert np.abs(found - without).max() > 0.1
+
+
+def test_areas_of_rings_alone_are_those_of_polygons():
+    sensor, pattern = silicon_sensor(), make_far_rings()
+    expected, _ = find_areas(sensor, np.zeros((11, 14)), pattern=pattern, flux=False)
+    found = np.ones((11, 14))
+    times_ring_areas(pattern, found)
+    # A polygon's sides of an eighth of a pixel are chords: each side is off by (1/8)^2 / 12 of the
+    # second derivative 0.5 (2 pi / 25)^2, which is 4e-5.
+    assert np.abs(found - expected).max() < 5e-5
+    assert np.abs(found - 1).max() > 0.1
