@@ -19,9 +19,24 @@ if TYPE_CHECKING:
     from bfsensor.measure.flat_pairs import FlatCovariances
     from bfsensor.recording.raw.images import AmplifierImage
 
+
+def _no_folders(
+    ctx: click.Context, param: click.Parameter, values: tuple[Path, ...]
+) -> tuple[Path, ...]:
+    """Refuse a folder, which has to be written as its files."""
+    for path in values:
+        if path.is_dir():
+            raise click.BadParameter(
+                f"{path} is a folder: give its files, such as {path}/flat_*.fits "
+                f"('bfsensor check {path}' lists what a folder holds)"
+            )
+    return values
+
+
 _FILES = click.argument(
-    "files", nargs=-1, required=True, type=click.Path(path_type=Path, exists=True)
-)
+    "files", nargs=-1, required=True, type=click.Path(path_type=Path, exists=True),
+    callback=_no_folders,
+)  # fmt: skip
 """Argument of one file or more; -1 is click's definition of any number."""
 
 _GAIN = click.option(

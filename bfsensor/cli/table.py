@@ -143,8 +143,7 @@ def table(
         --image-charge half_width_y=3.8um \\
         --image-charge drift_field=0um:0.736V/um,100um:0.364V/um
     """
-    from bfsensor.table.build import peak_memory
-    from bfsensor.table.table_plan import plan_table
+    from bfsensor.device.depletion import check_depleted
 
     began, cpu_began = time.perf_counter(), _cpu_seconds()
     _check_engine(context, engine, parameters)
@@ -158,6 +157,11 @@ def table(
         levels = levels if model is None else levels.for_image_charge(model)
         targets = [output or Path(f"{loaded.name}.fits")]
     check_targets(targets, overwrite, TableError)
+    check_depleted(loaded, levels.depths or ())
+    # Imported only now: compiled solvers take longer to load than it takes to refuse a device.
+    from bfsensor.table.build import peak_memory
+    from bfsensor.table.table_plan import plan_table
+
     plan = plan_table(
         loaded, charges=levels.charges, backgrounds=levels.backgrounds, depths=levels.depths,
         vertices=vertices, pixels=pixels, accuracy=accuracy,

@@ -127,3 +127,11 @@ def test_words_for_kinds_are_named_and_mapped(run, tmp_path):
         result = run("check", tmp_path)
         assert result.exit_code == 1
         assert message in result.stderr
+
+
+@pytest.mark.parametrize("words", [["flats"], ["spots", "--threshold", "500"]])
+def test_a_folder_is_to_be_given_as_its_files(run, tmp_path, words):
+    (tmp_path / "run_12").mkdir()
+    found = run("measure", *words, "run_12")
+    assert found.exit_code == 2
+    assert "run_12 is a folder" in found.output and "run_12/flat_*.fits" in found.output
