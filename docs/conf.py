@@ -6,6 +6,9 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import reference_pages
 
 from bfsensor import __version__
 
@@ -126,8 +129,16 @@ def link_pages(app: object, name: str, source: list[str]) -> None:
     source[0] = re.sub(r"(?<!!)\[([^]]+)\]\(\.\./\.\./[^)]+\)", r"`\1`", text)
 
 
+def write_reference() -> None:
+    """Write the pages of the files that the package reads and writes."""
+    folder = Path(__file__).with_name("reference")
+    for name, make in reference_pages.PAGES.items():
+        (folder / name).write_text(make() + "\n")
+
+
 # Written before Sphinx looks which pages there are.
 write_api()
+write_reference()
 write_effects()
 write_validation()
 

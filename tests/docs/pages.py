@@ -1,0 +1,29 @@
+"""What the tests of the documentation share: its folder, and its modules."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
+def load(name):
+    """Import a module of docs/, which is no package."""
+    spec = importlib.util.spec_from_file_location(f"docs_{name}", DOCS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def tables(page):
+    """Rows of a page's tables by heading, cells without their marks of code."""
+    out, heading = {}, ""
+    for line in page.splitlines():
+        if line.startswith("#"):
+            heading = line.strip("# ")
+        elif line.startswith("| "):
+            cells = [c.strip().strip("`") for c in re.split(r"(?<!\\)\|", line)[1:-1]]
+            out.setdefault(heading, []).append(cells)
+    return {name: rows[1:] for name, rows in out.items()}
