@@ -204,7 +204,7 @@ def _kind(one: dict[str, Any]) -> str:
     """Type of a field in words; parts that stand by themselves are links."""
     if "$ref" in one:
         name = one["$ref"].rpartition("/")[2]
-        return f"[{name}](#{name.replace('_', '-')})"
+        return f"[{name}](#{name})"
     if "anyOf" in one:
         return " or ".join(map(_kind, one["anyOf"]))
     if "const" in one:
