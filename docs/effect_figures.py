@@ -40,7 +40,7 @@ NOISE = 5.0  # e-, read noise of the images
 
 
 class Picture(NamedTuple):
-    """How to draw a class, and the sentence below the drawing."""
+    """A drawing of a class, and its caption."""
 
     draw: Callable[[], Figure]
     caption: str

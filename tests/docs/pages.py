@@ -1,4 +1,4 @@
-"""What the tests of the documentation share: its folder, and its modules."""
+"""The folder of the documentation, its modules and its tables, for the tests."""
 
 from __future__ import annotations
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from bfsensor.diagnose.report.class_words import CLASS_WORDS
+from tests.docs.examples import PAGES
 from tests.docs.pages import DOCS
-from tests.docs.test_examples import PAGES
 
 ROOT = DOCS.parent
 WRITTEN = {"reference/api.md", "concepts/effects.md", "gallery/index.md"}
