@@ -10,7 +10,7 @@ from bfsensor.effects.device_parameter import DeviceParameter
 from bfsensor.effects.library import LIBRARY
 from tests.docs.pages import load
 
-FIGURES = load("effect_figures")
+FIGURES, PARTS = load("effect_figures"), load("effect_figures.parts")
 LONG = ("device_parameter", "charge_loss", "saturation")
 """Pictures that solve a device or draw with the sensor: seconds each."""
 OTHERWISE = ("outside_library", "free_holes", "stop_diffusion")
@@ -42,8 +42,8 @@ def check(word, monkeypatch):
     shown = contents(figure)
     assert np.isfinite(shown).all()
     # The same with effects of no strength is another picture.
-    make = FIGURES.make_effect
-    monkeypatch.setattr(FIGURES, "make_effect", lambda *given: make(*given).scaled(0.0))
+    make = PARTS.make_effect
+    monkeypatch.setattr(PARTS, "make_effect", lambda *given: make(*given).scaled(0.0))
     assert not np.array_equal(contents(FIGURES.PICTURES[word].draw()), shown)
     return figure
 
