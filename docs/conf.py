@@ -6,6 +6,10 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import effect_figures
+import reference_pages
 
 from bfsensor import __version__
 
@@ -69,25 +73,52 @@ autosummary_context = {"own_methods": own_methods}
 suppress_warnings = ["config.cache"]  # of that function, which cannot be pickled
 
 
+def to_markdown(text: str) -> str:
+    """Turn a docstring's marks of code, formulae and headings into those of Markdown pages."""
+    text = re.sub(r"``([^`]+)``", r"`\1`", text)
+    text = re.sub(r":math:`([^`]+)`", r"{math}`\1`", text)
+    text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", text)
+    text = re.sub(r"^(\w+)\n-+$", r"**\1**\n", text, flags=re.MULTILINE)
+    return re.sub(
+        r"^\.\. math::((?:\n?[ \t]+.*|\n(?=\n[ \t]))+)",
+        lambda found: "```{math}\n" + inspect.cleandoc(found[1]) + "\n```",
+        text,
+        flags=re.MULTILINE,
+    )
+
+
 def write_effects() -> None:
-    """Write the page of effect classes from the library itself."""
+    """Write the page of effect classes from the library itself, and draw their pictures."""
     from bfsensor.diagnose.report.class_words import CLASS_WORDS
+    from bfsensor.effects.device_parameter import DeviceParameter
     from bfsensor.effects.library import LIBRARY
 
+    concepts = Path(__file__).with_name("concepts")
+    effect_figures.draw_once(concepts / "effects")
     lines = [
         "# Classes of effects",
         "",
-        "What a diagnosis looks for, and what `BrighterFatterSensor(effects=...)` draws. Ranges are",
-        "those in which a diagnosis seeks an effect.",
+        "A diagnosis looks for these effects, and `BrighterFatterSensor(effects=...)` draws them.",
+        "Ranges are those in which a diagnosis seeks an effect; pictures show stronger ones where",
+        "that makes them clearer.",
         "",
     ]
-    words = dict.fromkeys(kind.word for kind in LIBRARY)
-    for word in words:
+    kinds = (*LIBRARY, DeviceParameter)
+    for word in sorted({kind.word for kind in kinds}):
+        shown = effect_figures.PICTURES[word]
         lines += [f"## {word}", "", CLASS_WORDS[word].capitalize() + ".", ""]
-        for kind in (k for k in LIBRARY if k.word == word):
+        lines += [
+            f"```{{figure}} effects/{word}.png",
+            f":alt: {word}",
+            "",
+            shown.caption,
+            "```",
+        ]
+        lines += [""]
+        for kind in (k for k in kinds if k.word == word):
             if kind.variant:
                 lines += [f"**{kind.variant}**", ""]
-            lines += [inspect.getdoc(kind) or "", ""]
+            lines += [to_markdown(inspect.getdoc(kind) or ""), ""]
             if kind.parameters:
                 lines += ["| parameter | unit | from | to |", "|---|---|---|---|"]
                 lines += [
@@ -95,8 +126,8 @@ def write_effects() -> None:
                     for p in kind.parameters
                 ]
                 lines += [""]
-    text = "\n".join(lines).replace("``", "`")
-    Path(__file__).with_name("concepts").joinpath("effects.md").write_text(text)
+            lines += [f"Source: {kind.source}.", ""]
+    concepts.joinpath("effects.md").write_text("\n".join(lines))
 
 
 ROOMS = {
@@ -154,8 +185,16 @@ def link_pages(app: object, name: str, source: list[str]) -> None:
     source[0] = re.sub(r"(?<!!)\[([^]]+)\]\(\.\./\.\./[^)]+\)", r"`\1`", text)
 
 
+def write_reference() -> None:
+    """Write the pages of the files that the package reads and writes."""
+    folder = Path(__file__).with_name("reference")
+    for name, make in reference_pages.PAGES.items():
+        (folder / name).write_text(make() + "\n")
+
+
 # Written before Sphinx looks which pages there are.
 write_api()
+write_reference()
 write_effects()
 write_validation()
 
