@@ -117,7 +117,7 @@ def test_spots_ask_for_the_gain(tmp_path):
         hdus[1].header["GAIN"] = 0
     result = invoke("spots", path, "--threshold", 10)
     assert result.exit_code == 1
-    assert "GAIN = 0 cannot be meant (gain: 0.0001 to 10000 e-/ADU)" in result.output
+    assert "GAIN = 0 is out of range (gain: 0.0001 to 10000 e-/ADU)" in result.output
 
 
 def test_a_campaign_yaml_beside_the_files_is_followed(tmp_path):

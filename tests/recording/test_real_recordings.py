@@ -41,8 +41,8 @@ def test_sbig_headers():
     scan = scan_file(LANGFORD / "slitview.00000357.FLAT.FIT")
     (frame,) = read_images(scan, overscan=None)
     assert frame.image.shape == (495, 657)
-    assert (frame.gain, translate(scan.cards)[0]["exposure_time"]) == (0.46, 6.0)
-    assert scan.cards["TEMPERAT"] == pytest.approx(-5.232156846)
+    assert (frame.gain, translate(scan.header)[0]["exposure_time"]) == (0.46, 6.0)
+    assert scan.header["TEMPERAT"] == pytest.approx(-5.232156846)
     assert not frame.mask.any()
 
 
