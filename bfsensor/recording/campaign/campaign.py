@@ -123,11 +123,28 @@ class Campaign:
         return read_masks(self.folder, self.settings.masks, self.amplifiers)
 
     def of(self, kind: str) -> tuple[Exposure, ...]:
-        """Give the exposures of a kind, such as 'flat', in the order of time."""
+        """Give the exposures of a kind.
+
+        Parameters
+        ----------
+        kind : str
+            Kind such as 'flat'; see :class:`Exposure`.
+
+        Returns
+        -------
+        exposures : tuple of Exposure
+            Exposures in the order of time; empty where there are none.
+        """
         return tuple(one for one in self.exposures if one.kind == kind)
 
     def kinds(self) -> dict[str, int]:
-        """Count the exposures of each kind."""
+        """Count the exposures of each kind.
+
+        Returns
+        -------
+        kinds : dict of str to int
+            Numbers of exposures, in the order in which kinds first occur.
+        """
         out: dict[str, int] = {}
         for one in self.exposures:
             out[one.kind] = out.get(one.kind, 0) + 1
@@ -138,6 +155,16 @@ class Campaign:
 
         Readings that differ by no more than
         :data:`bfsensor.recording.campaign.exposures.TOLERANCES` count as one setting.
+
+        Parameters
+        ----------
+        kind : str
+            Kind of the exposures.
+
+        Returns
+        -------
+        conditions : dict of Condition to tuple of Exposure
+            Exposures by condition; empty where there are none.
         """
         return dict(self._conditions.get(kind, {}))
 
@@ -186,7 +213,18 @@ class Campaign:
         return tuple((a[0], a[1]) for a in groups.values() if len(a) == 2)
 
     def exposure_times(self, condition: Condition) -> tuple[float, ...]:
-        """Give the different exposure times of the pairs at a condition, ascending [s]."""
+        """Give the different exposure times of the pairs at a condition.
+
+        Parameters
+        ----------
+        condition : Condition
+            One of :meth:`conditions`.
+
+        Returns
+        -------
+        times : tuple of float
+            Exposure times that differ by more than the tolerance of pairs, ascending [s].
+        """
         times: list[float] = []
         for first, _ in self.pairs(condition):
             seconds = first.exposure_time or 0.0
@@ -196,7 +234,20 @@ class Campaign:
         return tuple(sorted(times))
 
     def without(self, exposure: Exposure, reason: str) -> Campaign:
-        """Return a copy with one more exposure set aside; its partner is no longer in a pair."""
+        """Return a copy with one more exposure set aside; its partner is no longer in a pair.
+
+        Parameters
+        ----------
+        exposure : Exposure
+            One of its exposures.
+        reason : str
+            Reason for setting it aside.
+
+        Returns
+        -------
+        campaign : Campaign
+            The copy.
+        """
         left = tuple(
             replace(one, pair=None)
             if one.pair is not None and one.pair == exposure.pair
@@ -208,7 +259,18 @@ class Campaign:
         return replace(self, exposures=left, set_aside=aside)
 
     def with_warnings(self, *more: Caution) -> Campaign:
-        """Return a copy with further warnings; those that it already has are not repeated."""
+        """Return a copy with further warnings; those that it already has are not repeated.
+
+        Parameters
+        ----------
+        *more : Caution
+            Warnings to add.
+
+        Returns
+        -------
+        campaign : Campaign
+            The copy.
+        """
         new = tuple(one for one in dict.fromkeys(more) if one not in self.warnings)
         return replace(self, warnings=(*self.warnings, *new))
 
@@ -272,7 +334,7 @@ def read_campaign(
     if not entries:
         inner = sorted(one.name for one in folder.iterdir() if one.is_dir())
         names = ", ".join(inner[:3]) + (" ..." if len(inner) > 3 else "")
-        more = f"; its {count_of(len(inner), 'folder')} ({names}) are not searched: give one of them"
+        more = f"; folders in it are not searched, give one of them: {names}"
         raise RecordingError(
             f"{folder}: no FITS files (names that end in {', '.join(SUFFIXES)})"
             + (more if inner else "")

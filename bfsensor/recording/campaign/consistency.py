@@ -245,8 +245,12 @@ def check_keywords(
             Caution(
                 "units",
                 f"{text} ({count_of(count, 'exposure')})",
-                "the value is taken as not known; campaign.yaml's keywords may state another "
-                "keyword, a unit, or the value",
+                "it is taken as not known"
+                + (
+                    ""
+                    if "campaign.yaml" in text
+                    else "; campaign.yaml's keywords may state another keyword, a unit, or the value"
+                ),
             )
         )
     return found
@@ -255,11 +259,15 @@ def check_keywords(
 def _consequence(name: str) -> str:
     """Say what needs a quantity, where it was looked for, and how to state it."""
     meaning = MEANINGS[name]
-    unit = f" [{meaning.unit}]" if meaning.unit else ""
+    # One lamp reading or exposure time for all exposures would be a false statement.
+    for_all = (
+        ""
+        if name in ("lamp", "exposure_time")
+        else f", or one value for all [{meaning.unit}], {{{name}: {{value: NUMBER}}}}"
+    )
     return (
-        f"{meaning.closes}; it is read from {', '.join(meaning.keywords)}: state another keyword in "
-        f"campaign.yaml, keywords: {{{name}: KEYWORD}}, or one value for all{unit}, "
-        f"keywords: {{{name}: {{value: NUMBER}}}}"
+        f"{meaning.closes}; headers were searched for {', '.join(meaning.keywords)}; campaign.yaml "
+        f"may name another keyword, keywords: {{{name}: KEYWORD}}{for_all}"
     )
 
 

@@ -222,7 +222,7 @@ def _read_entry(one: Entry, settings: CampaignSettings) -> None:
             "or correct the manifest"
         )
         return
-    cards = dict(scan.header)
+    cards = dict(scan.cards)
     for own in scan.own:
         cards = {**own, **cards}
     header, problems = translate(cards, card_units=scan.units, overrides=settings.overrides)

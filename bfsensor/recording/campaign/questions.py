@@ -36,6 +36,11 @@ class OpenQuestion:
         Number of such recordings that the campaign has, or what is missing.
     take : str
         Recording that would answer the question.
+
+    Examples
+    --------
+    >>> print(OpenQuestion("crosstalk: untested", "one amplifier", "read two amplifiers"))
+    crosstalk: untested (one amplifier); read two amplifiers
     """
 
     question: str

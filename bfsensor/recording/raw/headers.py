@@ -56,8 +56,6 @@ class FileScan:
     ----------
     path : Path
         The file.
-    header : dict of str to value
-        Values by keyword of the primary header, and of the extensions that hold only conditions.
     units : dict of str to str
         Units by keyword, from the comments of the primary header.
     amplifiers : tuple of AmplifierLayout
@@ -76,7 +74,8 @@ class FileScan:
     """
 
     path: Path
-    header: Mapping[str, Any]
+    cards: Mapping[str, Any]
+    """Values by keyword of the primary header, and of the extensions that hold only conditions."""
     units: Mapping[str, str]
     amplifiers: tuple[AmplifierLayout, ...]
     lamp: float | None = None

@@ -45,6 +45,10 @@ class AmplifierImage:
         subtracted.
     overscan_pixels : int
         Number of overscan pixels of a row.
+
+    Examples
+    --------
+    :func:`read_images` makes one; its example shows image, mean and unit.
     """
 
     name: str

@@ -143,7 +143,7 @@ def test_a_saturation_level_of_nothing_masks_nothing(tmp_path, plain, level):
     np.testing.assert_array_equal(found.mask, frame()[:, :32] >= 2490)
 
 
-def test_a_logical_card_is_no_gain(tmp_path):
+def test_a_logical_value_is_no_gain(tmp_path):
     (found,) = read_raw(write(tmp_path / "a.fits", frame(), GAIN=True))
     assert found.unit == "adu" and np.isnan(found.gain)
     assert found.no_gain == "GAIN = True is not a number"
