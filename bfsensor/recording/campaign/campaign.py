@@ -153,8 +153,9 @@ class Campaign:
     def conditions(self, kind: str = "flat") -> dict[Condition, tuple[Exposure, ...]]:
         """Group the exposures of a kind by their settings, the largest group first.
 
-        Readings that differ by no more than
-        :data:`bfsensor.recording.campaign.exposures.TOLERANCES` count as one setting.
+        Sorted readings whose neighbours differ by no more than
+        :data:`bfsensor.recording.campaign.exposures.TOLERANCES` count as one setting, so that a
+        slow drift stays one setting however far it goes.
 
         Parameters
         ----------
