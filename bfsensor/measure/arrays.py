@@ -1,4 +1,4 @@
-"""Images as this room works on them: floats of the machine, nan where there is no value."""
+"""Conversion of images to arrays of floats in which masked pixels are nan."""
 
 from __future__ import annotations
 
@@ -10,19 +10,24 @@ from bfsensor.typing import FloatArray
 
 
 def to_floats(values: ArrayLike, name: str) -> FloatArray:
-    """Give a new array of floats, nan where a masked array hides what it holds.
+    """Copy numbers to a new array of floats, nan where a masked array hides a value.
 
     Parameters
     ----------
     values : array_like
         Real numbers of any type and byte order.
     name : str
-        For the error.
+        Name of the argument, for errors.
+
+    Returns
+    -------
+    array : ndarray of float64
+        The copy, of the same shape.
 
     Raises
     ------
     MeasurementError
-        Complex numbers, text, or rows of different lengths.
+        The values are complex numbers or text, or rows have different lengths.
 
     Examples
     --------
@@ -33,7 +38,7 @@ def to_floats(values: ArrayLike, name: str) -> FloatArray:
     try:
         array = np.asarray(values)
         if array.dtype.kind not in "biufO":
-            raise TypeError(f"{array.dtype} are no real numbers")
+            raise TypeError(f"values of type {array.dtype} are not real numbers")
         out = np.array(array, float)
     except (TypeError, ValueError) as error:
         raise MeasurementError(f"{name}: not an array of real numbers: {error}") from None

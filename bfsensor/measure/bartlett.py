@@ -1,4 +1,4 @@
-"""Errors of measured covariances, with what ties the lags together (Bartlett)."""
+"""Covariance matrix of measured covariances (Bartlett), and helpers for quadrants of lags."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from bfsensor.typing import FloatArray
 
 
 def image_weights(lags: int) -> FloatArray:
-    """How many lags of the whole plane each lag of the quadrant stands for: 1, 2 or 4.
+    """Count the lags (+-i, +-j) of the plane for each lag of the quadrant: 1, 2 or 4.
 
     Parameters
     ----------
@@ -19,6 +19,7 @@ def image_weights(lags: int) -> FloatArray:
     Returns
     -------
     weights : ndarray, shape (lags + 1, lags + 1)
+        Counts as [j, i]; a sum over the plane is that over the quadrant with these weights.
 
     Examples
     --------
@@ -31,18 +32,19 @@ def image_weights(lags: int) -> FloatArray:
 
 
 def unfold(quadrant: ArrayLike, reach: int | None = None) -> FloatArray:
-    """Mirror a quadrant [j, i] to the plane of lags -reach..reach, zero beyond it.
+    """Mirror a quadrant [j, i] to the plane of lags -reach to reach, 0 beyond its largest lag.
 
     Parameters
     ----------
     quadrant : array_like, shape (..., lags + 1, lags + 1)
-        Values at lags from zero on.
+        Values at lags from 0 to ``lags``.
     reach : int, optional
-        Largest lag of the plane, by default that of the quadrant.
+        Largest lag of the plane, at least ``lags``; by default ``lags``.
 
     Returns
     -------
     plane : ndarray, shape (..., 2 reach + 1, 2 reach + 1)
+        Values with lag (0, 0) in the middle.
     """
     q = np.asarray(quadrant, float)
     lags = q.shape[-1] - 1
@@ -67,14 +69,15 @@ def bartlett_matrix(covariances: ArrayLike, pairs: ArrayLike) -> FloatArray:
     Parameters
     ----------
     covariances : array_like, shape (..., lags + 1, lags + 1)
-        True covariances, or measured ones, zero beyond the largest lag; indexed [j, i].
+        Covariances of the field, modelled or measured, indexed [j, i]; they are taken as 0
+        beyond the largest lag.
     pairs : array_like, same shape
-        Pairs at each lag, those of (i, -j) not counted.
+        Number of pairs of pixels at each lag (i, j), without those of (i, -j).
 
     Returns
     -------
     matrix : ndarray, shape (..., (lags + 1)**2, (lags + 1)**2)
-        Lags flattened as ``[j, i]``.
+        Covariance matrix, with lags flattened as ``[j, i]``.
 
     References
     ----------
@@ -89,13 +92,14 @@ def bartlett_matrix(covariances: ArrayLike, pairs: ArrayLike) -> FloatArray:
     c = np.asarray(covariances, float)
     counts = np.asarray(pairs, float)
     lags = c.shape[-1] - 1
-    # With the field even in both axes the sum over m is its convolution with itself, g:
-    # Cov(L, M) = [g(L - M) + g(L + M)] / N.
+    # C is even in both axes, so that the sum over m is the convolution of C with itself, g:
+    # Cov(L, M) = [g(L - M) + g(L + M)] / N.  The plane is twice as wide as the lags, for the
+    # convolution must not wrap around.
     plane = np.fft.ifftshift(unfold(c, 2 * lags), axes=(-2, -1))
     g = np.fft.ifft2(np.fft.fft2(plane).real ** 2).real
     j, i = (index.ravel() for index in np.indices(c.shape[-2:]))
     dj, di = j[:, None], i[:, None]
-    # g is even too, so the mean over (i, +-j) and (k, +-l) has two different terms each.
+    # g is even too: of the means over (i, +-j) and (k, +-l) two different terms of each sign remain.
     matrix = 0.5 * (
         g[..., dj - j, di - i]
         + g[..., dj + j, di + i]

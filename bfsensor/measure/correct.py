@@ -1,12 +1,11 @@
-r"""Take the brighter-fatter effect out of images: a scalar kernel, or shifts of edges.
+r"""Correction of images for the brighter-fatter effect, by a scalar kernel or by edge shifts.
 
-While a pixel fills, the charge around it moves its boundaries in proportion to what is
-there, so on average over an exposure by half of what they have moved at its end.  A boundary
-moved by s sweeps s times the light that falls on it from one pixel to the other.  Both
-corrections take the light on a boundary to be the mean of the two pixels that share it and
-move it back.  They differ in what they know of the shifts: the scalar kernel K knows them as
-the gradient of a potential, :math:`s = -\nabla (K \otimes F)`, the edge model has them
-for every edge.
+While a pixel fills, the charge around it shifts its boundaries in proportion to that charge.
+Averaged over an exposure the shift is half of that at its end.  A boundary that is shifted by s
+pixels moves s times the light that falls on it from one pixel to the other.  Both corrections
+take the light on a boundary to be the mean of the two pixels that share it, and move it back.
+They differ in their model of the shifts: for the scalar kernel K they are the gradient of a
+potential, :math:`s = -\nabla (K \otimes F)`; the edge model has a shift for every edge.
 """
 
 from __future__ import annotations
@@ -38,35 +37,38 @@ def correct_kernel(
     Parameters
     ----------
     image : array_like, shape (ny, nx)
-        Charge without bias [e-], of one exposure, every pixel finite.
+        Charge of one exposure without bias [e-], every pixel finite.
     kernel : array_like, shape (odd, odd)
-        K [1/e-] by lag [j, i], the centre in the middle; minus its Laplacian is a_ij.
+        K by lag [j, i] [1/e-], with the centre in the middle; minus its Laplacian is a_ij.
     conserving : bool
-        Take the divergence of what crosses the edges, each with the mean of its two pixels:
-        the sum of all charge stays.  Otherwise :math:`\tfrac12 (\nabla F \cdot \nabla
-        \phi + F \nabla^2 \phi)` by central differences, as first published, which keeps it
+        Compute the charge that crosses each edge from the mean of its two pixels, so that the
+        sum of all charge is kept.  If False, compute :math:`\tfrac12 (\nabla F \cdot \nabla
+        \phi + F \nabla^2 \phi)` by central differences, as first published, which keeps the sum
         only where gradients are small.
     threshold : float
-        The iteration ends when a step changes the pixels by less, in sum [e-]; inf: after
-        the first.
+        Sum of the absolute changes of all pixels in a step [e-] below which the iteration
+        ends; inf ends it after the first step.
     iterations : int
-        Steps at most.
+        Largest number of steps, 1 or more.
 
     Returns
     -------
     corrected : ndarray, shape (ny, nx)
+        Charge as it would have been collected without the effect [e-].
 
     Raises
     ------
     MeasurementError
-        An image or kernel that is not finite, or of another shape.
+        The image or the kernel has values that are not finite or another shape, or
+        ``threshold`` or ``iterations`` is out of range.
     ConvergenceError
         The threshold was not reached; ``history`` has the sum of changes by step.
 
     Notes
     -----
-    Charge outside the image is taken to be that of its nearest pixel: within the reach of
-    the kernel from the border this is a guess.  No charge crosses the border if conserving.
+    Charge outside the image is taken to be that of its nearest pixel: the correction is not
+    reliable closer to the border than the kernel reaches.  No charge crosses the border if
+    ``conserving`` is True.
 
     References
     ----------
@@ -94,7 +96,7 @@ def correct_kernel(
     history: list[float] = []
     found = given
     while len(history) < iterations:
-        # One pixel more all around: gradients at the border.
+        # The potential is needed one pixel beyond the border, for gradients there.
         pad = tuple((side // 2 + 1,) * 2 for side in k.shape)
         potential = fftconvolve(np.pad(found, pad, mode="edge"), k, mode="valid")
         new = given + move(found, potential)
@@ -103,8 +105,9 @@ def correct_kernel(
         if history[-1] < threshold:
             return found
     raise ConvergenceError(
-        f"after {iterations} steps the correction still changes by {history[-1]:.3g} e-, not "
-        f"below {threshold:g} e-",
+        f"after {iterations} steps the correction still changes by {history[-1]:.3g} e- in sum, "
+        f"not below threshold = {threshold:g} e-: raise iterations or threshold; growing changes "
+        "mean that the kernel is too strong for this charge",
         history,
     )
 
@@ -112,37 +115,38 @@ def correct_kernel(
 def correct_edges(image: ArrayLike, north: ArrayLike, east: ArrayLike) -> FloatArray:
     r"""Correct an image with the shifts of pixel edges.
 
-    With :math:`s` the shift that the charge at the end gives the edge between pixels 1 and 2,
-    :math:`\tfrac12 s` on average, the charge
+    With :math:`s` the shift of the edge between pixels 1 and 2 by the charge at the end of the
+    exposure, :math:`\tfrac12 s` on average, the charge
 
     .. math:: \delta = \tfrac12 s\, \tfrac12 (F_1 + F_2)
 
-    came to the wrong side of it.  Two convolutions, not iterated: shifts follow the charge
-    that was stored, and that is what the image shows.
+    was collected on the wrong side of it.  This takes two convolutions and no iteration,
+    because shifts follow the stored charge, which is what the image shows.
 
     Parameters
     ----------
     image : array_like, shape (ny, nx)
-        Charge without bias [e-], of one exposure, every pixel finite.
+        Charge of one exposure without bias [e-], every pixel finite.
     north, east : array_like, shape (n, n)
-        Shift [pixel/e-], outward positive, of the upper and of the right edge of the pixel
-        at lag i in x and j in y, ``[j, i]`` from (0, 0), by charge at (0, 0).  All other
-        edges by mirror symmetry; beyond the last nothing moves.
+        Shift of the upper and of the right edge [pixel/e-], outward positive, of the pixel at
+        lag i in x and j in y, ``[j, i]`` from (0, 0), by charge at (0, 0).  All other edges
+        follow by mirror symmetry; edges beyond the last lag do not move.
 
     Returns
     -------
     corrected : ndarray, shape (ny, nx)
-        Its sum is that of the image, to round-off.
+        Charge as it would have been collected without the effect [e-]; its sum is that of
+        the image to round-off.
 
     Raises
     ------
     MeasurementError
-        An image or shifts that are not finite, or of another shape.
+        The image or the shifts have values that are not finite, or another shape.
 
     Notes
     -----
-    Shifts are antisymmetric about the charge, edge by edge, so that uniform charge moves
-    none.  Charge outside the image is taken to be that of its nearest pixel.
+    Shifts are antisymmetric about the charge, edge by edge, so that uniform charge shifts no
+    edge.  Charge outside the image is taken to be that of its nearest pixel.
 
     References
     ----------
@@ -172,7 +176,7 @@ def correct_edges(image: ArrayLike, north: ArrayLike, east: ArrayLike) -> FloatA
 
 
 def _image(image: ArrayLike) -> FloatArray:
-    """Check an image."""
+    """Image as floats, checked to be two-dimensional and finite."""
     array = to_floats(image, "image")
     if array.ndim != 2 or min(array.shape) < 2:
         raise MeasurementError(
@@ -180,25 +184,26 @@ def _image(image: ArrayLike) -> FloatArray:
         )
     bad = np.count_nonzero(~np.isfinite(array))
     if bad:
-        # A convolution would spread them over all pixels.
+        # The convolution by Fourier transform would spread them over all pixels.
         raise MeasurementError(
-            f"image holds {bad} values that are not finite: fill them before a correction"
+            f"image holds {bad} values that are not finite: fill them, for instance from their "
+            "neighbours, before a correction"
         )
     return array
 
 
 def _shifts(image: FloatArray, upper: FloatArray) -> FloatArray:
-    """Shifts [pixel] of the edges between the rows of an image, (ny - 1, nx)."""
+    """Shifts of the edges between the rows of an image [pixel], shape (ny - 1, nx)."""
     n = len(upper)
     half = np.concatenate([upper[:, :0:-1], upper], axis=1)
-    # Rows of edges -n .. n - 1 about the charge: those below it are shifted the other way.
+    # Rows of edges from -n to n - 1 about the charge; those below it shift the other way.
     whole = np.concatenate([-half[::-1], half])
     padded = np.pad(image, ((n, n), (n - 1, n - 1)), mode="edge")
     return np.asarray(fftconvolve(padded, whole, mode="valid")[1:-1])
 
 
 def _gains(up: FloatArray, right: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """What pixels gain where the lower, left one of two gains what the other loses."""
+    """Gain of each pixel: of two neighbours the lower or left one gains what the other loses."""
     gain = np.zeros(shape)
     gain[:-1] += up
     gain[1:] -= up
@@ -208,7 +213,7 @@ def _gains(up: FloatArray, right: FloatArray, shape: tuple[int, ...]) -> FloatAr
 
 
 def _move_conserving(charge: FloatArray, potential: FloatArray) -> FloatArray:
-    """Half the divergence of F grad(potential), by what crosses the edges."""
+    """Half the divergence of F grad(potential), by the charge that crosses each edge."""
     inner = potential[1:-1, 1:-1]
     up = 0.25 * (charge[1:] + charge[:-1]) * (inner[1:] - inner[:-1])
     right = 0.25 * (charge[:, 1:] + charge[:, :-1]) * (inner[:, 1:] - inner[:, :-1])

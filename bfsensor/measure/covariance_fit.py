@@ -1,4 +1,4 @@
-"""The full covariance model fitted to a curve: a, b, noise and gain with their errors."""
+"""Fit of the full covariance model to a curve: a, b, noise and gain with their errors."""
 
 from __future__ import annotations
 
@@ -33,31 +33,36 @@ _NAMES = (
 
 @dataclass(frozen=True, eq=False)
 class CovarianceFit:
-    """What a covariance curve says about a sensor and its readout.
+    """Fitted parameters of the covariance model, with their covariance matrix.
 
     Attributes
     ----------
     a, c, noise : ndarray, shape (lags + 1, lags + 1)
         a_ij [1/e-], c_ij = a_ij b_ij [1/e-^2] and n_ij [e-^2], indexed [j, i].
     gain : float
-        [e-/unit]; of a curve in electrons, what the assumed gain is to be multiplied by.
+        Gain [e-/unit]; for a curve in electrons the factor by which the assumed gain is to be
+        multiplied.
     matrix : ndarray, shape (3 n + 1, 3 n + 1)
-        Covariance matrix of a, c, noise (n lags each, flattened as [j, i]) and gain; zero
-        rows for what was held.
+        Covariance matrix of a, c, noise (n lags each, flattened as [j, i]) and gain; rows and
+        columns of parameters that were held are 0.
     held : tuple of str
-        'c' and 'gain' where they were not free.
+        Parameters that were not free, among 'c' and 'gain'.
     chi2, dof : float, int
-        Of the pairs used, each with its full error matrix.
+        Chi-square of the used pairs, each with its full error matrix, and degrees of freedom.
     dropped : tuple of int
-        Rows of the curve left out as outliers inside the range.
+        Rows of the curve inside the range that were left out as outliers.
     level_range : tuple of float
         Lowest and highest level used [unit].
     range_reason : str
-        'given', 'found', 'whole curve', or 'too few pairs to find it'.
+        How the range was chosen: 'given', 'found', 'whole curve', or 'too few pairs to find it'.
     powers : int
         Highest power of the level in the model.
     unit, region : str
-        As in the curve.
+        Unit and name of the curve.
+
+    Examples
+    --------
+    :func:`fit_covariances` makes one; its example shows ``a`` and ``gain``.
     """
 
     a: FloatArray
@@ -87,37 +92,37 @@ class CovarianceFit:
 
     @property
     def a_errors(self) -> FloatArray:
-        """Errors of a [1/e-]."""
+        """Standard errors of a as [j, i] [1/e-]."""
         return self._errors(0)
 
     @property
     def c_errors(self) -> FloatArray:
-        """Errors of c [1/e-^2], zero where it was held."""
+        """Standard errors of c as [j, i] [1/e-^2]; 0 where it was held."""
         return self._errors(1)
 
     @property
     def noise_errors(self) -> FloatArray:
-        """Errors of the noise [e-^2]."""
+        """Standard errors of the noise as [j, i] [e-^2]."""
         return self._errors(2)
 
     @property
     def gain_error(self) -> float:
-        """Error of the gain [e-/unit], zero where it was held."""
+        """Standard error of the gain [e-/unit]; 0 where it was held."""
         return float(np.sqrt(self.matrix[-1, -1]))
 
     @property
     def b(self) -> FloatArray:
-        """Growth c / a of a with the level [1/e-]; means little where a is within its error of zero."""
+        """Growth c / a of a with the level [1/e-]; not constrained where a is within its error of 0."""
         return np.asarray(
             np.divide(self.c, self.a, out=np.zeros_like(self.a), where=self.a != 0)
         )
 
     @property
     def sum_rule(self) -> tuple[float, float]:
-        """Sum of a over the plane of the lags [1/e-] and its error.
+        """Sum of a over the plane of the lags and its standard error [1/e-].
 
-        Charge is conserved, so the sum over all lags is zero; what lags beyond the largest
-        hold is missing here, as is what a wrong gain does to a_00.
+        Charge is conserved, so that the sum over all lags is 0.  This sum differs from 0 by the
+        lags beyond the largest, and by the error of a_00 that a wrong gain makes.
         """
         n = self.a.size
         weights = image_weights(self.a.shape[0] - 1).ravel()
@@ -126,16 +131,40 @@ class CovarianceFit:
 
     @property
     def p_value(self) -> float:
-        """Chance of a chi-square as large."""
+        """Probability of a chi-square at least as large, if the model is true."""
         return float(chi2_distribution.sf(self.chi2, self.dof))
 
     def model(self, levels: ArrayLike) -> FloatArray:
-        """Fitted covariances [unit^2] at levels [unit], shape (n, lags + 1, lags + 1)."""
+        """Evaluate the fitted model.
+
+        Parameters
+        ----------
+        levels : array_like, shape (n,)
+            Mean levels [unit].
+
+        Returns
+        -------
+        covariances : ndarray, shape (n, lags + 1, lags + 1)
+            C_ij of one flat [unit^2], indexed [pair, j, i].
+        """
         m = self.gain * np.atleast_1d(np.asarray(levels, float))
         return (expand(self.a, self.c, self.powers).at(m) + self.noise) / self.gain**2
 
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write as ECSV, a row for each lag (beside, then renamed)."""
+        """Write the fit as ECSV, a row for each lag.
+
+        Parameters
+        ----------
+        path : path-like
+            File to write, under another name first and then renamed.
+        overwrite : bool
+            Replace an existing file.
+
+        Raises
+        ------
+        MeasurementError
+            The file exists and ``overwrite`` is False, or it cannot be written.
+        """
         j, i = np.indices(self.a.shape)
         n, units = self.a.size, ("1 / electron", "1 / electron2", "electron2")
         columns: dict[str, tuple[Any, str | None, str]] = {
@@ -156,7 +185,23 @@ class CovarianceFit:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> CovarianceFit:
-        """Read what :meth:`write` wrote; names the file and what is missing in it."""
+        """Read a file that :meth:`write` made.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+
+        Returns
+        -------
+        fit : CovarianceFit
+            Equal to the one that was written.
+
+        Raises
+        ------
+        MeasurementError
+            The file is missing, damaged or of another kind, or lacks a column.
+        """
         columns, meta = read_ecsv(
             path, SCHEMA, ("i", "j", *_MATRICES, "matrix"), (*_NAMES, "gain_variance")
         )
@@ -184,41 +229,46 @@ def fit_covariances(
 ) -> CovarianceFit:
     """Fit a, b, noise and gain to covariances against level.
 
-    The model is :func:`~bfsensor.measure.covariance_model.model_covariances`.  Every pair
-    counts with the inverse of its full error matrix (Bartlett's, of the fitted
-    covariances: weights from measured ones would favour pairs that came out low).  Start
-    values come from a parabola for the variance and from C_ij against level squared.
+    The model is :func:`~bfsensor.measure.covariance_model.model_covariances`.  Every pair is
+    weighted by the inverse of its full error matrix.  That is Bartlett's of the fitted
+    covariances, because weights from measured ones would favour pairs that fluctuated low.
+    Start values come from a parabola for the variance and from C_ij against level squared.
 
     Parameters
     ----------
     curve : CovarianceCurve
-        In electrons or ADU.
+        Covariances in electrons or ADU.
     lags : int, optional
-        Largest lag fitted, that of the curve by default.  a beyond it is taken as zero.
+        Largest lag fitted, by default that of the curve; a is taken as 0 beyond it.
     level_range : tuple of float, optional
         Lowest and highest level [unit].  By default the highest is found: from the lowest
         third on, pairs are added as long as a fit to those below predicts their nearest
         covariances, errors of that prediction included; three failures among five in a row
         end the range (:func:`~bfsensor.measure.covariance_solver.find_turnoff`).
     gain : float, optional
-        Hold the gain at this value [e-/unit].
+        Value at which the gain is held [e-/unit], above 0; by default it is fitted.
     constant_a : bool
-        Hold b at zero: areas strictly proportional to charge.
+        Hold b at 0: changes of area are strictly proportional to charge.
     powers : int
-        Highest power of the level in the model.  4 is the published equation: on 400 pairs
-        of 1e6 pixels up to a_00 mu = -0.2 it moves b_00 by two standard deviations.
+        Highest power of the level in the model, 1 to 12.  4 is the published equation: on 400
+        pairs of 1e6 pixels up to a_00 mu = -0.2 it moves b_00 by two standard deviations.
     outlier_chance : float
-        Chance to lose any pair of a good curve: pairs whose chi-square exceeds that are
-        dropped and listed.  Where the typical pair does not fit, the limit rises with it.
+        Probability that any pair of a sound curve is dropped, between 0 and 1; pairs of larger
+        chi-square are dropped and listed.  Where the median pair does not fit, the limit rises
+        in proportion to its chi-square.
 
     Returns
     -------
-    CovarianceFit
+    fit : CovarianceFit
+        Parameters with their covariance matrix, chi-square and range.
 
     Raises
     ------
     MeasurementError
-        Too few pairs, more than a quarter of them outliers, or a fit that does not settle.
+        An argument is out of range, the levels are too few, more than a quarter of the pairs
+        are outliers, or the set of outliers does not settle.
+    ConvergenceError
+        The fit found no minimum.
 
     References
     ----------
@@ -252,7 +302,7 @@ def fit_covariances(
     if len(np.unique(fitted.levels[inside])) < needed:
         raise MeasurementError(
             f"{len(inside)} pairs from {level_range[0]:g} to {level_range[1]:g} "
-            f"{curve.unit} do not fix the model: at least {needed} levels are needed"
+            f"{curve.unit} have fewer than the {needed} levels that the model needs"
         )
     used, found = _fit_without_outliers(
         fitted, inside, gain=gain, constant_a=constant_a, powers=powers,
@@ -278,13 +328,13 @@ def _fit_without_outliers(
     curve: CovarianceCurve, inside: NDArray[np.intp], *, gain: float | None,
     constant_a: bool, powers: int, chance: float,
 ) -> tuple[NDArray[np.intp], CovarianceSolution]:  # fmt: skip
-    """Fit, drop the pairs that do not belong, until none is left to drop."""
+    """Fit and drop outliers in turn until none is left."""
     n = (curve.lags + 1) ** 2
     limit = chi2_distribution.isf(chance / len(inside), n)
     typical = chi2_distribution.median(n)
     used = inside
     start = start_values(curve.select(inside), gain)
-    # Gross outliers would bend the first fit towards themselves: it bounds their pull.
+    # Gross outliers would pull the first fit towards themselves: their weight is bounded there.
     bound: float | None = limit
     for _ in range(10):
         found = solve(
@@ -300,7 +350,11 @@ def _fit_without_outliers(
         if len(used) < 0.75 * len(inside):
             raise MeasurementError(
                 f"{len(inside) - len(used)} of {len(inside)} pairs do not fit the model "
-                "that the others follow: they are no outliers"
+                "that the others follow, too many for outliers: give a level_range below "
+                "saturation, or look at their flats"
             )
         start = found
-    raise MeasurementError("the set of outlier pairs does not settle in 10 rounds")
+    raise MeasurementError(
+        "the set of outlier pairs does not settle in 10 rounds: leave doubtful pairs out, or give "
+        "a smaller outlier_chance"
+    )

@@ -1,4 +1,4 @@
-"""The covariances that areas following charge give, as a series in the level."""
+"""Model of flats' covariances whose pixel areas follow the charge, as a series in the level."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def model_covariances(
     gain: float = 1.0,
     powers: int = 8,
 ) -> FloatArray:
-    r"""Covariances at given levels, Astier et al. (2019), equation 20.
+    r"""Evaluate the covariance model of Astier et al. (2019), equation 20.
 
     With m the level in electrons, c = a b, and \* the convolution over the whole plane,
 
@@ -31,21 +31,21 @@ def model_covariances(
             + [\tfrac13 a * a * a + \tfrac56 a * c]_{ij} m^4 + \dots,
 
     the solution of :math:`d\tilde C / dm = 1 + 2 (\tilde a + \tilde c m) \tilde C` in every
-    Fourier mode: charge follows areas and areas follow charge.
+    Fourier mode.
 
     Parameters
     ----------
     levels : array_like, shape (n,)
-        Mean level [unit, electron or ADU].
+        Mean levels [unit], in electrons or ADU.
     a : array_like, shape (lags + 1, lags + 1)
         Relative change of the area of the pixel at lag (i, j) for each electron [1/e-],
         indexed [j, i]; the centre's is negative.
     b : array_like, same shape, optional
-        Growth of ``a`` with the level [1/e-]; none by default.
+        Growth of ``a`` with the level, b_ij [1/e-]; 0 by default.
     noise : array_like, same shape, optional
-        Covariance of the noise [e-^2]; none by default.
+        Covariance of the noise, n_ij [e-^2]; 0 by default.
     gain : float
-        [e-/unit].
+        Gain g [e-/unit], above 0.
     powers : int
         Highest power of the level.  The published equation stops at 4, which leaves out
         about (a m)^4 / 7.5 of a Fourier mode's variance: 1e-5 at a m = 0.1, 1e-3 at 0.3.
@@ -53,12 +53,12 @@ def model_covariances(
     Returns
     -------
     covariances : ndarray, shape (n, lags + 1, lags + 1)
-        [unit^2], indexed [pair, j, i].
+        C_ij of one flat [unit^2], indexed [pair, j, i].
 
     Raises
     ------
     MeasurementError
-        Shapes that do not fit, a gain that is not above 0, or too many powers.
+        Shapes do not match, the gain is not above 0, or ``powers`` is out of range.
 
     Examples
     --------
@@ -68,7 +68,7 @@ def model_covariances(
     """
     quadrant, mu = np.asarray(a, float), np.asarray(levels, float)
     if mu.ndim != 1:
-        raise MeasurementError(f"levels of shape {mu.shape} must be a list, (n,)")
+        raise MeasurementError(f"levels of shape {mu.shape} must have one axis, (n,)")
     if quadrant.ndim != 2 or quadrant.shape[0] != quadrant.shape[1]:
         raise MeasurementError(f"a of shape {quadrant.shape} is not (lags + 1, lags + 1)")
     for name, other in (("b", b), ("noise", noise)):
@@ -86,10 +86,10 @@ def model_covariances(
 
 @dataclass(frozen=True)
 class Series:
-    """Coefficients of the powers 1, 2, ... of the level, in electrons.
+    """Coefficients of the powers 1, 2, ... of the level in electrons, with derivatives.
 
-    ``value[p - 1]`` at the lags of the quadrant; ``by_a`` and ``by_c`` [p - 1, L, M] its
-    derivatives by a and c at the lag M, lags flattened.
+    ``value[p - 1]`` are those of the power p at the lags [j, i] of the quadrant; ``by_a`` and
+    ``by_c`` [p - 1, L, M] their derivatives at the lag L by a and c at the lag M, lags flattened.
     """
 
     value: FloatArray
@@ -97,7 +97,7 @@ class Series:
     by_c: FloatArray
 
     def at(self, m: FloatArray) -> FloatArray:
-        """Sum at levels m [e-], shape (n, lags + 1, lags + 1)."""
+        """Sum of the series at levels m [e-], shape (n, lags + 1, lags + 1) [e-^2]."""
         return np.asarray(np.tensordot(self.monomials(m), self.value, 1))
 
     def monomials(self, m: FloatArray) -> FloatArray:
@@ -116,7 +116,7 @@ def expand(a: FloatArray, c: FloatArray, powers: int, *, slopes: bool = False) -
     if int(powers) != powers:
         raise MeasurementError(f"powers = {powers} must be a whole number")
     lags = a.shape[0] - 1
-    # Wide enough that no product wraps around into the lags that are read.
+    # The plane is so wide that no product of the series wraps around into the lags that are read.
     reach = max(powers, 2) * lags
     a_k, c_k = (np.fft.fft2(np.fft.ifftshift(unfold(q, reach))).real for q in (a, c))
     zero = np.zeros_like(a_k)
@@ -135,12 +135,12 @@ def expand(a: FloatArray, c: FloatArray, powers: int, *, slopes: bool = False) -
 
 
 def _spread(response: FloatArray, lags: int) -> FloatArray:
-    """Change at lag L by a unit at the lag M and its mirror images: (powers, L, M)."""
+    """Change at the lag L by a unit at the lag M and its mirror images, shape (powers, L, M)."""
     j, i = (index.ravel() for index in np.indices((lags + 1, lags + 1)))
     total = np.zeros((len(response), len(j), len(j)))
     for sign_j in (1, -1):
         for sign_i in (1, -1):
-            # An image on an axis is its own mirror and counts once.
+            # A lag on an axis is its own mirror image and counts once.
             distinct = ((sign_j == 1) | (j > 0)) & ((sign_i == 1) | (i > 0))
             at = response[:, j[:, None] - sign_j * j, i[:, None] - sign_i * i]
             total += at * distinct

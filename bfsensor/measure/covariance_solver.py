@@ -1,4 +1,4 @@
-"""Least squares for the covariance model, and the level up to which it holds."""
+"""Least-squares solver of the covariance model, and the search for the turnoff level."""
 
 from __future__ import annotations
 
@@ -15,14 +15,19 @@ from bfsensor.measure.curve import CovarianceCurve
 from bfsensor.typing import FloatArray
 
 REJECT = 1e-4
-"""Chance at which a pair counts as not predicted by those below it."""
+"""Probability of chi-square below which a pair counts as not predicted by those below it.
+
+Chosen: three sound pairs in five then fail with the probability 10 REJECT^3 = 1e-11.  At twice the
+value the limit of chi-square falls from 23.5 to 22.0 for the four nearest lags, and gentler
+turnoffs end the range.
+"""
 
 
 @dataclass(frozen=True)
 class CovarianceSolution:
     """Parameters, their covariance matrix and the chi-square of each pair.
 
-    ``matrix`` is that of a, c, noise (flattened) and gain, with zero rows for held ones.
+    ``matrix`` is that of a, c, noise (lags flattened) and gain, 0 for parameters that are held.
     """
 
     a: FloatArray
@@ -41,7 +46,7 @@ class CovarianceSolution:
 
 
 def start_values(curve: CovarianceCurve, gain: float | None = None) -> CovarianceSolution:
-    """Start from a robust parabola of the variance, and from C_ij against level squared."""
+    """Start values from a robust parabola of the variance, and from C_ij against level squared."""
     mu, c, error = curve.levels, curve.covariances, curve.errors
     top = mu.max()
 
@@ -57,11 +62,11 @@ def start_values(curve: CovarianceCurve, gain: float | None = None) -> Covarianc
     slope = parabola.x[1]
     if gain is None and not slope > 0:
         raise MeasurementError(
-            f"the variance does not grow with the level (slope {slope:g}): no flats, or "
-            "all above the turnoff"
+            f"the variance does not grow with the level (slope {slope:g}): these are no flats, or "
+            "all of them are above the turnoff; give lower levels"
         )
     g = 1 / slope if gain is None else gain
-    # Weighted lines in level squared, for every lag at once.
+    # To first order C_ij is noise + a_ij mu^2: a weighted line in mu^2 for every lag.
     weight, square = error**-2, (mu**2)[:, None, None]
     total = weight.sum(0)
     centre = (weight * square).sum(0) / total
@@ -93,22 +98,27 @@ def solve(
     curve : CovarianceCurve
         Pairs to fit, all of them.
     start : CovarianceSolution
-        Where to start; gives what is held.
+        Start values, and the values of parameters that are held.
     free_gain, free_c : bool
         Whether gain and c are fitted.
     powers : int
         Highest power of the level.
     bound : float, optional
-        Chi-square of a pair above which its pull grows no further (Huber).
+        Chi-square of a pair above which its part grows with the root of it only (Huber).
     prior : ndarray, shape (3 n + 1,), optional
-        Inverse variances of a Gaussian prior about zero.
+        Inverse variances of a Gaussian prior about 0, for each parameter.
+
+    Returns
+    -------
+    found : CovarianceSolution
+        Parameters at the minimum of chi-square, their covariance matrix, and chi-squares.
 
     Raises
     ------
     ConvergenceError
-        No minimum found.
+        The fit found no minimum in 60 steps.
     MeasurementError
-        Parameters that the levels do not fix.
+        The levels do not constrain the parameters.
     """
     n = start.a.size
     free = np.ones(3 * n + 1, bool)
@@ -118,7 +128,7 @@ def solve(
     parameters = start.parameters.copy()
     damping, history = 1e-3, []
     for outer in range(60):
-        # Errors follow the fitted covariances; that settles with the parameters.
+        # The error matrices are those of the fitted covariances, and settle with the parameters.
         inverse = _inverse_errors(curve, parameters, powers)
         normal, gradient, each = _normal_equations(
             curve, parameters, inverse, powers, bound
@@ -133,7 +143,7 @@ def solve(
         if np.linalg.cond(part) > 1e13:
             raise MeasurementError(_UNFIXED)
         slope = gradient[free] * scale
-        # Newton's decrement: the drop of chi-square still to come.
+        # Newton's decrement: the drop of chi-square that a full step would give.
         history.append(float(slope @ np.linalg.solve(part, slope)))
         if history[-1] < 1e-6 and outer >= 3:
             break
@@ -150,16 +160,28 @@ def solve(
                     break
             damping = max(10 * damping, 1e-6)
         else:
-            raise ConvergenceError("the covariance fit found no way down", history)
+            raise ConvergenceError(
+                "no step of the covariance fit lowers chi-square: its history is attached; leave "
+                "pairs above saturation out with level_range",
+                history,
+            )
     else:
-        raise ConvergenceError("the covariance fit did not settle in 60 steps", history)
+        raise ConvergenceError(
+            f"the covariance fit did not settle in 60 steps: the last would lower chi-square by "
+            f"{history[-1]:.3g}, not below 1e-6",
+            history,
+        )
     matrix = np.zeros((3 * n + 1, 3 * n + 1))
     inverted = np.linalg.inv(part) * scale[:, None] * scale
     matrix[np.ix_(free, free)] = 0.5 * (inverted + inverted.T)
     return _solution(parameters, matrix, each, start.a.shape)
 
 
-_UNFIXED = "the levels do not fix the model's parameters: too few, or all alike"
+_UNFIXED = (
+    "the levels do not constrain the model's parameters, because they are too few or too close: "
+    "give more levels, or hold the gain or constant_a"
+)
+"""Message where the normal equations are singular."""
 
 
 def _chi_squares(
@@ -171,7 +193,7 @@ def _chi_squares(
 
 
 def _bounded(each: FloatArray, bound: float | None) -> float:
-    """Sum of chi-squares, growing as their root only above the bound."""
+    """Sum of chi-squares, of which those above the bound grow with their root only (Huber)."""
     if bound is None:
         return float(each.sum())
     root = 2 * np.sqrt(bound * np.maximum(each, bound)) - bound
@@ -205,7 +227,7 @@ def _inverse_errors(
     """Inverse of Bartlett's matrix of the modelled covariances, for each pair."""
     *_, model = _evaluate(curve.levels, parameters, powers, slopes=False)
     shape = curve.covariances.shape[1:]
-    # A start may give a variance below zero; what was measured then sets the errors.
+    # Start values may give a variance below 0; the measured covariances then set the errors.
     wrong = ~(model[:, 0] > 0.1 * curve.covariances[:, 0, 0])
     model[wrong] = curve.covariances[wrong].reshape(-1, model.shape[1])
     return np.asarray(
@@ -253,19 +275,18 @@ def find_turnoff(
 ) -> tuple[float, str]:
     """Find the highest level up to which the model predicts the nearest covariances.
 
-    From the lowest third (at least ten pairs) on: a fit of the lags up to (1, 1) predicts
-    each next pair, its own errors and the prediction's in the error matrix.  The range
-    ends below the first of three failures (chance below 1e-4) among five pairs in a row;
-    single failures are left to the search for outliers.  A turnoff so gentle that b takes
-    it up is not found.
+    From the lowest third (at least ten pairs) on, a fit of the lags up to (1, 1) predicts each
+    next pair, with the pair's own errors and those of the prediction.  The range ends below the
+    first of three failures (probability below REJECT) among five pairs in a row; single failures
+    are left to the search for outliers.  A turnoff so gentle that b describes it is not found.
 
-    Low levels alone do not fix a and c: a prior says that areas do not change by more than
-    about themselves up to the highest level.  It is used nowhere else.
+    Low levels alone do not constrain a and c.  A prior therefore limits the change of areas up to
+    the highest level to about the areas themselves; the final fit does not use it.
 
     Returns
     -------
     level : float
-        Highest level [unit].
+        Highest level of the range [unit].
     reason : str
         'found', 'whole curve', or 'too few pairs to find it'.
     """

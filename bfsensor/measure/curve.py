@@ -1,4 +1,4 @@
-"""Covariances against level: many pairs of flats of one region."""
+"""Covariance curves: covariances of many pairs of flats of one region against level."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class CovarianceCurve:
     covariances, errors : ndarray, shape (n, lags + 1, lags + 1)
         ``covariances[k, j, i]``: C_ij of pair k and its error [unit^2].
     pairs : ndarray of int, shape (n, lags + 1, lags + 1)
-        Pairs of pixels at each lag, those of (i, -j) not counted.
+        Number of pairs of pixels at each lag (i, j), without those of (i, -j).
     unit : str
         'electron' or 'adu'.
     region : str
@@ -90,17 +90,27 @@ class CovarianceCurve:
 
     @property
     def lags(self) -> int:
-        """Largest lag."""
+        """Largest lag in x and in y [pixel]."""
         return self.covariances.shape[-1] - 1
 
     @classmethod
     def from_pairs(cls, pairs: Iterable[FlatCovariances]) -> CovarianceCurve:
-        """Put measured pairs of one region together.
+        """Make a curve of measured pairs of one region.
+
+        Parameters
+        ----------
+        pairs : iterable of FlatCovariances
+            Pairs with the same lags, unit and region.
+
+        Returns
+        -------
+        curve : CovarianceCurve
+            The pairs, sorted by level.
 
         Raises
         ------
         MeasurementError
-            None, or pairs of different lags, units or regions.
+            There is no pair, or pairs differ in lags, unit or region.
         """
         found = list(pairs)
         if not found:
@@ -108,7 +118,9 @@ class CovarianceCurve:
         for name in ("lags", "unit", "region"):
             values = {getattr(one, name) for one in found}
             if len(values) > 1:
-                raise MeasurementError(f"pairs differ in {name}: {sorted(values)}")
+                raise MeasurementError(
+                    f"pairs differ in {name}: {sorted(values)}; a curve is of one {name}"
+                )
         return cls(
             levels=np.array([one.level for one in found]),
             covariances=np.array([one.covariances for one in found]),
@@ -133,13 +145,25 @@ class CovarianceCurve:
         Parameters
         ----------
         levels : array_like, shape (n,)
-            [unit].
+            Mean levels [unit].
         covariances : array_like, shape (n, lags + 1, lags + 1)
-            C_ij of one flat [unit^2], indexed [j, i].
+            C_ij of one flat [unit^2], indexed [pair, j, i].
         pixels : int
-            Pixels of each measurement.
-        unit, region : str
-            As the attributes.
+            Number of pixels of each measurement, 1 or more.
+        unit : {'electron', 'adu'}
+            Unit of the levels.
+        region : str
+            Name of the amplifier or region.
+
+        Returns
+        -------
+        curve : CovarianceCurve
+            The covariances, sorted by level.
+
+        Raises
+        ------
+        MeasurementError
+            Shapes do not match, or ``pixels`` is below 1.
         """
         c = np.asarray(covariances, float)
         if c.ndim != 3 or c.shape[1] != c.shape[2]:
@@ -154,7 +178,25 @@ class CovarianceCurve:
     def select(
         self, keep: ArrayLike | None = None, *, lags: int | None = None
     ) -> CovarianceCurve:
-        """Keep some pairs (mask or indices) and the lags up to ``lags``; all by default."""
+        """Return a curve of some pairs and lags.
+
+        Parameters
+        ----------
+        keep : array_like of bool or int, optional
+            Mask of the pairs, shape (n,), or their indices; by default all.
+        lags : int, optional
+            Largest lag to keep, by default that of the curve.
+
+        Returns
+        -------
+        curve : CovarianceCurve
+            A copy of the selected pairs.
+
+        Raises
+        ------
+        MeasurementError
+            The mask has another length, or ``lags`` is out of range.
+        """
         at = np.arange(len(self)) if keep is None else np.asarray(keep)
         if lags is not None and not 0 <= lags <= self.lags:
             raise MeasurementError(
@@ -172,7 +214,20 @@ class CovarianceCurve:
         )  # fmt: skip
 
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write as ECSV, a row for each pair, lags as [j, i] (beside, then renamed)."""
+        """Write the curve as ECSV, a row for each pair, lags as [j, i].
+
+        Parameters
+        ----------
+        path : path-like
+            File to write, under another name first and then renamed.
+        overwrite : bool
+            Replace an existing file.
+
+        Raises
+        ------
+        MeasurementError
+            The file exists and ``overwrite`` is False, or it cannot be written.
+        """
         text = "[j, i], i the lag in x, j in y"
         columns: dict[str, tuple[Any, str | None, str]] = {
             "level": (self.levels, self.unit, "mean level"),
@@ -185,7 +240,23 @@ class CovarianceCurve:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> CovarianceCurve:
-        """Read what :meth:`write` wrote; names the file and what is missing in it."""
+        """Read a file that :meth:`write` made.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+
+        Returns
+        -------
+        curve : CovarianceCurve
+            Equal to the one that was written.
+
+        Raises
+        ------
+        MeasurementError
+            The file is missing, damaged or of another kind, or lacks a column.
+        """
         names = ("level", "covariances", "errors", "pairs")
         columns, meta = read_ecsv(path, SCHEMA, names, ("unit", "region"))
         return cls(levels=columns.pop("level"), **columns, **meta)
@@ -194,24 +265,33 @@ class CovarianceCurve:
 def measure_curve(
     pairs: Iterable[Sequence[ArrayLike]] | NDArray[Any], **options: Any
 ) -> CovarianceCurve:
-    """Measure many pairs of flats of one region.
+    """Measure the covariances of many pairs of flats of one region.
 
     Parameters
     ----------
     pairs : iterable of (first, second)
-        Each as :func:`~bfsensor.measure.flat_pairs.flat_covariances` takes them; read one by
-        one, so a generator needs the memory of one pair.
+        Pairs of flats as :func:`~bfsensor.measure.flat_pairs.flat_covariances` takes them.
+        They are read one by one, so that a generator needs the memory of one pair.
     **options
-        Of :func:`~bfsensor.measure.flat_pairs.flat_covariances`.
+        Keyword arguments of :func:`~bfsensor.measure.flat_pairs.flat_covariances`.
 
     Returns
     -------
-    CovarianceCurve
+    curve : CovarianceCurve
+        Covariances of the pairs, sorted by level.
 
     Raises
     ------
     MeasurementError
-        No pair, or one that cannot be measured; names it by its place from 0.
+        There is no pair, or one cannot be measured; the message has its index from 0.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(8233)
+    >>> flats = (rng.poisson(mu, size=(2, 100, 100)) for mu in (1e4, 5e3))
+    >>> curve = measure_curve(flats, lags=1)
+    >>> curve.levels.round(-3).tolist(), curve.covariances.shape
+    ([5000.0, 10000.0], (2, 2, 2))
     """
     found = []
     for number, pair in enumerate(pairs):

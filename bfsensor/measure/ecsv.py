@@ -1,4 +1,4 @@
-"""ECSV in and out for the results of this room: units kept, equal after reading."""
+"""Writing and reading of measurements as ECSV, with units, equal bit for bit after reading."""
 
 from __future__ import annotations
 
@@ -37,25 +37,25 @@ def write_ecsv(
     *,
     overwrite: bool,
 ) -> None:
-    """Write columns (values, unit, description) and single values of the header.
+    """Write columns with units and descriptions, and single values in the header.
 
     Parameters
     ----------
     path : path-like
-        The file, written whole or not at all.
+        File to write, under another name first and then renamed.
     schema : str
-        What the file is.
+        Name of the kind of file, for :func:`read_ecsv`.
     columns : mapping of str to (array_like, str or None, str)
-        Rows along the first axis.
+        Values with rows along the first axis, unit and description of each column.
     meta : mapping
-        Single values and short arrays.
+        Single values and short arrays for the header.
     overwrite : bool
         Replace an existing file.
 
     Raises
     ------
     MeasurementError
-        The file exists and ``overwrite`` is not set, or it cannot be written.
+        The file exists and ``overwrite`` is False, or it cannot be written.
     """
     refuse_existing(path, overwrite, MeasurementError)
     table = Table(
@@ -66,7 +66,7 @@ def write_ecsv(
     )
     table.meta = {"schema": schema}
     for name, value in meta.items():
-        # YAML knows lists and plain numbers only.
+        # ECSV headers are YAML, which has lists and plain numbers but no arrays.
         table.meta[name] = np.asarray(value).tolist()
     with written_whole(path, MeasurementError) as beside:
         table.write(beside, format="ascii.ecsv", overwrite=True)
@@ -82,35 +82,38 @@ def read_ecsv(
     path : path-like
         The file.
     schema : str
-        What it must be.
+        Name of the kind of file that it must have.
     columns, meta : sequence of str
-        What it must hold; anything else in it is left alone.
+        Columns and header entries that it must have; others are ignored.
 
     Returns
     -------
     columns, meta : dict
-        Arrays, and values of the header.
+        Arrays of the columns, and values of the header.
 
     Raises
     ------
     MeasurementError
-        The file is missing, damaged, of another schema, or lacks something; names it.
+        The file is missing, damaged or of another schema, or lacks a column or an entry, which
+        the message names.
     """
     try:
         with warnings.catch_warnings():
-            # Of types that are none astropy only warns.
+            # astropy only warns of a column whose type does not exist.
             warnings.simplefilter("error", AstropyUserWarning)
             table = Table.read(path, format="ascii.ecsv")
-    # Damaged headers end in several kinds of exception inside astropy.
+    # astropy raises several classes of exception for damaged headers.
     except (
         OSError, ValueError, TypeError, KeyError, AttributeError, AstropyUserWarning
     ) as error:  # fmt: skip
         line = " ".join(str(error).split())[:200]
         raise MeasurementError(f"{path}: not readable as ECSV: {line}") from None
-    # Curves and fits of flats said 'kind' once.
+    # Older files of curves and fits have the schema under 'kind'.
     found = table.meta.get("schema", table.meta.get("kind"))
     if found != schema:
-        raise MeasurementError(f"{path}: its schema is {found!r}, not {schema!r}")
+        raise MeasurementError(
+            f"{path}: its schema is {found!r}, not {schema!r}: it is a file of another kind"
+        )
     for names, there in ((columns, table.colnames), (meta, table.meta)):
         lacking = [name for name in names if name not in there]
         if lacking:
@@ -128,14 +131,19 @@ def read_ecsv(
 def square_lags(
     path: str | os.PathLike[str], columns: Mapping[str, NDArray[Any]]
 ) -> dict[str, Any]:
-    """Bring columns with a row for each lag to the shape (lags + 1, lags + 1, ...), [j, i].
+    """Turn columns with a row for each lag into arrays (lags + 1, lags + 1, ...), [j, i].
 
     Parameters
     ----------
     path : path-like
-        The file, for the error.
+        Name of the file, for errors.
     columns : mapping of str to ndarray
-        With the lags as ``i`` and ``j``; rows in any order.
+        Columns, among them the lags ``i`` and ``j``; rows may be in any order.
+
+    Returns
+    -------
+    arrays : dict of str to ndarray
+        The columns other than ``i`` and ``j``.
 
     Raises
     ------
@@ -149,7 +157,9 @@ def square_lags(
         np.array_equal(columns["i"][order], i.ravel())
         and np.array_equal(columns["j"][order], j.ravel())
     ):
-        raise MeasurementError(f"{path}: its lags do not fill a square from (0, 0)")
+        raise MeasurementError(
+            f"{path}: its {len(order)} lags do not fill a square from (0, 0), one row each"
+        )
     return {
         name: values[order].reshape(side, side, *values.shape[1:])
         for name, values in columns.items()

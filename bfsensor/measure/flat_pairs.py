@@ -1,4 +1,4 @@
-"""Covariances of one pair of flats, without the biases of clipping and of local means."""
+"""Covariances of one pair of flats, corrected for the biases of clipping and of local means."""
 
 from __future__ import annotations
 
@@ -39,17 +39,18 @@ class FlatCovariances:
         ``covariances[j, i]``: C_ij of one flat [unit^2], lag i in x and j in y, the mean of
         the lags (i, j) and (i, -j).
     errors : ndarray, shape (lags + 1, lags + 1)
-        Bartlett's errors [unit^2]; :meth:`error_matrix` has what ties the lags together.
+        Standard errors after Bartlett [unit^2]; :meth:`error_matrix` gives the correlations
+        of the lags.
     pairs : ndarray of int, shape (lags + 1, lags + 1)
-        Pairs of pixels at the lag (i, j), without (i, -j).
+        Number of pairs of pixels at the lag (i, j), without those of (i, -j).
     level : float
-        Mean at which a linear covariance has this value [unit], see :func:`flat_covariances`.
+        Mean level to which the covariances belong [unit], see :func:`flat_covariances`.
     means : tuple of float
-        Mean of either flat [unit].
+        Mean of each flat [unit].
     pixels : int
-        Pixels used.
+        Number of pixels used.
     clipped : int
-        Pixels left out as outliers, the ring around them included.
+        Number of pixels left out as outliers, with the rings around them.
     unit : str
         'electron' or 'adu'.
     region : str
@@ -95,7 +96,7 @@ class FlatCovariances:
 
     @property
     def lags(self) -> int:
-        """Largest lag."""
+        """Largest lag in x and in y [pixel]."""
         return self.covariances.shape[0] - 1
 
     @property
@@ -104,22 +105,30 @@ class FlatCovariances:
         return np.asarray(self.covariances / self.covariances[0, 0])
 
     def error_matrix(self) -> FloatArray:
-        """Covariance matrix of the measured covariances, lags flattened as ``[j, i]``.
+        """Compute the covariance matrix of the measured covariances.
 
         Returns
         -------
         matrix : ndarray, shape ((lags + 1)**2, (lags + 1)**2)
-            [unit^4], after Bartlett (:func:`~bfsensor.measure.bartlett.bartlett_matrix`).
+            Matrix after Bartlett (:func:`~bfsensor.measure.bartlett.bartlett_matrix`)
+            [unit^4], with lags flattened as ``[j, i]``.
         """
         return bartlett_matrix(self.covariances, self.pairs)
 
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write as ECSV, a row for each lag (beside, then renamed).
+        """Write the covariances as ECSV, a row for each lag.
+
+        Parameters
+        ----------
+        path : path-like
+            File to write, under another name first and then renamed.
+        overwrite : bool
+            Replace an existing file.
 
         Raises
         ------
         MeasurementError
-            The file exists and ``overwrite`` is not set.
+            The file exists and ``overwrite`` is False, or it cannot be written.
         """
         j, i = np.indices(self.covariances.shape)
         columns = {
@@ -135,12 +144,22 @@ class FlatCovariances:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> FlatCovariances:
-        """Read what :meth:`write` wrote.
+        """Read a file that :meth:`write` made.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+
+        Returns
+        -------
+        found : FlatCovariances
+            Equal to the one that was written.
 
         Raises
         ------
         MeasurementError
-            Names the file and what is missing in it.
+            The file is missing, damaged or of another kind, or lacks a column.
         """
         columns, meta = read_ecsv(
             path, SCHEMA, ("i", "j", "covariance", "error", "pairs"),
@@ -164,52 +183,54 @@ def flat_covariances(
 ) -> FlatCovariances:
     r"""Measure the pixel covariances of a pair of flats.
 
-    Each flat is divided by its mean before they are subtracted, so a pattern both share
-    (illumination, response) drops out also if the lamp drifted between them:
+    Each flat is divided by its mean before they are subtracted, so that a pattern that both share
+    (illumination, pixel response) cancels also if the lamp drifted between them:
 
     .. math::
         d = w_1 F_1 - w_2 F_2, \quad w_k = 1 / m_k, \qquad
         C_{ij} = \langle d(x, y)\, d(x + i, y \pm j) \rangle / (w_1^2 + w_2^2).
 
-    Any covariance linear in the level is that at
-    :math:`\mu = (w_1^2 m_1 + w_2^2 m_2) / (w_1^2 + w_2^2)`, which is reported as the level.
+    A covariance that is linear in the level is measured at the level
+    :math:`\mu = (w_1^2 m_1 + w_2^2 m_2) / (w_1^2 + w_2^2)`, which is reported.
 
     Parameters
     ----------
     first, second : array_like, shape (ny, nx)
         Flats with bias subtracted [unit], axis 0 along y.
     mask : array_like of bool, shape (ny, nx), optional
-        True where a pixel is bad in either.  Pixels that are not finite, or hidden in a masked
-        array, are left out too.
+        True where a pixel is bad in either flat.  Pixels that are not finite, or hidden in a
+        masked array, are left out too.
     lags : int
-        Largest lag in x and y [pixel].
+        Largest lag in x and y [pixel], from 0 to below half the shorter side.
     clip : float
-        Outliers beyond this many sigma of the difference are left out; at least 3, or inf.
-        Sigma is the median absolute deviation, as a Gaussian's.  What this takes
-        from a Gaussian is put back: 1.5e-5 of the variance at 5, 2.7e-2 at 3.
+        Number of standard deviations of the difference beyond which a pixel is left out as an
+        outlier; at least 3, or inf for no clipping.  The standard deviation is that of a
+        Gaussian with the same median absolute deviation.  The part of a Gaussian that clipping
+        removes is corrected for: 1.5e-5 of the variance at 5, 2.7e-2 at 3.
     grow : int
-        Rings of pixels left out around an outlier: a particle's track is wider than what
-        sticks out of the noise.
+        Number of rings of pixels left out around an outlier, because a particle's track is
+        wider than the part of it above the noise.
     box : int, optional
-        Side of the boxes [pixel] whose mean is subtracted from the difference, against
-        changes of the lamp's shape; None for one box, the whole region.  The mean of n
-        pixels takes the n-th part of the sum of all covariances away, 2.4e-4 of the
-        variance at 64, which is put back.
+        Side of the boxes whose mean is subtracted from the difference [pixel], against changes
+        of the illumination's shape, more than ``2 * lags``; None for one box, the whole
+        region.  The mean of n pixels removes the n-th part of the sum of all covariances,
+        2.4e-4 of it at 64, which is corrected for.
     unit : {'electron', 'adu'}
         Unit of the flats.
     region : str
-        Name to carry along.
+        Name of the amplifier or region, for the result.
 
     Returns
     -------
-    FlatCovariances
+    found : FlatCovariances
+        Covariances with errors, level and numbers of pixels.
 
     Raises
     ------
     MeasurementError
-        The flats differ in shape, are not above zero in the mean, are too small for the
-        lags, are the same image, or differ by what is no Gaussian noise: more than 5 % of
-        the pixels beyond ``clip`` sigma.
+        The flats differ in shape, have a mean that is not above 0, are too small for the lags,
+        or are the same image; more than 5 % of the pixels differ by more than ``clip`` standard
+        deviations, which is not Gaussian noise; or an argument is out of range.
 
     Notes
     -----
@@ -236,16 +257,17 @@ def flat_covariances(
     for m in means:
         if not m > 0:
             raise MeasurementError(
-                f"a flat of mean {m:g} {unit} must be above 0: subtract the bias, not a flat"
+                f"a flat has the mean {m:g} {unit}, which must be above 0: subtract the bias level "
+                "only"
             )
     edges = box_edges(a.shape, box)
-    # Outliers pull the means by which they are found; a few rounds settle that.
+    # Outliers change the means and the scatter by which they are found: three rounds suffice.
     cut = np.inf
     for last in (False, False, False, True):
         difference = subtract_box_means(a / means[0] - b / means[1], good, edges)
         if last or not np.isfinite(clip):
             break
-        # Half of what is left of a Gaussian cut at so many sigma lies below the median.
+        # The median of |x| of a Gaussian that was cut at ``cut`` sigma in the round before.
         median = norm.ppf(0.5 + 0.25 * (2 * norm.cdf(cut) - 1))
         sigma = float(np.median(np.abs(difference[good]))) / median
         outliers = good & (np.abs(difference) > clip * sigma)
@@ -290,27 +312,28 @@ def measure_regions(
     mask: ArrayLike | None = None,
     **options: Any,
 ) -> dict[str, FlatCovariances]:
-    """Measure a pair of flats region by region, amplifiers for example.
+    """Measure the covariances of a pair of flats region by region, such as amplifiers.
 
     Parameters
     ----------
     first, second : array_like, shape (ny, nx)
         Flats, as :func:`flat_covariances` takes them.
     regions : mapping of str to (slice, slice)
-        Rows and columns of each.
-    mask : array_like of bool, optional
-        Bad pixels of the whole image.
+        Rows and columns of each region, by its name.
+    mask : array_like of bool, shape (ny, nx), optional
+        True where a pixel of the image is bad.
     **options
-        Of :func:`flat_covariances`.
+        Keyword arguments of :func:`flat_covariances`.
 
     Returns
     -------
     found : dict of str to FlatCovariances
+        Covariances by the region's name.
 
     Raises
     ------
     MeasurementError
-        A region that leaves the image, or that cannot be measured; names it.
+        A region leaves the image or cannot be measured; the message has its name.
 
     Examples
     --------
@@ -341,12 +364,12 @@ def measure_regions(
 
 
 def _check_outliers(outliers: int, pixels: int, clip: float) -> None:
-    """Refuse to clip what cannot be the tail of noise: it would set the variance."""
+    """Refuse to clip so many pixels that the clipping, not the noise, sets the variance."""
     if outliers > 0.05 * pixels:
         raise MeasurementError(
-            f"{100 * outliers / pixels:.0f} % of the pixels differ by more than {clip:g} sigma: "
-            "signals too coarsely quantised (below one step of noise), or structure that is "
-            "to be masked; clip=inf takes them as they are"
+            f"{100 * outliers / pixels:.0f} % of the pixels differ by more than {clip:g} sigma, "
+            "at most 5 % may: the flats are too coarsely quantised (noise below one step), or "
+            "have structure that must be masked; clip=inf clips nothing"
         )
 
 
@@ -354,7 +377,7 @@ def _checked(
     first: ArrayLike, second: ArrayLike, mask: ArrayLike | None,
     lags: int, clip: float, grow: int, box: int | None,
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:  # fmt: skip
-    """Check what was given; flats as floats, and the good pixels."""
+    """Check the arguments; flats as floats with bad pixels 0, and the good pixels."""
     a, b = to_floats(first, "first flat"), to_floats(second, "second flat")
     if a.ndim != 2 or a.shape != b.shape:
         raise MeasurementError(f"flats of shapes {a.shape} and {b.shape} are not a pair")
@@ -381,6 +404,6 @@ def _checked(
             )
         good &= ~bad
     if not good.any():
-        raise MeasurementError("the mask leaves no pixel")
+        raise MeasurementError("no pixel is finite in both flats and not masked")
     a[~good] = b[~good] = 0.0
     return a, b, good

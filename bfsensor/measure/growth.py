@@ -1,7 +1,7 @@
-"""Growth of spots that were drawn twice, with the brighter-fatter effect and without.
+"""Growth of spots that were simulated with the brighter-fatter effect and without it.
 
-Both images hold the same electrons: the ratio of their widths has a fraction of the error
-of either.  Errors come from leaving out one spot at a time.
+Both images hold the same electrons, so that the ratio of their widths has a fraction of the
+error of either width.  Errors are jackknife errors: one spot is left out at a time.
 """
 
 from __future__ import annotations
@@ -18,26 +18,31 @@ from bfsensor.measure.spots import Stamps
 from bfsensor.typing import FloatArray
 
 UNIT = 50_000.0
-"""Electrons in the peak for which slopes are given [e-]."""
+"""Electrons in the peak for which slopes are given [e-], as published by Lage et al. (2017)."""
 
 
 @dataclass(frozen=True)
 class Growth:
-    """How much wider spots are with the effect than without.
+    """Relative growth of spot widths by the effect, level by level, and its slope.
 
     Attributes
     ----------
     peak : ndarray, shape (levels,)
-        Signal in the peak without the effect [e-]: of the fitted model in a pixel at whose
-        middle the spot stands.
+        Signal in the peak without the effect [e-]: the fitted model in a pixel whose middle
+        is the spot's centre.
     sigma : ndarray, shape (levels, 2)
-        Widths in x and y without the effect [pixel].
+        Rms widths in x and y without the effect [pixel].
     growth, growth_error : ndarray, shape (levels, 2)
-        Of the widths in x and y [%].
+        Growth of the widths in x and y, and its standard error [%].
     slope, slope_error : ndarray, shape (2,)
-        Of the growth in x and y against the peak, through the origin [% per 50,000 e-].
+        Slope of the growth in x and y against the peak, through the origin, and its standard
+        error [% for 50,000 e-].
     spots : int
-        How many were measured.
+        Number of spots.
+
+    Examples
+    --------
+    :func:`measure_growth` makes one; its example shows the growth.
     """
 
     peak: FloatArray
@@ -57,24 +62,24 @@ def measure_growth(
     Parameters
     ----------
     on, off : array_like, shape (spots, levels, ny, nx)
-        Images of each spot with the effect and without [e-], a spot in the middle of each;
-        2 spots at least.
+        Images of each spot with the effect and without it [e-], with the spot in the middle;
+        2 spots at least, ny and nx odd.
     stamp : int
         Side of the postage stamp that is fitted [pixel], odd.
     weights : {'equal', 'noise'}
-        Of the pixels, see :func:`~bfsensor.measure.spot_fit.fit_spots`.
+        Weights of the pixels, see :func:`~bfsensor.measure.spot_fit.fit_spots`.
 
     Returns
     -------
-    Growth
-        Every level has the same weight per electron squared: the slope is the least squares
-        line through the origin with errors that do not depend on the level.
+    growth : Growth
+        Growth by level, and its slope: the least-squares line through the origin, in which all
+        levels have the same error.
 
     Raises
     ------
     MeasurementError
-        Shapes that do not fit, images without a pixel in the middle, fewer than two spots, or
-        a level that cannot be fitted; names it, from 0.
+        Shapes do not match, images have no pixel in the middle, there are fewer than two spots,
+        or a level cannot be fitted; the message has its index from 0.
 
     Examples
     --------
@@ -95,9 +100,13 @@ def measure_growth(
         )
     spots, _, ny, nx = on.shape
     if ny % 2 == 0 or nx % 2 == 0:
-        raise MeasurementError(f"images of {ny} x {nx} pixels have none in the middle")
+        raise MeasurementError(
+            f"images of {ny} x {nx} pixels have none in the middle: both sides must be odd"
+        )
     if spots < 2:
-        raise MeasurementError(f"{spots} spots: errors need 2 at least")
+        raise MeasurementError(
+            f"{spots} spots: errors from leaving one out need 2 at least"
+        )
     if stamp % 2 == 0 or not 3 <= stamp <= min(ny, nx):
         raise MeasurementError(
             f"stamp = {stamp} must be odd, from 3 to the side of the images, {min(ny, nx)}"
@@ -125,7 +134,7 @@ def measure_growth(
 
 
 def _measure(on: FloatArray, off: FloatArray, weights: str) -> tuple[FloatArray, ...]:
-    """Peak, width, growth by level, and slope of the growth."""
+    """Peaks, widths, growth by level, and slope of the growth."""
     peak, sigma, growth = [], [], []
     for level in range(on.shape[1]):
         try:

@@ -1,4 +1,4 @@
-"""What an electron does to the pixels around it, from flats with the effect and without."""
+"""Fit of the a-matrix to simulated flats with the brighter-fatter effect and without it."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def measure_response(on: ArrayLike, off: ArrayLike) -> FloatArray:
     Parameters
     ----------
     on, off : array_like, shape (steps, ny, nx)
-        Electrons collected up to the end of each step, as periodic images [e-]: ``off`` from
-        the same light with all pixels alike.
+        Electrons collected up to the end of each step, as periodic images [e-]; ``off`` from
+        the same light with equal pixels.
 
     Returns
     -------
@@ -34,7 +34,7 @@ def measure_response(on: ArrayLike, off: ArrayLike) -> FloatArray:
     Raises
     ------
     MeasurementError
-        Arrays that do not match, or are not finite.
+        The arrays do not match, or are not finite.
 
     Examples
     --------
@@ -55,11 +55,10 @@ def measure_response(on: ArrayLike, off: ArrayLike) -> FloatArray:
     images, plain = np.asarray(on, float), np.asarray(off, float)
     if images.shape != plain.shape or images.ndim != 3 or min(images.shape) < 1:
         raise MeasurementError(
-            f"flats of the shapes {images.shape} and {plain.shape}: two alike of (steps, ny, nx) "
-            "are needed"
+            f"flats of the shapes {images.shape} and {plain.shape} must both be (steps, ny, nx)"
         )
     if not (np.all(np.isfinite(images)) and np.all(np.isfinite(plain))):
-        raise MeasurementError("flats must be finite")
+        raise MeasurementError("flats hold values that are not finite")
     came = np.diff(plain, axis=0, prepend=0.0)
     moved = np.diff(images - plain, axis=0, prepend=0.0)
     held = np.concatenate([np.zeros_like(images[:1]), images[:-1]]) + 0.5 * came
@@ -71,9 +70,10 @@ def measure_response(on: ArrayLike, off: ArrayLike) -> FloatArray:
     for j, i in lags:
         shifts = sorted({(v % ny, u % nx) for v in (j, -j) for u in (i, -i)})
         total = sum(np.roll(held, shift, (1, 2)) for shift in shifts)
-        # A charge with mean 0 says nothing of the sum of all lags: it is 0.
+        # A charge with mean 0 does not constrain the sum of all lags, which is set to 0: each lag
+        # takes from (0, 0) what it gains.
         columns.append((step * (total - len(shifts) * held)).ravel())
-    # The lag (0, 0) is what closes the sum.
+    # The lag (0, 0) is not fitted: the sum rule gives it.
     design = np.column_stack(columns[1:])
     found = np.linalg.lstsq(design, moved.ravel(), rcond=None)[0]
     a = np.concatenate([[0.0], found]).reshape(ny // 2 + 1, nx // 2 + 1)

@@ -1,4 +1,4 @@
-"""Products of a difference image: local means off, pairs counted, biases put back."""
+"""Products of a difference image at all lags, and corrections for clipping and local means."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bfsensor.typing import FloatArray
 
 
 def box_edges(shape: tuple[int, ...], box: int | None) -> list[NDArray[np.int64]]:
-    """Edges of boxes of nearly equal size in y and x, the last included."""
+    """Edges of boxes of nearly equal size in y and in x, the last one included [pixel]."""
     counts = [1 if box is None else max(round(n / box), 1) for n in shape]
     return [
         np.round(np.linspace(0, n, c + 1)).astype(np.int64)
@@ -41,7 +41,7 @@ def sum_products(
     d: FloatArray, good: NDArray[np.bool_], lags: int
 ) -> tuple[FloatArray, NDArray[np.int64]]:
     """Sums of products and numbers of pairs, [sign of j, j, i]."""
-    # Padding keeps the far sides apart.
+    # Padding by the largest lag keeps opposite sides from wrapping into one another.
     shape = [next_fast_len(n + lags, real=True) for n in d.shape]
     out = []
     for image in (d, good.astype(float)):
@@ -53,7 +53,7 @@ def sum_products(
 
 
 def undo_clipping(raw: FloatArray, clip: float) -> FloatArray:
-    """Put back what clipping takes from a Gaussian.
+    """Correct covariances for the part that clipping removes from a Gaussian.
 
     Cut at k sigma its variance is t = 1 - 2 k phi(k) / (2 Phi(k) - 1) of the whole.  Two
     pixels correlated by rho have the density phi phi (1 + rho x y + ...) (Mehler), whose
@@ -71,13 +71,13 @@ def undo_clipping(raw: FloatArray, clip: float) -> FloatArray:
 def undo_box_means(
     raw: FloatArray, pixels: int, edges: list[NDArray[np.int64]]
 ) -> FloatArray:
-    """Put back what the subtraction of box means takes.
+    """Correct covariances for the part that the subtraction of box means removes.
 
-    Of a product d(p) d(q) at the lag L it takes the mean of C(p - r) over the box of q, the
-    mean of C(q - r) over the box of p, and gives the mean of C(r - s) over both: of order
-    S / n for n pixels a box, where S is the sum of all covariances.  That is a matrix on
-    the covariances, known from the boxes, and solved here; covariances beyond the largest
-    lag count as zero.  Bad pixels are taken as scattered at random.
+    From a product d(p) d(q) at the lag L the subtraction removes the mean of C(p - r) over the box
+    of q and the mean of C(q - r) over the box of p, and adds the mean of C(r - s) over both: of order
+    S / n for n pixels a box, where S is the sum of all covariances.  That is a matrix on the
+    covariances, known from the boxes, and solved here.  Covariances beyond the largest lag are
+    taken as 0, and bad pixels as scattered at random.
     """
     lags = raw.shape[0] - 1
     plane = np.arange(-lags, lags + 1)
@@ -99,7 +99,7 @@ def undo_box_means(
         uses.append(use)
         both.append(pair)
     taken = 2 * np.einsum("ab,cd->acbd", *uses) - np.einsum("ab,cd->acbd", *both)
-    # The pixels of the pair itself are good for certain, others as often as any.
+    # The two pixels of a pair are good for certain, others with the probability of any pixel.
     boxes = (len(edges[0]) - 1) * (len(edges[1]) - 1)
     share = np.full(taken.shape, 1 / full)
     share[:, :, lags, lags] = boxes / pixels

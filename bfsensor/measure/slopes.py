@@ -1,4 +1,4 @@
-r"""Brighter-fatter slopes: how the width of spots grows with their peak."""
+r"""Brighter-fatter slopes: relative growth of spot widths with the charge in their peak."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from bfsensor.measure.ecsv import read_ecsv, same_fields, write_ecsv
 from bfsensor.typing import FloatArray
 
 UNIT_PEAK = 50_000.0
-"""Slopes are per this many electrons in the peak, as published."""
+"""Electrons in the peak for which slopes are given [e-], as published by Lage et al. (2017)."""
 
 SCHEMA = "bfsensor.BFSlope 1"
 _UNITS = {"peak": "electron", "sigma": "pix", "error": "pix", "used": None}
@@ -29,28 +29,33 @@ class BFSlope:
     Parameters
     ----------
     slope, slope_error : float
-        s, in per cent of sigma_0 for 50,000 e- [%], with the error that the widths' own give.
+        Slope s, in per cent of sigma_0 for 50,000 e- [%], and its standard error from the errors
+        of the widths.
     range_error : float
-        By how much more than noise explains the slope differs over shorter ranges [%]:
-        the effect of the choice of the range.
+        Error of the slope by the choice of the range [%]: rms change of the slope over shorter
+        ranges, beyond the change that noise explains.
     sigma_0, sigma_0_error : float
-        Width without charge [pixel].
+        Width at a peak of 0 e- [pixel] and its standard error.
     rise, rise_error : float
-        Growth for 50,000 e-, in per cent of a pixel [%]: what Lage et al. (2017) print,
-        whose spots had 1 pixel before diffusion.
+        Growth for 50,000 e-, in per cent of a pixel [%], and its standard error.  Lage et al.
+        (2017) print this number; their spots had 1 pixel before diffusion.
     chi2 : float
-        Of the line within its range.
+        Chi-square of the line within its range.
     dof : int
-        Points within the range less 2.
+        Number of points within the range less 2.
     curvature : float
-        What a parabola would improve, in standard deviations; positive if it opens upwards;
-        nan with fewer than four points.
+        Coefficient of a parabola in place of the line over its standard error; positive if it
+        opens upwards; nan with fewer than four points.
     low, high : float
         Peaks of the first and last point in the range [e-].
     peak, sigma, error : ndarray, shape (n,)
-        All points, by rising peak [e-, pixel, pixel].
+        Peaks [e-], widths and errors of the widths [pixel] of all points, by rising peak.
     used : ndarray of bool, shape (n,)
-        Which are in the range.
+        True for points in the range.
+
+    Examples
+    --------
+    :func:`bf_slopes` makes one; its example shows slope and range.
     """
 
     slope: float
@@ -72,7 +77,7 @@ class BFSlope:
 
     @property
     def total_error(self) -> float:
-        """Both errors of the slope together [%]."""
+        """Standard error of the slope with that of the range, added in quadrature [%]."""
         return float(np.hypot(self.slope_error, self.range_error))
 
     def __eq__(self, other: object) -> bool:
@@ -81,7 +86,20 @@ class BFSlope:
     __hash__ = None  # type: ignore[assignment]
 
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write as ECSV, one row a point; raises MeasurementError if that cannot be."""
+        """Write the slope as ECSV, a row for each point, the slope in the header.
+
+        Parameters
+        ----------
+        path : path-like
+            File to write, under another name first and then renamed.
+        overwrite : bool
+            Replace an existing file.
+
+        Raises
+        ------
+        MeasurementError
+            The file exists and ``overwrite`` is False, or it cannot be written.
+        """
         columns = {name: (getattr(self, name), unit, "") for name, unit in _UNITS.items()}
         single = {
             one.name: getattr(self, one.name)
@@ -92,14 +110,30 @@ class BFSlope:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> BFSlope:
-        """Read what :meth:`write` wrote; raises MeasurementError for anything else."""
+        """Read a file that :meth:`write` made.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+
+        Returns
+        -------
+        slope : BFSlope
+            Equal to the one that was written.
+
+        Raises
+        ------
+        MeasurementError
+            The file is missing, damaged or of another kind, or lacks a column.
+        """
         header = [one.name for one in fields(cls) if one.name not in _UNITS]
         columns, single = read_ecsv(path, SCHEMA, tuple(_UNITS), header)
         return cls(**single, **columns)
 
 
 class _SlopeLine(NamedTuple):
-    """A line about zero peak: height, growth per electron, their covariance, the fit."""
+    """A fitted line: width at a peak of 0, growth per electron, covariance matrix, fit quality."""
 
     height: float
     growth: float
@@ -118,58 +152,58 @@ def bf_slopes(
     fewest: int = 5,
     probability: float = 0.01,
 ) -> BFSlope:
-    r"""Fit the B-F slope of spot widths along one axis, over the linear range that it finds.
+    r"""Fit the B-F slope of spot widths along one axis, over a linear range that is searched.
 
-    Low peaks can be spoilt by what is left of offsets and noise, high ones by saturation.
-    The range is the run of neighbouring points, at least ``fewest``, that covers most
-    electrons while (1) the chi2 of a line is not above what noise exceeds with the given
-    probability, (2) a parabola is not better than the line by more than noise makes it with
-    the same probability.  The second finds a gentle bend that chi2 does not.  Where the range
-    ends before the ladder does, one point more is left out: a bend begins before it shows (in
-    mocks that halves its pull on the slope, to a tenth of the error).
+    Low peaks can be biased by residual offsets and noise, high ones by saturation.  The range is
+    the run of neighbouring points, at least ``fewest``, that spans most electrons while two tests
+    pass: (1) chi-square of a line is below the value that noise exceeds with the given
+    probability; (2) a parabola is better than the line by no more than noise makes it with the
+    same probability.  The second finds a gentle curvature that chi-square does not.  Where the
+    range ends before the points do, one point more is left out, because curvature begins before a
+    test finds it (in mocks this halves its bias of the slope, to a tenth of the error).
 
     Parameters
     ----------
     peak : array_like, shape (n,)
-        Signal in the peak [e-], as :attr:`SpotFit.peak`: of the fitted model, without
-        background, in a pixel at whose middle the spot stands.
+        Signal in the peak [e-], as :attr:`SpotFit.peak`: the fitted model, without background,
+        in a pixel whose middle is the spot's centre.
     sigma : array_like, shape (n,)
-        Widths along one axis [pixel].
+        Rms widths along one axis [pixel].
     error : array_like, shape (n,) or (n, n)
-        Their errors [pixel], or their covariance matrix [pixel^2]: levels that share their
-        electrons, as in a simulation that builds spots up, are correlated.
+        Standard errors of the widths [pixel], or their covariance matrix [pixel^2]: levels that
+        share electrons, as in a simulation that adds charge step by step, are correlated.
     peak_error : array_like, shape (n,) or ()
-        Errors of the peaks [e-], independent.
+        Standard errors of the peaks [e-], independent of one another.
     limits : tuple of float, optional
-        Lowest and highest peak to use [e-]; the range is then given, not found.
+        Lowest and highest peak to use [e-]; the range is then given and not searched.
     fewest : int
-        Least number of points of a range, 4 or more.
+        Smallest number of points of a range, 4 or more.
     probability : float
-        With which noise alone fails each of the two tests, 0 to 1.  Larger ones see gentler
-        bends, and take more bad luck for a bend: at 0.05 one of 200 linear ladders of ten
-        points has no range at all.
+        Probability that noise alone fails one of the two tests, between 0 and 1.  A larger one
+        finds gentler curvatures, and mistakes noise for curvature more often: at 0.05 one of 200
+        linear series of ten points has no range at all.
 
     Returns
     -------
-    BFSlope
-        The slope with both errors, chi2 and range.
+    found : BFSlope
+        The slope with both errors, chi-square and range.
 
     Raises
     ------
     MeasurementError
-        Too few points, values outside their ranges, or no linear range.
+        There are too few points, values are out of range, or no range is linear.
 
     Notes
     -----
-    A bend below the tests' sight biases the slope, upwards if the widths take off.
-    ``range_error`` tells: over all runs that lack up to a third of the points of
-    the range, it is the root of the mean square of the slope's change less the part that
-    noise alone explains, 0 if negative.
+    A curvature too small for the tests biases the slope, upwards if the widths rise faster at
+    high peaks.  ``range_error`` estimates that: it is the root of the mean, over all runs that
+    lack up to a third of the range's points, of the squared change of the slope less the part
+    that noise explains, and 0 if that is negative.
 
-    Per cent are of sigma_0, not of a pixel; the published simulation divides neither by
-    sigma_0 nor fits with weights (``rise`` is its unit).  On the abscissa the mean signal
-    of the central pixel of spots strewn at random would be 8 % lower at a width of one
-    pixel, and the slope 8 % larger.
+    The slope is in per cent of sigma_0, not of a pixel.  The published simulation does not divide
+    by sigma_0 and fits without weights; ``rise`` is in its unit.  If the abscissa were the mean
+    signal of the central pixel of spots at random positions, it would be 8 % lower at a width of
+    one pixel, and the slope 8 % larger.
 
     References
     ----------
@@ -189,7 +223,8 @@ def bf_slopes(
     if not 0 < probability < 1:
         raise MeasurementError(f"probability = {probability} must be between 0 and 1")
     if np.any(dq > 0):
-        # Twice: the first growth is good to the little that the peaks' errors matter.
+        # An error of a peak acts through the growth, which the fit itself gives: the second
+        # round corrects the first.
         for _ in range(2):
             line = _fit_line(q, s, covariance)
             whole = covariance + np.diag((line.growth * dq) ** 2)
@@ -201,16 +236,17 @@ def bf_slopes(
         if inside.size < fewest:
             raise MeasurementError(
                 f"{inside.size} points from {limits[0]:g} to {limits[1]:g} e- are fewer "
-                f"than {fewest}"
+                f"than fewest = {fewest}"
             )
         first, last = int(inside[0]), int(inside[-1]) + 1
     line = _fit_line(*_part(q, s, covariance, first, last))
     if not line.height > 0:
         raise MeasurementError(
-            f"the line gives a width of {line.height:g} pixel at no peak"
+            f"the line gives a width of {line.height:g} pixel at a peak of 0 e-, which must be "
+            "above 0: give limits, or leave bad points out"
         )
     scale = 100 * UNIT_PEAK
-    # Of growth / height, to first order.
+    # Derivatives of growth / height by height and growth.
     by = np.array([-line.growth / line.height**2, 1 / line.height])
     used = np.zeros(len(q), bool)
     used[first:last] = True
@@ -239,7 +275,7 @@ def bf_slopes(
 def _points(
     peak: ArrayLike, sigma: ArrayLike, error: ArrayLike, peak_error: ArrayLike
 ) -> tuple[FloatArray, ...]:
-    """Points by rising peak, with the covariance of the widths and the peaks' errors."""
+    """Points by rising peak, with the covariance matrix of the widths and the peaks' errors."""
     q, s, e = (np.array(a, float) for a in (peak, sigma, error))
     if q.ndim != 1 or s.shape != q.shape or e.shape not in (q.shape, (q.size, q.size)):
         raise MeasurementError(
@@ -265,7 +301,9 @@ def _points(
             raise MeasurementError(f"errors of the widths must be above 0, not {e.min():g}")
         return q, s, np.diag(e[order] ** 2), dq
     if not np.allclose(e, e.T, rtol=1e-6, atol=0) or np.linalg.eigvalsh(e)[0] <= 0:
-        raise MeasurementError("a covariance matrix must be symmetric and positive")
+        raise MeasurementError(
+            "error, a covariance matrix, must be symmetric with eigenvalues above 0"
+        )
     return q, s, e[np.ix_(order, order)], dq
 
 
@@ -280,7 +318,7 @@ def _part(
 
 
 def _fit_line(q: FloatArray, s: FloatArray, covariance: FloatArray) -> _SlopeLine:
-    """Least squares with the covariance matrix; the parabola beside it."""
+    """Least-squares line with the covariance matrix, and the curvature of a parabola."""
     unit = UNIT_PEAK
     factor = cho_factor(covariance, lower=True)
     powers = np.vander(q / unit, 3, increasing=True)
@@ -291,7 +329,7 @@ def _fit_line(q: FloatArray, s: FloatArray, covariance: FloatArray) -> _SlopeLin
     weighted = cho_solve(factor, rest)
     curvature = float("nan")
     if len(q) >= 4:
-        # The square with what the line takes of it removed.
+        # The part of the square that no line can describe.
         bent = powers[:, 2] - line @ (errors @ (line.T @ cho_solve(factor, powers[:, 2])))
         size = float(bent @ cho_solve(factor, bent))
         curvature = float(bent @ weighted) / np.sqrt(size)
@@ -315,7 +353,7 @@ def _find_range(
     """First and one past the last point of the widest range that passes both tests."""
     n = len(q)
     if n < fewest:
-        raise MeasurementError(f"{n} points are fewer than {fewest}: no slope")
+        raise MeasurementError(f"{n} points are fewer than fewest = {fewest}")
     runs = [(i, j) for i in range(n) for j in range(i + fewest, n + 1)]
     runs.sort(key=lambda run: q[run[0]] - q[run[1] - 1])
     bend = float(chi2_distribution.isf(probability, 1))
@@ -323,7 +361,7 @@ def _find_range(
         line = _fit_line(*_part(q, s, covariance, first, last))
         highest = float(chi2_distribution.isf(probability, last - first - 2))
         if line.chi2 <= highest and line.curvature**2 <= bend:
-            # A bend begins before it shows: next to it one point more is left out.
+            # Curvature begins before a test finds it: one point more is left out beside it.
             if last < n and last - first > fewest:
                 last -= 1
             if first > 0 and last - first > fewest:
@@ -351,7 +389,8 @@ def _range_effect(
         for j in range(i + least, last + 1):
             if (i, j) != (first, last):
                 part = _fit_line(*_part(q, s, covariance, i, j))
-                # Of a part, the change has the difference of the variances.
+                # The estimate from a part less that from the whole has, for an efficient whole,
+                # the difference of the two variances.
                 noise = part.covariance[1, 1] - whole.covariance[1, 1]
                 excess.append((part.growth - whole.growth) ** 2 - noise)
     return float(np.sqrt(max(np.mean(excess), 0.0))) if excess else 0.0

@@ -1,8 +1,8 @@
-r"""The forward model of a region's spots: one shape, and each spot's own flux and centre.
+r"""Fit of a region's spots by a forward model: one shape, and each spot's own flux and centre.
 
 The normal equations are those of :mod:`bfsensor.measure.spot_normal`, solved in
-:mod:`bfsensor.measure.spot_solve`; here spots that do not belong are dropped, and errors and
-the bias of noise are found.
+:mod:`bfsensor.measure.spot_solve`.  This module drops outlying spots, and computes errors and the
+bias that noise causes.
 """
 
 from __future__ import annotations
@@ -19,8 +19,18 @@ from bfsensor.measure.spots import Stamps
 from bfsensor.typing import FloatArray
 
 _ROUNDS = 10
-# Of chi2 per pixel: a thousandth of the noise, which the tolerances of centres leave as well.
+"""Largest number of rounds of fitting and dropping spots.
+
+Chosen: beyond it the fit is refused as not converged.  With twice as many, a set of outliers that
+still changes in the tenth round would get ten more.
+"""
+
 _LEAST_MISFIT = 1e-6
+"""Smallest excess of chi-square per pixel for which a spot is dropped.
+
+Derived: residuals of a thousandth of the noise give (1e-3)^2; the tolerances of centres and
+rounding leave as much in spots without noise.
+"""
 
 
 def fit_spots(
@@ -40,59 +50,58 @@ def fit_spots(
         m_n(\mathrm{pixel}) = f_n \int_\mathrm{pixel}
             \mathcal N(\mathbf r - \mathbf r_n; \sigma_x, \sigma_y, \rho)\, d^2 r + b_n
 
-    is compared with every pixel, whose variance is the model's own signal plus the read
-    noise squared.  The widths are those before the pixels integrate.
+    is fitted to every pixel, whose variance is the model's own signal plus the read noise
+    squared.  The widths are those before the integration over pixels.
 
     Parameters
     ----------
     stamps : Stamps
-        Spots of a region in which the shape may be called one; at least one.
+        Spots of a region in which all have the same shape; at least one.
     read_noise : float
-        Rms of each pixel beside its Poisson noise [e-]; not used where the stamps bring
-        variances.
+        Rms noise of each pixel besides its Poisson noise [e-], 0 or more; not used where the
+        stamps have variances.
     weights : {'noise', 'equal'}
-        Of the pixels.  'noise', the inverse variance, has the smallest errors for Gaussian
-        spots.  Of any other profile it gives a width that moves with the peak, for the
-        wings count for more as they rise above the background: a slope without any effect.
-        'equal', as published, gives the same width at every peak, with errors larger by a
-        half: **take it for B-F slopes** unless chi2 says that the spots are Gaussian.
+        Weights of the pixels.  'noise', the inverse variance, has the smallest errors for
+        Gaussian spots.  For any other profile it gives a width that changes with the peak,
+        because the wings gain weight as they rise above the background: a slope without any
+        effect.  'equal', as published, gives the same width at every peak, with errors larger by
+        a half: **choose it for B-F slopes** unless chi-square shows that the spots are Gaussian.
     background : float, optional
-        Signal below the spots [e-], the same for all; by default one free number for
-        each spot, which costs little in stamps of 4 sigma and follows gradients.
+        Signal below the spots [e-], the same for all; by default a free parameter of each spot,
+        which costs little in stamps of 4 sigma and follows gradients.
     correlation : float or None
-        Of x and y in the spots, -0.8 to 0.8; 0, axes along the pixels, for the fields of
-        a CCD do not tilt a spot.  None: free.
+        Correlation of x and y in the spots, -0.8 to 0.8.  The default 0 has the axes along the
+        pixels, because the fields of a CCD do not tilt a spot.  None fits it.
     largest_offset : float
-        A spot with its centre further from the middle of its central pixel, in x or in y,
-        is dropped [pixel].
+        Largest distance of a spot's centre from the middle of its central pixel in x or in y
+        [pixel]; beyond it the spot is dropped.
     limit : float
-        A spot is dropped if its residuals, or its own widths, differ from those of the
-        region's other spots by more than this many standard deviations (the larger of
-        what noise gives and of 1.48 median deviations).
+        Largest deviation of a spot's residuals, or of its own widths, from those of the
+        region's other spots [standard deviations]; beyond it the spot is dropped.  The standard
+        deviation is the larger of that of noise and of 1.48 median deviations.
     correct_bias : bool
-        Noise in the centres makes spots look narrower, by :math:`\sigma / 2f` without
-        background.  That is small, but the same for all spots, while the error falls with
-        their number; the term is computed to first order (Box 1971) and taken out.
+        Add the mean amount by which noise in the centres makes spots look narrower,
+        :math:`\sigma / 2f` without background, to first order (Box 1971).  It is small but the
+        same for all spots, while the error falls with their number.
 
     Returns
     -------
-    SpotFit
+    fit : SpotFit
         Shape with errors, and every spot with its status.
 
     Raises
     ------
     MeasurementError
-        An argument outside its range, or fewer than half of the spots are left.
+        An argument is out of range, or fewer than half of the spots are left.
     ConvergenceError
-        The shape did not settle.
+        The shape, or the set of used spots, did not settle.
 
     Notes
     -----
-    Weights by noise follow the model, not the data: that is the maximum of the likelihood for
-    Poisson noise alone, and nearly so with read noise.  The boundaries that the brighter-fatter
-    effect moves also lower the variance near the peak and correlate neighbours; that is not
-    counted (in flats it is about 5 % of the variance at 50,000 e-).  The errors by scatter
-    between spots hold in any case.
+    The variances of the weights are the model's, not the data's: this maximises the likelihood
+    for Poisson noise alone, and nearly so with read noise.  The brighter-fatter effect also lowers
+    the variance near the peak and correlates neighbours, which is neglected here (in flats it is
+    about 5 % of the variance at 50,000 e-).  The errors by scatter between spots hold in any case.
 
     References
     ----------
@@ -125,12 +134,12 @@ def fit_spots(
     shape = approach(problem, spots, shape, ~never, largest_offset)
     used, wild = ~never, np.zeros(len(stamps), bool)
     seen: list[NDArray[np.bool_]] = []
-    # Why each spot was dropped last; a spot may come back if a worse one made it look bad,
-    # but not once sets begin to take turns.
+    # ``last`` holds the reason for which each spot was dropped last.  A spot may be used again if
+    # a worse one made it look bad; once a set of used spots occurs again, ``closed`` ends that.
     last = np.full(len(stamps), "masked", dtype="<U8")
     closed = False
     for count in range(_ROUNDS):
-        # First beside the shape that most spots ask for, then beside the fitted one.
+        # Spots are judged against the median shape first, then against the fitted one.
         if count:
             shape, wild = solve(problem, spots, shape, used, largest_offset)
         normal = problem.linearise(
@@ -149,7 +158,8 @@ def fit_spots(
         _check_enough(used, never)
     else:
         raise ConvergenceError(
-            f"which of {len(stamps)} spots to use did not settle in {_ROUNDS} rounds",
+            f"the choice of outliers among {len(stamps)} spots did not settle in {_ROUNDS} "
+            "rounds; raise limit, or leave doubtful spots out",
             [int(np.sum(one)) for one in seen],
         )
     return _finish(problem, spots, shape, normal, status, correct_bias)
@@ -184,7 +194,7 @@ def _check_enough(used: NDArray[np.bool_], never: NDArray[np.bool_]) -> None:
 
 
 def _masked(problem: SpotProblem) -> NDArray[np.bool_]:
-    """Spots with a bad pixel about the centre or with hardly more pixels than parameters."""
+    """Mask of spots with a bad pixel in the central 3 x 3, or with few pixels for a fit."""
     good = problem.stamps.good
     j, i = problem.ny // 2, problem.nx // 2
     core = good[:, j - 1 : j + 2, i - 1 : i + 2].all(axis=(1, 2))
@@ -202,16 +212,16 @@ def _judge(
     largest_offset: float,
     limit: float,
 ) -> NDArray[np.str_]:
-    """Status of every spot beside the shape that the used ones have."""
+    """Status of every spot by its deviation from the shape of the used ones."""
     dof = np.maximum(problem.good.sum(axis=1) - problem.own, 1)
     reduced = normal.chi2 / dof
     typical = float(np.median(reduced[used]))
     deviation = 1.4826 * float(np.median(np.abs(reduced[used] - typical)))
     noise = typical * np.sqrt(2 / dof)
     uneven = np.abs(reduced - typical) > limit * np.maximum(deviation, noise)
-    # A good fit is no fault, and what rounding leaves of noiseless spots is a good fit.
+    # A chi-square that is too small is no reason to drop a spot, nor are rounding errors.
     uneven &= reduced > typical + _LEAST_MISFIT
-    # What the widths would be if this spot alone decided.
+    # The step of the widths that each spot alone would take, over its standard error.
     inverse = invert(normal.rest)
     alone = np.einsum("nij,nj->ni", inverse, normal.score)
     variance = np.einsum("nij,njk,nki->ni", inverse, normal.score_variance, inverse)
@@ -248,7 +258,7 @@ def _finish(
     n, shared = int(np.sum(used)), problem.shared
     inverse = np.linalg.inv(normal.rest[used].sum(axis=0))
     score = normal.score[used]
-    # Scores sum to zero over the spots: n - 1 are independent.
+    # At the minimum the scores of the spots add up to 0: n - 1 are independent.
     spread = score.T @ score * (n / (n - 1)) if n > 1 else np.full((shared, shared), np.nan)
     covariances = []
     for scores in (normal.score_variance[used].sum(axis=0), spread):
@@ -293,12 +303,12 @@ def _bias(
     normal: Normal,
     used: NDArray[np.bool_],
 ) -> FloatArray:
-    """What to add to the widths for the curvature of the model in the noisy centres.
+    """Correction of the widths for the curvature of the model in the noisy centres.
 
-    The covariance of a spot's own parameters times the second derivatives of its model is
-    a mean residual; half of it, fitted, is the bias with its sign turned.  Unless weights
-    are the inverse variances, the derivatives at the noisy centres also correlate with
-    what is left of the noise; that mean score is a bias as it stands.
+    The covariance of a spot's own parameters times the second derivatives of its model is a
+    mean residual.  A fit to half of it is the bias with the opposite sign, hence the correction.
+    Unless the weights are inverse variances, the derivatives at the noisy centres are also
+    correlated with the residual noise, whose mean score is a bias and is subtracted.
     """
     slopes = problem.derivatives(spots, shape)
     by_xx, by_yy, by_xy = curvatures(slopes, shape)
@@ -323,7 +333,7 @@ def _noisy_derivatives(
     normal: Normal,
     slopes: FloatArray,
 ) -> FloatArray:
-    """Mean score of each spot from derivatives that its noise has changed, (n, own + shared)."""
+    """Mean score of each spot by derivatives that vary with its noise, shape (n, own + shared)."""
     model = spots.flux[:, None] * slopes[0] + spots.background[:, None]
     jacobian = problem.jacobian(spots.flux, slopes)
     own = slice(0, problem.own)
@@ -333,7 +343,7 @@ def _noisy_derivatives(
     left = with_noise - normal.own_covariance @ jacobian[:, own]
     left *= problem.good[:, None]
     by_flux = problem.jacobian(np.ones(len(model)), slopes)
-    # The flux itself and the background enter as they are.
+    # The model is linear in flux and background: their derivatives do not depend on the flux.
     by_flux[:, [0, *range(3, problem.own)]] = 0.0
     scores = np.einsum("nkp,np->nk", by_flux, left[:, 0])
     step = 1e-4

@@ -1,6 +1,6 @@
-r"""Adaptive elliptical moments of single spots: sizes that assume no profile.
+r"""Adaptive elliptical moments of single spots, which assume no profile.
 
-The weight is the Gaussian that has the spot's own moments,
+The weight is the Gaussian with the spot's own moments,
 :math:`w = e^{-\frac12 \mathbf d^T M^{-1} \mathbf d}`, :math:`\mathbf d = \mathbf r - \mathbf r_0`,
 found where
 
@@ -8,7 +8,7 @@ found where
     \sum w I\, \mathbf d = 0, \qquad
     \sum w I\, (\mathbf d \mathbf d^T - \tfrac12 M) = 0 .
 
-For a Gaussian M is its covariance matrix.
+For a Gaussian spot M is its covariance matrix.
 """
 
 from __future__ import annotations
@@ -26,8 +26,13 @@ from bfsensor.measure.spots import Stamps
 from bfsensor.typing import FloatArray
 
 SCHEMA = "bfsensor.SpotMoments 1"
+"""Name of the kind of file that :meth:`SpotMoments.write` makes."""
+
 PIXEL_VARIANCE = 1 / 12
-"""Variance of a pixel's own width [pixel^2], in the moments of anything it has integrated."""
+"""Variance of a uniform distribution over a pixel [pixel^2], exact.
+
+Integration over pixels adds it to the second moments of a spot.
+"""
 
 _UNITS = {
     "x": "pix",
@@ -49,7 +54,7 @@ _UNITS = {
 
 
 class MeanWidths(NamedTuple):
-    """Rms widths of a region's spots [pixel], pixel taken out, and their errors by noise."""
+    """Rms widths of a region's spots without the pixel's own, and their standard errors [pixel]."""
 
     sigma_x: float
     sigma_y: float
@@ -59,26 +64,31 @@ class MeanWidths(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SpotMoments:
-    """Moments of spots, one by one; arrays of shape (n,).
+    """Moments of single spots, as arrays of shape (n,).
 
     Parameters
     ----------
     x, y : ndarray of int
-        Central pixels of the stamps.
+        Column and row of the stamps' central pixels.
     centre_x, centre_y : ndarray
         Centroid from the middle of the central pixel [pixel].
     xx, xy, yy : ndarray
-        Elements of M [pixel^2], as the pixels show them: an integrated Gaussian has about
-        1/12 more than its own variance in xx and yy.
+        Elements of M [pixel^2], with the pixel's own width: those of an integrated Gaussian
+        exceed its variance by about 1/12 in xx and yy.
     flux : ndarray
-        Twice the weighted sum, the flux of a Gaussian [e-].
+        Twice the weighted sum, which is the flux of a Gaussian [e-].
     centre_x_error, centre_y_error, xx_error, xy_error, yy_error, flux_error : ndarray
-        From the noise of the pixels, to first order.  Second order is not taken out: of 300
-        spots with 500 e- in the peak the mean width is a quarter of its error too small.
+        Standard errors by the noise of the pixels, to first order.  The second order is not
+        corrected: for 300 spots with 500 e- in the peak the mean width is too small by a quarter
+        of its error.
     status : ndarray of str
         ``used``, ``masked`` (a bad pixel in the stamp), ``diverged`` (no solution, or one wider
         than a quarter of the stamp) or ``faint`` (flux below 5 times its error); moments are
-        nan unless used.
+        nan unless the status is ``used``.
+
+    Examples
+    --------
+    :func:`measure_moments` makes one; its example shows mean widths.
     """
 
     x: NDArray[np.int64]
@@ -99,20 +109,25 @@ class SpotMoments:
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """Which spots have moments."""
+        """Mask of the spots that have moments, shape (n,)."""
         return np.asarray(self.status == "used")
 
     def mean_widths(self) -> MeanWidths:
-        r"""Mean widths of the region's spots, weighted by flux.
+        r"""Compute mean widths of the region's spots, weighted by flux.
 
-        :math:`\sigma_x^2 = \langle M_{xx} \rangle - 1/12`.  Weights by the moments' own
-        errors would favour spots that noise made small.  The pixel's box is no Gaussian: a
-        width of 1 pixel comes out as 1.0010, of 2 pixels as 2.0001.
+        :math:`\sigma_x^2 = \langle M_{xx} \rangle - 1/12`.  Weights by the moments' own errors
+        would favour spots that noise made small.  The pixel's box is not a Gaussian: for a true
+        width of 1 pixel the result is 1.0010, for 2 pixels 2.0001.
+
+        Returns
+        -------
+        widths : MeanWidths
+            Rms widths in x and y, and their standard errors [pixel].
 
         Raises
         ------
         MeasurementError
-            No spot is used, or they are narrower than a pixel's own width.
+            No spot is used, or the spots are narrower than a pixel's own width.
         """
         weight = self.flux[self.used]
         if weight.size == 0:
@@ -124,7 +139,8 @@ class SpotMoments:
             mean = float(weight @ m)
             if not mean > PIXEL_VARIANCE:
                 raise MeasurementError(
-                    f"a mean moment of {mean:.3g} pixel^2 is less than a pixel's own, 1/12"
+                    f"a mean moment of {mean:.3g} pixel^2 is less than a pixel's own, 1/12: the "
+                    "spots are too narrow for moments; use fit_spots"
                 )
             sigma = float(np.sqrt(mean - PIXEL_VARIANCE))
             noise = float(np.sqrt(weight**2 @ e**2)) / (2 * sigma)
@@ -138,13 +154,42 @@ class SpotMoments:
     __hash__ = None  # type: ignore[assignment]
 
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write as ECSV, one row a spot; raises MeasurementError if that cannot be."""
+        """Write the moments as ECSV, a row for each spot.
+
+        Parameters
+        ----------
+        path : path-like
+            File to write, under another name first and then renamed.
+        overwrite : bool
+            Replace an existing file.
+
+        Raises
+        ------
+        MeasurementError
+            The file exists and ``overwrite`` is False, or it cannot be written.
+        """
         columns = {name: (getattr(self, name), unit, "") for name, unit in _UNITS.items()}
         write_ecsv(path, SCHEMA, columns, {}, overwrite=overwrite)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> SpotMoments:
-        """Read what :meth:`write` wrote; raises MeasurementError for anything else."""
+        """Read a file that :meth:`write` made.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+
+        Returns
+        -------
+        moments : SpotMoments
+            Equal to the one that was written.
+
+        Raises
+        ------
+        MeasurementError
+            The file is missing, damaged or of another kind, or lacks a column.
+        """
         return cls(**read_ecsv(path, SCHEMA, tuple(_UNITS), ())[0])
 
 
@@ -159,23 +204,23 @@ def measure_moments(
     Parameters
     ----------
     stamps : Stamps
-        Spots; those with a bad pixel get no moments.
+        Stamps of the spots; those with a bad pixel get no moments.
     background : float or array_like, shape (n,)
-        Signal below each spot [e-], taken off; its own error is not counted.  A background
-        of 0.1 % of the peak, left in, makes a spot 0.4 % wider.
+        Signal below each spot [e-], which is subtracted; its own error is neglected.  A
+        background of 0.1 % of the peak that is not subtracted makes a spot 0.4 % wider.
     read_noise : float
-        Rms of each pixel beside its Poisson noise [e-]; not used where the stamps bring
-        variances.
+        Rms noise of each pixel besides its Poisson noise [e-], 0 or more; not used where the
+        stamps have variances.
 
     Returns
     -------
-    SpotMoments
-        In the order of the stamps.
+    moments : SpotMoments
+        Moments in the order of the stamps.
 
     Raises
     ------
     MeasurementError
-        A background of another length or not finite, a read noise below 0.
+        The background has another length or is not finite, or the read noise is below 0.
 
     References
     ----------
@@ -201,7 +246,7 @@ def measure_moments(
     data = stamps.electrons.reshape(n, -1)
     light = data - np.broadcast_to(below, (n,))[:, None]
     if stamps.variance is None:
-        # Errors are sums over pixels with fixed weights: the data serve as variance.
+        # The weights do not depend on the variances: the data may serve as estimates of them.
         variance = np.maximum(data, 0.0) + read_noise**2
     else:
         variance = stamps.variance.reshape(n, -1)
@@ -232,9 +277,10 @@ def _equations(
     y: FloatArray,
     theta: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What must vanish, (n, 5); how each pixel enters it, (n, 6, pixels); its Jacobian.
+    """Equations of the moments: their sums, each pixel's coefficients, and the Jacobian.
 
-    The sixth is the weighted sum itself.  ``theta`` (n, 5): centre, xx, xy, yy.
+    The sums (n, 6) are the five that must vanish and the weighted sum of the light; coefficients
+    are (n, 6, pixels).  ``theta`` (n, 5) is centre, xx, xy and yy.
     """
     cx, cy, xx, xy, yy = theta.T[:, :, None]
     dx, dy = x - cx, y - cy
@@ -248,7 +294,7 @@ def _equations(
     sums = np.einsum("nkp,np->nk", enter, light)
     log_weight = np.stack([ux, uy, ux * ux / 2, ux * uy, uy * uy / 2], axis=1)
     slopes = (enter * light[:, None]) @ log_weight.transpose(0, 2, 1)
-    # Explicit places of the parameters, beside those in the weight.
+    # Derivatives by the parameters outside the weight.
     total = sums[:, 5]
     slopes[:, 0, 0] -= total
     slopes[:, 1, 1] -= total
@@ -264,10 +310,10 @@ def _equations(
 def _solve(
     light: FloatArray, x: FloatArray, y: FloatArray, size: int
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Centres and moments, (n, 5), and which of them settled.
+    """Centres and moments, (n, 5), and the mask of spots whose iteration converged.
 
-    The weighted moments, doubled, are a safe iteration that halves the error of a Gaussian
-    each time; Newton's steps end it.
+    Twice the weighted moments are a stable iteration, which halves the error for a Gaussian in
+    each step; after twelve steps Newton's method takes over.
     """
     n = len(light)
     theta = np.zeros((n, 5))
@@ -290,7 +336,7 @@ def _solve(
 
 
 def _newton(sums: FloatArray, slopes: FloatArray, otherwise: FloatArray) -> FloatArray:
-    """Newton's step, bounded, where the equations can be solved."""
+    """Newton's step, at most 0.5 in each parameter; ``otherwise`` where the Jacobian is singular."""
     fine = np.all(np.isfinite(slopes), axis=(1, 2)) & (np.linalg.cond(slopes) < 1e12)
     step = otherwise.copy()
     step[fine] = np.linalg.solve(slopes[fine], -sums[fine][:, :, None])[:, :, 0]
@@ -298,7 +344,7 @@ def _newton(sums: FloatArray, slopes: FloatArray, otherwise: FloatArray) -> Floa
 
 
 def _sane(theta: FloatArray, size: int) -> NDArray[np.bool_]:
-    """Centre inside the stamp, an ellipse that is one and has room there."""
+    """Mask of solutions with the centre in the stamp and an ellipse that fits into it."""
     cx, cy, xx, xy, yy = theta.T
     half = size / 2
     return np.asarray(
@@ -319,8 +365,7 @@ def _with_errors(
 ) -> tuple[FloatArray, FloatArray]:
     """Centre, moments and flux, (6, n), and their errors."""
     sums, enter, slopes = _equations(light, x, y, theta)
-    # The flux follows the weighted sum and the area of the weight's ellipse does not
-    # enter it: half of a Gaussian's light is in the sum, whatever its size.
+    # With the weight of its own moments half of a Gaussian's light is in the sum, for any size.
     flux = 2 * sums[:, 5]
     moved = -np.linalg.pinv(slopes[:, :5]) @ enter[:, :5]
     by_flux = 2 * (enter[:, 5:] + slopes[:, 5:] @ moved)

@@ -1,8 +1,9 @@
-r"""The normal equations of a region's spots: an arrow.
+r"""Normal equations of a region's spots, with each spot's own parameters eliminated.
 
-The shape's few parameters meet those of every spot, the spots' own never meet each other.
-Each spot's own parameters are eliminated from its own block, which leaves a system of two or
-three equations for the shape, at a cost that grows with the number of spots and no faster.
+The matrix has the form of an arrow: the shape's few parameters are coupled to those of every
+spot, parameters of different spots are not coupled.  Each spot's own parameters are eliminated
+from its own block, which leaves a system of two or three equations for the shape, at a cost in
+proportion to the number of spots.
 """
 
 from __future__ import annotations
@@ -16,12 +17,16 @@ from bfsensor.measure.spots import Stamps
 from bfsensor.typing import FloatArray
 
 LEAST_VARIANCE = 1.0
-"""Least variance of a pixel [e-^2].  Without it, where noise is left out, the far wings with
-their hundredths of an electron would decide on chi2."""
+"""Smallest variance of a pixel in the weights [e-^2].
+
+Chosen: without a limit and without read noise, wings with hundredths of an electron would dominate
+chi-square.  At twice the value pixels between 1 and 2 e- of signal also count less; with a read
+noise above 1.5 e- neither value acts.
+"""
 
 
 class Spots(NamedTuple):
-    """Each spot's own parameters, changed in place: shape (n,)."""
+    """Each spot's own parameters, arrays of shape (n,) that the solver changes in place."""
 
     flux: FloatArray
     x: FloatArray
@@ -32,13 +37,14 @@ class Spots(NamedTuple):
 class Normal(NamedTuple):
     """Normal equations of n spots with ``own`` parameters each and ``shared`` ones.
 
-    ``own_inverse`` (n, own, own) and ``cross`` (n, own, shared) are blocks; ``rest``
-    (n, shared, shared) and ``score`` (n, shared) what each spot leaves of the shape's
-    block and right side once its own parameters are eliminated; ``own_score`` (n, own).
-    ``weighted`` (n, own + shared, pixels): derivatives times weights.  ``own_covariance``
-    of each spot's own parameters at the fitted shape and ``score_variance`` of its score, from
-    the noise of its pixels; where weights are the inverse variances they are ``own_inverse`` and
-    ``rest``.  ``chi2`` (n,) of each spot, by its noise.
+    ``own_inverse`` (n, own, own) is the inverse of each spot's own block, ``cross`` (n, own,
+    shared) the block that couples it to the shape.  ``rest`` (n, shared, shared) and ``score``
+    (n, shared) are each spot's parts of the shape's block and right side after its own parameters
+    are eliminated; ``own_score`` (n, own) is the right side of its own parameters.  ``weighted``
+    (n, own + shared, pixels) are derivatives times weights.  ``own_covariance`` is the covariance
+    matrix of each spot's own parameters at the fitted shape, and ``score_variance`` that of its
+    score, from the noise of its pixels; where weights are the inverse variances they equal
+    ``own_inverse`` and ``rest``.  ``chi2`` (n,) is each spot's chi-square by its noise.
     """
 
     own_inverse: FloatArray
@@ -53,7 +59,7 @@ class Normal(NamedTuple):
 
 
 class SpotProblem:
-    """Stamps, their noise and weights, and what is free."""
+    """Stamps with their noise and weights, and the choice of free parameters."""
 
     def __init__(
         self,
@@ -77,7 +83,7 @@ class SpotProblem:
         self.shared = 3 if free_tilt else 2
 
     def derivatives(self, spots: Spots, shape: Shape) -> FloatArray:
-        """Fractions of the flux in each pixel and their gradients, (6, n, pixels)."""
+        """Fractions of the flux in each pixel and their derivatives, shape (6, n, pixels)."""
         slopes = gradients(spots.x, spots.y, shape, self.ny, self.nx)
         return slopes.reshape(6, len(self.data), -1)
 
@@ -85,12 +91,12 @@ class SpotProblem:
         """Variance of each pixel [e-^2]."""
         if self.known is not None:
             return self.known
-        # Of the model, not of the data: low pixels must not count for more.
+        # The model's signal, not the data's: pixels that fluctuated low would count for more.
         return np.maximum(np.maximum(model, 0.0) + self.read_noise**2, LEAST_VARIANCE)
 
     def jacobian(self, flux: FloatArray, slopes: FloatArray) -> FloatArray:
         """Derivatives of the model by each spot's own and the shared parameters."""
-        # A spot without flux would leave its centre without an equation.
+        # Without flux the derivatives by the centre vanish and the block is singular: 1 e- at least.
         flux = np.maximum(flux, 1.0)[:, None]
         rows = [slopes[0], flux * slopes[1], flux * slopes[2]]
         if self.own == 4:
@@ -101,7 +107,11 @@ class SpotProblem:
     def linearise(
         self, spots: Spots, slopes: FloatArray, *, with_noise: bool = False
     ) -> Normal:
-        """Normal equations at the present parameters; noise is right only if asked for."""
+        """Normal equations at the present parameters.
+
+        With equal weights ``own_covariance``, ``score_variance`` and ``chi2`` are correct only
+        if ``with_noise`` is set.
+        """
         model = spots.flux[:, None] * slopes[0] + spots.background[:, None]
         variance = self.variance(model)
         by_noise = self.good / variance
@@ -125,8 +135,8 @@ class SpotProblem:
                 [-eliminate, np.broadcast_to(np.eye(self.shared), rest.shape)], axis=2
             )
             score_variance = turn @ noise @ turn.transpose(0, 2, 1)
-            # Equal weights leave each spot's own parameters where chi2 is not least, and its
-            # excess has a long tail.  What the best ones would take off is known.
+            # With equal weights the spots' own parameters do not minimise chi-square, and its
+            # excess has a long tail.  The drop to its minimum, to first order, is subtracted.
             closer = jacobian[:, :own] * by_noise[:, None]
             gain = np.einsum("nap,np->na", closer, residual)
             best = invert(closer @ jacobian[:, :own].transpose(0, 2, 1))
@@ -148,6 +158,7 @@ def invert(blocks: FloatArray) -> FloatArray:
     """Inverses of small positive matrices, scaled to a unit diagonal before."""
     size = np.sqrt(np.maximum(np.einsum("naa->na", blocks), 1e-300))
     scaled = blocks / (size[:, :, None] * size[:, None, :])
-    # Far below what noise leaves; it keeps a spot without pixels from stopping all others.
+    # Far below the effect of noise; without it a spot without good pixels would make the whole
+    # inversion fail.
     scaled += 1e-12 * np.eye(blocks.shape[1])
     return np.asarray(np.linalg.inv(scaled) / (size[:, :, None] * size[:, None, :]))

@@ -1,4 +1,4 @@
-"""What the forward model of a region's spots gives, in memory and as ECSV."""
+"""Result of the forward model of a region's spots: widths, fluxes and centres, kept as ECSV."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ REASONS: Mapping[str, str] = {
     "width": "own widths far from those of the region's other spots",
     "diverged": "centre did not settle",
 }
-"""Why a spot was dropped, in the order in which the reasons are asked."""
+"""Reasons for which a spot is dropped; the first that holds is its status."""
 
 SCHEMA = "bfsensor.SpotFit 1"
 _UNITS = {
@@ -52,39 +52,43 @@ class SpotFit:
     sigma_x, sigma_y : float
         Rms widths of the Gaussian before its integration over pixels [pixel].
     correlation : float
-        Of x and y in the spot; 0 for axes along the pixels.
+        Correlation of x and y in the spot; 0 for axes along the pixels.
     covariance : ndarray, shape (3, 3)
-        Of (sigma_x, sigma_y, correlation), from the noise of the pixels if the spots are
-        Gaussian; 0 where the correlation was fixed.
+        Covariance matrix of (sigma_x, sigma_y, correlation) from the noise of the pixels,
+        valid for Gaussian spots; 0 for a correlation that was fixed.
     scatter_covariance : ndarray, shape (3, 3)
-        The same from the spots' scatter about the common shape: it holds for spots that
-        are not Gaussian and for wrong variances; good to :math:`1/\sqrt{2 n}` of itself, nan
-        with one spot.
+        The same matrix from the spots' scatter about the common shape, valid also for spots that
+        are not Gaussian and for wrong variances; its relative error is
+        :math:`1/\sqrt{2 n}`, nan with one spot.
     bias_x, bias_y : float
-        What the noise of the centres takes from the widths on average, already added to
-        ``sigma_x`` and ``sigma_y`` [pixel]; 0 if that was not wanted.
+        Mean amount by which noise of the centres lowers the widths [pixel], already added to
+        ``sigma_x`` and ``sigma_y``; 0 if ``correct_bias`` was False.
     chi2 : float
-        Of the used spots by the variances of their pixels, whatever the weights, each spot's
-        own parameters at their best.
+        Chi-square of the used spots by the variances of their pixels, for any weights, at the
+        minimum over each spot's own parameters.
     dof : int
-        Used pixels less free parameters.
+        Number of used pixels less free parameters.
     read_noise : float
-        As assumed [e-]; nan where variances were given.
+        Read noise that the fit assumed [e-]; nan where variances were given.
     weights : str
-        Of the pixels, ``noise`` or ``equal``.
+        Weights of the pixels, ``noise`` or ``equal``.
     x, y : ndarray of int, shape (n,)
-        Central pixels of the stamps.
+        Column and row of the stamps' central pixels.
     centre_x, centre_y, centre_x_error, centre_y_error : ndarray, shape (n,)
-        From the middle of the central pixel [pixel].
+        Centres from the middle of the central pixel and their standard errors [pixel].
     flux, flux_error, background, background_error : ndarray, shape (n,)
-        All electrons of the Gaussian [e-]; background per pixel [e-], error 0 where fixed.
-        Errors of single spots are those at the fitted shape.
+        Electrons of the whole Gaussian [e-] and background per pixel [e-], with standard errors
+        at the fitted shape; the error of a fixed background is 0.
     spot_chi2 : ndarray, shape (n,)
-        Of each spot.
+        Chi-square of each spot.
     spot_dof : ndarray of int, shape (n,)
-        Used pixels less the spot's own free parameters.
+        Number of used pixels less the spot's own free parameters.
     status : ndarray of str, shape (n,)
-        ``used``, or why the spot was dropped: a key of `REASONS`.
+        ``used``, or the reason for which the spot was dropped, a key of `REASONS`.
+
+    Examples
+    --------
+    :func:`fit_spots` makes one; its example shows widths and their error.
     """
 
     sigma_x: float
@@ -114,17 +118,17 @@ class SpotFit:
 
     @property
     def sigma_x_error(self) -> float:
-        """Error of sigma_x [pixel] from the noise of the pixels."""
+        """Standard error of sigma_x from the noise of the pixels [pixel]."""
         return float(np.sqrt(self.covariance[0, 0]))
 
     @property
     def sigma_y_error(self) -> float:
-        """Error of sigma_y [pixel] from the noise of the pixels."""
+        """Standard error of sigma_y from the noise of the pixels [pixel]."""
         return float(np.sqrt(self.covariance[1, 1]))
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """Which spots the shape is fitted to."""
+        """Mask of the spots to which the shape is fitted, shape (n,)."""
         return np.asarray(self.status == "used")
 
     @property
@@ -134,7 +138,7 @@ class SpotFit:
 
     @property
     def shape(self) -> Shape:
-        """The common shape."""
+        """Common shape of the spots: widths [pixel] and correlation."""
         return Shape(self.sigma_x, self.sigma_y, self.correlation)
 
     @property
@@ -148,17 +152,17 @@ class SpotFit:
 
     @cached_property
     def peaks(self) -> FloatArray:
-        """Signal of each spot's model in a pixel at whose middle the spot stands [e-].
+        """Signal of each spot's model in a pixel whose middle is the spot's centre [e-].
 
-        Without background, shape (n,).  It does not depend on where in the pixel the spot
-        fell, and is the abscissa of the slopes that Lage et al. (2017) simulate: their
-        amplitude integrated over the central pixel of a centred spot.
+        The shape is (n,), and the background is not included.  The signal does not depend on the
+        spot's position in its pixel.  It is the abscissa of the slopes that Lage et al. (2017)
+        simulate: their amplitude integrated over the central pixel of a centred spot.
         """
         return self.flux * float(integrate_gaussian([0.0], [0.0], self.shape, 1)[0, 0, 0])
 
     @property
     def peak(self) -> float:
-        """Mean of `peaks` of the used spots [e-]: the abscissa of B-F slopes."""
+        """Mean of `peaks` of the used spots [e-], the abscissa of B-F slopes."""
         return float(np.mean(self.peaks[self.used]))
 
     def __eq__(self, other: object) -> bool:
@@ -167,12 +171,19 @@ class SpotFit:
     __hash__ = None  # type: ignore[assignment]
 
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write as ECSV: one row a spot, what they share in the header.
+        """Write the fit as ECSV, a row for each spot, the common shape in the header.
+
+        Parameters
+        ----------
+        path : path-like
+            File to write, under another name first and then renamed.
+        overwrite : bool
+            Replace an existing file.
 
         Raises
         ------
         MeasurementError
-            The file exists and ``overwrite`` is not set, or it cannot be written.
+            The file exists and ``overwrite`` is False, or it cannot be written.
         """
         columns = {name: (getattr(self, name), unit, "") for name, unit in _UNITS.items()}
         shared = {
@@ -184,12 +195,22 @@ class SpotFit:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> SpotFit:
-        """Read what :meth:`write` wrote.
+        """Read a file that :meth:`write` made.
+
+        Parameters
+        ----------
+        path : path-like
+            The file.
+
+        Returns
+        -------
+        fit : SpotFit
+            Equal to the one that was written.
 
         Raises
         ------
         MeasurementError
-            The file is missing, damaged or of another schema; names it.
+            The file is missing, damaged or of another kind, or lacks a column.
         """
         header = [one.name for one in fields(cls) if one.name not in _UNITS]
         columns, shared = read_ecsv(path, SCHEMA, tuple(_UNITS), header)
@@ -198,4 +219,4 @@ class SpotFit:
                 shared[name] = np.array(shared[name], float).reshape(3, 3)
             return cls(**shared, **columns)
         except (TypeError, ValueError) as error:
-            raise MeasurementError(f"{path}: damaged: {error}") from None
+            raise MeasurementError(f"{path}: its header is damaged: {error}") from None

@@ -1,4 +1,4 @@
-"""Ways to the shape of a region's spots: a rough start, a robust approach, the last steps."""
+"""Solver for the shape of a region's spots: start values, median steps, Gauss-Newton steps."""
 
 from __future__ import annotations
 
@@ -12,16 +12,32 @@ from bfsensor.measure.spots import Stamps
 from bfsensor.typing import FloatArray
 
 _LARGEST_STEPS = 60
-# Where steps end: a thousandth of the smallest errors in use.
-_WIDTH_TOLERANCE, _CENTRE_TOLERANCE = 1e-8, 1e-6  # [pixel]
-# The approach need not be better than the limits of what is dropped afterwards.
+"""Largest number of Gauss-Newton steps; beyond it the fit is refused as not converged.
+
+Chosen: with twice as many, widths that converge slowly get twice the time; widths that converge
+sooner are the same.
+"""
+
+_WIDTH_TOLERANCE, _CENTRE_TOLERANCE = 1e-8, 1e-6
+"""Steps of the widths and of the centres below which the iteration ends [pixel].
+
+Chosen: a thousandth of the smallest errors in use.  At twice the values the iteration may end a
+step earlier, at widths that differ by less than these tolerances.
+"""
+
 _APPROACH_STEPS, _APPROACH_TOLERANCE = 25, 1e-4
+"""Largest number of median steps, and the step of the widths below which they end [pixel].
+
+Chosen: outliers are judged against this shape by limits of several standard deviations, for which
+1e-4 pixel is enough; the shape is fitted again afterwards.  At twice the tolerance the Gauss-Newton
+steps start from a rougher shape.
+"""
 
 
 def start(
     stamps: Stamps, background: float | None, correlation: float
 ) -> tuple[Spots, Shape]:
-    """Rough fluxes, centres and widths, none of which a few bad pixels can carry off."""
+    """Start values of fluxes, centres and widths, robust against a few bad pixels."""
     data, good = stamps.electrons, stamps.good
     n, ny, nx = data.shape
     rim = np.ones((ny, nx), bool)
@@ -36,7 +52,8 @@ def start(
     j, i = ny // 2, nx // 2
     core = light[:, j - 1 : j + 2, i - 1 : i + 2]
     inner = np.maximum(core.sum(axis=(1, 2)), 1.0)
-    # Three pixels hold part of the light: their centroid falls short of the centre.
+    # The central 3 x 3 pixels hold part of the light, whose centroid is too close to the middle:
+    # a factor of 1.6 corrects that for spots of about 1 pixel rms, as a start value.
     x = np.clip(1.6 * (core[:, :, 2] - core[:, :, 0]).sum(axis=1) / inner, -0.5, 0.5)
     y = np.clip(1.6 * (core[:, 2] - core[:, 0]).sum(axis=1) / inner, -0.5, 0.5)
     typical = np.median(light / inner[:, None, None], axis=0)
@@ -45,7 +62,7 @@ def start(
     for axis, size, centre in ((0, nx, x), (1, ny, y)):
         place = np.arange(size) - size // 2
         spread = float(typical.sum(axis=axis) @ place**2) / total - np.mean(centre**2)
-        # The pixel itself has the variance 1/12.
+        # Integration over the pixel has added the variance 1/12.
         widths.append(float(np.sqrt(np.clip(spread - 1 / 12, 0.2, (size / 4) ** 2))))
     flux = np.maximum(light.sum(axis=(1, 2)), inner)
     return Spots(flux, x, y, below), Shape(widths[0], widths[1], correlation)
@@ -58,10 +75,10 @@ def approach(
     used: NDArray[np.bool_],
     largest_offset: float,
 ) -> Shape:
-    """Find the shape that the median of the spots asks for, each by its own step.
+    """Find a robust shape by steps that are the median of each spot's own step.
 
-    A spot with a hundred times the light of the others in one pixel decides a common fit, and
-    makes the good ones look bad; the median does not know it.
+    A spot with a hundred times the light of the others in one pixel would dominate a common fit
+    and make the good spots look bad; it does not affect the median.
     """
     for _ in range(_APPROACH_STEPS):
         normal = problem.linearise(spots, problem.derivatives(spots, shape))
@@ -85,10 +102,11 @@ def solve(
     used: NDArray[np.bool_],
     largest_offset: float,
 ) -> tuple[Shape, NDArray[np.bool_]]:
-    """Gauss-Newton steps until the used spots rest; the others follow the shape.
+    """Fit the shape by Gauss-Newton steps until the centres of the used spots converge.
 
-    Weights follow the model, so the sum of squares is not what falls; steps are bounded
-    instead.  Returns also which spots did not settle.
+    Weights follow the model, so that the sum of squares need not fall from step to step and cannot
+    control the step size: steps are bounded instead.  The other spots follow the shape.  The
+    second return value is the mask of the spots whose centre did not converge.
     """
     history = []
     for _ in range(_LARGEST_STEPS):
@@ -103,8 +121,9 @@ def solve(
             return shape, unsettled
         if not (0.15 < shape.sigma_x < problem.nx and 0.15 < shape.sigma_y < problem.ny):
             raise ConvergenceError(
-                f"the widths ran to {shape.sigma_x:.3g} x {shape.sigma_y:.3g} pixel in "
-                f"stamps of {problem.nx} x {problem.ny}",
+                f"the widths went to {shape.sigma_x:.3g} x {shape.sigma_y:.3g} pixel in "
+                f"stamps of {problem.nx} x {problem.ny}: are there spots in the stamps, and is "
+                "the stamp 8 sigma wide?",
                 history,
             )
     if not np.any(unsettled & used):
@@ -124,7 +143,7 @@ def _move(
     step: FloatArray,
     largest_offset: float,
 ) -> tuple[Shape, FloatArray]:
-    """Change shape and spots by a step of the shape; how far each centre moved."""
+    """Apply a step to the shape and to the spots; gives also the move of each centre [pixel]."""
     largest = 0.2 * min(shape.sigma_x, shape.sigma_y)
     step = np.clip(step, -largest, largest)
     own = np.einsum(
@@ -139,7 +158,7 @@ def _move(
         spots.background[...] += own[:, 3]
     correlation = shape.correlation
     if problem.shared == 3:
-        # The edge of what is allowed; no spot on a CCD is there.
+        # Kept below LARGEST_CORRELATION; spots on a CCD have far smaller ones.
         correlation = float(np.clip(correlation + step[2], -0.75, 0.75))
     moved = np.maximum(np.abs(spots.x - before[0]), np.abs(spots.y - before[1]))
     return Shape(shape.sigma_x + step[0], shape.sigma_y + step[1], correlation), moved

@@ -1,8 +1,8 @@
-"""Spots on an image: found, and cut out as postage stamps.
+"""Search for spots on an image, and postage stamps of them.
 
-The road: :func:`find_spots` gives the pixels, :func:`cut_stamps` the stamps,
-:func:`bfsensor.measure.spot_fit.fit_spots` the sizes,
-:func:`bfsensor.measure.slopes.bf_slopes` the brighter-fatter slope of a ladder of them.
+:func:`find_spots` gives the brightest pixels, :func:`cut_stamps` the stamps,
+:func:`bfsensor.measure.spot_fit.fit_spots` the sizes, and
+:func:`bfsensor.measure.slopes.bf_slopes` the brighter-fatter slope of sizes at several fluxes.
 """
 
 from __future__ import annotations
@@ -21,20 +21,27 @@ from bfsensor.measure.arrays import to_floats
 from bfsensor.typing import FloatArray
 
 STAMP = 9
-"""Pixels of a stamp a side, as in Lage et al. (2017), section 2.1: 4 sigma of their spots."""
+"""Side of a stamp [pixel], as in Lage et al. (2017), section 2.1: 4 sigma of their spots."""
 
 
 @dataclass(frozen=True, eq=False)
 class SpotList:
-    """Pixels with spots, and how many candidates were rejected and why.
+    """Brightest pixels of spots, and the numbers of rejected candidates by reason.
 
     Parameters
     ----------
-    x, y : ndarray of int
-        Column and row of the brightest pixel.
+    x, y : ndarray of int, shape (n,)
+        Column and row of the brightest pixel of each spot, from 0.
     rejected : mapping of str to int
-        Candidates by the first reason that holds: ``border`` (the stamp does not fit),
-        ``neighbour`` (a brighter one is too near), ``saturated``, ``masked``.
+        Numbers of rejected candidates by the first reason that holds, in this order:
+        ``neighbour`` (a brighter one is too near), ``border`` (the stamp leaves the image),
+        ``saturated``, ``masked``.
+
+    Examples
+    --------
+    >>> spots = SpotList(np.array([20, 31]), np.array([10, 12]), {"border": 1})
+    >>> len(spots), spots.rejected["border"]
+    (2, 1)
     """
 
     x: NDArray[np.int64]
@@ -58,18 +65,18 @@ class Stamps:
     Parameters
     ----------
     electrons : ndarray, shape (n, ny, nx)
-        Signals [e-], both sides odd.
+        Signals [e-]; ny and nx odd, 3 or more.
     good : ndarray of bool, shape (n, ny, nx), optional
-        Pixels to be used; all where left out.  Values that are not finite never are.
+        True for pixels to use, by default all.  Values that are not finite are never used.
     variance : ndarray, shape (n, ny, nx), optional
-        Known variance of each pixel [e-^2]; otherwise it follows from the model.
+        Known variance of each pixel [e-^2], above 0; by default a fit takes that of its model.
     x, y : ndarray of int, shape (n,), optional
-        Column and row of the central pixels on the image; 0 where left out.
+        Column and row of the central pixels on the image, by default 0.
 
     Raises
     ------
     MeasurementError
-        Arrays that do not fit together, even sides, variances that are not above 0.
+        Shapes do not match, sides are even, or a variance is not above 0.
 
     Examples
     --------
@@ -88,7 +95,8 @@ class Stamps:
         electrons = to_floats(self.electrons, "stamps")
         if electrons.ndim != 3 or len(electrons) == 0:
             raise MeasurementError(
-                f"stamps of shape {electrons.shape} must be (spots, rows, columns)"
+                f"stamps of shape {electrons.shape} must be (spots, rows, columns), with one spot "
+                "at least"
             )
         ny, nx = electrons.shape[1:]
         if ny % 2 == 0 or nx % 2 == 0 or min(ny, nx) < 3:
@@ -100,7 +108,7 @@ class Stamps:
             variance = _fitting("variance", np.array(self.variance, float), electrons.shape)
             if not np.all(variance[good] > 0):
                 raise MeasurementError("variance of used pixels must be above 0 e-^2")
-            # Any number serves where the pixel is not used.
+            # Unused pixels need a finite variance above 0, whose value does not matter.
             object.__setattr__(self, "variance", np.where(good, variance, 1.0))
         object.__setattr__(self, "electrons", np.where(good, electrons, 0.0))
         object.__setattr__(self, "good", good)
@@ -114,7 +122,18 @@ class Stamps:
         return len(self.electrons)
 
     def select(self, which: NDArray[Any]) -> Stamps:
-        """Give some of the stamps, by a mask or by indices."""
+        """Return some of the stamps.
+
+        Parameters
+        ----------
+        which : ndarray of bool or int
+            Mask of the stamps, shape (n,), or their indices.
+
+        Returns
+        -------
+        stamps : Stamps
+            The selected stamps.
+        """
         variance = None if self.variance is None else self.variance[which]
         return Stamps(
             self.electrons[which], self.good[which], variance, self.x[which], self.y[which]
@@ -122,7 +141,7 @@ class Stamps:
 
 
 def _fitting(name: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Give the array if it has the shape that the others ask for."""
+    """Return an array after a check of its shape."""
     if array.shape != shape:
         raise MeasurementError(f"{name} has the shape {array.shape}, not {shape}")
     return array
@@ -139,38 +158,38 @@ def find_spots(
 ) -> SpotList:
     """Find the brightest pixels of spots.
 
-    A candidate is a pixel above the threshold that no other of the eight around it exceeds
-    (of equal ones the first in reading order).  It gives only the pixel; the centre is
-    for the fit to find.
+    A candidate is a pixel above the threshold that none of the eight around it exceeds (of equal
+    ones the first in reading order).  Only the pixel is found; :func:`fit_spots` finds the centre.
 
     Parameters
     ----------
     image : array_like, shape (ny, nx)
         Signals [e-].
     threshold : float
-        Least signal of the brightest pixel, background included [e-].
+        Signal that the brightest pixel must exceed, background included [e-].
     separation : int
-        Of two candidates less than this apart in x and in y [pixel] the fainter is
-        rejected; by default stamps of kept spots do not contain one another's centres.
-        The brighter one stays: the fit decides whether it is disturbed.
+        Smallest distance of two spots [pixel], 2 or more: of two candidates that are closer
+        both in x and in y the fainter is rejected.  By default stamps of kept spots do not
+        contain one another's centres.  The brighter one stays, and the fit decides whether
+        it is disturbed.
     saturation : float
-        A spot with a pixel of its stamp at this signal or above is rejected [e-].
+        Signal [e-] at or above which a pixel of the stamp makes a spot rejected.
     mask : array_like of bool, shape (ny, nx), optional
-        Bad pixels, True; so are values that are not finite, or hidden in a masked array.  A
-        spot with a bad pixel in the 3 x 3 about its centre is rejected; elsewhere the fit
-        does without them.
+        True where a pixel is bad; pixels that are not finite, or hidden in a masked array, are
+        bad too.  A spot with a bad pixel in the 3 x 3 around its brightest pixel is rejected;
+        elsewhere the fit leaves bad pixels out.
     stamp : int
-        Pixels of the stamps a side; spots whose stamp leaves the image are rejected.
+        Side of the stamps [pixel], odd; spots whose stamp leaves the image are rejected.
 
     Returns
     -------
-    SpotList
-        In reading order, with the rejected by reason.
+    spots : SpotList
+        Spots in reading order, and numbers of rejected candidates by reason.
 
     Raises
     ------
     MeasurementError
-        An argument outside its range.
+        An argument is out of range.
 
     Examples
     --------
@@ -197,7 +216,7 @@ def find_spots(
     half = stamp // 2
     ny, nx = data.shape
     inside = (x >= half) & (x < nx - half) & (y >= half) & (y < ny - half)
-    # uniform_filter rounds: one bad pixel of nine is 0.111.
+    # One bad pixel of nine gives 0.111; 0.05 allows for the filter's rounding errors.
     spoilt = uniform_filter(bad.astype(float), 3, mode="nearest")[y, x] > 0.05
     highest = maximum_filter(clean, stamp, mode="nearest")[y, x]
     reasons = {
@@ -241,14 +260,14 @@ def _check_search(
         raise MeasurementError(f"stamp = {stamp} pixels must be odd, 3 or more")
     if min(data.shape) < stamp:
         raise MeasurementError(
-            f"an image of {data.shape} pixels holds no stamp of {stamp} x {stamp}"
+            f"an image of {data.shape} pixels is smaller than a stamp of {stamp} x {stamp}"
         )
 
 
 def _leave_brighter(
     x: NDArray[Any], y: NDArray[Any], separation: int, shape: tuple[int, ...]
 ) -> NDArray[np.bool_]:
-    """Which of the candidates, brightest first, have no brighter kept one too near."""
+    """Mask of the candidates, brightest first, that have no brighter kept one too near."""
     taken = np.zeros(shape, bool)
     alone = np.zeros(len(x), bool)
     for n, (i, j) in enumerate(zip(x, y, strict=True)):
@@ -274,29 +293,39 @@ def cut_stamps(
     image : array_like, shape (ny, nx)
         Signals [e-].
     spots : SpotList
-        From :func:`find_spots`, with the same or a larger stamp.
+        Spots from :func:`find_spots`, with the same or a larger stamp.
     size : int
-        Pixels a side, odd.
+        Side of the stamps [pixel], odd, 3 or more.
     mask : array_like of bool, shape (ny, nx), optional
-        Bad pixels, True.
+        True where a pixel is bad.
     variance : array_like, shape (ny, nx), optional
         Known variance of each pixel [e-^2].
 
     Returns
     -------
-    Stamps
-        In the order of the spots.
+    stamps : Stamps
+        Stamps in the order of the spots.
 
     Raises
     ------
     MeasurementError
-        No spots, or a stamp that leaves the image.
+        There are no spots, a stamp leaves the image, or shapes do not match.
+
+    Examples
+    --------
+    >>> image = np.zeros((40, 40))
+    >>> image[12, 20] = 1e5
+    >>> stamps = cut_stamps(image, find_spots(image, threshold=1e3), size=7)
+    >>> stamps.electrons.shape, stamps.x.tolist(), float(stamps.electrons[0, 3, 3])
+    ((1, 7, 7), [20], 100000.0)
     """
     data = to_floats(image, "image")
     if data.ndim != 2:
         raise MeasurementError(f"an image has rows and columns, not the shape {data.shape}")
     if len(spots) == 0:
-        raise MeasurementError(f"no spots to cut out; rejected: {dict(spots.rejected)}")
+        raise MeasurementError(
+            f"no spots to cut out; rejected candidates by reason: {dict(spots.rejected)}"
+        )
     if size < 3 or size % 2 == 0:
         raise MeasurementError(f"size = {size} pixels of a stamp must be odd, 3 or more")
     step = np.arange(size) - size // 2
@@ -304,7 +333,8 @@ def cut_stamps(
     ny, nx = data.shape
     if rows.min() < 0 or columns.min() < 0 or rows.max() >= ny or columns.max() >= nx:
         raise MeasurementError(
-            f"stamps of {size} x {size} pixels leave the image of {ny} x {nx}"
+            f"stamps of {size} x {size} pixels leave the image of {ny} x {nx}: find spots with "
+            f"stamp={size}"
         )
     at = (rows, columns)
     return Stamps(

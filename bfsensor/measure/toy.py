@@ -1,4 +1,4 @@
-r"""The toy model of the brighter-fatter effect in flats: charge moves the pixel boundaries.
+r"""Toy model of the brighter-fatter effect in flats: charge in two pixels shifts their boundary.
 
 **Two pixels** (Lage, Bradshaw & Tyson 2017, appendix) share a partition.  With the
 difference of their charges :math:`D = N_1 - N_2` the areas are :math:`1 \mp \alpha D`, so
@@ -38,13 +38,19 @@ from bfsensor.errors import MeasurementError
 from bfsensor.typing import FloatArray
 
 LARGEST_RMS_AREA = 0.2
-"""Largest rms change of the pixels' areas for which the closed forms are given.
+"""Largest rms change of the pixels' areas, relative to the area, for which closed forms are given.
 
-A boundary then is five standard deviations or more from closing a pixel; the moments of
-two pixels differ from those of the darts by less than 1e-6."""
+Chosen: a boundary is then five standard deviations or more from closing a pixel.  The moments of two
+pixels differ from the exact ones by less than 1e-6 of the level there (measured in
+tests/measure/test_toy.py); at twice the value, 2.5 standard deviations, the closed forms fail.
+"""
 
 MOST_DARTS = 1e9
-"""Largest mean number of electrons a pixel; their count fits 32 bits."""
+"""Largest mean number of electrons in a pixel [e-].
+
+Derived: twice as many, the electrons of a pair of pixels, are still below the 2^31 of counts of
+32 bits.
+"""
 
 
 @dataclass(frozen=True)
@@ -54,12 +60,18 @@ class PairMoments:
     Parameters
     ----------
     mean : ndarray
-        Of one pixel [e-].
+        Mean charge of one pixel [e-].
     variance : ndarray
-        Of one pixel [e-^2].
+        Variance of one pixel [e-^2].
     covariance : ndarray
-        Of both [e-^2]; Lage et al. (2017) call it the correlation, and the ratio to the
-        variance the covariance.
+        Covariance of the two pixels [e-^2].  Lage et al. (2017) call it the correlation, and its
+        ratio to the variance the covariance.
+
+    Examples
+    --------
+    >>> moments = PairMoments(np.array(400.0), np.array(384.8), np.array(15.2))
+    >>> float(moments.variance + moments.covariance)
+    400.0
     """
 
     mean: FloatArray
@@ -68,7 +80,7 @@ class PairMoments:
 
 
 def _check_pair(alpha: ArrayLike, level: ArrayLike, largest: float) -> list[NDArray]:
-    """Both as arrays of one shape, if they are within their ranges."""
+    """Alpha and level as arrays of one shape, checked to be in range."""
     a, mu = np.broadcast_arrays(np.asarray(alpha, float), np.asarray(level, float))
     if not np.all((a >= 0) & (a <= largest)):
         raise MeasurementError(f"alpha = {a} 1/e- must be from 0 to {largest:g} 1/e-")
@@ -78,7 +90,7 @@ def _check_pair(alpha: ArrayLike, level: ArrayLike, largest: float) -> list[NDAr
 
 
 def predict_pair(alpha: ArrayLike, level: ArrayLike) -> PairMoments:
-    r"""Moments of two pixels with a moving partition, to all orders in alpha.
+    r"""Predict the moments of two pixels with a moving partition, to all orders in alpha.
 
     To first order :math:`\mathrm{Var} = \lambda_0 (1 - \alpha \lambda_0)` and
     :math:`\mathrm{Cov} = \alpha \lambda_0^2`; their sum is :math:`\lambda_0` always.
@@ -89,21 +101,22 @@ def predict_pair(alpha: ArrayLike, level: ArrayLike) -> PairMoments:
         Fraction of its area that a pixel loses for each electron that it has more than
         the other [1/e-], 0 to 0.08 (there the rms change of area may reach 0.2).
     level : array_like
-        Mean electrons a pixel, :math:`\lambda_0` [e-].
+        Mean number of electrons in a pixel, :math:`\lambda_0` [e-], 0 to 1e9.
 
     Returns
     -------
-    PairMoments
-        Of the shape that both arguments broadcast to.
+    moments : PairMoments
+        Moments, of the shape to which both arguments broadcast.
 
     Raises
     ------
     MeasurementError
-        A value outside its range.
+        A value is out of range.
 
     References
     ----------
-    The module's docstring.  The printed formula: :func:`predict_pair_as_printed`.
+    The docstring of :mod:`bfsensor.measure.toy` derives it; :func:`predict_pair_as_printed` has
+    the published formula.
 
     Examples
     --------
@@ -117,9 +130,9 @@ def predict_pair(alpha: ArrayLike, level: ArrayLike) -> PairMoments:
 
 
 def predict_pair_as_printed(alpha: ArrayLike, level: ArrayLike) -> PairMoments:
-    r"""Moments of two pixels as the appendix of Lage et al. (2017) prints them.
+    r"""Predict the moments of two pixels as the appendix of Lage et al. (2017) prints them.
 
-    To be shown beside :func:`predict_pair`, for no other use:
+    The function serves only to compare the printed formulae with :func:`predict_pair`:
 
     .. math::
         \mathrm{Mean} = \lambda_0 (1 - \tfrac{\alpha}{2}), \quad
@@ -129,24 +142,24 @@ def predict_pair_as_printed(alpha: ArrayLike, level: ArrayLike) -> PairMoments:
     The covariance is right to first order.  The variance has half the slope: the printed
     distribution, :math:`P_1 P_2 (1 - \tfrac{\alpha}{2} (N_1 - N_2)^2)` once normalised,
     itself gives :math:`\lambda_0 (1 - \alpha (\lambda_0 + \tfrac12))`.  That distribution is
-    no more than an estimate: it puts the final charges into the rates of independent
-    Poisson counts, which lowers the mean by :math:`\alpha \lambda_0 / 2` where the darts
-    keep it.  The exponents of the printed Poisson probabilities lack their minus.
+    only an approximation: it puts the final charges into the rates of independent Poisson
+    counts, which lowers the mean by :math:`\alpha \lambda_0 / 2`, while the exact process keeps
+    it.  The exponents of the printed Poisson probabilities lack their minus sign.
 
     Parameters
     ----------
     alpha, level : array_like
-        As for :func:`predict_pair`.
+        Alpha [1/e-] and level [e-], as for :func:`predict_pair`.
 
     Returns
     -------
-    PairMoments
-        Of the shape that both arguments broadcast to.
+    moments : PairMoments
+        Moments, of the shape to which both arguments broadcast.
 
     Raises
     ------
     MeasurementError
-        A value outside its range.
+        A value is out of range.
 
     Examples
     --------
@@ -161,18 +174,19 @@ def predict_pair_as_printed(alpha: ArrayLike, level: ArrayLike) -> PairMoments:
 def throw_at_pair(
     alpha: float, level: float, *, realisations: int, seed: int
 ) -> NDArray[np.int64]:
-    """Throw darts at two pixels, moving the partition after each.
+    """Simulate two pixels electron by electron ("darts"), moving the partition after each.
 
     Parameters
     ----------
     alpha : float
-        As for :func:`predict_pair`, 0 to 1 [1/e-].
+        Alpha of :func:`predict_pair` [1/e-], 0 to 1.
     level : float
-        Mean electrons a pixel [e-]; the number of darts is Poisson about twice that.
+        Mean number of electrons in a pixel [e-]; the number of darts is Poisson distributed
+        with twice that mean.
     realisations : int
-        How many times.  A smaller number gives the first of a larger one.
+        Number of simulated pairs.  A smaller number gives the first of those of a larger one.
     seed : int
-        0 to 2^64 - 1.  Realisations of equal seed share random numbers at any alpha.
+        Seed, 0 to 2^64 - 1.  Realisations with the same seed share random numbers at any alpha.
 
     Returns
     -------
@@ -182,8 +196,8 @@ def throw_at_pair(
     Raises
     ------
     MeasurementError
-        A value outside its range, or a partition that left the pair: where alpha is so
-        large that one pixel was full and took all area, there is no such model.
+        A value is out of range, or the partition left the pair: where alpha is so large that
+        one pixel takes all the area, the model is not defined.
 
     Examples
     --------
@@ -198,7 +212,7 @@ def throw_at_pair(
     if alpha * largest > 1:
         raise MeasurementError(
             f"alpha = {alpha} 1/e- with a difference of {largest:.0f} e-: the partition left "
-            "the pixels; a smaller alpha is needed"
+            "the pixels; choose a smaller alpha or level"
         )
     first = (darts + difference.astype(np.int64)) // 2
     return np.stack([first, darts - first], axis=1)
@@ -215,13 +229,13 @@ def measure_pair(charges: ArrayLike) -> tuple[PairMoments, PairMoments]:
     Returns
     -------
     moments, errors : PairMoments
-        The mean is that of the first pixel (that of both would not see the effect);
-        variance and covariance use both.
+        Moments and their standard errors.  The mean is that of the first pixel, because the
+        effect does not change that of both; variance and covariance use both.
 
     Raises
     ------
     MeasurementError
-        Another shape, or fewer than two realisations.
+        The charges have another shape, or fewer than two realisations.
 
     Examples
     --------
@@ -236,7 +250,7 @@ def measure_pair(charges: ArrayLike) -> tuple[PairMoments, PairMoments]:
         )
     n = len(pairs)
     deviations = pairs - pairs.mean(axis=0)
-    # n / (n - 1): the means were taken from the same pairs.
+    # n / (n - 1) removes the bias of means that were taken from the same pairs.
     squares = (deviations**2).mean(axis=1) * n / (n - 1)
     products = deviations.prod(axis=1) * n / (n - 1)
     samples = (pairs[:, 0], squares, products)
@@ -247,12 +261,15 @@ def measure_pair(charges: ArrayLike) -> tuple[PairMoments, PairMoments]:
 def draw_darts(
     mean: float, realisations: int, seed: int
 ) -> tuple[NDArray[np.int64], np.uint32, np.uint32]:
-    """Poisson numbers of darts, and the key of their random words."""
+    """Numbers of darts, Poisson distributed, and the key of their random numbers."""
     if not 1 <= realisations < 2**32:
         raise MeasurementError(f"realisations = {realisations} must be from 1 to 2^32 - 1")
     if not 0 <= seed < 2**64:
         raise MeasurementError(f"seed = {seed} must be from 0 to 2^64 - 1")
     if not 0 <= mean <= 2 * MOST_DARTS:
-        raise MeasurementError(f"{mean:g} darts: at most {2 * MOST_DARTS:g} can be thrown")
+        raise MeasurementError(
+            f"{mean:g} electrons in all must be from 0 to {2 * MOST_DARTS:g}: choose a smaller "
+            "level or size"
+        )
     darts = np.random.default_rng(seed).poisson(mean, realisations)
     return darts, np.uint32(seed & 0xFFFFFFFF), np.uint32(seed >> 32)

@@ -1,8 +1,8 @@
-r"""The toy model of the brighter-fatter effect on an array of pixels.
+r"""Toy model of the brighter-fatter effect in flats on an array of pixels.
 
 Electrons already in the array change the areas to
-:math:`A_i = 1 + \sum_j a_{i-j} N_j` with :math:`\sum a = 0` and :math:`a_0 < 0` [1/e-].  Let
-the mean :math:`\mu` be the clock: electrons reach pixel i at the rate :math:`A_i`, so
+:math:`A_i = 1 + \sum_j a_{i-j} N_j` with :math:`\sum a = 0` and :math:`a_0 < 0` [1/e-].  With
+the mean :math:`\mu` as time, electrons reach pixel i at the rate :math:`A_i`, so that
 
 .. math::
     \frac{d E[N_i N_j]}{d \mu} = E[A_i N_j + N_i A_j] + \delta_{ij} E[A_i]
@@ -30,25 +30,25 @@ from bfsensor.typing import FloatArray
 
 
 def close_sum(a: ArrayLike) -> FloatArray:
-    """Give the area that an a-matrix lacks to the ring of pixels around it, in equal parts.
+    """Add a ring of equal values around an a-matrix, so that its sum is 0.
 
-    Measured and tabulated a-matrices end at some lag, the electric field does not: what
-    their pixels lose on the whole, those farther out gain.
+    Measured and tabulated a-matrices end at some lag, the electric field does not: the area
+    that their pixels lose in sum is gained by pixels farther out.
 
     Parameters
     ----------
     a : array_like, shape (2 reach_y + 1, 2 reach_x + 1)
-        Lag (0, 0) in the middle [1/e-].
+        a-matrix with lag (0, 0) in the middle [1/e-].
 
     Returns
     -------
     closed : ndarray, shape (2 reach_y + 3, 2 reach_x + 3)
-        Sums to 0 within round-off.
+        a-matrix with the ring [1/e-]; its sum is 0 to round-off.
 
     Raises
     ------
     MeasurementError
-        Even sides.
+        A side is even, or a value is not finite.
 
     Examples
     --------
@@ -61,7 +61,7 @@ def close_sum(a: ArrayLike) -> FloatArray:
 
 
 def _check_lags(a: ArrayLike) -> FloatArray:
-    """An a-matrix with a middle, in finite numbers."""
+    """a-matrix as an array, checked to have odd sides and finite values."""
     a = np.asarray(a, float)
     if a.ndim != 2 or a.shape[0] % 2 == 0 or a.shape[1] % 2 == 0:
         raise MeasurementError(
@@ -74,7 +74,7 @@ def _check_lags(a: ArrayLike) -> FloatArray:
 
 
 def _wrap(a: ArrayLike, size: int, level: float) -> FloatArray:
-    """The a-matrix on a periodic array, lag (0, 0) first, if all is allowed."""
+    """Checked a-matrix on a periodic array, with lag (0, 0) first."""
     a = _check_lags(a)
     if not max(a.shape) <= size <= 4096:
         raise MeasurementError(
@@ -83,8 +83,8 @@ def _wrap(a: ArrayLike, size: int, level: float) -> FloatArray:
         )
     if abs(a.sum()) > 1e-9 * np.abs(a).max():
         raise MeasurementError(
-            f"a-matrix sums to {a.sum():.3g} 1/e-; it must sum to 0, for areas are only "
-            "shared out anew (close_sum gives the rest to the next ring)"
+            f"a-matrix sums to {a.sum():.3g} 1/e-; it must sum to 0, because the whole area stays "
+            "the same (bfsensor.measure.toy_array.close_sum adds the rest in a ring)"
         )
     if not 0 <= level <= MOST_DARTS:
         raise MeasurementError(f"level = {level} e- must be from 0 to {MOST_DARTS:g} e-")
@@ -95,7 +95,7 @@ def _wrap(a: ArrayLike, size: int, level: float) -> FloatArray:
 
 
 def predict_array(a: ArrayLike, level: float, *, size: int = 64) -> FloatArray:
-    r"""Covariances of a flat whose pixel areas are linear in the charges, to all orders.
+    r"""Predict covariances of a flat whose pixel areas are linear in the charges, to all orders.
 
     .. math::
         C(\mu) = \mathrm{FFT}^{-1}\, \frac{e^{2 a_k \mu} - 1}{2 a_k}
@@ -106,23 +106,24 @@ def predict_array(a: ArrayLike, level: float, *, size: int = 64) -> FloatArray:
     a : array_like, shape (2 reach_y + 1, 2 reach_x + 1)
         ``a[reach_y + j, reach_x + i]`` is the fraction of its area that the pixel at the
         lag i in x and j in y gains for each electron [1/e-]: negative in the middle, where
-        the pixel that holds the electron loses; sum 0.  Need not be symmetric: a flat sees
-        the mean of opposite lags.
+        the pixel that holds the electron loses area; its sum is 0.  It need not be symmetric:
+        the covariances depend on the mean of opposite lags.
     level : float
-        Mean electrons a pixel, :math:`\mu` [e-].
+        Mean number of electrons in a pixel, :math:`\mu` [e-], 0 to 1e9.
     size : int
-        Pixels along each side of the periodic array.
+        Side of the periodic array [pixel], up to 4096.
 
     Returns
     -------
     covariances : ndarray, shape (size, size)
-        ``covariances[j, i]`` [e-^2]; negative lags count from the end.
+        ``covariances[j, i]`` is C_ij [e-^2]; negative lags count from the end.
 
     Raises
     ------
     MeasurementError
-        The a-matrix has even sides, does not fit or does not sum to 0, ``level`` is out of
-        range, or areas change by more than `LARGEST_RMS_AREA`, where the model ends.
+        The a-matrix has even sides, does not fit into the array or does not sum to 0, ``level``
+        is out of range, or areas change by more than `LARGEST_RMS_AREA`, beyond which the model
+        does not hold.
 
     Examples
     --------
@@ -133,13 +134,13 @@ def predict_array(a: ArrayLike, level: float, *, size: int = 64) -> FloatArray:
     '43348 1443 1648 75 50000'
     """
     modes = np.fft.fft2(_wrap(a, size, level))
-    # Beyond an exponent of 600 areas are out of all bounds anyway, but not out of numbers.
+    # The limit avoids overflow; such areas are refused below.
     spectrum = level * exprel(np.minimum(2 * modes.real * level, 600.0))
     area = np.sqrt((np.abs(modes) ** 2 * spectrum).mean())
     if area > LARGEST_RMS_AREA:
         raise MeasurementError(
-            f"level = {level} e-: areas change by {area:.2g} rms, above {LARGEST_RMS_AREA}; "
-            "the model ends where pixels close"
+            f"level = {level} e-: areas change by {area:.2g} rms, above {LARGEST_RMS_AREA}, "
+            "where pixels may close and the model does not hold; choose a smaller level or a"
         )
     return np.fft.ifft2(spectrum).real
 
@@ -147,27 +148,27 @@ def predict_array(a: ArrayLike, level: float, *, size: int = 64) -> FloatArray:
 def throw_at_array(
     a: ArrayLike, level: float, *, size: int, realisations: int, seed: int
 ) -> NDArray[np.int32]:
-    """Throw darts at a periodic array of pixels, changing the areas after each.
+    """Simulate a periodic array of pixels electron by electron, changing the areas after each.
 
     Parameters
     ----------
     a, level, size
-        As for :func:`predict_array`; the number of darts is Poisson about
-        ``level * size**2``.
+        a-matrix, level and side of the array as for :func:`predict_array`; the number of
+        electrons is Poisson distributed with the mean ``level * size**2``.
     realisations : int
-        How many arrays.  A smaller number gives the first of a larger one.
+        Number of simulated arrays.  A smaller number gives the first of those of a larger one.
     seed : int
-        0 to 2^64 - 1.
+        Seed, 0 to 2^64 - 1.
 
     Returns
     -------
     charges : ndarray of int, shape (realisations, size, size)
-        Electrons, [realisation, y, x].
+        Electrons in each pixel, [realisation, y, x].
 
     Raises
     ------
     MeasurementError
-        A value outside its range, or a pixel whose area left the range 0 to 2.
+        A value is out of range, or the area of a pixel left the range 0 to 2.
 
     Examples
     --------
@@ -189,7 +190,7 @@ def throw_at_array(
     if least < 0 or largest > 2:
         raise MeasurementError(
             f"level = {level} e-: areas went from {least:.2f} to {largest:.2f} of the pixel; "
-            "they must stay between 0 and 2"
+            "they must stay between 0 and 2: choose a smaller level or a"
         )
     return charges.reshape(realisations, size, size)
 
@@ -200,20 +201,21 @@ def measure_array(charges: ArrayLike, level: float) -> tuple[FloatArray, FloatAr
     Parameters
     ----------
     charges : array_like, shape (realisations, ny, nx)
-        Electrons.
+        Electrons in each pixel.
     level : float
-        The mean that they were drawn about [e-]; taken as known, so that the Poisson noise
-        of the sum is part of the covariances as it is in the prediction.
+        True mean of the simulation [e-].  It is not estimated, so that the Poisson noise of the
+        sum is part of the covariances, as it is in the prediction.
 
     Returns
     -------
     covariances, errors : ndarray, shape (ny, nx)
-        ``covariances[j, i]`` [e-^2] and standard errors; negative lags from the end.
+        ``covariances[j, i]`` is C_ij, with its standard error [e-^2]; negative lags count from
+        the end.
 
     Raises
     ------
     MeasurementError
-        Another shape, or fewer than two realisations.
+        The charges have another shape, or fewer than two realisations.
 
     Examples
     --------

@@ -36,7 +36,7 @@ def entries(page):
     """Pages that the tables of contents of a page list, relative to docs/."""
     text = (DOCS / page).read_text(encoding="utf-8")
     found = []
-    for tree in re.findall(r"```{toctree}\n(?::.*\n)*\n(.*?)```", text, re.DOTALL):
+    for tree in re.findall(r"```{toctree}\n(?::[^\n]*\n)*\n(.*?)```", text, re.DOTALL):
         for line in tree.split("\n"):
             if line:
                 target = re.sub(r".*<(.*)>$", r"\1", line)

@@ -33,7 +33,7 @@ def plain_edges(image, north, east):
     out = image.copy()
 
     def shift(upper, along, across):
-        """Of the edge between pixels at ``along`` and ``along`` + 1 from the charge."""
+        """Shift of the edge between pixels at ``along`` and ``along`` + 1 from the charge."""
         if abs(across) >= n or not -n <= along < n:
             return 0.0
         if along >= 0:
@@ -68,7 +68,7 @@ def test_edges_against_the_plain_sum():
 
 @pytest.mark.parametrize("conserving", [True, False])
 def test_a_blob_and_a_blob_of_a_kernel(conserving):
-    r"""Of broad Gaussians the convolution and its derivatives are Gaussians.
+    r"""The convolution of broad Gaussians and its derivatives are Gaussians.
 
     F of width s, K of width t: phi has the width w of both, F div grad phi + grad F grad phi
     is F phi [(r^2 / w^4 - 2 / w^2) + r^2 / (s^2 w^2)].

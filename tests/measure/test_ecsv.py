@@ -100,7 +100,7 @@ def test_lags_in_any_order_and_missing_ones(tmp_path):
     path.write_text("\n".join([*lines[:-4], *lines[:-5:-1]]) + "\n")
     assert CovarianceFit.read(path) == result
     path.write_text("\n".join(lines[:-1]) + "\n")
-    with pytest.raises(MeasurementError, match="do not fill a square"):
+    with pytest.raises(MeasurementError, match="lags do not fill a square"):
         CovarianceFit.read(path)
 
 

@@ -71,9 +71,7 @@ def test_a_masked_array_hides_its_pixels():
 def test_flats_without_noise_are_refused():
     first, second = flats()
     for pair in ((first, first), (2 * first, first), (np.full((80, 80), 5.0),) * 2):
-        assert refusal(flat_covariances, *pair, lags=2) == (
-            "the flats do not differ: the same image twice, or no noise"
-        )
+        assert "the flats do not differ" in refusal(flat_covariances, *pair, lags=2)
     assert flat_covariances(first, second, lags=2).covariances[0, 0] > 0
 
 
@@ -82,7 +80,8 @@ def test_noise_below_one_step_of_the_digits_is_not_clipped_away():
     rng = np.random.default_rng(6101)
     coarse = np.full((2, 80, 80), 1000.0) + (rng.random((2, 80, 80)) < 0.05)
     message = refusal(flat_covariances, *coarse, lags=2)
-    assert "10 % of the pixels differ by more than 5 sigma: signals too coarsely" in message
+    assert message.startswith("10 % of the pixels differ by more than 5 sigma")
+    assert "clip=inf" in message
     found = flat_covariances(*coarse, lags=2, clip=np.inf)
     # 0.05 x 0.95 e-^2, of 6400 pixels in each: fourth moments give 3.3 %.
     assert found.covariances[0, 0] == pytest.approx(0.0475, rel=0.15)
@@ -111,9 +110,8 @@ def curve(levels, noise=25.0, **changes):
 def test_campaigns_of_one_pair():
     one = measure_curve([flats()], lags=2)
     assert "1 pairs from" in refusal(fit_covariances, one)
-    assert "at least 2 levels are needed" in refusal(
-        fit_covariances, one, gain=1.0, constant_a=True
-    )
+    # Without gain and b two parameters a lag are left.
+    assert "2 levels" in refusal(fit_covariances, one, gain=1.0, constant_a=True)
 
 
 def test_the_pair_that_fails_is_named():
@@ -151,7 +149,7 @@ def test_choices_from_a_curve():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: model_covariances(1e4, A), "levels of shape () must be a list"),
+        (lambda: model_covariances(1e4, A), "levels of shape ()"),
         (lambda: model_covariances([1e4], A[:1]), "a of shape (1, 2) is not"),
         (
             lambda: model_covariances([1e4], A, b=np.ones(3)),
@@ -212,6 +210,4 @@ def test_growth_names_the_level_and_needs_a_middle():
         "level 1: only 0 of 4 spots agree"
     )
     even = np.ones((3, 2, 10, 11))
-    assert refusal(measure_growth, even, even) == (
-        "images of 10 x 11 pixels have none in the middle"
-    )
+    assert "images of 10 x 11 pixels" in refusal(measure_growth, even, even)

@@ -264,7 +264,7 @@ def test_reading_what_was_written(tmp_path):
         found.pixels + 1, found.clipped, found.unit, found.region,
     )  # fmt: skip
     assert other != found
-    with pytest.raises(MeasurementError, match="exists; say overwrite to replace it"):
+    with pytest.raises(MeasurementError, match=r"pair\.ecsv exists.*overwrite"):
         found.write(path)
     assert "adu2" in path.read_text()
     path.write_text(
@@ -285,20 +285,18 @@ FLAT = np.full((40, 40), 100.0)
 @pytest.mark.parametrize(
     ("first", "second", "options", "message"),
     [
-        (FLAT, FLAT[:20], {}, "flats of shapes (40, 40) and (20, 40) are not a pair"),
-        (FLAT, FLAT, {"lags": 20}, "lags = 20 must be from 0 to below half the shorter "
-         "side of (40, 40)"),
-        (FLAT, FLAT, {"clip": 2.5}, "clip = 2.5 must be at least 3 sigma, or inf for none"),
-        (FLAT, FLAT, {"box": 16}, "box = 16 pixels must be more than twice the largest lag, 8"),
-        (FLAT, FLAT, {"grow": -1}, "grow = -1 must not be negative"),
-        (FLAT, FLAT, {"mask": FLAT}, "mask of shape (40, 40) and type float64 must be bool, (40, 40)"),
-        (FLAT, FLAT, {"mask": FLAT > 0}, "the mask leaves no pixel"),
-        (-1e6 * FLAT, FLAT, {}, "a flat of mean -1e+08 electron must be above 0: "
-         "subtract the bias, not a flat"),
-        (FLAT, FLAT, {"unit": "DN"}, "unit = 'DN' is not one of electron, adu"),
+        (FLAT, FLAT[:20], {}, r"shapes \(40, 40\) and \(20, 40\)"),
+        (FLAT, FLAT, {"lags": 20}, r"lags = 20 .*\(40, 40\)"),
+        (FLAT, FLAT, {"clip": 2.5}, "clip = 2.5 .* 3 sigma, or inf"),
+        (FLAT, FLAT, {"box": 16}, "box = 16 pixels .*, 8$"),
+        (FLAT, FLAT, {"grow": -1}, "grow = -1 "),
+        (FLAT, FLAT, {"mask": FLAT}, r"mask of shape \(40, 40\) and type float64 .*bool"),
+        (FLAT, FLAT, {"mask": FLAT > 0}, "no pixel is finite .*not masked"),
+        (-1e6 * FLAT, FLAT, {}, r"mean -1e\+08 electron.* above 0"),
+        (FLAT, FLAT, {"unit": "DN"}, "unit = 'DN' .*electron, adu"),
         (
             FLAT[:18, :18], FLAT[:18, :18], {"lags": 8, "mask": np.arange(324).reshape(18, 18) % 2 > 0},
-            "162 good pixels of (18, 18) leave 0 pairs at a lag of 8; at least 100 are needed",
+            r"162 good pixels of \(18, 18\) leave 0 pairs at a lag of 8.* 100 ",
         ),
     ],
 )  # fmt: skip
@@ -306,6 +304,5 @@ def test_refusals(first, second, options, message):
     rng = np.random.default_rng(23)
     noise = rng.standard_normal((40, 40))
     first = first + noise[: first.shape[0], : first.shape[1]]
-    with pytest.raises(MeasurementError) as caught:
+    with pytest.raises(MeasurementError, match=message):
         flat_covariances(first, second, **options)
-    assert str(caught.value) == message

@@ -60,7 +60,7 @@ def test_noise_averages_out():
     [
         (np.zeros((3, 5, 5)), np.zeros((2, 5, 5)), "of the shapes"),
         (np.zeros((5, 5)), np.zeros((5, 5)), "of the shapes"),
-        (np.full((1, 5, 5), np.nan), np.zeros((1, 5, 5)), "must be finite"),
+        (np.full((1, 5, 5), np.nan), np.zeros((1, 5, 5)), "not finite"),
     ],
 )
 def test_refuses_what_is_no_flat(on, off, message):

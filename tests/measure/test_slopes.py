@@ -181,7 +181,7 @@ def test_measured_sizes_of_the_seed_paper_give_its_slopes(axis, printed, apart):
 
 
 def test_simulated_sizes_of_the_seed_paper_give_its_slopes_in_per_cent_of_a_pixel():
-    # Fig. 9: the curves bend, and the printed slopes are those of 54 to 110 ke-, without
+    # Fig. 9: the curves are not straight, and the printed slopes are those of 54 to 110 ke-, without
     # weights, per 50,000 e- and not divided by sigma_0 (that would be up to 4 % less).
     printed = {
         (row["Vbb_V"], row["Vpar_hi_V"], row["axis"]): float(row["sim_pct_per_50ke"])
@@ -223,7 +223,7 @@ def test_files_give_back_what_was_written(tmp_path):
     [
         ({"sigma": np.ones(5)}, "have the shapes (24,), (5,) and (24,)"),
         ({"error": np.zeros(24)}, "errors of the widths must be above 0"),
-        ({"error": -np.eye(24)}, "symmetric and positive"),
+        ({"error": -np.eye(24)}, "covariance matrix"),
         (
             {"peak": np.where(PEAK > 50e3, 60e3, PEAK)},
             "two points have the same peak, 60000",
@@ -232,9 +232,9 @@ def test_files_give_back_what_was_written(tmp_path):
         ({"peak_error": np.ones(3)}, "peak_error has the shape (3,)"),
         ({"peak_error": -1.0}, "peak_error must not be below 0"),
         ({"fewest": 3}, "fewest = 3 points must be 4 or more"),
-        ({"fewest": 25}, "24 points are fewer than 25"),
+        ({"fewest": 25}, "24 points are fewer than fewest = 25"),
         ({"probability": 0.0}, "probability = 0.0"),
-        ({"limits": (0.0, 4e4)}, "4 points from 0 to 40000 e- are fewer than 5"),
+        ({"limits": (0.0, 4e4)}, "4 points from 0 to 40000 e- are fewer than fewest = 5"),
         ({"sigma": np.tile([1.0, 1.1], 12)}, "lie on a line within their errors"),
         ({"sigma": -grow(PEAK)}, "the line gives a width of -1.02 pixel"),
     ],

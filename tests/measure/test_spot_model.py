@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import dblquad
 
 from bfsensor.errors import MeasurementError
+from bfsensor.measure import spot_model
 from bfsensor.measure.spot_model import Shape, curvatures, gradients, integrate_gaussian
 
 SHAPES = [
@@ -39,6 +40,24 @@ def test_pixels_agree_with_adaptive_quadrature(shape):
         )  # fmt: skip
         assert error < 1e-10
         assert abs(stamp[j + 3, i + 4] - value) < 2e-10
+
+
+def test_ten_nodes_are_enough_up_to_the_largest_correlation(monkeypatch):
+    def error(rho):
+        stamps = []
+        for nodes in (10, 60):
+            found = np.polynomial.legendre.leggauss(nodes)
+            for name, values in zip(("_NODES", "_WEIGHTS"), found, strict=True):
+                monkeypatch.setattr(spot_model, name, values)
+            stamps += [
+                integrate_gaussian([0.3, 0.0], [-0.2, 0.0], Shape(w, w, rho), 15)
+                for w in (0.4, 1.0, 3.0)
+            ]
+        return np.abs(np.array(stamps[:3]) - np.array(stamps[3:])).max()
+
+    assert error(spot_model.LARGEST_CORRELATION) < 5e-10
+    monkeypatch.setattr(spot_model, "LARGEST_CORRELATION", 0.9)
+    assert error(0.9) > 1e-8
 
 
 def test_pixels_agree_with_thrown_photons():

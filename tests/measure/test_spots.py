@@ -132,7 +132,7 @@ def test_lists_pickle():
         ({"saturation": 500.0}, "saturation = 500 e- must be above the threshold, 1000"),
         ({"separation": 1}, "separation = 1"),
         ({"stamp": 8}, "stamp = 8"),
-        ({"stamp": 41}, "holds no stamp of 41 x 41"),
+        ({"stamp": 41}, "stamp of 41 x 41"),
         ({"mask": np.zeros((3, 3))}, r"mask has the shape (3, 3), not (30, 40)"),
     ],
 )

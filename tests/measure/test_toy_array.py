@@ -94,7 +94,7 @@ def test_first_order_sits_at_its_lag():
 
 @pytest.mark.parametrize("level", [0.0, 10.0, 900.0])
 def test_nothing_is_lost(level):
-    # The sum of all covariances is the Poisson variance: charge is only shared out anew.
+    # The sum of all covariances is the Poisson variance: charge only moves between pixels.
     assert predict_array(SHAPE * 1e-3, level).sum() == pytest.approx(level, rel=1e-12)
     charges = throw_at_array(SHAPE * 1e-3, level, size=8, realisations=3, seed=97)
     again = throw_at_array(SHAPE * 0.0, level, size=8, realisations=3, seed=97)
@@ -204,7 +204,7 @@ def test_the_ring_takes_what_is_missing():
         ),
         (
             lambda: throw_at_array(SHAPE * 1e-9, 1e8, size=64, realisations=9, seed=2),
-            r"4.096e\+11 darts: at most 2e\+09",
+            r"4.096e\+11 electrons in all must be from 0 to 2e\+09",
         ),
         (lambda: close_sum(np.zeros((2, 3))), r"shape \(2, 3\): two axes of odd"),
         (

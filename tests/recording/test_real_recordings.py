@@ -103,8 +103,8 @@ def test_hsc_kernel_through_lsst_format(tmp_path):
     assert again == dataset
     a = again.area_changes(again.detectors["HSC"])
     assert a[0, 0] < 0
-    # 2.2 between the axes is the README's.  Rows as y is what the sensor's physics says, and
-    # what tells an exchange of axes: in the kernel itself axis 1 is the deeper, by 1.15.
+    # The ratio of 2.2 between the axes is the README's.  By the sensor's physics rows are y, which
+    # would show an exchange of axes: in the kernel itself axis 1 is the deeper, by 1.15.
     assert a[1, 0] / a[0, 1] == pytest.approx(2.2, abs=0.05)
     assert again.larger_axis(again.detectors["HSC"]) == "y"
     assert again.larger_axis(again.detectors["HSC"].T) == "x"

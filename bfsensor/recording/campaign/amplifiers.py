@@ -1,4 +1,4 @@
-"""Pixels of an exposure, one frame for each amplifier, in the order in which they were read."""
+"""Pixels of an exposure as one frame for each amplifier, and images of the whole sensor."""
 
 from __future__ import annotations
 
@@ -17,23 +17,32 @@ from bfsensor.recording.raw.sections import AmplifierLayout, to_sensor
 
 @dataclass(frozen=True, eq=False)
 class AmplifierFrame:
-    """What one amplifier read out of one exposure, as it came.
+    """Raw pixels of one amplifier in one exposure, in readout order.
 
     Attributes
     ----------
     name : str
-        Of the amplifier.
+        Name of the amplifier.
     pixels : ndarray of float32, shape (ny, nx)
-        All that was read [ADU], prescan and overscan with it: axis 1 counts serial
-        transfers from the output, axis 0 parallel ones.  Nothing is subtracted.
+        All pixels [ADU], with prescan and overscan: axis 1 counts serial transfers from the
+        output, axis 0 parallel ones.  Nothing is subtracted.
     bad : ndarray of bool, shape (ny, nx)
-        Not finite, saturated, or masked in campaign.yaml.
+        True where a pixel is not finite, saturated, or masked in campaign.yaml.
     layout : AmplifierLayout
-        Where it lies in the file and on the sensor.
+        Place of the amplifier in the file and on the sensor.
     saturation : float
-        Level at which ``bad`` begins [ADU]; inf where none is known.
+        Level at and above which a pixel counts as saturated [ADU]; inf where none is known.
     exposure : int
         Number of the exposure.
+
+    Examples
+    --------
+    >>> from bfsensor.recording.raw.sections import layout_of
+    >>> sections = {"DATASEC": "[3:34,1:20]"}
+    >>> layout = layout_of("a.fits", "A", 0, (20, 40), sections)
+    >>> frame = AmplifierFrame("A", np.zeros((20, 40), np.float32), np.zeros((20, 40), bool), layout)
+    >>> frame.image.shape, frame.prescan.shape, frame.serial_overscan.shape
+    ((20, 32), (20, 2), (20, 6))
     """
 
     name: str
@@ -45,7 +54,7 @@ class AmplifierFrame:
 
     @property
     def image(self) -> NDArray[np.float32]:
-        """Pixels that saw light, a view."""
+        """Pixels of the image section (DATASEC), shape (ny, nx) [ADU]; a view."""
         return self.pixels[self.layout.data]
 
     @property
@@ -55,23 +64,23 @@ class AmplifierFrame:
 
     @property
     def prescan(self) -> NDArray[np.float32]:
-        """Columns read before the image's first, in its rows, a view."""
+        """Columns read before the image's first, in the image's rows [ADU]; a view."""
         rows, columns = self.layout.data
         return self.pixels[rows, : columns.start]
 
     @property
     def serial_overscan(self) -> NDArray[np.float32]:
-        """Columns read after the image's last, in its rows, a view.
+        """Columns read after the image's last, in the image's rows [ADU]; a view.
 
-        The first column is the first transfer without a pixel, also where BIASSEC leaves it
-        out: deferred charge is there.
+        The first column is the first transfer beyond the image, also where BIASSEC leaves it
+        out, because deferred charge appears there.
         """
         rows, columns = self.layout.data
         return self.pixels[rows, columns.stop :]
 
     @property
     def parallel_overscan(self) -> NDArray[np.float32]:
-        """Rows read after the image's last, in its columns, a view."""
+        """Rows read after the image's last, in the image's columns [ADU]; a view."""
         rows, columns = self.layout.data
         return self.pixels[rows.stop :, columns]
 
@@ -87,17 +96,17 @@ class AmplifierFrame:
 
     @property
     def origin(self) -> tuple[int, int] | None:
-        """Lowest x and y on the sensor, from 0; None where not known."""
+        """Lowest x and y on the sensor, from 0 [pixel]; None without DETSEC."""
         return self.layout.origin
 
     @property
     def gain(self) -> float | None:
-        """As header or campaign.yaml says [e-/ADU]; None where neither does."""
+        """Gain by header or campaign.yaml [e-/ADU]; None where neither states one."""
         return self.layout.gain
 
     @property
     def noise(self) -> float | None:
-        """As header or campaign.yaml says [e-]; None where neither does."""
+        """Read noise by header or campaign.yaml [e-]; None where neither states one."""
         return self.layout.noise
 
 
@@ -107,25 +116,38 @@ def read_exposure(campaign: Campaign, exposure: Exposure) -> tuple[AmplifierFram
     Parameters
     ----------
     campaign : Campaign
-        It gives the layout of the amplifiers and the masks.
+        Campaign with the layout of the amplifiers and the masks.
     exposure : Exposure
         One of its exposures.
 
     Returns
     -------
     frames : tuple of AmplifierFrame
-        In the order of ``campaign.amplifiers``.
+        One frame for each of ``campaign.amplifiers``, in their order.
 
     Raises
     ------
     RecordingError
-        The file cannot be read, or is not what its header said when the campaign was read.
+        The file cannot be read, or has changed since the campaign was read.
 
     Notes
     -----
-    Files are opened, read extension by extension, and closed
-    (:func:`bfsensor.recording.raw.pixels.read_pixels`): no more than one exposure is held, as
-    float32 and a byte of mask for each pixel.
+    The file is read extension by extension and closed
+    (:func:`bfsensor.recording.raw.pixels.read_pixels`).  Frames take 5 bytes for each pixel: a
+    float32 and a byte of mask.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from astropy.io import fits
+    >>> from bfsensor.recording import read_campaign
+    >>> header = fits.Header({"IMGTYPE": "FLAT", "EXPTIME": 2.0, "DATASEC": "[1:8,1:6]"})
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     fits.PrimaryHDU(np.full((6, 10), 900, np.uint16), header).writeto(f"{folder}/a.fits")
+    ...     campaign = read_campaign(folder)
+    ...     (frame,) = read_exposure(campaign, campaign.exposures[0])
+    >>> frame.image.shape, frame.serial_overscan.shape, float(frame.image.mean())
+    ((6, 8), (6, 2), 900.0)
     """
     return tuple(
         AmplifierFrame(
@@ -144,25 +166,26 @@ def assemble(
     frames: Sequence[AmplifierFrame],
     images: Mapping[str, ArrayLike] | None = None,
 ) -> NDArray[np.float32]:
-    """Put amplifiers where they lie on the sensor.
+    """Assemble the image of a sensor from its amplifiers.
 
     Parameters
     ----------
     frames : sequence of AmplifierFrame
-        Of one exposure.
+        Frames of one exposure.
     images : mapping of str to array_like, optional
-        What to put there, by amplifier, of the shape of its image, in readout order: such as
-        images in electrons.  By default the raw pixels.
+        Image of each amplifier, in readout order and of the shape of its image section, such
+        as one in electrons.  By default the raw pixels.
 
     Returns
     -------
     image : ndarray of float32, shape (ny, nx)
-        From the lowest to the highest x and y of these amplifiers; nan in gaps.
+        Image from the lowest to the highest x and y of these amplifiers; nan in gaps.
 
     Raises
     ------
     RecordingError
-        An amplifier whose place is not known, or two that overlap.
+        There are no frames, an amplifier has no DETSEC, two overlap, or an image has another
+        shape.
     """
     if not frames:
         raise RecordingError("no amplifiers to put together")
@@ -170,7 +193,10 @@ def assemble(
     for one in frames:
         box = one.layout.footprint()
         if box is None:
-            raise RecordingError(f"{one.name}: no DETSEC says where it lies on the sensor")
+            raise RecordingError(
+                f"{one.name}: no DETSEC, so that its place on the sensor is not known; state it in "
+                "campaign.yaml: amplifiers: [{name: ..., detector: '[x1:x2,y1:y2]'}, ...]"
+            )
         boxes.append(box)
     x0, y0 = min(b[0] for b in boxes), min(b[2] for b in boxes)
     shape = max(b[3] for b in boxes) - y0, max(b[1] for b in boxes) - x0
@@ -180,7 +206,8 @@ def assemble(
         image = one.image if images is None else np.asarray(images[one.name])
         if image.shape != one.layout.shape:
             raise RecordingError(
-                f"{one.name}: an image of shape {image.shape}, not {one.layout.shape}"
+                f"{one.name}: an image of shape {image.shape}, not {one.layout.shape} as its "
+                "image section"
             )
         place = np.s_[low - y0 : high - y0, left - x0 : right - x0]
         if filled[place].any():

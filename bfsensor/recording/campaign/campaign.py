@@ -1,4 +1,4 @@
-"""A campaign: a folder of exposures of one sensor, listed, checked, nothing guessed."""
+"""Campaigns: reading and checking a folder of raw exposures of one sensor by their headers."""
 
 from __future__ import annotations
 
@@ -28,12 +28,14 @@ from bfsensor.recording.campaign.exposures import (
     Exposure,
     Progress,
     SetAside,
+    count_of,
     find_pairs,
     group_conditions,
     named,
 )
 from bfsensor.recording.campaign.manifest import Entry, gather, set_order
 from bfsensor.recording.campaign.settings import CampaignSettings, read_settings
+from bfsensor.recording.raw.headers import SUFFIXES
 from bfsensor.recording.raw.masks import read_masks
 from bfsensor.recording.raw.sections import AmplifierLayout
 
@@ -49,26 +51,33 @@ _QUANTITIES = (
 
 @dataclass(frozen=True)
 class Campaign:
-    """Exposures of one sensor, and what was said and found of them.
+    """Exposures of one sensor, with their conditions, amplifiers, pairs and warnings.
 
     Attributes
     ----------
     folder : Path
-        Where it is.
+        Folder of the files.
     name : str
-        Of campaign.yaml, else the folder's.
+        Name in campaign.yaml, else that of the folder.
     exposures : tuple of Exposure
-        In the order of time.
+        Exposures that are used, in the order of time.
     set_aside : tuple of SetAside
         Files that are not used, each with its reason.
     warnings : tuple of Caution
-        What a reader should know, each once.
+        Warnings, each once.
     amplifiers : tuple of AmplifierLayout
-        In the order of the files; every exposure has the same.
+        Amplifiers in the order of the files; all exposures have the same.
     settings : CampaignSettings
-        Its campaign.yaml: keywords, masks, lamp, spots.
+        Entries of campaign.yaml.
     has_manifest : bool
-        Whether there was a list of exposures.
+        True where a manifest.ecsv lists exposures.
+
+    Examples
+    --------
+    >>> flats = tuple(Exposure(n, Path(f"f{n}.fits"), "flat", n, 2.0, pair=0) for n in (0, 1))
+    >>> campaign = Campaign(Path("run_1"), "run_1", flats)
+    >>> campaign.kinds(), len(campaign.pairs(exposure_time=2.0))
+    ({'flat': 2}, 1)
     """
 
     folder: Path
@@ -82,12 +91,12 @@ class Campaign:
 
     @property
     def card(self) -> Path | None:
-        """The device card, a JSON file; None without one."""
+        """JSON file of the nominal device, ``device_card`` in campaign.yaml; None without one."""
         return self.settings.device_card
 
     @property
     def baseline(self) -> Path | str | None:
-        """What the simulation predicts: a file of the folder, or a device's name."""
+        """Source of the simulation's prediction: a file of the folder, or a device's name."""
         if not self.settings.baseline:
             return None
         path = self.folder / self.settings.baseline
@@ -95,12 +104,12 @@ class Campaign:
 
     @property
     def spot_grid(self) -> float | None:
-        """Pitch of the spots' mask [pixel]."""
+        """Pitch of the mask of spots [pixel]; None where campaign.yaml states none."""
         return self.settings.spot_grid
 
     @property
     def lamp_error(self) -> float | None:
-        """Relative error of one reading of the lamp monitor."""
+        """Relative error of one reading of the lamp monitor; None where not stated."""
         return self.settings.lamp_error
 
     @cached_property
@@ -110,15 +119,32 @@ class Campaign:
 
     @cached_property
     def masks(self) -> dict[str, NDArray[np.bool_]]:
-        """Pixels that campaign.yaml leaves out, by amplifier in readout order."""
+        """Masks of bad pixels from campaign.yaml, by amplifier, in readout order."""
         return read_masks(self.folder, self.settings.masks, self.amplifiers)
 
     def of(self, kind: str) -> tuple[Exposure, ...]:
-        """Give the exposures of a kind, such as 'flat'."""
+        """Give the exposures of a kind.
+
+        Parameters
+        ----------
+        kind : str
+            Kind such as 'flat'; see :class:`Exposure`.
+
+        Returns
+        -------
+        exposures : tuple of Exposure
+            Exposures in the order of time; empty where there are none.
+        """
         return tuple(one for one in self.exposures if one.kind == kind)
 
     def kinds(self) -> dict[str, int]:
-        """Count the exposures of each kind."""
+        """Count the exposures of each kind.
+
+        Returns
+        -------
+        kinds : dict of str to int
+            Numbers of exposures, in the order in which kinds first occur.
+        """
         out: dict[str, int] = {}
         for one in self.exposures:
             out[one.kind] = out.get(one.kind, 0) + 1
@@ -127,8 +153,19 @@ class Campaign:
     def conditions(self, kind: str = "flat") -> dict[Condition, tuple[Exposure, ...]]:
         """Group the exposures of a kind by their settings, the largest group first.
 
-        Readings closer than the tolerances (:data:`bfsensor.recording.campaign.exposures.TOLERANCES`)
-        count as one setting.
+        Sorted readings whose neighbours differ by no more than
+        :data:`bfsensor.recording.campaign.exposures.TOLERANCES` count as one setting, so that a
+        slow drift stays one setting however far it goes.
+
+        Parameters
+        ----------
+        kind : str
+            Kind of the exposures.
+
+        Returns
+        -------
+        conditions : dict of Condition to tuple of Exposure
+            Exposures by condition; empty where there are none.
         """
         return dict(self._conditions.get(kind, {}))
 
@@ -142,18 +179,25 @@ class Campaign:
         condition : Condition, optional
             One of :meth:`conditions`; by default all.
         exposure_time : float, optional
-            [s], to the tolerance of pairs.
+            Exposure time of the pairs [s], to the relative tolerance of pairs; by default all.
+
+        Returns
+        -------
+        pairs : tuple of (Exposure, Exposure)
+            The two flats of each pair.
 
         Raises
         ------
         RecordingError
-            A condition that this campaign has not.
+            The campaign has no flats at the condition.
         """
         flats = self.of("flat")
         if condition is not None:
             if condition not in self.conditions():
                 there = "; ".join(str(one) for one in self.conditions())
-                raise RecordingError(f"no flats at {condition}; there are {there}")
+                raise RecordingError(
+                    f"no flats at {condition}; there are flats at: {there or 'no condition'}"
+                )
             flats = self.conditions()[condition]
         if exposure_time is not None:
             off = self.settings.pair_tolerance * exposure_time
@@ -170,7 +214,18 @@ class Campaign:
         return tuple((a[0], a[1]) for a in groups.values() if len(a) == 2)
 
     def exposure_times(self, condition: Condition) -> tuple[float, ...]:
-        """Give the exposure times of the pairs at a condition, ascending [s]."""
+        """Give the different exposure times of the pairs at a condition.
+
+        Parameters
+        ----------
+        condition : Condition
+            One of :meth:`conditions`.
+
+        Returns
+        -------
+        times : tuple of float
+            Exposure times that differ by more than the tolerance of pairs, ascending [s].
+        """
         times: list[float] = []
         for first, _ in self.pairs(condition):
             seconds = first.exposure_time or 0.0
@@ -180,7 +235,20 @@ class Campaign:
         return tuple(sorted(times))
 
     def without(self, exposure: Exposure, reason: str) -> Campaign:
-        """Give the campaign with one more exposure set aside, its partner left alone."""
+        """Return a copy with one more exposure set aside; its partner is no longer in a pair.
+
+        Parameters
+        ----------
+        exposure : Exposure
+            One of its exposures.
+        reason : str
+            Reason for setting it aside.
+
+        Returns
+        -------
+        campaign : Campaign
+            The copy.
+        """
         left = tuple(
             replace(one, pair=None)
             if one.pair is not None and one.pair == exposure.pair
@@ -192,7 +260,18 @@ class Campaign:
         return replace(self, exposures=left, set_aside=aside)
 
     def with_warnings(self, *more: Caution) -> Campaign:
-        """Give the campaign with further warnings; one that it has is not repeated."""
+        """Return a copy with further warnings; those that it already has are not repeated.
+
+        Parameters
+        ----------
+        *more : Caution
+            Warnings to add.
+
+        Returns
+        -------
+        campaign : Campaign
+            The copy.
+        """
         new = tuple(one for one in dict.fromkeys(more) if one not in self.warnings)
         return replace(self, warnings=(*self.warnings, *new))
 
@@ -202,34 +281,36 @@ def read_campaign(
 ) -> Campaign:
     """Read the headers of a folder of recordings, and check them against one another.
 
-    No pixels are kept, and of each file only parts are looked at (all of it where
-    manifest.ecsv gives SHA-256 sums): see :func:`bfsensor.recording.campaign.inspection.inspect` for
-    what the pixels say.
+    Pixels are not kept, and only parts of each file are read (all of it where manifest.ecsv has
+    SHA-256 sums); :func:`bfsensor.recording.inspect_campaign` checks the pixels.
 
     Parameters
     ----------
     folder : path-like
-        FITS files of one sensor, raw; ``campaign.yaml`` (:mod:`bfsensor.recording.campaign.settings`)
-        and ``manifest.ecsv`` (a row for each exposure) where there are any.
+        Folder with raw FITS files of one sensor, each exposure a file of its own.  It may also
+        hold ``campaign.yaml`` (:data:`bfsensor.recording.campaign.settings.ENTRIES`) and
+        ``manifest.ecsv`` with a row for each exposure
+        (:data:`bfsensor.recording.campaign.manifest.COLUMNS`).
     progress : callable, optional
-        Called with the files done and their number.
+        Function that is called with the number of files done and the number of all.
 
     Returns
     -------
     campaign : Campaign
+        The exposures, with warnings and the files that are not used.
 
     Raises
     ------
     RecordingError
-        No such folder, a campaign.yaml or manifest.ecsv that cannot be read, or no exposure
-        that can be used.  A file that is broken, cut off, doubled or contradicts its manifest
-        or the other files is no error: it is named in ``set_aside``.
+        The folder does not exist, campaign.yaml or manifest.ecsv cannot be read, or no exposure
+        can be used.  A file that is broken, cut short, a duplicate, or contradicts its manifest
+        or the other files raises nothing: it is named in ``set_aside``.
 
     Notes
     -----
-    Pairs are the manifest's (column 'pair'); without it flats that follow one another
-    directly, of equal exposure time and settings.  Files without a row in the manifest are
-    taken as their headers say.
+    Pairs are those of the manifest's column 'pair'; without it, flats that follow one another
+    directly, of equal exposure time and settings.  Files without a row in the manifest have the
+    conditions of their headers.
 
     Examples
     --------
@@ -252,9 +333,13 @@ def read_campaign(
     settings = read_settings(folder)
     entries, has_manifest = gather(folder, settings, progress)
     if not entries:
-        inner = sum(1 for one in folder.iterdir() if one.is_dir())
-        more = f"; its {inner} folders are not looked into" if inner else ""
-        raise RecordingError(f"{folder}: no FITS files{more}")
+        inner = sorted(one.name for one in folder.iterdir() if one.is_dir())
+        names = ", ".join(inner[:3]) + (" ..." if len(inner) > 3 else "")
+        more = f"; folders in it are not searched, give one of them: {names}"
+        raise RecordingError(
+            f"{folder}: no FITS files (names that end in {', '.join(SUFFIXES)})"
+            + (more if inner else "")
+        )
     set_aside_duplicates(entries)
     amplifiers = set_aside_other_layouts(entries)
     warnings = set_aside_contradictions(entries)
@@ -263,7 +348,7 @@ def read_campaign(
     if len(aside) == len(entries):
         rest = f" (and {len(aside) - 1} more)" if len(aside) > 1 else ""
         raise RecordingError(
-            f"{folder}: none of {len(aside)} exposures can be used: {aside[0]}{rest}"
+            f"{folder}: none of {count_of(len(aside), 'exposure')} can be used: {aside[0]}{rest}"
         )
     exposures = _paired(_exposures(entries), settings)
     strays = [one for one in entries if has_manifest and one.row is None and not one.reason]
@@ -273,14 +358,20 @@ def read_campaign(
         warnings.append(
             Caution(
                 "manifest", f"{len(strays)} files have no row in the manifest "
-                f"({named(these)}); taken as their headers say",
-                exposures=tuple(one.number for one in these),
+                f"({named(these)})",
+                "they are used with the conditions of their headers; add rows, or leave them out in "
+                "campaign.yaml: excluded: [FILE, ...]",
+                tuple(one.number for one in these),
             )
         )  # fmt: skip
     lost = settings.baseline if "." in settings.baseline else ""
     if lost and not (folder / lost).exists():
         warnings.append(
-            Caution("baseline", f"{lost} is not there", "nothing to compare with")
+            Caution(
+                "baseline",
+                f"{lost}, the baseline of campaign.yaml, is not there",
+                "no prediction to compare with; give a file in the folder, or a device's name",
+            )
         )
     warnings += [Caution("settings", text) for text in settings.remarks]
     warnings += check_layout(amplifiers)
@@ -297,7 +388,7 @@ def read_campaign(
         settings=settings,
         has_manifest=has_manifest,
     )
-    _ = campaign.masks  # wrong ones are refused here, not at the first exposure
+    _ = campaign.masks  # Faulty masks are refused here, before pixels are read.
     return campaign.with_warnings(*warnings)
 
 
@@ -325,7 +416,7 @@ def _exposures(entries: Sequence[Entry]) -> tuple[Exposure, ...]:
 def _paired(
     exposures: tuple[Exposure, ...], settings: CampaignSettings
 ) -> tuple[Exposure, ...]:
-    """Give the flats their pairs, unless the manifest did."""
+    """Pair the flats, unless the manifest states pairs."""
     flats = [one for one in exposures if one.kind == "flat"]
     if any(one.pair is not None for one in flats):
         return exposures

@@ -1,4 +1,4 @@
-"""What headers and sizes alone show to be wrong in a campaign."""
+"""Checks of a campaign's headers and layouts against one another, without reading pixels."""
 
 from __future__ import annotations
 
@@ -18,16 +18,21 @@ from bfsensor.recording.campaign.exposures import (
 )
 from bfsensor.recording.campaign.manifest import Entry
 from bfsensor.recording.raw.headers import whole_digest
-from bfsensor.recording.raw.keywords import MEANINGS
+from bfsensor.recording.raw.keywords import DATES, MEANINGS, TIMES
 from bfsensor.recording.raw.sections import AmplifierLayout, overlaps
 
 SAME = ("kind", "exposure_time", "wavelength", "filter", "back_bias", "temperature")
+"""Quantities that must agree between two files of equal pixels for one of them to be used."""
+
+PLACE = "campaign.yaml: amplifiers: [{name: ..., detector: '[x1:x2,y1:y2]'}, ...]"
+"""Entry that states the places of amplifiers on the sensor, for messages."""
 
 
 def set_aside_duplicates(entries: Sequence[Entry]) -> None:
-    """Set aside files whose pixels another one has, bit for bit.
+    """Set aside files whose pixels equal another file's, bit for bit.
 
-    The first one stays where all say the same of it; where they do not, none can be trusted.
+    The first of them stays where headers and manifest agree on their settings; where they do not,
+    it is not known which settings are right, and all are set aside.
     """
     groups: dict[str, list[Entry]] = {}
     for one in entries:
@@ -50,21 +55,19 @@ def set_aside_duplicates(entries: Sequence[Entry]) -> None:
             for other in others:
                 other.reason = f"the same pixels as {first.path.name}"
                 if not agree:
-                    other.reason += ", but said to be of other settings"
+                    other.reason += ", but header or manifest state other settings"
             if others and not agree:
                 copy = others[0].path.name
-                first.reason = (
-                    f"the same pixels as {copy}, but said to be of other settings"
-                )
+                first.reason = f"the same pixels as {copy}, but header or manifest state other settings"
 
 
 def set_aside_other_layouts(entries: Sequence[Entry]) -> tuple[AmplifierLayout, ...]:
-    """Keep the layout of amplifiers that most files have; others are set aside.
+    """Set aside files whose amplifiers differ in layout from those of most files.
 
     Returns
     -------
     amplifiers : tuple of AmplifierLayout
-        As the first file of that layout has them; none without files.
+        Amplifiers of the first file of the most frequent layout; empty without files.
     """
     used = [one for one in entries if not one.reason and one.scan is not None]
     counts = Counter(_geometry(one) for one in used)
@@ -79,10 +82,10 @@ def set_aside_other_layouts(entries: Sequence[Entry]) -> tuple[AmplifierLayout, 
 
 
 def set_aside_contradictions(entries: Sequence[Entry]) -> list[Caution]:
-    """Set aside files of which manifest and header say different things.
+    """Set aside files whose manifest and header differ.
 
-    Where most do, it is no slip but a difference of units or meaning: they stay, as the
-    manifest has them, with a warning.
+    Where most files differ, the cause is a unit or a meaning and not a slip: all of them stay, with
+    the manifest's values and a warning.
     """
     having = [one for one in entries if one.row is not None and not one.reason]
     wrong = [one for one in having if one.disagree]
@@ -91,24 +94,28 @@ def set_aside_contradictions(entries: Sequence[Entry]) -> list[Caution]:
             Caution(
                 "manifest",
                 f"manifest and headers differ in {len(wrong)} of {len(having)} exposures, such "
-                f"as {wrong[0].path.name}: {wrong[0].disagree[0]}; the manifest is taken",
-                "levels and conditions are no better than its units",
+                f"as {wrong[0].path.name}: {wrong[0].disagree[0]}; the manifest's values are used",
+                "conditions are wrong if its columns are in other units; state them in its header "
+                "or in campaign.yaml: keywords: {exposure_time: {unit: ms}}",
             )
         ]
     for one in wrong:
-        one.reason = f"manifest and header differ: {'; '.join(one.disagree)}"
+        one.reason = (
+            f"manifest and header differ: {'; '.join(one.disagree)}; correct one of them"
+        )
     return []
 
 
 def check_layout(amplifiers: Sequence[AmplifierLayout]) -> list[Caution]:
-    """Check that the amplifiers of a sensor fit one another and have overscan."""
+    """Check the places of a sensor's amplifiers, and their overscan sections."""
     found = []
     for name, other in overlaps(amplifiers):
         found.append(
             Caution(
                 "layout",
                 f"DETSEC of {name} and {other} overlap",
-                "position maps, crosstalk by place and frames of the sensor cannot be made",
+                "maps and images of the sensor cannot be made; correct the places in "
+                + PLACE,
             )
         )
     for one in amplifiers:
@@ -118,16 +125,23 @@ def check_layout(amplifiers: Sequence[AmplifierLayout]) -> list[Caution]:
                     "layout",
                     f"{one.name}: DETSEC has {one.on_sensor[1]} x {one.on_sensor[0]} pixels, "
                     f"DATASEC {one.shape[1]} x {one.shape[0]}",
-                    "its place on the sensor is not known",
+                    "its place on the sensor is not known; state it in " + PLACE,
                 )
             )
     if amplifiers and all(one.origin is None for one in amplifiers) and len(amplifiers) > 1:
         found.append(
-            Caution("layout", "no DETSEC", "position maps across amplifiers cannot be made")
+            Caution(
+                "layout",
+                "no DETSEC",
+                f"maps across amplifiers cannot be made; state their places in {PLACE}",
+            )
         )
     found += [
         Caution(
-            "overscan", f"{one.name}: {one.bias_problem}", "its level is not subtracted"
+            "overscan",
+            f"{one.name}: {one.bias_problem}",
+            "the overscan's level is not subtracted; state the section in campaign.yaml: "
+            "amplifiers: [{name: ..., bias: '[x1:x2,y1:y2]'}, ...]",
         )
         for one in amplifiers
         if one.bias_problem
@@ -139,7 +153,8 @@ def check_layout(amplifiers: Sequence[AmplifierLayout]) -> list[Caution]:
                 "axes",
                 f"{above[0].name}: BIASSEC lies above DATASEC, not beside it: it is no serial "
                 "overscan, or x and y are exchanged",
-                "serial and parallel effects are exchanged if so; x must be serial",
+                "x must be the serial direction, else serial and parallel effects are exchanged; "
+                "transpose the images if it is not",
             )
         )
     before = [
@@ -151,9 +166,10 @@ def check_layout(amplifiers: Sequence[AmplifierLayout]) -> list[Caution]:
         found.append(
             Caution(
                 "overscan",
-                f"{before[0]}: BIASSEC lies before DATASEC: taken as prescan (if the file holds "
-                "the rows backwards, say so with a reversed 'data' in campaign.yaml)",
-                "prescan carries no deferred charge",
+                f"{before[0]}: BIASSEC lies before DATASEC and is taken as prescan",
+                "a prescan shows no deferred charge; if the file stores its columns against the "
+                "readout, reverse the section in campaign.yaml: amplifiers: [{name: ..., data: "
+                "'[x2:x1,y1:y2]'}, ...]",
             )
         )
     return found
@@ -162,7 +178,7 @@ def check_layout(amplifiers: Sequence[AmplifierLayout]) -> list[Caution]:
 def check_gains(
     amplifiers: Sequence[AmplifierLayout], entries: Sequence[Entry]
 ) -> list[Caution]:
-    """Name the amplifiers whose gain is not the same in all headers; one is taken for all."""
+    """Report amplifiers whose gain differs between headers; one of them is used for all files."""
     found = []
     scans = [one.scan for one in entries if not one.reason and one.scan is not None]
     for layout in amplifiers:
@@ -179,9 +195,10 @@ def check_gains(
         found.append(
             Caution(
                 "gain",
-                f"{layout.name}: headers give different gains [e-/ADU]: {words}; {taken} is taken "
+                f"{layout.name}: headers give different gains [e-/ADU]: {words}; {taken} is used "
                 "for all",
-                "everything per electron is wrong by the ratio in the other files",
+                "results per electron are wrong by the ratio in the other files; state the gain in "
+                "campaign.yaml: keywords: {gain: {value: ...}}",
             )
         )
     return found
@@ -190,7 +207,7 @@ def check_gains(
 def check_keywords(
     exposures: Sequence[Exposure], entries: Sequence[Entry]
 ) -> list[Caution]:
-    """Name what headers do not say, once, with the question that it closes."""
+    """Report each quantity that headers lack, once, with the analysis that needs it."""
     found: list[Caution] = []
     lit = [one for one in exposures if one.kind in LIT]
     sets = {
@@ -203,35 +220,66 @@ def check_keywords(
     }  # fmt: skip
     for name, members in sets.items():
         lacking = [one for one in members if getattr(one, name) is None]
-        found += _lacking(words.get(name, name), lacking, members, MEANINGS[name].closes)
+        found += _lacking(words.get(name, name), lacking, members, _consequence(name))
     dark = [one for one in lit if one.wavelength is None and one.filter is None]
-    found += _lacking("wavelength or filter", dark, lit, MEANINGS["wavelength"].closes)
+    found += _lacking("wavelength or filter", dark, lit, _consequence("wavelength"))
     timeless = [one for one in exposures if one.mjd is None]
     found += _lacking(
-        "time", timeless, exposures, "drifts of gain, lamp and bias cannot be ordered"
-    )
+        "time", timeless, exposures,
+        "drifts of gain, lamp and bias cannot be ordered in time; add a column mjd to manifest.ecsv, "
+        f"or one of the keywords {', '.join((*TIMES, *DATES))} to the headers",
+    )  # fmt: skip
     guessed = [one for one in entries if one.kind_from_name and not one.reason]
     if guessed:
         found.append(
             Caution(
-                "kind", f"the kind of {len(guessed)} exposures is from their names only"
+                "kind",
+                f"the kind of {len(guessed)} exposures is from their names only",
+                "a misnamed file would be used as another kind; manifest.ecsv with the columns "
+                "file and kind states kinds",
             )
         )
     problems = Counter(p for one in entries if not one.reason for p in one.problems)
     for text, count in problems.items():
-        found.append(Caution("units", f"{text} ({count} exposures); taken as not known"))
+        found.append(
+            Caution(
+                "units",
+                f"{text} ({count_of(count, 'exposure')})",
+                "it is taken as not known"
+                + (
+                    ""
+                    if "campaign.yaml" in text
+                    else "; campaign.yaml's keywords may state another keyword, a unit, or the value"
+                ),
+            )
+        )
     return found
 
 
+def _consequence(name: str) -> str:
+    """Say what needs a quantity, where it was looked for, and how to state it."""
+    meaning = MEANINGS[name]
+    # One lamp reading or exposure time for all exposures would be a false statement.
+    for_all = (
+        ""
+        if name in ("lamp", "exposure_time")
+        else f", or one value for all [{meaning.unit}], {{{name}: {{value: NUMBER}}}}"
+    )
+    return (
+        f"{meaning.closes}; headers were searched for {', '.join(meaning.keywords)}; campaign.yaml "
+        f"may name another keyword, keywords: {{{name}: KEYWORD}}{for_all}"
+    )
+
+
 def check_units(exposures: Sequence[Exposure]) -> list[Caution]:
-    """Hold exposure times against the clock, and back biases against one another."""
+    """Check exposure times against the time stamps, and signs of back biases."""
     found = []
     timed = [
         one for one in exposures if one.mjd is not None and one.exposure_time is not None
     ]
     timed.sort(key=lambda one: one.mjd or 0.0)
     if len(timed) > 2:
-        # Whether the stamp is the beginning or the end, it fits into one of the gaps beside it.
+        # A stamp may be of the begin or the end: the exposure must fit into a gap on either side.
         gaps = np.diff([one.mjd for one in timed]) * 86400.0
         room = np.maximum(np.append(gaps, np.inf), np.insert(gaps, 0, np.inf))
         times = np.array([one.exposure_time for one in timed])
@@ -246,7 +294,7 @@ def check_units(exposures: Sequence[Exposure]) -> list[Caution]:
                     f"{int(late.sum())} exposures are longer than the time until the next one "
                     f"began ({worst.path.name}: {worst.exposure_time:g} s)"
                     + (
-                        "; in ms? say so: keywords: {exposure_time: {unit: ms}}"
+                        "; in ms? then campaign.yaml: keywords: {exposure_time: {unit: ms}}"
                         if fits
                         else ""
                     ),
@@ -261,8 +309,9 @@ def check_units(exposures: Sequence[Exposure]) -> list[Caution]:
                 "units",
                 f"back bias is {'of both signs' if both else 'positive'} "
                 f"({', '.join(f'{v:+g}' for v in sorted(biases))} V): a sensor that collects "
-                "electrons has a negative one; keywords: {back_bias: {scale: -1}} turns it",
-                "a device of the wrong sign cannot be fitted",
+                "electrons has a negative one",
+                "the device's prediction is impossible; campaign.yaml: keywords: {back_bias: "
+                "{scale: -1}} changes the sign",
             )
         )
     stamps = Counter(one.mjd for one in exposures if one.mjd is not None)
@@ -272,7 +321,8 @@ def check_units(exposures: Sequence[Exposure]) -> list[Caution]:
             Caution(
                 "time",
                 f"{len(twice)} exposures share time stamps ({named(twice)})",
-                "their order, and so pairs, may be wrong",
+                "their order, and with it pairs of flats, may be wrong; a column pair in "
+                "manifest.ecsv states pairs",
                 tuple(one.number for one in twice),
             )
         )
@@ -280,7 +330,7 @@ def check_units(exposures: Sequence[Exposure]) -> list[Caution]:
 
 
 def check_pairs(exposures: Sequence[Exposure]) -> list[Caution]:
-    """Name the flats without a partner, and a ladder that climbs with time."""
+    """Report flats without a partner, and exposure times that rise or fall with time."""
     flats = [one for one in exposures if one.kind == "flat"]
     alone = [one for one in flats if one.pair is None]
     found = []
@@ -288,7 +338,10 @@ def check_pairs(exposures: Sequence[Exposure]) -> list[Caution]:
         found.append(
             Caution(
                 "pairs", f"{len(alone)} of {len(flats)} flats have no partner ({named(alone)})",
-                "they give means, no covariances", tuple(one.number for one in alone),
+                "they give levels and no covariances; flats are paired that follow one another "
+                "directly with equal exposure time and settings, or by a column pair in "
+                "manifest.ecsv",
+                tuple(one.number for one in alone),
             )
         )  # fmt: skip
     partners = Counter(one.pair for one in flats if one.pair is not None)
@@ -297,7 +350,8 @@ def check_pairs(exposures: Sequence[Exposure]) -> list[Caution]:
         found.append(
             Caution(
                 "pairs", f"pairs of the manifest that are not two flats: {named(odd)}",
-                exposures=tuple(one.number for one in odd),
+                "they are not used; each value of the column pair must stand at two flats",
+                tuple(one.number for one in odd),
             )
         )  # fmt: skip
     for members in group_conditions(flats).values():
@@ -310,15 +364,16 @@ def check_pairs(exposures: Sequence[Exposure]) -> list[Caution]:
         if abs(np.corrcoef(order, rank)[0, 1]) > 0.9:
             found.append(
                 Caution(
-                    "time", "exposure times climb or fall with time",
-                    "drifts of gain or lamp cannot be told from nonlinearity",
+                    "time", "exposure times rise or fall with time",
+                    "drifts of gain or lamp cannot be separated from nonlinearity; take levels in "
+                    "another order, or repeat one at the end",
                 )
             )  # fmt: skip
     return found
 
 
 def _ranks(values: Any) -> Any:
-    """Ranks, ties averaged."""
+    """Rank of each value from 0; equal values have the mean of their ranks."""
     _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
     ends = np.cumsum(counts)
     return (ends - (counts + 1) / 2)[inverse]
@@ -327,7 +382,7 @@ def _ranks(values: Any) -> Any:
 def _lacking(
     word: str, lacking: Sequence[Exposure], members: Sequence[Exposure], closes: str
 ) -> list[Caution]:
-    """Say what is missing, where it is missing in all or in some."""
+    """Warning that a quantity is missing in all or in some of the exposures that need it."""
     if not lacking:
         return []
     if len(lacking) == len(members):
@@ -345,7 +400,7 @@ def _geometry(one: Entry) -> tuple[Any, ...]:
 
 
 def _first_difference(one: Entry, model: Entry, count: int) -> str:
-    """Say in what a file's amplifiers differ from those of most."""
+    """Describe the first difference of a file's amplifiers from those of most files."""
     if one.scan is None or model.scan is None:
         return "not read"
     mine, theirs = one.scan.amplifiers, model.scan.amplifiers
@@ -378,7 +433,7 @@ def _place(one: AmplifierLayout) -> str:
 
 
 def _bias_above(one: AmplifierLayout) -> bool:
-    """Whether the overscan that the header names follows in y, not in x."""
+    """Whether BIASSEC follows the image in y and not in x."""
     return bool(
         one.bias is not None
         and one.bias[0].start >= one.data[0].stop

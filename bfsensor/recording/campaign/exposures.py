@@ -1,4 +1,4 @@
-"""Exposures of a campaign, grouped by the conditions under which they were taken."""
+"""Exposures of a campaign: their conditions, their grouping by condition, and pairs of flats."""
 
 from __future__ import annotations
 
@@ -13,42 +13,54 @@ from bfsensor.device.condition import Condition
 TOLERANCES = {
     "wavelength": 1.0, "temperature": 2.0, "back_bias": 0.5, "gate_high": 0.1, "gate_low": 0.1,
 }  # fmt: skip
-"""Steps that a bench's readings make by themselves [nm, K, V]: smaller gaps are one setting."""
+"""Largest gap between neighbouring readings that count as one setting [nm, K, V].
+
+Chosen: above the scatter of a test bench's monitors, below the steps that are set on purpose.  If
+they were twice as large, two temperatures 3 K apart would be one condition, and two flats of
+such a step could be a pair.
+"""
 
 LIT = ("flat", "sflat", "spot", "qe", "light")
-"""Kinds that a lamp made."""
+"""Kinds of exposures to light of a lamp."""
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """One exposure; None where nothing says.
+    """One exposure and its conditions; a condition that is not known is None.
 
     Attributes
     ----------
     number : int
-        SEQNUM where every exposure has its own, else the position.
+        SEQNUM where every exposure has a different one, else the position.
     path : Path
         The file.
     kind : str
-        'bias', 'dark', 'flat', 'sflat', 'spot', 'qe', 'ppump', 'fe55' or 'light'.
+        'bias', 'dark', 'flat', 'sflat' (superflat), 'spot', 'qe' (quantum efficiency), 'ppump'
+        (pocket pumping), 'fe55' or 'light' (any other exposure to light).
     position : int
-        Place in the order of time, from 0, those set aside counted.
+        Place in the order of time, from 0; exposures that are set aside are counted.
     exposure_time : float or None
-        [s].
+        Exposure time [s].
     mjd : float or None
-        As the header has it: beginning or middle, it does not say [d].
+        Time stamp [MJD]: begin or middle of the exposure, as the camera writes it.
     wavelength : float or None
-        [nm]; None also without light.
+        Wavelength of the light [nm]; None also without light.
     filter : str or None
         Name of a filter.
     back_bias, gate_high, gate_low : float or None
-        Back bias, collecting and barrier gates [V].
+        Voltages of the back side, the collecting gates and the barrier gates [V].
     temperature : float or None
-        Of the sensor [K].
+        Temperature of the sensor [K].
     lamp : float or None
-        Reading of the lamp monitor, of any unit; None without light.
+        Reading of the lamp monitor, in any unit; None without light.
     pair : int or None
-        Equal for the two flats of a pair.
+        Number of the pair, equal for its two flats; None for an exposure without a partner.
+
+    Examples
+    --------
+    >>> one = Exposure(7, Path("f7.fits"), "flat", 7, gate_high=4.0, gate_low=-8.0)
+    >>> one.gates, one.back_bias
+    ((4.0, -8.0), None)
     """
 
     number: int
@@ -68,7 +80,7 @@ class Exposure:
 
     @property
     def gates(self) -> tuple[float, float] | None:
-        """Collecting and barrier gate [V]; None unless both are known."""
+        """Voltages of the collecting and the barrier gates [V]; None unless both are known."""
         if self.gate_high is None or self.gate_low is None:
             return None
         return self.gate_high, self.gate_low
@@ -76,7 +88,7 @@ class Exposure:
 
 @dataclass(frozen=True)
 class SetAside:
-    """A file that is not used, and why."""
+    """A file that is not used, and the reason."""
 
     path: Path
     reason: str
@@ -87,18 +99,19 @@ class SetAside:
 
 @dataclass(frozen=True)
 class Caution:
-    """Something about a campaign that its reader should know.
+    """Warning about a campaign.
 
     Attributes
     ----------
     topic : str
-        One word, such as 'lamp', 'gain', 'saturation'.
+        Subject in one word, such as 'missing', 'gain', 'saturation'.
     message : str
-        What is wrong, and where.
+        The finding, with the files or amplifiers that it concerns.
     closes : str
-        The question that it closes or bends; '' where none.
+        Consequence: the result that is impossible or biased, and the remedy where there is one;
+        '' without consequence.
     exposures : tuple of int
-        Numbers of the exposures it is about; empty where all.
+        Numbers of the exposures concerned; empty where it concerns all.
     """
 
     topic: str
@@ -113,16 +126,18 @@ class Caution:
 def group_conditions(
     exposures: Sequence[Exposure],
 ) -> dict[Condition, tuple[Exposure, ...]]:
-    """Group exposures by their settings, readings that jitter taken as one.
+    """Group exposures by their settings.
 
     Parameters
     ----------
     exposures : sequence of Exposure
+        Exposures in any order.
 
     Returns
     -------
     groups : dict of Condition to tuple of Exposure
-        The largest first.
+        Exposures by condition, the largest group first.  A condition holds the median of the
+        readings that :data:`TOLERANCES` count as one setting.
 
     Examples
     --------
@@ -136,7 +151,7 @@ def group_conditions(
     }
     groups: dict[Condition, list[Exposure]] = {}
     for k, one in enumerate(exposures):
-        # A filter's name beside a monochromator says nothing more.
+        # The wavelength of a monochromator is the condition: its order-sorting filter is not.
         word = one.filter if settings["wavelength"][k] is None else None
         values = {name: found[k] for name, found in settings.items()}
         groups.setdefault(Condition(filter=word, **values), []).append(one)
@@ -145,7 +160,7 @@ def group_conditions(
 
 
 def cluster(values: Sequence[float | None], gap: float) -> list[float | None]:
-    """Give each value the median of its cluster: sorted neighbours no further than ``gap``.
+    """Replace each value by the median of its cluster, whose neighbours differ by at most ``gap``.
 
     Examples
     --------
@@ -159,7 +174,7 @@ def cluster(values: Sequence[float | None], gap: float) -> list[float | None]:
     medians = {}
     for part in np.split(np.array(known), cuts):
         members = [v for v in values if v is not None and part[0] <= v <= part[-1]]
-        # Ten digits: the mean of two readings should print as they do.
+        # Ten digits, so that the mean of two readings prints with few, such as -60.05.
         medians.update(dict.fromkeys(part.tolist(), float(f"{np.median(members):.10g}")))
     return [None if v is None else medians[float(v)] for v in values]
 
@@ -167,22 +182,23 @@ def cluster(values: Sequence[float | None], gap: float) -> list[float | None]:
 def find_pairs(
     exposures: Sequence[Exposure], *, tolerance: float = 1e-3
 ) -> list[tuple[Exposure, Exposure]]:
-    """Pair flats: neighbours in time, of equal exposure time and settings.
+    """Pair flats that follow one another, of equal exposure time and settings.
 
-    Whatever lay between two flats, also an exposure that was set aside, parts them: a pair
-    is never made across a gap.
+    Two flats with another exposure between them, also one that was set aside, are no pair: the
+    lamp may have drifted, and of four equal flats with the second lost, the first and the third
+    would else be paired.
 
     Parameters
     ----------
     exposures : sequence of Exposure
-        In the order of time.
+        Flats.
     tolerance : float
-        Relative difference of the exposure times.
+        Largest difference of the exposure times over the longer one.
 
     Returns
     -------
     pairs : list of (Exposure, Exposure)
-        Each exposure at most once.
+        Pairs in the order of time, each exposure in at most one.
     """
     same = {
         one.number: setting
@@ -211,7 +227,7 @@ def _equal(one: float | None, other: float | None, tolerance: float) -> bool:
 
 
 def named(exposures: Iterable[Exposure], most: int = 3) -> str:
-    """Name some exposures and count the rest.
+    """Names of the first ``most`` exposures' files, with the number of the others.
 
     Examples
     --------
@@ -224,7 +240,7 @@ def named(exposures: Iterable[Exposure], most: int = 3) -> str:
 
 
 def count_of(number: int, word: str) -> str:
-    """Give a number with its noun.
+    """Number with its noun in singular or plural.
 
     Examples
     --------
@@ -238,4 +254,4 @@ def count_of(number: int, word: str) -> str:
 
 
 Progress = Callable[[int, int], None]
-"""Called with what is done and what there is."""
+"""Function that is called with the number of files done and the number of all."""

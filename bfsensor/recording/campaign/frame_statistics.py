@@ -7,19 +7,25 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class FrameStatistics:
-    """One amplifier in one exposure.
+    """Level, pedestal and noise of one amplifier in one exposure.
 
     Attributes
     ----------
-    exposure, amplifier : int, str
-        Which.
+    exposure : int
+        Number of the exposure.
+    amplifier : str
+        Name of the amplifier.
     level : float
-        Mean of the box in the middle, cut at 5 sigma, above the pedestal [ADU].
-    pedestal, noise : float
-        Mean of the serial overscan and the scatter in it [ADU]; without overscan the biases'
-        mean, and no scatter; nan without either.
+        Mean of the pixels within 5 sigma of the median in a box in the middle of the image,
+        less the pedestal [ADU].
+    pedestal : float
+        Mean of the serial overscan [ADU]; without overscan the median level of the biases; nan
+        without either.
+    noise : float
+        Standard deviation of the serial overscan [ADU]; nan without overscan.
     not_finite, saturated, top : float
-        Shares of the image's pixels: not finite, saturated, and equal to the largest one.
+        Fractions of the image's pixels, from 0 to 1, that are not finite, that are saturated,
+        and that equal the largest finite value.
     """
 
     exposure: int
@@ -34,22 +40,24 @@ class FrameStatistics:
 
 @dataclass(frozen=True)
 class PairStatistics:
-    """One amplifier in a pair of flats.
+    """Level and variance of one amplifier in a pair of flats.
 
     Attributes
     ----------
     first, second : int
         Numbers of the exposures.
     amplifier : str
-        Which.
+        Name of the amplifier.
     level : float
-        Mean of both [ADU].
+        Mean level of the two flats [ADU].
     variance : float
-        Half the variance of the difference in the box, cut at 5 sigma [ADU^2].
+        Half the variance of the difference in a box in the middle of the image, of pixels
+        within 5 sigma of its median [ADU^2]; nan with fewer than 100 pixels.
     pixels : int
-        Used.
+        Number of pixels of the variance; 0 where it is nan.
     mismatch : float
-        Relative difference of the two levels.
+        Difference of the second level from the first over their mean; 0 where it is below 5 ADU,
+        which errors of the pedestals explain.
     """
 
     first: int

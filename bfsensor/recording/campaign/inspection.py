@@ -1,4 +1,4 @@
-"""What the pixels of a campaign show to be wrong: one pass, one exposure at a time."""
+"""Checks of a campaign's pixels: levels, variances and gains, one exposure in memory at a time."""
 
 from __future__ import annotations
 
@@ -30,25 +30,36 @@ from bfsensor.recording.campaign.level_checks import (
 from bfsensor.recording.raw.overscan import MAD_TO_SIGMA, find_overscan, mean_and_scatter
 
 BOX = 256
-"""Side of the box in the middle of each amplifier from which levels and variances come: a
-pair's variance has an error of 0.6 % there."""
+"""Side of the box in the middle of each amplifier in which levels and variances are taken [pixel].
+
+Chosen: the variance of a pair then has a relative error of sqrt(2) / 256 = 0.6 %.  Twice the side
+halves it, for 4 times the memory of flats that wait for their partners.
+"""
 
 MOST_NAN = 0.1
-"""Share of pixels that are not finite above which an exposure is set aside."""
+"""Largest fraction of an amplifier's image that may be not finite; beyond, an exposure is set aside.
+
+Chosen: a few bad columns pass, a file with missing parts does not.  At twice the value an exposure
+of which 15 % are missing would be used.
+"""
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """A campaign after its pixels were looked at.
+    """A campaign with the statistics of its pixels.
 
     Attributes
     ----------
     campaign : Campaign
-        With what was found among its warnings, and unreadable exposures set aside.
+        Campaign with further warnings; exposures whose pixels cannot be used are set aside.
     frames : tuple of FrameStatistics
-        By exposure and amplifier.
+        Statistics of each exposure and amplifier.
     pairs : tuple of PairStatistics
-        By pair and amplifier.
+        Statistics of each pair of flats and amplifier.
+
+    Examples
+    --------
+    :func:`inspect_campaign` makes one; its example shows the statistics of a pair.
     """
 
     campaign: Campaign
@@ -56,31 +67,58 @@ class Inspection:
     pairs: tuple[PairStatistics, ...]
 
     def levels(self, exposure: int) -> dict[str, float]:
-        """Give the level of each amplifier in an exposure [ADU]."""
+        """Give the level of each amplifier in an exposure.
+
+        Parameters
+        ----------
+        exposure : int
+            Number of the exposure.
+
+        Returns
+        -------
+        levels : dict of str to float
+            Level above the pedestal by amplifier [ADU]; empty for an exposure that is not used.
+        """
         return {f.amplifier: f.level for f in self.frames if f.exposure == exposure}
 
 
 def inspect_campaign(campaign: Campaign, *, progress: Progress | None = None) -> Inspection:
-    """Read every exposure once, and hold levels, variances and gains against one another.
+    """Read every exposure once, and compare levels, variances and gains.
 
     Parameters
     ----------
     campaign : Campaign
-        As :func:`bfsensor.recording.campaign.campaign.read_campaign` gives it.
+        Campaign as :func:`bfsensor.recording.read_campaign` reads it.
     progress : callable, optional
-        Called with the exposures done and their number.
+        Function that is called with the number of exposures done and the number of all.
 
     Returns
     -------
     inspection : Inspection
-        Exposures whose pixels cannot be read, or of which more than a tenth are not finite,
-        are set aside in its campaign.  Saturated pairs, gains that the header has wrong by
-        more than 20 %, flats whose level steps or stands out, biases with light, drifting
-        pedestals and unequal pairs stay and are named.
+        Exposures whose pixels cannot be read, or of which more than a tenth are not finite, are
+        set aside in its campaign.  Its campaign's warnings report saturated pairs, gains of
+        headers that mean over variance contradicts by more than 20 %, outliers and steps of
+        levels, steps of pedestals, and unequal pairs; these exposures stay.
 
     Notes
     -----
-    Held at a time: one exposure, and the boxes of flats that wait for their partners.
+    Memory holds one exposure, and the boxes of flats that wait for their partners.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from astropy.io import fits
+    >>> from bfsensor.recording import read_campaign
+    >>> rng = np.random.default_rng(8231)
+    >>> header = fits.Header({"IMGTYPE": "FLAT", "EXPTIME": 2.0, "CCDGAIN": 1.0})
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     for n in range(2):
+    ...         data = rng.poisson(9000, (64, 64)).astype(np.uint16)
+    ...         fits.PrimaryHDU(data, header).writeto(f"{folder}/{n}.fits")
+    ...     found = inspect_campaign(read_campaign(folder))
+    >>> (pair,) = found.pairs
+    >>> abs(pair.level - 9000) < 10, abs(pair.variance / pair.level - 1) < 0.1
+    (True, True)
     """
     frames: list[FrameStatistics] = []
     pairs: list[PairStatistics] = []
@@ -123,8 +161,9 @@ def inspect_campaign(campaign: Campaign, *, progress: Progress | None = None) ->
         cautions.append(
             Caution(
                 "pixels",
-                f"pixels that are not finite in {named(holed)}; they are masked",
-                exposures=tuple(one.number for one in holed),
+                f"pixels that are not finite in {named(holed)}",
+                "they are masked",
+                tuple(one.number for one in holed),
             )
         )
     cautions += check_mismatch(found, pairs)
@@ -137,7 +176,7 @@ def inspect_campaign(campaign: Campaign, *, progress: Progress | None = None) ->
 
 
 def check_mismatch(campaign: Campaign, pairs: Sequence[PairStatistics]) -> list[Caution]:
-    """Name the pairs whose two levels differ: their fixed pattern does not drop out."""
+    """Report the pairs whose two levels differ, so that their fixed pattern does not cancel."""
     wrong = sorted({(p.first, p.second) for p in pairs if abs(p.mismatch) > MISMATCH})
     if not wrong:
         return []
@@ -147,14 +186,15 @@ def check_mismatch(campaign: Campaign, pairs: Sequence[PairStatistics]) -> list[
         Caution(
             "pairs",
             f"{count_of(len(wrong), 'pair')} of unequal levels, by up to {most:.1%} ({named(first)})",
-            "fixed pattern does not drop out of them",
+            "fixed pattern stays in their differences and raises their variance; a stable lamp, or "
+            "pairs of equal levels by a column pair in manifest.ecsv, avoid that",
             tuple(n for pair in wrong for n in pair),
         )
     ]
 
 
 def _statistics(frame: AmplifierFrame) -> FrameStatistics:
-    """Level, pedestal and shares of bad pixels of one amplifier."""
+    """Level, pedestal and fractions of bad pixels of one amplifier."""
     image = frame.image
     finite = np.isfinite(image)
     share = 1.0 - float(np.count_nonzero(finite)) / image.size
@@ -178,7 +218,10 @@ def _statistics(frame: AmplifierFrame) -> FrameStatistics:
 
 
 def _box(frame: AmplifierFrame) -> NDArray[np.float32]:
-    """Middle of an image, copied, nan where it is masked but not for saturation."""
+    """Middle of an image, copied; masked pixels are nan, saturated ones stay.
+
+    Saturated pixels must stay: the collapse of their variance is what shows saturation.
+    """
     ny, nx = frame.image.shape
     y, x = max((ny - BOX) // 2, 0), max((nx - BOX) // 2, 0)
     place = np.s_[y : y + BOX, x : x + BOX]
@@ -191,7 +234,7 @@ def _compare(
     first: Exposure, second: Exposure, amplifier: str, one: NDArray[np.float32],
     other: NDArray[np.float32],
 ) -> PairStatistics:  # fmt: skip
-    """Variance of a pair; its level is filled in once the pedestals are known."""
+    """Variance of a pair; :func:`_with_levels` fills in its level, which needs the pedestals."""
     difference = (one - other).astype(np.float64)
     difference = difference[np.isfinite(difference)]
     if difference.size < 100:
@@ -200,7 +243,7 @@ def _compare(
         )
     middle = np.median(difference)
     sigma = MAD_TO_SIGMA * np.median(np.abs(difference - middle))
-    # Differences that are all equal (saturated) have no MAD; none is cut then.
+    # Differences that are mostly equal (saturated flats) have a MAD of 0: no cut then.
     kept = difference[np.abs(difference - middle) <= 5 * sigma] if sigma else difference
     return PairStatistics(
         first.number,
@@ -216,7 +259,7 @@ def _compare(
 def _above_biases(
     campaign: Campaign, frames: Sequence[FrameStatistics]
 ) -> list[FrameStatistics]:
-    """Take the biases' level off where there was no overscan."""
+    """Subtract the median level of the biases from levels without overscan."""
     biases = {one.number for one in campaign.of("bias")}
     out = []
     for name in dict.fromkeys(f.amplifier for f in frames):
@@ -240,7 +283,7 @@ def _with_levels(
         a, b = level[pair.first, pair.amplifier], level[pair.second, pair.amplifier]
         mean = (a + b) / 2
         off = (b - a) / mean if mean > 0 else 0.0
-        # Two dim flats differ by their pedestals' errors: no mismatch of the light.
+        # Levels of dim flats differ by errors of the pedestals, not by light: 5 ADU are allowed.
         off = off if abs(b - a) > 5.0 else 0.0
         out.append(replace(pair, level=mean, mismatch=off))
     return out

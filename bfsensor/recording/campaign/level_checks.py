@@ -1,4 +1,4 @@
-"""Checks of levels against one another, the clock, the lamp and the header's gain."""
+"""Checks of flats' and biases' levels: saturation, gains, outliers and steps in time."""
 
 from __future__ import annotations
 
@@ -15,26 +15,47 @@ if TYPE_CHECKING:
     from bfsensor.recording.campaign.frame_statistics import FrameStatistics, PairStatistics
 
 GAIN_RANGE = (0.8, 1.25)
-"""Header's gain over mean / variance that passes: beyond is another amplifier's, or 2."""
+"""Smallest and largest ratio of the header's gain to mean over variance that passes.
+
+Chosen: far above the few percent that :func:`measure_gains` is uncertain by, and below the factor
+of 2 that variances of differences, not halved, make.  If the range were twice as wide, 0.64 to 1.56, a
+gain wrong by 1.5, such as another amplifier's, would not be reported.
+"""
 
 COLLAPSE = 0.9
-"""A variance below this part of that of a lower level is saturated: the brighter-fatter
-effect slows its rise, it never turns it."""
+"""Largest ratio of a pair's variance to that of a lower level at which it counts as saturated.
+
+The brighter-fatter effect slows the rise of the variance with the level and does not turn it; full
+wells and the converter's end do.  Chosen: at 0.8, twice the margin, pairs whose variance fell by
+10 to 20 % would pass as sound.  The fall must also be 5 times its statistical error.
+"""
 
 STEP, OUTLIER = 0.02, 0.2
-"""Relative steps and outliers of the flats' rate that are named."""
+"""Relative step in time of the flats' rate, and relative deviation of one flat, that are reported.
+
+Chosen: a step twice as large would let a lamp or gain that changed by 3 % pass, and an outlier twice
+as large a flat that is 30 % too dim.  A step must also be 6 times the scatter beside it.
+"""
 
 MISMATCH = 0.02
-"""Relative difference of the two levels of a pair above which it is named."""
+"""Relative difference of the two levels of a pair above which it is reported.
+
+A difference of m at the level L [ADU] leaves (m L p)^2 / 2 of a fixed pattern of the relative rms p in
+the pair's variance.  Chosen: at twice the value 4 times as much may remain unreported.
+"""
 
 WINDOW = 5
-"""Exposures on each side of a step."""
+"""Number of exposures on each side of a step whose medians are compared.
+
+Chosen: with twice as many, steps among the first or last 9 exposures, and all steps in fewer than
+20, would be missed; the scatter of the medians would be smaller by sqrt(2).
+"""
 
 
 def check_saturation(
     campaign: Campaign, frames: Sequence[FrameStatistics], pairs: Sequence[PairStatistics]
 ) -> list[Caution]:
-    """Name pairs whose variance falls, and frames with many pixels at one highest value."""
+    """Report pairs whose variance falls with the level, and flats with many saturated pixels."""
     flats = {one.number: one for one in campaign.of("flat")}
     lit = [f for f in frames if f.exposure in flats]
     full = sorted({f.exposure for f in lit if f.saturated > 0.01})
@@ -46,7 +67,8 @@ def check_saturation(
                 "saturation",
                 f"more than 1 % of the pixels are saturated in {len(full)} flats "
                 f"({named(flats[n] for n in full)}); they are masked",
-                "means and variances of what is left are biased",
+                "mean and variance of the other pixels are biased; leave these flats out in "
+                "campaign.yaml: excluded: [FILE, ...]",
                 tuple(full),
             )
         )
@@ -54,10 +76,10 @@ def check_saturation(
         found.append(
             Caution(
                 "saturation",
-                f"pixels heap up at one highest value in {len(heaped)} flats "
-                f"({named(flats[n] for n in heaped)}): the converter's end? say so: "
-                "keywords: {saturation: {value: ADU}}",
-                "saturated pixels are not masked",
+                f"more than 1 % of the pixels have the image's highest value in {len(heaped)} "
+                f"flats ({named(flats[n] for n in heaped)}), as at the end of a converter's range",
+                "saturated pixels are not masked; state that value [ADU] in campaign.yaml: "
+                "keywords: {saturation: {value: ...}}",
                 tuple(heaped),
             )
         )
@@ -65,7 +87,7 @@ def check_saturation(
 
 
 def _check_collapse(campaign: Campaign, pairs: Sequence[PairStatistics]) -> list[Caution]:
-    """Name the pairs of each amplifier whose variance is below that of lower levels."""
+    """Report the pairs of each amplifier whose variance is below that of lower levels."""
     collapsed: dict[str, list[PairStatistics]] = {}
     for mine in _by_amplifier(pairs, _conditions(campaign)):
         rising = sorted((p for p in mine if p.pixels), key=lambda p: p.level)
@@ -85,8 +107,9 @@ def _check_collapse(campaign: Campaign, pairs: Sequence[PairStatistics]) -> list
             Caution(
                 "saturation",
                 f"{name}: the variance of {count_of(len(wrong), 'pair')} is below that of lower levels, "
-                f"from {lowest.level:.0f} ADU on: saturated",
-                "leave them out of covariances; they give the full well",
+                f"from {lowest.level:.0f} ADU on: the full well or the converter's end is reached",
+                "their covariances do not measure the brighter-fatter effect; leave these flats "
+                "out in campaign.yaml: excluded: [FILE, ...]",
                 tuple(n for p in wrong for n in (p.first, p.second)),
             )
         )
@@ -96,7 +119,7 @@ def _check_collapse(campaign: Campaign, pairs: Sequence[PairStatistics]) -> list
 def check_gain(
     campaign: Campaign, frames: Sequence[FrameStatistics], pairs: Sequence[PairStatistics]
 ) -> list[Caution]:
-    """Hold the header's gains against mean over variance of the flat pairs."""
+    """Compare the header's gains with mean over variance of the flat pairs."""
     found = []
     measured = measure_gains(frames, pairs)
     for layout in campaign.amplifiers:
@@ -107,9 +130,10 @@ def check_gain(
             found.append(
                 Caution(
                     "gain",
-                    f"{layout.name}: no gain; mean over variance of the pairs says "
-                    f"{gain:.3g} e-/ADU",
-                    "a white excess of variance cannot be told from it without Fe55",
+                    f"{layout.name}: no gain in header or campaign.yaml; mean over variance of the "
+                    f"pairs gives {gain:.3g} e-/ADU",
+                    "a white excess of variance cannot be separated from the gain without Fe55; "
+                    f"to use this one, campaign.yaml: keywords: {{gain: {{value: {gain:.3g}}}}}",
                 )
             )
         elif not GAIN_RANGE[0] <= layout.gain / gain <= GAIN_RANGE[1]:
@@ -119,7 +143,9 @@ def check_gain(
                     f"{layout.name}: the gain is {layout.gain:.3g} e-/ADU by header or "
                     f"campaign.yaml, {gain:.3g} by mean over variance of the pairs (ratio "
                     f"{layout.gain / gain:.2f})",
-                    "everything per electron is wrong by that ratio",
+                    "results per electron are wrong by that ratio if the pairs are right; then "
+                    f"state the gain in campaign.yaml: keywords: {{gain: {{value: {gain:.3g}}}}}, "
+                    "or one for each of amplifiers",
                 )
             )
     return found
@@ -130,19 +156,21 @@ def measure_gains(
 ) -> dict[str, float]:
     """Estimate gains by mean over variance, extrapolated to low levels [e-/ADU].
 
-    A check, not a measurement: good to a few percent.
+    The estimate serves to check headers; it is good to a few percent.
     """
     gains = {}
     for name in dict.fromkeys(p.amplifier for p in pairs):
         noise = [f.noise for f in frames if f.amplifier == name and np.isfinite(f.noise)]
         white = float(np.median(noise)) ** 2 if noise else 0.0
         mine = [p for p in pairs if p.amplifier == name and p.pixels and p.level > 0]
-        # The pattern of unequal flats stays in their difference.
+        # The fixed pattern stays in the difference of unequal flats.  At low levels an error of
+        # the read noise would enter the gain: shot noise must be 3 times as large.
         mine = [p for p in mine if p.variance > 4 * white and abs(p.mismatch) <= MISMATCH]
         if not mine:
             continue
-        # Above half of the largest variance the brighter-fatter effect bends the curve, and
-        # saturation turns it.
+        # The brighter-fatter effect lowers variance over mean in proportion to the level, to first
+        # order: its value at level 0 is 1 / gain.  Higher orders, and the turnover at saturation,
+        # are kept out by a limit of 0.6 of the level at which the variance is largest.
         most = max(p.variance for p in mine)
         level_of_most = max(p.level for p in mine if p.variance >= 0.99 * most)
         low = [p for p in mine if p.level <= 0.6 * level_of_most] or mine
@@ -157,7 +185,7 @@ def measure_gains(
 
 
 def check_levels(campaign: Campaign, frames: Sequence[FrameStatistics]) -> list[Caution]:
-    """Name biases with light, and flats that stand out of those like them."""
+    """Report biases and flats whose level differs from those of the same settings."""
     found = []
     by_number = {one.number: one for one in campaign.exposures}
     biases = {one.number for one in campaign.of("bias")}
@@ -174,8 +202,10 @@ def check_levels(campaign: Campaign, frames: Sequence[FrameStatistics]) -> list[
         found.append(
             Caution(
                 "levels",
-                f"biases whose level stands out: {named(by_number[n] for n in sorted(lit))}",
-                "light or another kind of exposure under a wrong name",
+                "biases whose level differs from the others' by more than 10 times the noise: "
+                f"{named(by_number[n] for n in sorted(lit))}",
+                "they saw light, or are exposures of another kind; leave them out in "
+                "campaign.yaml: excluded: [FILE, ...]",
                 tuple(sorted(lit)),
             )
         )
@@ -186,7 +216,9 @@ def check_levels(campaign: Campaign, frames: Sequence[FrameStatistics]) -> list[
                 "levels",
                 f"the level of {len(out)} flats is off by more than {OUTLIER:.0%} from others "
                 f"of the same exposure time and settings ({named(by_number[n] for n in out)})",
-                exposures=tuple(out),
+                "lamp, shutter or header is wrong there; leave them out in campaign.yaml: "
+                "excluded: [FILE, ...]",
+                tuple(out),
             )
         )
     return found
@@ -195,7 +227,7 @@ def check_levels(campaign: Campaign, frames: Sequence[FrameStatistics]) -> list[
 def check_level_steps(
     campaign: Campaign, frames: Sequence[FrameStatistics]
 ) -> list[Caution]:
-    """Find a step in time of the flats' rate: a lamp or a gain that jumped."""
+    """Report a step in time of the flats' level over exposure time, and over the lamp."""
     rates = [(n, r) for n, r in _rates(campaign, frames) if abs(r - 1) <= OUTLIER]
     at, step, scatter = _largest_step(np.array([r for _, r in rates]))
     if abs(step) < STEP or abs(step) < 6 * scatter:
@@ -207,14 +239,14 @@ def check_level_steps(
             "levels",
             f"the flats' rate {lamp}steps by {step:+.1%} at "
             f"{by_number[rates[at][0]].path.name}",
-            "gain and lamp jumped there: fit the parts apart",
+            "lamp or gain changed there; analyse the exposures before and after it as two campaigns",
             (rates[at][0],),
         )
     ]
 
 
 def check_pedestals(campaign: Campaign, frames: Sequence[FrameStatistics]) -> list[Caution]:
-    """Find a step in time of the pedestals."""
+    """Report a step in time of the overscan's level."""
     found = []
     by_number = {one.number: one for one in campaign.exposures}
     for name in dict.fromkeys(f.amplifier for f in frames):
@@ -229,7 +261,7 @@ def check_pedestals(campaign: Campaign, frames: Sequence[FrameStatistics]) -> li
                     "pedestal",
                     f"{name}: the overscan steps by {step:+.1f} ADU at "
                     f"{by_number[mine[at].exposure].path.name} (noise {noise:.1f} ADU)",
-                    "biases taken before do not hold after it",
+                    "bias frames from before the step do not give the zero level after it",
                     (mine[at].exposure,),
                 )
             )
@@ -239,9 +271,9 @@ def check_pedestals(campaign: Campaign, frames: Sequence[FrameStatistics]) -> li
 def _rates(
     campaign: Campaign, frames: Sequence[FrameStatistics]
 ) -> list[tuple[int, float]]:
-    """Levels by the lamp's light over the median of flats like them, in the order of time.
+    """Level over lamp reading of each flat, over the median of its group, in the order of time.
 
-    Only flats of the same settings and exposure time are compared: no nonlinearity enters.
+    A group has the same settings and exposure time, so that nonlinearity does not enter.
     """
     level: dict[int, list[float]] = {}
     for f in frames:
@@ -279,7 +311,7 @@ def _largest_step(values: FloatArray) -> tuple[int, float, float]:
         before, after = values[k - WINDOW : k], values[k : k + WINDOW]
         step = float(np.median(after) - np.median(before))
         both = np.concatenate([before - np.median(before), after - np.median(after)])
-        # A window that has a part of the other side gives the same step, with more scatter.
+        # Medians of a window that is off by an exposure give the same step, with more scatter.
         score = abs(step) - 2 * float(np.mean(np.abs(both)))
         if score > most:
             best, most = (k, step, 1.4826 * float(np.median(np.abs(both)))), score
@@ -287,7 +319,7 @@ def _largest_step(values: FloatArray) -> tuple[int, float, float]:
 
 
 def _conditions(campaign: Campaign) -> dict[int, int]:
-    """Give the number of the condition of each flat."""
+    """Index of the condition of each flat, by the flat's number."""
     return {
         one.number: k
         for k, members in enumerate(campaign.conditions("flat").values())

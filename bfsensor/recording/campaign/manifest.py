@@ -1,4 +1,4 @@
-"""The list of a campaign's exposures: from manifest.ecsv, from headers, or from both."""
+"""List of a campaign's exposures, from manifest.ecsv, from headers, or from both."""
 
 from __future__ import annotations
 
@@ -27,31 +27,35 @@ COLUMNS = {
     "gate_low": ("parllo", "gate_low"), "lamp": ("diode", "lamp", "mondiode"),
     "pair": ("pair",), "sha256": ("sha256",),
 }  # fmt: skip
-"""Columns of manifest.ecsv by quantity; units as in headers, unless the column has one."""
+"""Names of manifest.ecsv's columns by quantity, of which the first found is read.
+
+A column without a unit has the unit of headers (``header_unit`` of
+:data:`bfsensor.recording.raw.keywords.MEANINGS`).
+"""
 
 
 @dataclass
 class Entry:
-    """One file on its way to become an exposure.
+    """One file or row of the manifest while a campaign is read.
 
     Attributes
     ----------
     path : Path
-        Where it is, or should be.
+        The file; it need not exist where only the manifest names it.
     row : mapping or None
-        What the manifest says; None without a row.
+        Quantities of the manifest's row; None without one.
     said : dict
-        Quantities, the manifest's before the header's.
+        Quantities of the manifest, and of the header where the manifest has none.
     scan : FileScan or None
-        None where the file could not be read.
+        Headers; None where the file could not be read.
     reason : str
-        Why it is set aside; '' while it is not.
+        Why the file is set aside; '' where it is not.
     disagree : tuple of str
         Quantities in which manifest and header differ, with both values.
     problems : tuple of str
-        Values that cannot be meant.
+        Values outside their possible range.
     kind_from_name : bool
-        Only the file's name says what it is.
+        True where the kind is known by the file's name only.
     """
 
     path: Path
@@ -65,7 +69,7 @@ class Entry:
 
 
 def list_files(folder: Path) -> list[Path]:
-    """FITS files of a folder, numbers in their names in order.
+    """FITS files of a folder, sorted by name with numbers in numerical order.
 
     Raises
     ------
@@ -81,7 +85,7 @@ def list_files(folder: Path) -> list[Path]:
 
 
 def natural(name: str) -> list[tuple[int, float, str]]:
-    """Sort key by which 'flat9.5' comes before 'flat10'."""
+    """Sort key of a file name that puts 'flat9.5' before 'flat10'."""
     parts = re.split(r"(\d+(?:\.\d+)?)", name.lower())
     return [(0, float(p), "") if p[:1].isdigit() else (1, 0.0, p) for p in parts]
 
@@ -89,19 +93,26 @@ def natural(name: str) -> list[tuple[int, float, str]]:
 def read_manifest(
     path: Path, overrides: Mapping[str, Override] | None = None
 ) -> list[dict[str, Any]]:
-    """Read manifest.ecsv: a mapping for each row, None where it says nothing.
+    """Read manifest.ecsv.
 
     Parameters
     ----------
     path : Path
         The file.
     overrides : mapping of str to Override, optional
-        Units and scales of campaign.yaml, for columns that have no unit themselves.
+        The ``keywords:`` of campaign.yaml: units and scales of columns that have no unit, and
+        words of kinds.
+
+    Returns
+    -------
+    rows : list of dict
+        Quantities of each row in the units of :func:`bfsensor.recording.raw.keywords.translate`;
+        None where a cell is empty.
 
     Raises
     ------
     RecordingError
-        Not ECSV, or without a column of files.
+        The file is not ECSV, or has no column of file names.
     """
     try:
         table = Table.read(path, format="ascii.ecsv")
@@ -115,7 +126,10 @@ def read_manifest(
         if any(word in lower for word in words)
     }
     if "file" not in there:
-        raise RecordingError(f"{path}: no column 'file' among {', '.join(table.colnames)}")
+        raise RecordingError(
+            f"{path}: no column 'file' with the names of the exposures' files among "
+            f"{', '.join(table.colnames)}"
+        )
     units = {
         MEANINGS[name].keywords[0]: str(table[column].unit)
         for name, column in there.items()
@@ -144,23 +158,25 @@ def read_manifest(
 def gather(
     folder: Path, settings: CampaignSettings, progress: Any = None
 ) -> tuple[list[Entry], bool]:
-    """Read all headers and put them beside the manifest.
+    """Read all headers and compare them with the manifest.
 
     Parameters
     ----------
     folder : Path
-        The campaign.
+        Folder of the campaign.
     settings : CampaignSettings
-        Of its campaign.yaml.
+        Settings of its campaign.yaml.
     progress : callable, optional
-        Called with the files done and their number.
+        Function that is called with the number of files done and the number of all.
 
     Returns
     -------
     entries : list of Entry
-        Rows of the manifest in its order, then files without a row; set aside where a file is
-        missing, broken, changed since the manifest, excluded or of no known kind.
+        Rows of the manifest in its order, then files without a row.  Entries have a reason
+        where a file is missing, broken, changed since the manifest, excluded or of no known
+        kind.
     has_manifest : bool
+        True where a manifest has rows.
     """
     files = {one.name: one for one in list_files(folder)}
     rows = read_manifest(settings.manifest, settings.overrides) if settings.manifest else []
@@ -188,7 +204,7 @@ def gather(
 
 
 def _read_entry(one: Entry, settings: CampaignSettings) -> None:
-    """Fill an entry from its file; the reason says why where that fails."""
+    """Fill an entry from its file, or set it aside with the reason."""
     row = one.row or {}
     one.said = dict(row)
     try:
@@ -201,7 +217,10 @@ def _read_entry(one: Entry, settings: CampaignSettings) -> None:
     one.scan = scan
     sha = row.get("sha256")
     if sha and file_sha256(one.path) != str(sha).lower():
-        one.reason = "its SHA-256 is not the manifest's: another file, or changed since"
+        one.reason = (
+            "its SHA-256 is not the manifest's: the file was changed or replaced; copy it again, "
+            "or correct the manifest"
+        )
         return
     cards = dict(scan.cards)
     for own in scan.own:
@@ -219,7 +238,7 @@ def _read_entry(one: Entry, settings: CampaignSettings) -> None:
         said[name] = given
         if value is not None and _differ(name, given, value):
             disagree.append(
-                f"{name} {_short(given)} in the manifest, {_short(value)} in it"
+                f"{name} {_short(given)} in the manifest, {_short(value)} in the header"
             )
     one.said = {**said, "pair": row.get("pair"), "sha256": sha}
     one.disagree = tuple(disagree)
@@ -231,7 +250,8 @@ def _read_entry(one: Entry, settings: CampaignSettings) -> None:
     if one.said["kind"] is None:
         one.reason = next(
             (text for text in one.problems if "as a kind of exposure" in text),
-            "neither header, manifest nor name says what kind of exposure it is",
+            "neither header, manifest nor file name states the kind of exposure; add a column kind "
+            "to manifest.ecsv, or the header's keyword to campaign.yaml: keywords: {kind: KEYWORD}",
         )
     elif one.said["kind"] in ("bias", "dark"):
         one.said.update(dict.fromkeys(("wavelength", "filter", "lamp")))
@@ -240,8 +260,9 @@ def _read_entry(one: Entry, settings: CampaignSettings) -> None:
 def set_order(entries: Sequence[Entry]) -> list[Entry]:
     """Put entries in the order of time.
 
-    By time stamp where most have one, else by number, else as they are (manifest, names).
-    One that has none comes after its neighbour in the manifest or by name.
+    The order is that of time stamps where most have one, else of numbers, else that of the
+    manifest or of names.  An entry without a stamp stays behind its neighbour in the manifest or by
+    name.
     """
     used = [one for one in entries if not one.reason]
     for clock in ("mjd", "number"):
@@ -260,7 +281,7 @@ def set_order(entries: Sequence[Entry]) -> list[Entry]:
 
 
 def _differ(name: str, one: Any, other: Any) -> bool:
-    """Whether manifest and header cannot both be right."""
+    """Whether values of manifest and header differ by more than rounding and jitter."""
     if name == "kind":
         return bool(one != other) and not {one, other} <= set(LIT)
     if name == "exposure_time":
@@ -271,7 +292,7 @@ def _differ(name: str, one: Any, other: Any) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    """Give a cell of a table as Python has it; None where masked, blank or nan."""
+    """Value of a table's cell as a Python object; None where it is masked, blank or nan."""
     if value is np.ma.masked:
         return None
     value = value.item() if isinstance(value, np.generic) else value

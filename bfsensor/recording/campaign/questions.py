@@ -1,4 +1,4 @@
-"""Which questions a campaign leaves open, and the recording that would close each."""
+"""Questions that a campaign's recordings cannot answer, each with the recording that would."""
 
 from __future__ import annotations
 
@@ -9,10 +9,19 @@ from bfsensor.recording.campaign.campaign import Campaign
 from bfsensor.recording.campaign.exposures import LIT, count_of
 
 SERIAL_OVERSCAN, PARALLEL_OVERSCAN = 24, 16
-"""Columns and rows that deferred charge, traps and the amplifier's memory need."""
+"""Columns and rows of overscan below which deferred charge and traps count as hardly seen [pixel].
+
+Chosen: of the charge that traps release with a time constant of t transfers, exp(-24 / t) comes
+after 24 columns and is not seen.  With twice as many asked for, time constants twice as long
+would be seen as well, and most campaigns would be asked for another readout.
+"""
 
 BIASES, DARKS, LEVELS, PAIRS = 10, 10, 8, 24
-"""What a campaign that separates most effects has; pairs are for each level."""
+"""Numbers of biases, of darks, of levels, and of pairs at one level below which more are asked for.
+
+Chosen: errors of noise, dark current and covariances fall with the square root of the number, so
+that twice as many would make them smaller by sqrt(2) for twice the time at the bench.
+"""
 
 
 @dataclass(frozen=True)
@@ -22,11 +31,16 @@ class OpenQuestion:
     Attributes
     ----------
     question : str
-        What stays untested or cannot be told apart.
+        Effect that stays untested, or effects that cannot be separated.
     because : str
-        What these recordings have of it.
+        Number of such recordings that the campaign has, or what is missing.
     take : str
-        The recording that would answer it.
+        Recording that would answer the question.
+
+    Examples
+    --------
+    >>> print(OpenQuestion("crosstalk: untested", "one amplifier", "read two amplifiers"))
+    crosstalk: untested (one amplifier); read two amplifiers
     """
 
     question: str
@@ -38,22 +52,35 @@ class OpenQuestion:
 
 
 def open_questions(campaign: Campaign) -> tuple[OpenQuestion, ...]:
-    """Give what a campaign's recordings cannot separate, whatever the analysis.
+    """Give the questions that a campaign's recordings cannot answer by any analysis.
 
     Parameters
     ----------
     campaign : Campaign
+        Campaign as :func:`bfsensor.recording.read_campaign` reads it, with or without its pixels
+        inspected.
 
     Returns
     -------
     questions : tuple of OpenQuestion
-        Empty only for a campaign that has everything.
+        Open questions, the fundamental ones first; empty for a campaign that has all kinds of
+        recordings.
 
     Notes
     -----
-    Some twins stay whatever is taken of these kinds: charge left behind in the serial
-    register and an amplifier that remembers differ only with the pixel time or a reversed
-    clock, and a white excess of variance is a gain without an X-ray source.
+    Two ambiguities remain with all of these recordings.  Charge deferred in the serial register
+    and an amplifier whose output depends on the previous pixel differ only when the pixel time
+    or the clock direction changes.  A white excess of variance acts like a gain unless an
+    X-ray source gives the gain.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from bfsensor.recording import Exposure
+    >>> flat = Exposure(0, Path("f0.fits"), "flat", 0)
+    >>> questions = open_questions(Campaign(Path("run_1"), "run_1", (flat,)))
+    >>> questions[0].because, questions[0].take
+    ('no pairs of flats', 'take flats in pairs of equal exposure time')
     """
     return tuple(
         OpenQuestion(question, because, take)
@@ -63,7 +90,7 @@ def open_questions(campaign: Campaign) -> tuple[OpenQuestion, ...]:
 
 
 def _settings(campaign: Campaign, name: str) -> list[float]:
-    """Different settings of a quantity among flats and spots."""
+    """Different values of a setting among flats and spots, ascending."""
     found = {
         getattr(condition, name)
         for kind in ("flat", "spot")
@@ -73,7 +100,7 @@ def _settings(campaign: Campaign, name: str) -> list[float]:
 
 
 def _one(name: str, unit: str, word: str) -> Callable[[Campaign], str]:
-    """Whether there is less than two of a setting."""
+    """Make a check that finds fewer than two values of a setting."""
 
     def find(campaign: Campaign) -> str:
         if not (campaign.of("flat") or campaign.of("spot")):
@@ -87,7 +114,7 @@ def _one(name: str, unit: str, word: str) -> Callable[[Campaign], str]:
 
 
 def _fewer(kind: str, wanted: int) -> Callable[[Campaign], str]:
-    """Whether there are less exposures of a kind than wanted."""
+    """Make a check that finds fewer exposures of a kind than wanted."""
 
     def find(campaign: Campaign) -> str:
         count = len(campaign.of(kind))
@@ -113,7 +140,9 @@ def _lamp(campaign: Campaign) -> str:
     if not lacking:
         return ""
     return (
-        "no lamp monitor" if len(lacking) == len(lit) else "not every exposure has a lamp"
+        "no lamp monitor"
+        if len(lacking) == len(lit)
+        else f"no lamp reading in {len(lacking)} of {len(lit)} exposures"
     )
 
 
@@ -129,7 +158,7 @@ def _levels(campaign: Campaign) -> str:
 
 
 def _pairs(campaign: Campaign) -> str:
-    """Most pairs at one level: weak terms need them."""
+    """Whether one level at least has the pairs that weak covariances need."""
     counts = [
         len(campaign.pairs(one, exposure_time=time))
         for one in campaign.conditions()
@@ -148,7 +177,7 @@ def _rates(campaign: Campaign) -> str:
 
 
 def _after(campaign: Campaign) -> str:
-    """Whether a dark or bias follows a flat directly."""
+    """Whether a dark or bias follows an exposure to light directly."""
     kinds = {one.position: one.kind for one in campaign.exposures}
     follows = any(
         kind in ("dark", "bias") and kinds.get(place - 1) in LIT
@@ -171,33 +200,39 @@ def _spot_temperatures(campaign: Campaign) -> str:
 _QUESTIONS: tuple[tuple[str, Callable[[Campaign], str], str], ...] = (
     ("covariances, gain and the brighter-fatter effect in flats: untested", _flats,
      "take flats in pairs of equal exposure time"),
-    ("charge loss, gain nonlinearity and the lamp: cannot be told apart", _lamp,
-     "record a photodiode"),
-    ("exposure time and flux act alike (shutter, nonlinearity, lamp)", _rates,
-     "repeat two levels at another lamp current"),
+    ("charge loss, gain nonlinearity and drifts of the lamp: cannot be told apart", _lamp,
+     "record a photodiode's reading in the header of each exposure (MONDIODE)"),
+    ("effects of exposure time (shutter, dark current) and of charge (nonlinearity): cannot be "
+     "told apart", _rates, "repeat two levels at another lamp current"),
     ("chromatic effect: untested", _one("wavelength", "nm", "wavelength"),
      "take flats and spots at two more wavelengths"),
-    ("device errors and missing physics: cannot be told apart by voltage",
-     _one("back_bias", "V", "back bias"), "take two levels at a second back bias"),
-    ("storage height and free holes: untested", _one("gate_low", "V", "barrier voltage"),
-     "take two levels at other parallel voltages"),
-    ("odd, curl and sub-pixel parts of the shifts: never seen by flats",
+    ("errors of the device's parameters and missing physics: cannot be told apart",
+     _one("back_bias", "V", "back bias"), "take flat pairs of two levels at a second back bias"),
+    ("depth of the stored charge and free holes between pixels: untested",
+     _one("gate_low", "V", "barrier voltage"),
+     "take flat pairs of two levels at other voltages of the parallel gates"),
+    ("boundary shifts that keep pixel areas (odd, curl and sub-pixel parts): not seen in flats",
      _fewer("spot", 1), "take spots at several fluxes and positions"),
     ("diffusion and optics: cannot be told apart", _spot_temperatures,
-     "take spots at a second temperature, focus untouched"),
+     "take spots at a second temperature without touching the focus"),
     ("serial charge transfer, traps and the amplifier's memory: hardly seen", _serial,
-     f"read {SERIAL_OVERSCAN} columns of overscan"),
+     f"read {SERIAL_OVERSCAN} columns of serial overscan"),
     ("parallel charge transfer: hardly seen", _parallel,
-     f"read {PARALLEL_OVERSCAN} rows of overscan"),
+     f"read {PARALLEL_OVERSCAN} rows of parallel overscan"),
     ("correlated noise: hardly tested", _fewer("bias", BIASES), f"take {BIASES} biases"),
     ("dark current, glow and hot columns: hardly tested", _fewer("dark", DARKS),
      f"take {DARKS} darks"),
     ("persistence: untested", _after, "take darks directly after saturated flats"),
-    ("crosstalk: untested", _amplifiers, "read two amplifiers, spots on one"),
-    ("changes of the shifts with charge (b) and full well: weak", _levels,
-     f"take {LEVELS} levels, past the turnover"),
-    ("long range of the shifts and other weak covariances: weak", _pairs,
-     f"take {PAIRS} pairs at two levels"),
-    ("a white excess of variance (Fano, quantum yield) is the same as a gain",
+    ("crosstalk: untested", _amplifiers, "read two amplifiers with spots on one of them"),
+    ("change of the boundary shifts with charge (b_ij) and full well: weakly constrained", _levels,
+     f"take pairs at {LEVELS} levels, some beyond the level of the largest variance"),
+    ("covariances at large lags and other weak ones: weakly constrained", _pairs,
+     f"take {PAIRS} pairs at each of two levels"),
+    ("a white excess of variance (Fano factor, quantum yield) and the gain: cannot be told apart",
      _fewer("fe55", 1), "take an Fe55 exposure"),
 )  # fmt: skip
+"""Each question with the check that finds it open, and the recording that would answer it.
+
+One exposure of spots or Fe55 closes its question.  Chosen: with two demanded, a campaign that has
+a single one would be asked for another, although the effect is not untested.
+"""

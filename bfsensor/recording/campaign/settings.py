@@ -1,4 +1,4 @@
-"""What a campaign.yaml may say: what the headers of a campaign cannot."""
+"""The file campaign.yaml: its entries and their checks."""
 
 from __future__ import annotations
 
@@ -15,55 +15,65 @@ from bfsensor.recording.raw.headers import SECTION_ENTRIES
 from bfsensor.recording.raw.keywords import AMPLIFIER_UNITS, Override, parse_overrides
 
 SCHEMA = "bfsensor-campaign-1"
+"""Value of the entry ``schema``; a file with another one is refused."""
+
 NAME = "campaign.yaml"
+"""Name of the file in the campaign's folder."""
+
 ENTRIES = (
     "schema", "name", "sensor", "instrument", "manifest", "device_card", "baseline",
     "lamp_monitor", "spots", "keywords", "amplifiers", "masks", "excluded", "pairs",
     "nuisances",
 )  # fmt: skip
-"""
-name, sensor, instrument: words.  manifest, device_card, baseline: files (a baseline may be
-a device's name).  lamp_monitor: ``{keyword: MONDIODE, relative_error: 2e-4}``.  spots:
-``{grid_px: 30}``.  keywords: see :func:`bfsensor.recording.raw.keywords.parse_overrides`.
-amplifiers: a list of ``{name: A, hdu: 0, window: '[1:1080,1:4146]', data: '[57:1080,51:4146]',
-bias: '[7:56,51:4146]', detector: '[2048:1025,1:4096]', gain: 4.1, noise: 6, saturation: 65535}``,
-sections as in FITS, of the stored image.  masks: sections of the sensor, or FITS
-images of it, 0 where good.  excluded: names or patterns of files, or a mapping of them to
-reasons.  pairs:
-``{tolerance: 1e-3}``, the relative difference of exposure times that still makes a pair.
+"""Entries of campaign.yaml, all optional:
+
+- name, sensor, instrument: words;
+- manifest, device_card, baseline: files in the folder (a baseline may be a device's name);
+- lamp_monitor: ``{keyword: MONDIODE, relative_error: 2e-4}``, the keyword of the lamp monitor and
+  the relative error of one reading;
+- spots: ``{grid_px: 30}``, the pitch of the mask of spots [pixel];
+- keywords: header keywords, see :func:`bfsensor.recording.raw.keywords.parse_overrides`;
+- amplifiers: a list of ``{name: A, hdu: 0, window: '[1:1080,1:4146]', data: '[57:1080,51:4146]',
+  bias: '[7:56,51:4146]', detector: '[2048:1025,1:4096]', gain: 4.1, noise: 6,
+  saturation: 65535}``; sections as in FITS, of the stored image, ``detector`` of the sensor; gain
+  [e-/ADU], noise [e-], saturation [ADU];
+- masks: sections of the sensor, or FITS images of it, 0 where a pixel is good;
+- excluded: names or patterns of files, or a mapping of them to reasons;
+- pairs: ``{tolerance: 1e-3}``, the largest relative difference of a pair's exposure times;
+- nuisances: a mapping that is kept and not used.
 """
 
 
 @dataclass(frozen=True)
 class CampaignSettings:
-    """A campaign.yaml, checked.
+    """Entries of a campaign.yaml, checked.
 
     Attributes
     ----------
     name, sensor : str
-        Words; '' where not given.
+        Names of the campaign and of the sensor; '' where not given.
     manifest, device_card : Path or None
-        Files, found.
+        Existing files; None where not given.
     baseline : str
-        A file in the folder, or a name of one of our devices; '' where not given.
+        File in the folder, or name of a built-in device; '' where not given.
     lamp_error : float or None
-        Relative error of one reading of the lamp monitor.
+        Relative error of one reading of the lamp monitor; None where not given.
     spot_grid : float or None
-        Pitch of the spots' mask [pixel].
+        Pitch of the mask of spots [pixel]; None where not given.
     overrides : mapping of str to Override
-        Keywords.
+        The entry ``keywords``, by quantity.
     amplifiers : tuple of mappings
-        Sections by amplifier; empty where the headers have them.
+        The entry ``amplifiers``; empty where the headers state the sections.
     masks : tuple of str
-        Sections or files.
+        Sections of the sensor, or names of FITS images.
     excluded : mapping of str to str
-        Reasons by pattern.
+        Reasons for leaving files out, by pattern of their names.
     pair_tolerance : float
-        Relative difference of exposure times.
+        Largest difference of a pair's exposure times over the longer one.
     nuisances : mapping
-        As it is.
+        The entry ``nuisances``, which is not used.
     remarks : tuple of str
-        What in it was not understood.
+        Entries that are not known and were ignored, each in a sentence.
     """
 
     name: str = ""
@@ -82,7 +92,7 @@ class CampaignSettings:
     remarks: tuple[str, ...] = ()
 
     def reason_to_exclude(self, name: str) -> str | None:
-        """Give the reason for which campaign.yaml leaves a file out; None where it does not."""
+        """Give the reason for which campaign.yaml excludes a file; None where it does not."""
         for pattern, reason in self.excluded.items():
             if fnmatch.fnmatch(name, pattern):
                 return reason
@@ -90,21 +100,23 @@ class CampaignSettings:
 
 
 def read_settings(folder: Path) -> CampaignSettings:
-    """Read campaign.yaml; without one, what holds for any folder.
+    """Read the campaign.yaml of a folder; without one all settings have their defaults.
 
     Parameters
     ----------
     folder : Path
-        The campaign.
+        Folder of the campaign.
 
     Returns
     -------
-    CampaignSettings
+    settings : CampaignSettings
+        The checked entries.
 
     Raises
     ------
     RecordingError
-        Not YAML, an unknown schema, an entry of the wrong form, or a file that is not there.
+        The file is not YAML or of an unknown schema, an entry has the wrong form, or a file that
+        it names does not exist.
     """
     path = folder / NAME
     if not path.is_file():
@@ -117,13 +129,18 @@ def read_settings(folder: Path) -> CampaignSettings:
         raise RecordingError(f"{path}: not readable as YAML: {line}") from None
     given = {} if given is None else given
     if not isinstance(given, Mapping):
-        raise RecordingError(f"{path}: must be a mapping of entries")
+        raise RecordingError(
+            f"{path}: must be a mapping of entries, such as 'name: run 3'; entries are "
+            f"{', '.join(ENTRIES)}"
+        )
     schema = given.get("schema", SCHEMA)
     if schema != SCHEMA:
-        raise RecordingError(f"{path}: schema = {schema!r} is not {SCHEMA!r}")
+        raise RecordingError(
+            f"{path}: schema = {schema!r} is not {SCHEMA!r}, the only one that is read"
+        )
     unknown = [str(key) for key in given if key not in ENTRIES]
     remarks = [
-        f"campaign.yaml: {key} is not known and was passed over (known: {', '.join(ENTRIES)})"
+        f"campaign.yaml: {key} is not known and is ignored; entries are {', '.join(ENTRIES)}"
         for key in unknown
     ]
     lamp = _mapping(path, given, "lamp_monitor")
@@ -157,12 +174,12 @@ def _mapping(path: Path, given: Mapping[str, Any], name: str) -> Mapping[str, An
 
 
 def _number(path: Path, given: Mapping[str, Any], entry: str, name: str) -> float | None:
-    """Read a number above 0; None where it is not given."""
+    """Number above 0 of an entry; None where it is not given."""
     value = given.get(name)
     if value is None:
         return None
     try:
-        number = float(value)  # YAML takes 1e-4, without a point, for a word
+        number = float(value)  # YAML reads 1e-4, without a decimal point, as a word
     except (TypeError, ValueError):
         number = float("nan")
     if not number > 0:
@@ -175,13 +192,16 @@ def _number(path: Path, given: Mapping[str, Any], entry: str, name: str) -> floa
 def _file(
     folder: Path, path: Path, given: Mapping[str, Any], name: str, default: str | None
 ) -> Path | None:
-    """Find a file that the entry names; the default only where it is there."""
+    """Path of the file that an entry names; without the entry the default file, if it exists."""
     value = given.get(name)
     if value is None:
         there = default is not None and (folder / default).is_file()
         return folder / str(default) if there else None
     if not (folder / str(value)).is_file():
-        raise RecordingError(f"{path}: {name}: {folder / str(value)} is not there")
+        raise RecordingError(
+            f"{path}: {name}: {folder / str(value)} is not there; give a file name relative to "
+            "the folder"
+        )
     return folder / str(value)
 
 
@@ -190,7 +210,9 @@ def _texts(path: Path, given: Mapping[str, Any], name: str) -> tuple[str, ...]:
     if isinstance(value, str):
         return (value,)
     if not isinstance(value, list | tuple) or not all(isinstance(v, str) for v in value):
-        raise RecordingError(f"{path}: {name} = {value!r} must be a list of texts")
+        raise RecordingError(
+            f"{path}: {name} = {value!r} must be a list of texts, such as ['...', '...']"
+        )
     return tuple(value)
 
 
@@ -207,14 +229,20 @@ def _amplifiers(path: Path, given: Any) -> tuple[Mapping[str, Any], ...]:
     if given is None:
         return ()
     if not isinstance(given, list) or not given:
-        raise RecordingError(f"{path}: amplifiers must be a list")
+        raise RecordingError(
+            f"{path}: amplifiers must be a list of mappings, such as "
+            "[{name: A, bias: '[513:540,1:2000]'}]"
+        )
     names = []
     for entry in given:
         if not isinstance(entry, Mapping) or "name" not in entry or set(entry) - allowed:
             raise RecordingError(
-                f"{path}: amplifiers: {entry!r} must have a name, and of {sorted(allowed)} only"
+                f"{path}: amplifiers: {entry!r} must have a name and no entries but "
+                f"{', '.join(sorted(allowed))}"
             )
         names.append(str(entry["name"]))
     if len(set(names)) < len(names):
-        raise RecordingError(f"{path}: amplifiers: names {names} must differ")
+        raise RecordingError(
+            f"{path}: amplifiers: the names {', '.join(names)} must differ from one another"
+        )
     return tuple(given)

@@ -1,4 +1,4 @@
-"""One look at a FITS file without its pixels: cards, amplifiers, and whether it is whole."""
+"""Headers of a FITS file, the layout of its amplifiers, and checks that it is complete."""
 
 from __future__ import annotations
 
@@ -29,43 +29,53 @@ SUFFIXES = (".fits", ".fit", ".fts", ".fits.fz", ".fits.gz", ".fit.gz")
 SECTION_ENTRIES = {
     "window": "WINDOW", "data": "DATASEC", "bias": "BIASSEC", "detector": "DETSEC",
 }  # fmt: skip
-"""Sections that campaign.yaml may give for an amplifier, and the card that each stands for."""
+"""Sections that campaign.yaml may give for an amplifier, and the keyword that each stands for."""
 
 SHARED_SECTIONS = ("DATASEC", "BIASSEC", "CCDSUM")
-"""Cards that all amplifiers may have in common; a place on the sensor is each one's own."""
+"""Keywords that a primary header without an image may give for all amplifiers.
+
+DETSEC is not among them: each amplifier has its own place on the sensor.
+"""
 
 CONDITION_TABLES = ("TEST_COND", "CCD_COND")
+"""Extensions of LSST's test stands whose headers hold voltages and temperatures."""
+
 _SAMPLE = 1 << 15
+"""Bytes of each of three samples of an image that are compared to find duplicates.
+
+Chosen: twice as many reads twice as many bytes of every file.  The result does not depend on it:
+files whose samples agree are compared as a whole.
+"""
 
 
 @dataclass(frozen=True)
 class FileScan:
-    """What the headers of one file say.
+    """Headers of one raw file and the layout of its amplifiers.
 
     Attributes
     ----------
     path : Path
         The file.
-    cards : dict of str to value
-        Of the primary header, and of the extensions that hold only conditions.
     units : dict of str to str
-        Units that the cards' comments give.
+        Units by keyword, from the comments of the primary header.
     amplifiers : tuple of AmplifierLayout
-        In the order of the file.
+        One for each amplifier, in the order of the file.
     lamp : float or None
-        Mean current of a photodiode's table in the file [nA].
+        Mean current of the photodiode [nA], where the file has a table of it against time.
     sample : str
         Digest of parts of the data, equal for equal data.
     own : tuple of mappings
-        Cards of the extensions, in the order of ``amplifiers``.
+        Values by keyword of the extensions, in the order of ``amplifiers``.
     problems : tuple of mappings
-        What is wrong with the gain, noise or saturation of each amplifier, by those words.
+        For each amplifier why its 'gain', 'noise' or 'saturation' cannot be used; empty where
+        all that are given can.
     spans : tuple of (int, int)
-        Where data begin in the file, and their length [byte].
+        Offset of each part of the data in the file, and its length [byte].
     """
 
     path: Path
     cards: Mapping[str, Any]
+    """Values by keyword of the primary header, and of the extensions that hold only conditions."""
     units: Mapping[str, str]
     amplifiers: tuple[AmplifierLayout, ...]
     lamp: float | None = None
@@ -76,7 +86,7 @@ class FileScan:
 
 
 def is_fits(path: str | os.PathLike[str]) -> bool:
-    """Whether a file's name is one of FITS, of either case.
+    """Whether a file's name ends as those of FITS files do, in small letters or capitals.
 
     Examples
     --------
@@ -87,7 +97,7 @@ def is_fits(path: str | os.PathLike[str]) -> bool:
 
 
 def header_cards(header: fits.Header) -> dict[str, Any]:
-    """Cards with a value, by keyword; comments and history are left out."""
+    """Values of a header by keyword; comments and history are left out."""
     skipped = ("COMMENT", "HISTORY", "", "SIMPLE", "XTENSION", "BITPIX", "BSCALE", "BZERO")
     return {
         card.keyword: card.value
@@ -102,26 +112,27 @@ def scan_file(
     amplifiers: Sequence[Mapping[str, Any]] | None = None,
     overrides: Mapping[str, Override] | None = None,
 ) -> FileScan:
-    """Read the headers of a file, not its pixels, and check that nothing was cut off.
+    """Read the headers of a file, not its pixels, and check that it is not cut short.
 
     Parameters
     ----------
     path : path-like
         Raw FITS: one extension for each amplifier or one image, plain or tile-compressed.
     amplifiers : sequence of mappings, optional
-        What campaign.yaml says of each amplifier, before the headers.
+        The ``amplifiers:`` of campaign.yaml, which replace what the headers say.
     overrides : mapping of str to Override, optional
-        Keywords that campaign.yaml puts before the table's.
+        The ``keywords:`` of campaign.yaml.
 
     Returns
     -------
-    FileScan
+    scan : FileScan
+        Headers and layout.
 
     Raises
     ------
     RecordingError
-        The file is truncated, damaged, holds no image or sections that leave it; names
-        file and extension.
+        The file is truncated or damaged, holds no two-dimensional image or several exposures, or
+        a section leaves its image.  The message names file and extension.
     """
     path = Path(path)
     with open_fits(path, as_stored=True) as hdus:
@@ -135,7 +146,7 @@ def _scan(
     path: Path, hdus: fits.HDUList, given: Sequence[Mapping[str, Any]] | None,
     overrides: Mapping[str, Override],
 ) -> FileScan:  # fmt: skip
-    """Gather what an open file says."""
+    """Collect headers and layout of an open file."""
     cards = header_cards(hdus[0].header)
     units = header_units(hdus[0].header)
     images: dict[int, tuple[str, tuple[int, int], dict[str, Any]]] = {}
@@ -155,7 +166,9 @@ def _scan(
     # The last block may lack its padding, never its data.
     size, compressed = path.stat().st_size, path.suffix.lower() == ".gz"
     if spans and not compressed and size < sum(spans[-1]):
-        raise RecordingError(f"is truncated: {size} bytes of {sum(spans[-1])}")
+        raise RecordingError(
+            f"is truncated: it has {size} of {sum(spans[-1])} bytes; copy it again"
+        )
     if not images:
         cubes = [cube for hdu in hdus if (cube := _cube_shape(hdu.header)) is not None]
         if cubes:
@@ -165,8 +178,8 @@ def _scan(
                 "write each plane as a file of its own with its own header, in Python "
                 "fits.writeto(f'flat_{k:03}.fits', cube[k], header)"
             )
-        raise RecordingError("holds no two-dimensional image")
-    # A primary header without an image speaks for all extensions.
+        raise RecordingError("holds no two-dimensional image (NAXIS = 2) in any extension")
+    # Test stands write the sections that all amplifiers share into a primary header without image.
     shared = {} if 0 in images else {card: cards.get(card) for card in SHARED_SECTIONS}
     layouts, problems = [], []
     for layout, own, stated in _layouts(images, given, shared):
@@ -226,7 +239,7 @@ def _layouts(
     given: Sequence[Mapping[str, Any]] | None,
     shared: Mapping[str, Any],
 ) -> Iterator[tuple[AmplifierLayout, dict[str, Any], Mapping[str, Any]]]:
-    """Amplifiers with the cards of their extensions and what campaign.yaml says of them."""
+    """Layouts of the amplifiers, their extensions' headers, their entries of campaign.yaml."""
     names = [name for name, _, _ in images.values()]
     if not given:
         given = [
@@ -241,9 +254,11 @@ def _layouts(
             wanted = (named or list(images))[0]
         if wanted not in images:
             there = ", ".join(str(k) for k in images)
-            raise RecordingError(f"{name}: no image in HDU {wanted}; there are {there}")
+            raise RecordingError(
+                f"{name}: no image in HDU {wanted} (amplifiers: hdu); HDUs with images: {there}"
+            )
         _, shape, own = images[wanted]
-        # A card WINDOW of a camera is another thing than campaign.yaml's.
+        # Some cameras have a keyword WINDOW of another meaning than campaign.yaml's entry.
         cards = {**shared, **own, "WINDOW": None}
         cards |= {
             card: entry[word] for word, card in SECTION_ENTRIES.items() if word in entry
@@ -254,7 +269,7 @@ def _layouts(
 def _mean_current(hdu: fits.BinTableHDU, cards: Mapping[str, Any]) -> float | None:
     """Mean photodiode current over the exposure [nA], from its table of time [s] and current [A].
 
-    The current between exposures is the tables' lowest tenth, and taken off.
+    The dark current of the diode, the median of the lowest tenth of the readings, is subtracted.
     """
     names = {str(name).upper(): name for name in hdu.columns.names}
     times = next((names[n] for n in names if n.endswith("MEAS_TIMES")), None)
@@ -271,12 +286,12 @@ def _mean_current(hdu: fits.BinTableHDU, cards: Mapping[str, Any]) -> float | No
 
 
 def whole_digest(scan: FileScan) -> str:
-    """Digest of all data of a file: equal pixels, equal digests."""
+    """Digest of all data of a file, equal for equal pixels."""
     return _digest(scan.path, scan.spans, whole=True)
 
 
 def file_sha256(path: Path) -> str:
-    """SHA-256 of a whole file, read in pieces."""
+    """SHA-256 of a whole file in hexadecimal digits."""
     digest = hashlib.sha256()
     with open(path, "rb") as stream:
         while piece := stream.read(1 << 20):
@@ -285,7 +300,7 @@ def file_sha256(path: Path) -> str:
 
 
 def _digest(path: Path, spans: Sequence[tuple[int, int]], *, whole: bool) -> str:
-    """Digest of the data: all of it, or the first, middle and last 32 kB of each part."""
+    """Digest of all data, or of the first, middle and last 32 KiB of each extension's."""
     digest = hashlib.blake2b(digest_size=16)
     opener = gzip.open if path.suffix.lower() == ".gz" else open
     with opener(path, "rb") as stream:

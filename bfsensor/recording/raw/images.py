@@ -26,21 +26,29 @@ class AmplifierImage:
     image : ndarray, shape (ny, nx)
         Data section in readout order, overscan subtracted, in ``unit``.
     mask : ndarray of bool, shape (ny, nx)
-        True where saturated (header, or the end of an integer's range), masked or not finite,
-        which a row without a finite overscan pixel is too.
+        True where a pixel is saturated (by the header's level, or at the end of the integers'
+        range), masked in campaign.yaml, or not finite.  A row whose overscan has no finite
+        pixel is masked as a whole.
     unit : str
         'electron', or 'adu' where no gain is known.
     gain : float
-        [e-/ADU]; nan where not known.
+        Gain [e-/ADU]; nan where not known.
     no_gain : str
         Why no gain is known; '' where one is.
     overscan : str
-        How the overscan was subtracted; 'none' where it was not.
-    overscan_level, overscan_noise : float
-        Median of the overscan [ADU], and its scatter about its rows' medians as of a
-        Gaussian [unit]; nan without overscan.
+        Method by which the overscan was subtracted; 'none' where it was not.
+    overscan_level : float
+        Median of the overscan [ADU]; nan where it was not subtracted.
+    overscan_noise : float
+        Scatter of the overscan about the medians of its rows [unit]: 1.4826 times the median
+        absolute deviation, the standard deviation of Gaussian noise; nan where it was not
+        subtracted.
     overscan_pixels : int
-        Overscan pixels of a row.
+        Number of overscan pixels of a row.
+
+    Examples
+    --------
+    :func:`read_images` makes one; its example shows image, mean and unit.
     """
 
     name: str
@@ -68,31 +76,33 @@ def read_images(
     Parameters
     ----------
     scan : FileScan
-        The file's headers (:func:`bfsensor.recording.raw.headers.scan_file`), with what
-        campaign.yaml says beside them.
+        The file's headers and layout (:func:`bfsensor.recording.raw.headers.scan_file`).
     gain : float, optional
-        [e-/ADU], for all amplifiers; by default each one's by campaign.yaml or header, as
-        :func:`bfsensor.recording.raw.keywords.amplifier_quantity` finds it.  Without any the
-        image stays in ADU, and says so.
+        Gain of all amplifiers [e-/ADU], above 0; by default each one's by campaign.yaml or
+        header, as :func:`bfsensor.recording.raw.keywords.amplifier_quantity` finds it.  Without
+        a gain the image stays in ADU, and its ``unit`` is 'adu'.
     overscan : {'row median', 'row mean', 'median', None}
-        Each row's median or mean over the overscan, the median of all of it, or nothing where
-        there is none.  A row's level has an error, which all its pixels share: it adds
-        sigma^2 / n (mean) or pi / 2 of that (median) to the variance and to the covariances
-        at all lags in x, where n is the number of overscan pixels of a row.
+        Level to subtract: each row's median or mean over the overscan, the median of all of it,
+        or none.  A row's level has an error that all its pixels share: it adds sigma^2 / n
+        (mean) or pi / 2 times that (median) to the variance and to the covariances at all
+        lags in x, where sigma is the noise of one pixel and n the number of overscan pixels of
+        a row.
     skip : int
-        Overscan columns next to the image to leave out: charge deferred from the last pixels
-        comes out there.
+        Number of overscan columns next to the image to leave out, not negative: charge deferred
+        from the last pixels of the image appears there.
     masks : mapping of str to ndarray of bool, optional
-        Pixels to leave out, by amplifier, in readout order.
+        Pixels of the data section to leave out, by amplifier, in readout order.
 
     Returns
     -------
     amplifiers : tuple of AmplifierImage
+        One for each amplifier, in the order of ``scan.amplifiers``.
 
     Raises
     ------
     RecordingError
-        Names file, amplifier and card.
+        The file cannot be read, a gain, ``skip`` or ``overscan`` is not allowed, or there is
+        no overscan to subtract.  The message names file, amplifier and keyword.
 
     Examples
     --------
@@ -116,7 +126,7 @@ def read_images(
             f"overscan = {overscan!r} is not one of {', '.join(OVERSCANS)}, or None"
         )
     if skip < 0:
-        raise RecordingError(f"skip = {skip} must not be negative")
+        raise RecordingError(f"skip = {skip} columns must be 0 or more")
     if gain is not None and not 0 < gain < np.inf:
         raise RecordingError(f"gain = {gain:g} e-/ADU must be above 0")
     amplifiers = []

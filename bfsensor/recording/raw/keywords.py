@@ -1,7 +1,8 @@
-"""What header keywords mean: the first hit wins, units and signs are made one.
+"""Table of FITS header keywords by quantity, and their translation into the package's units.
 
 The table follows the keywords of NOAO, of LSST's test stands (eotest), of LSST's cameras and of
-SBIG's proposal for FITS extensions.  A campaign's ``keywords:`` entry puts its own before these.
+SBIG's proposal for FITS extensions.  The first keyword found decides.  Keywords in the
+``keywords:`` entry of a campaign.yaml are tried before the table's.
 """
 
 from __future__ import annotations
@@ -22,21 +23,22 @@ from bfsensor.errors import RecordingError
 
 @dataclass(frozen=True)
 class Meaning:
-    """One quantity and where headers keep it.
+    """The header keywords of one quantity, its unit and its possible range.
 
     Attributes
     ----------
     keywords : tuple of str
-        In the order in which they are tried.
+        FITS keywords, in the order in which they are tried.
     unit : str
-        Of the value that comes out; '' for words and plain numbers.
+        Unit of the translated value; '' for words and plain numbers.
     header_unit : str
-        What the header's number is in, unless the card's comment begins with a unit in
-        brackets, as FITS recommends.
+        Unit of the header's number, unless the keyword's comment begins with a unit in
+        brackets, as the FITS standard recommends.
     low, high : float
-        Range of values that can be meant, in ``unit``.
+        Smallest and largest possible value, in ``unit``; a number outside is taken as not
+        known and reported.
     closes : str
-        The question that cannot be answered without it; '' where none.
+        Analysis that is impossible without the quantity; '' where none.
     """
 
     keywords: tuple[str, ...]
@@ -53,48 +55,61 @@ MEANINGS: dict[str, Meaning] = {
     "number": Meaning(("SEQNUM",)),
     "exposure_time": Meaning(
         ("EXPTIME", "EXPOSURE", "DARKTIME"), "s", "s", 0.0, np.inf,
-        "pairs of flats cannot be found, nor nonlinearity be told from the lamp",
+        "flats cannot be paired, nor nonlinearity be separated from changes of the lamp",
     ),
     "wavelength": Meaning(
         ("MONOWL",), "nm", "nm", 100.0, 3000.0,
-        "a chromatic effect cannot be told from the strength of the brighter-fatter effect",
+        "a chromatic effect cannot be separated from the strength of the brighter-fatter effect",
     ),
     "filter": Meaning(("FILTER", "FILTER1")),
     "temperature": Meaning(
         ("CCDTEMP", "CCD-TEMP", "TEMPERAT", "TEMP_SET"), "K", "deg_C", 1.0, 373.0,
-        "diffusion cannot be told from the optics, nor gain drift from the lamp's",
+        "diffusion cannot be separated from the optics, nor gain drift from the lamp's",
     ),
     "back_bias": Meaning(
         ("VBB", "V_BSS"), "V", "V", -1000.0, 1000.0,
-        "errors of the device (thickness, doping) cannot be told from missing physics",
+        "errors of the device (thickness, doping) cannot be separated from missing physics",
     ),
     "gate_high": Meaning(
         ("PARLHI", "V_P1H"), "V", "V", -100.0, 100.0,
-        "the storage height and free holes cannot be told from other asymmetries of x and y",
+        "the depth of the stored charge and free holes cannot be separated from other "
+        "asymmetries of x and y",
     ),
     "gate_low": Meaning(("PARLLO", "V_P1L"), "V", "V", -100.0, 100.0),
     "lamp": Meaning(
         ("MONDIODE",), "", "", 0.0, np.inf,
         "charge loss and gain nonlinearity cannot be told apart, nor either from the lamp",
     ),
-    # Where SBIG's EGAIN [e-/ADU] stands beside GAIN, GAIN is the camera's setting.  Beyond the
-    # limits 16 bits would span less than 7 or more than 6e8 electrons.
+    # Where SBIG's EGAIN [e-/ADU] stands beside GAIN, GAIN is the camera's setting.  Outside
+    # 1e-4 to 1e4 e-/ADU the range of 16 bits would be below 7 or above 6e8 electrons.
     "gain": Meaning(("CCDGAIN", "EGAIN", "E-GAIN", "GAIN"), "", "", 1e-4, 1e4),
     "noise": Meaning(("CCDNOISE", "RDNOISE", "READNOIS"), "", "", 0.0, 1e5),
     "saturation": Meaning(("SATURATE", "SATLEVEL"), "", "", 0.0, np.inf),
 }  # fmt: skip
-"""Section 5 of the format of campaigns; exposure time and temperature also as older cameras
-write them.  The lamp is taken as it is: only its ratios are used."""
+"""Header keywords and possible range of each quantity that a campaign uses.
+
+Exposure time and temperature are also found under the keywords of older cameras.  The lamp
+monitor's unit does not matter: only ratios of its readings are used.
+
+The ranges are in the quantity's unit.  Chosen: wide enough for every silicon sensor, and narrow
+enough to show another unit.  With upper limits twice as high a wavelength of 5500 Angstrom would
+pass as 5500 nm, and a temperature of 173 K, taken as deg C, as 446 K.
+"""
 
 WORDS = ("kind", "test", "filter")
 """Quantities that are words; the others are numbers."""
 
 AMPLIFIER_UNITS = {"gain": "e-/ADU", "noise": "e-", "saturation": "ADU"}
-"""Quantities that each amplifier has of its own, with the units that they are in."""
+"""Unit of each quantity that amplifiers of one exposure have separately."""
 
 TIMES = ("MJD-OBS", "MJD", "MJD-BEG")
+"""Keywords of a time stamp as a modified Julian date [d], in the order in which they are tried."""
+
 DATES = ("DATE-OBS", "DATE-BEG")
+"""Keywords of a date, with or without the time of day, tried where there is no Julian date."""
+
 CLOCKS = ("TIME-OBS", "UTSTART", "UT")
+"""Keywords of the time of day (UT), for a date without one."""
 
 KINDS = {
     "bias": "bias", "zero": "bias", "dark": "dark", "flat": "flat", "dflat": "flat",
@@ -104,9 +119,11 @@ KINDS = {
     "ppump": "ppump", "fe55": "fe55", "obs": "light", "object": "light", "light": "light",
     "exp": "light", "science": "light",
 }  # fmt: skip
-"""Kinds by the words of headers; 'light' says no more than that there was some."""
+"""Kind of exposure by the header's word, in small letters; 'light' is any exposure to light."""
 
 _SAYS_MORE = ("sflat", "spot", "qe", "ppump", "fe55")
+"""Kinds that a test's name states where the exposure type is only 'flat' or 'light'."""
+
 _IN_NAMES = re.compile(r"(?:^|[^a-z])(bias|zero|dark|sflat|flat|spot|fe55)s?(?![a-z])")
 
 
@@ -117,14 +134,14 @@ class Override:
     Attributes
     ----------
     keywords : tuple of str
-        Tried before the table's.
+        Keywords that are tried before those of :data:`MEANINGS`.
     unit : str
-        What the numbers of headers, and of a manifest's column without a unit, are in; '' as
-        the table says.
+        Unit of the header's number, of ``value``, and of a manifest's column without a unit; ''
+        for the unit of :data:`MEANINGS`.
     scale : float
-        These numbers are multiplied by it, such as -1 for a sign.
+        Factor that these numbers are multiplied by, such as -1 for a sign.
     value : object
-        The same for every exposure, whatever headers say; None for what they say.
+        Value of every exposure, whatever the headers say; None to use the headers.
     values : tuple of (str, str)
         Words of headers, in small letters, and the words that they stand for.
     """
@@ -142,20 +159,23 @@ def parse_overrides(where: str, entries: Mapping[str, Any] | None) -> dict[str, 
     Parameters
     ----------
     where : str
-        Named in errors.
-    entries : mapping
-        By quantity: a keyword, a list of them, or a mapping with ``keyword``, ``unit``,
-        ``scale`` or ``value``; of kind, test and filter, ``values``: a mapping of the words of
-        headers to those that they stand for, ``{offset: bias, flatfield: flat}``.
+        Name of the file, for errors.
+    entries : mapping or None
+        For each quantity of :data:`MEANINGS` a keyword, a list of keywords, or a mapping with
+        ``keyword``, ``unit``, ``scale`` or ``value``.  Kind, test and filter may also have
+        ``values``, a mapping of the header's words to those that they stand for, such as
+        ``{offset: bias, flatfield: flat}``.
 
     Returns
     -------
     overrides : dict of str to Override
+        One for each quantity of ``entries``; empty without entries.
 
     Raises
     ------
     RecordingError
-        A quantity or entry that is not known, a unit that does not convert.
+        A quantity or an entry is not known, a unit does not convert, or a scale is no finite
+        number.
 
     Examples
     --------
@@ -163,7 +183,10 @@ def parse_overrides(where: str, entries: Mapping[str, Any] | None) -> dict[str, 
     {'exposure_time': Override(keywords=('EXPTIME',), unit='ms', scale=1.0, value=None)}
     """
     if not isinstance(entries or {}, Mapping):
-        raise RecordingError(f"{where}: keywords must be a mapping, not {entries!r}")
+        raise RecordingError(
+            f"{where}: keywords must be a mapping of quantities to header keywords, such as "
+            f"{{exposure_time: TEXP}}, not {entries!r}"
+        )
     out: dict[str, Override] = {}
     for name, entry in (entries or {}).items():
         if name not in MEANINGS:
@@ -176,8 +199,8 @@ def parse_overrides(where: str, entries: Mapping[str, Any] | None) -> dict[str, 
             "keyword", "unit", "scale", "value", "values"
         }:  # fmt: skip
             raise RecordingError(
-                f"{where}: keywords: {name} = {entry!r} must be a keyword, a list of them, or "
-                "a mapping with keyword, unit, scale, value, values"
+                f"{where}: keywords: {name} = {entry!r} must be a keyword of the headers, a list "
+                "of keywords, or a mapping with some of keyword, unit, scale, value, values"
             )
         words = entry.get("keyword", ())
         words = (words,) if isinstance(words, str) else tuple(str(w) for w in words)
@@ -193,7 +216,8 @@ def parse_overrides(where: str, entries: Mapping[str, Any] | None) -> dict[str, 
             scale = np.nan
         if not np.isfinite(scale):
             raise RecordingError(
-                f"{where}: keywords: {name}: scale = {entry['scale']!r} is not a number"
+                f"{where}: keywords: {name}: scale = {entry['scale']!r} is not a number; give a "
+                "finite one, such as -1"
             )
         values = _word_map(where, name, entry.get("values"))
         out[name] = Override(words, unit, scale, entry.get("value"), values)
@@ -201,13 +225,13 @@ def parse_overrides(where: str, entries: Mapping[str, Any] | None) -> dict[str, 
 
 
 def _word_map(where: str, name: str, given: Any) -> tuple[tuple[str, str], ...]:
-    """Check the ``values`` of a quantity: words of headers to words that are understood."""
+    """Check the ``values`` of a quantity, which map words of headers to known words."""
     if given is None:
         return ()
     if name not in WORDS or not isinstance(given, Mapping):
         raise RecordingError(
             f"{where}: keywords: {name}: values = {given!r} must be a mapping such as "
-            f"{{offset: bias}}, and of {', '.join(WORDS)} only"
+            f"{{offset: bias}}; only {', '.join(WORDS)} have values"
         )
     for word in given.values() if name == "kind" else ():
         if str(word).lower() not in KINDS:
@@ -220,11 +244,11 @@ def _word_map(where: str, name: str, given: Any) -> tuple[tuple[str, str], ...]:
 
 def _known_kinds() -> str:
     """Name the words for kinds of exposures that are understood."""
-    return f"these are, in any case: {', '.join(KINDS)}"
+    return f"words that are, in capitals or small letters: {', '.join(KINDS)}"
 
 
 def header_units(header: fits.Header) -> dict[str, str]:
-    """Units that cards give in brackets at the start of their comments, by keyword."""
+    """Units by keyword, where a comment begins with one in brackets, such as '[ms] exposure'."""
     out = {}
     for card in header.cards:
         match = re.match(r"\s*\[([^\]]+)\]", card.comment or "")
@@ -234,29 +258,31 @@ def header_units(header: fits.Header) -> dict[str, str]:
 
 
 def translate(
-    cards: Mapping[str, Any],
+    header: Mapping[str, Any],
     *,
     card_units: Mapping[str, str] | None = None,
     overrides: Mapping[str, Override] | None = None,
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Give what a header says, in the units of this package.
+    """Translate a header into quantities in the units of this package.
 
     Parameters
     ----------
-    cards : mapping of str to value
-        Of the header; case of the keywords does not matter.
+    header : mapping of str to value
+        Values of the header by keyword; case of the keywords does not matter.
     card_units : mapping of str to str, optional
-        Units that the cards' comments give.
+        Units by keyword, as :func:`header_units` finds them.
     overrides : mapping of str to Override, optional
+        The ``keywords:`` of campaign.yaml.
 
     Returns
     -------
     meaning : dict of str to value
-        A key for 'mjd' and for each of :data:`MEANINGS` that an exposure has as a whole (not
-        :data:`AMPLIFIER_UNITS`); None where the header says nothing or what cannot be meant.
-        Exposure time [s], wavelength [nm], temperature [K], voltages [V], lamp as it is.
+        The time stamp 'mjd' [d] and each quantity of :data:`MEANINGS` that an exposure has as
+        a whole (not :data:`AMPLIFIER_UNITS`): exposure time [s], wavelength [nm], temperature
+        [K], voltages [V], lamp in the header's unit.  None where the header has no value, or
+        none within the possible range.
     problems : tuple of str
-        Values that cannot be meant, and what they may be.
+        Values outside the possible range, each with the unit that would explain it.
 
     Examples
     --------
@@ -264,7 +290,7 @@ def translate(
     >>> found["kind"], found["exposure_time"], round(found["temperature"], 2)
     ('flat', 2.0, 173.15)
     """
-    given = _capitals(cards)
+    given = _capitals(header)
     units = _capitals(card_units or {})
     found: dict[str, Any] = {}
     problems: list[str] = []
@@ -291,16 +317,18 @@ def amplifier_quantity(
     stated: Any = None,
     overrides: Mapping[str, Override] | None = None,
 ) -> tuple[float | None, str]:
-    """Find the gain, noise or saturation of one amplifier: every reader's only way to it.
+    """Find the gain, noise or saturation of one amplifier.
+
+    All readers of raw files use this function, so that no two of them disagree.
 
     Parameters
     ----------
     name : str
         One of :data:`AMPLIFIER_UNITS`.
     own, primary : mapping of str to value
-        Cards of the amplifier's extension and of the primary header.
+        Values by keyword of the amplifier's extension and of the primary header.
     stated : object, optional
-        What campaign.yaml says of this amplifier.
+        Value in campaign.yaml's entry for this amplifier.
     overrides : mapping of str to Override, optional
         The ``keywords:`` of campaign.yaml.
 
@@ -309,17 +337,17 @@ def amplifier_quantity(
     value : float or None
         Gain [e-/ADU], noise [e-] or saturation [ADU]; None where it is not known.
     problem : str
-        What is wrong with the value that was found; '' where there is none or it is good.
+        Why the value that was found cannot be used; '' where none was found or it can.
 
     Notes
     -----
-    In this order: campaign.yaml's entry for the amplifier; its ``value`` for all; its keywords;
-    then those of :data:`MEANINGS`, all of them in the amplifier's extension first, where NOAO
-    and LSST keep the gain of each amplifier, then in the primary header, which may hold a
-    nominal one.  The first number decides: one that cannot be meant, such as a gain of 0, is
-    no reason to try the next keyword.  A card that holds a word or a logical value, such as
-    GAIN = 'HIGH', is a setting and says nothing.  A saturation of 0 or less, which some
-    cameras write where they know none, is not one.
+    Values are searched in this order: campaign.yaml's entry for the amplifier; its ``value``
+    for all; its keywords; then those of :data:`MEANINGS`, all of them in the amplifier's
+    extension first, where NOAO and LSST keep the gain of each amplifier, then in the primary
+    header, which may hold a nominal one.  The first number decides: if it is out of range,
+    such as a gain of 0, the next keyword is not tried.  A word or a logical value, such as
+    GAIN = 'HIGH', is a camera's setting and is passed over.  A saturation of 0 or less stands
+    for one that is not known, as some cameras write it.
 
     Examples
     --------
@@ -328,7 +356,7 @@ def amplifier_quantity(
     >>> amplifier_quantity("gain", {"GAIN": 100, "EGAIN": 0.25}, {})
     (0.25, '')
     >>> amplifier_quantity("gain", {"GAIN": 0}, {"EGAIN": 2.0})
-    (None, 'GAIN = 0 cannot be meant (gain: 0.0001 to 10000 e-/ADU)')
+    (None, 'GAIN = 0 is out of range (gain: 0.0001 to 10000 e-/ADU)')
     """
     if stated is not None:
         key = f"campaign.yaml's {name}"
@@ -338,7 +366,7 @@ def amplifier_quantity(
 
 
 def kind_in_name(name: str) -> str | None:
-    """Give the kind that a file's name says, such as 'flat' for 'Pencil5.FLAT.FIT'.
+    """Give the kind of exposure in a file's name; None where it names none, or several.
 
     Examples
     --------
@@ -350,7 +378,7 @@ def kind_in_name(name: str) -> str | None:
 
 
 def _capitals(cards: Mapping[str, Any]) -> dict[str, Any]:
-    """Cards with their keywords in capitals."""
+    """Values of a header with their keywords in capitals."""
     return {str(key).upper(): value for key, value in cards.items()}
 
 
@@ -382,7 +410,7 @@ def _look_up(
 
 
 def _is_number(value: Any) -> bool:
-    """Whether a card holds a number, be it between quotes; logical values are none."""
+    """Whether a header's value is a number, also between quotes; logical values are none."""
     if isinstance(value, bool):
         return False
     try:
@@ -395,7 +423,7 @@ def _is_number(value: Any) -> bool:
 def _checked(
     name: str, value: Any, key: str, unit: str, override: Override, meaning: Meaning
 ) -> tuple[Any, str]:
-    """Convert one value; None, and what is wrong with it, where it cannot be meant."""
+    """Convert one value; None, and the problem, where it is no number or out of range."""
     if name in WORDS:
         text = str(value).strip()
         return dict(override.values).get(text.lower(), text), ""
@@ -418,14 +446,16 @@ def _checked(
     if not meaning.low <= number_in_unit <= meaning.high:
         if name in AMPLIFIER_UNITS:
             allowed = f"{meaning.low:g} to {meaning.high:g} {AMPLIFIER_UNITS[name]}"
-            return None, f"{key} = {value} cannot be meant ({name}: {allowed})"
+            return None, f"{key} = {value} is out of range ({name}: {allowed})"
         others = _other_units(name, number, meaning)
-        return None, f"{key} = {value} cannot be meant in {unit or 'this'}{others}"
+        there = f"{meaning.low:g} to {meaning.high:g} {meaning.unit}".strip()
+        taken = f"{value} {unit}".strip()
+        return None, f"{key} = {taken} is out of range ({name}: {there}){others}"
     return number_in_unit, ""
 
 
 def _other_units(name: str, number: float, meaning: Meaning) -> str:
-    """Name the units in which a number would be possible, and how to say so."""
+    """Name the units in which a number would be possible, and the entry that states one."""
     tried = {"wavelength": ("Angstrom", "um"), "temperature": ("K",),
              "back_bias": ("mV",), "gate_high": ("mV",), "gate_low": ("mV",)}  # fmt: skip
     fitting = [
@@ -436,7 +466,8 @@ def _other_units(name: str, number: float, meaning: Meaning) -> str:
     if not fitting:
         return ""
     return (
-        f" ({' or '.join(fitting)}? say so: keywords: {{{name}: {{unit: {fitting[0]}}}}})"
+        f"; if it is in {' or '.join(fitting)}, state that in campaign.yaml: keywords: "
+        f"{{{name}: {{unit: {fitting[0]}}}}}"
     )
 
 
@@ -455,7 +486,7 @@ def _convert(number: float, unit: str, wanted: str) -> float:
 
 
 def _kind_of(kind: str | None, test: str | None) -> tuple[str | None, bool]:
-    """Kind of an exposure, and whether it was understood: the test may say more than 'flat'."""
+    """Kind of an exposure, and whether it was understood; a test may be more specific."""
     said = KINDS.get((kind or "").lower())
     more = KINDS.get((test or "").lower())
     if said in (None, "light", "flat") and more in _SAYS_MORE:
@@ -466,18 +497,19 @@ def _kind_of(kind: str | None, test: str | None) -> tuple[str | None, bool]:
 
 
 def _not_a_kind(said: str, given: Mapping[str, Any], override: Override | None) -> str:
-    """Say which word of the header was not understood as a kind, and how to explain it."""
+    """Say which word of the header is no known kind, and how campaign.yaml maps it."""
     keywords = (*(override.keywords if override else ()), *MEANINGS["kind"].keywords)
     capitals = (keyword.upper() for keyword in keywords)
     key = next((key for key in capitals if str(given.get(key, "")).strip()), "kind")
     return (
-        f"{key} = {said!r} is not understood as a kind of exposure; {_known_kinds()}; say which it "
-        f"is in campaign.yaml: keywords: {{kind: {{keyword: {key}, values: {{{said}: flat}}}}}}"
+        f"{key} = {said!r} is not understood as a kind of exposure; {_known_kinds()}; map it in "
+        "campaign.yaml to the one that it is, here flat: keywords: "
+        f"{{kind: {{keyword: {key}, values: {{{said}: flat}}}}}}"
     )
 
 
 def _mjd_of(given: Mapping[str, Any]) -> float | None:
-    """Time stamp [d]; None where there is none, or a day without a time."""
+    """Time stamp [MJD]; None where there is none, or a date without the time of day."""
     for key in TIMES:
         if isinstance(given.get(key), int | float) and np.isfinite(given[key]):
             return float(given[key])

@@ -1,4 +1,4 @@
-"""Pixels that campaign.yaml leaves out, by amplifier."""
+"""Masks of bad pixels that campaign.yaml names, cut into amplifiers."""
 
 from __future__ import annotations
 
@@ -16,26 +16,29 @@ from bfsensor.recording.raw.sections import AmplifierLayout, parse_section, to_s
 def read_masks(
     folder: Path, masks: Sequence[str], layouts: Sequence[AmplifierLayout]
 ) -> dict[str, NDArray[np.bool_]]:
-    """Read what campaign.yaml says is bad, cut into amplifiers.
+    """Read the ``masks:`` of campaign.yaml and cut them into amplifiers.
 
     Parameters
     ----------
     folder : Path
-        The campaign.
+        Folder of the campaign.
     masks : sequence of str
-        FITS sections of the sensor, or FITS images of it, 0 where good.
+        FITS sections of the sensor, such as '[1:2,1:495]', or names of FITS images of the whole
+        sensor, 0 where a pixel is good.
     layouts : sequence of AmplifierLayout
+        The amplifiers.
 
     Returns
     -------
     masks : dict of str to ndarray of bool
-        Image sections by amplifier in readout order, True where bad; empty without masks.
+        Masks of the image sections by amplifier, in readout order, True where a pixel is bad;
+        empty without masks.
 
     Raises
     ------
     RecordingError
-        A section or file that cannot be read, is of another size, or an amplifier whose
-        place on the sensor is not known.
+        A section or file cannot be read, an image has another size than the sensor, or an
+        amplifier has no DETSEC.
     """
     if not masks:
         return {}
@@ -47,7 +50,8 @@ def read_masks(
     lost = [name for name, box in boxes.items() if box is None]
     if lost:
         raise RecordingError(
-            f"{folder}: masks are of the sensor, and {lost[0]} has no DETSEC"
+            f"{folder}: masks are in pixels of the sensor, and {lost[0]} has no DETSEC; give its "
+            "place in campaign.yaml: amplifiers: [{name: ..., detector: '[x1:x2,y1:y2]'}]"
         )
     width = max(box[1] for box in boxes.values() if box is not None)
     height = max(box[3] for box in boxes.values() if box is not None)
@@ -60,8 +64,8 @@ def read_masks(
         image = _read_mask(folder / text)
         if image.shape != sensor.shape:
             raise RecordingError(
-                f"{folder / text}: a mask of {image.shape[1]} x {image.shape[0]} pixels for a "
-                f"sensor of {width} x {height}"
+                f"{folder / text}: the mask has {image.shape[1]} x {image.shape[0]} pixels, the "
+                f"sensor {width} x {height}"
             )
         sensor |= image
     out = {}
@@ -77,4 +81,4 @@ def _read_mask(path: Path) -> NDArray[np.bool_]:
         for hdu in hdus:
             if hdu.is_image and hdu.data is not None:
                 return np.asarray(hdu.data) != 0
-    raise RecordingError(f"{path}: holds no image")
+    raise RecordingError(f"{path}: holds no image; a mask is a FITS image, 0 where good")

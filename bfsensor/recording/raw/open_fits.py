@@ -1,4 +1,4 @@
-"""FITS files opened so that whatever is wrong with them is one error."""
+"""Opening of FITS files: every fault of a file is raised as one RecordingError."""
 
 from __future__ import annotations
 
@@ -16,39 +16,45 @@ from bfsensor.errors import RecordingError
 BROKEN = (
     OSError, EOFError, ValueError, TypeError, LookupError, zlib.error, fits.VerifyError,
 )  # fmt: skip
-"""What astropy may raise on a damaged file, in its headers and in its data."""
+"""Exceptions that astropy raises on damaged headers and damaged data."""
 
 
 @contextmanager
 def open_fits(
     path: str | os.PathLike[str], *, as_stored: bool = False
 ) -> Iterator[fits.HDUList]:
-    """Open a file, letting the harmless faults of old cameras' cards pass, but not a file cut short.
+    """Open a file; old cameras' faulty keywords are mended, files cut short are refused.
 
     Parameters
     ----------
     path : path-like
-        The file, plain or in gzip.
+        The file, plain or compressed with gzip.
     as_stored : bool
         Leave tile-compressed images as the tables that they are stored as: faster where only
         headers are read.
 
+    Yields
+    ------
+    hdus : astropy.io.fits.HDUList
+        The open file.
+
     Raises
     ------
     RecordingError
-        The file cannot be read, here or in the block; names it.
+        The file cannot be read, when it is opened or in the ``with`` block.  The message names
+        the file.
     """
     with warnings.catch_warnings():
-        # Lower-case exponents, null padding: read correctly, warned about.
+        # astropy warns of lower-case exponents and null padding, and reads them correctly.
         warnings.simplefilter("ignore", AstropyUserWarning)
-        # What is left of a file cut short would be read without a word.
+        # Of a file cut short astropy returns the remaining pixels and only warns.
         warnings.filterwarnings(
             "error",
             "(?s).*(truncated|corrupted|Error validating header)",
             AstropyUserWarning,
         )
         try:
-            # Opened here: astropy leaves a file open in whose headers it fails.
+            # fits.open(path) would leave the file open where reading its headers fails.
             with (
                 open(path, "rb") as stream,
                 fits.open(
@@ -65,7 +71,7 @@ def open_fits(
                 f"{path}: is truncated or damaged: {one_line(warning)}"
             ) from None
         except Exception as error:
-            # The class that its decompression of tiles raises is in no public module.
+            # astropy raises this class on damaged tiles, and has it in no public module.
             if not isinstance(error, BROKEN) and type(error).__name__ != "CfitsioException":
                 raise
             raise RecordingError(f"{path}: cannot be read: {one_line(error)}") from None

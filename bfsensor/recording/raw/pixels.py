@@ -1,4 +1,4 @@
-"""Pixels of a raw file by amplifier, in the order in which they were read, and which are bad."""
+"""Pixels of a raw file by amplifier, in readout order, with a mask of the bad ones."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from bfsensor.recording.raw.sections import AmplifierLayout
 
 @dataclass(frozen=True, eq=False)
 class AmplifierPixels:
-    """What one amplifier read, as it came.
+    """Raw pixels of one amplifier in one exposure.
 
     Attributes
     ----------
     layout : AmplifierLayout
-        Where it lies in the file and on the sensor.
+        Place of the amplifier in the file and on the sensor.
     values : ndarray, shape (ny, nx)
-        All that was read [ADU], prescan and overscan with it: axis 1 counts serial transfers
-        from the output, axis 0 parallel ones.
+        All pixels [ADU], with prescan and overscan: axis 1 counts serial transfers from the
+        output, axis 0 parallel ones.
     bad : ndarray of bool, shape (ny, nx)
-        Not finite, saturated, or masked.
+        True where a pixel is not finite, saturated, or masked.
     saturation : float
-        Level from which on a pixel is saturated [ADU]; inf where none is known.
+        Level at and above which a pixel counts as saturated [ADU]; inf where none is known.
     """
 
     layout: AmplifierLayout
@@ -53,16 +53,17 @@ def read_pixels(
     path : path-like
         The file.
     layouts : sequence of AmplifierLayout
-        Of its amplifiers, as :func:`bfsensor.recording.raw.headers.scan_file` finds them.
+        Layouts of its amplifiers, as :func:`bfsensor.recording.raw.headers.scan_file` finds
+        them.
     masks : mapping of str to ndarray of bool, optional
         Pixels of the data section to leave out, by amplifier, in readout order.
     dtype : dtype
-        Of the values; single precision holds every number of a 16 bit converter.
+        Type of the values; single precision holds every number of a 16 bit converter exactly.
 
     Returns
     -------
     pixels : tuple of AmplifierPixels
-        In the order of ``layouts``.
+        One for each amplifier, in the order of ``layouts``.
 
     Raises
     ------
@@ -71,8 +72,8 @@ def read_pixels(
 
     Notes
     -----
-    Saturated is what reaches the saturation of header or campaign.yaml, or the largest number
-    that the integers of the file can stand for.
+    A pixel is saturated where it reaches the saturation of header or campaign.yaml, or the
+    largest number that the integers of the file can hold.
     """
     found = []
     stored: NDArray[Any] | None = None
@@ -88,7 +89,8 @@ def read_pixels(
             if stored is None or stored.shape != layout.stored:
                 shape = None if stored is None else stored.shape
                 raise RecordingError(
-                    f"{path}: {layout.name} has the shape {shape}, not {layout.stored}"
+                    f"{path}: {layout.name} has the shape (ny, nx) = {shape}, not "
+                    f"{layout.stored} as in its header or in the other files"
                 )
             mask = None if masks is None else masks.get(layout.name)
             found.append(_cut(layout, stored, end, mask, dtype))
@@ -101,7 +103,7 @@ def end_of_range(header: fits.Header) -> float:
     Parameters
     ----------
     header : Header
-        As it is before astropy scales the data and changes it.
+        Header as stored: astropy removes BSCALE and BZERO from it when it scales the data.
 
     Examples
     --------
@@ -114,7 +116,8 @@ def end_of_range(header: fits.Header) -> float:
     ends = (0, 255) if bits == 8 else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
     scale, zero = float(header.get("BSCALE", 1.0)), float(header.get("BZERO", 0.0))
     largest = max(scale * end + zero for end in ends)
-    # Scaled integers come out as floats, rounded: half a step keeps the last one in.
+    # Scaled integers become floats with rounding errors: half a step below the last integer's
+    # value, the last one still counts as saturated and the one before does not.
     return largest if scale == 1.0 else largest - 0.5 * abs(scale)
 
 

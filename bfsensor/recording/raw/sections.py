@@ -1,8 +1,8 @@
-"""Where one amplifier lies in its file and on the sensor: FITS sections, reversed ones too.
+"""Place of an amplifier in its file and on the sensor, from FITS sections.
 
-Everything here is in readout order: x counts serial transfers from the output, y parallel
-ones.  A reversed DATASEC means that the file stores an axis backwards, a reversed DETSEC that
-the sensor's coordinate runs against the readout.
+Arrays are in readout order: x counts serial transfers from the output, y parallel ones.  A
+reversed DATASEC, such as [256:129,1:256], means that the file stores an axis against the readout,
+a reversed DETSEC that the sensor's coordinate runs against the readout.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from bfsensor.errors import RecordingError
 
 Box = tuple[slice, slice]
-"""Rows and columns."""
+"""Slices of the rows and the columns of an image."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """A FITS section, '[x1:x2,y1:y2]', as slices from 0 and two directions."""
+    """A FITS section, '[x1:x2,y1:y2]', as slices from 0, with flags for reversed axes."""
 
     rows: slice
     columns: slice
@@ -37,19 +37,24 @@ class Section:
 
 
 def parse_section(text: Any, where: str) -> Section:
-    """Read a FITS section of either direction.
+    """Read a FITS section, whose axes may be reversed.
 
     Parameters
     ----------
     text : str
-        Such as '[1:128,1:256]', counted from 1, ends included, x first.
+        Section such as '[1:128,1:256]', counted from 1, ends included, x first.
     where : str
-        Named in errors.
+        Name of file and keyword, for errors.
+
+    Returns
+    -------
+    section : Section
+        The section as slices; reversed axes have their flag set.
 
     Raises
     ------
     RecordingError
-        It is not of that form, or begins below 1.
+        The text is not of that form, or a number is below 1.
 
     Examples
     --------
@@ -59,10 +64,15 @@ def parse_section(text: Any, where: str) -> Section:
     """
     match = re.fullmatch(r"\s*\[\s*(\d+):(\d+)\s*,\s*(\d+):(\d+)\s*\]\s*", str(text))
     if match is None:
-        raise RecordingError(f"{where} = {text!r} is not like '[1:512,1:2000]'")
+        raise RecordingError(
+            f"{where} = {text!r} is not like '[1:512,1:2000]', first and last column, then "
+            "first and last row"
+        )
     x1, x2, y1, y2 = (int(number) for number in match.groups())
     if min(x1, x2, y1, y2) < 1:
-        raise RecordingError(f"{where} = {text!r} begins below 1")
+        raise RecordingError(
+            f"{where} = {text!r} begins below 1, where FITS counts pixels from"
+        )
     return Section(
         slice(min(y1, y2) - 1, max(y1, y2)), slice(min(x1, x2) - 1, max(x1, x2)),
         x1 > x2, y1 > y2,
@@ -71,37 +81,39 @@ def parse_section(text: Any, where: str) -> Section:
 
 @dataclass(frozen=True)
 class AmplifierLayout:
-    """Where the pixels of an amplifier are, in the file and on the sensor.
+    """Place of an amplifier's pixels in the file and on the sensor, with gain and noise.
 
     Attributes
     ----------
     name : str
         EXTNAME, or the name given in campaign.yaml.
     hdu : int
-        Number of the extension.
+        Index of the HDU that holds the image, 0 for the primary one.
     stored : tuple of int
         Shape (ny, nx) of the stored image.
     window : (slice, slice)
-        Rows and columns of the stored image that are this amplifier's.
+        Rows and columns of the stored image that belong to this amplifier.
     stored_flip_x, stored_flip_y : bool
-        The file holds the axis backwards.
+        True where the file stores the axis against the readout.
     data : (slice, slice)
-        Image section, in readout order within the window.
+        Image section (DATASEC), in readout order within the window.
     bias : (slice, slice) or None
-        Overscan that the header names, likewise.
+        Overscan that BIASSEC names, in readout order within the window; None without one.
     origin : tuple of int or None
         Sensor coordinates (x, y) of the corner of lowest x and y, from 0, in pixels as read
-        (binned); None where not known.
+        (binned); None where DETSEC is not given.
     flip_x, flip_y : bool
-        The sensor's coordinate falls in readout order.
+        True where the sensor's coordinate falls in readout order.
     on_sensor : tuple of int or None
-        Rows and columns there; not those of ``data`` where the header is wrong.
+        Rows and columns that DETSEC spans, in pixels as read; they differ from those of
+        ``data`` where the header is wrong.
     binning : tuple of int
-        In x and y.
+        Binning in x and y (CCDSUM); (1, 1) where DETSEC is not given.
     bias_problem : str
         Why BIASSEC cannot be used; '' where it can, or is not given.
     gain, noise, saturation : float or None
-        [e-/ADU], [e-], [ADU], where the header or campaign.yaml says.
+        Gain [e-/ADU], read noise [e-] and saturation level [ADU]; None where neither header
+        nor campaign.yaml has one.
     """
 
     name: str
@@ -150,13 +162,13 @@ class AmplifierLayout:
         return int(self.data[1].start)
 
     def geometry(self) -> tuple[Any, ...]:
-        """What must agree between exposures: everything but gain, noise and saturation."""
+        """Attributes that must agree between exposures: all but gain, noise and saturation."""
         return tuple(
             str(getattr(self, name)) for name in self.__dataclass_fields__
         )[:-3]  # fmt: skip
 
     def footprint(self) -> tuple[int, int, int, int] | None:
-        """First and last + 1 of x and of y on the sensor."""
+        """First x, last x + 1, first y, last y + 1 on the sensor; None without DETSEC."""
         if self.origin is None:
             return None
         (x, y), (ny, nx) = self.origin, self.shape
@@ -164,35 +176,41 @@ class AmplifierLayout:
 
 
 def layout_of(
-    where: str, name: str, hdu: int, stored: tuple[int, int], cards: Mapping[str, Any]
+    where: str, name: str, hdu: int, stored: tuple[int, int], header: Mapping[str, Any]
 ) -> AmplifierLayout:
     """Find one amplifier's place from DATASEC, BIASSEC, DETSEC and CCDSUM.
 
-    A blank section is as good as none; without DATASEC the whole image is data.  A BIASSEC that
-    cannot be used, as trimmed images still have, is kept as ``bias_problem``: without it there
-    is no level to subtract, but the data are what they are.
+    A blank section counts as not given; without DATASEC the whole image is data.  A BIASSEC
+    that cannot be used is no error, because trimmed images often still have one: the reason is
+    kept as ``bias_problem``, and the level of the overscan is not subtracted.
 
     Parameters
     ----------
     where : str
-        Named in errors.
+        Name of the file or amplifier, for errors.
     name, hdu, stored
-        See :class:`AmplifierLayout`.
-    cards : mapping
-        Also WINDOW, the amplifier's section of the stored image, from campaign.yaml.
+        As in :class:`AmplifierLayout`.
+    header : mapping
+        Sections by keyword; WINDOW is the amplifier's section of the stored image, from
+        campaign.yaml.
+
+    Returns
+    -------
+    layout : AmplifierLayout
+        The place, without gain, noise and saturation.
 
     Raises
     ------
     RecordingError
-        Another section that is none, or leaves the image; says so where it would fit with x and
-        y exchanged.
+        A section other than BIASSEC cannot be read or leaves the image.  The message says
+        where it would fit with x and y exchanged.
     """
     window = Section(slice(0, stored[0]), slice(0, stored[1]))
-    window = _section_in("WINDOW", cards, where, stored, window) or window
-    data = _section_in("DATASEC", cards, where, stored, window) or window
+    window = _section_in("WINDOW", header, where, stored, window) or window
+    data = _section_in("DATASEC", header, where, stored, window) or window
     bias, problem = None, ""
     try:
-        bias = _section_in("BIASSEC", cards, where, stored, window)
+        bias = _section_in("BIASSEC", header, where, stored, window)
     except RecordingError as error:
         problem = str(error).removeprefix(f"{where}: ")
 
@@ -208,11 +226,11 @@ def layout_of(
         bias=None if bias is None else readout(bias), origin=None, flip_x=False, flip_y=False,
         on_sensor=None, bias_problem=problem,
     )  # fmt: skip
-    if not cards.get("DETSEC"):
+    if not header.get("DETSEC"):
         return layout
-    place = parse_section(cards["DETSEC"], f"{where}: DETSEC")
-    bx, by = _binning(cards.get("CCDSUM"), where)
-    # Some cameras count the binned pixels there, most the sensor's own.
+    place = parse_section(header["DETSEC"], f"{where}: DETSEC")
+    bx, by = _binning(header.get("CCDSUM"), where)
+    # Most cameras count unbinned pixels in DETSEC, some binned ones: the shape decides.
     if place.shape == layout.shape:
         bx_place, by_place = 1, 1
     else:
@@ -227,17 +245,17 @@ def layout_of(
 
 
 def to_sensor(layout: AmplifierLayout, image: NDArray[Any]) -> NDArray[Any]:
-    """Turn an image in readout order as the sensor lies (and back), a view."""
+    """Turn an image from readout order into sensor coordinates, or back; a view."""
     return image[:: -1 if layout.flip_y else 1, :: -1 if layout.flip_x else 1]
 
 
 def overlaps(layouts: Sequence[AmplifierLayout]) -> list[tuple[str, str]]:
-    """Names of the amplifiers that claim the same pixels of the sensor.
+    """Pairs of amplifiers whose DETSEC share pixels of the sensor.
 
     Examples
     --------
-    >>> card = {"DETSEC": "[1:4,1:4]"}
-    >>> overlaps([layout_of("x", n, 1, (4, 4), card) for n in ("A", "B")])
+    >>> header = {"DETSEC": "[1:4,1:4]"}
+    >>> overlaps([layout_of("x", n, 1, (4, 4), header) for n in ("A", "B")])
     [('A', 'B')]
     """
     found = []
@@ -252,7 +270,7 @@ def overlaps(layouts: Sequence[AmplifierLayout]) -> list[tuple[str, str]]:
 
 
 def _seen_from(part: slice, whole: slice, flipped: bool) -> slice:
-    """Slice within a window, from its other end where the axis is stored backwards."""
+    """Slice within a window, counted from the output's end of the axis."""
     if flipped:
         return slice(whole.stop - part.stop, whole.stop - part.start)
     return slice(part.start - whole.start, part.stop - whole.start)
@@ -265,14 +283,18 @@ def _section_in(
     stored: tuple[int, int],
     window: Section,
 ) -> Section | None:
-    """Section of a card, which must lie in the image and in the amplifier's part of it."""
+    """Section of a keyword, checked to lie in the image and in the amplifier's window."""
     text = cards.get(card)
     if not str(text or "").strip():
         return None
     found = parse_section(text, f"{where}: {card}")
     _inside(found, stored, f"{where}: {card} = {text!r}")
     if not _within(found, window):
-        raise RecordingError(f"{where}: {card} = {text!r} leaves the amplifier's window")
+        rows, columns = window.rows, window.columns
+        raise RecordingError(
+            f"{where}: {card} = {text!r} leaves the amplifier's window "
+            f"[{columns.start + 1}:{columns.stop},{rows.start + 1}:{rows.stop}]"
+        )
     return found
 
 
@@ -298,13 +320,15 @@ def _inside(section: Section, stored: tuple[int, int], where: str) -> None:
 
 
 def _binning(text: Any, where: str) -> tuple[int, int]:
-    """Read CCDSUM, '2 2'; 1 in both where it is not there."""
+    """Binning in x and y from CCDSUM, such as '2 2'; 1 in both without it."""
     if text is None:
         return 1, 1
     try:
         bx, by = (int(float(word)) for word in np.atleast_1d(str(text).split()))
     except ValueError:
-        raise RecordingError(f"{where}: CCDSUM = {text!r} is not like '1 1'") from None
+        raise RecordingError(
+            f"{where}: CCDSUM = {text!r} is not like '1 1', the binning in x and in y"
+        ) from None
     if min(bx, by) < 1:
         raise RecordingError(f"{where}: CCDSUM = {text!r} must be above 0")
     return bx, by

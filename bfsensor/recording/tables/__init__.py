@@ -1,4 +1,4 @@
-"""Recordings that others reduced: tables of a_ij, covariances, spots, profiles and settings."""
+"""Readers of reduced recordings: tables of a_ij, covariances, spots, profiles and settings."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Tables of a_ij that others measured."""
+"""Tables of measured a_ij, the relative change of pixel areas per electron."""
 
 from __future__ import annotations
 
@@ -24,12 +24,21 @@ class AreaChangeTable:
     Attributes
     ----------
     path : Path
-        Where they came from.
+        File of the table.
     a, errors : ndarray, shape (ny, nx)
-        [j, i], from lag (0, 0) [1/e-]; nan where not given.
+        a_ij and their standard errors as ``a[j, i]``, from lag (0, 0) [1/e-]; nan where the
+        table has no row.
     independent : ndarray of bool, shape (ny, nx)
-        False at (0, 0) where it was set so that all lags add up to nothing.
+        True where a value was measured; False at (0, 0) where a_00 was computed from the
+        others so that all lags add up to 0.
     warnings : tuple of str
+        Warnings about axes and the sum of all lags.
+
+    Examples
+    --------
+    >>> a = np.array([[-2e-6, 1e-7], [3e-7, 5e-8]])
+    >>> AreaChangeTable(Path("a.csv"), a, abs(a) / 10, np.isfinite(a)).what
+    'a_ij, lags to 1, 1, a_00 = -2.000e-06 per electron'
     """
 
     path: Path
@@ -40,7 +49,7 @@ class AreaChangeTable:
 
     @property
     def what(self) -> str:
-        """One line for a list."""
+        """Kind, largest lags and a_00 of the table, in one line."""
         ny, nx = self.a.shape
         return f"a_ij, lags to {nx - 1}, {ny - 1}, a_00 = {self.a[0, 0]:.3e} per electron"
 
@@ -55,31 +64,45 @@ def read_area_changes(
         "err_per_e",
     ),
 ) -> AreaChangeTable:
-    """Read a table of a_ij, comma-separated or ECSV, lines with # passed over.
+    r"""Read a table of a_ij, comma-separated or ECSV; lines that begin with # are comments.
 
     Parameters
     ----------
     path : path-like
-        The table.
+        The table, with a row for each lag of the quadrant i >= 0, j >= 0.
     columns : tuple of str
-        Names of the columns of the lag in x, the lag in y, the value and its error
-        [1/e-]; by default those of the published ITL and E2V tables as they are kept here.
-        A table with the axes the other way is read by exchanging the first two.
+        Names of the columns of the lag in x (serial), the lag in y (parallel), the value and
+        its standard error [1/e-]; by default those of the published ITL and E2V tables in this
+        repository.  A table with exchanged axes is read by exchanging the first two names.
 
     Returns
     -------
-    AreaChangeTable
+    table : AreaChangeTable
+        The values as [j, i], with warnings.
 
     Raises
     ------
     RecordingError
-        A column is missing, a lag is given twice or is no whole number.
+        The file cannot be read, a column is missing, or a lag is given twice, below 0 or not
+        a whole number.
 
     Notes
     -----
-    Such tables are C_ij over C_00 and the level, or slopes of it: the flux range is the
-    publisher's.  Where all lags, those of both signs counted, add up to less than a
-    hundredth of the sum's error, a_00 was computed from the rest: it is no measurement.
+    Such tables are C_ij over C_00 and the level, or the slope of that against the level, over
+    the range of flux that their publisher chose.  Where all lags, counted with both signs, add
+    up to less than a hundredth of the sum's error, a_00 was computed from the others and is not a
+    measurement.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> text = "i_serial,j_parallel,cov_per_e,err_per_e\n0,0,-2e-6,1e-8\n0,1,3e-7,1e-8\n"
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "areas.csv"
+    ...     _ = path.write_text(text)
+    ...     table = read_area_changes(path)
+    >>> table.a.shape, float(table.a[1, 0])
+    ((2, 1), 3e-07)
     """
     path = Path(path)
     try:
@@ -91,11 +114,15 @@ def read_area_changes(
     require(str(path), table.colnames, columns)
     i, j = (whole_numbers(path, table, name) for name in columns[:2])
     if min(i.min(), j.min()) < 0:
-        raise RecordingError(f"{path}: lags below 0 are not read; average the quadrants")
+        raise RecordingError(
+            f"{path}: lags below 0 are not read; average the quadrants into i >= 0, j >= 0"
+        )
     a = np.full((j.max() + 1, i.max() + 1), np.nan)
     errors = a.copy()
     if len(set(zip(i.tolist(), j.tolist(), strict=True))) < len(i):
-        raise RecordingError(f"{path}: a lag is given twice")
+        raise RecordingError(
+            f"{path}: a lag ({columns[0]}, {columns[1]}) is given twice; one row each is allowed"
+        )
     a[j, i], errors[j, i] = floats(table, columns[2]), floats(table, columns[3])
     times = np.where(np.arange(a.shape[1]) > 0, 2, 1) * np.where(
         np.arange(a.shape[0]) > 0, 2, 1
@@ -108,6 +135,6 @@ def read_area_changes(
         independent[0, 0] = False
         warnings.append(
             f"all lags add up to {total:.1e}, with an error of {scatter:.1e}: a_00 was set by "
-            "the sum and is not independent; charge conservation is not tested by this table"
+            "the sum of the others, is not fitted, and the table does not test charge conservation"
         )
     return AreaChangeTable(path, a, errors, independent, tuple(w for w in warnings if w))

@@ -1,4 +1,4 @@
-"""Tables of calibration files by column name, FITS or ECSV: what LSST's datasets share."""
+"""Base class and reading and writing, FITS or ECSV, of LSST's calibration datasets."""
 
 from __future__ import annotations
 
@@ -31,14 +31,15 @@ _Kind = TypeVar("_Kind", bound="CalibrationTable")
 
 @dataclass(frozen=True, eq=False)
 class CalibrationTable:
-    """Columns by the pipeline's names, a row for each amplifier, lags as [j, i].
+    """Columns of a calibration dataset, with matrices of lags as [j, i].
 
     Attributes
     ----------
     columns : mapping of str to ndarray
-        The first axis is the amplifier; matrices of lags are unfolded to (..., j, i).
+        Columns by the pipeline's names.  The first axis is the amplifier; matrices of lags have
+        the shape (..., j, i).
     meta : mapping of str to value
-        Cards of the header; kind, schema and version of the dataset are filled in.
+        Values of the header by keyword; kind, schema and version of the dataset are filled in.
     """
 
     columns: Columns
@@ -73,28 +74,35 @@ class CalibrationTable:
 
     @property
     def version(self) -> float:
-        """Version of the format that the header names."""
+        """Version of the format that the header states."""
         return float(look_up(self.meta, f"{self.OBSTYPE}_VERSION", self.VERSION))
 
     @classmethod
     def read(cls: type[_Kind], path: str | os.PathLike[str]) -> _Kind:
-        """Read FITS, or ECSV where the name ends so.
+        """Read the dataset from FITS, or from ECSV where the file's name ends in .ecsv.
 
         Parameters
         ----------
         path : path-like
             The file.
 
+        Returns
+        -------
+        dataset : same class
+            The dataset, with matrices of lags as [j, i].
+
         Raises
         ------
         RecordingError
-            Names the file and the column that is missing, of another unit or length, or
-            the kind of dataset found instead.
+            The file cannot be read, holds another kind of dataset, or a column is missing, in
+            another unit or of another length.  The message names file and column.
         """
         tables = read_tables(path)
         kind = look_up(tables[0].meta, "OBSTYPE", None)
         if kind != cls.OBSTYPE:
-            raise RecordingError(f"{path}: its OBSTYPE is {kind!r}, not {cls.OBSTYPE!r}")
+            raise RecordingError(
+                f"{path}: its OBSTYPE is {kind!r}, not {cls.OBSTYPE!r} as of {cls.__name__}"
+            )
         return cls._from_tables(str(path), tables)
 
     @classmethod
@@ -102,12 +110,22 @@ class CalibrationTable:
         return cls(cls._unfold(path, tables[0]), tables[0].meta)
 
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write FITS, or ECSV where the name ends so (beside, then renamed).
+        """Write the dataset as FITS, or as ECSV where the file's name ends in .ecsv.
+
+        The file is written under another name and then renamed, so that a partly written file
+        never has its name.
+
+        Parameters
+        ----------
+        path : path-like
+            File to write.
+        overwrite : bool
+            Replace an existing file.
 
         Raises
         ------
         RecordingError
-            The file exists and ``overwrite`` is not set, or cannot hold this.
+            The file exists and ``overwrite`` is False, or its format cannot hold the dataset.
         """
         write_tables(path, self._to_tables(), overwrite=overwrite)
 
@@ -116,12 +134,12 @@ class CalibrationTable:
 
     @classmethod
     def _sides(cls, columns: Columns, meta: Mapping[str, Any]) -> Sides:
-        """Lengths that the shapes of the matrices name."""
+        """Lengths of the matrices' axes, by the words in ``MATRICES``."""
         raise NotImplementedError
 
     @classmethod
     def _unfold(cls, path: str, table: Table) -> dict[str, NDArray[Any]]:
-        """Check units and lengths; matrices to (..., j, i)."""
+        """Check units and lengths, and turn flattened matrices into arrays (..., j, i)."""
         require(path, table.colnames, cls.REQUIRED)
         columns: dict[str, NDArray[Any]] = {}
         for name in table.colnames:
@@ -147,7 +165,7 @@ class CalibrationTable:
         return columns
 
     def _fold(self) -> Table:
-        """Put columns back as the pipelines have them."""
+        """Table with the matrices flattened as the pipelines have them."""
         table = Table()
         for name, array in self.columns.items():
             held = array
@@ -164,14 +182,17 @@ class CalibrationTable:
 
 
 def require(where: str, there: Any, names: tuple[str, ...]) -> None:
-    """Raise unless all names are there."""
+    """Raise RecordingError unless a table has all these columns."""
     lacking = [name for name in names if name not in there]
     if lacking:
-        raise RecordingError(f"{where}: {', '.join(lacking)} missing")
+        given = ", ".join(map(str, there)) or "none"
+        raise RecordingError(
+            f"{where}: {', '.join(lacking)} missing; its columns are {given}"
+        )
 
 
 def same(one: Columns, other: Columns) -> bool:
-    """Whether both hold the same arrays, nan equal to nan."""
+    """Whether two mappings have the same arrays in the same order, nan equal to nan."""
     if list(one) != list(other):
         return False
     return all(
@@ -181,12 +202,12 @@ def same(one: Columns, other: Columns) -> bool:
 
 
 def look_up(meta: Mapping[str, Any], key: str, default: Any) -> Any:
-    """Give a card whatever the case of its keyword: FITS changes that of short ones."""
+    """Value of a keyword in letters of either case: FITS turns short keywords into capitals."""
     return next((v for k, v in meta.items() if k.lower() == key.lower()), default)
 
 
 def plain(array: NDArray[Any]) -> NDArray[Any]:
-    """Text as str, numbers in the machine's byte order."""
+    """Array with text as str and with numbers in the machine's byte order."""
     if array.dtype.kind == "S":
         array = np.char.decode(array)
     return array.astype(array.dtype.newbyteorder("="))
@@ -206,18 +227,18 @@ def read_tables(path: str | os.PathLike[str]) -> list[Table]:
         warnings.simplefilter("ignore", UnitsWarning)
         tables = [_from_hdu(hdu) for hdu in hdus if isinstance(hdu, fits.BinTableHDU)]
     if not tables:
-        raise RecordingError(f"{path}: holds no table")
+        raise RecordingError(f"{path}: holds no table, but images or headers only")
     return tables
 
 
 def _from_ecsv(path: str | os.PathLike[str]) -> Table:
-    """Read a table; numbers that are left out are nan, text is empty."""
+    """Read an ECSV table; empty cells of floats become nan, those of text ''."""
     try:
         with warnings.catch_warnings():
-            # Of types that are none astropy only warns.
+            # astropy only warns of a column whose type does not exist.
             warnings.simplefilter("error", AstropyUserWarning)
             table = Table.read(path, format="ascii.ecsv")
-    # Damaged headers end in several kinds of exception inside astropy.
+    # astropy raises several classes of exception for damaged headers.
     except (
         OSError, ValueError, TypeError, KeyError, AttributeError, AstropyUserWarning
     ) as error:  # fmt: skip
@@ -227,7 +248,10 @@ def _from_ecsv(path: str | os.PathLike[str]) -> Table:
         if not np.any(getattr(table[name], "mask", False)):
             continue
         if table[name].dtype.kind not in "fU":
-            raise RecordingError(f"{path}: column {name} has empty cells")
+            raise RecordingError(
+                f"{path}: column {name} has empty cells, which its type "
+                f"{table[name].dtype} does not allow"
+            )
         table[name] = table[name].filled(np.nan if table[name].dtype.kind == "f" else "")
     return table
 
@@ -235,12 +259,14 @@ def _from_ecsv(path: str | os.PathLike[str]) -> Table:
 def write_tables(
     path: str | os.PathLike[str], tables: list[Table], *, overwrite: bool
 ) -> None:
-    """Write tables beside and rename the file; ECSV where the name ends so.
+    """Write tables as FITS, or one table as ECSV where the file's name ends in .ecsv.
+
+    The file is written under another name and then renamed.
 
     Raises
     ------
     RecordingError
-        The file exists and ``overwrite`` is not set, or cannot hold this.
+        The file exists and ``overwrite`` is False, or its format cannot hold the tables.
     """
     target = Path(path)
     refuse_existing(target, overwrite, RecordingError)
@@ -252,7 +278,7 @@ def write_tables(
                 tables[0].write(beside, format="ascii.ecsv", overwrite=True)
                 return
             with warnings.catch_warnings():
-                # Keywords above eight letters become HIERARCH cards, as LSST's do.
+                # Keywords of more than eight letters become HIERARCH ones, as in LSST's files.
                 warnings.simplefilter("ignore", VerifyWarning)
                 hdus = [fits.PrimaryHDU(), *(_to_hdu(table) for table in tables)]
                 fits.HDUList(hdus).writeto(beside, overwrite=True)
@@ -263,8 +289,8 @@ def write_tables(
 def _to_hdu(table: Table) -> fits.BinTableHDU:
     plain = table.copy()
     meta, plain.meta = dict(plain.meta), {}
-    # As in the pipelines' files, units are those of the format: FITS knows no electron, and
-    # readers would warn of every column.  ECSV keeps them.
+    # The pipelines' FITS files have no units, and ours neither: the FITS standard has no unit
+    # 'electron', and readers would warn of every column.  ECSV files keep the units.
     for name in plain.colnames:
         plain[name].unit = None
     hdu = fits.table_to_hdu(plain)
@@ -277,10 +303,11 @@ _LAYOUT = re.compile(
     r"(XTENSION|BITPIX|NAXIS\d*|PCOUNT|GCOUNT|TFIELDS|CHECKSUM|DATASUM|COMMENT|HISTORY|"
     r"T(TYPE|FORM|UNIT|DIM|NULL|SCAL|ZERO|DISP)\d+|)"
 )
+"""Keywords of the FITS standard that describe a table's layout and are no part of ``meta``."""
 
 
 def _from_hdu(hdu: fits.BinTableHDU) -> Table:
-    """Take columns as they are: a nan is a value here, a column may have no width."""
+    """Table of an extension's columns, in which nan is a value and a column may have no width."""
     table = Table()
     for column in hdu.columns:
         empty = re.search(r"[(,]0[,)]", column.dim or "") is not None

@@ -1,4 +1,4 @@
-"""Covariances that others measured: our ECSV table and LSST's datasets."""
+"""Tables of flats' covariances by amplifier, level and lag, from ECSV or LSST's datasets."""
 
 from __future__ import annotations
 
@@ -17,11 +17,20 @@ from bfsensor.recording.tables.lsst_datasets import PhotonTransferDataset
 from bfsensor.typing import FloatArray
 
 KIND = "bfsensor covariance table"
+"""Value of the header entry ``kind`` in files that :meth:`CovarianceTable.write` makes."""
 
 UNIT_RANGE = (0.8, 1.25)
-"""C_00 over the level of the dimmest flats that passes: Poisson's 1, less the effect."""
+"""Range of C_00 over the level [e-] of an amplifier's dimmest flats without a warning.
 
-AXES_REMARK = "exchanged axes cannot be seen in one table: compare with the spots, or with an overscan"
+Poisson's statistics give 1, which the brighter-fatter effect lowers by a few percent and read noise
+raises.  Chosen: variances of differences, not halved, and gains wrong by 2 are outside.  If the range
+were twice as wide, 0.64 to 1.56, a gain wrong by 1.5 would pass.
+"""
+
+AXES_REMARK = (
+    "exchanged axes cannot be seen in one table: compare with spots or with an overscan"
+)
+"""Advice in the warning of :func:`warn_of_axes`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,23 +40,27 @@ class CovarianceTable:
     Attributes
     ----------
     path : Path
-        Where they came from.
+        File of the table.
     amplifier : ndarray of str, shape (n,)
-        A row for each covariance.
+        Name of the amplifier of each covariance.
     level : ndarray, shape (n,)
         Mean of the flats [e-].
     lag_x, lag_y : ndarray of int, shape (n,)
-        i along x, serial, and j along y, parallel.
+        Lags i along x (serial) and j along y (parallel) [pixel].
     covariance, error : ndarray, shape (n,)
-        Of one flat, not of a difference [e-^2].
+        Covariance of one flat, not of a difference, and its standard error [e-^2].
     pixels, pairs : ndarray of int, shape (n,)
-        Pairs of pixels and of flats; 0 where not said.
+        Numbers of pairs of pixels and of pairs of flats; 0 where the file has none.
     wavelength, back_bias : ndarray, shape (n,)
-        [nm], [V]; nan where not said.
+        Wavelength [nm] and back bias [V]; nan where the file has none.
     matrix : ndarray, shape (n, n), or None
         Covariance matrix of the rows [e-^4]; None where only errors are known.
     warnings : tuple of str
-        What a reader should know.
+        Warnings about errors, units and axes.
+
+    Examples
+    --------
+    :func:`read_covariances` makes one; its example shows rows and warnings.
     """
 
     path: Path
@@ -66,7 +79,7 @@ class CovarianceTable:
 
     @property
     def what(self) -> str:
-        """One line for a list."""
+        """Kind, number of rows, amplifiers, levels and largest lags, in one line."""
         names = sorted(set(self.amplifier.tolist()))
         return (
             f"covariances, {len(self.level)} rows, {len(names)} amplifiers, "
@@ -75,16 +88,29 @@ class CovarianceTable:
         )
 
     def error_matrix(self) -> FloatArray:
-        """Covariance matrix of the rows, diagonal where only errors are known [e-^4]."""
+        """Give the covariance matrix of the rows, diagonal where only errors are known.
+
+        Returns
+        -------
+        matrix : ndarray, shape (n, n)
+            Covariance matrix [e-^4].
+        """
         return np.diag(self.error**2) if self.matrix is None else self.matrix
 
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write ECSV: amp, mu_e, i, j, cov, sigma, npix, npair, wavelength, vbb.
+        """Write ECSV with the columns amp, mu_e, i, j, cov, sigma, npix, npair, wavelength, vbb.
+
+        Parameters
+        ----------
+        path : path-like
+            File to write, with the ending .ecsv.
+        overwrite : bool
+            Replace an existing file.
 
         Raises
         ------
         RecordingError
-            The file exists and ``overwrite`` is not set, or cannot be written.
+            The file exists and ``overwrite`` is False, or cannot be written.
         """
         table = Table(
             {
@@ -102,29 +128,42 @@ class CovarianceTable:
 
 
 def read_covariances(path: str | os.PathLike[str]) -> CovarianceTable:
-    """Read covariances of flats: our ECSV, or LSST's PhotonTransferCurveDataset.
+    """Read covariances of flats from ECSV, or from LSST's PhotonTransferCurveDataset.
 
     Parameters
     ----------
     path : path-like
-        ECSV with the columns i, j, cov and mu_e (or mu_adu: then a column or header entry
-        ``gain``), and amp, sigma, npix, npair, wavelength, vbb, matrix where known.  Header:
-        ``unit`` of cov, 'electron' (squared) or 'adu'; ``difference``, true where cov is of
-        the difference of two flats.  Or LSST's dataset, FITS or ECSV.
+        ECSV with the columns i, j (lags along x and y), cov, sigma (its standard error) and mu_e,
+        the level [e-] (or mu_adu [ADU]: then a column or header entry ``gain`` [e-/ADU]), and
+        optionally amp, npix, npair, wavelength [nm], vbb [V], matrix.  Its header may state
+        ``unit`` of cov and sigma, 'electron' (squared, the default) or 'adu', and ``difference``,
+        true where cov is that of the difference of two flats.  Or LSST's dataset, FITS or ECSV.
 
     Returns
     -------
     table : CovarianceTable
+        The covariances in electrons, with warnings.
 
     Raises
     ------
     RecordingError
-        A column, gain or unit is missing, or a value is not finite.
+        The file cannot be read, a column, gain or unit is missing, or a value is not finite.
 
     Notes
     -----
-    C_00 of the dimmest flats must be their level, by Poisson's statistics: what is off by
-    more than 20 % is named, with what the ratio stands for.
+    By Poisson's statistics C_00 of the dimmest flats equals their level.  A warning reports an
+    amplifier where it differs by more than 20 %, with the likely cause.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> rows = [(0, 0, 5e3, 4.9e3, 20.0), (1, 0, 5e3, 3.0, 1.0), (0, 1, 5e3, 7.0, 1.0)]
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "covariances.ecsv"
+    ...     Table(rows=rows, names=("i", "j", "mu_e", "cov", "sigma")).write(path)
+    ...     table = read_covariances(path)
+    >>> table.covariance.tolist(), len(table.warnings)
+    ([4900.0, 3.0, 7.0], 1)
     """
     path = Path(path)
     table = read_tables(path)[0]
@@ -138,7 +177,9 @@ def read_covariances(path: str | os.PathLike[str]) -> CovarianceTable:
     elif "mu_adu" in table.colnames:
         level = floats(table, "mu_adu") * gain
     else:
-        raise RecordingError(f"{path}: mu_e (or mu_adu with a gain) missing")
+        raise RecordingError(
+            f"{path}: no column of the level, mu_e [e-] or mu_adu [ADU] with a gain"
+        )
     unit = str(table.meta.get("unit", "electron"))
     if unit not in ("electron", "adu"):
         raise RecordingError(f"{path}: unit = {unit!r} is not 'electron' or 'adu'")
@@ -149,7 +190,7 @@ def read_covariances(path: str | os.PathLike[str]) -> CovarianceTable:
         error = floats(table, "sigma") * factor
     else:
         raise RecordingError(
-            f"{path}: sigma missing: a covariance without error is refused"
+            f"{path}: sigma missing, the standard errors of cov, without which it cannot be fitted"
         )
     matrix = None
     if "matrix" in table.colnames:
@@ -162,7 +203,7 @@ def read_covariances(path: str | os.PathLike[str]) -> CovarianceTable:
     else:
         warnings.append(
             "no covariance matrix: rows are taken as independent, and chi-square is too large or "
-            "too small by what they share"
+            "too small by the errors that they share; a column matrix states it"
         )
     names = table["amp"] if "amp" in table.colnames else ["all"] * n
     return _checked(
@@ -178,26 +219,27 @@ def read_covariances(path: str | os.PathLike[str]) -> CovarianceTable:
 
 
 def from_photon_transfer(dataset: PhotonTransferDataset, path: Path) -> CovarianceTable:
-    """Turn LSST's dataset into a table in electrons, with its own gains.
+    """Convert LSST's dataset to a table in electrons, with the dataset's gains.
 
-    Errors are its weights', or where it has none those of white noise, C_00 / sqrt(n) for n
-    pixels and sqrt(2) times that at lag (0, 0).
+    Errors are those of the dataset's weights.  Without weights they are those of white noise:
+    C_00 / sqrt(n) for n pixels, and sqrt(2) times that at lag (0, 0).
 
     Parameters
     ----------
     dataset : PhotonTransferDataset
-        As its ``read`` gives it.
+        The dataset.
     path : Path
-        Its file, which messages and the table name.
+        Its file, for messages and for the table.
 
     Returns
     -------
-    CovarianceTable
+    table : CovarianceTable
+        Covariances of the pairs that the pipeline kept.
 
     Raises
     ------
     RecordingError
-        No amplifier has a gain, or neither weights nor a number of pixels.
+        No amplifier has a gain, or an amplifier has neither weights nor a number of pixels.
     """
     parts: dict[str, list[ArrayLike]] = {}
     white = False
@@ -227,7 +269,10 @@ def from_photon_transfer(dataset: PhotonTransferDataset, path: Path) -> Covarian
             error = np.repeat(error, c.shape[2], 2)
             error[:, 0, 0] *= np.sqrt(2)
         else:
-            raise RecordingError(f"{path}: {name}: neither weights nor NPIXEL_COVARIANCES")
+            raise RecordingError(
+                f"{path}: {name}: no errors: neither COVARIANCES_SQRT_WEIGHTS above 0 nor "
+                "NPIXEL_COVARIANCES"
+            )
         levels, j, i = np.meshgrid(
             np.asarray(curve["levels"]) * gain, np.arange(c.shape[1]),
             np.arange(c.shape[2]), indexing="ij",
@@ -239,12 +284,14 @@ def from_photon_transfer(dataset: PhotonTransferDataset, path: Path) -> Covarian
         ):  # fmt: skip
             parts.setdefault(key, []).append(value)
     if not parts:
-        raise RecordingError(f"{path}: no amplifier has a gain")
+        raise RecordingError(
+            f"{path}: no amplifier has a GAIN above 0, which electrons need"
+        )
     columns: dict[str, Any] = {name: np.concatenate(v) for name, v in parts.items()}
     n = len(columns["level"])
     warnings = ["no covariance matrix: rows are taken as independent"]
     if white:
-        warnings.append("no weights: errors are those of white noise")
+        warnings.append("no COVARIANCES_SQRT_WEIGHTS: errors are those of white noise")
     if lost:
         warnings.append(f"no gain for {', '.join(lost)}: left out")
     return _checked(
@@ -257,14 +304,14 @@ def from_photon_transfer(dataset: PhotonTransferDataset, path: Path) -> Covarian
 
 
 def _checked(table: CovarianceTable) -> CovarianceTable:
-    """Refuse what cannot be used; add warnings about units and axes."""
+    """Refuse values that are not finite and errors of 0; add warnings about units and axes."""
     from dataclasses import replace
 
     for name in ("level", "covariance", "error"):
         wrong = ~np.isfinite(getattr(table, name))
         if wrong.any():
             raise RecordingError(
-                f"{table.path}: {wrong.sum()} rows of {name} are not finite"
+                f"{table.path}: {wrong.sum()} rows of {name} are not finite; leave them out"
             )
     if np.any(table.error <= 0):
         raise RecordingError(f"{table.path}: errors must be above 0")
@@ -277,7 +324,7 @@ def _checked(table: CovarianceTable) -> CovarianceTable:
         ratio = (
             float(table.covariance[k] / table.level[k]) if table.level[k] > 0 else np.nan
         )
-        # Read noise may be as large as the shot noise of a few hundred electrons.
+        # Below 300 e- the read noise of some sensors is as large as the shot noise.
         if table.level[k] > 300 and not UNIT_RANGE[0] <= ratio <= UNIT_RANGE[1]:
             warnings.append(
                 f"{name}: C_00 over the level is {ratio:.3g} at {table.level[k]:.0f} e-, where it "
@@ -292,16 +339,16 @@ def _checked(table: CovarianceTable) -> CovarianceTable:
 
 
 def _meaning(ratio: float) -> str:
-    """Name the slip that a ratio of variance and level stands for."""
+    """Name the likely cause of a wrong ratio of variance and level."""
     if 1.6 < ratio < 2.4:
-        return "of a difference of two flats, or a gain wrong by 2?"
+        return "of a difference of two flats (header entry difference: true), or a gain wrong by 2?"
     if 0.4 < ratio < 0.6:
         return "halved twice, or a gain wrong by 2?"
-    return "a wrong gain, or ADU taken for electrons?"
+    return "a wrong gain, or ADU taken for electrons (header entry unit: adu)?"
 
 
 def warn_of_axes(x: float, y: float) -> str:
-    """Warn where the neighbour in x gains more than that in y; '' otherwise."""
+    """Warning where the neighbour in x gains more than that in y; '' otherwise."""
     if not x > y:
         return ""
     return (
@@ -311,25 +358,27 @@ def warn_of_axes(x: float, y: float) -> str:
 
 
 def _gain(path: Path, table: Table) -> FloatArray:
-    """Gain of each row [e-/ADU]; nan where not said, an error where it is needed."""
+    """Gain of each row [e-/ADU]; nan without one, which is an error for values in ADU."""
     if "gain" in table.colnames:
         return floats(table, "gain")
     value = table.meta.get("gain")
     needed = "mu_e" not in table.colnames or table.meta.get("unit") == "adu"
     if value is None and needed:
-        raise RecordingError(f"{path}: in ADU, and no gain in a column or the header")
+        raise RecordingError(
+            f"{path}: in ADU, and no gain [e-/ADU] in a column or header entry gain"
+        )
     return np.full(len(table), np.nan if value is None else float(value))
 
 
 def floats(table: Table, name: str) -> FloatArray:
-    """Give a column as floats; nan where it is masked or not there."""
+    """Column of a table as floats; nan where it is masked or missing."""
     if name not in table.colnames:
         return np.full(len(table), np.nan)
     return np.asarray(np.ma.filled(np.ma.asarray(table[name], float), np.nan), float)
 
 
 def whole_numbers(path: Path, table: Table, name: str) -> NDArray[np.int64]:
-    """Give a column as whole numbers; 0 where it is not there."""
+    """Column of a table as whole numbers; 0 where it is missing."""
     values = floats(table, name) if name in table.colnames else np.zeros(len(table))
     if not np.all(values == np.round(values)):
         raise RecordingError(f"{path}: {name} must be whole numbers")

@@ -1,8 +1,8 @@
-"""LSST's calibration datasets by column name, without the LSST stack.
+"""LSST's calibration datasets, read and written without the LSST stack.
 
 The pipelines index every matrix of lags as [i][j], i along the serial direction, and store
-it flattened; here all are [j, i].  Their files carry no units: columns without one are
-taken in the units that the pipelines document (``UNITS``), a different unit is refused.
+it flattened; here all are [j, i].  Their files carry no units: columns without one are in the
+units that the pipelines document (``UNITS``), and a column in another unit is refused.
 Formats: ip_isr, ``ptcDataset.py`` (to version 2.6), ``brighterFatterKernel.py`` (1.1) and
 ``electrostaticBrighterFatter.py`` (1.1).
 """
@@ -37,19 +37,32 @@ class PhotonTransferDataset(CalibrationTable):
     Attributes
     ----------
     columns : mapping of str to ndarray
-        Among others ``AMPLIFIER_NAME``, ``RAW_MEANS`` [ADU], ``GAIN`` [e-/ADU],
-        ``COVARIANCES`` (amplifier, pair, j, i) [ADU^2], ``A_MATRIX`` (amplifier, j, i)
-        [1/e-], ``B_MATRIX``, ``NOISE_MATRIX``.
+        Columns by the pipeline's names, a row for each amplifier.  Among them are
+        ``AMPLIFIER_NAME``, ``RAW_MEANS`` [ADU], ``GAIN`` [e-/ADU], ``COVARIANCES`` (amplifier,
+        pair, j, i) [ADU^2], ``A_MATRIX`` (amplifier, j, i) [1/e-], ``B_MATRIX`` and
+        ``NOISE_MATRIX``.
     meta : mapping of str to value
-        Cards of the header.
+        Values of the header by keyword.
 
     Examples
     --------
-    Refit what the pipeline measured (``path`` a calibration file)::
+    Take one amplifier's covariances out of a dataset; a file gives one by
+    ``PhotonTransferDataset.read(path)``.  To fit them, pass the arguments to
+    ``bfsensor.measure.CovarianceCurve.from_arrays``.
 
-        dataset = PhotonTransferDataset.read(path)
-        curve = CovarianceCurve.from_arrays(**dataset.curve("C10"), pixels=900_000)
-        fit = fit_covariances(curve)
+    >>> one = np.ones(1)
+    >>> dataset = PhotonTransferDataset(
+    ...     {
+    ...         "AMPLIFIER_NAME": np.array(["C10"]), "PTC_FIT_TYPE": np.array(["PARTIAL"]),
+    ...         "COV_MATRIX_SIDE": np.array([2]), "EXP_ID_MASK": np.array([[True, False]]),
+    ...         "RAW_MEANS": np.array([[5e3, 2e4]]), "RAW_VARS": np.array([[5e3, 2e4]]),
+    ...         "GAIN": one, "NOISE": one, "COVARIANCES": np.zeros((1, 2, 2, 2)),
+    ...         "A_MATRIX": np.zeros((1, 2, 2)),
+    ...     }
+    ... )
+    >>> found = dataset.curve("C10")
+    >>> found["levels"].tolist(), found["covariances"].shape
+    ([5000.0], (1, 2, 2))
     """
 
     OBSTYPE = "PTC"
@@ -104,11 +117,27 @@ class PhotonTransferDataset(CalibrationTable):
 
     @property
     def amplifiers(self) -> tuple[str, ...]:
-        """Names, in the order of the rows."""
+        """Names of the amplifiers, in the order of the rows."""
         return tuple(str(name) for name in self.columns["AMPLIFIER_NAME"])
 
     def row(self, amplifier: str) -> int:
-        """Give the row of an amplifier."""
+        """Give the row of an amplifier.
+
+        Parameters
+        ----------
+        amplifier : str
+            Name of the amplifier.
+
+        Returns
+        -------
+        row : int
+            Its index in the columns, from 0.
+
+        Raises
+        ------
+        RecordingError
+            The dataset has no such amplifier.
+        """
         if amplifier not in self.amplifiers:
             raise RecordingError(
                 f"no amplifier {amplifier!r} among {', '.join(self.amplifiers)}"
@@ -116,13 +145,24 @@ class PhotonTransferDataset(CalibrationTable):
         return self.amplifiers.index(amplifier)
 
     def curve(self, amplifier: str) -> dict[str, Any]:
-        """Levels and covariances of the pairs that the pipeline kept, and their names.
+        """Give levels and covariances of the pairs that the pipeline kept.
+
+        Parameters
+        ----------
+        amplifier : str
+            Name of the amplifier.
 
         Returns
         -------
         arguments : dict
-            ``levels`` [ADU], ``covariances`` (n, j, i) [ADU^2], ``unit``, ``region``: what
-            ``CovarianceCurve.from_arrays`` takes, with ``pixels`` where the file has it.
+            Arguments of :meth:`bfsensor.measure.CovarianceCurve.from_arrays`: ``levels`` [ADU],
+            ``covariances`` (n, j, i) [ADU^2], ``unit``, ``region``, and ``pixels`` where the file
+            has NPIXEL_COVARIANCES.  Pairs with covariances that are not finite are left out.
+
+        Raises
+        ------
+        RecordingError
+            The dataset has no such amplifier.
         """
         k = self.row(amplifier)
         levels = np.atleast_1d(self.columns["RAW_MEANS"][k])
@@ -136,7 +176,25 @@ class PhotonTransferDataset(CalibrationTable):
         return out
 
     def noise(self, amplifier: str) -> float:
-        """Read noise [e-]; before version 1.9 full-covariance fits stored its square."""
+        """Give the read noise of an amplifier.
+
+        Before version 1.9 of the format, full-covariance fits stored its square in NOISE.
+
+        Parameters
+        ----------
+        amplifier : str
+            Name of the amplifier.
+
+        Returns
+        -------
+        noise : float
+            Read noise [e-].
+
+        Raises
+        ------
+        RecordingError
+            The dataset has no such amplifier.
+        """
         k = self.row(amplifier)
         value = float(self.columns["NOISE"][k])
         squared = str(self.columns["PTC_FIT_TYPE"][k]).startswith("FULLCOVARIANCE")
@@ -150,16 +208,27 @@ class BrighterFatterKernel(CalibrationTable):
     Attributes
     ----------
     columns : mapping of str to ndarray
-        ``AMPLIFIER``, ``GAIN`` [e-/ADU], ``RAW_MEANS``, ``RAW_XCORRS`` (amplifier, pair,
-        j, i), ``MEAN_XCORRS`` and ``KERNEL`` (amplifier, j, i), centre in the middle.
+        Columns by the pipeline's names, a row for each amplifier: ``AMPLIFIER``, ``GAIN``
+        [e-/ADU], ``RAW_MEANS`` [ADU], ``RAW_XCORRS`` (amplifier, pair, j, i), ``MEAN_XCORRS``
+        and ``KERNEL`` (amplifier, j, i), whose centre is in the middle.
+    meta : mapping of str to value
+        Values of the header by keyword.
     detectors : mapping of str to ndarray, shape (ny, nx)
-        Kernels of whole detectors, [j, i].
+        Kernels of whole detectors as [j, i], by the detector's name.
 
     Notes
     -----
-    The kernels inherit [i][j] from the covariances they are solved from; ip_isr pull
-    request 263 (May 2023) mended their transposition, so one in an older file may have its
-    axes exchanged: compare with the covariances beside it (:meth:`larger_axis`).
+    The kernels inherit [i][j] from the covariances from which they are solved.  ip_isr pull
+    request 263 (May 2023) corrected their transposition: a kernel in an older file may have its
+    axes exchanged.  Compare :meth:`larger_axis` with the covariances in the file.
+
+    Examples
+    --------
+    >>> y, x = np.mgrid[-3:4, -3:4]
+    >>> kernel = -1e-6 * np.exp(-(x**2 / 2 + y**2) / 2)
+    >>> a = BrighterFatterKernel.area_changes(kernel)
+    >>> a.shape, bool(a[0, 0] < 0), bool(a[1, 0] > a[0, 1])
+    ((3, 3), True, True)
     """
 
     detectors: Mapping[str, FloatArray] = field(default_factory=dict)
@@ -203,7 +272,9 @@ class BrighterFatterKernel(CalibrationTable):
         dx, dy = (int(look_up(meta, f"KERNEL_D{axis}", 17)) for axis in "XY")
         means = columns.get("RAW_MEANS", columns.get("MEANS"))
         if means is None:
-            raise RecordingError("RAW_MEANS (before version 1.1: MEANS) is missing")
+            raise RecordingError(
+                "no column RAW_MEANS (before version 1.1: MEANS) of the flats' levels"
+            )
         pairs = means.reshape(len(means), -1).shape[1]
         return {"KERNEL_DX": dx, "KERNEL_DY": dy, "side": (dx - 1) // 2, "pairs": pairs}
 
@@ -220,7 +291,8 @@ class BrighterFatterKernel(CalibrationTable):
                 flat = np.asarray(kernel, float)
                 if flat.size != dx * dy:
                     raise RecordingError(
-                        f"{path}: detector kernel of {flat.size} numbers, not {dx} x {dy}"
+                        f"{path}: the kernel of detector {name} has {flat.size} numbers, not "
+                        f"{dx} x {dy} as KERNEL_DX and KERNEL_DY state"
                     )
                 detectors[str(name)] = flat.reshape(dx, dy).T.copy()
         return cls(cls._unfold(path, tables[0]), meta, detectors)
@@ -236,17 +308,18 @@ class BrighterFatterKernel(CalibrationTable):
 
     @staticmethod
     def area_changes(kernel: FloatArray) -> FloatArray:
-        """Give the a_ij [1/e-] that a kernel stands for: minus its Laplacian.
+        """Give the a_ij of a kernel, minus its Laplacian.
 
         Parameters
         ----------
         kernel : ndarray, shape (ny, nx)
-            [j, i], of odd sides, zero beyond them.
+            Kernel as [j, i], of odd sides, with its centre in the middle.
 
         Returns
         -------
         a : ndarray, shape (ny // 2, nx // 2)
-            By lag [j, i] from (0, 0), up to where the kernel still has neighbours.
+            a_ij by lag [j, i] from (0, 0) [1/e-], up to the last lag at which the kernel has
+            neighbours on all sides.
 
         References
         ----------
@@ -258,9 +331,19 @@ class BrighterFatterKernel(CalibrationTable):
         return np.asarray(4 * k[1:-1, 1:-1] - around)
 
     def larger_axis(self, kernel: FloatArray) -> str:
-        """Give the axis, 'x' or 'y', whose next pixel gains the larger area.
+        """Give the axis along which the neighbouring pixel gains more area.
 
-        The kernel itself may be the deeper along the other one.
+        The kernel itself may be deeper along the other axis.
+
+        Parameters
+        ----------
+        kernel : ndarray, shape (ny, nx)
+            Kernel as [j, i], of odd sides of 5 at least.
+
+        Returns
+        -------
+        axis : {'x', 'y'}
+            'y', parallel, for most thick CCDs; 'x' suggests exchanged axes.
         """
         a = self.area_changes(kernel)
         return "y" if a[1, 0] > a[0, 1] else "x"
@@ -273,19 +356,32 @@ _FITTED = ("A_MATRIX_MODEL", "ATH", "ATH_MINUS_BETA", "A_N", "A_S", "A_E", "A_W"
 class DistortionMatrix(CalibrationTable):
     """LSST's ElectrostaticBrighterFatterDistortionMatrix, after Astier & Regnault 2023.
 
-    One row for a detector.
+    The table has one row, for a detector.
 
     Attributes
     ----------
     columns : mapping of str to ndarray
-        ``A_MATRIX``, ``A_MATRIX_SIGMA``, ``USED_PIXELS``, ``A_MATRIX_MODEL`` (1, j, i)
-        [1/e-], ``A_N``, ``A_S``, ``A_E``, ``A_W``: shifts of the four boundaries, north
-        towards larger j; ``FIT_PARAM_NAMES``, ``FIT_PARAMS`` and more.
+        Columns by the pipeline's names: ``A_MATRIX``, ``A_MATRIX_SIGMA``, ``USED_PIXELS`` and
+        ``A_MATRIX_MODEL`` (1, j, i) [1/e-]; ``A_N``, ``A_S``, ``A_E``, ``A_W``, shifts of the four
+        boundaries by lag, north towards larger j; ``FIT_PARAM_NAMES``, ``FIT_PARAMS`` and others.
+    meta : mapping of str to value
+        Values of the header by keyword.
 
     Notes
     -----
-    ip_isr 25d94e1 fills its own ``aMatrixModel`` from ``A_MATRIX_SIGMA`` when it reads; the
-    column in the file is the model's.
+    ip_isr at commit 25d94e1 fills its own ``aMatrixModel`` from ``A_MATRIX_SIGMA`` when it reads a
+    file; the column ``A_MATRIX_MODEL`` of the file is nevertheless that of the model.
+
+    Examples
+    --------
+    >>> names = np.array([["thickness", "zq"]])
+    >>> matrix = np.zeros((1, 4, 4))
+    >>> columns = dict.fromkeys(DistortionMatrix.REQUIRED, matrix) | {
+    ...     "INPUT_RANGE": np.array([4]), "FIT_RANGE": np.array([4]),
+    ...     "FIT_PARAM_NAMES": names, "FIT_PARAMS": np.array([[100.0, 1.1]]),
+    ... }
+    >>> DistortionMatrix(columns).parameters
+    {'thickness': 100.0, 'zq': 1.1}
     """
 
     OBSTYPE = "BF_DISTORTION_MATRIX"

@@ -1,4 +1,4 @@
-"""What a device is fitted to, read from a file of any known kind, with its condition."""
+"""Measured tables to which a device is fitted, read from files of several kinds."""
 
 from __future__ import annotations
 
@@ -30,24 +30,36 @@ CONDITIONS = {
     "temperature": ("temperature", 1.0),
     "wavelength": ("length", 1e3),
 }
-"""Fields of a condition, with the kind of their quantity and the factor to V, K and nm."""
+"""Fields of a condition, each with the kind of its quantity and a factor to V, K or nm.
+
+The factor is exact: 1 for internal units (V, K), and 1000 nm to an um for a wavelength.
+"""
 
 FEWEST = 3
-"""Amplifiers whose scatter gives an error."""
+"""Smallest number of amplifiers from whose scatter the error of their mean is taken.
+
+Chosen: the scatter of n amplifiers has itself a relative error of 1 / sqrt(2 (n - 1)), 50 % for 3.  With
+6 it would be 32 %, and datasets of 3 to 5 amplifiers would be refused.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredTable:
-    """Measured numbers and the condition that holds for all of them.
+    """A measured table and the condition that holds for all of it.
 
     Attributes
     ----------
     table : AreaChangeTable or SettingTable
-        The numbers.
+        The measured numbers with their errors.
     condition : Condition
-        Of the whole file; None where nothing says.
+        Condition of the whole file; its fields are None where the file states nothing.
     sigma : float or None
-        Width of the spots of slopes in x and y, diffusion included [pixel]; None: not said.
+        Rms width in x and y of the spots whose slopes were measured, diffusion included
+        [pixel]; None where the file does not state it.
+
+    Examples
+    --------
+    :func:`read_measured` makes one; its example shows the condition.
     """
 
     table: AreaChangeTable | SettingTable
@@ -55,7 +67,24 @@ class MeasuredTable:
     sigma: float | None = None
 
     def at(self, given: Mapping[str, str]) -> MeasuredTable:
-        """Give a copy with parts of the condition stated anew, as :func:`parse_condition`."""
+        """Return a copy with parts of the condition replaced.
+
+        Parameters
+        ----------
+        given : mapping of str to str
+            Quantities with units such as ``{'back_bias': '-60 V'}``, with the keys of
+            :data:`CONDITIONS` and ``sigma`` [pixel]; the other parts stay.
+
+        Returns
+        -------
+        measured : MeasuredTable
+            The same table with the changed condition.
+
+        Raises
+        ------
+        RecordingError
+            A key is not known, or a value is not such a quantity.
+        """
         fields, sigma = parse_condition(given)
         return replace(
             self,
@@ -70,13 +99,20 @@ def parse_condition(given: Mapping[str, Any]) -> tuple[dict[str, Any], float | N
     Parameters
     ----------
     given : mapping of str to str
-        Quantities with units by the keys of :data:`CONDITIONS`; ``sigma``, a width in pixels,
-        without.
+        Quantities with units, with the keys of :data:`CONDITIONS`; ``sigma``, a width from 0.1 to
+        10 pixels, has none.
+
+    Returns
+    -------
+    fields : dict of str to float
+        Voltages [V], temperature [K] and wavelength [nm], as :class:`Condition` has them.
+    sigma : float or None
+        The width [pixel]; None where it is not given.
 
     Raises
     ------
     RecordingError
-        An unknown key, or not such a quantity.
+        A key is not known, or a value is not such a quantity.
 
     Examples
     --------
@@ -97,36 +133,51 @@ def parse_condition(given: Mapping[str, Any]) -> tuple[dict[str, Any], float | N
             fields[key] = round(to_internal(text, kind) * factor, 9)
         except KeyError:
             raise RecordingError(
-                f"{key!r} is no condition; there are {', '.join(CONDITIONS)} and sigma"
+                f"{key!r} is not a condition; conditions are {', '.join(CONDITIONS)}, sigma"
             ) from None
         except DeviceError as error:
             raise RecordingError(f"{key}: {error}") from None
         except RecordingError:
             raise
         except ValueError:
-            raise RecordingError(f"{key} = {text!r} is not a number") from None
+            raise RecordingError(
+                f"{key} = {text!r} is not a number of pixels, such as 1.02"
+            ) from None
     return fields, sigma
 
 
 def read_measured(path: str | os.PathLike[str]) -> MeasuredTable:
-    """Read measured a_ij, slopes, saturation levels or diffusion widths.
+    r"""Read measured a_ij, slopes, saturation levels or diffusion widths.
 
     Parameters
     ----------
     path : path-like
-        a_ij (:func:`~bfsensor.recording.tables.area_changes.read_area_changes`), LSST's photon transfer
-        dataset, or a table by setting
-        (:func:`~bfsensor.recording.tables.setting_tables.read_setting_table`).  The header of an ECSV
-        file may have an entry ``conditions`` with the keys of :func:`parse_condition`.
+        Table of a_ij (:func:`~bfsensor.recording.read_area_changes`), LSST's photon transfer
+        dataset, or a table by setting (:func:`~bfsensor.recording.read_setting_table`).  The
+        header of an ECSV file may have an entry ``conditions``: quantities with units such as
+        ``{back_bias: -60 V, wavelength: 620 nm}``, of back_bias, gate_high, gate_low, temperature
+        and wavelength, and ``sigma``, the width of spots [pixel].
 
     Returns
     -------
-    MeasuredTable
+    measured : MeasuredTable
+        The table with its condition.
 
     Raises
     ------
     RecordingError
-        None of these kinds, or wrong in itself.
+        The file does not exist, is of none of these kinds, or has values that cannot be used.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> text = "back_bias,slope,slope_error,axis\n-60,0.71,0.09,x\n-60,0.92,0.07,y\n"
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "slopes.csv"
+    ...     _ = path.write_text(text)
+    ...     found = read_measured(path).at({"wavelength": "620 nm"})
+    >>> found.table.values.tolist(), str(found.condition)
+    ([0.71, 0.92], '620 nm')
     """
     path = Path(path)
     if not path.is_file():
@@ -145,13 +196,15 @@ def read_measured(path: str | os.PathLike[str]) -> MeasuredTable:
         found = MeasuredTable(read_setting_table(path))
     elif {"i", "j", "cov"} <= set(table.colnames):
         raise RecordingError(
-            f"{path}: covariances by level; fit their a_ij first (fit_covariances) and give "
-            "columns i_serial, j_parallel, cov_per_e, err_per_e"
+            f"{path}: the table has covariances by level; fit their a_ij first, in Python "
+            "bfsensor.measure.fit_covariances, and give a table of them with the columns "
+            "i_serial, j_parallel, cov_per_e, err_per_e"
         )
     else:
         raise RecordingError(
-            f"{path}: neither a_ij (i_serial, j_parallel, cov_per_e, err_per_e) nor slopes, "
-            f"saturation or diffusion by setting; its columns are {', '.join(table.colnames)}"
+            f"{path}: neither a_ij (columns i_serial, j_parallel, cov_per_e, err_per_e) nor "
+            "slopes (slope, axis), saturation or diffusion by setting; its columns are "
+            f"{', '.join(table.colnames)}"
         )
     try:
         return found.at(stated)
@@ -160,21 +213,24 @@ def read_measured(path: str | os.PathLike[str]) -> MeasuredTable:
 
 
 def area_changes_of_amplifiers(path: Path) -> AreaChangeTable:
-    """Mean a_ij of the amplifiers of LSST's photon transfer dataset, with the mean's error.
+    """Mean a_ij of the amplifiers in LSST's photon transfer dataset, with the mean's error.
 
     Raises
     ------
     RecordingError
-        Fewer than :data:`FEWEST` amplifiers with a finite matrix: no scatter, no error.
+        Fewer than :data:`FEWEST` amplifiers have a finite matrix, or their matrices are equal.
     """
     a = np.asarray(PhotonTransferDataset.read(path).columns["A_MATRIX"], float)
     a = a[np.isfinite(a).all(axis=(1, 2))]
     if len(a) < FEWEST:
         raise RecordingError(
-            f"{path}: {len(a)} amplifiers with an A_MATRIX; the error of the mean is taken from "
-            f"their scatter, which needs {FEWEST}"
+            f"{path}: {len(a)} amplifiers have a finite A_MATRIX; the error of their mean is taken "
+            f"from their scatter, which needs {FEWEST}"
         )
     errors = a.std(axis=0, ddof=1) / np.sqrt(len(a))
     if not np.all(errors > 0):
-        raise RecordingError(f"{path}: the amplifiers' A_MATRIX do not differ: no errors")
+        raise RecordingError(
+            f"{path}: A_MATRIX is the same for all amplifiers in some lags: their scatter gives no "
+            "error"
+        )
     return AreaChangeTable(path, a.mean(axis=0), errors, np.isfinite(errors))

@@ -1,4 +1,4 @@
-"""Recordings that others reduced: covariances, spot sizes, radial profiles."""
+"""Reduced recordings of any kind in a folder or file; tables of spots and radial profiles."""
 
 from __future__ import annotations
 
@@ -27,27 +27,38 @@ SPOT_COLUMNS = {
     "size": ("T", "size"), "e1": ("e1",), "e2": ("e2",), "x": ("x",), "y": ("y",),
     "kurtosis": ("kurtosis",), "wavelength": ("wavelength",), "back_bias": ("vbb", "back_bias"),
 }  # fmt: skip
-"""Columns of spot tables by quantity: electrons and pixels, size T = Ixx + Iyy [pixel^2]."""
+"""Names of a spot table's columns by quantity, of which the first found is read.
+
+Flux and peak [e-], sigma_x, sigma_y, x and y [pixel], size T = Ixx + Iyy [pixel^2], wavelength [nm],
+back bias [V].
+"""
 
 LABELS = ("amp", "amplifier", "segment", "state", "region")
-"""Columns whose words part a spot table."""
+"""Columns whose words divide a spot table into groups."""
 
 
 @dataclass(frozen=True, eq=False)
 class SpotTable:
-    """Sizes, shapes and places of spots against their flux.
+    """Sizes, shapes and positions of spots against their flux.
 
     Attributes
     ----------
     path : Path
-        Where they came from.
+        File of the table.
     values : mapping of str to ndarray, shape (n,)
-        By quantity, keys of :data:`SPOT_COLUMNS`.
+        Values by quantity, with keys and units of :data:`SPOT_COLUMNS`.
     errors : mapping of str to ndarray, shape (n,)
-        Of those that have any.
+        Standard errors of the quantities that have any.
     group : ndarray of str, shape (n,)
-        Words of the label columns, joined.
+        Words of the label columns of each row, such as its amplifier, joined by blanks.
     warnings : tuple of str
+        Warnings about missing errors and positions.
+
+    Examples
+    --------
+    >>> sizes = {"flux": np.array([1e4, 2e5]), "size": np.array([2.1, 2.2])}
+    >>> SpotTable(Path("spots.csv"), sizes, {}, np.array(["A", "A"])).what
+    'spots, 2 rows, 1 groups, flux, size'
     """
 
     path: Path
@@ -69,19 +80,28 @@ class SpotTable:
 
 @dataclass(frozen=True, eq=False)
 class RadialProfile:
-    """A quantity against the distance from the wafer's centre: tree rings.
+    """A quantity against the distance from the wafer's centre, as tree rings show it.
 
     Attributes
     ----------
     path : Path
-        Where it came from.
+        File of the profile.
     radius : ndarray, shape (n,)
-        [pixel], ascending.
+        Distance from the centre of the rings [pixel], ascending.
     value, error : ndarray, shape (n,)
-        [unit]; error nan where not given, rows without a value are left out.
+        Values and their standard errors [unit]; errors are nan where the file has none, rows
+        without a value are left out.
     unit : str
-        As the caller says: files of this kind do not.
+        Unit of the values, as the caller or an ECSV file states it; '' where it is not known.
     warnings : tuple of str
+        Warnings about missing errors, units and values.
+
+    Examples
+    --------
+    >>> radius = np.arange(1000.0, 1100.0)
+    >>> profile = RadialProfile(Path("r.txt"), radius, np.sin(radius), 0 * radius, "percent")
+    >>> profile.what
+    'radial profile, 100 rows from 1000 to 1099 pixels, rms 0.709 percent'
     """
 
     path: Path
@@ -104,22 +124,33 @@ Reduced = CovarianceTable | AreaChangeTable | SpotTable | RadialProfile
 
 
 def read_spots(path: str | os.PathLike[str]) -> SpotTable:
-    """Read a table of spots, ECSV or comma-separated.
+    r"""Read a table of spots, ECSV or comma-separated.
 
     Parameters
     ----------
     path : path-like
-        With a flux or peak [e-] and sigma_x and sigma_y [pixel] or T [pixel^2]; a column
-        NAME_error (or NAME_err, NAME_sigma) is an error.
+        Table with a column flux or peak [e-], and with sigma_x and sigma_y [pixel] or T
+        [pixel^2]; a column NAME_error (or NAME_err, NAME_sigma) is the standard error of NAME.
 
     Returns
     -------
-    SpotTable
+    table : SpotTable
+        The spots, with warnings.
 
     Raises
     ------
     RecordingError
-        No flux, or no size.
+        The file cannot be read, or has no column of flux or of size.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "spots.csv"
+    ...     _ = path.write_text("flux,sigma_x,sigma_y\n1e4,1.0,1.1\n2e5,1.1,1.2\n")
+    ...     spots = read_spots(path)
+    >>> spots.values["sigma_x"].tolist(), len(spots.warnings)
+    ([1.0, 1.1], 2)
     """
     path = Path(path)
     table = _read_text(path)
@@ -133,9 +164,14 @@ def read_spots(path: str | os.PathLike[str]) -> SpotTable:
             if f"{column}_{end}" in table.colnames:
                 errors[name] = np.asarray(table[f"{column}_{end}"], float)
     if not {"flux", "peak"} & set(values):
-        raise RecordingError(f"{path}: no flux or peak among {', '.join(table.colnames)}")
+        raise RecordingError(
+            f"{path}: no column flux or peak [e-] among {', '.join(table.colnames)}"
+        )
     if not ({"sigma_x", "sigma_y"} <= set(values) or "size" in values):
-        raise RecordingError(f"{path}: no sigma_x and sigma_y, nor T, among its columns")
+        raise RecordingError(
+            f"{path}: no columns sigma_x and sigma_y [pixel], nor T [pixel^2], among "
+            f"{', '.join(table.colnames)}"
+        )
     labels = [name for name in LABELS if name in table.colnames]
     group = np.array(
         [" ".join(str(table[name][k]) for name in labels) for k in range(len(table))], str
@@ -143,31 +179,49 @@ def read_spots(path: str | os.PathLike[str]) -> SpotTable:
     warnings = []
     sizes = [name for name in ("sigma_x", "sigma_y", "size") if name in values]
     if any(name not in errors for name in sizes):
-        warnings.append("sizes without errors: take the scatter about a fit, and say so")
+        warnings.append(
+            "sizes without errors: add a column such as sigma_x_error; the scatter about a fit "
+            "against flux estimates them"
+        )
     if "x" not in values or "y" not in values:
-        warnings.append("no positions: odd parts of the shifts cannot be tested")
+        warnings.append(
+            "no positions (columns x and y): boundary shifts that differ between opposite sides "
+            "of a pixel cannot be tested"
+        )
     return SpotTable(path, values, errors, group, tuple(warnings))
 
 
 def read_profile(path: str | os.PathLike[str], *, unit: str = "") -> RadialProfile:
-    """Read a radial profile: columns of radius, value and, where there is one, error.
+    """Read a radial profile: columns of radius, value and, optionally, error.
 
     Parameters
     ----------
     path : path-like
-        Numbers in columns, or ECSV with the columns radius, value, error.
+        Numbers in two or three columns without names, or ECSV with the columns radius, value,
+        error.
     unit : str
-        Of the value, such as 'percent'.
+        Unit of the value, such as 'percent'; '' for the unit of an ECSV file's column.
 
     Returns
     -------
-    RadialProfile
+    profile : RadialProfile
+        The rows that have a value, with warnings.
 
     Raises
     ------
     RecordingError
-        Not two or three columns of numbers, fewer than ten values, or radii that do not
-        ascend.
+        The file does not have two or three columns of numbers, has fewer than ten values, or
+        its radii do not ascend.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "rings.txt"
+    ...     np.savetxt(path, np.c_[np.arange(20), np.cos(np.arange(20))])
+    ...     profile = read_profile(path, unit="percent")
+    >>> len(profile.radius), profile.warnings
+    (20, ('no errors: the scatter between neighbouring rings estimates them',))
     """
     path = Path(path)
     if path.suffix == ".ecsv":
@@ -181,35 +235,52 @@ def read_profile(path: str | os.PathLike[str], *, unit: str = "") -> RadialProfi
         except (OSError, ValueError) as error:
             raise RecordingError(f"{path}: cannot be read: {error}") from None
     if len(columns) not in (2, 3):
-        raise RecordingError(f"{path}: {len(columns)} columns, not radius, value and error")
+        raise RecordingError(
+            f"{path}: {len(columns)} columns, not two or three: radius, value and error"
+        )
     radius, value = columns[:2]
     errors = columns[2] if len(columns) == 3 else np.full(len(radius), np.nan)
     kept = np.isfinite(radius) & np.isfinite(value)
     if kept.sum() < 10 or np.any(np.diff(radius[kept]) <= 0):
-        raise RecordingError(f"{path}: fewer than ten values, or radii that do not ascend")
+        raise RecordingError(
+            f"{path}: a profile needs ten values at least, here {int(kept.sum())}, and radii that "
+            "ascend: sort the rows by radius"
+        )
     warnings = []
     if len(columns) == 2:
-        warnings.append("no errors: take the scatter between rings")
+        warnings.append("no errors: the scatter between neighbouring rings estimates them")
     if not unit:
-        warnings.append("no unit: amplitudes can be compared among such files only")
+        warnings.append(
+            "no unit: amplitudes can be compared with other such files only; an ECSV file may "
+            "state the unit of its column value"
+        )
     if not kept.all():
-        warnings.append(f"{int((~kept).sum())} radii without a value left out")
+        warnings.append(f"{int((~kept).sum())} radii have no value and are left out")
     return RadialProfile(
         path, radius[kept], value[kept], errors[kept], unit, tuple(warnings)
     )
 
 
 def find_reduced(path: str | os.PathLike[str]) -> tuple[Reduced, ...]:
-    """Read what a folder, or one file, holds of reduced recordings.
+    """Read the reduced recordings of a folder, or of one file.
 
-    Known by their columns: covariances, a_ij, spots and profiles in ECSV (a_ij and spots
-    also comma-separated), LSST's photon transfer datasets in FITS.  Other files are passed
-    over in a folder.
+    Kinds are recognised by their columns: covariances, a_ij, spots and profiles in ECSV (a_ij
+    and spots also comma-separated), and LSST's photon transfer datasets in FITS.
+
+    Parameters
+    ----------
+    path : path-like
+        Folder, of which files of other kinds are ignored; or one file.
+
+    Returns
+    -------
+    found : tuple of CovarianceTable, AreaChangeTable, SpotTable or RadialProfile
+        The tables, sorted by file name; empty where a folder has none or does not exist.
 
     Raises
     ------
     RecordingError
-        One file, of none of these kinds; or one of these that is wrong in itself.
+        The one file is of none of these kinds, or a file of one of these kinds cannot be used.
     """
     path = Path(path)
     if path.is_file():
@@ -223,7 +294,9 @@ def find_reduced(path: str | os.PathLike[str]) -> tuple[Reduced, ...]:
             )
         if found is None:
             raise RecordingError(
-                f"{path}: no covariances, a_ij, spots, profile or photon transfer dataset"
+                f"{path}: not a table of covariances (columns i, j, cov), a_ij (i_serial, "
+                "j_parallel, cov_per_e, err_per_e), spots (flux, sigma_x, sigma_y), a profile "
+                "(radius, value) or a photon transfer dataset, in .ecsv, .csv, .txt, .dat or FITS"
             )
         return (found,)
     if not path.is_dir():
@@ -241,12 +314,12 @@ def find_reduced(path: str | os.PathLike[str]) -> tuple[Reduced, ...]:
 
 
 def holds_images(folder: Path) -> bool:
-    """Whether a folder has FITS files that are no reduced recordings."""
+    """Whether a folder has FITS files other than LSST's photon transfer datasets."""
     return any(not _is_photon_transfer(one) for one in list_files(folder))
 
 
 def _read_known(path: Path) -> Reduced | None:
-    """Read a file by what its columns are; None where they are not known."""
+    """Read a file of the kind that its columns show; None for files of other kinds."""
     if is_fits(path.name):
         return read_covariances(path) if _is_photon_transfer(path) else None
     if path.suffix not in (".ecsv", ".csv"):

@@ -1,4 +1,4 @@
-"""Tables of one number a setting: B-F slopes, saturation levels, diffusion widths."""
+"""Tables with one number for each setting: B-F slopes, saturation levels, diffusion widths."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ SETTINGS = {
     "wavelength": ("wavelength", "wavelength_nm"),
     "temperature": ("temperature", "temperature_K"),
 }
-"""Columns of a setting [V, nm, K], by the fields of a condition."""
+"""Names of the columns of a setting [V, nm, K], by the fields of a condition."""
 
 
 class _Form(NamedTuple):
-    """Columns that make a kind: value, error, and whether each row is of one axis."""
+    """Names of a kind's columns for value and error, and whether a column ``axis`` is needed."""
 
     values: tuple[str, ...]
     errors: tuple[str, ...]
@@ -41,28 +41,34 @@ KINDS = {
     "saturation": _Form(("saturation", "sat_level_e"), ("saturation_error",), False),
     "diffusion": _Form(("diffusion",), ("diffusion_error",), False),
 }
+"""Columns of each kind of table, in the units of :class:`SettingTable`."""
 
 
 @dataclass(frozen=True, eq=False)
 class SettingTable:
-    """Measured numbers, each at a setting of its own.
+    """Measured slopes, saturation levels or diffusion widths, each with its own condition.
 
     Attributes
     ----------
     path : Path
-        Where they came from.
+        File of the table.
     kind : str
-        'slopes' [% of a pixel for 50,000 e- in the central pixel], 'saturation' [e-] or
-        'diffusion' [um].
+        'slopes', rise of a spot's rms width for 50,000 e- in its central pixel [% of a pixel],
+        'saturation' [e-] or 'diffusion' [um].
     values, errors : ndarray, shape (n,)
-        Errors nan where not given.
+        Values and their standard errors; errors are nan where the table has none.
     axes : tuple of str
         'x' or 'y' of each slope; '' for other kinds.
     conditions : tuple of Condition
-        None where the table does not say.
+        Condition of each value; a field is None where the table has no column for it.
     meta : mapping
         Header entries of an ECSV file.
     warnings : tuple of str
+        Warnings about missing errors and repeated rows.
+
+    Examples
+    --------
+    :func:`read_setting_table` makes one; its example shows values and conditions.
     """
 
     path: Path
@@ -76,7 +82,7 @@ class SettingTable:
 
 
 def is_setting_table(names: list[str]) -> str | None:
-    """Give the kind that columns stand for; None where they are no such table.
+    """Give the kind of table that has these columns; None where none has.
 
     Examples
     --------
@@ -91,27 +97,42 @@ def is_setting_table(names: list[str]) -> str | None:
 
 
 def read_setting_table(path: str | os.PathLike[str]) -> SettingTable:
-    """Read slopes, saturation levels or diffusion widths, comma-separated or ECSV.
+    r"""Read slopes, saturation levels or diffusion widths, comma-separated or ECSV.
 
     Parameters
     ----------
     path : path-like
-        With the columns of one of :data:`KINDS` and, where known, of :data:`SETTINGS`; slopes
-        with ``axis``, 'x' or 'y'.
+        Table with the columns of one of :data:`KINDS`: ``slope`` [% of a pixel for 50,000 e-] with
+        ``axis``, 'x' or 'y'; ``saturation`` [e-]; or ``diffusion`` [um]; each may have
+        ``..._error``.  Columns of :data:`SETTINGS` are optional: ``back_bias``, ``gate_high``,
+        ``gate_low`` [V], ``wavelength`` [nm], ``temperature`` [K].
 
     Returns
     -------
-    SettingTable
+    table : SettingTable
+        The values with their conditions.
 
     Raises
     ------
     RecordingError
-        No such column, an axis that is neither, or a value that is not finite.
+        The file cannot be read or has no such column, an axis is neither 'x' nor 'y', a value
+        is not finite, or an error is not above 0.
 
     Notes
     -----
-    Rows that repeat a measurement (the published slopes stand beside two simulations each)
-    are read once.
+    Rows that repeat a measurement are read once: published slopes, for instance, stand twice
+    where they are compared with two simulations.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> text = "gate_low,gate_high,saturation,saturation_error\n-8,4,180e3,5e3\n-8,3,150e3,5e3\n"
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "wells.csv"
+    ...     _ = path.write_text(text)
+    ...     table = read_setting_table(path)
+    >>> table.kind, table.values.tolist(), [str(one) for one in table.conditions]
+    ('saturation', [180000.0, 150000.0], ['gates -8/4 V', 'gates -8/3 V'])
     """
     path = Path(path)
     table = read_text(path)
@@ -119,14 +140,15 @@ def read_setting_table(path: str | os.PathLike[str]) -> SettingTable:
     if kind is None:
         words = ", ".join(" or ".join(form.values) for form in KINDS.values())
         raise RecordingError(
-            f"{path}: none of the columns {words} among {', '.join(table.colnames)}"
+            f"{path}: none of the columns {words} (slopes also need axis) among "
+            f"{', '.join(table.colnames)}"
         )
     form = KINDS[kind]
     values = floats(table, next(n for n in form.values if n in table.colnames))
     errors = floats(table, next((n for n in form.errors if n in table.colnames), ""))
     if not np.all(np.isfinite(values)):
         raise RecordingError(
-            f"{path}: {int(np.sum(~np.isfinite(values)))} values not finite"
+            f"{path}: {int(np.sum(~np.isfinite(values)))} values are not finite; leave these rows out"
         )
     if np.any(errors <= 0):
         raise RecordingError(f"{path}: errors must be above 0")
@@ -149,9 +171,15 @@ def read_setting_table(path: str | os.PathLike[str]) -> SettingTable:
         for row in rows
     ]
     conditions = tuple(Condition(**fields) for fields in stated)
-    warnings = [] if np.all(np.isfinite(errors)) else ["no errors: they have to be assumed"]
+    warnings = []
+    if not np.all(np.isfinite(errors)):
+        warnings.append(
+            f"values without errors: add a column {form.errors[0]}, else errors are assumed"
+        )
     if len(rows) < len(table):
-        warnings.append(f"{len(table) - len(rows)} rows repeat a measurement: read once")
+        warnings.append(
+            f"{len(table) - len(rows)} rows repeat a measurement and are not read"
+        )
     return SettingTable(
         path, kind, values[rows], errors[rows], tuple(axes[row] for row in rows), conditions,
         dict(table.meta), tuple(warnings),
@@ -159,12 +187,12 @@ def read_setting_table(path: str | os.PathLike[str]) -> SettingTable:
 
 
 def read_text(path: Path) -> Table:
-    """Read a comma-separated or ECSV table, lines with # passed over in the former.
+    """Read a comma-separated table, in which lines that begin with # are comments, or ECSV.
 
     Raises
     ------
     RecordingError
-        It cannot be read so.
+        The file cannot be read as such a table.
     """
     try:
         form = "ecsv" if path.suffix == ".ecsv" else "csv"

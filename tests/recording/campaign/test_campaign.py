@@ -125,32 +125,31 @@ def test_missing_keywords_name_the_question_once(copied):
     (copied / "manifest.ecsv").unlink()
     for path in copied.glob("flat*"):
         edit(path, MONDIODE=None)
-    (text,) = [t for t in messages(read_campaign(copied)) if "lamp monitor" in t]
-    assert text.startswith(
-        "no lamp monitor: charge loss and gain nonlinearity cannot be told"
-    )
+    (one,) = read_campaign(copied).warnings
+    assert (one.topic, one.message, one.exposures) == ("missing", "no lamp monitor", ())
+    # The keyword that was looked for, and how to state another.
+    assert "MONDIODE" in one.closes and "keywords: {lamp: " in one.closes
     for path in sorted(copied.glob("*.fits"))[:2]:
         edit(path, VBB=None)
-    (text,) = [t for t in messages(read_campaign(copied)) if "back bias" in t]
-    assert text.startswith(
-        "no back bias in 2 of 24 exposures (bias_0000.fits, bias_0001.fits)"
-    )
+    (one,) = [w for w in read_campaign(copied).warnings if "back bias" in w.message]
+    assert (one.topic, one.exposures) == ("missing", (0, 1))
+    assert "2 of 24" in one.message and "(bias_0000.fits, bias_0001.fits)" in one.message
+    assert "VBB" in one.closes and "keywords: {back_bias: " in one.closes
 
 
 def test_a_file_that_contradicts_the_manifest_is_set_aside(copied):
     edit(copied / "flat_0015.fits", EXPTIME=9.0)
     campaign = read_campaign(copied)
     (aside,) = campaign.set_aside
-    assert str(aside) == (
-        "flat_0015.fits: manifest and header differ: exposure_time 2 in the manifest, 9 in it"
-    )
+    assert aside.path.name == "flat_0015.fits"
+    assert "exposure_time 2 in the manifest, 9 in the header" in aside.reason
     assert [one.path.name for one in campaign.of("flat") if one.pair is None] == [
         "flat_0014.fits"
     ]
 
 
 def test_pairs_are_not_made_across_a_gap(copied):
-    """Of four equal flats the second is lost: the first stays alone, 3 and 4 are a pair."""
+    """The second of four equal flats is lost: the first stays alone, 3 and 4 are a pair."""
     (copied / "manifest.ecsv").unlink()
     for number in (14, 15, 16, 17):
         edit(copied / f"flat_00{number}.fits", EXPTIME=2.0)
@@ -192,6 +191,11 @@ def test_wrong_settings_are_refused(copied, text, words):
         read_campaign(copied)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_folders_inside_a_folder_without_files_are_named(copied, tmp_path):
+    with pytest.raises(RecordingError, match=r"folders .*: copy$"):
+        read_campaign(tmp_path)
 
 
 def test_settings_are_used(copied):
@@ -250,29 +254,27 @@ def test_damage_in_rice_compressed_tiles(copied):
 def test_gains_that_cannot_be_meant_or_that_differ_are_named(copied):
     for number in range(12, 24):
         edit(copied / f"flat_00{number}.fits", CCDGAIN=0 if number < 20 else 2.0)
-    said = messages(read_campaign(copied))
-    assert said[:2] == [
-        f"{name}: headers give different gains [e-/ADU]: 2.2 in 12 files, none in 8 files, 2 in "
-        "4 files; 2.2 e-/ADU is taken for all: everything per electron is wrong by the ratio in "
-        "the other files"
-        for name in ("SEGMENT10", "SEGMENT11")
-    ]
-    assert said[2:] == [
-        "CCDGAIN = 0 cannot be meant (gain: 0.0001 to 10000 e-/ADU) (8 exposures); taken as not "
-        "known"
-    ]
+    *gains, units = read_campaign(copied).warnings
+    for one, name in zip(gains, ("SEGMENT10", "SEGMENT11"), strict=True):
+        assert one.topic == "gain" and one.message.startswith(f"{name}: ")
+        assert (
+            "2.2 in 12 files, none in 8 files, 2 in 4 files; 2.2 e-/ADU is" in one.message
+        )
+        assert "keywords: {gain: {value: " in one.closes
+    assert units.topic == "units" and units.message.startswith("CCDGAIN = 0 ")
+    assert "(8 exposures)" in units.message
 
 
 def test_an_overscan_that_cannot_be_used_is_named(copied):
-    """As trimmed images have it: the biases give the level."""
+    """Trimmed images often still have the keyword; the biases give the level."""
     for path in copied.glob("*.fits"):
         with fits.open(path, mode="update") as hdus:
             hdus[2].header["BIASSEC"] = "[200:230,1:112]"
     found = inspect_campaign(read_campaign(copied))
-    assert messages(found.campaign) == [
-        "SEGMENT11: BIASSEC = '[200:230,1:112]' leaves the image, 112 x 112 pixels: its level is "
-        "not subtracted"
-    ]
+    (one,) = found.campaign.warnings
+    assert one.topic == "overscan" and "112 x 112 pixels" in one.message
+    assert one.message.startswith("SEGMENT11: BIASSEC = '[200:230,1:112]'")
+    assert "amplifiers: [{name: ..., bias: " in one.closes
     one, other = (
         [f.level for f in found.frames if f.amplifier == name]
         for name in ("SEGMENT10", "SEGMENT11")
@@ -336,13 +338,11 @@ def test_steps_of_lamp_and_pedestal(tmp_path):
 
 
 def test_a_ladder_that_climbs_with_time(copied):
-    """Without the two flats at its end, level and time are one."""
+    """Without the two flats at its end, the level rises with time throughout."""
     (copied / "campaign.yaml").write_text("excluded: [flat_0022.fits, flat_0023.fits]\n")
-    said = messages(read_campaign(copied))
-    assert said == [
-        "exposure times climb or fall with time: drifts of gain or lamp cannot be told from "
-        "nonlinearity"
-    ]
+    (one,) = read_campaign(copied).warnings
+    assert one.topic == "time"
+    assert "exposure times" in one.message and "nonlinearity" in one.closes
 
 
 def test_part_of_a_practice_campaign(tmp_path):

@@ -157,8 +157,8 @@ def test_a_reversed_data_section_is_read_in_the_order_of_readout(tmp_path):
     np.testing.assert_array_equal(backwards.image, forwards.image)
 
 
-def test_columns_after_the_image_are_overscan_where_no_card_says(tmp_path):
-    """As a campaign reads them; a blank card says as little as none."""
+def test_columns_after_the_image_are_overscan_without_biassec(tmp_path):
+    """A blank BIASSEC counts as none."""
     (named,) = read_raw(write_frame(tmp_path / "a.fits", [raw_frame(61)]))
     for number, cards in enumerate(({"BIASSEC": None}, {"BIASSEC": " "})):
         path = write_frame(tmp_path / f"{number}.fits", [raw_frame(61)], cards)
@@ -213,49 +213,41 @@ def test_saturation_and_gain_unknown(tmp_path):
     ("cards", "words"),
     [
         ({}, "no gain in the header"),
-        ({"GAIN": -1.0}, "GAIN = -1.0 cannot be meant (gain: 0.0001 to 10000 e-/ADU)"),
-        ({"GAIN": "HIGH"}, "GAIN = 'HIGH' is not a number"),
+        ({"GAIN": -1.0}, "GAIN = -1.0"),
+        ({"GAIN": "HIGH"}, "GAIN = 'HIGH'"),
     ],
 )
 def test_an_image_without_a_gain_says_why(tmp_path, cards, words):
     path = write_frame(tmp_path / "a.fits", [raw_frame(66)], cards)
     (found,) = read_raw(path)
-    assert (found.unit, found.no_gain) == ("adu", words) and np.isnan(found.gain)
+    assert found.unit == "adu" and np.isnan(found.gain)
+    assert found.no_gain.startswith(words)
     (given,) = read_raw(path, gain=2.0)
     assert (given.unit, given.no_gain, given.gain) == ("electron", "", 2.0)
     np.testing.assert_array_equal(given.image, 2 * found.image)
 
 
 @pytest.mark.parametrize(
-    ("cards", "options", "message"),
+    ("cards", "options", "words"),
     [
         (
             {"DATASEC": None, "BIASSEC": None},
             {},
-            "no BIASSEC, and no columns after DATASEC; name the overscan in campaign.yaml "
-            "(amplifiers: bias) or by `bfsensor measure --sections`, or choose the overscan "
-            "'none' to subtract nothing",
+            ("BIASSEC", "campaign.yaml", "--sections", "--overscan none"),
         ),
-        (
-            {"DATASEC": "[4:63,1:51]"},
-            {},
-            "DATASEC = '[4:63,1:51]' leaves the image, 79 x 50 pixels",
-        ),
-        ({"DATASEC": "4:63"}, {}, "DATASEC = '4:63' is not like '[1:512,1:2000]'"),
-        (
-            {"BIASSEC": "[64:79,2:50]"},
-            {},
-            "BIASSEC has the rows 2 to 50, not all of 1 to 50; "
-            "overscan='median' needs no rows",
-        ),
-        ({}, {"skip": 16}, "skip = 16 leaves nothing of the overscan"),
+        ({"DATASEC": "[4:63,1:51]"}, {}, ("DATASEC = '[4:63,1:51]'", "79 x 50 pixels")),
+        ({"DATASEC": "4:63"}, {}, ("DATASEC = '4:63'", "'[1:512,1:2000]'")),
+        ({"BIASSEC": "[64:79,2:50]"}, {}, ("2 to 50", "1 to 50", "'median'")),
+        ({}, {"skip": 16}, ("skip = 16",)),
     ],
 )
-def test_refusals(tmp_path, cards, options, message):
+def test_refusals(tmp_path, cards, options, words):
     path = write_frame(tmp_path / "a.fits", [raw_frame(67)], cards)
     with pytest.raises(RecordingError) as caught:
         read_raw(path, **options)
-    assert str(caught.value) == f"{path}: image: {message}"
+    message = str(caught.value)
+    assert message.startswith(f"{path}: image: ")
+    assert [word for word in words if word not in message] == []
 
 
 def test_refusals_without_a_frame(tmp_path):
@@ -268,7 +260,7 @@ def test_refusals_without_a_frame(tmp_path):
     with pytest.raises(RecordingError, match="holds a cube of 2 images of 4 x 3 pixels"):
         read_raw(tmp_path / "cube.fits")
     path = write_frame(tmp_path / "a.fits", [raw_frame(67)])
-    with pytest.raises(RecordingError, match=r"a\.fits: A: no image in HDU 3; there are 0"):
+    with pytest.raises(RecordingError, match=r"a\.fits: A: no image in HDU 3 .*: 0$"):
         read_raw(path, [{"name": "A", "hdu": 3}])
     with pytest.raises(RecordingError, match="overscan = 'rows' is not one of row median"):
         read_raw(path, overscan="rows")

@@ -65,7 +65,7 @@ def test_units_of_overrides_and_of_comments():
         ({"MONOWL": 6200}, "wavelength", "{unit: Angstrom}"),
         ({"VBB": -60000.0}, "back_bias", "{unit: mV}"),
         ({"EXPTIME": "long"}, "exposure_time", "EXPTIME = 'long' is not a number"),
-        ({"EXPTIME": -1.0}, "exposure_time", "EXPTIME = -1.0 cannot be meant"),
+        ({"EXPTIME": -1.0}, "exposure_time", "EXPTIME = -1.0 s"),
         ({"SEQNUM": "inf"}, "number", "SEQNUM = inf is not finite"),
         ({"SEQNUM": "first"}, "number", "SEQNUM = 'first' is not a number"),
     ],
@@ -108,9 +108,9 @@ def test_which_gain_counts(own, primary, stated, keywords, gain):
 @pytest.mark.parametrize(
     ("value", "words"),
     [
-        (0, "GAIN = 0 cannot be meant (gain: 0.0001 to 10000 e-/ADU)"),
-        (-1.5, "GAIN = -1.5 cannot be meant"),
-        (2e4, "GAIN = 20000.0 cannot be meant"),
+        (0, "GAIN = 0 is out of range (gain: 0.0001 to 10000 e-/ADU)"),
+        (-1.5, "GAIN = -1.5"),
+        (2e4, "GAIN = 20000.0"),
         ("nan", "GAIN = nan is not finite"),
         ("LOW", "GAIN = 'LOW' is not a number"),
         (False, "GAIN = False is not a number"),
@@ -128,12 +128,10 @@ def test_saturation_of_nothing():
     for value in (0, -1.0):
         assert amplifier_quantity("saturation", {"SATURATE": value}, {}) == (None, "")
     assert amplifier_quantity("saturation", {"SATLEVEL": 6e4}, {}) == (6e4, "")
-    assert amplifier_quantity("noise", {"RDNOISE": -3}, {}) == (
-        None, "RDNOISE = -3 cannot be meant (noise: 0 to 100000 e-)",
-    )  # fmt: skip
-    assert amplifier_quantity("gain", {}, {}, stated="much") == (
-        None, "campaign.yaml's gain = 'much' is not a number",
-    )  # fmt: skip
+    noise, problem = amplifier_quantity("noise", {"RDNOISE": -3}, {})
+    assert noise is None and problem.startswith("RDNOISE = -3")
+    gain, problem = amplifier_quantity("gain", {}, {}, stated="much")
+    assert gain is None and "campaign.yaml" in problem and "'much'" in problem
 
 
 def test_times():

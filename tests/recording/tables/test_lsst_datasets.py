@@ -127,7 +127,7 @@ def distortion_table(filters=("g_6", "y_10")):
 
 
 def write_as_lsst(path, *tables):
-    """As its writer does: a primary without data, tables with their cards, no units."""
+    """Write as LSST's pipelines do: a primary without data, tables with headers, no units."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         hdus = [fits.table_to_hdu(table) for table in tables]
@@ -208,7 +208,7 @@ def test_kernels(tmp_path, shape):
     assert found.columns["RAW_XCORRS"].shape == (2, PAIRS, side, side)
     found.write(tmp_path / "again.fits")
     assert BrighterFatterKernel.read(tmp_path / "again.fits") == found
-    with pytest.raises(RecordingError, match="ECSV holds one table, not 2; use FITS"):
+    with pytest.raises(RecordingError, match=r"again\.ecsv: .*one table, not 2.*FITS"):
         found.write(tmp_path / "again.ecsv")
 
 
@@ -244,7 +244,10 @@ def broken(tmp_path, change):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t.remove_columns(["COVARIANCES", "GAIN"]), "GAIN, COVARIANCES missing"),
+        (
+            lambda t: t.remove_columns(["COVARIANCES", "GAIN"]),
+            "GAIN, COVARIANCES missing; ",
+        ),
         (lambda t: t.meta.update(OBSTYPE="bfk"), "its OBSTYPE is 'bfk', not 'PTC'"),
         (lambda t: t.meta.pop("OBSTYPE"), "its OBSTYPE is None, not 'PTC'"),
         (
@@ -262,7 +265,7 @@ def test_refusals(tmp_path, change, message):
     path = broken(tmp_path, change)
     with pytest.raises(RecordingError) as caught:
         PhotonTransferDataset.read(path)
-    assert str(caught.value) == f"{path}: {message}"
+    assert str(caught.value).startswith(f"{path}: {message}")
 
 
 def test_refusals_of_files(tmp_path):
@@ -273,7 +276,7 @@ def test_refusals_of_files(tmp_path):
         PhotonTransferDataset.read(tmp_path / "image.fits")
     path = write_as_lsst(tmp_path / "ptc.fits", photon_transfer_table())
     found = PhotonTransferDataset.read(path)
-    with pytest.raises(RecordingError, match="exists; say overwrite to replace it"):
+    with pytest.raises(RecordingError, match=r"ptc\.fits exists.*overwrite"):
         found.write(path)
     with pytest.raises(RecordingError, match="no amplifier 'C17' among C00, C01"):
         found.curve("C17")

@@ -137,7 +137,7 @@ def test_what_cannot_be_used_is_refused(tmp_path, change, words):
     path = write(table, tmp_path / "c.ecsv")
     with pytest.raises(RecordingError) as caught:
         read_covariances(path)
-    assert str(caught.value) == f"{path}: {words}" or words in str(caught.value)
+    assert str(caught.value).startswith(f"{path}: {words}")
 
 
 def photon_transfer(side=3, gain=1.5, weights=True):
@@ -221,16 +221,16 @@ def test_spots_and_profiles(tmp_path):
     assert set(spots.errors) == {"sigma_x"} and len(spots.warnings) == 2
     table.remove_column("flux")
     table.write(tmp_path / "none.ecsv", format="ascii.ecsv")
-    with pytest.raises(RecordingError, match="no flux or peak"):
+    with pytest.raises(RecordingError, match=r"none\.ecsv: .*flux or peak .*sigma_x"):
         read_spots(tmp_path / "none.ecsv")
     radius = np.arange(0.0, 300, 3)
     value = np.where(radius < 30, np.nan, np.sin(radius))
     np.savetxt(tmp_path / "rings.txt", np.c_[radius, value])
     rings = read_profile(tmp_path / "rings.txt", unit="percent")
     assert rings.radius[0] == 30 and len(rings.radius) == 90
-    assert rings.warnings[-1] == "10 radii without a value left out"
+    assert rings.warnings[-1].startswith("10 radii ")
     np.savetxt(tmp_path / "rings.txt", np.c_[radius[::-1], value])
-    with pytest.raises(RecordingError, match="do not ascend"):
+    with pytest.raises(RecordingError, match=r"rings\.txt: .*ascend"):
         read_profile(tmp_path / "rings.txt")
 
 

@@ -255,12 +255,10 @@ def test_refusals():
     for options, message in (
         ({"lags": 3}, "lags = 3 must be from 0 to 2, the curve's"),
         ({"gain": -1.0}, "gain = -1.0 e-/adu must be above 0"),
-        ({"level_range": (1e3, 6e3)}, "2 pairs from 1000 to 6000 adu do not fix the model: at "
-         "least 4 levels are needed"),
-    ):  # fmt: skip
-        with pytest.raises(MeasurementError) as caught:
+        ({"level_range": (1e3, 6e3)}, "2 pairs from 1000 to 6000 adu .* 4 levels"),
+    ):
+        with pytest.raises(MeasurementError, match=message):
             fit_covariances(curve, **options)
-        assert str(caught.value) == message
     dark = dataclasses.replace(
         curve, covariances=np.where(curve.covariances == curve.covariances[:, :1, :1], 50.0, 0.0)
         - curve.levels[:, None, None] * 1e-3 * (np.arange(9).reshape(3, 3) == 0),
