@@ -119,11 +119,19 @@ def diagnose_measured(
 
     Examples
     --------
-    Diagnose measured area changes a_ij, kept in a file, against a shipped table::
+    Diagnose area changes a_ij [1/e-] that conserve area:
 
-        table = find_reduced_recording(Path("areas.csv"))
-        baseline = find_baseline("e2v_ccd250")
-        result = diagnose_measured(measure_reduced(table, reach=baseline.reach), baseline)
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> from bfsensor.diagnose import free_baseline, measure_reduced
+    >>> from bfsensor.recording.tables.area_changes import AreaChangeTable
+    >>> a = np.zeros((3, 3)); a[0, 0], a[0, 1], a[1, 0] = -1.4e-6, 3e-7, 4e-7
+    >>> errors, independent = np.full((3, 3), 1e-8), np.ones((3, 3), bool)
+    >>> table = AreaChangeTable(Path("drawn"), a, errors, independent)
+    >>> baseline = free_baseline()
+    >>> measured = measure_reduced(table, reach=baseline.reach)
+    >>> diagnose_measured(measured, baseline).mismatch.detected
+    False
     """
     predictor, fit = fit_bounded(measured, baseline)
     more = _of_free(measured, baseline, fit)

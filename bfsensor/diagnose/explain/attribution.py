@@ -155,6 +155,13 @@ class Attribution:
         Candidates that could not be fitted, and why.
     free_form : OpenWorld, optional
         Nonparametric model of the mismatch outside the library, part of ``fit``.
+
+    Examples
+    --------
+    List the effects found by a diagnosis with their 68 % intervals::
+
+        for found in result.attribution.found:
+            print(found.effect.word, found.intervals())
     """
 
     found: tuple[Found, ...]
@@ -195,7 +202,13 @@ class Attribution:
         return list(dict.fromkeys(words))
 
     def chi2dof(self) -> tuple[float, float]:
-        """Chi-square per held-out value, without and with the effects; nan without such values."""
+        """Calculate the chi-square per held-out value.
+
+        Returns
+        -------
+        before, after : float
+            Without and with the effects; nan without held-out values.
+        """
         count = sum(n for *_, n in self.heldout.values())
         if not count:
             return np.nan, np.nan

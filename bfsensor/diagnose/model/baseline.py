@@ -249,6 +249,7 @@ class Baseline:
         Returns
         -------
         dict of str to dict of (wavelength, back_bias) to (dkx, dky)
+            Change of the shifts for a unit of each parameter [pixel/e- per unit].
         """
         return {
             name: {key: self.derivative(name, key) for key in self.edges}
@@ -256,7 +257,18 @@ class Baseline:
         }
 
     def scale_at(self, key: tuple[float, float]) -> float:
-        """Ratio of a_00 at a condition of ``edges`` to that at the reference; 1 if that is 0."""
+        """Calculate the ratio of a_00 at a condition of ``edges`` to that at the reference.
+
+        Parameters
+        ----------
+        key : tuple of float
+            Wavelength [nm] and back bias [V], a key of ``edges``.
+
+        Returns
+        -------
+        float
+            The ratio; 1 where a_00 at the reference is 0.
+        """
         own = self.edges[key]
         nominal = centre(*self.edges.get(self.reference, own))
         return centre(*own) / nominal if nominal else 1.0
@@ -264,7 +276,20 @@ class Baseline:
     def edges_on(
         self, condition: Condition, change: Mapping[str, float] | None, background: float
     ) -> Edges:
-        """Calculate the shifts per electron [pixel/e-] where all pixels hold a background [e-]."""
+        """Calculate the shifts per electron where all pixels hold a background.
+
+        Parameters
+        ----------
+        condition, change
+            As for :meth:`at`.
+        background : float
+            Charge in all pixels [e-].
+
+        Returns
+        -------
+        kx, ky : ndarray
+            Shifts of right and upper edges [pixel/e-].
+        """
         kx, ky = self.at(condition, change)[0]
         away, key = background - self.level, self.nearest(condition)
         for power, more in ((1, self.slopes), (2, self.bends)):
@@ -276,7 +301,20 @@ class Baseline:
     def areas_on(
         self, condition: Condition, change: Mapping[str, float] | None, background: float
     ) -> FloatArray:
-        """Calculate the area changes per electron [1/e-] where all pixels hold a background [e-]."""
+        """Calculate the area changes per electron where all pixels hold a background.
+
+        Parameters
+        ----------
+        condition, change
+            As for :meth:`at`.
+        background : float
+            Charge in all pixels [e-].
+
+        Returns
+        -------
+        ndarray
+            Area changes, lag (0, 0) in the middle [1/e-].
+        """
         return area_matrix(*self.edges_on(condition, change, background))
 
     def flat_areas(

@@ -162,6 +162,7 @@ def find_baseline(
     Returns
     -------
     Baseline
+        Shifts, with free parameters where the file or the name 'none' provides them.
 
     Raises
     ------

@@ -68,12 +68,19 @@ class Diagnosis:
 
     Examples
     --------
-    Diagnose a folder of recordings against a device file and write the report::
-
-        campaign = read_campaign("recordings/")
-        result = diagnose(CampaignSource(campaign), find_baseline("device.toml"))
-        print(result.said())
-        write_report(result, "out/")
+    >>> from bfsensor.diagnose import diagnose_measured
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> from bfsensor.diagnose import free_baseline, measure_reduced
+    >>> from bfsensor.recording.tables.area_changes import AreaChangeTable
+    >>> a = np.zeros((3, 3)); a[0, 0], a[0, 1], a[1, 0] = -1.4e-6, 3e-7, 4e-7
+    >>> errors, independent = np.full((3, 3), 1e-8), np.ones((3, 3), bool)
+    >>> table = AreaChangeTable(Path("drawn"), a, errors, independent)
+    >>> baseline = free_baseline()
+    >>> measured = measure_reduced(table, reach=baseline.reach)
+    >>> result = diagnose_measured(measured, baseline, campaign="drawn")
+    >>> result.to_report()["detected"], result.location()["lags"]
+    (False, [])
     """
 
     campaign: str
@@ -196,7 +203,13 @@ class Diagnosis:
         return []
 
     def said(self) -> str:
-        """Summarise the diagnosis in a few sentences, as printed and at the top of report.html."""
+        """Summarise the diagnosis in a few sentences, as printed and at the top of report.html.
+
+        Returns
+        -------
+        str
+            The key 'said' of report.json.
+        """
         m = self.mismatch
         if not m.detected:
             parts = [
@@ -238,7 +251,13 @@ class Diagnosis:
         return out
 
     def to_report(self) -> dict[str, Any]:
-        """Make the contents of report.json, as a dictionary of plain Python types."""
+        """Make the contents of report.json, as a dictionary of plain Python types.
+
+        Returns
+        -------
+        dict
+            Keys of the layout named by its key 'schema'.
+        """
         fitted = {
             name: {"value": float(v), "error": float(e)}
             for name, v, e in zip(
