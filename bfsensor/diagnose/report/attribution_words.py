@@ -58,8 +58,9 @@ def said_of(attribution: Attribution) -> list[str]:
     """Sentences: effects with their parameters, what is left, and chi-squares of held-out data."""
     out = []
     left = attribution.mismatch
-    # An effect "explains" a mismatch only where nothing that stands out is left beside it.
-    verb = "accounts for part of it" if left.detected else "explains it"
+    # An effect "explains" a mismatch only where it does so alone, and nothing that stands out is left.
+    alone = len(attribution.found) == 1 and not (left.detected or attribution.open_world)
+    verb = "explains it" if alone else "explains part of it"
     for found in attribution.found:
         if isinstance(found.effect, AxesExchanged):
             out.append(
@@ -67,11 +68,11 @@ def said_of(attribution: Attribution) -> list[str]:
             )
             continue
         out.append(f"{_said_effect(found, verb)}.")
-    if attribution.found:
+    if attribution.found and attribution.free_form is None:
         out.append(_said_left(attribution))
     named = any(f.effect.word == OUTSIDE for f in attribution.found)
     if attribution.open_world and not (named and attribution.free_form is None):
-        what = "what is left" if attribution.found else "it"
+        what = "the rest" if attribution.found else "it"
         out.append(f"No effect of the library explains {what}.")
     elif not attribution.found and left.detected:
         out.append(
@@ -79,7 +80,8 @@ def said_of(attribution: Attribution) -> list[str]:
             f"library, which takes a family-wise p below {OUTSIDE_ALARM:g}."
         )
     if attribution.free_form is not None:
-        out.append(said_freely(attribution.free_form))
+        # The residuals are those with the nonparametric terms.
+        out += [said_freely(attribution.free_form), _said_left(attribution)]
     before, after = attribution.chi2dof()
     if (attribution.found or attribution.free_form is not None) and before == before:
         way = "falls" if after < before else "rises"
@@ -106,6 +108,7 @@ def _said_effect(found: Found, verb: str) -> str:
         # A device's own quantities are in the unit of its file, which the effect does not know.
         unit = f" {units[name]}" if units[name] and name in words else ""
         interval = said_interval(told, "68")
+        interval = f"68 %: {interval}" if name in found.errors else interval
         values.append(
             f"{words.get(name, name)} = {said_value(word, name, told['value'])}{unit} ({interval})"
         )
@@ -121,8 +124,8 @@ def _said_left(attribution: Attribution) -> str:
     left = attribution.mismatch
     p = said_family_p(left.p_value)
     if not left.detected:
-        return f"Beside that, nothing stands out (family-wise p {p}; brackets: 68 % intervals)."
-    text = f"What is left still stands out (family-wise p {p}; brackets: 68 % intervals)"
+        return f"Nothing else stands out (family-wise p {p})."
+    text = f"What is left still stands out (family-wise p {p})"
     if not attribution.open_world and left.p_value < OUTSIDE_ALARM:
         text += f", but within the {100 * ACCURACY:g} % to which effects are predicted"
     return f"{text}."

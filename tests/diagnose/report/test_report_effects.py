@@ -108,6 +108,8 @@ def test_an_effect_explains_only_where_nothing_is_left(explained):
     left = replace(told.mismatch, p_value=1e-30)
     part = replace(explained, attribution=replace(told, mismatch=left)).said()
     assert "explains it" in whole and "explains it" not in part
+    outside = replace(told, open_world=True)
+    assert "explains it:" not in replace(explained, attribution=outside).said()
     assert f"family-wise p {told.mismatch.p_value:.2g}" in whole
     # A p-value at the floor of its calculation is printed as a bound.
     assert "family-wise p < 2e-30" in part
