@@ -21,8 +21,8 @@ UNIT = 1e-3
 on."""
 
 SIZES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
-"""Standard deviations that are tried for the process [:data:`UNIT`]. Chosen: from a third to the next
-the likelihood hardly changes; the ends are far below and above covariances that noise lets show."""
+"""Standard deviations that are tried for the process [:data:`UNIT`]. Chosen, to be
+derived: steps of a factor of 3; a process beyond either end is given the size of that end."""
 
 RANGES = ((0.01, 1.0), (0.01, 3.0), (1.5, 1.0), (1.5, 3.0))
 """Correlation lengths that are tried: in lags [pixel] (0.01: lags are independent), and in the natural

@@ -28,8 +28,8 @@ narrowest is 1/32 of the side; more widths lengthen the search, and single colum
 of their own."""
 
 PERIODS = 160
-"""Number of ripple frequencies of the first search, evenly spaced.  Chosen, to be derived: the step is
-1.5e-3 cycles per pixel time; with half as many, ripples between two steps are missed."""
+"""Number of ripple frequencies of the first search, evenly spaced. Chosen, to be derived: the step is
+1.5e-3 cycles per pixel time; with half as many, ripples between two steps may be missed."""
 
 FINE = 61
 """Number of frequencies of the second search, one step to either side.  Chosen: to 1/30 of a step; twice

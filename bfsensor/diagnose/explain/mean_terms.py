@@ -22,9 +22,9 @@ CURVES = 5
 several turns, which waves describe with fewer terms."""
 
 CYCLES, CYCLE_STEP = 10, 0.25
-"""Largest number of waves over the campaign, and step between the numbers that are tried.  Chosen, to be
-derived: a quarter of a wave shifts the phase at the end by 90 degrees; with twice the step, waves
-between two steps lose up to half of their amplitude at the ends."""
+"""Largest number of waves over the campaign, and step between the numbers that are tried. Chosen, to
+be derived: a wave between two steps is off by at most an eighth of a period at the ends of the
+campaign; with twice the step, by a quarter."""
 
 EIGHTHS = range(4)
 """Phases of a wave that are tried, in eighths; derived: the other four are the same with the other

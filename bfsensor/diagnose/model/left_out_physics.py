@@ -72,8 +72,8 @@ errors."""
 
 GUARD = Edge("x", (EdgeStrip(50.0, 20.0, "none"), EdgeStrip(200.0)))
 """Edge of a device whose file describes none: a guard ring, 50 um wide at 20 V, and 200 um of bare
-silicon. Chosen, to be derived: a
-usual layout; the strength that is found scales its displacements."""
+silicon. Chosen, to be derived: a usual layout; the strength that is found scales its
+displacements."""
 
 RIM = 40
 """Number of boundaries from the edge whose displacements are calculated.  Derived: a disturbance between

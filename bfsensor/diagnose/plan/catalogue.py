@@ -19,7 +19,8 @@ levels separate a linear, a quadratic and a cubic law; below 1, so that nothing 
 
 CURRENT_MODE = 5e-5
 """Relative error of the light measured by a photodiode whose current is integrated. Chosen, to be
-derived: twice as large quarters the expected chi-square differences that rest on the lamp."""
+derived: twice as large lowers expected chi-square differences that rest on the lamp, at most to a
+quarter."""
 
 FLATS = ("flat_cov", "flat_mean", "serial_overscan", "parallel_overscan")
 BIASES = ("bias_cov", "bias_level", "amp_cross")

@@ -31,8 +31,8 @@ from bfsensor.units import to_celsius
 
 LAMP_ERROR = 2e-4
 """Relative error of the lamp in planned exposures that state none, whatever the campaign's own is.
-Chosen, to be derived: twice as large quarters the expected chi-square differences that rest on the
-lamp."""
+Chosen, to be derived: twice as large lowers expected chi-square differences that rest on the lamp, at
+most to a quarter."""
 
 SETTLED = 3
 """Number of fixed-point iterations for the mean of a flat, on which effects depend. Derived: effects

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Draw = Callable[["Axes"], None]
 DOTS = 130
 """Resolution of the figures [dots per inch].  Chosen: half a page wide they are sharp on screens and
-paper; twice as many quadruple the size of report.html."""
+paper; twice as many make report.html about four times as large."""
 
 VISIBLE = 0.2
 """Change of a pull [standard errors] from which on a second figure, with the effects, is drawn.
