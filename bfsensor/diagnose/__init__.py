@@ -1,4 +1,4 @@
-"""Recordings held against a simulation: what is left, where it lies, and which effect explains it."""
+"""Diagnosis: compare recordings with a simulation, locate the mismatch, find effects behind it."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""A diagnosis: measure, fit the baseline, locate what is left, explain it, plan what to take."""
+"""Run a diagnosis: measure channels, fit the baseline, locate and explain residuals, plan recordings."""
 
 from __future__ import annotations
 
@@ -33,28 +33,46 @@ def diagnose(
     progress: Callable[[int, int], None] | None = None,
     explain: bool = True,
 ) -> Diagnosis:
-    """Hold a campaign's recordings against a baseline.
+    """Compare a campaign's recordings with a baseline, and explain the mismatch.
 
     Parameters
     ----------
     source : Source
-        The exposures.
+        Exposures in order of time, such as a :class:`CampaignSource`.
     baseline : Baseline
-        What the simulation predicts.
+        Boundary shifts that the simulation predicts, from :func:`find_baseline` and others.
     campaign : str
-        Its name.
+        Name of the campaign, for the report.
     seed : int
-        Of the draws of noise that p-values come from.
+        Seed of the noise draws that p-values come from; the same seed gives the same result.
     notes : sequence of str
-        What reading had to say, for the report.
+        Warnings from reading the recordings, for the report.
     progress : callable, optional
         Called with (exposures done, exposures in all).
     explain : bool
-        Look for what explains a mismatch, beyond where it is.
+        Whether to find effects that explain a mismatch, and recordings to take next; without it
+        the mismatch is only located, which is much faster.
 
     Returns
     -------
     Diagnosis
+        Fit, mismatch, effects found and advice.
+
+    Raises
+    ------
+    MeasurementError
+        No exposure can be used, or no channel can be measured in them.
+    ConvergenceError
+        The baseline's predictions overflow or cannot be fitted.
+
+    Examples
+    --------
+    Diagnose a folder of recordings against a shipped device::
+
+        from bfsensor.recording.campaign.campaign import read_campaign
+
+        source = CampaignSource(read_campaign("recordings/"))
+        print(diagnose(source, find_baseline("itl_sta3800c")).said())
     """
     measured = measure_channels(source, progress=progress)
     return diagnose_measured(
@@ -71,19 +89,49 @@ def diagnose_measured(
     notes: Sequence[str] = (),
     explain: bool = True,
 ) -> Diagnosis:
-    """Hold channels that are measured already against a baseline; see :func:`diagnose`.
+    """Compare measured channels with a baseline, and explain the mismatch.
 
     Parameters
     ----------
     measured : MeasuredChannels
         From :func:`bfsensor.diagnose.measure_channels` or
         :func:`bfsensor.diagnose.measure_reduced`.
-    baseline, campaign, seed, notes, explain
-        As for :func:`diagnose`.
+    baseline : Baseline
+        Boundary shifts that the simulation predicts.
+    campaign : str
+        Name of the campaign, for the report.
+    seed : int
+        Seed of the noise draws that p-values come from.
+    notes : sequence of str
+        Warnings from reading the recordings, for the report.
+    explain : bool
+        Whether to find effects that explain a mismatch, as for :func:`diagnose`.
 
     Returns
     -------
     Diagnosis
+        Fit, mismatch, effects found and advice.
+
+    Raises
+    ------
+    ConvergenceError
+        The baseline's predictions overflow or cannot be fitted.
+
+    Examples
+    --------
+    Diagnose area changes a_ij [1/e-] that conserve area:
+
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> from bfsensor.diagnose import free_baseline, measure_reduced
+    >>> from bfsensor.recording.tables.area_changes import AreaChangeTable
+    >>> a = np.zeros((3, 3)); a[0, 0], a[0, 1], a[1, 0] = -1.4e-6, 3e-7, 4e-7
+    >>> errors, independent = np.full((3, 3), 1e-8), np.ones((3, 3), bool)
+    >>> table = AreaChangeTable(Path("drawn"), a, errors, independent)
+    >>> baseline = free_baseline()
+    >>> measured = measure_reduced(table, reach=baseline.reach)
+    >>> diagnose_measured(measured, baseline).mismatch.detected
+    False
     """
     predictor, fit = fit_bounded(measured, baseline)
     more = _of_free(measured, baseline, fit)
@@ -113,7 +161,7 @@ def diagnose_measured(
 
 
 def _of_free(measured: MeasuredChannels, baseline: Baseline, fit: BaselineFit) -> list[str]:
-    """What floats without a device behind it, and what few levels leave open of that."""
+    """Notes on the free a_ij of a baseline without a device, and on flats of too few levels."""
     if not baseline.not_below:
         return []
     errors = dict(zip(fit.names, fit.errors, strict=True))
@@ -122,12 +170,12 @@ def _of_free(measured: MeasuredChannels, baseline: Baseline, fit: BaselineFit) -
         f"{errors[f'device {n}'] * baseline.spread[n]:.1g}" if n in fit.pulls else f"{n} held at 0"
         for n in baseline.not_below
     )  # fmt: skip
-    out = [f"a_ij that float, per electron: {text}"]
+    out = [f"fitted area changes a_ij [1/e-]: {text}"]
     flats = [c for c in measured.channels if c.word == "flat_cov"]
     levels = {float(v) for c in flats for v in c.axes["time"]}
     if len(levels) < 2 and not any(c.unit == PER_ELECTRON for c in flats):
         out.append(
-            "flats at fewer than two levels: a positive covariance of near neighbours cannot be told "
-            "from the brighter-fatter effect, nor the gain from its a_00"
+            "flats at fewer than two levels: these do not separate other positive covariances of near "
+            "neighbours from the brighter-fatter effect, nor the gain from its a_00"
         )
     return out

@@ -121,7 +121,7 @@ def test_the_command_diagnoses_a_folder(tmp_path):
     )
     out = tmp_path / "out"
     asked = ["--predict", "seconds=40,back_bias=-40", "--predict", "flux=5e5"]
-    # What explains it is asked of the command by the golden cases.
+    # The golden cases run the command with the search for effects.
     words = ["diagnose", str(folder), "-o", str(out), "--locate-only", *asked]
     result = CliRunner().invoke(main, words)
     assert result.exit_code == 0, result.output
@@ -140,8 +140,8 @@ def test_the_command_diagnoses_a_folder(tmp_path):
     assert none.exit_code == 1 and "nothing: not a baseline" in none.stderr
 
 
-def test_a_device_off_its_card_is_told_and_not_absorbed(tmp_path):
-    """The fit takes a parameter far off its card: the pull is a finding, named and in words."""
+def test_a_device_far_from_nominal_is_reported_and_not_absorbed(tmp_path):
+    """A parameter that the fit moves far from its nominal value is a finding, in words too."""
     measured, predictor, fit = fit_virtual(seed=8112)
     point = fit.values[: len(predictor.names)]
     moved = point.copy()

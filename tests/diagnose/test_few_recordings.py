@@ -1,4 +1,4 @@
-"""Campaigns with next to nothing in them: what can be said is said, else one clear error."""
+"""Campaigns with very few recordings: a diagnosis of what they allow, or one clear error."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ def test_measured_areas_beside_tables(kind, baseline, detected):
 
 
 def test_temperatures_are_in_kelvin_from_the_header_on(tmp_path):
-    """Of dark current that doubles every 6 K a mistake of 273 would be a factor of 5e13."""
+    """A mistake of 273 K would change a dark current that doubles every 6 K by a factor of 5e13."""
     write(
         tmp_path, [("BIAS", 0.0, 0, -95.0)] * 2 + [("FLAT", 5.0, 2e4, -95.0)] * 2, seed=73
     )

@@ -1,1 +1,1 @@
-"""What explains what is left: effects of the library, or nonparametric terms."""
+"""Explanations of a mismatch: effects of the library, or nonparametric terms where none fits."""

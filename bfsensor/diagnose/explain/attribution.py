@@ -1,4 +1,4 @@
-"""What an attribution says: effects with their rivals, probabilities, ties and intervals."""
+"""Result of an attribution: effects found, their rivals, class probabilities and intervals."""
 
 from __future__ import annotations
 
@@ -19,29 +19,36 @@ from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.effect import Effect, Parameter
 
 TIED = 3.0
-"""Difference of the log-likelihood from the best within which a rival cannot be told apart."""
+"""Difference of the log-likelihood within which a rival is listed as not distinguished from the effect.
+Chosen, to be derived: a rival may be exp(3) = 20 times less likely; twice as large, 400 times, and
+more classes are listed as tied."""
 
 ALIKE = 0.95
-"""Cosine between templates from which on rivals are of one class."""
+"""Cosine between two whitened templates above which a rival is listed as not distinguished up to a
+log-likelihood difference of 2 :data:`TIED`.  Chosen, to be derived: at 0.95 a tenth of the template's
+square differs; with (1 - cosine) twice as large, rivals that differ in a fifth are listed."""
 
 OUTSIDE = 0.02
-"""Prior probability that what a clean fit explains is none of the library after all (assumed)."""
+"""Least probability of the class outside_library, where effects leave nothing that stands out.
+Chosen, to be derived: twice as large scales the probabilities of all other classes by 0.96 / 0.98."""
 
 OUTSIDE_WORD = "outside_library"
-"""Class of what no effect of the library is."""
+"""Class, in report.json, of a mismatch that no effect of the library explains."""
 
 
 FAILS = 25.0
-"""Increase of a channel's chi-square, of values that were not fitted, beyond which what was found is
-said to fail there; of 165 concealed trials two had more than 12, both of fits gone astray."""
+"""Increase of a channel's held-out chi-square by the effects above which the report warns of that
+channel. Chosen, to be derived: two of the 165 concealed trials of commit 829b542 exceeded 12, both
+with wrong fits; twice as large, failures of up to 7 standard deviations pass without a warning."""
 
 WIDENED = 1.12
-"""Factor on standard errors: of 141 parameters of concealed trials 68 % were within it, by errors of
-linear fits 63 % were (closed forms, shapes that bend and tails are left out of these)."""
+"""Factor on standard errors in all intervals.  Measured on 141 parameters of concealed trials (commit
+a6e672b): 68 % of the true values lie within 1.12 standard errors, 63 % within 1, for linear errors
+leave out the closed forms' errors, curvature and tails."""
 
 
 LEVELS = {"68": 1.0, "95": 1.96}
-"""Half widths of intervals, in standard errors of a Gaussian."""
+"""Half widths of the intervals [standard errors], exact for a Gaussian: 68.3 % and 95.0 %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,19 +58,19 @@ class Found:
     Attributes
     ----------
     effect : Effect
-        With its best parameters.
+        Effect with its fitted parameters.
     gain : float
-        Increase of the chi-square when it is left out.
+        Increase of the chi-square when the effect is left out; nan if it was not ranked.
     errors : dict of str to float
-        Standard errors of the fitted parameters.
+        Standard errors of the fitted parameters, in their units.
     probability : dict of str to float
-        Of each class word in its place.
+        Probability of each class to be the true one in this effect's place; they sum to 1.
     tied : tuple of str
-        Classes that cannot be told from it, its own first.
+        Classes that the recordings do not distinguish from this effect, its own first.
     rivals : tuple of Rival
-        Best of each kind in its place, best first.
+        Best candidate of each kind in the effect's place, best first.
     profiles : mapping of str to Profile
-        Of parameters whose chi-square is no parabola.
+        Likelihood profiles of parameters whose chi-square is not a parabola.
     """
 
     effect: Effect
@@ -77,16 +84,23 @@ class Found:
     def intervals(self, scale: float = WIDENED) -> dict[str, dict[str, Any]]:
         """Values with intervals of 68 and 95 %, as report.json has them.
 
-        Of parameters with a profile they end where the chi-square has risen by as much as
-        errors, widened, say; 'open68' and 'open95' list ends, 'lo' or 'hi', that it does not
-        reach within the range of fits, 'stopped68' and 'stopped95' those of them that lie inside
-        it: beyond nothing could be predicted, or the chi-square hardly rose.  Of all others see
-        :func:`linear_interval`.
+        The interval of a parameter with a likelihood profile ends where the chi-square has risen by
+        ``scale**2`` (68 %) or ``(1.96 * scale)**2`` (95 %).  'open68' and 'open95' list the ends, 'lo'
+        or 'hi', at which the chi-square does not rise that far within the range of fits;
+        'stopped68' and 'stopped95' list those of them inside the range, where no prediction could
+        be made beyond, or the profile became flat.  All other parameters have the intervals
+        of :func:`~bfsensor.diagnose.fit.local_likelihood.linear_interval`.
 
         Parameters
         ----------
         scale : float
-            Factor on errors.
+            Factor on standard errors, above 0.
+
+        Returns
+        -------
+        dict of str to dict
+            By parameter: 'value'; of fitted ones also 'lo68', 'hi68', 'lo95' and 'hi95', in the
+            parameter's unit, with the keys above where they apply.
         """
         out = {}
         for p in self.effect.parameters:
@@ -99,13 +113,13 @@ class Found:
         return out
 
     def _interval(self, p: Parameter, level: str, width: float) -> dict[str, Any]:
-        """Ends of one interval; 'open95' and the like name those that were not reached."""
+        """Ends of one interval, with the keys 'open..' and 'stopped..' where an end is not reached."""
         keys = f"lo{level}", f"hi{level}"
         if p.name not in self.profiles:
             ends = linear_interval(self.effect[p.name], width * self.errors[p.name], p)
             return dict(zip(keys, ends, strict=True))
         low, high, *closed = self.profiles[p.name].interval(width)
-        # The fit may have ended a little off the lowest place.
+        # The fit ends near the minimum of the profile, not at it: the interval must hold both.
         low, high = min(low, self.effect[p.name]), max(high, self.effect[p.name])
         told: dict[str, Any] = dict(zip(keys, (low, high), strict=True))
         open_ = [k for k, c in zip(("lo", "hi"), closed, strict=True) if not c]
@@ -121,26 +135,33 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Attribution:
-    """What explains a mismatch.
+    """Effects, or nonparametric terms, that explain a mismatch, and the fit with them.
 
     Attributes
     ----------
     found : tuple of Found
-        Effects, the one that explains most first; empty where none does.
+        Effects, the one with the largest gain first; empty where none was found.
     fit : BaselineFit
-        With them.
+        Fit of the baseline, effects and terms together.
     predictor : Predictor
-        Of that fit.
+        Model that ``fit`` belongs to.
     mismatch : Mismatch
-        What is left with them.
+        Residuals of ``fit`` that stand out, with their family-wise p-values.
     open_world : bool
-        Whether something is left that no effect of the library explains.
+        Whether a mismatch is left, or modelled, that no effect of the library explains.
     heldout : dict of str to (float, float, int)
-        Chi-square before and after, and number of values, by channel, of what was not fitted.
+        By channel: chi-square of held-out values without and with the effects, and their number.
     notes : tuple of str
-        How it went.
+        Candidates that could not be fitted, and why.
     free_form : OpenWorld, optional
-        Model of what is outside the library, in ``fit``.
+        Nonparametric model of the mismatch outside the library, part of ``fit``.
+
+    Examples
+    --------
+    List the effects found by a diagnosis with their 68 % intervals::
+
+        for found in result.attribution.found:
+            print(found.effect.word, found.intervals())
     """
 
     found: tuple[Found, ...]
@@ -154,7 +175,7 @@ class Attribution:
 
     @property
     def probability(self) -> dict[str, float]:
-        """Of each class to be among what was left out, most probable first."""
+        """Probability that the baseline lacks an effect of each class, most probable first."""
         out: dict[str, float] = {}
         for found in self.found:
             for word, p in found.probability.items():
@@ -163,6 +184,8 @@ class Attribution:
         sure = self.open_world and not any(
             f.effect.word == OUTSIDE_WORD for f in self.found
         )
+        # 0.9 is chosen, to be derived: with a mismatch left over, effects found beside it are
+        # often parts of the same unmodelled cause, so that they share a probability of 0.1.
         outside = max(0.9 if sure else OUTSIDE, named)
         if not self.found:
             return {OUTSIDE_WORD: 1.0} if self.open_world else {}
@@ -172,14 +195,20 @@ class Attribution:
 
     @property
     def tied(self) -> list[str]:
-        """Classes that may be what was left out."""
+        """Classes that may be the cause: those found, those tied to them, and outside_library."""
         words = [w for f in self.found for w in f.tied]
         if self.open_world:
             words.append(OUTSIDE_WORD)
         return list(dict.fromkeys(words))
 
     def chi2dof(self) -> tuple[float, float]:
-        """Chi-square over number of all values that were not fitted, before and after."""
+        """Calculate the chi-square per held-out value.
+
+        Returns
+        -------
+        before, after : float
+            Without and with the effects; nan without held-out values.
+        """
         count = sum(n for *_, n in self.heldout.values())
         if not count:
             return np.nan, np.nan
@@ -188,9 +217,9 @@ class Attribution:
 
     @property
     def fails_in(self) -> tuple[str, ...]:
-        """Channels that were not fitted and are described worse than without any effect.
+        """Channels whose held-out chi-square the effects raise by more than :data:`FAILS`.
 
-        By more than :data:`FAILS`: by chance a parameter that was fitted costs 1.
+        A correct effect also raises it, by about 1 for each fitted parameter.
         """
         return tuple(
             w for w, (before, after, _) in self.heldout.items() if after - before > FAILS
@@ -200,11 +229,23 @@ class Attribution:
 def class_probabilities(
     ranking: Sequence[Rival], temperature: float = 1.0
 ) -> dict[str, float]:
-    """Of each class in one place: evidence over the sum of all, variants of a class together."""
+    """Probability of each class in one effect's place, from the evidences of its candidates.
+
+    Parameters
+    ----------
+    ranking : sequence of Rival
+        Candidates; ``evidence`` is the logarithm of the marginal likelihood.
+    temperature : float
+        Divisor of the evidences, 1 for probabilities as they are; larger values spread them.
+
+    Returns
+    -------
+    dict of str to float
+        Probabilities above 1e-4 by class; variants of a class share one prior.
+    """
     if not ranking:
         return {}
     z = np.array([r.evidence for r in ranking]) / temperature
-    # Variants share their class's prior.
     counts = {w: sum(r.word == w for r in ranking) for w in {r.word for r in ranking}}
     weights = np.exp(z - z.max()) / np.array([counts[r.word] for r in ranking])
     out: dict[str, float] = {}
@@ -214,7 +255,15 @@ def class_probabilities(
 
 
 def tied_classes(effect: Effect, ranking: Sequence[Rival]) -> tuple[str, ...]:
-    """Classes that cannot be told from an effect, its own first."""
+    """Classes that the recordings do not distinguish from an effect, its own first.
+
+    Parameters
+    ----------
+    effect : Effect
+        Effect that was found.
+    ranking : sequence of Rival
+        Candidates in its place.
+    """
     own = next((r for r in ranking if r.effect.name == effect.name), None)
     words = [effect.word]
     if own is not None:

@@ -1,4 +1,4 @@
-"""Free-form model of the boundaries' shifts: charge is conserved, for neighbours share edges."""
+"""Nonparametric terms of boundary shifts: single edges, which conserve charge as pixels share them."""
 
 from __future__ import annotations
 
@@ -17,23 +17,28 @@ from bfsensor.response.edge_response import area_matrix
 from bfsensor.typing import Edges, FloatArray
 
 REACH = 3
-"""Largest lag [pixel] of the area changes: a window of 7 x 7."""
+"""Largest lag of the added area changes [pixel]: a window of 7 x 7 pixels. Chosen, to be derived:
+twice as large has 3.5 times as many edges to search, and so a higher threshold for each."""
 
 ODD_REACH = 2
-"""The same of odd shifts, of which spots alone know."""
+"""Largest lag of odd shifts [pixel], which only spots constrain.  Chosen, to be derived: twice as large
+adds edges that the few pixels of a spot hardly distinguish."""
 
 POWERS = (0, 1)
-"""Of the charge that a shift per electron goes with."""
+"""Powers of the charge that shifts per electron go with. Chosen: a shift proportional to the charge,
+and its first correction; a third power makes the search half as long again."""
 
 UNIT = 1e-8
-"""Shift per electron [pixel/e-] of a coefficient of 1; at 1e5 e- for the power 1."""
+"""Shift per electron [pixel/e-] of a coefficient of 1; at 1e5 e- for the power 1.  Defined: the unit of
+the coefficients in report.json."""
 
 Edge = tuple[str, int, int]
-"""Axis that the edge moves along, distance along it (0: the near edge) and across it."""
+"""Axis that an edge moves along, and its distance [pixel] from the charge along it (0: the nearest
+edge, half a pixel away) and across it."""
 
 
 def edge_names(reach: int = REACH) -> list[Edge]:
-    """Edges in the window, up to reflections of it in x and y."""
+    """Edges in the window of ``reach`` pixels, one of each set that reflections in x and y make."""
     return [
         (axis, along, across)
         for axis in "xy" for along in range(reach) for across in range(reach + 1)
@@ -41,17 +46,23 @@ def edge_names(reach: int = REACH) -> list[Edge]:
 
 
 def shifts_of(edge: Edge, shape: tuple[int, int], *, odd: str = "") -> Edges:
-    """Shifts of one edge and of its reflections by :data:`UNIT`.
+    """Kernels of one edge and its reflections, all shifted by :data:`UNIT`.
 
     Parameters
     ----------
     edge : tuple
-        Which, see :data:`Edge`; away from the charge is positive.
+        Edge, see :data:`Edge`; shifts away from the charge are positive.
     shape : tuple of int
-        Of the kernels, odd sides.
+        Shape of the kernels, odd sides.
     odd : str
-        Axis ('x' or 'y') along which the two sides move alike (x) rather than apart; what
-        moves along the other axis changes its sign across.
+        '' for shifts that mirror each other on both sides of the charge; 'x' or 'y' for shifts
+        in the same direction on both sides along that axis.  Edges that move along the other
+        axis then change sign from one side to the other.
+
+    Returns
+    -------
+    kx, ky : ndarray
+        Shifts of right and upper edges [pixel/e-].
     """
     axis, along, across = edge
     kernels = np.zeros((2, *shape))
@@ -71,7 +82,7 @@ def shifts_of(edge: Edge, shape: tuple[int, int], *, odd: str = "") -> Edges:
 
 
 def kernel_families(scene: Scene, *, spots: bool) -> list[Family]:
-    """Shifts that are even in x and in y; odd ones, where spots stand out."""
+    """Families of even shifts, where there are covariances, and of odd ones, where spots stand out."""
     baseline = scene.model.predictor.baseline
     shape = next(iter(baseline.edges.values()))[0].shape
     words = {c.word for c in scene.model.fit.channels}
@@ -86,7 +97,7 @@ def kernel_families(scene: Scene, *, spots: bool) -> list[Family]:
 
 
 def _terms(scene: Scene, shape: tuple[int, int]) -> Iterator[Term]:
-    """Single edges; both axes alike; by power of the charge."""
+    """Single edges of either axis, and of both axes alike, by power of the charge."""
     for p in POWERS:
         for axis, along, across in edge_names():
             edges = shifts_of((axis, along, across), shape)
@@ -99,14 +110,15 @@ def _terms(scene: Scene, shape: tuple[int, int]) -> Iterator[Term]:
 
 
 def odd_terms(scene: Scene) -> Iterator[Term]:
-    """Shifts to one side: those of the baseline, and of single edges near the charge."""
+    """Odd shifts: the size of the baseline's own, and single edges near the charge."""
     baseline = scene.model.predictor.baseline
     kx, ky = next(iter(baseline.edges.values()))
     for axis, k in (("x", kx), ("y", ky)):
         own = np.abs(k), np.zeros_like(k)
         edges = own if axis == "x" else own[::-1]
         where = {"odd": axis, "axis": axis, "shape": "baseline", "power": 0}
-        # What spots tell of a shape of its own is little: the baseline's, if that does.
+        # Spots constrain the shape of odd shifts weakly, so the baseline's shape is preferred where it
+        # explains as much.
         yield replace(_kernel_term(scene, where, edges, 0), simple=True)
         for edge in edge_names(ODD_REACH):
             if edge[2] >= ODD_REACH:
@@ -136,7 +148,7 @@ def _kernel_term(scene: Scene, where: Mapping[str, Any], edges: Edges, p: int) -
 
 
 def _column(scene: Scene, edges: Edges, p: int, channel: Channel) -> FloatArray | None:
-    """By a step as large as what shows: through the whole prediction, spots too."""
+    """Change of the full prediction for a coefficient of 1, spots included."""
     if channel.word not in ("flat_cov", "spot"):
         return None
     predictor = scene.model.predictor
@@ -150,7 +162,7 @@ def _column(scene: Scene, edges: Edges, p: int, channel: Channel) -> FloatArray 
 
 
 def _rough(scene: Scene, edges: Edges, p: int, channel: Channel) -> FloatArray | None:
-    """Of flats, to first order in the shifts; of spots in full."""
+    """Change of flats to first order in the shifts, which is fast; of spots by the full prediction."""
     if channel.word != "flat_cov" or channel.unit == PER_ELECTRON:
         return _column(scene, edges, p, channel)
     x = channel.axes

@@ -1,4 +1,4 @@
-"""Gaussian process over lag and level: what covariances of flats do, no law assumed."""
+"""Gaussian process over lag and level, for covariances of flats that follow no simple law."""
 
 from __future__ import annotations
 
@@ -12,23 +12,33 @@ from bfsensor.diagnose.explain.terms import Family, Scene, Term, lag_family
 from bfsensor.typing import FloatArray
 
 KNOTS = 5
-"""Levels that the process is given at, evenly in the logarithm, straight between them."""
+"""Number of levels at which the process has values, evenly spaced in the logarithm; linear in the
+logarithm between them. Chosen: twice as many follow finer changes with level than :data:`RANGES`
+allow."""
 
 UNIT = 1e-3
-"""Covariance over the level of a coefficient of 1."""
+"""Covariance over the level [e-^2/e-] of a coefficient of 1. Defined: a unit, which no result depends
+on."""
 
 SIZES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
-"""Tried for the process, in that unit."""
+"""Standard deviations that are tried for the process [:data:`UNIT`]. Chosen, to be
+derived: steps of a factor of 3; a process beyond either end is given the size of that end."""
 
 RANGES = ((0.01, 1.0), (0.01, 3.0), (1.5, 1.0), (1.5, 3.0))
-"""Tried ranges of its correlation: in lags [pixel], and in the logarithm of the level."""
+"""Correlation lengths that are tried: in lags [pixel] (0.01: lags are independent), and in the natural
+logarithm of the level.  Chosen, to be derived: longer ones make the process smoother in lag or level."""
 
 
 def process_choice(scene: Scene) -> Choice | None:
-    """Fit the process by the likelihood of its size and ranges; its mean is one term.
+    """Choose size and correlation lengths by their marginal likelihood; the mean becomes one term.
 
-    Whatever the fit's parameters can do is projected out first: the process takes nothing from
-    them.  The score is twice the logarithm of the likelihood over that without it.
+    What the fit's parameters can change is projected out first, so that the process does not
+    compete with them.  The score is twice the logarithm of the likelihood ratio to no process.
+
+    Returns
+    -------
+    Choice or None
+        The term; None where there are no covariances of flats, or noise explains them as well.
     """
     lags = lag_family(scene)
     if lags is None:

@@ -1,4 +1,4 @@
-"""Free-form models of what flats show against position, and of its power of the level."""
+"""Nonparametric terms of flats against position: columns, rows, boxes, pixel parity and ripples."""
 
 from __future__ import annotations
 
@@ -19,29 +19,39 @@ from bfsensor.diagnose.model.map_shapes import Places
 from bfsensor.typing import FloatArray
 
 POWERS = (0, 1)
-"""Of the level, that relative patterns go with: additive ones go with -1, which few flats tell."""
+"""Powers of the level that relative patterns go with: the same at all levels, or growing with it.
+Chosen: additive patterns (power -1) are left out, for bright flats hardly constrain them."""
 
 OCTAVES = 5
-"""Sizes of strips and boxes, from half of the side on."""
+"""Number of widths of strips, each half of the one before, from half the side on. Chosen: the
+narrowest is 1/32 of the side; more widths lengthen the search, and single columns and rows are terms
+of their own."""
 
 PERIODS = 160
-"""Tried of ripples, evenly in frequency."""
+"""Number of ripple frequencies of the first search, evenly spaced. Chosen, to be derived: the step is
+1.5e-3 cycles per pixel time; with half as many, ripples between two steps may be missed."""
 
 FINE = 61
-"""Tried of each between its neighbours."""
+"""Number of frequencies of the second search, one step to either side.  Chosen: to 1/30 of a step; twice
+as many double its time."""
 
 FINEST, WIDE = 9, 4.0
-"""Tried with all that a ripple does, twice: over so many of those steps to either side, as the
-closed form leaks, and between neighbours of the best."""
+"""Number of frequencies of the last two searches, which use the full prediction, and the half width
+of the first of them [steps of the second search]. Chosen: the approximate prediction of the second
+search leaves power out, so that its best frequency may be off by a few steps; wider costs time
+only."""
 
 SHORTEST, LONGEST = 4.0, 100.0
-"""Period of ripples in readout time [pixel times]."""
+"""Range of ripple periods [pixel times]. Chosen, to be derived: shorter ones alternate between pixels
+like a parity pattern, longer ones are smooth along a row; a wider range raises the threshold for
+all."""
 
 AXES = {"column": "x", "row": "y"}
+"""Axis that columns and rows are counted along."""
 
 
 def share_powers(scene: Scene, p: int) -> dict[tuple[str, str], float]:
-    """By fold and map: how much of a pattern that goes with the level to the power p it has."""
+    """Weight, by (fold, map), of a pattern that goes with the level (in 1e5 e-) to the power p."""
     measured = scene.model.predictor.measured
     gain = float(np.mean(scene.gains)) / SCALE
     return {
@@ -53,9 +63,9 @@ def share_powers(scene: Scene, p: int) -> dict[tuple[str, str], float]:
 def pattern_column(
     change: FloatArray, shares: Mapping[tuple[str, str], float], channel: Channel
 ) -> FloatArray:
-    """What a relative change of flats does to columns, rows, blocks and the chess pattern.
+    """Change of columns, rows, blocks and the chess pattern by a relative change of flats.
 
-    Rings and texture, which go with its square, are left out.
+    Rings and texture, which are quadratic in it, are left out: see :func:`_squared`.
     """
     out = np.zeros(len(channel))
     x = channel.axes
@@ -67,7 +77,7 @@ def pattern_column(
         if not share or not len(rows):
             continue
         axes = {k: v[rows] for k, v in x.items()}
-        # Maps have the same columns, rows and blocks, unless pixels lack.
+        # All maps share their columns, rows and blocks unless pixels are masked: reduce once.
         if found is None or len(found) != len(rows):
             found = reduce_map(change, axes)
         out[rows] = share * found
@@ -75,7 +85,7 @@ def pattern_column(
 
 
 def map_families(scene: Scene) -> list[Family]:
-    """Patterns of columns, rows and boxes; of two-pixel parity; ripples in readout time."""
+    """Families of patterns of columns, rows and boxes, of two-pixel parity, and of readout ripples."""
     if not any(c.word == "flat_map" for c in scene.model.fit.channels):
         return []
     kinds: list[tuple[str, dict[str, Any], dict[tuple[str, str], float]]] = [
@@ -109,9 +119,10 @@ def map_families(scene: Scene) -> list[Family]:
 
 
 def refine_ripple(scene: Scene, term: Term) -> Family:
-    """The ripple of the frequency near one's that fits best, down to what the texture resolves.
+    """Refine a ripple's frequency in three searches of decreasing step.
 
-    One alone: beside it a neighbour would share its amplitude.
+    The family returned holds the best ripple alone: a neighbour in frequency beside it would
+    take part of its amplitude.
     """
     step = (1 / SHORTEST - 1 / LONGEST) / (PERIODS - 1)
     for count, rough, wider in (
@@ -144,7 +155,7 @@ def _pattern(
 def _squared(
     name: str, image: Callable[[], FloatArray], shares: Mapping[tuple[str, str], float]
 ) -> Term:
-    """What a pattern does to rings and texture, which go with its square."""
+    """Term of rings and texture, which are quadratic in a pattern."""
 
     def column(channel: Channel) -> FloatArray | None:
         if channel.word != "flat_map":
@@ -191,7 +202,7 @@ def _parities(
 def _shapes(
     scene: Scene,
 ) -> Iterator[tuple[str, dict[str, Any], tuple[FloatArray, FloatArray], str]]:
-    """Separable shapes: name, where, their values along x and y, and what they are of."""
+    """Separable shapes: name, place, factors along x and y, and kind ('column', 'row' or 'box')."""
     ny, nx = scene.model.predictor.layout.shape
     for what, n in (("column", nx), ("row", ny)):
         axis = AXES[what]
@@ -248,7 +259,7 @@ def _shapes(
 def _places(
     scene: Scene, channel: Channel
 ) -> tuple[Places, NDArray[np.str_], NDArray[np.int64]]:
-    """Where a channel's values belong, names of its maps and which of them each is of; kept."""
+    """Places of a channel's values, names of its maps, and the map of each value; cached."""
 
     def find() -> tuple[Places, NDArray[np.str_], NDArray[np.int64]]:
         places = Places.of(channel.axes, scene.model.predictor.layout.shape)
@@ -263,7 +274,7 @@ def _separable(
     shares: Mapping[tuple[str, str], float],
     channel: Channel,
 ) -> FloatArray | None:
-    """Column of a product of a function of x and one of y, without making the image."""
+    """Column of a pattern that is a product of functions of x and of y, without making the image."""
     if channel.word != "flat_map":
         return None
     places, names, maps = _places(scene, channel)
@@ -273,9 +284,10 @@ def _separable(
 
 
 def _ripple(scene: Scene, frequency: float) -> Term:
-    """Sine of the readout time, the same in all frames; its coefficient is the square of its size.
+    """Sine of the readout time with the same phase in all frames, relative to the signal.
 
-    Relative to the signal: ratios of maps do not show it.
+    Its coefficient is the square of its amplitude [1e-6], as power spectra are quadratic.  Ratios
+    of maps do not contain it.
     """
     return Term(
         f"ripple of {1 / frequency:.4g} pixel times", {"period": 1 / frequency},
@@ -305,7 +317,7 @@ def _ripple_column(scene: Scene, frequency: float, channel: Channel) -> FloatArr
 
 
 def _ripple_rough(scene: Scene, frequency: float, channel: Channel) -> FloatArray | None:
-    """The same in closed form, what leaks into other rings left out."""
+    """Closed form of :func:`_ripple_column`, without the power that leaks into other rings."""
     if channel.word != "flat_map":
         return None
     x = channel.axes

@@ -1,4 +1,4 @@
-"""Free-form models of the mean of flats: by level, in time, by the exposure before."""
+"""Nonparametric terms of the mean of flats: by level, in time, and by the exposure before."""
 
 from __future__ import annotations
 
@@ -14,23 +14,29 @@ from bfsensor.diagnose.explain.terms import SCALE, Family, Scene, Term
 from bfsensor.typing import FloatArray
 
 LEVEL_POWERS = (1, 2, 3, 4)
-"""Of the relative change of the mean with the level."""
+"""Powers of the level in relative changes of the mean. Chosen: up to the fourth; higher ones are so
+alike over a ladder of levels that they are not distinguished."""
 
 CURVES = 5
-"""Highest order of the polynomial in time."""
+"""Highest order of Legendre polynomials in time.  Chosen, to be derived: twice as many follow drifts of
+several turns, which waves describe with fewer terms."""
 
 CYCLES, CYCLE_STEP = 10, 0.25
-"""Most waves over the campaign, and between one number of them that is tried and the next."""
+"""Largest number of waves over the campaign, and step between the numbers that are tried. Chosen, to
+be derived: a wave between two steps is off by at most an eighth of a period at the ends of the
+campaign; with twice the step, by a quarter."""
 
 EIGHTHS = range(4)
-"""Phases of a wave that are tried, in eighths of it: the other half has the other sign."""
+"""Phases of a wave that are tried, in eighths; derived: the other four are the same with the other
+sign."""
 
 PERIODS = 41
-"""Tried of the best wave, from the one before to the one after."""
+"""Number of periods tried around the best wave, one step to either side.  Chosen: to 1/20 of a step;
+twice as many double the time."""
 
 
 def mean_families(scene: Scene) -> list[Family]:
-    """Means of flats, and fluxes of spots: by level, in time, by the exposure before."""
+    """Families of the means of flats: by level, in time, and by the exposure before."""
     flats = [c for c in scene.model.fit.channels if c.word == "flat_mean"]
     if not flats:
         return []
@@ -38,7 +44,7 @@ def mean_families(scene: Scene) -> list[Family]:
     shots = scene.model.predictor.measured.shots
     hours = {s.number: s.hours for s in shots}
     if len(set(hours.values())) < len(hours):
-        # Without times of their own exposures follow one another evenly.
+        # Without times in the headers, exposures are taken to follow one another evenly.
         hours = {s.number: float(n) for n, s in enumerate(shots)}
     if hours:
         terms = tuple(_in_time(flats, hours, len(scene.gains)))
@@ -49,7 +55,7 @@ def mean_families(scene: Scene) -> list[Family]:
 
 
 Times = Callable[[Channel], FloatArray]
-"""Hours since the first flat of all values of a channel."""
+"""Function that gives the hours since the first flat of each value of a channel."""
 
 
 def _relative(
@@ -59,7 +65,7 @@ def _relative(
     *,
     spots: bool = True,
 ) -> Term:
-    """Term that multiplies means of flats, and of spots the flux."""
+    """Term that multiplies the means of flats, and if ``spots`` the fluxes of spots."""
 
     def column(channel: Channel) -> FloatArray | None:
         x = channel.axes
@@ -73,7 +79,7 @@ def _relative(
 
 
 def _by_level(scene: Scene, flats: list[Channel]) -> Iterator[Term]:
-    """Powers of the level, and single levels, of all amplifiers and of each."""
+    """Terms by power of the level and by single level, for all amplifiers and for each."""
     times = np.unique(np.concatenate([c.axes["time"] for c in flats]))
 
     def own(channel: Channel, amp: int | None) -> FloatArray:
@@ -103,7 +109,7 @@ def _by_level(scene: Scene, flats: list[Channel]) -> Iterator[Term]:
 
 
 def _amplifiers(scene: Scene) -> list[tuple[int | None, str]]:
-    """All amplifiers together, and each."""
+    """All amplifiers together (None), and each by its index from 0; labels count from 1."""
     count = len(scene.gains)
     each = [(n, f", amplifier {n + 1}") for n in range(count)] if count > 1 else []
     return [(None, ""), *each]
@@ -116,7 +122,7 @@ def _in_time(flats: list[Channel], hours: dict[int, float], count: int) -> Itera
     span = max(last - first, 1e-9)
 
     def at(channel: Channel) -> FloatArray:
-        # Of exposures that were not taken nothing is known: the campaign's middle.
+        # Planned exposures have no time: they are put at the middle of the campaign.
         there = [hours.get(int(n), first + span / 2) for n in channel.axes["exposure"]]
         return np.array(there) - first
 
@@ -141,7 +147,7 @@ def _in_time(flats: list[Channel], hours: dict[int, float], count: int) -> Itera
 
 
 def _wave(at: Times, span: float, period: float, phase: float) -> Term:
-    """One wave of the mean, as a cosine from the first flat on."""
+    """Cosine of the time since the first flat, with a period [h] and a phase [rad]."""
 
     def change(c: Channel) -> FloatArray:
         return np.asarray(np.cos(2 * np.pi * at(c) / period - phase))
@@ -152,9 +158,9 @@ def _wave(at: Times, span: float, period: float, phase: float) -> Term:
 
 
 def refine_wave(choice: Choice, scene: Scene) -> Choice:
-    """Choose again with the period and the phase that fit best in place of the first wave.
+    """Choose again with the best period and phase in place of the first wave.
 
-    What is left of its phase is a coefficient of its own.
+    A second coefficient, a quarter of a period later, takes up the rest of the phase.
     """
     first = choice.terms[0]
     if "wave" not in first.where:
@@ -183,9 +189,9 @@ def refine_wave(choice: Choice, scene: Scene) -> Choice:
 
 
 def _after_exposure(scene: Scene) -> Iterator[Term]:
-    """Powers of the mean level of the exposure before; what that was where one is missing."""
+    """Terms by power of the mean level of the exposure before; one more for missing exposures."""
     measured = scene.model.predictor.measured
-    # Levels of exposures are by rough gains.
+    # Levels of exposures were calculated with rough gains: scale them to the fitted ones.
     scale = float(np.mean(scene.gains) / np.mean(measured.gains))
     before: dict[int, float] = {}
     known: dict[int, bool] = {}

@@ -1,4 +1,4 @@
-"""Free-form models of what no effect of the library explains."""
+"""Nonparametric models of a mismatch that no effect of the library explains."""
 
 from __future__ import annotations
 
@@ -26,23 +26,27 @@ from bfsensor.files import Cache
 from bfsensor.typing import FloatArray
 
 MOST_GROUPS = 3
-"""Free-form models that are put together."""
+"""Largest number of groups of terms in one model.  Chosen, to be derived: twice as many describe more
+independent causes and take twice as long; campaigns with one cause need one or two."""
 
 SHORTLIST = 8
-"""Terms of the shifts that are looked at in spots as well."""
+"""Number of terms of boundary shifts whose exact change of spots is calculated after a search in flats
+alone.  Chosen: twice as many double the time, and terms that rank ninth are hardly chosen."""
 
 PREFIX = "free "
-"""Of the names of coefficients among the fit's parameters."""
+"""Prefix of the coefficients' names among the fit's parameters."""
 
 FILTER = "readout filter"
+"""Group of echoes in readout order."""
+
 WITH_TESTS = (
     "boundary shifts", "odd boundary shifts", "covariances by lag",
     "smooth covariances over lag and level",
 )  # fmt: skip
-"""Groups that are held against what physics asks of shifts."""
+"""Groups for which the physical constraints on boundary shifts are tested."""
 
 HIDDEN = ("edges", "wave")
-"""What terms keep to be made again."""
+"""Keys of a term's ``where`` that hold arrays or functions, which the report leaves out."""
 
 By = dict[str, tuple[float, float, int]]
 """Chi-square before and after, and number of values, by channel."""
@@ -50,16 +54,16 @@ By = dict[str, tuple[float, float, int]]
 
 @dataclass(frozen=True, eq=False)
 class Coefficient:
-    """One number of a free-form model.
+    """One fitted coefficient of a nonparametric model.
 
     Attributes
     ----------
     name : str
-        Of its term.
+        Name of its term.
     value, error : float
-        In the unit of the term: see the module of its group.
+        Value and standard error, in the unit of the term: see the module of its group.
     where : mapping
-        What the term stands for.
+        Numbers that define the term, such as 'lags', 'power' or 'period'.
     """
 
     name: str
@@ -70,29 +74,29 @@ class Coefficient:
 
 @dataclass(frozen=True, eq=False)
 class OpenWorld:
-    """A free-form model of what is outside the library.
+    """A nonparametric model of a mismatch outside the library.
 
     Attributes
     ----------
     groups : tuple of str
-        Which of the models were needed, the one that explains most first.
+        Groups of terms that were needed, the one that explains most first.
     coefficients : tuple of Coefficient
-        Refitted together with all else, without any penalty.
+        Coefficients, refitted together with all other parameters without a penalty.
     by_group : mapping of str to tuple of str
         Names of each group's coefficients.
     folds : mapping of str to dict
         By fold ('fit', 'select', 'held-out'): chi-square before and after, and number of
-        values, by channel; before is without the free-form model.
+        values, by channel; 'before' is without the nonparametric terms.
     scores : mapping of str to float
-        Of the groups that competed: decrease of the chi-square less what chance gives.
+        By group that competed: decrease of the chi-square less what chance gives.
     tests : mapping of str to mapping
-        Constraints: 'p_value', and 'value' with 'error' where there is one.
+        Results of :func:`~bfsensor.diagnose.explain.shift_constraints.test_constraints`.
     nearest : tuple of (str, float)
-        Candidates of the library with the angle [degrees] between what they and this change.
+        Candidates of the library with the angle [degrees] between their template and the terms'.
     alike : mapping of str to tuple of (str, float)
-        By group: terms that explain as much in the place of its first, with their coefficients.
+        By group: terms that explain as much in place of its first, with their coefficients.
     mismatch : Mismatch
-        What is left with it.
+        Residuals with the model that stand out.
     """
 
     groups: tuple[str, ...]
@@ -107,7 +111,7 @@ class OpenWorld:
 
     @property
     def group(self) -> str:
-        """The one that explains most."""
+        """Group that explains most."""
         return self.groups[0]
 
     def of_group(self, group: str) -> list[Coefficient]:
@@ -116,7 +120,7 @@ class OpenWorld:
         return [c for c in self.coefficients if c.name in names]
 
     def chi2dof(self, fold: str = "held-out") -> tuple[float, float]:
-        """Chi-square per value of a fold, before and after; nan where it is empty."""
+        """Chi-square per value of a fold, without and with the terms; nan where the fold is empty."""
         held = self.folds.get(fold, {})
         n = sum(v[2] for v in held.values())
         if not n:
@@ -132,26 +136,26 @@ def explain_outside(
     free: FreeFit | None = None,
     seed: int = 1,
 ) -> tuple[OpenWorld, Model] | None:
-    """Model freely what nothing of the library explains; None where no free form does.
+    """Describe a mismatch outside the library by nonparametric terms.
 
     Parameters
     ----------
     base : Model
-        With those effects that stay.
+        Model with the effects that stay.
     mismatch : Mismatch
-        What it leaves.
+        Its residuals that stand out.
     rivals : sequence of Rival
-        Candidates of the library, screened against the same fit, for the nearest of them.
+        Candidates of the library, screened against the same fit, to list the most similar ones.
     free : FreeFit, optional
-        Of the same, if it is there already.
+        Result of :func:`fit_free_form` for this model, if it was calculated before.
     seed : int
-        Of the noise that p-values come from.
+        Seed of the noise draws that p-values come from.
 
     Returns
     -------
-    OpenWorld
-    Model
-        With it.
+    OpenWorld, Model
+        The description, and the model with its terms; None in place of both where no group
+        of terms explains the mismatch.
     """
     free = fit_free_form(base, mismatch, seed=seed) if free is None else free
     if not free.choices:
@@ -169,7 +173,7 @@ def explain_outside(
                 continue
             value, error = (float(v) for v in values[PREFIX + term.name])
             if choice.family.group == FILTER:
-                # Coefficients are fitted at the gains that came out.
+                # Columns hold the gains fixed at their fitted values: add the gains' error.
                 error = float(np.hypot(error, abs(value) * relative))
             coefficients.append(Coefficient(term.name, value, error, _plain(term.where)))
             names.append(term.name)
@@ -196,7 +200,7 @@ def explain_outside(
 
 
 def _gain_error(fit: BaselineFit) -> float:
-    """Relative error of the gains."""
+    """Mean relative error of the fitted gains."""
     own = [
         e / v
         for n, v, e in zip(fit.names, fit.values, fit.errors, strict=True)
@@ -206,7 +210,7 @@ def _gain_error(fit: BaselineFit) -> float:
 
 
 def _plain(where: Mapping[str, Any]) -> dict[str, Any]:
-    """What a report can hold: without kernels."""
+    """Copy of ``where`` without arrays and functions, for the report."""
     return {
         k: v for k, v in where.items() if not isinstance(v, np.ndarray) and k not in HIDDEN
     }
@@ -214,7 +218,7 @@ def _plain(where: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class FreeFit:
-    """A model with the columns of free-form terms, and how they were found."""
+    """A model with the columns of nonparametric terms, and the choices that led to them."""
 
     model: Model
     choices: tuple[Choice, ...]
@@ -224,7 +228,7 @@ class FreeFit:
 
     @property
     def penalty(self) -> float:
-        """What chance would have given: chi-square that does not count as explained."""
+        """Chi-square that chance gives terms chosen from as many; it is not counted as explained."""
         gain = sum(z * z for c in self.choices for z in c.z)
         return float(gain - sum(c.score for c in self.choices))
 
@@ -232,18 +236,19 @@ class FreeFit:
 def fit_free_form(
     model: Model, mismatch: Mismatch, *, before: BaselineFit | None = None, seed: int = 1
 ) -> FreeFit:
-    """Choose the free-form model that explains most, refit all, and so on while something counts.
+    """Add the group of terms that explains most, refit everything, and repeat while residuals stand out.
 
     Parameters
     ----------
     model : Model
-        With effects that stay, or without.
+        Model with or without effects.
     mismatch : Mismatch
-        What it leaves.
+        Its residuals that stand out.
     before : BaselineFit, optional
-        Without effects: of what these explain a small part may be left; by default the model's.
+        Fit without the effects; residuals within the error of the effects' predictions do not
+        count, and that error is relative to what they explain.  By default the model's own fit.
     seed : int
-        Of the noise that p-values come from.
+        Seed of the noise draws that p-values come from.
     """
     before = model.fit if before is None else before
     choices: list[Choice] = []
@@ -271,7 +276,7 @@ def fit_free_form(
 
 
 class Columns:
-    """Columns of terms as the predictor takes them; each is made once a channel."""
+    """Columns of terms in the form that a predictor takes; each is calculated once per channel."""
 
     def __init__(self, terms: Sequence[Term]) -> None:
         self.terms = tuple(each for t in terms for each in (t, *t.more))
@@ -287,7 +292,7 @@ class Columns:
 
 
 def compete(scene: Scene, mismatch: Mismatch) -> list[Choice]:
-    """Choices of all families that what is left concerns, the best first."""
+    """Choices of all families that change a channel with findings, the best score first."""
     words = {f.word for f in mismatch.findings}
     fit = scene.model.fit
     out: list[Choice] = []
@@ -311,7 +316,7 @@ def compete(scene: Scene, mismatch: Mismatch) -> list[Choice]:
 
 
 def _families(scene: Scene, words: set[str]) -> list[Family]:
-    """Families that see any of the channels that stand out."""
+    """Families of terms that change any of the channels that stand out."""
     out: list[Family] = []
     if words & {"flat_cov", "spot"}:
         out += kernel_families(scene, spots="spot" in words)
@@ -329,7 +334,7 @@ def _families(scene: Scene, words: set[str]) -> list[Family]:
 
 
 def _with_spots(choice: Choice, fit: BaselineFit) -> Choice | None:
-    """Choose again among the nearest terms, spots in view."""
+    """Choose again among the most significant terms, with spots; None without spots."""
     if not any(c.word == "spot" for c in fit.channels):
         return None
     rough = Dictionary(choice.family, fit)
@@ -344,7 +349,7 @@ def _with_spots(choice: Choice, fit: BaselineFit) -> Choice | None:
 
 
 def nearest_of(template: FloatArray, rivals: Sequence[Rival]) -> list[tuple[str, float]]:
-    """Angles [degrees] between a template and those of candidates, nearest first."""
+    """Angles [degrees] between a whitened template and those of candidates, the smallest first."""
     out = []
     for rival in rivals:
         if rival.template.shape != template.shape:
@@ -357,7 +362,7 @@ def nearest_of(template: FloatArray, rivals: Sequence[Rival]) -> list[tuple[str,
 
 
 def compare_folds(before: Model, after: Model) -> dict[str, By]:
-    """Chi-squares before and after by fold and channel."""
+    """Chi-squares of two models by fold and channel: (before, after, number of values)."""
     out: dict[str, By] = {"held-out": compare_held_out(before, after)}
     for n, channel in enumerate(after.fit.channels):
         rows = slice(int(after.fit.starts[n]), int(after.fit.starts[n + 1]))

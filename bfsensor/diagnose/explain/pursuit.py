@@ -1,4 +1,4 @@
-"""Search for the few terms of a free-form model that explain what a fit leaves."""
+"""Matching pursuit: choose the few nonparametric terms of a family that explain a fit's residuals."""
 
 from __future__ import annotations
 
@@ -15,46 +15,53 @@ from bfsensor.errors import ConvergenceError
 from bfsensor.typing import FloatArray
 
 MOST_TERMS = 6
-"""Terms of one family."""
+"""Largest number of terms of one family. Chosen, to be derived: twice as many fit finer detail, which
+the select fold mostly refuses."""
 
 ACCURACY = 0.02
-"""Deviate, relative to the first term's, below which a term counts as what its column, which is
-good to about a per cent, has left over."""
+"""Deviate relative to the first term's below which a term counts as an error of the first one's column.
+Chosen, to be derived: twice the error of about 1 % that columns have; twice as large, real terms of 2 to
+4 % of the first are lost."""
 
 SPANNED = 1e-3
-"""Part of a column's square that the fit's parameters must leave for it to be a term."""
+"""Least part of a column's square that the fit's parameters do not span; columns below are no terms.
+Chosen: such a column differs from a combination of parameters by 3 % of its norm; twice as large
+removes the terms that are hardest to separate from gains and light."""
 
 SAME = 6.0
-"""Increase of the chi-square up to which another term in the first one's place explains as much:
-three in the logarithm of the likelihood."""
+"""Difference of the chi-square up to which another term in the first one's place is listed as explaining
+as much.  Chosen, to be derived: 3 in the log-likelihood, a ratio of 20; twice as large, of 400."""
 
 MOST_ALIKE = 3
-"""Such terms that are told."""
+"""Largest number of terms that are listed as explaining as much.  Chosen: length of the report only."""
 
 VISIBLE = 0.05
-"""Part of a template's square in the select fold from which on that fold judges."""
+"""Least part of the first template's square in the select fold for that fold to decide how many terms
+are kept. Chosen, to be derived: below it noise would decide; twice as large, more choices go
+unchecked."""
 
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """Terms of a family that explain a remainder.
+    """Terms of a family that explain a fit's residuals.
 
     Attributes
     ----------
     family : Family
+        Family that the terms were chosen from.
     terms : tuple of Term
-        Most important first.
+        Chosen terms, the most significant first.
     z : tuple of float
-        Deviate of each, those before it taken off.
+        Deviate [standard deviations] of each term, the terms before it projected out.
     score : float
         Decrease of the chi-square less what chance gives the best of as many terms.
     select : float
-        Decrease of the chi-square of the select fold, coefficients from the others; nan where it
-        does not see them.
+        Decrease of the select fold's chi-square, with coefficients from the other folds; nan
+        where that fold does not constrain the terms.
     template : ndarray
-        What they change together, whitened, the fit's parameters projected out.
+        Whitened change by all terms together, the fit's parameters projected out.
     alike : tuple of (Term, float)
-        Others that explain as much in the first one's place, with their coefficients there.
+        Terms that explain as much in the first one's place, with their coefficients there.
     """
 
     family: Family
@@ -67,13 +74,14 @@ class Choice:
 
 
 class Dictionary:
-    """Columns of a family, whitened, and what the fit's parameters take of them.
+    """Whitened columns of a family's terms, and their projections onto the fit's parameters.
 
     Parameters
     ----------
     family : Family
+        Terms to choose from.
     fit : BaselineFit
-        Whose remainder is to be explained.
+        Fit whose residuals are to be explained.
     """
 
     def __init__(self, family: Family, fit: BaselineFit) -> None:
@@ -89,7 +97,7 @@ class Dictionary:
                 try:
                     found = (term.rough or term.column)(channel)
                 except ConvergenceError:
-                    # Where so much changes that spots have no shape it is no explanation.
+                    # A unit coefficient that destroys the spots' shapes makes no usable column.
                     found, usable[n] = None, False
                 if found is not None:
                     columns[:, n] = found
@@ -107,27 +115,29 @@ class Dictionary:
 
     @property
     def critical(self) -> float:
-        """Square of the deviate that noise gives the best of all terms once in a hundred times."""
+        """Square of the deviate that noise gives the best of all terms with probability ALARM."""
         count = max(int((self.free > 0).sum()), self.family.tried, 1)
         return float(chi2.isf(ALARM / count, 1))
 
     def products(self, left: FloatArray) -> FloatArray:
-        """Of all columns with a remainder."""
+        """Scalar products of all columns with whitened residuals."""
         return np.asarray(self.x.T @ left[self.rows])
 
     def template(self, n: int) -> FloatArray:
-        """Column, the fit's parameters projected out, priors' rows included."""
+        """Column with the fit's parameters projected out, rows of the priors included."""
         out = -self.fit.basis @ self.u[:, n]
         out[self.rows] += self.x[:, n]
         return np.asarray(out)
 
     def pursue(self, *, positive: bool = False) -> list[tuple[int, float]]:
-        """Take the farthest term, project it out of all, and so on: places and deviates."""
+        """Take the term of largest deviate, project it out of the others, and repeat."""
         b, free = self.products(self.fit.left), self.free.copy()
         first = free.copy()
         taken: list[FloatArray] = []
         path: list[tuple[int, float]] = []
         while len(path) < MOST_TERMS:
+            # A term of which earlier ones span more than 98 % (chosen) would have a coefficient
+            # dominated by their errors.
             open_ = (free > 0.02 * first) & (free > 0)
             z = np.where(open_, b / np.sqrt(np.where(open_, free, 1.0)), 0.0)
             size = z if positive else np.abs(z)
@@ -147,7 +157,7 @@ class Dictionary:
         return path
 
     def _farthest(self, size: FloatArray) -> int:
-        """Place of the largest deviate; of a simple term's, if that explains as much."""
+        """Index of the largest deviate, or of the best simple term if that explains as much."""
         if not len(size):
             return 0
         best = int(np.argmax(size))
@@ -156,11 +166,11 @@ class Dictionary:
         return n if size[n] ** 2 > size[best] ** 2 - self._same(size[best]) else best
 
     def _same(self, z: float) -> float:
-        """Difference of chi-squares that tells no two terms apart: by chance, or by inaccuracy."""
+        """Difference of chi-squares that does not separate two terms, by chance or errors of columns."""
         return SAME + (ACCURACY * z) ** 2
 
     def alike(self, n: int, *, positive: bool = False) -> tuple[tuple[Term, float], ...]:
-        """Other terms that explain as much alone as a term does, with their coefficients."""
+        """Other terms that alone explain as much as a given one, with their coefficients."""
         b = self.products(self.fit.left)
         z = np.where(
             self.free > 0, b / np.sqrt(np.where(self.free > 0, self.free, 1.0)), 0.0
@@ -173,7 +183,18 @@ class Dictionary:
         )
 
     def choose(self, *, positive: bool = False) -> Choice | None:
-        """Choose terms: as many of those that noise does not reach as the select fold agrees to."""
+        """Choose the terms beyond noise, as many as lower the select fold's chi-square most.
+
+        Parameters
+        ----------
+        positive : bool
+            Whether coefficients must be positive.
+
+        Returns
+        -------
+        Choice or None
+            None where no term is beyond noise, or the select fold's chi-square would rise.
+        """
         path = self.pursue(positive=positive)
         if not path:
             return None
@@ -197,7 +218,7 @@ class Dictionary:
         )  # fmt: skip
 
     def gains(self) -> tuple[float, int]:
-        """Decrease of the chi-square with all terms together, and how many are free."""
+        """Decrease of the chi-square with all terms together, and the number of independent ones."""
         use = np.nonzero(self.free > 0)[0]
         if not len(use):
             return 0.0, 0
@@ -215,7 +236,7 @@ class Dictionary:
         return out
 
     def _gain(self, templates: FloatArray, own: NDArray[np.bool_]) -> float:
-        """Decrease of the select fold's chi-square, coefficients from the others."""
+        """Decrease of the select fold's chi-square, with coefficients from the other folds."""
         left = self.fit.left
         c = np.linalg.lstsq(templates[~own], left[~own], rcond=None)[0]
         after = left[own] - templates[own] @ c

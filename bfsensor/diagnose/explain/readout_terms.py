@@ -1,4 +1,4 @@
-"""Free-form model of the readout: a linear response to earlier pixels, of either power of them."""
+"""Nonparametric terms of the readout: echoes of earlier pixels, linear or quadratic in their signal."""
 
 from __future__ import annotations
 
@@ -15,26 +15,30 @@ from bfsensor.effects.effect import Effect, Layout, Parameter
 from bfsensor.typing import FloatArray
 
 LAGS = 64
-"""Farthest pixel back."""
+"""Largest delay of an echo [pixel times].  Chosen, to be derived: twice as large doubles the search and
+raises the threshold of each delay; overscans of fewer pixels do not constrain long ones."""
 
 POWERS = (1, 2)
-"""Of the earlier pixel's signal."""
+"""Powers of the earlier pixel's signal.  Chosen: linear, and the first correction to it."""
 
 NEAR_SPOTS = (4, 16)
-"""Lags that put a trace where crosstalk is measured, beside an amplifier's own spots [pixel]."""
+"""Range of delays [pixel times] whose echo of an amplifier's own spots falls on pixels where
+crosstalk is measured. Chosen, to be derived: outside it the two do not overlap; a wider range adds
+free parameters to each term and weakens crosstalk as a constraint."""
 
 STEP = 1e-4
-"""Of the derivatives of spots."""
+"""Coefficient of an echo by which derivatives of spots are taken. Chosen: the response is linear in
+it, so that twice as large changes derivatives by errors of the spots' fit alone."""
 
 
 def filter_family(scene: Scene) -> Family | None:
-    """Response h_n S^p of the pixel n pixel times later.
+    """Make the family of echoes: a signal S adds h_n S^p to the pixel read n pixel times later.
 
-    Seen behind the light, in the overscan, as a step that ends n pixels in; in the first n
-    columns, which lack it; in covariances along the row at the lag n; in the mean (p = 2); in
-    spots.  Amplifiers that read from the other side are mirrored.
+    An echo shows in the overscan as a step that ends n pixels in, in the first n columns, which
+    lack it, in covariances along the row at lag n, in the mean (p = 2) and in spots.  It is
+    mirrored in amplifiers that read from the other side.  None without overscans and covariances.
     """
-    # Area changes know no level that a response could go with.
+    # Area changes per electron have no level that an echo could be calculated from.
     words = {c.word for c in scene.model.fit.channels if c.unit != PER_ELECTRON}
     if not words & {"serial_overscan", "flat_cov"}:
         return None
@@ -50,9 +54,10 @@ def filter_family(scene: Scene) -> Family | None:
 
 
 def _beside_spots(scene: Scene, n: int, p: int) -> Iterator[Term]:
-    """What stands beside an amplifier's own spots is taken for crosstalk of another's.
+    """Terms for echoes of an amplifier's own spots that are measured as crosstalk.
 
-    How much depends on where spots lie, which the channel does not say: free for each pair.
+    Their size depends on the places of the spots, which the channel does not hold, so that each
+    pair of amplifiers has a free coefficient.
     """
     if not NEAR_SPOTS[0] <= n <= NEAR_SPOTS[1]:
         return
@@ -90,7 +95,7 @@ def _column(
 
 
 def _answer(level: FloatArray, p: int) -> FloatArray:
-    """Response of a coefficient of 1 to a signal [e-]: S, or S^2 at 1e5 e-."""
+    """Echo [e-] of a signal S [e-] for a coefficient of 1: S, or S^2 / 1e5 e-."""
     return np.asarray(level * (level / SCALE) ** (p - 1))
 
 
@@ -99,7 +104,7 @@ def _overscan(scene: Scene, n: int, p: int, channel: Channel) -> FloatArray:
     amp = x["amp"].astype(int)
     gain = scene.gains[amp]
     head = int(x["k"].max())
-    # The last pixels are the profile's zero.
+    # The mean of the last TAIL pixels is subtracted from every profile as its zero.
     zero = np.mean(np.arange(head + 1, head + TAIL + 1) <= n)
     columns = np.array([s.columns for s in scene.model.predictor.layout.segments])[amp]
     lit = (x["k"] <= n) & (n - x["k"] < columns)
@@ -111,7 +116,7 @@ def _means(scene: Scene, n: int, p: int, channel: Channel) -> FloatArray:
     amp = x["amp"].astype(int)
     gain = scene.gains[amp]
     segments = scene.model.predictor.layout.segments
-    # Of the mean the first n columns get nothing; the overscan's second half is its zero.
+    # The first n columns have no echo, and the overscan's second half is subtracted as the zero.
     share = np.array([
         max(s.columns - n, 0) / s.columns - _of_zero(n, s.serial_overscan) for s in segments
     ])  # fmt: skip
@@ -119,7 +124,7 @@ def _means(scene: Scene, n: int, p: int, channel: Channel) -> FloatArray:
 
 
 def _of_zero(n: int, depth: int) -> float:
-    """Part of an overscan's second half, the zero of a frame, that the response reaches."""
+    """Fraction of an overscan's second half, the zero of a frame, that the echo reaches."""
     return float(np.mean(np.arange(depth // 2, depth) < n)) if depth else 0.0
 
 
@@ -131,7 +136,7 @@ def _covariances(scene: Scene, n: int, p: int, channel: Channel) -> FloatArray:
         if n >= flats.c.shape[-1] // 2:
             continue
         slope = p * (flats.level / SCALE) ** (p - 1)
-        # A pixel and the one n before: C(i - n) + C(i + n), rows apart by j.
+        # An echo of the pixel n before adds h (C(i - n) + C(i + n)) at lag (i, j).
         both = np.roll(flats.c, n, -1) + np.roll(flats.c, -n, -1)
         changed = slope[:, None, None] * both / flats.gain[:, None, None] ** 2
         out[flats.rows] = at_lags(changed, flats.flat, i[flats.rows], j[flats.rows])
@@ -150,7 +155,7 @@ def _maps(scene: Scene, n: int, p: int, channel: Channel) -> FloatArray:
 
 
 class _Echo(Effect):
-    """The response in spots: widths and wings are what a fit makes of the images."""
+    """Echo in images of spots, whose widths and wings the fit then measures as in recordings."""
 
     word = "readout_filter"
     parameters = (
@@ -177,5 +182,5 @@ class _Echo(Effect):
 
 
 def _spots(scene: Scene, n: int, p: int, channel: Channel) -> FloatArray:
-    """By a small step; amplifiers that read from either side are averaged."""
+    """Derivative of spots by a small echo; amplifiers that read from either side are averaged."""
     return scene.changed_by(_Echo({"h": STEP, "lag": n, "power": p}), channel) / STEP

@@ -1,4 +1,4 @@
-"""Tests of what physics asks of boundary shifts: none is imposed, each is given with its p-value."""
+"""Tests of physical constraints on boundary shifts, such as charge conservation, with their p-values."""
 
 from __future__ import annotations
 
@@ -18,31 +18,37 @@ from bfsensor.response.edge_response import area_matrix
 from bfsensor.typing import FloatArray
 
 LOSS = 1e-8
-"""Charge lost per electron [1/e-] of a coefficient of 1."""
+"""Charge lost per stored electron [1/e-] of a coefficient of 1.  Defined: a unit."""
 
 Test = Mapping[str, float]
+"""Result of a test: 'p_value', and 'value', 'error', 'chi2', 'dof' where they are known."""
 
 
 def test_constraints(model: Model, terms: Mapping[Term, float]) -> dict[str, Test]:
-    """Hold a model of covariances or shifts against conservation, symmetry and decay.
+    """Test a nonparametric model of covariances or shifts for conservation, symmetry and decay.
+
+    No constraint is imposed on the model; each is tested.
 
     Parameters
     ----------
     model : Model
-        With the terms, fitted.
+        Model with the terms, fitted.
     terms : mapping of Term to float
-        With their coefficients.
+        Terms with their coefficients.
 
     Returns
     -------
     dict of str to mapping
-        Each with 'p_value', that the constraint holds; 'value' and 'error' where one number
-        says how far off it is.  'sum rule': charge lost per electron besides the shifts, or
-        the sum of single lags' covariances over what is there at one lag; 'even in x', 'even
-        in y': a part of the shifts, of the baseline's shape, to one side, which spots' skewness
-        alone sees; 'reciprocity': both together, a at one lag and at its opposite; 'x and y
-        alike': added area changes against their transposes; 'decay': power r^-p of the
-        added area changes.
+        By constraint: 'p_value' of the data if it holds; 'value' and 'error' of its violation
+        where that is one number.
+
+        - 'sum rule': charge lost per electron besides the shifts, or the sum of the added
+          covariances of single lags over the root of their sum of squares.
+        - 'even in x', 'even in y': shifts to one side, as a fraction of the baseline's, which
+          only the skewness of spots constrains.
+        - 'reciprocity': both together; the area change at a lag equals that at its opposite.
+        - 'x and y alike': added shifts along x against those along y.
+        - 'decay': power p of r^-p with which added area changes fall off; no p-value.
     """
     scene = Scene(model)
     words = {c.word for c in model.fit.channels}
@@ -76,7 +82,7 @@ def test_constraints(model: Model, terms: Mapping[Term, float]) -> dict[str, Tes
 
 
 def _amplitude(scene: Scene, term: Term, words: tuple[str, ...]) -> dict[str, float]:
-    """Amplitude of one more term, and that it is nothing."""
+    """Amplitude of one more term, and the p-value of its being 0."""
     d = Dictionary(Family("test", (term,), words), scene.model.fit)
     if not d.free[0] > 0:
         return {"p_value": 1.0, "chi2": 0.0, "dof": 0.0}
@@ -89,7 +95,7 @@ def _amplitude(scene: Scene, term: Term, words: tuple[str, ...]) -> dict[str, fl
 
 
 def _fitted(model: Model, terms: list[Term]) -> dict[str, float]:
-    """That some coefficients of a fit are nothing."""
+    """Test that given coefficients of a fit are 0."""
     names = list(model.fit.names)
     rows = [names.index(f"free {t.name}") for t in terms]
     values = model.fit.values[rows]
@@ -107,7 +113,7 @@ def _fitted(model: Model, terms: list[Term]) -> dict[str, float]:
 
 
 def _loss(scene: Scene) -> dict[str, float] | None:
-    """Charge lost in proportion to what is there, seen by covariances alone."""
+    """Test for charge lost in proportion to the stored charge, by covariances alone."""
 
     def column(channel: Channel) -> FloatArray | None:
         if channel.word != "flat_cov" or channel.unit == PER_ELECTRON:
@@ -127,7 +133,7 @@ def _loss(scene: Scene) -> dict[str, float] | None:
 
 
 def _sum_over_lags(model: Model, terms: Mapping[Term, float]) -> dict[str, float]:
-    """Sum of the added covariances at 1e5 e-, lags and their reflections, over their length."""
+    """Test that the added covariances at 1e5 e- sum to 0 over lags and their reflections."""
     names = list(model.fit.names)
     rows, weights = [], []
     for term in terms:
@@ -145,7 +151,7 @@ def _sum_over_lags(model: Model, terms: Mapping[Term, float]) -> dict[str, float
 
 
 def _alike(model: Model, terms: Mapping[Term, float]) -> dict[str, float]:
-    """That the fitted shifts are the same along x and along y."""
+    """Test that the fitted shifts are the same along x and along y."""
     names = list(model.fit.names)
     keys: dict[tuple[Any, ...], dict[int, float]] = {}
     for term in terms:
@@ -157,7 +163,7 @@ def _alike(model: Model, terms: Mapping[Term, float]) -> dict[str, float]:
     rows = sorted({r for parts in keys.values() for r in parts})
     if not rows:
         return {"p_value": 1.0, "chi2": 0.0, "dof": 0.0}
-    # Differences of x and y, edge by edge; an edge that one axis alone has counts as such.
+    # Differences of x and y, edge by edge; an edge fitted along one axis only differs by itself.
     matrix = np.array([[parts.get(r, 0.0) for r in rows] for parts in keys.values()])
     difference = matrix @ model.fit.values[rows]
     covariance = matrix @ model.fit.covariance[np.ix_(rows, rows)] @ matrix.T
@@ -170,7 +176,7 @@ def _alike(model: Model, terms: Mapping[Term, float]) -> dict[str, float]:
 
 
 def _decay(a: FloatArray) -> dict[str, float] | None:
-    """Power of the distance that area changes fall off with, from three lags on."""
+    """Power of the distance with which area changes fall off; None with fewer than three distances."""
     centre = a.shape[0] // 2
     y, x = np.indices(a.shape) - centre
     r = np.hypot(x, y)

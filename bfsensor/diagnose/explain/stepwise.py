@@ -1,4 +1,4 @@
-"""Attribution: which effects explain a mismatch, which others would, and how well."""
+"""Stepwise attribution: add effects while they explain a baseline's residuals, then compare each."""
 
 from __future__ import annotations
 
@@ -54,33 +54,36 @@ from bfsensor.effects.effect import Effect
 from bfsensor.errors import ConvergenceError
 
 MOST = 4
-"""Effects that are looked for at once."""
+"""Largest number of effects that are added one after another; a mismatch beyond is left over.
+Chosen, to be derived: twice as many double the longest search, and change only campaigns with five or
+more effects."""
 
 WEAK = 6.0
-"""Increase of the chi-square when it is left out, below which an effect is dropped again."""
-
-REMAINDER = 0.02
-"""Part of the chi-square that effects explain up to which what is left is laid to their closed
-forms: seven standard deviations of fifty."""
+"""Increase of the chi-square when an effect is left out, below which it is removed again; also the
+least gain of candidates that are tried although noise may reach it.  Chosen, to be derived: one
+parameter gains 6 by chance with a probability of 1.4 %; at 12 (0.05 %) more faint effects are missed."""
 
 FAINT = 2
-"""Candidates below the threshold that are tried."""
+"""Number of candidates below the noise threshold that are fitted where none is above it.  Chosen, to be
+derived: twice as many cost two more fits and find faint effects whose templates rank third or fourth."""
 
 NEEDED = 0.5
-"""Part of what an effect explains by itself that it must explain beside a free form to be named."""
+"""Least ratio of an effect's gain in chi-square beside nonparametric terms to its gain alone.
+Chosen, to be derived: at 1 an effect is kept only if no term takes any part of its gain; at a quarter,
+effects are named that mostly imitate the unmodelled cause."""
 
 FAR_BETTER = 8.0
-"""Chi-square by which one free form must explain more than effects that leave nothing, each charged
-with what chance gives, before these are not believed: likelihoods as 1 to 55."""
+"""Chi-square by which one group of nonparametric terms must explain more than the effects, after both
+are charged with what chance gives, to replace them. Chosen, to be derived: a likelihood ratio of
+exp(4) = 55; twice as large asks for 3,000, and wrong effects that leave nothing are named more
+often."""
 
 TAKEN = 9.0
-"""Chi-square that a parameter of an effect takes by chance, as the best of a library."""
-
-FOLDS = ("fit", "select")
-
+"""Chi-square that each fitted parameter of an effect is charged with, as it is the best of many
+candidates.  Chosen, to be derived: twice as large replaces more effects by nonparametric terms."""
 
 WIDTHS = [WIDENED * w for w in LEVELS.values()]
-"""Roots of the rises of the chi-square that intervals end at."""
+"""Square roots of the rises of the chi-square at which intervals end, 68 % and 95 %."""
 
 
 def attribute(
@@ -91,28 +94,37 @@ def attribute(
     kinds: Sequence[type[Effect]] | None = None,
     seed: int = 1,
 ) -> Attribution:
-    """Say which effects explain what a baseline leaves.
+    """Find the effects that explain the residuals of a baseline.
 
-    Forward steps: the candidate with the greatest evidence among those whose gain noise does not
-    reach (:data:`~bfsensor.diagnose.detect.locate.ALARM`, the largest of all candidates), if the fold
-    that selects agrees; a full refit; scans of what is then left; again, until nothing stands
-    out.  Then each effect is taken out once and held against all others in its place: a better
-    one replaces it, those as good are its class.
+    Forward steps: take the candidate with the greatest evidence among those whose gain exceeds
+    the largest gain of noise (false-alarm rate
+    :data:`~bfsensor.diagnose.detect.locate.ALARM` over all candidates), refit everything, scan the new
+    residuals, and repeat until nothing stands out.  Then each effect is taken out once and compared
+    with all candidates in its place: a better one replaces it, equally good ones are listed as tied.
 
-    What is left after that and counts (see :mod:`bfsensor.diagnose.detect.model_error`) is outside the
-    library and modelled freely, first without any effect: those that explained part of it are
-    named only if the free form cannot do without them.  One free form that leaves nothing and
-    explains far more than the effects found so far (:data:`FAR_BETTER`), whether these leave
-    anything or not, ends the search.
+    A mismatch that is left after that, beyond the error of the effects' predictions (see
+    :mod:`bfsensor.diagnose.detect.model_error`), is outside the library and is fitted with nonparametric
+    terms, first without any effect: effects that explained part of it are named only if the terms
+    cannot replace them.  The search also ends where one group of terms leaves nothing and explains
+    far more than the effects found so far (:data:`FAR_BETTER`).
 
     Parameters
     ----------
-    predictor, fit, mismatch
-        The baseline, fitted, and what it leaves.
+    predictor : Predictor
+        Model of the baseline.
+    fit : BaselineFit
+        Its fit.
+    mismatch : Mismatch
+        Residuals of that fit that stand out.
     kinds : sequence of type, optional
-        Candidates; by default :func:`candidates_of` the baseline.
+        Candidate effects; by default :func:`candidates_of` the baseline.
     seed : int
-        Of the noise that thresholds come from.
+        Seed of the noise draws that thresholds come from.
+
+    Returns
+    -------
+    Attribution
+        Effects found, possibly none, with the fit that includes them.
     """
     kinds = candidates_of(predictor.baseline) if kinds is None else kinds
     kinds = tellable(kinds, predictor, fit.channels)
@@ -152,10 +164,10 @@ def _forward(
 ) -> tuple[
     Model, Mismatch, dict[int, list[Rival]], list[str], tuple[OpenWorld, Model] | None
 ]:
-    """Add effects one by one while something counts and a candidate explains it.
+    """Add effects one by one while residuals stand out and a candidate explains them.
 
-    Also gives the rankings by number of effects there were, notes, and a free form that is
-    better than all that.
+    Returns the model, its mismatch, the rankings by number of effects present, notes, and a
+    nonparametric model that explains far more, or None.
     """
     model, first = base, mismatch
     notes: list[str] = []
@@ -177,8 +189,8 @@ def _forward(
             good = [r for r in ranking if r.gain > critical and not r.refuted] or good
             rankings[len(model.effects)] = ranking
         else:
-            # That something is there is proved already: a fainter candidate will do, if with it
-            # nothing is left.
+            # The mismatch itself is beyond noise already, so that a candidate below the noise of the
+            # best of all candidates may explain it; :func:`_step` asks that it leave nothing.
             good = [r for r in ranking if r.gain > WEAK and not r.refuted][:FAINT]
         step = _step(
             model, good, kinds, seed, notes, sure=bool(good) and good[0].gain > critical
@@ -201,7 +213,7 @@ def _step(
     *,
     sure: bool,
 ) -> tuple[Model, Mismatch] | None:
-    """Fit with the first of some candidates that can be fitted; an unsure one must leave nothing."""
+    """Fit the first candidate that converges; one below the threshold must leave nothing."""
     for rival in good:
         try:
             further = model.with_effects((*model.effects, rival.effect))
@@ -214,7 +226,7 @@ def _step(
 
 
 def _is_outside(base: Model, model: Model, mismatch: Mismatch) -> bool:
-    """Whether what is left is outside the library: see :mod:`bfsensor.diagnose.detect.model_error`."""
+    """Whether the residuals are outside the library: :mod:`bfsensor.diagnose.detect.model_error`."""
     explained = explained_by_word(base.fit, model.fit)
     return stands_out(mismatch, explained, fits=len(model.effects), alarm=OUTSIDE_ALARM)
 
@@ -227,11 +239,11 @@ def _outside(
     kinds: Sequence[type[Effect]],
     seed: int,
 ) -> tuple[list[Found], Model, Mismatch, OpenWorld | None]:
-    """Model freely what is left, and say which effects are needed beside that.
+    """Fit nonparametric terms to the residuals, and keep the effects that are needed beside them.
 
-    An effect that explains part of something foreign is no cause of it: what the free form
-    explains alone, without any effect, names none.  Effects stay if it does not, each if it
-    takes more of the chi-square than :data:`NEEDED` of what it takes by itself.
+    An effect that explains part of an unmodelled cause is not the cause: where terms explain
+    the mismatch without any effect, none is named.  Otherwise an effect stays if its gain beside
+    the terms is more than :data:`NEEDED` of its gain alone.
     """
     first = locate_mismatch(base.fit, seed=seed) if model.effects else mismatch
     alone = fit_free_form(base, first, seed=seed)
@@ -267,7 +279,7 @@ def _better(
     rankings: Mapping[int, list[Rival]],
     seed: int,
 ) -> tuple[OpenWorld, Model] | None:
-    """Model freely what a baseline leaves, if one free form does, and far better than effects."""
+    """Nonparametric model by one group of terms, if it explains far more than the effects do."""
     least = base.fit.total - model.fit.total - _critical(model.effects) + FAR_BETTER
     choices = compete(Scene(base), mismatch)
     if not choices or choices[0].score < least:
@@ -281,10 +293,10 @@ def _better(
 
 
 def _does_without(base: Model, alone: FreeFit, model: Model, beside: FreeFit) -> bool:
-    """Whether a free form alone explains as much as effects do with another one beside them.
+    """Whether nonparametric terms alone explain as much as effects with terms beside them.
 
-    Each term and parameter is charged with what chance gives; of free forms of as many groups
-    that are seen far beyond noise, the inaccuracy of the columns decides nothing.
+    Each term and parameter is charged with what chance gives.  Where both models have as many
+    groups, a difference within the error of the predictions (:data:`ACCURACY`) counts as none.
     """
     if not alone.choices:
         return False
@@ -298,7 +310,7 @@ def _does_without(base: Model, alone: FreeFit, model: Model, beside: FreeFit) ->
 def _place(
     model: Model, n: int, kinds: Sequence[type[Effect]], mismatch: Mismatch
 ) -> list[Rival]:
-    """All candidates in the place of one effect of a model."""
+    """Rank all candidates in the place of one effect of a model."""
     others = [e for k, e in enumerate(model.effects) if k != n]
     without = model.with_effects(others)
     screen = Screen(without.predictor, without.fit, seen_of(mismatch))
@@ -311,7 +323,7 @@ def _critical(effects: Sequence[Effect]) -> float:
 
 
 def _needed(model: Model, base: Model) -> list[Effect]:
-    """Effects that a model with a free form cannot do without."""
+    """Effects whose gain nonparametric terms cannot take over."""
     out = []
     for n, effect in enumerate(model.effects):
         others = [e for k, e in enumerate(model.effects) if k != n]
@@ -325,7 +337,7 @@ def _needed(model: Model, base: Model) -> list[Effect]:
 def _found(
     model: Model, n: int, ranking: Sequence[Rival], profiles: Mapping[str, Profile]
 ) -> Found:
-    """One effect of a model with those that may stand in its place."""
+    """One effect of a model, with the candidates that may stand in its place."""
     effect = model.effects[n]
     gain = next((r.gain for r in ranking if r.effect.name == effect.name), np.nan)
     return Found(
@@ -335,7 +347,7 @@ def _found(
 
 
 def _settled(model: Model) -> tuple[Model, list[dict[str, Profile]]]:
-    """Profiles of all effects' parameters, and the fit gone on where one of them is lower."""
+    """Profiles of all effects' parameters, with a new fit where one finds a lower chi-square."""
     profiles: dict[int, dict[str, Profile]] = {}
     for n in range(len(model.effects)):
         lower, own = settle(model, n, WIDTHS)
@@ -355,10 +367,12 @@ def _judge(
     kinds: Sequence[type[Effect]],
     seed: int,
 ) -> tuple[list[Found], Model, Mismatch]:
-    """Hold each effect against all others in its place; drop and replace."""
+    """Compare each effect with all candidates in its place; remove or replace it where needed."""
     swapped = True
     rounds = 0
     places = dict(rankings)
+    # Three rounds are chosen, to be derived: two effects that replace each other in turn would
+    # otherwise never end; each round costs as many rankings as there are effects.
     while swapped and len(model.effects) > 1 and rounds < 3:
         swapped, rounds = False, rounds + 1
         for n in range(len(model.effects)):
@@ -375,6 +389,8 @@ def _judge(
                 (r for r in ranking if r.effect.name == model.effects[n].name), None
             )
             best = ranking[0]
+            # A margin of 1 in the logarithm of the evidence, chosen, to be derived, prevents a
+            # swap between candidates whose evidences differ by less than their approximation.
             if best.effect.name != model.effects[n].name and (
                 here is None or best.evidence > here.evidence + 1.0
             ):

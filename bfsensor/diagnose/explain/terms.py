@@ -1,4 +1,4 @@
-"""Terms that free-form models are made of: what they see, and covariances by lag."""
+"""Terms of nonparametric models: their definition, the fit they see, and covariances by single lag."""
 
 from __future__ import annotations
 
@@ -20,30 +20,32 @@ from bfsensor.files import Cache
 from bfsensor.typing import FloatArray
 
 SCALE = 1e5
-"""Signal [e-] that coefficients of powers of it are given at."""
+"""Signal [e-] at which coefficients of its powers are given.  Defined: the unit in report.json."""
 
 LAG_POWERS = (0, 1, 2, 3)
-"""Of the covariances at one lag with the level."""
+"""Powers of the level in the covariance at one lag.  Chosen: noise, light, and two orders of
+brighter-fatter response; higher ones are so alike over a ladder that none is preferred."""
 
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """One column of a free-form model.
+    """One column of a nonparametric model.
 
     Attributes
     ----------
     name : str
-        Of the coefficient.
+        Name of the coefficient, a key of report.json.
     where : mapping
-        What it stands for, for words: 'lag', 'power', 'period', ...
+        Numbers that define the term, such as 'lag', 'power' or 'period'.
     column : callable
-        Gives the change of a channel for a coefficient of 1, in its unit; None where there is none.
+        Takes a channel and gives its change for a coefficient of 1, in the channel's unit; None
+        where the term does not change it.
     rough : callable, optional
-        The same, quicker, good enough to be searched with.
+        Faster approximation of ``column``, for searches.
     more : tuple of Term
-        What goes with it beyond the first order, each with a coefficient of its own.
+        Terms of second order that go with it, each with a coefficient of its own.
     simple : bool
-        Taken before others that explain as much.
+        Whether it is preferred to others that explain as much.
     """
 
     name: str
@@ -61,12 +63,14 @@ class Family:
     Attributes
     ----------
     group : str
-        Which of the free-form models.
+        Group of nonparametric terms, as in report.json.
     terms : tuple of Term
+        Terms to choose from.
     words : tuple of str
-        Channels that the search looks at; the fit looks at all.
+        Channels that the search uses; the fit uses all.
     tried : int
-        Terms that these were chosen from before, if more than there are.
+        Number of terms that an earlier search chose these from, where it is larger: the noise
+        threshold counts them all.
     """
 
     group: str
@@ -79,9 +83,9 @@ class Family:
 class Flats:
     """Flats of one condition in a channel of covariances.
 
-    ``rows`` of the channel; ``flat``: which of the flats each belongs to; ``gain`` [e-/ADU],
-    ``level`` [e-], changes of areas ``a`` [1/e-] and covariances ``c`` [e-^2] at all lags of a
-    periodic array, by flat.
+    ``rows``: values of the channel; ``flat``: index of the flat that each belongs to.  By flat:
+    ``gain`` [e-/ADU], ``level`` [e-], area changes ``a`` [1/e-], and covariances ``c`` [e-^2] at all
+    lags of a periodic array.
     """
 
     condition: Condition
@@ -95,14 +99,14 @@ class Flats:
 
 @dataclass(eq=False)
 class Scene:
-    """A fitted model as terms see it.
+    """A fitted model with cached predictions that nonparametric terms share.
 
     Attributes
     ----------
     model : Model
-        Whose remainder is to be explained.
+        Model whose residuals are to be explained.
     kept : Cache
-        What terms share, by a word and what it is of.
+        Cached results, by a name and the object they belong to.
     """
 
     model: Model
@@ -110,13 +114,13 @@ class Scene:
 
     @property
     def gains(self) -> FloatArray:
-        """Of the amplifiers, as fitted [e-/ADU]."""
+        """Fitted gains of the amplifiers [e-/ADU]."""
         count = len(self.model.predictor.measured.amplifiers)
         return np.asarray(self.model.fit.values[:count])
 
     @property
     def device(self) -> dict[str, float]:
-        """Device parameters as fitted, away from nominal."""
+        """Fitted device parameters less their nominal values, by name."""
         p, baseline = self.model.predictor, self.model.predictor.baseline
         return {
             name: float(self.model.fit.values[row]) * baseline.spread[name]
@@ -124,7 +128,7 @@ class Scene:
         }
 
     def changed_by(self, effect: Effect, channel: Channel) -> FloatArray:
-        """What an effect adds to the prediction of a channel, in its unit."""
+        """Change of a channel's prediction by an effect, in the channel's unit."""
         p = self.model.predictor
         point = self.model.fit.values[: len(p.names)]
         more = p.with_effects((*p.effects, effect), point)
@@ -132,19 +136,19 @@ class Scene:
         return np.asarray(more.predict(channel, both) - self.here(channel))
 
     def here(self, channel: Channel) -> FloatArray:
-        """What the model predicts of a channel, linear terms left out."""
+        """Prediction of a channel by the model, without the linear parameters; cached."""
         p = self.model.predictor
         point = self.model.fit.values[: len(p.names)]
         return self.kept.get(("here", channel), lambda: p.predict(channel, point))
 
     def responses(self, flats: Flats, p: int) -> FloatArray:
-        """Change of the flats' power for a response that goes with the level to the power p."""
+        """Derivative of flats' power spectra by a response that goes with the level to the power p."""
         return self.kept.get(
             ("response", flats, p), lambda: flat_response(flats.a, flats.level, power=p)
         )
 
     def flats(self, channel: Channel) -> list[Flats]:
-        """Flats of a channel of covariances, by condition; what effects do to them is left out."""
+        """Flats of a channel of covariances by condition, without changes that effects make."""
         return self.kept.get(("flats", channel), lambda: self._found_flats(channel))
 
     def _found_flats(self, channel: Channel) -> list[Flats]:
@@ -171,7 +175,7 @@ def at_lags(
 
 
 def lag_family(scene: Scene) -> Family | None:
-    """Covariances of flats at single lags, by power of the level."""
+    """Family of covariances of flats at single lags, by power of the level; None without levels."""
     channels = [c for c in scene.model.fit.channels if c.word == "flat_cov"]
     if not channels or channels[0].unit == PER_ELECTRON:
         return None

@@ -1,1 +1,1 @@
-"""What a baseline and effects predict of every channel."""
+"""Predictions of every channel from a baseline and effects."""

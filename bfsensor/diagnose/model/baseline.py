@@ -1,4 +1,4 @@
-"""What the simulation predicts before anything is found: boundary shifts, their freedom."""
+"""The baseline of a diagnosis: boundary shifts per electron, their derivatives, and their file."""
 
 from __future__ import annotations
 
@@ -20,56 +20,63 @@ from bfsensor.typing import Edges, FloatArray
 from bfsensor.units import to_kelvin
 
 Key = tuple[float, float]
-"""Wavelength [nm] and back bias [V] of shifts that are held."""
+"""Wavelength [nm] and back bias [V] at which a baseline has shifts."""
 
 BY_FIELD = (
     "doping", "silicon.background_doping", "operating_point.back_bias", "vbb", "back_bias",
 )  # fmt: skip
-"""Parameters that change the drift field alone: see :meth:`Baseline.derivative`."""
+"""Names of parameters that change only the drift field: see :meth:`Baseline.derivative`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Baseline:
-    """Shifts of pixel boundaries per electron, by condition, and how far they may float.
+    """Shifts of pixel boundaries per electron, by condition, and the free parameters they depend on.
 
     Attributes
     ----------
     name : str
-        Where it comes from.
+        Path or name of its source, as printed in reports.
     edges : mapping of (wavelength, back_bias) to (kx, ky)
-        Shift of the right and the upper edge of each pixel per electron stored in the pixel
-        in the middle [pixel/e-], [row dy, column dx], odd sides.
+        Shift of the right (kx) and the upper edge (ky) of each pixel per electron stored in the
+        central pixel [pixel/e-], positive to the right and upwards, indexed [row dy, column dx];
+        all of one shape with odd sides.
     derivatives : mapping of str to (dkx, dky)
-        Their change for a unit of each device parameter, at ``reference``.
+        Change of the shifts for a unit of each free device parameter, at ``reference``.
     spread : mapping of str to float
-        Standard deviation of each parameter about its nominal value.
+        Standard deviation of each parameter about its nominal value, in its unit.
     reference : tuple of float
-        Wavelength [nm] and back bias [V] of the derivatives; nan where any is meant.
+        Wavelength [nm] and back bias [V] of the derivatives; nan if the shifts hold at all.
     not_below : tuple of str
         Parameters that cannot be below 0, such as areas that neighbours gain.
     slopes : mapping of (wavelength, back_bias) to (dkx, dky), optional
         Change of the shifts per electron with the level of a flat [pixel/e-^2].
-    bends : mapping of (wavelength, back_bias) to (dkx, dky), optional
-        Half of the second derivative by the level [pixel/e-^3], where there are slopes.
     level : float
         Level [e-] at which the shifts are those of ``edges``, where there are slopes.
     nominal : mapping of str to float
-        Values of the parameters that the shifts are given for.
-    card : mapping of str to object
-        What else is known of the device: 'pixel', 'thickness' [um], 'front' [V], 'absorption'
-        [um by nm].
+        Parameter values that ``edges`` were calculated with.
     held : mapping of (wavelength, back_bias) to mapping of str to (dkx, dky)
-        The derivatives where they were found at that condition too.
+        Derivatives calculated at conditions other than ``reference``.
     warming : mapping of (wavelength, back_bias) to (dkx, dky), optional
-        Change of the shifts with the temperature [pixel/e-/K], where it is known.
+        Change of the shifts with temperature [pixel/e-/K], where it was calculated.
     temperature : float
-        At which the shifts hold [K], where there is warming.
+        Temperature of ``edges`` [K], where there is warming; nan otherwise.
     spots_bend : bool
-        Whether spots follow the slopes, as flats do: charge then moves boundaries less and less
-        while it gathers.
+        Whether shifts of spots also change with ``slopes``, as those of flats do.
     pieces : tuple of type
-        Physics that the simulation may leave out, as candidates
+        Candidate effects for physics that the simulation leaves out
         (:func:`bfsensor.diagnose.model.left_out_physics.physics_left_out`).
+
+    Raises
+    ------
+    DiagnosisError
+        There are no shifts, their shapes differ or have even sides, or a parameter has no spread.
+
+    Examples
+    --------
+    >>> k = np.zeros((3, 3)); k[1, 0], k[1, 1] = 1e-7, -1e-7
+    >>> baseline = Baseline("mine", {(620.0, -60.0): (k, k.T)}, {}, {}, (620.0, -60.0))
+    >>> baseline.reach, baseline.parameters
+    (0, ())
     """
 
     name: str
@@ -80,9 +87,12 @@ class Baseline:
     not_below: tuple[str, ...] = ()
     slopes: Mapping[tuple[float, float], Edges] = field(default_factory=dict)
     bends: Mapping[tuple[float, float], Edges] = field(default_factory=dict)
+    """Half of the second derivative by the level [pixel/e-^3], by condition, where there are slopes."""
     level: float = 0.0
     nominal: Mapping[str, float] = field(default_factory=dict)
     card: Mapping[str, Any] = field(default_factory=dict)
+    """Known dimensions of the device: 'pixel', 'thickness' [um], 'front' [V], 'absorption' [um] by
+    wavelength [nm]."""
     held: Mapping[Key, Mapping[str, Edges]] = field(default_factory=dict)
     warming: Mapping[Key, Edges] = field(default_factory=dict)
     temperature: float = np.nan
@@ -105,25 +115,44 @@ class Baseline:
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Device parameters that may float."""
+        """Names of the free device parameters."""
         return tuple(self.derivatives)
 
     @property
     def reach(self) -> int:
-        """Largest lag at which the areas are complete [pixel]."""
+        """Largest lag [pixel] at which all edges of a pixel are within the shifts' window."""
         return next(iter(self.edges.values()))[0].shape[0] // 2 - 1
 
     def without(self, names: Iterable[str]) -> Baseline:
-        """Give the baseline with some parameters held at their nominal values."""
+        """Make a copy in which some parameters are fixed at their nominal values.
+
+        Parameters
+        ----------
+        names : iterable of str
+            Parameters to fix; names that are not free are ignored.
+
+        Returns
+        -------
+        Baseline
+            Copy without their derivatives.
+        """
         gone = set(names)
         kept = {k: v for k, v in self.derivatives.items() if k not in gone}
         floors = tuple(n for n in self.not_below if n in kept)
         return replace(self, derivatives=kept, not_below=floors)
 
     def nearest(self, condition: Condition) -> tuple[float, float]:
-        """Wavelength and back bias held that come nearest to a condition.
+        """Find the condition with shifts that is nearest in back bias, then in wavelength.
 
-        An unknown one of a condition is taken as the reference's.
+        Parameters
+        ----------
+        condition : Condition
+            Wavelength [nm], back bias [V]; unknown ones are taken as the reference's.
+
+        Returns
+        -------
+        wavelength, back_bias : float
+            A key of ``edges``.
         """
         wavelength, bias = (
             given if np.isfinite(given) else own
@@ -134,10 +163,22 @@ class Baseline:
     def at(
         self, condition: Condition, change: Mapping[str, float] | None = None
     ) -> tuple[Edges, bool]:
-        """Shifts at a condition, parameters changed from nominal, and whether it is held.
+        """Calculate the shifts at a condition, with device parameters changed.
 
-        Where the baseline knows how they change with the temperature they are those of the
-        condition's.
+        Parameters
+        ----------
+        condition : Condition
+            Wavelength [nm], back bias [V] and temperature [K]; the nearest condition with shifts
+            is used, and scaled to the temperature where ``warming`` holds it.
+        change : mapping of str to float, optional
+            Device parameters less their nominal values, in their units.
+
+        Returns
+        -------
+        (kx, ky) : tuple of ndarray
+            Shifts per electron [pixel/e-].
+        exact : bool
+            Whether the nearest condition is within 0.5 nm and 0.5 V.
         """
         key = self.nearest(condition)
         kx, ky = self.edges[key]
@@ -157,21 +198,34 @@ class Baseline:
         return (kx, ky), exact
 
     def derivative(self, name: str, key: Key) -> Edges:
-        r"""Change of the shifts for a unit of a parameter, at a condition that is held.
+        r"""Calculate the change of the shifts for a unit of a parameter, at one of the conditions.
 
-        Its own where it was found there.  Else that of the reference, times a power of the
-        ratio r of the areas a_00: shifts go as the charge's field over the drift field E, so
-        that what changes the charge's field (heights, widths) changes them by r of what it
-        does at the reference, and what changes E alone, :data:`BY_FIELD`, by
-        :math:`r^2`, for :math:`d(1/E) = -dE/E^2`.
+        A derivative that was calculated at that condition is returned as it is.  Otherwise that of
+        the reference is scaled by a power of the ratio r of the areas a_00.  Shifts are
+        proportional to the field of the stored charge over the drift field E: a parameter of the
+        charge's field (heights, widths) changes them by r times its effect at the reference, and a
+        parameter of E alone, :data:`BY_FIELD`, by :math:`r^2` times, as
+        :math:`d(1/E) = -dE/E^2`.
+
+        Parameters
+        ----------
+        name : str
+            One of ``parameters``.
+        key : tuple of float
+            Wavelength [nm] and back bias [V], a key of ``edges``.
+
+        Returns
+        -------
+        dkx, dky : ndarray
+            Change of the shifts [pixel/e- per unit of the parameter].
 
         Notes
         -----
-        Held against full solutions of the virtual sensor of ``validation.concealed`` at 20 V
-        less back bias, where r = 1.37 (largest error over the largest change, lags to 2):
-        doping 0.1 % (26.7 % with r), h, zx, zy 0.3 %, wx, wy 1 %, thickness, which does both,
-        10 %.  At 950 nm, r = 0.97, what the depth of conversion does is missed: h, doping 3 %,
-        zx, zy 2 %, wx, wy, thickness 5 to 7 %.
+        Compared with full solutions of the virtual sensor of ``validation.concealed`` at 20 V
+        less back bias, where r = 1.37, the largest error over the largest change at lags to 2 is:
+        doping 0.1 % (26.7 % with r), h, zx, zy 0.3 %, wx, wy 1 %, thickness, which changes both
+        fields, 10 %.  At 950 nm, r = 0.97, the depth of conversion is not accounted for: h, doping
+        3 %, zx, zy 2 %, wx, wy, thickness 5 to 7 %.
 
         Examples
         --------
@@ -190,14 +244,31 @@ class Baseline:
         return factor * dkx, factor * dky
 
     def derivatives_by_condition(self) -> dict[str, dict[Key, Edges]]:
-        """All derivatives at all conditions that are held."""
+        """Calculate the derivatives of all parameters at all conditions of ``edges``.
+
+        Returns
+        -------
+        dict of str to dict of (wavelength, back_bias) to (dkx, dky)
+            Change of the shifts for a unit of each parameter [pixel/e- per unit].
+        """
         return {
             name: {key: self.derivative(name, key) for key in self.edges}
             for name in self.derivatives
         }
 
     def scale_at(self, key: tuple[float, float]) -> float:
-        """Factor on changes of the shifts at a condition that is held: that of a_00."""
+        """Calculate the ratio of a_00 at a condition of ``edges`` to that at the reference.
+
+        Parameters
+        ----------
+        key : tuple of float
+            Wavelength [nm] and back bias [V], a key of ``edges``.
+
+        Returns
+        -------
+        float
+            The ratio; 1 where a_00 at the reference is 0.
+        """
         own = self.edges[key]
         nominal = centre(*self.edges.get(self.reference, own))
         return centre(*own) / nominal if nominal else 1.0
@@ -205,7 +276,20 @@ class Baseline:
     def edges_on(
         self, condition: Condition, change: Mapping[str, float] | None, background: float
     ) -> Edges:
-        """Shifts per electron where all pixels hold a background [e-]."""
+        """Calculate the shifts per electron where all pixels hold a background.
+
+        Parameters
+        ----------
+        condition, change
+            As for :meth:`at`.
+        background : float
+            Charge in all pixels [e-].
+
+        Returns
+        -------
+        kx, ky : ndarray
+            Shifts of right and upper edges [pixel/e-].
+        """
         kx, ky = self.at(condition, change)[0]
         away, key = background - self.level, self.nearest(condition)
         for power, more in ((1, self.slopes), (2, self.bends)):
@@ -217,7 +301,20 @@ class Baseline:
     def areas_on(
         self, condition: Condition, change: Mapping[str, float] | None, background: float
     ) -> FloatArray:
-        """Change of the areas per electron [1/e-] where all pixels hold a background [e-]."""
+        """Calculate the area changes per electron where all pixels hold a background.
+
+        Parameters
+        ----------
+        condition, change
+            As for :meth:`at`.
+        background : float
+            Charge in all pixels [e-].
+
+        Returns
+        -------
+        ndarray
+            Area changes, lag (0, 0) in the middle [1/e-].
+        """
         return area_matrix(*self.edges_on(condition, change, background))
 
     def flat_areas(
@@ -226,22 +323,23 @@ class Baseline:
         change: Mapping[str, float] | None,
         levels: FloatArray,
     ) -> FloatArray:
-        r"""Change of the areas per electron [1/e-] that flats of given levels have felt.
+        r"""Calculate the effective area changes per electron [1/e-] of flats of given levels.
 
-        Covariances grow as :math:`2\int a(\mu)\,\mu\,d\mu`, to first order in a: of a response
-        that goes straight with the level, that of 2/3 of the level reached counts; a bend adds
-        1/18 of the level squared.
+        To first order in a, covariances grow as :math:`2\int a(\mu)\,\mu\,d\mu`.  A response that
+        is linear in the level therefore counts as at 2/3 of the level reached; a quadratic term
+        adds 1/18 of the level squared.
 
         Parameters
         ----------
         condition, change
             As for :meth:`at`.
         levels : ndarray, shape (n,)
-            Of the flats [e-].
+            Levels of the flats [e-].
 
         Returns
         -------
-        a : ndarray, shape (n, ny, nx), or (ny, nx) where the response does not change
+        a : ndarray, shape (n, ny, nx), or (ny, nx) without slopes
+            Area changes, lag (0, 0) in the middle [1/e-].
         """
         a = area_matrix(*self.at(condition, change)[0])
         key = self.nearest(condition)
@@ -258,19 +356,12 @@ def level_areas(
     *,
     grown: bool = True,
 ) -> FloatArray:
-    """Change of the areas per electron [1/e-] by a response that goes with the level.
+    """Calculate the area changes per electron [1/e-] by a response that changes with the level.
 
-    Parameters
-    ----------
-    slope, bend : tuple of ndarray
-        Change of the shifts per electron of the level, and half the second derivative.
-    level : float
-        At which nothing changes [e-].
-    levels : ndarray, shape (n,)
-        Of the flats, or of the background.
-    grown : bool
-        Whether flats grew up to the level, as in :meth:`Baseline.flat_areas`, or a background
-        of it stands.
+    ``slope`` is the derivative of the shifts by the level [pixel/e-^2]; the second argument is half
+    the second derivative [pixel/e-^3], or None.  The change is 0 at ``level`` [e-].  ``levels``, shape
+    (n,), are those of flats if ``grown``, as in :meth:`Baseline.flat_areas`, or of a background that
+    was there before [e-].
     """
     away = ((2 / 3 if grown else 1.0) * levels - level)[:, None, None]
     a = away * area_matrix(*slope)
@@ -283,17 +374,17 @@ def level_areas(
 
 
 def _off(one: float, other: float) -> float:
-    """Difference; 0 where either is not known, for it then counts as met."""
+    """Absolute difference; 0 where either is unknown, so that an unknown setting matches any."""
     return abs(one - other) if np.isfinite(one) and np.isfinite(other) else 0.0
 
 
 def _signed(one: float, other: float) -> float:
-    """Difference; 0 where either is not known."""
+    """Difference with sign; 0 where either is unknown."""
     return one - other if np.isfinite(one) and np.isfinite(other) else 0.0
 
 
 def centre(kx: FloatArray, ky: FloatArray) -> float:
-    """Give a_00 [1/e-]."""
+    """Area change of the pixel that holds the charge, a_00 [1/e-]."""
     a = area_matrix(kx, ky)
     return float(a[a.shape[0] // 2, a.shape[1] // 2])
 
@@ -301,26 +392,42 @@ def centre(kx: FloatArray, ky: FloatArray) -> float:
 def read_edges(
     path: str | os.PathLike[str], *, card: str | os.PathLike[str] | None = None
 ) -> Baseline:
-    """Read a file of edge displacements, and the spread of the device card beside it.
+    """Read a baseline from a file of edge displacements and, optionally, a device card beside it.
+
+    A device card, the keyword-only argument, is a JSON file with ``spread_1sigma``, the standard
+    deviation of each parameter in its unit, and optionally ``nominal``; without one no parameter
+    is free.
 
     Parameters
     ----------
     path : path-like
-        JSON: ``conditions`` by "wavelength_backbias" with kx and ky, and
-        ``derivatives_WAVELENGTH_mBACKBIAS`` by parameter with dkx and dky, the reference's
-        first, as many as there are; ``slopes`` and ``bends`` by level about ``level``,
-        ``warming`` by temperature about ``temperature`` [C], by condition.
-    card : path-like, optional
-        JSON with ``spread_1sigma`` by parameter; without one nothing floats.
+        JSON with the key ``conditions``: by "WAVELENGTH_BACKBIAS" [nm, V], such as "620_-60",
+        the shifts ``kx`` and ``ky`` [pixel/e-].  Optional keys:
+        ``derivatives_WAVELENGTH_mBACKBIAS`` (m for minus; the reference's first): by parameter
+        ``dkx`` and ``dky``; ``slopes``: by condition
+        ``dkx`` and ``dky`` with the level about ``level`` [e-] (half of the second derivatives under
+        a key of their own, see :func:`~bfsensor.diagnose.model.device_baseline.write_edges`);
+        ``warming``: by condition, with the temperature about ``temperature`` [deg C].
 
     Returns
     -------
     Baseline
+        Shifts, with derivatives of the parameters that have a spread.
 
     Raises
     ------
     DiagnosisError
-        Names the file and what it lacks.
+        A file cannot be read, or lacks a key; names the file and the key.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> text = {"conditions": {"620_-60": {"kx": [[-1e-7]], "ky": [[-1e-7]]}}}
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "edges.json"
+    ...     _ = path.write_text(json.dumps(text))
+    ...     list(read_edges(path).edges)
+    [(620.0, -60.0)]
     """
     try:
         text = json.loads(Path(path).read_text())
@@ -380,7 +487,9 @@ def read_edges(
                     float(k): float(v) for k, v in told["absorption_um"].items()
                 }
         except (OSError, KeyError, ValueError, TypeError) as error:
-            raise DiagnosisError(f"{card}: not a device card: {error!r}") from None
+            raise DiagnosisError(
+                f"{card}: not a JSON file with 'spread_1sigma' by parameter: {error!r}"
+            ) from None
     derivatives = {k: v for k, v in derivatives.items() if k in spread}
     return Baseline(
         str(path), edges, derivatives, spread, reference, nominal=nominal, card=known,

@@ -1,4 +1,4 @@
-"""The road from a device to its shifts, walked anew for every change of it, and kept."""
+"""Boundary shifts of a device from full solutions, by background and depth, cached in a folder."""
 
 from __future__ import annotations
 
@@ -21,10 +21,17 @@ from bfsensor.table.table_plan import TablePlan
 from bfsensor.typing import Edges, FloatArray
 
 SPAN = 25_000.0
-"""To either side of it, of the backgrounds that tell how the response changes [e-]."""
+"""Distance of the outer two of three backgrounds from :data:`~bfsensor.response.edge_response.LEVEL`
+[e-].  Chosen: the three then span most of a flat's levels, 15,000 to 65,000 e-; twice as large would
+put the lowest below 0; half as large, errors of the second derivative are four times as large."""
 
 BEYOND = 50 * CHARGE
-"""Largest charge above the background [e-]: the response is differential, so a small one."""
+"""Charge step above the background that shifts per electron are taken over [e-], 5,000. Chosen: twice
+as large doubles the share of the change with charge in it; half as large, errors of boundaries
+double."""
+
+FORMAT = "walk"
+"""First word of the text that cached files are named after; changing it makes old files unused."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,9 +41,9 @@ class Walk:
     Attributes
     ----------
     backgrounds : tuple of float
-        Charge of all pixels [e-].
+        Charge of all pixels [e-], one or three equidistant values.
     depths : ndarray, shape (nd,)
-        [um above the gates], the last one the back surface.
+        Heights of conversion above the gates [um], the last one the back surface.
     kx, ky : ndarray, shape (backgrounds, nd, 2 REACH + 3, 2 REACH + 3)
         Mean shifts of right and upper edges per electron [pixel/e-].
     """
@@ -47,26 +54,33 @@ class Walk:
     ky: FloatArray
 
     def edges(self, wavelength: float | None, temperature: float) -> Edges:
-        """Shifts about the middle background.
+        """Shifts [pixel/e-] at the middle background, averaged over the depths of conversion.
 
         Parameters
         ----------
         wavelength : float or None
-            Of the light [nm]; None: all of it converts at the back surface.
+            Wavelength of the light [nm]; None: all of it converts at the back surface.
         temperature : float
-            Of the silicon that absorbs it [K].
+            Temperature of the absorbing silicon [K].
         """
         kx, ky = self._mixed(wavelength, temperature)
         middle = len(self.backgrounds) // 2
         return kx[middle], ky[middle]
 
     def bent(self, wavelength: float | None, temperature: float) -> tuple[Edges, Edges]:
-        """Slope of the shifts by the background [pixel/e-^2], and half the second derivative.
+        """Derivative of the shifts by the background [pixel/e-^2], and half the second [pixel/e-^3].
 
-        Of the parabola through three backgrounds.
+        Both are of the parabola through three backgrounds.
+
+        Raises
+        ------
+        DiagnosisError
+            The response was calculated at one background only.
         """
         if len(self.backgrounds) != 3:
-            raise DiagnosisError("the response was walked at one background, not at three")
+            raise DiagnosisError(
+                "the response was calculated at one background; its change with level takes three"
+            )
         low, _, high = self.backgrounds
         half = 0.5 * (high - low)
         slopes, bends = [], []
@@ -76,7 +90,7 @@ class Walk:
         return (slopes[0], slopes[1]), (bends[0], bends[1])
 
     def _mixed(self, wavelength: float | None, temperature: float) -> Edges:
-        """By background, weighted by where light converts."""
+        """Shifts by background, weighted by the fraction of light that converts at each depth."""
         return mixed(self.kx, self.ky, self.depths, wavelength, temperature)
 
 
@@ -87,18 +101,19 @@ def walk(
     backgrounds: Sequence[float] = (LEVEL,),
     keep: Path | None = None,
 ) -> Walk:
-    """Walk from a device to its shifts: potential, boundaries, one background after another.
+    """Calculate a device's shifts: solve potential and boundaries at one background after another.
 
     Parameters
     ----------
     device : Device
-        Mirror-symmetric.
+        Mirror-symmetric device.
     cells : int
-        Of the mesh, a pixel: 0.4 CPU seconds a background at 8, 1.4 at 16, 3.6 at 32.
+        Cells of the mesh per pixel; about 0.4 CPU seconds per background at 8, 1.4 at 16, 3.6 at
+        32.
     backgrounds : sequence of float
-        One, or three equally far from each other [e-].
+        One background, or three equidistant ones [e-].
     keep : Path, optional
-        Folder in which the result is kept, and found by a later walk.
+        Folder in which results are cached, by device, mesh, background and package version.
     """
     depths = response_depths(device)
     both = [_at(device, cells, float(b), depths, keep) for b in backgrounds]
@@ -113,16 +128,16 @@ def _at(
     depths: tuple[float, ...],
     keep: Path | None,
 ) -> Edges:
-    """Shifts by depth about one background, walked or read."""
+    """Shifts by depth at one background, calculated or read from the cache."""
     text = "\n".join([
-        "walk 1", bfsensor.__version__, device.physics, f"{cells} {VERTICES} {REACH}",
+        f"{FORMAT} 1", bfsensor.__version__, device.physics, f"{cells} {VERTICES} {REACH}",
         " ".join(f"{v:.9g}" for v in (background, *depths)),
     ])  # fmt: skip
     name = f"walk_{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
     path = None if keep is None else keep / name
     if path is not None and path.exists():
         return _read(path)
-    # The full well is not asked for: it takes as long as the table.
+    # The full well is given, not calculated: that would take as long as the table.
     plan = TablePlan(
         device, (background, background + BEYOND), (background,), depths, VERTICES, REACH,
         cells, 0, max(4 * background, 2e5),
@@ -141,5 +156,6 @@ def _read(path: Path) -> Edges:
             return data["kx"], data["ky"]
     except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise DiagnosisError(
-            f"{path}: not a finished walk; delete it to walk again ({error})"
+            f"{path}: not a finished file of boundary shifts; delete it to calculate it again "
+            f"({error})"
         ) from None

@@ -1,4 +1,4 @@
-"""A device as a baseline whose parameters float: our simulation run again at shifted values."""
+"""A baseline from a device: simulated shifts, and their derivatives by its uncertain parameters."""
 
 from __future__ import annotations
 
@@ -22,20 +22,24 @@ from bfsensor.typing import Edges
 from bfsensor.units import to_celsius
 
 CELLS, FINE = 16, 32
-"""Cells a pixel of the tables whose differences are taken, and of the device's own, which has the
-accuracy of shipped ones: a difference needs it less."""
+"""Mesh cells per pixel of solutions whose differences give derivatives, and of the nominal device.
+Chosen: 32 is the mesh of the shipped tables; mesh errors mostly cancel in a difference, so 16 do.  Twice
+as many cells take about three times as long."""
 
 TABLES = "nominal as shipped, differences at 16 cells, at every back bias, with levels"
-"""How shifts are made: what was kept of others is not read again."""
+"""Method of the shifts, part of the name of cached files: files of other methods are not read."""
 
 STEP = 0.5
-"""Shift of a parameter to either side [its uncertainty]."""
+"""Shift of a parameter to either side for its derivative [its uncertainty]. Chosen: twice as large
+makes errors of curvature four times as large; half as large doubles errors of the solutions."""
 
 WARMER = 10.0
-"""Between the temperatures whose difference tells how shifts change with it [K]."""
+"""Temperature step for the derivative of shifts by temperature [K]. Chosen: twice as large doubles
+the error of curvature, for the difference is to one side; half as large doubles errors of the
+solutions."""
 
 PARTS = ("levels", "depths")
-"""What a baseline can be made without."""
+"""Parts of the physics that a baseline can be calculated without: change with level, and depths."""
 
 
 def baseline_of_device(
@@ -49,41 +53,49 @@ def baseline_of_device(
     keep: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Baseline:
-    """Simulate the shifts of a device, and their change with its uncertain parameters.
+    """Simulate the shifts of a device, and their derivatives by its uncertain parameters.
 
     Parameters
     ----------
     device : Device
-        Mirror-symmetric.
+        Mirror-symmetric device.
     parameters : sequence of str
-        Which float, by their dotted names; ``('all',)`` for every quantity whose file states an
-        uncertainty.
+        Dotted names of the parameters that are free in fits; ``('all',)`` for every quantity
+        with an uncertainty in the device's file.
     back_biases : sequence of float
-        Back biases to hold besides the device's own [V].
+        Back biases besides the device's own [V].
     lacks : sequence of str
-        What is left out, as simpler simulations do, of :data:`PARTS`: 'levels', so that the
+        Parts of the physics that are left out, as simpler simulations do: 'levels', so that the
         response is the same at all levels; 'depths', so that all light converts at the back
         surface.
     warming : bool
-        Whether shifts follow the temperature: absorption, and heat of the carriers.
+        Whether shifts change with temperature, through absorption and the carriers' heat.
     cells : int
-        Of the device's own tables, a pixel.
+        Mesh cells per pixel of the nominal device.
     keep : Path, optional
-        Folder where walks are kept (:func:`~bfsensor.diagnose.model.cached_response.walk`).
+        Folder where solutions are cached.
     progress : callable, optional
-        Called with (walks made, walks in all).
+        Called with (solutions made, solutions in all).
 
     Returns
     -------
     Baseline
-        Derivatives at every back bias and wavelength, from tables half an uncertainty to either
-        side, or to the one side on which there is such a device.
+        Shifts at eight wavelengths from 400 to 950 nm and each back bias, with derivatives from
+        central differences of half an uncertainty, or one-sided ones where the device does not
+        exist on the other side.
 
     Raises
     ------
     DiagnosisError
-        A parameter that the device does not have, or without uncertainty; names those that are.
-        An unknown part to be left out.
+        A parameter that the device does not have, or that has no uncertainty (names those that
+        have), one that exists on neither side, or an unknown part in ``lacks``.
+
+    Examples
+    --------
+    A baseline takes seconds to minutes of CPU time, so that this example does not run in tests::
+
+        device = Device.load("itl_sta3800c")
+        baseline = baseline_of_device(device, parameters=("silicon.thickness",))
     """
     known = device_parameters(device)
     chosen = list(known) if tuple(parameters) == ("all",) else list(parameters)
@@ -95,8 +107,8 @@ def baseline_of_device(
     for part in lacks:
         if part not in PARTS:
             raise DiagnosisError(
-                f"lacks = {part!r} must be one of {', '.join(PARTS)}; what else a device lacks is "
-                "for its file to say"
+                f"lacks = {part!r} must be one of {', '.join(PARTS)}; leave out other physics in the "
+                "device's file"
             )
     own = float(device.operating_point.back_bias)
     biases = [
@@ -153,17 +165,17 @@ def baseline_of_device(
 def _sides(
     device: Device, name: str, spread: float, walked: Callable[..., Walk]
 ) -> tuple[Walk, Walk, float]:
-    """Walks with a quantity higher and lower, and how far apart they are."""
+    """Responses with a quantity raised and lowered, and the difference of its values."""
     sides: dict[float, Walk] = {}
     refused = ""
     for by in (STEP * spread, -STEP * spread):
         try:
             sides[by] = walked(change_parameter(device, name, by), CELLS)
         except DeviceError as error:
-            # At the end of what can be, such as oxides of equal thickness: from one side.
+            # The shifted device does not exist, such as a negative thickness: one-sided difference.
             refused = str(error)
     if not sides:
-        raise DiagnosisError(f"{device.name}: {name!r} cannot float: {refused}")
+        raise DiagnosisError(f"{device.name}: {name!r} cannot be changed: {refused}")
     if len(sides) == 1:
         sides[0.0] = walked(device, CELLS)
     (high, up), (low, down) = sorted(sides.items(), key=lambda s: -s[0])
@@ -175,7 +187,7 @@ def _slope(up: Edges, down: Edges, apart: float) -> Edges:
 
 
 def _card(device: Device) -> dict[str, float]:
-    """What a card says of a device: pitch and thickness [um], voltage of the front [V]."""
+    """Dimensions of a device for effects: pitch and thickness [um], voltage of the front [V]."""
     return {
         "pixel": 0.5 * (device.pixel.pitch_x + device.pixel.pitch_y),
         "thickness": device.silicon.thickness,
@@ -186,14 +198,14 @@ def _card(device: Device) -> dict[str, float]:
 def write_edges(baseline: Baseline, path: str | os.PathLike[str]) -> None:
     """Write a baseline's shifts, derivatives and spreads as :func:`read_edges` reads them.
 
-    The spread goes into the same file: it is its own device card.
+    Spreads go into the same file, which then also is its device card.
     """
 
     def lists(pair: Edges, names: tuple[str, str]) -> dict[str, list]:
         return {n: np.asarray(a).tolist() for n, a in zip(names, pair, strict=True)}
 
     changes = "dkx", "dky"
-    # The reference's first.
+    # :func:`read_edges` takes the first derivatives as those of the reference.
     ordered = {baseline.reference: baseline.derivatives, **baseline.held}
     text = {
         "note": "edge displacements per electron of a device, right / upper edge; spreads included",

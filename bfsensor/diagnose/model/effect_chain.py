@@ -1,4 +1,4 @@
-"""What effects change in each channel: from what they do to light, charge and signal."""
+"""Changes of each channel by a chain of effects on light, charge and signal."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ ADDED = (
     "flat_mean", "serial_overscan", "parallel_overscan", "bias_cov", "bias_level", "dark_map",
     "amp_cross", "code_hist",
 )  # fmt: skip
-"""Channels whose change effects give themselves, by a method of that name."""
+"""Channels whose change an effect calculates by its method of the same name."""
 
 ROUNDS = 4
-"""Of the inversion of the signal's law: its departure from 1 is a few per cent at most."""
+"""Number of fixed-point iterations that invert the signal's law. Derived: each multiplies the error
+by the law's slope less 1, at most about 0.05, so that four leave 0.05**5 = 3e-7 of the level."""
 
 
 def layout_of(measured: MeasuredChannels, baseline: Baseline) -> Layout:
-    """Sensor and campaign as effects see them."""
+    """Make the description of sensor and campaign that effects calculate with."""
     wavelength, bias = baseline.reference
     card = baseline.card
     reference = [s.temperature for s in measured.shots if np.isfinite(s.temperature)]
@@ -47,23 +48,23 @@ def layout_of(measured: MeasuredChannels, baseline: Baseline) -> Layout:
 
 
 class EffectChain:
-    """Several effects in the order of their stages, as a campaign shows them.
+    """Several effects, applied in the order of their stages from light to converter.
 
     Parameters
     ----------
     effects : sequence of Effect
-        Any order.
+        Effects in any order.
     layout : Layout
         Sensor and campaign.
     measured : MeasuredChannels
-        Of which flats the maps are made.
+        Channels of the campaign, for the flats that each map is made of.
     baseline : Baseline
-        Its shifts even patterns out.
+        Boundary shifts, by which the brighter-fatter feedback relaxes patterns of flats.
     kept : Cache
-        Holds results of :class:`MapChange` that stay valid when effects change.
+        Results of :class:`MapChange` that stay valid when effects change.
     evening : (float, mapping of str to float)
-        Gain [e-/ADU] and departures of the device's parameters from nominal by which patterns
-        are evened out.
+        Gain [e-/ADU] and device parameters less their nominal values at which that feedback is
+        calculated.
     """
 
     def __init__(
@@ -84,18 +85,18 @@ class EffectChain:
             self.law = self.law.with_law(effect.law())
 
     def shot(self, condition: Condition, kind: str = "flat", seconds: float = 0.0) -> Shot:
-        """Exposure at a condition; what is not known is the reference's."""
+        """Make an exposure at a condition; unknown settings are those of the reference."""
         return shot_at(self.layout, condition, kind, seconds)
 
     def edges(self, edges: Edges, condition: Condition) -> Edges:
-        """Shifts with all effects."""
+        """Boundary shifts [pixel/e-] with all effects."""
         for effect in self.effects:
             edges = effect.edges(*edges, self.shot(condition), self.layout)
         return edges
 
     @property
     def leaves_spots(self) -> bool:
-        """Whether spots grow and are read as without effects, their light apart."""
+        """Whether effects leave growth and readout of spots unchanged, except for added light."""
         own = ("edges", "law", "level_response", "spot_light", "spot_image", "signal")
         return all(
             getattr(type(e), name) is getattr(Effect, name)
@@ -104,21 +105,21 @@ class EffectChain:
         )
 
     def area_change(self, edges: Edges, condition: Condition) -> FloatArray:
-        """What effects add to the area changes of given shifts [1/e-]."""
+        """Change that effects make to the area changes of given shifts [1/e-]."""
         changed = self.edges(edges, condition)
         if changed is edges:
             return np.zeros_like(edges[0])
         a, more = area_matrix(*edges), area_matrix(*changed)
         if more.shape == a.shape:
             return more - a
-        # Shifts may reach farther than the baseline's.
+        # An effect's shifts may have a wider window than the baseline's.
         margin = (more.shape[0] - a.shape[0]) // 2
         return np.asarray(more - np.pad(a, margin))
 
     def level_change(
         self, condition: Condition, levels: FloatArray, *, grown: bool = True
     ) -> FloatArray | None:
-        """What effects that go with the level add to the areas [1/e-]; None: nothing."""
+        """Change of the areas by effects that depend on the level [1/e-]; None without such effects."""
         total = None
         for level, slope, bend in self._level_responses(condition):
             one = level_areas(slope, bend, level, levels, grown=grown)
@@ -132,9 +133,9 @@ class EffectChain:
     def spot_edges(
         self, edges: Edges, slopes: Edges | None, condition: Condition
     ) -> tuple[Edges, Edges | None]:
-        """Shifts without charge and their slopes, of spots, with all effects."""
+        """Shifts of spots without charge, and their slopes with charge, with all effects."""
         kx, ky = self.edges(edges, condition)
-        # Shifts may reach farther than their slopes do.
+        # Shifts may have a wider window than their slopes.
         reach = kx.shape[0] // 2
         if slopes is not None:
             slopes = pad_areas(slopes[0], reach), pad_areas(slopes[1], reach)
@@ -145,20 +146,20 @@ class EffectChain:
         return (kx, ky), slopes
 
     def signal(self, level: FloatArray, axes: Axes) -> FloatArray:
-        """Signal after the amplifier of collected charge [e-]."""
+        """Signal after the amplifier [e-] of collected charge [e-]."""
         for effect in self.effects:
             level = effect.signal(level, axes, self.layout)
         return level
 
     def collected(self, signal: FloatArray, axes: Axes) -> FloatArray:
-        """Collected charge of a signal [e-]."""
+        """Collected charge [e-] of a signal [e-], by fixed-point iteration."""
         level = signal
         for _ in range(ROUNDS):
             level = signal - (self.signal(level, {**axes, "level": level}) - level)
         return np.asarray(level)
 
     def covariances(self, c: FloatArray, axes: Axes) -> FloatArray:
-        """Covariances of flats after all effects, the signal's slope among them [e-^2]."""
+        """Covariances of flats [e-^2] after all effects, scaled by the square of the signal's slope."""
         level = np.asarray(axes["level"], float)
         for effect in self.effects:
             step = 1e-3 * np.maximum(level, 1.0)
@@ -172,7 +173,7 @@ class EffectChain:
     def added(
         self, channel: Channel, gains: FloatArray, axes: dict[str, NDArray]
     ) -> FloatArray:
-        """Change of a channel, of :data:`ADDED`, in its unit; axes as measured, levels in ADU."""
+        """Change of one of the channels :data:`ADDED`, in its unit; ``axes`` with levels in ADU."""
         own, axes = self._in_electrons(channel, gains, axes)
         out = np.zeros(len(channel))
         for effect in self.effects:
@@ -190,7 +191,7 @@ class EffectChain:
                 out += level - np.expm1(self.law.loss * level) / self.law.loss
         out = out / _unit(channel, own, gains)
         if channel.word == "bias_level":
-            # Variances over those that white noise makes.
+            # Values are variances relative to white noise; those of frames are their logarithms.
             what, ratio = axes["what"], out / own / axes["white"]
             out = np.where(what == "rows", ratio, out)
             out = np.where(what == "frames", np.log1p(np.maximum(ratio, 0.0)), out)
@@ -199,7 +200,7 @@ class EffectChain:
     def _in_electrons(
         self, channel: Channel, gains: FloatArray, axes: dict[str, NDArray]
     ) -> tuple[FloatArray, dict[str, NDArray]]:
-        """Gain of each value, and axes with levels in electrons."""
+        """Gain of each value [e-/ADU], and axes with levels in electrons."""
         rows = len(channel)
         amp = axes.get("amp", np.zeros(rows)).astype(int)
         own = gains[amp] if len(gains) else np.ones(rows)
@@ -213,7 +214,7 @@ class EffectChain:
     def _in_overscan(
         self, effect: Effect, word: str, axes: dict[str, NDArray], last: int | None
     ) -> FloatArray:
-        """Mean of what an effect adds to an overscan's last pixels, or to its second half [e-]."""
+        """Mean change of an overscan's last pixels, or of its second half, by an effect [e-]."""
         out = np.zeros(len(axes["amp"]))
         if word not in effect.touches:
             return out
@@ -235,7 +236,7 @@ class EffectChain:
     def spot_change(
         self, condition: Condition
     ) -> tuple[float, tuple[float, float], Mapping[str, float]]:
-        """Added variance [pixel^2], halo and axes of the spots at a condition."""
+        """Added variance [pixel^2], halo (fraction, width [pixel]) and axes of spots at a condition."""
         shot = self.shot(condition, "spot")
         variance, share, wide = 0.0, 0.0, 1.0
         for effect in self.effects:
@@ -247,7 +248,7 @@ class EffectChain:
         return variance, (share, wide), axes
 
     def spot_image(self, images: FloatArray, axes: Mapping[str, float]) -> FloatArray:
-        """Mean images of spots [e-] as they are read."""
+        """Mean images of spots [e-] after readout."""
         for effect in self.effects:
             images = effect.spot_image(images, axes, self.layout)
             shaped = {
@@ -258,7 +259,7 @@ class EffectChain:
         return images
 
     def map_change(self, channel: Channel) -> FloatArray:
-        """Change of the flats' maps."""
+        """Change of a channel of flats against position."""
         if self._maps is None:
             self._maps = MapChange(
                 self.effects,
@@ -271,7 +272,7 @@ class EffectChain:
         return self._maps.of(channel)
 
     def spot_flux(self, axes: Axes) -> FloatArray:
-        """Added to electrons of spots, exposure by exposure [e-]."""
+        """Change of the fluxes of spots by effects, exposure by exposure [e-]."""
         out = np.zeros(len(axes["flux"]))
         for effect in self.effects:
             if "spot" in effect.touches:
@@ -279,7 +280,7 @@ class EffectChain:
         return out
 
     def spot_ghosts(self, shown: FloatArray, lit: FloatArray) -> FloatArray | None:
-        """Parts of the charge of spots that others show, shape (n, m); None of none."""
+        """Fractions of the charge of spots ``lit`` that reappear in ``shown``, shape (n, m), or None."""
         parts = [e.spot_ghosts(shown, lit, self.layout) for e in self.effects]
         some = [p for p in parts if p is not None]
         return np.sum(some, axis=0) if some else None
@@ -287,7 +288,7 @@ class EffectChain:
     def modes(
         self, channel: Channel, gains: FloatArray, axes: dict[str, NDArray]
     ) -> FloatArray:
-        """Shapes of what chance adds to a channel, in its unit, shape (n, modes)."""
+        """Shapes of the random effects in a channel, in its unit, shape (n, modes)."""
         own, axes = self._in_electrons(channel, gains, axes)
         axes["fold"] = np.full(len(channel), channel.fold)
         found = [
@@ -299,7 +300,7 @@ class EffectChain:
 
 
 def pad_areas(a: FloatArray, reach: int) -> FloatArray:
-    """Area changes on a wider window."""
+    """Pad area changes with zeros to a window of ``reach`` pixels to either side."""
     more = reach - a.shape[-1] // 2
     if more <= 0:
         return a
@@ -307,7 +308,7 @@ def pad_areas(a: FloatArray, reach: int) -> FloatArray:
 
 
 def _unit(channel: Channel, own: FloatArray, gains: FloatArray) -> FloatArray:
-    """Electrons of one unit of each value."""
+    """Electrons (or their square) per unit of each value."""
     if channel.unit == "adu2" and "other" in channel.axes:
         return np.asarray(own * gains[channel.axes["other"].astype(int)])
     if channel.unit == "adu2":

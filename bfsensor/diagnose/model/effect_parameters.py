@@ -1,4 +1,4 @@
-"""Parameters of effects that a fit moves: from where, by what steps, how far."""
+"""Free parameters of effects: start values, derivative steps, and limits of a fit's steps."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from bfsensor.typing import FloatArray
 
 
 class FittedEffects:
-    """Effects whose parameters a fit moves, one after another.
+    """The free parameters of several effects as one vector.
 
     Parameters
     ----------
     effects : sequence of Effect
-        With the values at which the fit begins.
+        Effects with the values at which the fit starts.
 
     Attributes
     ----------
     effects : tuple of Effect
-        As given.
+        The same effects.
     names : tuple of str
-        Of the parameters.
+        Names of the parameters in a fit.
     start, steps : ndarray, shape (n,)
-        Where the fit begins, and steps of derivatives.
+        Start values, and steps of numerical derivatives, in the parameters' units.
     shapes : ndarray of bool, shape (n,)
-        Which are of the shape of an effect, not its amplitude.
+        Whether a parameter describes the shape of an effect, not its amplitude.
     """
 
     def __init__(self, effects: Sequence[Effect] = ()) -> None:
@@ -43,7 +43,7 @@ class FittedEffects:
         return len(self._each)
 
     def at(self, values: FloatArray) -> tuple[Effect, ...]:
-        """Effects with their parameters as given, shape (n,)."""
+        """Make the effects with given parameters, shape (n,)."""
         left = iter(values)
         return tuple(
             e.with_values(**{p.name: float(next(left)) for p in fitted(e)})
@@ -51,11 +51,11 @@ class FittedEffects:
         )
 
     def touch(self, word: str) -> NDArray[np.bool_]:
-        """Which parameters a channel can depend on."""
+        """Mask of the parameters that a channel can depend on."""
         return np.array([word in e.touches for _, e, _ in self._each], bool)
 
     def reach(self, values: FloatArray) -> FloatArray:
-        """Smallest and largest steps of a fit from values, shape (2, n)."""
+        """Smallest and largest steps that a fit may take from given values, shape (2, n)."""
         ends = [
             reach_of(p, float(v)) for (_, _, p), v in zip(self._each, values, strict=True)
         ]
@@ -63,12 +63,12 @@ class FittedEffects:
 
 
 def fitted(effect: Effect) -> list[Parameter]:
-    """Parameters that a fit may move: whole numbers stay where the search put them."""
+    """Parameters that are fitted; whole numbers keep the values of the search."""
     return [p for p in effect.parameters if p.law != "whole"]
 
 
 def widened(p: Parameter) -> tuple[float, float]:
-    """Range of a parameter in fits: ten times beyond the plausible one, or half of its width."""
+    """Range of a parameter in fits: ten times the plausible one, or half its width beyond it."""
     if p.law == "log":
         low = -10 * p.high if p.signed else (0.0 if p.amplitude else 0.3 * p.low)
         return p.neutral + low, p.neutral + (10 * p.high if p.amplitude else 3 * p.high)
@@ -79,20 +79,21 @@ def widened(p: Parameter) -> tuple[float, float]:
 def reach_of(p: Parameter, value: float) -> tuple[float, float]:
     """Smallest and largest step of a fit from a parameter's value.
 
-    Effects stay in their ranges, widened; parameters of a shape go no farther than a
-    derivative can tell: to half or twice, or a quarter of a range.
+    Amplitudes stay within their widened range.  Parameters of a shape also change by no more
+    than to half or twice their value, or a quarter of their range, in one step, as a
+    derivative predicts larger changes badly.
     """
     away, far = value - p.neutral, 0.25 * (p.high - p.low)
     range_ = np.array(widened(p)) - value
     step = np.array([-0.5, 1.0]) * away if p.law == "log" else far * np.array([-1, 1])
     held = p.amplitude or (p.law == "log" and p.signed)
     low, high = range_ if held else np.clip(step, *range_)
-    # From beyond its range no farther.
+    # A value outside its range may only move towards it.
     return min(float(low), 0.0), max(float(high), 0.0)
 
 
 def _step(effect: Effect, p: Parameter) -> float:
-    """Of derivatives: small against the value, or the least plausible one."""
+    """Step of a derivative: small against the value, or against the least plausible value."""
     if p.step:
         return p.step
     scale = abs(effect[p.name] - p.neutral)

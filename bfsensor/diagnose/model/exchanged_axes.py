@@ -1,4 +1,4 @@
-"""Named hypotheses outside the library: they stand among the candidates like its effects."""
+"""Hypotheses outside the library that are tested like effects: x and y of the baseline exchanged."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from bfsensor.typing import Edges, FloatArray
 
 
 class AxesExchanged(Effect):
-    """The baseline's x and y are exchanged: its shifts go ``amp`` of the way to their transposes.
+    """The baseline's x and y are exchanged: its shifts move by ``amp`` towards their transposes.
 
-    1 where a table, a file of covariances or a list of lags was read with its axes the other way
-    round.  Half an exchange has no such meaning: about 1 the size is free, as a test.
+    ``amp`` is 1 where a table, a file of covariances or a list of lags was read with its axes
+    exchanged.  Other values have no such meaning; it is free about 1 as a test of the hypothesis.
     """
 
     word = "outside_library"
@@ -26,22 +26,24 @@ class AxesExchanged(Effect):
     )
 
     def edges(self, kx: FloatArray, ky: FloatArray, shot: Shot, layout: Layout) -> Edges:
-        """Shifts of right and upper edges per electron."""
+        """Shifts of right and upper edges [pixel/e-], moved towards their transposes."""
         amp = self["amp"]
         return kx + amp * (ky.T - kx), ky + amp * (kx.T - ky)
 
 
 NAMED: tuple[type[Effect], ...] = (AxesExchanged,)
-"""All of them."""
+"""All hypotheses outside the library."""
 
 
 def says_exchanged(value: float, error: float) -> str:
-    """In words, with how far the size is from a whole exchange."""
+    """Sentence that states the exchange and its size, with the distance from a complete one."""
     off = abs(value - 1.0) / error if error > 0 else np.inf
     fits = (
-        "as a whole exchange has it" if off < 3 else f"{off:.1f} standard deviations from 1"
+        "1 for a complete exchange"
+        if off < 3
+        else f"{off:.1f} standard deviations from 1, which is a complete exchange"
     )
     return (
-        f"The axes are exchanged: the shifts in x are those of the baseline in y and the other "
-        f"way round ({value:.2f} +- {error:.2f} of the way, {fits})"
+        "The axes are exchanged: the boundary shifts in x are those of the baseline in y, and those "
+        f"in y are the baseline's in x (size {value:.2f} +- {error:.2f}, {fits})"
     )

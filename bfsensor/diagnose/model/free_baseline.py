@@ -1,4 +1,4 @@
-"""A baseline for sensors of which nothing is known: white noise, and near areas that float."""
+"""A baseline for unknown sensors: white noise, and free area changes of the nearest neighbours."""
 
 from __future__ import annotations
 
@@ -8,31 +8,35 @@ from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.typing import Edges, FloatArray
 
 NAME = "none: white noise, near a_ij that float"
+"""Name of the baseline in reports."""
 
 SPREAD = 4e-6
-"""Width of the priors of the a_ij [1/e-]: ten times the largest neighbour's of thick CCDs with
-pixels of 10 um, so that data of any use decide alone."""
+"""Standard deviation of the priors of the a_ij [1/e-]. Chosen: ten times the largest neighbour's a_ij
+of thick CCDs with 10 um pixels, so that flats of any use constrain them far better than the prior;
+twice as large changes no fit of such flats."""
 
 HALF = 5
+"""Half side of the shifts' window [pixel]. Chosen: wider than the two lags that are free; twice as
+large changes nothing but the window, as all other shifts are 0."""
 
 
 def free_baseline() -> Baseline:
-    """White noise of light and readout, and a brighter-fatter effect of any near shape.
+    """Make a baseline of white noise and a brighter-fatter effect of free short-range shape.
 
-    The area changes a_10, a_01, a_20, a_02 and a_11 float, alike in all four quadrants and not
-    below 0: charges repel, so that neighbours of a full pixel grow.  a_00 follows, for areas
-    are conserved; further lags stay at 0.  Boundaries shift as the areas ask, towards the
-    charge.  Nothing is assumed of wavelength or voltage: all conditions share one matrix.
+    The area changes a_10, a_01, a_20, a_02 and a_11 are free, equal in all four quadrants and not
+    below 0: charges repel, so that neighbours of a full pixel grow.  a_00 follows from the
+    conservation of area; farther lags are 0.  Boundaries shift towards the charge by as much as
+    these areas require.  All wavelengths and voltages share one matrix.
 
     Returns
     -------
     Baseline
-        Its parameters float with priors that any data of use override.
+        Baseline with five free parameters and wide priors.
 
     Notes
     -----
-    At one level of the light a positive covariance of near neighbours is taken by these a_ij,
-    whatever made it; several levels part what goes with the level's square from the rest.
+    With flats of one level, these a_ij take up any positive covariance of near neighbours,
+    whatever its cause; several levels separate covariances that grow with the level's square.
 
     Examples
     --------
@@ -41,7 +45,7 @@ def free_baseline() -> Baseline:
     """
     side = 2 * HALF + 1
     zero = np.zeros((side, side))
-    # What grows at one place was taken from the pixel in the middle, across all edges between.
+    # Area that a pixel gains comes from the central pixel, across all edges between the two.
     near, second = _towards({(0, 1): 1.0}), _towards({(0, 1): 1.0, (0, 2): 1.0})
     diagonal = _towards({(0, 1): 1.0, (1, 1): 0.5, (-1, 1): 0.5})
     edges: dict[str, Edges] = {
@@ -55,7 +59,7 @@ def free_baseline() -> Baseline:
 
 
 def _towards(shifts: dict[tuple[int, int], float]) -> FloatArray:
-    """Shifts towards the middle of edges in x: by row, and number of the edge to either side."""
+    """Kernel of shifts towards the centre along x; keys: row, and edge counted from the centre."""
     out = np.zeros((2 * HALF + 1, 2 * HALF + 1))
     for (dy, edge), shift in shifts.items():
         # Element dx is the right edge of the pixel dx.

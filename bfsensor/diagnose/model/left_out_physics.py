@@ -1,8 +1,8 @@
-"""What a device's simulation may leave out, as candidates: the road walked again with it.
+"""Physics that a device's simulation may leave out, as candidate effects from solutions with it.
 
-Each piece is one change of the device, or of how light and charge are followed in it; the
-difference of the tables with and without is its template, at every light and back bias that the
-baseline holds.  ``strength`` 1 is all of it, 0 the baseline as it is.
+Each candidate is one change of the device, or of the calculation of light and charge in it.  Its
+template is the difference of the boundary shifts with and without the change, at every wavelength
+and back bias of the baseline; ``strength`` 0 is the baseline, 1 the whole change.
 """
 
 from __future__ import annotations
@@ -43,68 +43,82 @@ from bfsensor.typing import Edges, FloatArray
 from bfsensor.units import VACUUM_PERMITTIVITY
 
 CELLS = FINE
-"""Of the meshes of templates, a pixel: as fine as the device's own tables.  From 16 cells templates of
-side diffusion and levels left more than 2 % of themselves, which at 70 standard deviations is
-said to be outside the library; at 8 cells the nearest areas are 5 to 10 % off."""
+"""Mesh cells per pixel of the templates' solutions, those of the device's own. Measured (commit
+45435d9): with 16, templates of side diffusion and levels are off by more than 2 %, which an effect of
+70 standard deviations turns into a mismatch outside the library; with 8, the nearest areas are 5 to
+10 % off."""
 
 BACKGROUNDS = LEVEL - SPAN, LEVEL, LEVEL + SPAN
+"""Backgrounds of solutions whose change with level is needed [e-]."""
 
 HOLES = 3.0
-"""Rise of the quasi-Fermi level of the stops' holes that is all of the piece [V]: 3 V below 0 V,
-holes of the ITL device leave the barrier gates and a_10 is 35 % smaller; at 5 V it is 50 %."""
+"""Rise of the quasi-Fermi level of the channel stops' holes at ``strength`` 1 [V]. Chosen: measured
+on the ITL device (commit 45435d9), holes leave the barrier gates and a_10 falls by 35 %; twice as
+large only halves the strength that is found, as long as the change is linear (at 5 V a_10 falls by 50
+%)."""
 
 SIDE = 1.1
-"""Side diffusion of the stops that is all of the piece [um]: that of the published ITL device."""
+"""Side diffusion of the channel stops at ``strength`` 1 [um].  Fitted value of the shipped
+itl_sta3800c (its device.toml); twice as large only halves the strength that is found."""
 
 RIPPLE = 0.01
-"""Relative amplitude of the doping's ripple of which the rings' template is."""
+"""Relative amplitude of the doping's ripple in the template of rings. Chosen: the displacements are
+linear in it, so that twice as large only halves the strength that is found."""
 
 PERIODS = np.geomspace(5.0, 200.0, 24)
-"""Of ripples [pixel] at which displacements are held; between them they go smoothly."""
+"""Periods of ripples [pixel] at which displacements are calculated, 17 % apart; they are interpolated
+between. Chosen: displacements vary smoothly with the period; steps twice as large quadruple the small
+errors."""
 
 GUARD = Edge("x", (EdgeStrip(50.0, 20.0, "none"), EdgeStrip(200.0)))
-"""Where a device's file says nothing of its edge: a guard ring at 20 V and free silicon beyond."""
+"""Edge of a device whose file describes none: a guard ring, 50 um wide at 20 V, and 200 um of bare
+silicon. Chosen, to be derived: a usual layout; the strength that is found scales its
+displacements."""
 
 RIM = 40
-"""Boundaries from the edge of which displacements are held."""
+"""Number of boundaries from the edge whose displacements are calculated.  Derived: a disturbance between
+conducting planes decays as exp(-pi x / thickness), to 4e-6 over 400 um in 100 um of silicon; twice as
+many change nothing."""
 
 if TYPE_CHECKING:
     from bfsensor.sensor.drift_field import Drift
 
 LEVEL_OF_HOLES = "operating_point.hole_quasi_fermi_level"
 SPREAD_OF_STOPS = "channel_stop.side_diffusion"
+"""Dotted names of the two quantities of a device that candidates change."""
 
-SOURCE = "Differences of our own tables with and without: {}"
+SOURCE = "Differences of simulated tables with and without: {}"
+"""Source of a candidate, as printed in reports."""
 
 
 def physics_left_out(
     device: Device, baseline: Baseline, *, cells: int = CELLS, keep: Path | None = None
 ) -> tuple[type[Effect], ...]:
-    """Make the candidates for what a device's baseline leaves out.
+    """Make candidate effects for physics that a device's baseline leaves out.
 
     Parameters
     ----------
     device : Device
-        That the baseline was made of, mirror-symmetric or with an edge.
+        Device of the baseline, mirror-symmetric or with an edge.
     baseline : Baseline
-        From :func:`~bfsensor.diagnose.model.device_baseline.baseline_of_device`: its conditions are
-        those of the templates; what it already holds (levels, depths) is no candidate.
+        From :func:`~bfsensor.diagnose.model.device_baseline.baseline_of_device`.  Templates are made at
+        its conditions; physics that it includes (levels, depths) is no candidate.
     cells : int
-        Of the meshes, a pixel.
+        Mesh cells per pixel.
     keep : Path, optional
-        Folder where walks are kept.
+        Folder where solutions are cached.
 
     Returns
     -------
     tuple of type
-        Free holes, side diffusion of the stops, response by level (where the baseline has
-        none), conversion depth (where it has none), diffusion in the field, rings of the
-        doping, field of the edge; for ``dataclasses.replace(baseline, pieces=...)``.
+        Free holes, side diffusion of the stops, change with level and conversion depth (each where
+        the baseline lacks it), diffusion in the field, rings of the doping, field of the edge
+        (where the device allows it); for ``dataclasses.replace(baseline, pieces=...)``.
 
     Notes
     -----
-    Straight in their strength, which at 1 is exact.  Diffusion widens spots; that it smooths
-    the shifts themselves is left out.  Rings and edge need a depleted device.
+    Changes are linear in the strength, and exact at 1.  Diffusion widens spots; its smoothing of
+    the shifts is left out.  Rings and edge need a depleted device.
     """
     plain = dataclasses.replace(
         device, edge=None, silicon=dataclasses.replace(device.silicon, ripples=())
@@ -138,9 +152,9 @@ def physics_left_out(
         return {b: walked(change_parameter(one, quantity, by)) for b, one in here.items()}
 
     def differences(quantity: str, all_of_it: float) -> Moved:
-        """Of the shifts, with so much more of a quantity, at every condition.
+        """Differences of the shifts with a quantity raised, at every condition.
 
-        Or with so much less, and turned round, where a device cannot have more of it.
+        The quantity is lowered instead, and the sign changed, where the raised device is refused.
         """
         less = {b: walked(one) for b, one in here.items()}
         sign = 1.0
@@ -179,7 +193,7 @@ def physics_left_out(
     drifts = {bias: _drift(one) for bias, one in here.items()}
     found.append(_diffusion(drifts, list(colours), device))
     found.append(_rings(drifts, list(colours), plain))
-    # Of a device that the edge's field cannot hold there is no such candidate.
+    # Devices that the solver of the edge's field refuses have no such candidate.
     with contextlib.suppress(DeviceError):
         found.append(_rim(device, here, list(colours)))
     return tuple(found)
@@ -190,12 +204,12 @@ def _less(new: Edges, old: Edges, sign: float = 1.0) -> Edges:
 
 
 def _bent(walked: Walk, colour: float | None, kelvin: float) -> tuple[Edges, Edges] | None:
-    """Change with the level, where it was walked."""
+    """Change of the response with the level; None where it was calculated at one background."""
     return None if len(walked.backgrounds) == 1 else walked.bent(colour, kelvin)
 
 
 def _as_bent(levels: list[tuple[Key, tuple[Edges, Edges]]]) -> QuadraticTemplate | None:
-    """Slopes and bends of all conditions; None of none."""
+    """Derivatives by the level of all conditions as a template; None without any."""
     if not levels:
         return None
     slopes, bends = (tuple((k, pair[n]) for k, pair in levels) for n in range(2))
@@ -250,8 +264,8 @@ def _depths(
 
 
 def _drift(device: Device) -> Drift:
-    """The mean field above the plane that stands for the pixels."""
-    # Sensors import GalSim, which takes a second.
+    """Mean field above the conducting plane that represents the pixels."""
+    # Imported here because the sensor package imports GalSim, which takes a second.
     from bfsensor.sensor.drift_field import solve_drift
 
     return solve_drift(
@@ -260,9 +274,9 @@ def _drift(device: Device) -> Drift:
 
 
 def _of_light(drift: Drift, values: FloatArray, wavelength: float, kelvin: float) -> float:
-    """Mean of what depends on the height of conversion, over where light converts."""
+    """Mean of values by height, weighted by the fraction of light that converts there."""
     heights = drift.heights
-    # At the heights themselves; linear between.
+    # Weights of values at these heights, linear between them.
     weights = conversion_weights(heights, float(heights[-1]), wavelength, kelvin)
     return float(weights @ values)
 
@@ -285,10 +299,10 @@ def _diffusion(
 def ring_shifts(
     device: Device, drift: Drift, front: float, periods: FloatArray
 ) -> FloatArray:
-    r"""Displacements by a ripple of the doping, against the height of conversion.
+    r"""Calculate displacements by a ripple of the doping, against the height of conversion.
 
-    A ripple :math:`\delta \cos k x` of the doping N between the plane that stands for the
-    pixels, at :math:`z_g`, and the back contact at L, both conducting, makes
+    A ripple :math:`\delta \cos k x` of the doping N between the plane that represents the
+    pixels, at :math:`z_g`, and the back contact at L, both conducting, makes the potential
 
     .. math::
         \phi = \frac{\delta N}{\epsilon k^2} \left[ 1 -
@@ -299,25 +313,25 @@ def ring_shifts(
     Parameters
     ----------
     device : Device
-        For doping, permittivity and pitch.
+        Device, for doping, permittivity and pitch.
     drift : Drift
-        Its mean field.
+        Mean field of the device.
     front : float
         Height of the plane [um].
     periods : ndarray, shape (n,)
-        [pixel].
+        Periods of the ripple [pixel].
 
     Returns
     -------
     shifts : ndarray, shape (n, heights)
-        Amplitude [pixel], of :data:`RIPPLE`.
+        Amplitude of the displacement [pixel] by a relative ripple of :data:`RIPPLE`.
     """
     pitch = 0.5 * (device.pixel.pitch_x + device.pixel.pitch_y)
     z, field = drift.heights, drift.field
     k = 2 * np.pi / (periods[:, None] * pitch)
     high = z[-1]
     inside = z >= front
-    # sinh of far apart places, without overflow.
+    # Ratios of sinh as exponentials, which do not overflow for large k.
     up, down, whole = high - z, z - front, high - front
     scale = 1 - np.exp(-2 * k * whole)
     one = np.exp(-k * (whole - up)) * (1 - np.exp(-2 * k * up))
@@ -365,7 +379,7 @@ def _rim(device: Device, here: dict[float, Device], colours: list[float]) -> typ
 
 
 def rim_shifts(device: Device) -> tuple[FloatArray, FloatArray]:
-    """Depths [um] and displacements inwards [pixel], shape (depths, n), of a device's edge."""
+    """Depths [um], and displacements inwards [pixel], shape (depths, n), near a device's edge."""
     field = solve_edge(device)
     high = float(field.z[-1])
     depths = np.array([field.front.height + 2.0, 20.0, 0.5 * high, 0.85 * high, high])

@@ -1,4 +1,4 @@
-"""Columns of the linear parameters of a baseline: light, darks, shape of the light, fluxes."""
+"""Columns of a baseline's linear parameters: light, dark current, shape of the light, spot fluxes."""
 
 from __future__ import annotations
 
@@ -12,25 +12,31 @@ from bfsensor.diagnose.model.map_shapes import Places
 from bfsensor.typing import FloatArray
 
 MAP_ORDER = 4
-"""Order of the polynomial in x and y that the light on the sensor may have."""
+"""Largest total order of the polynomial in x and y that describes the light on the sensor. Chosen, to
+be derived: twice as large takes up more of smooth effects such as rings of long period."""
 
 
 def linear_columns(
     channel: Channel, rows: Rows, measured: MeasuredChannels
 ) -> dict[str, FloatArray]:
-    """What the values of a channel change with each linear parameter, by name.
+    """Make the columns of a channel's linear parameters: its change for a unit of each, by name.
 
-    Light by amplifier and condition, dark current, shape of the light, flux of the spots; the
-    same name is the same parameter in all channels.
+    Parameters are the light by amplifier and condition, the dark current, the shape of the light
+    and the flux of the spots; the same name is the same parameter in all channels.
 
     Parameters
     ----------
     channel : Channel
-        Whose values.
+        Channel to make columns for.
     rows : dict
-        Which of them belong to each condition.
+        Indices of its values by condition.
     measured : MeasuredChannels
-        The campaign, for its amplifiers.
+        Channels of the campaign, for its amplifiers.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Columns in the channel's unit; empty for channels without linear parameters.
     """
     if channel.word == "flat_mean":
         return _mean_columns(channel, rows)
@@ -80,7 +86,7 @@ def _map_columns(channel: Channel, measured: MeasuredChannels) -> dict[str, Floa
         f"light {p}{q}": places.product(u**p, v**q, size)
         for p in range(MAP_ORDER + 1) for q in range(MAP_ORDER + 1 - p)
     }  # fmt: skip
-    # Amplifiers were divided by their means: steps between them are free.
+    # Each amplifier was divided by its mean, so that steps between amplifiers are free.
     for amp, s in enumerate(measured.segments[1:], 1):
         inside = np.zeros(nx), np.zeros(ny)
         inside[0][s.x : s.x + s.columns] = 1.0
@@ -92,8 +98,8 @@ def _map_columns(channel: Channel, measured: MeasuredChannels) -> dict[str, Floa
             out[f"map {name} {what}"] = np.where(here, column, 0.0)
         ring = here & (x["what"] == "ring")
         if ring.any():
-            # Sizes of pixels, and the effect, which evens the pixels' response out: more at
-            # some levels and conditions than at others, so that ratios keep of it.
+            # Pixel sizes have power at high frequency, and brighter-fatter feedback relaxes the
+            # pixels' response by amounts that differ between levels and conditions.
             for power in (2, 4):
                 out[f"map {name} rings k{power}"] = np.where(ring, x["k"] ** power, 0.0)
         if name == "all" and ring.any():

@@ -1,4 +1,4 @@
-"""What effects change in the maps of flats, in the spatial frequencies that even them out."""
+"""Changes of the maps of flats by effects, relaxed by brighter-fatter feedback per frequency."""
 
 from __future__ import annotations
 
@@ -31,18 +31,21 @@ from bfsensor.response.edge_response import area_matrix
 from bfsensor.typing import FloatArray
 
 Spectrum = NDArray[np.complex128]
+"""Half of a two-dimensional Fourier transform, as ``scipy.fft.rfft2`` returns it."""
 
 FAINT = 0.01
-"""Part of its error that a texture's change must reach to be worked out."""
+"""Least change of a texture relative to its error for the texture to be calculated. Chosen: smaller
+changes change the chi-square by less than 1e-4 per value; twice as large, by less than 4e-4."""
 
 KEPT, KEPT_PIXELS = 12, 2_000_000
-"""Changes by single effects that are kept, and up to which size of a sensor."""
+"""Largest number of cached changes by single effects, and largest sensor for which they are cached
+[pixel]. Chosen: up to 12 arrays of 16 MB; twice as large doubles memory and changes no result."""
 
 
 def shot_at(
     layout: Layout, condition: Condition, kind: str = "flat", seconds: float = 0.0
 ) -> Shot:
-    """Exposure at a condition; what is not known is the reference's."""
+    """Make an exposure at a condition; unknown settings are those of the reference."""
     values = (
         float(own) if np.isfinite(own) else usual
         for own, usual in zip(numbers_of(condition), layout.reference, strict=True)
@@ -53,28 +56,28 @@ def shot_at(
 class MapChange:
     """Change of the flats' maps by effects.
 
-    A pattern of pixel areas fills up unevenly and is evened out by the shifts that its own
-    charge makes, mode by mode as the fluctuations of the light are: (exp(a m) - 1) / (a m) of it
-    is left at the level m.  Light's patterns are taken as wide against the reach of the shifts,
-    which are even there: of waves of 40 pixels that keeps 1 % too much.  What comes after
-    collection is not evened out.
+    A pattern of pixel areas fills pixels unevenly, and the boundary shifts by that charge relax
+    it.  At each spatial frequency, as for fluctuations of the light, a fraction
+    (exp(a m) - 1) / (a m) is left at the level m.  Patterns of the light are taken as wide
+    compared with the shifts' reach, where nothing relaxes; for waves of 40 pixels this leaves 1 %
+    too much.  Changes after collection are not relaxed.
 
     Parameters
     ----------
     effects : sequence of Effect
-        In the order of their stages.
+        Effects in the order of their stages.
     layout : Layout
         Sensor and campaign.
     measured : MeasuredChannels
-        Of which flats the maps are made.
+        Channels of the campaign, for the flats that each map is made of.
     baseline : Baseline
-        Its shifts even patterns out.
+        Boundary shifts, by which patterns are relaxed.
     kept : Cache
-        Holds what stays valid when effects change: rows of maps, what is left of patterns, and
-        changes by single effects.
+        Results that stay valid when effects change: rows of maps, remaining fractions of
+        patterns, and changes by single effects.
     evening : (float, mapping of str to float)
-        Gain [e-/ADU] and departures of the device's parameters from nominal by which patterns
-        are evened out.
+        Gain [e-/ADU] and device parameters less their nominal values at which patterns are
+        relaxed.
     """
 
     def __init__(
@@ -99,7 +102,7 @@ class MapChange:
         self._made: dict[tuple, Spectrum | None] = {}
 
     def of(self, channel: Channel) -> FloatArray:
-        """Change of all values of the channel."""
+        """Change of all values of a channel of flats against position."""
         out = np.zeros(len(channel))
         if not self.effects:
             return out
@@ -117,7 +120,7 @@ class MapChange:
     def _spectrum(
         self, name: tuple[str, str], shares: Sequence[MapShare]
     ) -> Spectrum | None:
-        """Transform of a map's change."""
+        """Fourier transform of a map's relative change; None without a change."""
         total: Spectrum | None = None
         for key, group in self._groups(shares).items():
             first = group[0]
@@ -133,7 +136,7 @@ class MapChange:
         return total
 
     def _groups(self, shares: Sequence[MapShare]) -> dict[tuple, list[MapShare]]:
-        """Flats that effects treat alike."""
+        """Flats of a map in groups that effects change by the same amount."""
         out: dict[tuple, list[MapShare]] = {}
         for share in shares:
             where = None if self._standing else share.condition
@@ -147,7 +150,7 @@ class MapChange:
         return float(sum(s.weight for s in group))
 
     def _left(self, key: tuple, group: Sequence[MapShare]) -> FloatArray:
-        """Weights of the flats by mode: what is left of a pattern in each."""
+        """Sum of the flats' weights times the remaining fraction of a pattern, by spatial frequency."""
 
         def evened() -> FloatArray:
             parts = [
@@ -158,7 +161,7 @@ class MapChange:
         return self._evened.get(key, evened)
 
     def _left_at(self, condition: Condition, level: float) -> FloatArray:
-        """What is left of a pattern's modes at a level [e-], on the sensor's grid."""
+        """Remaining fraction of a pattern at a level [e-], by spatial frequency of the sensor."""
         a = area_matrix(*self.baseline.at(condition, self._device)[0])
         wide = np.zeros(self.layout.shape)
         half = a.shape[0] // 2
@@ -169,7 +172,7 @@ class MapChange:
         return np.where(small, 1 + x / 2, np.expm1(x) / np.where(small, 1.0, x))
 
     def _areas(self, key: tuple, share: MapShare) -> Spectrum | None:
-        """Of the pixels' areas in a weak flat."""
+        """Transform of the relative change of the pixels' areas without charge."""
 
         def change(effect: Effect, shot: Shot) -> FloatArray | None:
             return area_change(effect, shot, self.layout)
@@ -177,7 +180,7 @@ class MapChange:
         return self._sum("areas", key, share, change)
 
     def _light(self, key: tuple, share: MapShare) -> Spectrum | None:
-        """Of the light."""
+        """Transform of the relative change of the light."""
 
         def change(effect: Effect, shot: Shot) -> FloatArray | None:
             factor = effect.light_map(shot, self.layout)
@@ -186,7 +189,7 @@ class MapChange:
         return self._sum("light", key, share, change)
 
     def _patterns(self, group: Sequence[MapShare]) -> Spectrum | None:
-        """Of what comes after collection, which goes with each flat's own level."""
+        """Transform of changes after collection, which depend on each flat's level."""
         total: FloatArray | None = None
         for share in group:
             shot = self._shot(share)
@@ -207,7 +210,7 @@ class MapChange:
         share: MapShare,
         change: Callable[[Effect, Shot], FloatArray | None],
     ) -> Spectrum | None:
-        """Transform of what all effects change, made once."""
+        """Transform of the sum of all effects' changes, cached."""
         if (word, *key) not in self._made:
             shot = self._shot(share)
             parts = [
@@ -226,14 +229,14 @@ class MapChange:
         shot: Shot,
         change: Callable[[Effect, Shot], FloatArray | None],
     ) -> FloatArray | None:
-        """Change by one effect; of some effects that stay as they are it is kept."""
+        """Change by one effect, cached where there are several effects and the sensor is small."""
         if len(self.effects) == 1 or np.prod(self.layout.shape) > KEPT_PIXELS:
             return change(effect, shot)
         key = word, effect, None if effect.standing else shot
         return self._parts.get(key, lambda: change(effect, shot))
 
     def _transform(self, change: FloatArray) -> Spectrum:
-        """Spatial frequencies of a relative change, each amplifier over its mean."""
+        """Fourier transform of a relative change, each amplifier divided by its mean."""
         total = 1.0 + np.broadcast_to(change, self.layout.shape)
         for segment in self.layout.segments:
             part = np.s_[segment.y : segment.y + segment.rows,
@@ -244,7 +247,7 @@ class MapChange:
 
 
 def _rows(channel: Channel, name: str) -> tuple[NDArray[np.int64], Axes]:
-    """Values of a map: which they are, and where they belong."""
+    """Indices of a map's values in a channel, and their places."""
     rows = np.nonzero(channel.axes["map"] == name)[0]
     parts = parts_of({k: channel.axes[k][rows] for k in ("what", "x", "y", "k")})
     errors = channel.errors[rows[parts["texture"]]]
@@ -253,7 +256,7 @@ def _rows(channel: Channel, name: str) -> tuple[NDArray[np.int64], Axes]:
 
 
 def area_change(effect: Effect, shot: Shot, layout: Layout) -> FloatArray | None:
-    """Relative change of the pixels' areas by an effect; None of none."""
+    """Relative change of the pixels' areas by an effect; None if it displaces no edges."""
     moved = effect.displacements(shot, layout)
     if moved is None:
         return None
@@ -261,7 +264,7 @@ def area_change(effect: Effect, shot: Shot, layout: Layout) -> FloatArray | None
 
 
 def lines_of_map(effect: Effect, channel: Channel, layout: Layout) -> FloatArray:
-    """Change of columns, rows and blocks of the map of all light alone, nothing evened out."""
+    """Change of columns, rows and blocks of the map of all light, without relaxation."""
     x, out = channel.axes, np.zeros(len(channel))
     own = np.nonzero(x["map"] == "all")[0]
     if not len(own):
@@ -285,7 +288,7 @@ def lines_of_map(effect: Effect, channel: Channel, layout: Layout) -> FloatArray
 
 
 def block_means(change: FloatArray) -> FloatArray:
-    """Means of a map's blocks."""
+    """Mean values of a map's blocks."""
     ny, nx = change.shape
     side = block_side((ny, nx))
     whole = change[: ny // side * side, : nx // side * side]
@@ -295,47 +298,47 @@ def block_means(change: FloatArray) -> FloatArray:
 def block_places(
     axes: Axes, rows: NDArray[np.int64], shape: tuple[int, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Which row and column of blocks values belong to."""
+    """Row and column of the block that each value belongs to."""
     side = block_side(shape)
     y, x = (((axes[n][rows] + 0.5) / side).astype(int) for n in "yx")
     return y, x
 
 
 PARTS = ("column", "row", "block", "ring", "texture", "chess")
+"""Kinds of values of a map: axis 'what' of the channel."""
 
 
 def parts_of(axes: Axes) -> dict[str, NDArray[Any]]:
-    """Axes 'x', 'y', 'k' of a map's values, and which of them are each of :data:`PARTS`."""
+    """Axes 'x', 'y', 'k' of a map's values, and the indices of each of :data:`PARTS`."""
     found = {w: np.nonzero(axes["what"] == w)[0] for w in PARTS}
     return found | {k: axes[k] for k in ("x", "y", "k")}
 
 
 def reduce_map(change: FloatArray, axes: Axes) -> FloatArray:
-    """What a change of a map does to its values.
+    """Reduce a relative change of a map to the values of the channel.
 
     Parameters
     ----------
     change : ndarray, shape (ny, nx)
-        Relative.
+        Relative change of each pixel.
     axes : mapping
-        'what', 'x', 'y', 'k' of the values.
+        Axes 'what', 'x', 'y' and 'k' of the values.
     """
     ny, nx = change.shape
     return reduce_spectrum(rfft2(change), (ny, nx), parts_of(axes))
 
 
 def reduce_spectrum(delta: Spectrum, shape: tuple[int, int], axes: Axes) -> FloatArray:
-    """What a change of a map does to its columns, rows, blocks, rings, texture and chess pattern.
+    """Reduce the transform of a map's change to columns, rows, blocks, rings, texture and chess.
 
     Parameters
     ----------
     delta : ndarray, shape (ny, nx // 2 + 1)
-        Transform of the change.
+        Fourier transform of the relative change.
     shape : tuple of int
-        Rows and columns.
+        Rows and columns of the map.
     axes : mapping
-        'x', 'y', 'k' of the values, and which of them are each of :data:`PARTS`; 'faint': mean
-        square up to which a change has no texture.
+        From :func:`parts_of`; 'faint': mean square of a change up to which its texture is 0.
     """
     ny, nx = shape
     column, row, block, ring, texture, chess = (axes[w] for w in PARTS)
@@ -350,7 +353,7 @@ def reduce_spectrum(delta: Spectrum, shape: tuple[int, int], axes: Axes) -> Floa
     if len(chess):
         out[chess] = map_chess(change)[0]
     if len(ring) or len(texture):
-        # Rings and texture are those of a map without its smooth shape.
+        # Rings and texture are measured on maps whose smooth shape is removed.
         q_y, q_x = (smooth_shapes(n) for n in shape)
         (f_y, _), (_, f_x) = (_smooth_spectra(n) for n in shape)
         smooth = q_y.T @ change @ q_x
@@ -365,6 +368,6 @@ def reduce_spectrum(delta: Spectrum, shape: tuple[int, int], axes: Axes) -> Floa
 
 @lru_cache(maxsize=8)
 def _smooth_spectra(n: int) -> tuple[Spectrum, Spectrum]:
-    """Transforms of the smooth shapes along a side, all frequencies and those from 0 on."""
+    """Transforms of the smooth shapes along a side, at all and at non-negative frequencies."""
     shapes = smooth_shapes(n)
     return fft(shapes, axis=0), rfft(shapes, axis=0)

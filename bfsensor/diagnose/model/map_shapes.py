@@ -1,4 +1,4 @@
-"""What shapes on the sensor are in the means of a map's columns, rows and blocks."""
+"""Means of separable shapes on the sensor over a map's columns, rows and blocks."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from bfsensor.typing import FloatArray
 
 
 class Places(NamedTuple):
-    """Where values of maps belong.
+    """Places of a map's values on the sensor.
 
     Attributes
     ----------
     column, row, block : ndarray of int
-        Which values are means of columns, of rows and of blocks.
+        Indices of the values that are means of columns, of rows and of blocks.
     x, y : ndarray of int
-        Of these columns and rows.
+        Sensor columns and rows of the former two [pixel].
     across, down : ndarray of int
-        Columns and rows of blocks of these blocks.
+        Column and row of each block, counted in blocks.
     side : int
-        Of a block [pixel].
+        Side of a block [pixel].
     """
 
     column: NDArray[np.int64]
@@ -38,7 +38,7 @@ class Places(NamedTuple):
 
     @classmethod
     def of(cls, axes: Mapping[str, NDArray], shape: tuple[int, int]) -> Places:
-        """Find them by the axes 'what', 'x' and 'y' of a channel, on a sensor of that shape."""
+        """Find the places from a channel's axes 'what', 'x' and 'y' and the sensor's shape."""
         column, row, block = (
             np.nonzero(axes["what"] == k)[0] for k in ("column", "row", "block")
         )
@@ -48,7 +48,7 @@ class Places(NamedTuple):
         return cls(column, row, block, x, y, across, down, side)
 
     def product(self, along_x: FloatArray, along_y: FloatArray, size: int) -> FloatArray:
-        """Of a function of x times one of y, shapes (nx,), (ny,): ``size`` values of a channel.
+        """Means of a function of x, shape (nx,), times one of y, shape (ny,): ``size`` values.
 
         Examples
         --------

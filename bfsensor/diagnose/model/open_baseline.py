@@ -1,4 +1,4 @@
-"""Campaigns as the channels take them, and the baseline that a campaign names."""
+"""Sources of a diagnosis: exposures of a campaign, and the baseline that a user names."""
 
 from __future__ import annotations
 
@@ -23,21 +23,41 @@ from bfsensor.recording.tables.covariance_tables import CovarianceTable
 from bfsensor.recording.tables.reduced import find_reduced, holds_images
 
 LAMP_ERROR = 1e-3
-"""Relative error of a lamp monitor of which campaign.yaml does not tell (assumed)."""
+"""Relative error of a lamp monitor reading, where campaign.yaml states none. Chosen, to be derived:
+twice as large halves the significance of nonlinearity, drift and loss in the means of flats."""
 
 
 class CampaignSource:
-    """Exposures of a campaign, read one by one.
+    """Exposures of a campaign, read one at a time as :func:`~bfsensor.diagnose.diagnose` needs them.
 
     Parameters
     ----------
     campaign : Campaign
         From :func:`bfsensor.recording.campaign.campaign.read_campaign`.
 
+    Attributes
+    ----------
+    campaign : Campaign
+        The same campaign.
+    exposures : sequence of Exposure
+        Exposures in order of time, with the settings of their groups.
+    lamp_error : float
+        Relative error of a lamp monitor reading.
+    shape : tuple of int
+        Rows and columns of the sensor [pixel].
+
     Raises
     ------
     DiagnosisError
-        The amplifiers' places on the sensor are not known and there are several.
+        There are several amplifiers and the header does not state their places on the sensor,
+        or no exposure can be used.
+
+    Examples
+    --------
+    Open a folder of recordings::
+
+        source = CampaignSource(read_campaign("recordings/"))
+        print(len(source.exposures), source.shape)
     """
 
     def __init__(self, campaign: Campaign) -> None:
@@ -49,7 +69,7 @@ class CampaignSource:
             if layout.origin is None and len(campaign.amplifiers) > 1:
                 raise DiagnosisError(
                     f"{campaign.folder}: where amplifier {layout.name} lies on the sensor is not "
-                    "known: give DETSEC, or sections in campaign.yaml"
+                    "known: give DETSEC in the headers, or sections in campaign.yaml"
                 )
             x, y = layout.origin or (0, 0)
             down, across = layout.data
@@ -60,14 +80,25 @@ class CampaignSource:
         self.shape = (rows, columns)
 
     def read(self, exposure: Exposure) -> Sequence[AmplifierFrame]:
-        """Frames of an exposure, in the order of the amplifiers."""
+        """Read the frames of one exposure.
+
+        Parameters
+        ----------
+        exposure : Exposure
+            One of ``exposures``.
+
+        Returns
+        -------
+        sequence of AmplifierFrame
+            One frame for each amplifier, in the campaign's order.
+        """
         return read_exposure(self.campaign, exposure)
 
 
 def _settled(campaign: Campaign) -> list[Exposure]:
-    """Exposures with the settings of their group: readings that jitter are one condition.
+    """Exposures with the settings of their group, as logged readings scatter about a set point.
 
-    Pairs are the manifest's or nobody's: without one, flats are paired as their levels allow.
+    Pairs are taken from the manifest; without one, flats are paired later by their levels.
     """
     settled = {}
     for kind in campaign.kinds():
@@ -82,17 +113,22 @@ def _settled(campaign: Campaign) -> list[Exposure]:
 
 
 def find_reduced_recording(path: Path) -> AreaChangeTable | CovarianceTable | None:
-    """Read the reduced recording that a path is, or that is all a folder holds.
+    """Read a reduced recording (a_ij or covariances) from a file, or from a folder without images.
+
+    Parameters
+    ----------
+    path : Path
+        File or folder.
 
     Returns
     -------
     recording : AreaChangeTable or CovarianceTable, or None
-        None where the path is a folder with images, or with nothing known: a campaign.
+        None where the path is a folder with images, or without any reduced recording: a campaign.
 
     Raises
     ------
     DiagnosisError
-        It holds neither a_ij nor covariances, or more than one such table.
+        The path holds neither a_ij nor covariances, or more than one such table.
     """
     if path.is_dir() and holds_images(path):
         return None
@@ -114,27 +150,34 @@ def find_baseline(
 ) -> Baseline:
     """Read a baseline: edge displacements (.json), a table (.fits), a GalSim stem, or a device.
 
+    For edge displacements the keyword-only argument is the path of a device card, with the
+    spread of the free parameters, as in :func:`read_edges`.
+
     Parameters
     ----------
-    given : str or path-like
-        A file, the name of a built-in device, or 'none' for white noise with shifts that
-        float (:func:`bfsensor.diagnose.model.free_baseline.free_baseline`).
-    card : path-like, optional
-        Device card with the spread of the parameters, for edge displacements.
+    given : str or path-like or None
+        A file, the name of a built-in device, or 'none' for white noise with free area changes
+        (:func:`bfsensor.diagnose.model.free_baseline.free_baseline`).
 
     Returns
     -------
     Baseline
+        Shifts, with free parameters where the file or the name 'none' provides them.
 
     Raises
     ------
     DiagnosisError
-        None of these, or none given; names what is allowed.
+        ``given`` is None, or none of these; names what is allowed.
+
+    Examples
+    --------
+    >>> find_baseline("none").parameters
+    ('a10', 'a01', 'a20', 'a02', 'a11')
     """
     if given is None:
         raise DiagnosisError(
             "no baseline: name one in campaign.yaml or with --baseline (edge displacements .json, "
-            "a table .fits, a GalSim stem, a built-in device, or none where nothing is known)"
+            "a table .fits, a GalSim stem, a built-in device, or 'none' for an unknown sensor)"
         )
     if os.fspath(given) == "none":
         return free_baseline()
@@ -153,40 +196,50 @@ def simulate_baseline(
     warming: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Baseline:
-    """Simulate a device with floating parameters, or read what an earlier run kept.
+    """Simulate the baseline of a device with free parameters, or read it from the cache.
 
     Parameters
     ----------
     given : str or path-like
         Name of a built-in device, or a device file.
     parameters : sequence of str
-        Which float; ('all',) for all with an uncertainty.
+        Dotted names of the free parameters; ('all',) for all with an uncertainty.
     back_biases : sequence of float
-        Of the recordings [V].
+        Back biases of the recordings [V].
     keep : Path
-        Folder where the shifts are kept as ``baseline_KEY.json``.
+        Folder where the shifts are cached as ``baseline_KEY.json``.
     warming : bool
-        Whether shifts follow the temperature, which recordings at several ask for.
+        Whether shifts change with temperature; needed for recordings at several temperatures.
     progress : callable, optional
-        Called with (tables made, tables in all).
+        Called with (solutions made, solutions in all).
 
     Returns
     -------
     Baseline
+        As :func:`baseline_of_device` makes it.
 
     Raises
     ------
     DiagnosisError
-        The baseline is no device: only a device can be simulated anew.
+        ``given`` is None or no device: tables and edge displacements have no parameters.
+
+    Examples
+    --------
+    This takes seconds to minutes of CPU time the first time::
+
+        simulate_baseline("itl_sta3800c", ("silicon.thickness",), [-60.0], keep=Path("cache"))
     """
     if given is None or Path(given).suffix in (".json", ".fits"):
         raise DiagnosisError(
-            f"parameters float for a device, by name or .toml, not for {given or 'no baseline'}"
+            "free parameters need a device as baseline, by name or .toml, not "
+            f"{given or 'no baseline'}"
         )
     try:
         device = Device.load(given)
     except DeviceError as error:
-        raise DiagnosisError(f"parameters float for a device: {error}") from None
+        raise DiagnosisError(
+            f"free parameters need a device as baseline: {error}"
+        ) from None
     text = "\n".join([
         TABLES, device.to_toml(), *parameters, *(f"{b:g}" for b in back_biases), *["warming"] * warming,
     ])  # fmt: skip
@@ -207,16 +260,16 @@ def simulate_baseline(
 def with_physics(
     baseline: Baseline, given: str | os.PathLike[str], *, keep: Path
 ) -> Baseline:
-    """Give a simulated device's baseline what the simulation may leave out, as candidates.
+    """Add candidate effects for physics that a simulated baseline leaves out.
 
     Parameters
     ----------
     baseline : Baseline
         From :func:`simulate_baseline`.
     given : str or path-like
-        The device that it was made of.
+        Device of the baseline.
     keep : Path
-        Folder where tables are kept: half a minute of CPU time the first time.
+        Folder where solutions are cached; they take half a minute of CPU time the first time.
     """
     pieces = physics_left_out(Device.load(given), baseline, keep=keep)
     return replace(baseline, pieces=pieces)

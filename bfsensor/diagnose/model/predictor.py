@@ -1,4 +1,4 @@
-"""Every channel from one set of parameters: device, gains, noise, lamp, pixel response."""
+"""The model of a diagnosis: predicts every channel from one set of parameters and effects."""
 
 from __future__ import annotations
 
@@ -31,34 +31,42 @@ from bfsensor.response.edge_response import area_matrix
 from bfsensor.typing import FloatArray
 
 REDUCED_LEVEL = 40_000.0
-"""Background [e-] at which a_ij without a level are predicted: halfway to a flat of 80,000 e-, at
-which published covariances are quoted."""
+"""Background [e-] at which a_ij without a stated level are predicted. Chosen: half of 80,000 e-, the
+level up to which published covariances are usually fitted; twice as large changes a_ij by 40,000 e-
+times their slope with level."""
 
 Columns = Callable[[Channel], dict[str, FloatArray]]
 """Columns of further linear parameters of a channel, by name, in its unit."""
 
 
 class Predictor:
-    """Predicts the channels of a campaign; what may float honestly is a parameter.
+    """Predicts the channels of a campaign from a baseline, effects and all free parameters.
 
-    Non-linear parameters: gain of each amplifier [e-/ADU], variance of its read noise [ADU^2],
-    the device's parameters in units of their spread, widths of the spots without charge for
-    each wavelength and temperature.  Linear ones, as columns of :meth:`linear`: light by amplifier and
-    condition, dark current, shape of the light, levels of bias and noise, flux of the spots.
+    Nonlinear parameters are the gain of each amplifier [e-/ADU], the variance of its read noise
+    [ADU^2], the device's parameters less nominal in units of their spread, the widths of spots
+    without charge for each wavelength and temperature [pixel], and the effects' parameters.  Linear
+    ones, the columns of :meth:`linear`, are the light by amplifier and condition, dark current,
+    shape of the light, and flux of the spots.
 
     Parameters
     ----------
     measured : MeasuredChannels
-        The campaign, for its amplifiers, conditions and positions of spots.
+        Channels of the campaign, for its amplifiers, conditions and places of spots.
     baseline : Baseline
         Boundary shifts.
     effects : sequence of Effect
-        What is added to it; their parameters are non-linear ones.
+        Effects added to the baseline.
 
     Attributes
     ----------
+    names : tuple of str
+        Names of the nonlinear parameters.
+    start, steps : ndarray, shape (n,)
+        Start values, and steps of numerical derivatives.
+    notes : list of str
+        Assumptions for the report.
     kept : Cache
-        Shared with copies of the same baseline; those who use predictors keep theirs in it.
+        Cached results, shared with copies that have the same baseline.
     """
 
     def __init__(
@@ -87,7 +95,7 @@ class Predictor:
         ])  # fmt: skip
         n, p = 2 * self._amps, len(baseline.parameters)
         self.prior_rows = np.arange(n, n + p)
-        """Parameters with a prior of mean 0 and width 1."""
+        """Indices of the parameters with a prior of mean 0 and standard deviation 1."""
         self._noise_told = _noise_told(measured)
         if not self._noise_told.all():
             names = [
@@ -96,8 +104,8 @@ class Predictor:
                 if not told
             ]
             self.notes.append(
-                f"read noise of {', '.join(names)} taken as {np.sqrt(noise[0]):.3g} ADU: no biases, "
-                "and flats of one level cannot tell it from the gain"
+                f"read noise of {', '.join(names)} taken as {np.sqrt(noise[0]):.3g} ADU: there are no "
+                "biases, and flats of one level do not separate it from the gain"
             )
         exact = {
             condition: baseline.at(condition)[1]
@@ -107,8 +115,8 @@ class Predictor:
         for condition, held in exact.items():
             if not held:
                 self.notes.append(
-                    f"baseline has no shifts at {label_of(condition)}: the nearest condition's are "
-                    "taken"
+                    "the baseline has no boundary shifts at wavelength/back bias/temperature "
+                    f"{label_of(condition)} [nm/V/C]: those of the nearest condition are used"
                 )
 
         self.columns: tuple[Columns, ...] = ()
@@ -117,20 +125,20 @@ class Predictor:
 
     @property
     def effects(self) -> tuple[Effect, ...]:
-        """Effects that are added to the baseline, as they were given."""
+        """Effects added to the baseline, with their start values."""
         return self._free.effects
 
     def with_effects(
         self, effects: Sequence[Effect], point: FloatArray | None = None
     ) -> Predictor:
-        """Copy with other effects, which shares what does not depend on them.
+        """Make a copy with other effects, which shares cached results that do not depend on them.
 
         Parameters
         ----------
         effects : sequence of Effect
-            Instead of those there are.
+            Effects in place of the present ones.
         point : ndarray, optional
-            Where fits begin: parameters other than effects'.
+            Start values of the parameters other than the effects'.
         """
         other = copy(self)
         plain = len(self.names) - len(self._free)
@@ -140,7 +148,7 @@ class Predictor:
         return other
 
     def with_columns(self, columns: Columns, point: FloatArray | None = None) -> Predictor:
-        """Copy with further linear parameters; fits begin at ``point``."""
+        """Make a copy with further linear parameters, whose fits start at ``point``."""
         other = copy(self)
         other.columns = (*self.columns, columns)
         if point is not None:
@@ -152,20 +160,21 @@ class Predictor:
         edges: tuple[FloatArray, FloatArray],
         slopes: tuple[FloatArray, FloatArray] | None = None,
     ) -> Predictor:
-        """Copy with shifts of boundaries added to the baseline's [pixel/e-].
+        """Make a copy with boundary shifts added to the baseline's.
 
         Parameters
         ----------
         edges : tuple of ndarray
-            Of right and upper edges; at other conditions scaled as the baseline's own are.
+            Shifts of right and upper edges [pixel/e-] at the reference; at other conditions they
+            are scaled by the ratio of the baseline's a_00.
         slopes : tuple of ndarray, optional
-            Their change with the charge that pushes [pixel/e-^2].
+            Change of the shifts with the stored charge [pixel/e-^2].
         """
         other = copy(self)
         own = self.baseline
         scales = {k: own.scale_at(k) for k in own.edges}
         if slopes is not None:
-            # The baseline's own hold at a level that may not be 0.
+            # The baseline's shifts hold at its level: the sum must have no change at zero charge.
             edges = edges[0] + own.level * slopes[0], edges[1] + own.level * slopes[1]
         moved = {
             k: tuple(o + scales[k] * d for o, d in zip(own.edges[k], edges, strict=True))
@@ -182,7 +191,7 @@ class Predictor:
                 for k in own.edges
             }
         other.baseline = replace(own, **changed)  # type: ignore[arg-type]
-        # What was kept goes with the baseline.
+        # Cached results depend on the baseline.
         other.kept, other.spots = Cache(), self.spots.with_baseline(other.baseline, slopes)
         return other
 
@@ -191,21 +200,22 @@ class Predictor:
         spots: Iterable[Condition] = (),
         maps: Mapping[tuple[str, str], tuple[MapShare, ...]] | None = None,
     ) -> Predictor:
-        """Copy that predicts spots at further conditions, and further maps, as well.
+        """Make a copy that also predicts spots at further conditions, and further maps.
 
-        Spots fall on their pixels as others of the same light and temperature do.
+        Spots have the places within their pixels of others of the same wavelength and temperature.
 
         Parameters
         ----------
         spots : iterable of Condition
             Conditions that the campaign may lack.
         maps : mapping of (fold, map) to tuple of MapShare, optional
-            Of which flats each is made.
+            Flats that each further map is made of.
 
         Raises
         ------
         DiagnosisError
-            The campaign has no spots of that wavelength and temperature: nothing tells their width.
+            The campaign has no spots of that wavelength and temperature, so that their width
+            without charge is unknown.
         """
         other = copy(self)
         other.spots = self.spots.with_conditions(spots)
@@ -227,16 +237,21 @@ class Predictor:
         *,
         only: str | None = None,
     ) -> FloatArray:
-        """What a channel should read, linear terms left out.
+        """Predict a channel without its linear parameters.
 
         Parameters
         ----------
         channel : Channel
-            Its axes say where.
+            Channel whose axes state where each value belongs; its values are not used.
         parameters : ndarray
-            In the order of ``names``.
+            Nonlinear parameters in the order of ``names``.
         only : str, optional
-            Predict spots of this wavelength and temperature alone, such as '620/-100' [nm, C].
+            Predict only spots of this wavelength and temperature, such as '620/-100' [nm, C].
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            Prediction in the channel's unit.
         """
         a = self._amps
         chain = self.chain(parameters)
@@ -262,7 +277,7 @@ class Predictor:
         return out
 
     def chain(self, parameters: FloatArray) -> EffectChain | None:
-        """Effects with their parameters as given; None of none."""
+        """Chain of the effects at given parameters; None without effects."""
         if not self.effects:
             return None
         return EffectChain(
@@ -271,15 +286,15 @@ class Predictor:
             self.measured,
             self.baseline,
             self.kept,
-            # Patterns are evened out as where the fit began: they hardly depend on it.
+            # Relaxation of patterns hardly depends on gain and device: the start values do.
             (_mean_gain(self.start[: self._amps]), self._device(self.start)),
         )
 
     def modes(self, channel: Channel, parameters: FloatArray) -> FloatArray:
-        """What chance adds to a channel by its effects, in its unit, shape (n, modes).
+        """Shapes of the effects' random effects in a channel, in its unit, shape (n, modes).
 
-        Shapes whose strengths are independent and of variance 1: the values' covariance grows
-        by ``modes @ modes.T``.
+        Their strengths are independent with variance 1, so that they add ``modes @ modes.T`` to
+        the covariance of the values.
         """
         chain = self.chain(parameters)
         if chain is None:
@@ -288,7 +303,7 @@ class Predictor:
         return chain.modes(channel, gains, self._with_light(channel, gains))
 
     def _device(self, parameters: FloatArray) -> dict[str, float]:
-        """Departures of the device's parameters from nominal."""
+        """Device parameters less their nominal values, in their units."""
         own = parameters[2 * self._amps : 2 * self._amps + len(self.baseline.parameters)]
         return {
             name: float(value) * self.baseline.spread[name]
@@ -296,9 +311,9 @@ class Predictor:
         }
 
     def _layout_at(self, parameters: FloatArray) -> Layout:
-        """Layout with the gains and the read noise that parameters say."""
+        """Layout with gains and read noise at given parameters."""
         gains, noise = parameters[: self._amps], parameters[self._amps : 2 * self._amps]
-        # Levels of exposures are by the rough gains, which may be a quarter off.
+        # Levels were calculated with rough gains, which may be off by a quarter.
         scale = _mean_gain(gains) / _mean_gain(np.array(self.layout.gains))
         return replace(
             self.layout,
@@ -308,26 +323,26 @@ class Predictor:
         )
 
     def effects_at(self, parameters: FloatArray) -> tuple[Effect, ...]:
-        """Effects with their parameters as given."""
+        """Make the effects with given parameters."""
         return self._free.at(parameters[len(parameters) - len(self._free) :])
 
     def _rows(self, channel: Channel) -> Rows:
-        """Rows of a channel by condition, found once: channels do not change."""
+        """Indices of a channel's values by condition; cached, as channels do not change."""
         return self._of_channels.get(("rows", channel), lambda: rows_by_condition(channel))
 
     def shapes(self) -> NDArray[np.bool_]:
-        """Which parameters are of the shape of an effect, not its amplitude."""
+        """Mask of the parameters that describe an effect's shape, not its amplitude."""
         plain = len(self.names) - len(self._free)
         return np.append(np.zeros(plain, bool), self._free.shapes)
 
     def reach(self, point: FloatArray) -> FloatArray:
-        """Smallest and largest steps of a fit from a point, shape (2, parameters)."""
+        """Smallest and largest steps that a fit may take from a point, shape (2, parameters)."""
         plain = len(self.names) - len(self._free)
         free = np.repeat([[-np.inf], [np.inf]], plain, axis=1)
         return np.concatenate([free, self._free.reach(point[plain:])], axis=1)
 
     def _with_light(self, channel: Channel, gains: FloatArray) -> dict[str, NDArray]:
-        """Axes, of flats with 'light': electrons that light in proportion would bring."""
+        """Axes of a channel; for flats also 'light': electrons of a linear response to the lamp."""
         if channel.word not in ("flat_mean", "flat_cov") or channel.unit == PER_ELECTRON:
             return dict(channel.axes)
         light = self._of_channels.get(("light", channel), lambda: self._light(channel))
@@ -335,7 +350,7 @@ class Predictor:
         return dict(channel.axes) | {"light": gains[amps] * light}
 
     def _light(self, channel: Channel) -> FloatArray:
-        """Light of flats in units of the level that weak ones show [ADU]."""
+        """Light of flats [ADU], calibrated on the levels of the weakest 40 %."""
         x = channel.axes
         light = x["time"] * x.get("lamp", np.array(1.0))
         out = np.zeros(len(channel))
@@ -348,7 +363,7 @@ class Predictor:
         return out
 
     def depends(self, channel: Channel) -> NDArray[np.bool_]:
-        """Which parameters a channel can depend on: the others need no derivative."""
+        """Mask of the parameters that a channel can depend on; others need no derivative."""
         names = np.array(self.names)
         device = np.char.startswith(names, "device")
         sigma = np.char.startswith(names, "sigma")
@@ -380,11 +395,11 @@ class Predictor:
         n: int,
         here: FloatArray,
     ) -> FloatArray:
-        """Derivative of a channel by one parameter, given the prediction there."""
+        """Derivative of a channel by parameter ``n``, given the prediction ``here``."""
         step = parameters.copy()
         step[n] += self.steps[n]
         if channel.word == "spot" and self.names[n].startswith("sigma"):
-            # Of one width the spots of others know nothing.
+            # A width changes only spots of its own wavelength and temperature.
             first = self.names.index(next(m for m in self.names if m.startswith("sigma")))
             only = self.spots.widths[(n - first) // 2]
             moved = self.predict(channel, step, only=only)
@@ -395,7 +410,8 @@ class Predictor:
             return out
         ratio = self.names[n].startswith("gain") or self.names[n].endswith(" full_well")
         if channel.word == "flat_mean" and ratio:
-            # Full pixels tell the ratio of full well and gain to one part in 1e5: both sides.
+            # Saturated flats constrain full well over gain to 1e-5, so that a one-sided difference
+            # would bias the fit: take a central one.
             back = parameters.copy()
             back[n] -= self.steps[n]
             both = self.predict(channel, step) - self.predict(channel, back)
@@ -403,7 +419,7 @@ class Predictor:
         return (self.predict(channel, step) - here) / self.steps[n]
 
     def linear(self, channel: Channel) -> dict[str, FloatArray]:
-        """Columns of the linear parameters, by name; the same name is the same parameter."""
+        """Columns of the linear parameters by name; the same name is the same parameter."""
         out = linear_columns(channel, self._rows(channel), self.measured)
         for more in self.columns:
             out |= more(channel)
@@ -467,12 +483,12 @@ class Predictor:
 
 
 def _mean_gain(gains: FloatArray) -> float:
-    """Mean over amplifiers; 1 for a_ij, which have none."""
+    """Mean gain of the amplifiers [e-/ADU]; 1 for a_ij, which have no amplifiers."""
     return float(np.mean(gains)) if len(gains) else 1.0
 
 
 def _noise_told(measured: MeasuredChannels) -> NDArray[np.bool_]:
-    """Of which amplifiers biases, or flats of several levels, tell the read noise."""
+    """Mask of the amplifiers whose read noise biases, or flats of several levels, constrain."""
     count = len(measured.amplifiers)
     told = np.zeros(count, bool)
     levels: list[set[float]] = [set() for _ in range(count)]
@@ -489,5 +505,5 @@ def _noise_told(measured: MeasuredChannels) -> NDArray[np.bool_]:
 
 
 def used_channels(channels: Sequence[Channel], folds: Sequence[str]) -> list[Channel]:
-    """Channels of some folds."""
+    """Select the channels of given folds."""
     return [c for c in channels if c.fold in folds]

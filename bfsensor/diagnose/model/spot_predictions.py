@@ -1,4 +1,4 @@
-"""Widths of spots against flux, from boundary shifts: deterministic, as the fit measures them."""
+"""Growth of Gaussian spots under boundary shifts, and their widths as the channel measures them."""
 
 from __future__ import annotations
 
@@ -19,35 +19,49 @@ from bfsensor.errors import ConvergenceError
 from bfsensor.typing import FloatArray
 
 STEPS = 12
-"""Of equal light: widths of spots of one pixel and 1e6 e- are 5e-5 pixel off; 1.4e-4 with 8."""
+"""Number of steps of equal light in which a spot grows.  Measured (compared with 96 steps in
+tests/validation/effects/test_collection_spots.py): widths of spots of 1 pixel and 1e6 e- are off by 5e-5
+pixel; with 8 steps, by 1.4e-4."""
 
 SPILLING = 24
-"""Steps where charge spills: what is measured turns sharply with the flux."""
+"""Number of steps where pixels exceed the full well. Chosen: each step is a knot of the interpolation
+in flux, which has a sharp turn at the full well; twice as many take twice as long."""
 
 KNOTS = 4
-"""Fluxes at which spots are measured where nothing spills: nearly straight between them."""
+"""Number of fluxes at which spots are measured below the full well. Chosen: widths are nearly linear
+in the flux, so that a cubic through four points is enough; twice as many take twice as long."""
 
 CHANGES = 7
-"""Fluxes, equal steps in their logarithm, at which changes after collection are found."""
+"""Number of fluxes, equidistant in the logarithm, at which changes after collection are calculated.
+Chosen: twice as many follow sharper nonlinearity of the amplifier and take twice as long."""
 
 MEASURED = ("sigma_x", "sigma_y", "skew_x", "skew_y", "wings", "flux")
+"""Quantities of the channel of spots, in the order of :func:`_measure`."""
 
 LITTLE = 1e-5
-"""Excess charge that is no longer shared out [full wells]."""
+"""Largest excess charge that spilling leaves in a pixel [full wells]. Chosen: 1 e- of 1e5, far below
+the noise; twice as large ends one or two rounds earlier."""
 
 FEW = 4
-"""Places of spots that are crossed with one another where charge spills."""
+"""Largest number of places whose x and y are combined with one another where charge spills.  Chosen: 16
+combinations; twice as large means 64, and takes four times as long."""
 
 LINEAR = Law()
+"""Collection with shifts proportional to the stored charge, without loss or full well."""
+
 NO_HALO = (0.0, 1.0)
+"""Fraction of the light in a halo, and the halo's added width [pixel].  Defined: none."""
+
 ALONE = (np.inf, 0.0)
+"""Distance of the next spots [pixel], and the fraction of places with one.  Defined: none."""
 
 
 class _Light(NamedTuple):
-    """One Gaussian of the light of spots: in each pixel along an axis, and at its far edge.
+    """One Gaussian component of the light of spots, as factors along x and along y.
 
-    ``edges``: the light at the edge and its first three derivatives, each over the factorial
-    of its order plus one: what a shift of the edge sweeps over is their power series.
+    ``along_x``, ``along_y``: fraction of the light in each pixel.  ``edges_x``, ``edges_y``: density
+    at the far edge of each pixel and its first three derivatives, divided by the factorial of
+    their order plus one, so that the light that a shift s sweeps over is their power series in s.
     """
 
     along_x: FloatArray
@@ -75,18 +89,18 @@ class _Light(NamedTuple):
         return self.along_y * self.along_x
 
     def across_x(self, shift: FloatArray) -> FloatArray:
-        """Light between right edges and where their shifts put them."""
+        """Light that shifts of the right edges sweep over."""
         return self.along_y * _swept(self.edges_x, shift)
 
     def across_y(self, shift: FloatArray) -> FloatArray:
-        """Light between upper edges and where their shifts put them."""
+        """Light that shifts of the upper edges sweep over."""
         return self.along_x * _swept(self.edges_y, shift)
 
 
 def _lines(
     centre: FloatArray, sigma: float, neighbours: tuple[float, float]
 ) -> tuple[FloatArray, FloatArray]:
-    """Pixels of a Gaussian along one axis, shape (n, 21), and series at their far edges."""
+    """Fractions of a Gaussian in pixels along one axis, shape (n, 21), and series at their far edges."""
     pitch, share = neighbours
     along: FloatArray | float = 0.0
     series: FloatArray | float = 0.0
@@ -109,9 +123,9 @@ def _swept(series: FloatArray, s: FloatArray) -> FloatArray:
 
 
 def spill(charge: FloatArray, full_well: float, rounds: int = 64) -> FloatArray:
-    """Charge beyond the full well goes to both neighbours in the column, shape (n, ny, nx).
+    """Move charge beyond the full well to both neighbours in the column, shape (n, ny, nx) [e-].
 
-    What finds no room within so many pixels, or leaves the image, is lost.
+    Charge that finds no room within ``rounds`` pixels, or leaves the image, is lost.
     """
     charge = charge.copy()
     for _ in range(rounds):
@@ -137,11 +151,11 @@ def grow_spots(
     law: Law = LINEAR,
     slopes: tuple[FloatArray, FloatArray] | None = None,
 ) -> FloatArray:
-    """Mean images of Gaussian spots as they build up.
+    """Calculate mean images of Gaussian spots as they build up.
 
-    The light that each boundary sweeps over by its shift, seen at the middle of each step,
-    goes from one of its pixels to the other.  What two shifts share at a corner, second order
-    in them, is left out.
+    In each step the light that a boundary's shift sweeps over, with the shift of the middle of
+    the step, moves from one of its pixels to the other.  Products of two shifts at a corner, of
+    second order, are left out.
 
     Parameters
     ----------
@@ -152,24 +166,26 @@ def grow_spots(
     phases : ndarray, shape (n, 2)
         Centres within the middle pixel [pixel].
     flux : float
-        Electrons of a whole spot at the end [e-].
+        Charge of a whole spot at the end [e-].
     steps : int
         Steps of equal charge; the error falls with the third power of their number.
     halo : tuple of float
-        Share of the light in a wide component, and the sigma that it has more [pixel].
+        Fraction of the light in a wide component, and the sigma that is added to its width in
+        quadrature [pixel].
     neighbours : tuple of float
-        Distance of the next spots in x and y [pixel], and how many of the places there hold
-        one: of their light the halo alone reaches so far.
+        Distance of the next spots in x and y [pixel], and the fraction of those places that hold
+        one; only their halos reach this spot.
     law : Law
-        How collection departs from linear shifts; what is beyond the full well is spilled.
+        Departure of the collection from shifts proportional to charge; charge beyond its full
+        well spills.
     slopes : tuple of ndarray, optional
-        Change of the shifts per electron with the charge Q of the pixel that pushes
-        [pixel/e-^2]: boundaries move by these times Q^2 / 2 besides.
+        Change of the shifts per electron with the charge Q of the pixel that causes them
+        [pixel/e-^2]: boundaries move by these times Q^2 / 2 in addition.
 
     Returns
     -------
     images : ndarray, shape (steps, n, 21, 21)
-        Electrons at the end of each step [e-].
+        Charge at the end of each step [e-].
     """
     centres = np.asarray(phases, float)
     parts = [_Light.of(1.0 - halo[0], sigma, centres)]
@@ -178,7 +194,7 @@ def grow_spots(
         parts.append(_Light.of(halo[0], wide, centres, neighbours))
     each = flux / steps
     light = each * np.sum([part.whole for part in parts], axis=0)
-    # Farther than across the image no shift is asked for; a cyclic array need not be wider.
+    # Shifts farther than the image is wide are not needed, so that the periodic array may be small.
     half = min(kx.shape[0] // 2, WING - 1)
     kept = slice(kx.shape[0] // 2 - half, kx.shape[0] // 2 + half + 1)
     side = next_fast_len(WING + half, real=True)
@@ -195,10 +211,10 @@ def grow_spots(
         bent = rfft2(np.roll(more, (-half, -half), (-2, -1)))
     charge = np.zeros_like(light)
     out = np.empty((steps, *light.shape))
-    # Gains of the last step and of the one before: they go nearly straight with time.
+    # Charge gained in the last two steps, by which the next is extrapolated linearly.
     last, before = light, light
     for step in range(steps):
-        # In the first step the gain itself has grown by half of what it grows in later ones.
+        # The mean gain of the first step holds half of the growth of later ones: double it once.
         coming = last + (last - before) * (2.0 if step == 1 else 1.0)
         middle = charge + 0.5 * coming - 0.125 * (coming - last)
         kept_part = np.exp(-law.loss * middle) if law.loss else None
@@ -228,15 +244,20 @@ def grow_spots(
 
 
 def representative_phases(phases: FloatArray) -> FloatArray:
-    """Four centres whose mean of what changes smoothly over a pixel is nearly that of all.
+    """Choose four centres whose mean of any smooth function of the centre is nearly that of all.
 
-    In x and in y the means of the four quarters of the sorted places, of evenly spread ones
-    exact up to three waves a pixel; put together so that x and y do not correlate.
+    They are the means of the four quarters of the sorted places, in x and in y, combined so that x
+    and y are uncorrelated.  For evenly spread places this is exact up to three waves per pixel.
 
     Parameters
     ----------
     phases : ndarray, shape (n, 2)
         Centres within their pixels [pixel].
+
+    Returns
+    -------
+    ndarray, shape (4, 2)
+        Centres [pixel].
     """
     quarters = [
         [part.mean() if part.size else np.nan for part in np.array_split(np.sort(v), 4)]
@@ -260,30 +281,37 @@ def predict_spots(
     slopes: tuple[FloatArray, FloatArray] | None = None,
     change: Callable[[FloatArray], FloatArray] | None = None,
 ) -> dict[str, FloatArray]:
-    """What the fit of the channels measures of such spots, at given fluxes.
+    """Predict the quantities that the channel of spots measures, at given fluxes.
 
     Parameters
     ----------
     kx, ky, sigma, phases
         As for :func:`grow_spots`.
     fluxes : array_like, shape (n,)
-        Electrons of a spot as they are read, with what is lost or lies beside, after ``change``
-        [e-].
+        Fluxes of the spots as they are read, after ``change``, including charge that is lost or
+        lies outside the stamp [e-].
     halo, neighbours, law, slopes
         As for :func:`grow_spots`.
     change : callable, optional
-        What happens to the images [e-] after collection.
+        Function of the images [e-] that applies effects after collection.
 
     Returns
     -------
     dict of str to ndarray, shape (n,)
-        'sigma_x', 'sigma_y' [pixel], 'skew_x', 'skew_y' [pixel^3], 'wings'; 'flux', electrons
-        gained or lost.
+        'sigma_x', 'sigma_y' [pixel], 'skew_x', 'skew_y' [pixel^3], 'wings' (fraction of the flux);
+        'flux', charge gained or lost [e-].
+
+    Raises
+    ------
+    ConvergenceError
+        A flux is not above 0, or shifts are so large that images are not finite.
     """
     wanted = np.asarray(fluxes, float)
     top = float(wanted.max())
     if not (np.isfinite(wanted).all() and wanted.min() > 0):
-        raise ConvergenceError(f"spots of {wanted.min():.3g} to {top:.3g} e- have no shape")
+        raise ConvergenceError(
+            f"spots of {wanted.min():.3g} to {top:.3g} e- cannot be predicted: fluxes must be above 0"
+        )
     centres = np.asarray(phases, float)
     grow = partial(
         grow_spots, kx, ky, sigma=sigma, flux=top, halo=halo, neighbours=neighbours, law=law,
@@ -293,7 +321,7 @@ def predict_spots(
     images = grow(phases=centres)
     spilling = bool(images[-1].max() >= law.full_well)
     if spilling:
-        # Where the first pixels spill depends on places: all in x with all in y.
+        # The flux at which pixels spill depends on the place: combine all x with all y.
         if len(centres) <= FEW:
             centres = np.array(np.meshgrid(*centres.T)).reshape(2, -1).T
         every = 1
@@ -302,14 +330,14 @@ def predict_spots(
     light = top * np.arange(every, len(images) + 1, every) / len(images)
     if not np.isfinite(images).all():
         raise ConvergenceError(
-            f"spots of {top:.3g} e- have no shape: shifts reach over pixels"
+            f"spots of {top:.3g} e- cannot be predicted: boundary shifts exceed a pixel"
         )
     plain = measure(images[every - 1 :: every])
     lines = _interpolate(plain[:, -1], np.column_stack([plain[:, :-1], plain[:, -1] - light]),
                          turning=spilling)  # fmt: skip
     if change is None or np.array_equal(change(images[-1]), images[-1]):
         return dict(zip(MEASURED, lines(wanted).T, strict=True))
-    # What comes after collection need not be smooth: between fluxes as they are.
+    # Changes after collection need not be smooth in the flux: interpolate them piecewise.
     knots = np.geomspace(min(wanted.min(), 0.999 * top), top, CHANGES)
     those = np.array([_image_at(images, flux / top) for flux in knots])
     both = measure(np.concatenate([those, change(those)]))
@@ -323,7 +351,7 @@ def predict_spots(
 def _interpolate(
     knots: FloatArray, values: FloatArray, *, turning: bool
 ) -> Callable[[FloatArray], FloatArray]:
-    """Lines through values at knots of the flux: cubics, or pieces where they turn sharply."""
+    """Interpolation in the flux: one cubic, or monotonic pieces where values turn sharply."""
     if turning:
         pieces = PchipInterpolator(knots, values)
         return lambda flux: np.asarray(pieces(np.maximum(flux, knots[0])))
@@ -333,7 +361,7 @@ def _interpolate(
 
 
 def _image_at(images: FloatArray, part: float) -> FloatArray:
-    """Images at a part of their last flux, their shapes being straight in it between steps."""
+    """Images at a fraction of the last flux, their shapes interpolated linearly between steps."""
     at = part * len(images)
     low = int(np.clip(np.floor(at), 1, len(images) - 1))
     one, two = images[low - 1] / low, images[low] / (low + 1)
@@ -343,7 +371,7 @@ def _image_at(images: FloatArray, part: float) -> FloatArray:
 def _measure(
     wide: FloatArray, sigma: tuple[float, float], centres: FloatArray
 ) -> FloatArray:
-    """What the channels measure of k images, shape (k, 6), in the order of :data:`MEASURED`."""
+    """Quantities :data:`MEASURED` of k sets of images, shape (k, 6)."""
     count, n = wide.shape[:2]
     margin = (WING - STAMP) // 2
     stamps = wide[..., margin:-margin, margin:-margin]

@@ -1,4 +1,4 @@
-"""The channel of spots, condition by condition, from shifts, widths without charge and effects."""
+"""Prediction of the channel of spots by condition, from shifts, widths without charge and effects."""
 
 from __future__ import annotations
 
@@ -22,18 +22,20 @@ from bfsensor.errors import DiagnosisError
 from bfsensor.typing import Edges, FloatArray
 
 Found = dict[str, FloatArray]
+"""Predicted quantities of spots, by name."""
 
 
 class SpotPredictor:
-    """Predicts spots; their widths without charge are parameters.
+    """Predicts the channel of spots; their widths without charge are free parameters.
 
-    Optics know of the wavelength, diffusion of the silicon's temperature, of which cards do not
-    speak: a width for each of both.  What goes with voltages at one temperature is left to be found.
+    The optics depend on wavelength, and diffusion on temperature, neither of which a baseline
+    describes: each pair has a free width in x and in y.  A change of the width with back bias at
+    one temperature is not free, so that it can be found as an effect.
 
     Parameters
     ----------
     measured : MeasuredChannels
-        The campaign, for its conditions and the places of its spots.
+        Channels of the campaign, for its conditions and the places of its spots.
     baseline : Baseline
         Boundary shifts.
 
@@ -42,7 +44,7 @@ class SpotPredictor:
     widths : list of str
         Wavelength and temperature of each width, such as '620/-100' [nm, C].
     start : list of float
-        Along x and y of each: where fits begin [pixel].
+        Start values of the widths along x and y in turn [pixel].
     """
 
     def __init__(self, measured: MeasuredChannels, baseline: Baseline) -> None:
@@ -66,7 +68,7 @@ class SpotPredictor:
         }
 
     def with_baseline(self, baseline: Baseline, slopes: Edges | None) -> SpotPredictor:
-        """Copy of another baseline; ``slopes`` where its own are not of spots."""
+        """Make a copy with another baseline; ``slopes`` apply where the baseline has none for spots."""
         other = copy(self)
         other.baseline, other._kept = baseline, {}
         if slopes is not None:
@@ -74,14 +76,15 @@ class SpotPredictor:
         return other
 
     def with_conditions(self, conditions: Iterable[Condition]) -> SpotPredictor:
-        """Copy that predicts spots at further conditions as well.
+        """Make a copy that also predicts spots at further conditions.
 
-        Spots fall on their pixels as others of the same light and temperature do.
+        Spots have the places within their pixels of others of the same wavelength and temperature.
 
         Raises
         ------
         DiagnosisError
-            The campaign has no spots of that wavelength and temperature: nothing tells their width.
+            The campaign has no spots of that wavelength and temperature, so that their width
+            without charge is unknown.
         """
         other = copy(self)
         other._phases = dict(self._phases)
@@ -92,8 +95,8 @@ class SpotPredictor:
             like = next((c for c in self._phases if width_of(c) == width), None)
             if like is None:
                 raise DiagnosisError(
-                    f"spots at wavelength/temperature {width}: their width without charge is known "
-                    f"at {', '.join(self.widths) or 'none'} only"
+                    f"spots at wavelength/temperature {width} [nm/C]: their width without charge is "
+                    f"known at {', '.join(self.widths) or 'none'} only"
                 )
             other._phases[condition] = self._phases[like]
         return other
@@ -109,27 +112,32 @@ class SpotPredictor:
         only: str | None = None,
         chain: EffectChain | None = None,
     ) -> FloatArray:
-        """What the channel should read, linear terms left out.
+        """Predict a channel of spots without its linear parameters.
 
         Parameters
         ----------
         channel : Channel
-            Of spots.
+            Channel of spots.
         rows_of : dict
-            Its rows by condition.
+            Indices of its values by condition.
         gains : ndarray
-            Of the amplifiers [e-/ADU].
+            Gains of the amplifiers [e-/ADU].
         device : mapping of str to float
-            Departures of the device's parameters.
+            Device parameters less their nominal values, in their units.
         sigmas : ndarray, shape (2 widths,)
             Widths without charge [pixel], x and y in turn.
         only : str, optional
-            The only one of ``widths`` that is predicted; elsewhere 0.
+            One of ``widths``: other spots are not predicted, and have the value 0.
         chain : EffectChain, optional
-            Effects.
+            Effects added to the baseline.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            Prediction in the unit of each value.
         """
         x = channel.axes
-        # Images were put on the scale of electrons with rough gains.
+        # Images were converted to electrons with rough gains: scale fluxes to the fitted ones.
         scale = float(np.mean(gains / np.array(self.measured.gains)))
         out = np.zeros(len(channel))
         for condition in self._phases:
@@ -162,7 +170,7 @@ class SpotPredictor:
     def _add_ghosts(
         self, out: FloatArray, x: Mapping[str, NDArray], chain: EffectChain
     ) -> None:
-        """Add to fluxes and widths what spots of all folds left behind."""
+        """Add to fluxes and widths the charge that earlier spots of all folds left behind."""
         placed = self.measured.placed
         lit = np.array([s.number for s in placed], float)
         fluxes = np.array([s.flux for s in placed])
@@ -176,7 +184,7 @@ class SpotPredictor:
             if what == "flux":
                 out[rows] += parts @ fluxes
                 continue
-            # Exposures that are only planned lie nowhere yet.
+            # Planned exposures have no places yet: their widths do not change.
             known = np.isin(numbers, list(place_of))
             rows, own = rows[known], [place_of[n] for n in numbers[known].tolist()]
             if self._gained is None:
@@ -188,12 +196,12 @@ class SpotPredictor:
     def _shifts(
         self, condition: Condition, device: Mapping[str, float]
     ) -> tuple[Edges, Edges | None]:
-        """Shifts of spots, without charge where they go with it, and their slopes."""
+        """Shifts of spots at zero charge, and their slopes with charge, if there are any."""
         (kx, ky), _ = self.baseline.at(condition, device)
         key = self.baseline.nearest(condition)
         if not self.baseline.spots_bend or key not in self.baseline.slopes:
             return (kx, ky), self._slopes
-        # Slopes of free forms are among them.
+        # Slopes of nonparametric terms are part of the baseline's here.
         sx, sy = self.baseline.slopes[key]
         level = self.baseline.level
         return (kx - level * sx, ky - level * sy), (sx, sy)
@@ -204,7 +212,7 @@ class SpotPredictor:
         state: tuple[FloatArray, ...],
         slopes: Edges | None,
     ) -> Found:
-        """Spots that no effect changes, at a condition; kept while effects' parameters alone move."""
+        """Spots that no effect changes, at a condition; cached while only effects' parameters change."""
         kept = self._kept.get(condition)
         if kept is None or not all(map(np.array_equal, kept[0], state)):
             kx, ky, sigma, fluxes = state
@@ -225,7 +233,7 @@ class SpotPredictor:
         chain: EffectChain,
         given: Mapping[str, float],
     ) -> Found:
-        """Spots with effects, at a condition; ``given`` goes to what happens after collection."""
+        """Spots with effects, at a condition; ``given`` are axes for effects after collection."""
         variance, halo, axes = chain.spot_change(condition)
         wide = sigma
         if variance:
@@ -241,13 +249,13 @@ class SpotPredictor:
 
 
 def width_of(condition: Condition) -> str:
-    """Wavelength and temperature of a condition: what spots have one width at."""
+    """Wavelength and temperature of a condition, such as '620/-100' [nm, C], which share a width."""
     wavelength, _, temperature = label_of(condition).split("/")
     return f"{wavelength}/{temperature}"
 
 
 def _axes(x: Mapping[str, NDArray], rows: NDArray[np.int64]) -> dict[str, float]:
-    """Of a condition's exposures: when they were taken, and background for each electron."""
+    """Mean time [h] of a condition's exposures, and background per electron of flux."""
     out = {}
     if "hours" in x:
         out["hours"] = float(np.mean(x["hours"][rows]))

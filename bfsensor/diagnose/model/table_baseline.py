@@ -20,40 +20,51 @@ from bfsensor.table.table import DistortionTable
 from bfsensor.typing import Edges, FloatArray
 
 WAVELENGTHS = (400.0, 480.0, 550.0, 620.0, 700.0, 750.0, 870.0, 950.0)
-"""At which shifts are held [nm]."""
+"""Wavelengths at which shifts are calculated [nm].  Chosen: usual wavelengths of flats; light of another
+one takes the nearest of these, which the report notes; twice as many only take longer."""
 
 SPAN = 0.15, 0.6
-"""Parts of the largest background of a table between which the response is taken as a parabola."""
+"""Lowest and highest background of the parabola in level, as fractions of a table's largest. Chosen, to
+be derived: the levels of most flats; over twice the range a parabola fits the middle less well."""
 
 BACK_BIAS = "operating_point.back_bias"
 """Parameter of :func:`with_operating_point`."""
 
 CHARGE = 100.0
-"""Charge above the background [e-] that stands for the differential response."""
+"""Charge above the background [e-] at which shifts per electron are interpolated from a table.  Chosen:
+twice as large changes no shift of the tables itl_sta3800c and e2v_ccd250 by more than 1.1e-4 of the
+largest."""
 
 
 def baseline_of_table(given: str | os.PathLike[str]) -> Baseline:
-    """Baseline of a table: a .fits file, a GalSim stem, or the name of a shipped device.
+    """Make a baseline of a table: a .fits file, a GalSim stem, or the name of a shipped device.
 
-    Shifts are those of the differential response, which flats see, averaged along the edge and
-    over the depths at which the light converts.  It changes with the level: a parabola through
-    three backgrounds is held (:data:`SPAN`); a table of one charge, such as
-    GalSim's, gives that charge's over it and has no slope.  Nothing of the device floats: its
-    table holds no derivatives.
+    Shifts are the differential response that flats measure: the change by a small charge on a
+    uniform background, per electron, averaged along each edge and over the depths at which light
+    converts.  Their change with level is a parabola through three backgrounds.  A table of one
+    charge, such as GalSim's, gives the mean shift per electron of that charge and no change with
+    level.  A table has no derivatives, so that no device parameter is free.
 
     Parameters
     ----------
     given : str or path-like
-        File, stem (a path, or the name of one of GalSim's own), or device.
+        File, stem (a path, or the name of one of GalSim's own sensors), or device.
 
     Returns
     -------
     Baseline
+        Shifts at eight wavelengths from 400 to 950 nm and the table's back bias.
 
     Raises
     ------
     DiagnosisError
-        None of these.
+        ``given`` is none of these, or its file is damaged.
+
+    Examples
+    --------
+    >>> baseline = baseline_of_table("itl_sta3800c")
+    >>> len(baseline.edges), baseline.parameters
+    (8, ())
     """
     path = Path(given)
     shipped = tables_dir() / os.fspath(given) / "table.fits"
@@ -107,30 +118,35 @@ def baseline_of_table(given: str | os.PathLike[str]) -> Baseline:
 def with_operating_point(
     given: str | os.PathLike[str], other: str | os.PathLike[str], *, spread: float = 2.0
 ) -> Baseline:
-    """Baseline of a table whose operating point floats on the line to that of another table.
+    """Make a baseline whose back bias is free, on the line between two tables of one device.
 
-    Of one device at two operating points: the parameter is the back bias, and whatever else
-    differs between the two (gates, as the E2V tables') goes with it in proportion.  It stands among
-    the candidates of an attribution like any parameter of the device.
+    Other settings that differ between the two tables, such as gate voltages, change in proportion
+    with the back bias.  The back bias is also a candidate of an attribution, like any device
+    parameter.
 
     Parameters
     ----------
     given, other : str or path-like
-        As for :func:`baseline_of_table`; shifts are those of ``given`` until the parameter moves.
+        As for :func:`baseline_of_table`; the nominal shifts are those of ``given``.
     spread : float
-        Of the back bias about its value [V].  The default is assumed: 2 V, as of a set point that
-        is told in whole volts and dropped over cables.
+        Standard deviation of the back bias about its nominal value [V], above 0.  The default of 2
+        V is chosen for a set point in whole volts with drops over cables.
+
+    Returns
+    -------
+    Baseline
+        Baseline of ``given`` with the free parameter 'operating_point.back_bias' [V].
 
     Raises
     ------
     DiagnosisError
-        The two are of devices that differ by more than the operating point, of one back bias, or
-        of unlike reach.
+        The tables are of devices that differ by more than the operating point, of the same back
+        bias, or of different reach.
 
     Notes
     -----
-    The shifts are taken as straight in the back bias between the tables: exact at both.  In truth
-    they go about with its inverse, which halfway from -50 to -70 V is 3 % below the line.
+    Shifts are linear in the back bias between the tables, and exact at both.  True shifts go about
+    with its inverse, which halfway from -50 to -70 V is 3 % below the line.
 
     Examples
     --------
@@ -161,7 +177,7 @@ def with_operating_point(
 
 
 def _card(given: str | os.PathLike[str]) -> dict[str, object] | None:
-    """What a table's device is made of; None where the table does not know it."""
+    """Device of a table without name and operating point; None where the table does not hold it."""
     shipped = tables_dir() / os.fspath(given) / "table.fits"
     path = shipped if shipped.exists() else Path(given)
     text = DistortionTable.read(path).device_text if path.suffix == ".fits" else ""
@@ -172,7 +188,7 @@ def _card(given: str | os.PathLike[str]) -> dict[str, object] | None:
 
 
 def _stem(path: Path) -> Path:
-    """The path, or GalSim's own file of that name where nothing lies at it."""
+    """The path, or GalSim's own file of that name where there is no such path."""
     import galsim
 
     own = Path(galsim.meta_data.share_dir) / "sensors" / path.name
@@ -189,23 +205,23 @@ def edges_at(
     *,
     background: float = 0.0,
 ) -> Edges:
-    """Mean shifts of right and upper edges [pixel/e-] of light of one wavelength.
+    """Mean shifts of right and upper edges [pixel/e-] for light of one wavelength.
 
     Parameters
     ----------
     table : DistortionTable
-        Total displacements.
+        Table of total displacements.
     wavelength : float
-        Of the light [nm].
+        Wavelength of the light [nm].
     temperature : float
-        Of the silicon [K].
+        Temperature of the silicon [K].
     background : float
-        Charge in all pixels [e-], about which the response is taken.
+        Charge in all pixels [e-] to which the small charge is added.
 
     Returns
     -------
     kx, ky : ndarray, shape (2 reach + 3, 2 reach + 3)
-        With a ring of pixels around the table's whose outer edges do not move.
+        Shifts, with a ring of pixels around the table's whose outer edges do not move.
     """
     weights = conversion_weights(table.depths, table.thickness, wavelength, temperature)
     return _seen(edges_by_depth(table, background=background), weights)

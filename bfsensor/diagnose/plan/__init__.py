@@ -1,1 +1,1 @@
-"""What to record next, and what recordings not taken would show."""
+"""Recordings to take next, and predictions for exposures that were not taken."""

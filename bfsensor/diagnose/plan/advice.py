@@ -1,4 +1,4 @@
-"""Which recording tells apart what the recordings so far cannot."""
+"""Advice on the recording that would separate effects which present recordings do not distinguish."""
 
 from __future__ import annotations
 
@@ -18,29 +18,33 @@ from bfsensor.errors import ConvergenceError, DiagnosisError
 from bfsensor.units import to_celsius
 
 ENOUGH = 25.0
-"""Expected difference of the chi-squares from which on a recording decides."""
+"""Expected difference of chi-squares above which a recording is expected to decide.  Chosen: 5 standard
+deviations; twice as large asks for about twice as many exposures."""
 
 TIMES = (1, 2, 4, 8)
-"""How often a recording's exposures may be taken."""
+"""Multiples of a recording's exposures that are considered.  Chosen: a further doubling would advise
+recordings of hundreds of exposures where nothing smaller decides."""
 
 
 @dataclass(frozen=True)
 class Advice:
-    """A recording for one pair of classes.
+    """A recording that would separate one pair of classes.
 
     Attributes
     ----------
     recording : Recording
-        What to take.
+        Recording to take.
     times : int
-        How often its exposures.
+        Multiple of its exposures.
     separates : tuple of str
         The two classes.
     expected : float
-        Difference of the chi-squares of the two, each fitted to all there is by then, of the
-        new recordings alone; the smaller of the two directions.
+        Expected difference of the two models' chi-squares in the new recording, both refitted to
+        all recordings; the smaller one of either model being true.
     others : tuple of (str, int, float)
-        Other recordings: name, exposures, expected difference; best first.
+        Other recordings, the best first: name, exposures, expected difference.
+    taken : int
+        Exposures of the present campaign, the number that a repetition of all takes; 0 if unknown.
     """
 
     recording: Recording
@@ -52,31 +56,34 @@ class Advice:
 
     @property
     def exposures(self) -> int:
-        """Number of exposures."""
+        """Number of exposures to take; 0 if unknown."""
         return self.times * (self.recording.exposures or self.taken)
 
     @property
     def decides(self) -> bool:
-        """Whether it is expected to be enough."""
+        """Whether the expected difference reaches :data:`ENOUGH`."""
         return self.expected >= ENOUGH
 
     def said(self) -> str:
-        """Give the advice in a sentence."""
+        """State the advice in one sentence."""
         one, other = self.separates
-        # Of a reduced recording it is not known how many were taken.
+        # A reduced recording does not state its number of exposures.
         count = f"{self.exposures} exposures" if self.exposures else f"{self.times} times"
         text = (
-            f"{self.recording.words} ({count}{_levels(self)}): expected to tell "
+            f"{self.recording.words} ({count}{_levels(self)}): expected to separate "
             f"{one} from {other} by a chi-square difference of {self.expected:.3g}"
         )
         if not self.decides:
-            text += f", which does not reach {ENOUGH:g}, but nothing planned tells more"
+            text += (
+                f", below the {ENOUGH:g} that decide; no other recording that was considered promises "
+                "more"
+            )
         if self.recording.rule is not None:
             text += f"; {self.recording.rule.why}"
         return text + "."
 
     def to_report(self) -> dict[str, Any]:
-        """Block of report.json."""
+        """Make the block of the key 'plan' in report.json."""
         out = {
             "recording": self.recording.name,
             "separates": list(self.separates),
@@ -101,38 +108,69 @@ class Advice:
 
 @dataclass(frozen=True)
 class RecordingPlan:
-    """Advice for each pair of classes that is tied; empty where none is."""
+    """Advice for each pair of classes that recordings do not distinguish.
+
+    Attributes
+    ----------
+    advised : tuple of Advice
+        One recording for each pair; empty where no classes are tied.
+    notes : tuple of str
+        Recordings that could not be predicted, and why.
+
+    Examples
+    --------
+    >>> RecordingPlan().said()
+    []
+    """
 
     advised: tuple[Advice, ...] = ()
     notes: tuple[str, ...] = ()
 
     def said(self) -> list[str]:
-        """Sentences, one for each recording."""
+        """State the advice in sentences, one for each recording, without repetitions.
+
+        Returns
+        -------
+        list of str
+            The key 'recommended_recordings' of report.json.
+        """
         return list(dict.fromkeys(a.said() for a in self.advised))
 
     def to_report(self) -> list[dict[str, Any]]:
-        """Give the key 'plan' of report.json."""
+        """Make the key 'plan' of report.json.
+
+        Returns
+        -------
+        list of dict
+            One block for each pair of classes.
+        """
         return [a.to_report() for a in self.advised]
 
 
 def plan(
     attribution: Attribution, candidates: Sequence[Recording] | None = None
 ) -> RecordingPlan:
-    """Find the cheapest recording that is expected to tell apart what is tied.
+    """Find the smallest recording that is expected to separate classes that are tied.
 
-    Each pair of tied classes is fitted to the recordings there are, one in the place of the
-    other.  For each candidate the two fits' predictions are held against one another as its
-    noise will allow, the wrong one's parameters refitted
-    (:class:`~bfsensor.diagnose.plan.planned_exposures.Information`); recordings that are not
-    predicted follow their rule (:func:`ruled`).  The one that reaches :data:`ENOUGH` with the
-    fewest exposures is advised, else the one that comes nearest.
+    Each pair of tied classes is fitted to the present recordings, one in place of the other.  For
+    each candidate recording the predictions of the two fits are compared within its noise, with
+    the wrong one's parameters refitted
+    (:class:`~bfsensor.diagnose.plan.planned_exposures.Information`); recordings without a prediction
+    follow their rule (:func:`ruled`).  Advised is the one that reaches :data:`ENOUGH` with the fewest
+    exposures, or else the one with the largest expected difference.
 
     Parameters
     ----------
     attribution : Attribution
-        What was found, with what it is tied to.
+        Effects found, with the classes tied to them.
     candidates : sequence of Recording, optional
-        By default :func:`~bfsensor.diagnose.plan.catalogue.make_recordings` of the campaign.
+        Recordings to consider; by default
+        :func:`~bfsensor.diagnose.plan.catalogue.make_recordings` of the campaign.
+
+    Returns
+    -------
+    RecordingPlan
+        Empty where nothing is tied.
     """
     model = Model(attribution.predictor, attribution.fit)
     pairs = [(f, r) for f in attribution.found for r in _tied(f)]
@@ -147,7 +185,7 @@ def plan(
             try:
                 found = here.forecasts(recording.planned)
             except DiagnosisError:
-                continue  # Of a light that the campaign has not: nothing is predicted.
+                continue  # The campaign has no such light, so that it cannot be predicted.
             if found:
                 made[recording.name] = found
     advised, notes = [], []
@@ -181,7 +219,7 @@ def plan(
 
 
 def _tied(found: Found) -> list[Rival]:
-    """Best rival of each other class that is tied."""
+    """Best rival of each other class that is tied to an effect."""
     return [
         next(r for r in found.rivals if r.word == word)
         for word in found.tied
@@ -197,11 +235,11 @@ def _expected(
     found: Found,
     rival: Rival,
 ) -> list[float] | None:
-    """Expected differences of the chi-squares, by :data:`TIMES`; None where none is known."""
+    """Expected chi-square differences for each of :data:`TIMES`; None where they are not known."""
     if recording.rule is not None:
         return [ruled(recording, here, found, rival, times=t) for t in TIMES]
     if recording.again:
-        # What sets the two apart in what there is, without its noise.
+        # Difference of the two fits' predictions of the present recordings, without their noise.
         n = len(here.fit.residuals)
         away = here.fit.left[:n] - there.fit.left[:n]
         return [t * float(away @ away) for t in TIMES]
@@ -216,27 +254,33 @@ def _expected(
 def ruled(
     recording: Recording, here: Forecaster, found: Found, rival: Rival, *, times: int = 1
 ) -> float:
-    r"""Expected difference of the chi-squares in a recording that follows a rule.
+    r"""Calculate the expected chi-square difference in a recording that follows a rule.
 
-    Of two templates that are alike in what was recorded and are left with :math:`f_a` and
-    :math:`f_b` of themselves in the new recording,
+    For two templates that are equal in the present recordings, and scaled by :math:`f_a` and
+    :math:`f_b` in the new one,
 
     .. math::
         \Delta\chi^2 = \frac{(f_a - f_b)^2\, G}{1 + f^2 G / G_0} ,
 
-    G the gain that as many exposures of the kind recorded would bring, :math:`G_0` that of all
-    there are: the amplitude of the wrong one, f the larger of the two, gives way within its error.
+    where G is the chi-square gain of as many exposures of the kind recorded, :math:`G_0` that of the
+    present ones, and f the larger of the two factors: the wrong effect's amplitude is refitted
+    within its error.
 
     Parameters
     ----------
     recording : Recording
-        With its rule.
+        Recording with a rule.
     here : Forecaster
-        Of the accepted fit.
+        Forecaster of the accepted fit.
     found, rival
-        The two.
+        The effect found and its rival.
     times : int
-        How often its exposures are taken.
+        Multiple of the recording's exposures.
+
+    Raises
+    ------
+    DiagnosisError
+        The recording has no rule.
     """
     rule = recording.rule
     if rule is None:
@@ -249,7 +293,7 @@ def ruled(
     layout = here.predictor.layout
     if rule.strength is not None:
         if not layout.segments:
-            return 0.0  # A reduced recording tells neither pixels nor read noise.
+            return 0.0  # A reduced recording states neither pixels nor read noise.
         noise = float(np.nanmean(np.array(here.measured.read_noise) * here.gains))
         seen = found.effect if own else rival.effect
         return times * recording.exposures * rule.strength(seen, layout, noise)
@@ -270,7 +314,7 @@ def ruled(
 def _choose(
     judged: Sequence[tuple[Recording, Sequence[float]]], words: tuple[str, str], taken: int
 ) -> Advice:
-    """Fewest exposures that are enough; the greatest difference where none are."""
+    """Choose the fewest exposures that decide, or the largest difference where none does."""
     options = [
         Advice(r, t, words, v, taken=taken)
         for r, values in judged for t, v in zip(TIMES, values, strict=True)
@@ -288,16 +332,16 @@ def _choose(
 
 
 def _levels(advice: Advice) -> str:
-    """Levels and conditions of a recipe, in words."""
+    """Levels of a recipe's flats in words [e-], to two digits."""
     planned = advice.recording.planned
     levels = [p.level for p in planned if p.kind == "flat" and np.isfinite(p.level)]
     if not levels:
         return ""
-    return " at " + ", ".join(f"{v / 1e3:.0f}" for v in levels) + " thousand electrons"
+    return " at levels of " + ", ".join(f"{float(f'{v:.2g}'):,.0f}" for v in levels) + " e-"
 
 
 def _recipe(planned: Planned, times: int) -> dict[str, Any]:
-    """What is given of planned exposures, temperature in deg C."""
+    """Settings of planned exposures that differ from the campaign's, with temperature in deg C."""
     usual = Planned(planned.kind, 0)
     told = {
         name: value

@@ -1,4 +1,4 @@
-"""Recordings that could be taken, and how classes of effects show in those that are not predicted."""
+"""Catalogue of recordings that could be taken, with rules for those that are not predicted."""
 
 from __future__ import annotations
 
@@ -14,34 +14,38 @@ from bfsensor.effects.effect import Effect, Layout
 from bfsensor.units import to_celsius
 
 PARTS = (0.1, 0.3, 0.6, 0.9)
-"""Levels of a short ladder, in parts of the campaign's brightest flats or spots."""
+"""Levels of a short ladder, as fractions of the campaign's brightest flats or spots. Chosen: four
+levels separate a linear, a quadratic and a cubic law; below 1, so that nothing saturates."""
 
 CURRENT_MODE = 5e-5
-"""Relative error of the light by a photodiode whose current is integrated (assumed)."""
+"""Relative error of the light measured by a photodiode whose current is integrated. Chosen, to be
+derived: twice as large lowers expected chi-square differences that rest on the lamp, at most to a
+quarter."""
 
 FLATS = ("flat_cov", "flat_mean", "serial_overscan", "parallel_overscan")
 BIASES = ("bias_cov", "bias_level", "amp_cross")
+"""Channels that a recording of flats, and one of biases, repeats."""
 
 
 @dataclass(frozen=True)
 class Rule:
-    """How templates scale in a recording that is not predicted channel by channel.
+    """Factors on the templates of classes in a recording that is not predicted channel by channel.
 
     Attributes
     ----------
     channels : tuple of str
         Channels of the campaign that the recording repeats with its change.
     exposures : str
-        Kind of exposures that these channels are made of.
+        Kind of exposures that these channels are measured in.
     keeps : mapping of str to float
-        By class: what is left of its template, 1 unchanged, 0 gone.
+        Factor on the template by class: 1 unchanged, 0 gone, -1 with the other sign.
     other : float
-        Of classes that are not named.
+        Factor on classes that are not in ``keeps``.
     why, source : str
-        The reason, and where it is from.
+        Reason, and its source, for the report.
     strength : callable, optional
-        Of a recording that repeats no channel: chi-square of one exposure for an effect, the
-        sensor and its read noise [e-].
+        For a recording that repeats no channel: gives the chi-square of one exposure from an
+        effect, the layout and the read noise [e-].
     """
 
     channels: tuple[str, ...]
@@ -53,7 +57,7 @@ class Rule:
     strength: Callable[[Effect, Layout, float], float] | None = None
 
     def of(self, word: str) -> float:
-        """What is left of a class's template."""
+        """Factor on the template of a class."""
         return self.keeps.get(word, self.other)
 
 
@@ -64,15 +68,15 @@ class Recording:
     Attributes
     ----------
     name : str
-        Short.
+        Short name, as in report.json.
     words : str
-        What to do, in plain words, to be followed by the number of exposures.
+        Instruction in plain words, to be followed by the number of exposures.
     planned : tuple of Planned
-        The exposures.
+        Exposures to take.
     rule : Rule, optional
-        For what our laws do not predict; without one channels are predicted.
+        Rule for a recording that cannot be predicted; without one its channels are predicted.
     again : bool
-        The whole campaign once more.
+        Whether the recording is the whole campaign once more.
     """
 
     name: str
@@ -83,24 +87,26 @@ class Recording:
 
     @property
     def exposures(self) -> int:
-        """How many are taken."""
+        """Number of exposures."""
         return sum(p.count for p in self.planned)
 
 
 LINE = 1620.0
-"""Electrons of a Mn K-alpha photon."""
+"""Charge of a Mn K-alpha photon of 5.9 keV [e-].  Derived: 5.9 keV over 3.65 eV per electron-hole pair
+(Janesick 2001, Scientific CCDs, SPIE)."""
 
 CLOUDS = 1e-3
-"""Photons of Fe55 for each pixel of an exposure, few enough not to overlap (assumed)."""
+"""Photons of Fe55 per pixel and exposure. Chosen: few enough that their charge clouds rarely overlap;
+twice as many halve the exposures that are needed."""
 
 
 def _clouds(effect: Effect, layout: Layout, noise: float) -> float:
-    """Chi-square of what an effect puts beside the clouds of one exposure of Fe55."""
+    """Chi-square of the charge that an effect moves beside the clouds of one exposure of Fe55."""
     transfers = {
         "cti_serial": 0.5 * float(np.mean([s.columns for s in layout.segments])),
         "cti_parallel": 0.5 * float(np.mean([s.rows for s in layout.segments])),
     }
-    # Coupling goes to either side.
+    # Coupling moves charge to both sides, which doubles its chi-square.
     factors = {
         "ax": 2**0.5,
         "ay": 2**0.5,
@@ -119,87 +125,91 @@ IN_PIXEL = {
     ),
     "saturation": 0.0,
 }  # fmt: skip
-"""At equal signal of two pixels together: these go with the charge of one."""
+"""Factors on classes that depend on the charge of one pixel, where two are binned. Derived: at equal
+signal each pixel holds half of the charge, and no pixel reaches the full well."""
 
 RULES: Mapping[str, Rule] = {
     "binned_serial": Rule(
         FLATS, "flat", {**IN_PIXEL, "cti_serial": 0.5},
-        why="the same signal is made of half of the charge in each pixel: what is in the charge "
-        "(loss, transfer, boundaries) halves, what is in the signal stays",
+        why="the same signal comes from half of the charge in each pixel: effects of the charge (loss, "
+        "transfer, boundaries) halve, effects of the signal stay",
         source="charge is summed on the output node: Janesick 2001, Scientific CCDs, SPIE, ch. 1",
     ),
     "binned_parallel": Rule(
         FLATS, "flat", {**IN_PIXEL, "cti_parallel": 0.5},
-        why="the same signal is made of half of the charge in each pixel, two rows meet in the "
-        "register: what is in the rows' charge halves, what is in the register or behind it stays",
+        why="the same signal comes from half of the charge in each pixel, as two rows are added in the "
+        "register: effects of the pixels' charge halve, effects in or behind the register stay",
         source="Janesick 2001, Scientific CCDs, SPIE, ch. 1",
     ),
     "near_columns": Rule(
         ("serial_overscan",), "flat", {"cti_serial": 0.5},
-        why="behind an edge of light halfway to the amplifier charge has had half of the transfers, "
-        "while amplifier, clamp and a trap at the output know nothing of columns",
+        why="behind an edge of light halfway to the amplifier the charge has had half of the transfers, "
+        "while effects of amplifier, clamp and a trap at the output do not depend on the column",
         source="transfers against local offset: Snyder et al. 2021, JATIS 7, 048002",
     ),
     "near_rows": Rule(
         ("parallel_overscan",), "flat", {"cti_parallel": 0.5},
-        why="behind an edge of light halfway up charge has had half of the parallel transfers",
+        why="behind an edge of light halfway up the charge has had half of the parallel transfers",
         source="as for columns",
     ),
     "pixel_time": Rule(
         FLATS, "flat",
         {"electronic_memory": 0.1, "amp_crosstalk": 0.5, "trap_serial": 0.5,
          "correlated_noise": 0.7},
-        why="settling falls with the exponential of the pixel time (1e-3 left at one pixel time, "
-        "1e-6 at two; a tenth is assumed, for clamps settle more slowly), what is left behind at "
+        why="the amplifier's memory falls exponentially with the pixel time (1e-3 after one, 1e-6 after "
+        "two; a tenth is assumed to be left, as clamps settle more slowly), charge left behind at "
         "transfers hardly changes",
         source="Snyder & Roodman 2019, Proc. SPIE 11117; sizes assumed",
     ),
     "reverse_clocks": Rule(
         BIASES, "bias",
         {"correlated_noise": 1.0, "bias_instability": 1.0, "adc_bits": 1.0}, other=0.0,
-        why="the serial register is clocked away from the amplifier: no charge arrives, what is "
-        "left is the amplifier's own",
+        why="the serial register is clocked away from the amplifier: no charge arrives, and only the "
+        "amplifier's own noise and level are left",
         source="Janesick 2001, Scientific CCDs, SPIE, ch. 6",
     ),
     "clocks_off": Rule(
         BIASES, "bias", {"correlated_noise": 1.0, "bias_instability": 0.3}, other=0.0,
-        why="what clocks inject is gone with them, noise of the amplifier and pickup stay",
+        why="signals that clocks inject are gone, noise of the amplifier and pickup stay",
         source="assumed",
     ),
     "one_amplifier": Rule(
         ("amp_cross",), "spot", {"amp_crosstalk": 1.0}, other=0.0,
-        why="with light on one amplifier alone only a signal can be in the others; shared noise and "
-        "ghosts of their own light are gone",
+        why="with light on one amplifier alone, a signal in the others is crosstalk; ghosts of their "
+        "own light are gone, and shared noise averages out",
         source="O'Connor 2015, JINST 10, C05010",
     ),
     "other_light": Rule(
         ("flat_cov", "flat_mean", "flat_map"), "flat",
         {"illumination_turbulence": 0.0, "shutter_timing": 0.0}, other=1.0,
-        why="another projector with a shutter of its own: what is in the light goes with it",
+        why="effects of the light change with the projector and its shutter, effects of the sensor "
+        "stay",
         source="turbulence in front of the sensor: Broughton et al. 2024, arXiv 2411.13386",
     ),
     "ladder_reversed": Rule(
         ("flat_mean", "flat_cov"), "flat",
         {"gain_drift": -1.0},
-        why="levels in the opposite order of time: what goes with time changes its sign against "
-        "the level",
+        why="with levels in the opposite order of time, an effect of time changes its sign against the "
+        "level",
         source="order of exposures only",
     ),
     "purge": Rule(
         ("flat_map",), "flat", {"tearing": 0.0, "dark_hot": 1.0},
-        why="a purge of holes before each exposure takes tearing away and no other pattern",
+        why="a purge of holes before each exposure removes tearing and no other pattern",
         source="Juramy et al. 2020, Proc. SPIE 11454, 1145412",
     ),
     "fe55": Rule(
         (), "dark",
         {"interpixel_coupling": 1.0, "cti_serial": 1.0, "cti_parallel": 1.0,
          "electronic_memory": 1.0}, other=0.0, strength=_clouds,
-        why="1600 electrons in a dark frame: no pixel is filled, no lamp is on; coupling and transfer "
-        "are in the clouds' tails, what needs charge or light is gone",
+        why="1600 electrons per photon in a dark frame: no pixel is filled and no lamp is on; coupling "
+        "and transfer show in the clouds' tails, effects of large charges or of the lamp are gone",
         source="Janesick 2001, Scientific CCDs, SPIE, ch. 2",
     ),
 }  # fmt: skip
-"""By recording: of a class's template, in the channels that the recording repeats."""
+"""Rules by recording. Factors are derived where ``why`` states a proportion; others (0.1, 0.3, 0.7
+and the 0.5 of pixel_time) are chosen, to be derived: nearer to 1 they lower the expected
+differences."""
 
 SPECIAL = {
     "binned_serial": "Take pairs of flats binned by two along the row",
@@ -212,23 +222,28 @@ SPECIAL = {
     "one_amplifier": "Take spots on one amplifier only, each amplifier in its turn",
     "other_light": "Take pairs of flats with another projector and shutter",
     "ladder_reversed": "Take the ladder of flats once more in the opposite order of time",
-    "purge": "Take pairs of flats, the holes purged by bipolar voltages before each",
+    "purge": "Take pairs of flats, each after a purge of holes by bipolar clock voltages",
     "fe55": "Take exposures of Fe55",
 }
-"""What to do for the recordings of :data:`RULES`."""
+"""Instructions for the recordings of :data:`RULES`."""
 
 
 def make_recordings(
     usual: Condition, brightest: float, brightest_spot: float
 ) -> tuple[Recording, ...]:
-    """Recordings that can be taken of a sensor, the smallest useful number of exposures of each.
+    """Make the catalogue of recordings for a campaign, each with a small number of exposures.
 
     Parameters
     ----------
     usual : Condition
-        Of most of the campaign's flats.
+        Condition of most of the campaign's flats.
     brightest, brightest_spot : float
         Level of its brightest flats and flux of its brightest spots [e-].
+
+    Returns
+    -------
+    tuple of Recording
+        Recordings with a prediction, and those of :data:`RULES`.
     """
     bias = usual.back_bias
 
@@ -283,7 +298,7 @@ def make_recordings(
 
 
 def _ruled(brightest: float, brightest_spot: float) -> list[Recording]:
-    """Those of :data:`RULES`."""
+    """Recordings of :data:`RULES`."""
     out = []
     for name, rule in RULES.items():
         special = SPECIAL[name]
@@ -295,7 +310,7 @@ def _ruled(brightest: float, brightest_spot: float) -> list[Recording]:
         elif name == "fe55":
             planned = (Planned("dark", 50, seconds=60.0, special=special),)
         else:
-            # At equal signal, which the converter must hold.
+            # Binning adds two pixels: half of the level keeps the signal within the converter's range.
             each = 0.5 if name.startswith("binned") else 1.0
             planned = tuple(
                 Planned("flat", 4, level=p * each * brightest, special=special)

@@ -1,4 +1,4 @@
-"""Exposures that were not taken: what a fit predicts of them, how well, with which noise."""
+"""Forecasts of exposures that were not taken: channels, their derivatives by parameters, and noise."""
 
 from __future__ import annotations
 
@@ -30,24 +30,28 @@ from bfsensor.typing import FloatArray
 from bfsensor.units import to_celsius
 
 LAMP_ERROR = 2e-4
-"""Relative error of a lamp monitor where a campaign tells none."""
+"""Relative error of the lamp in planned exposures that state none, whatever the campaign's own is.
+Chosen, to be derived: twice as large lowers expected chi-square differences that rest on the lamp, at
+most to a quarter."""
 
 SETTLED = 3
-"""Rounds in which the mean of a flat, which effects change by per cents, is found."""
+"""Number of fixed-point iterations for the mean of a flat, on which effects depend. Derived: effects
+change the mean by a few per cent, so that each round leaves a few per cent of the error and three
+less than 1e-4; twice as many change nothing visible."""
 
 MAP = "planned"
-"""Names of maps of flats that were not taken begin so."""
+"""Prefix of the names of maps of planned flats."""
 
 
 class Forecaster:
-    """Predicts channels of exposures that were not taken.
+    """Predicts the channels of exposures that were not taken.
 
     Parameters
     ----------
     predictor : Predictor
-        The baseline, effects included.
+        Model of baseline and effects.
     fit : BaselineFit
-        Of that predictor.
+        Its fit.
     """
 
     def __init__(self, predictor: Predictor, fit: BaselineFit) -> None:
@@ -66,15 +70,15 @@ class Forecaster:
         )
         levels = [float(c.axes["level"].max()) for c in flats if len(c)]
         self.brightest = float(self.gains.mean()) * max(levels) if levels else 0.0
-        """Level of the brightest flats [e-]."""
+        """Level of the campaign's brightest flats [e-]; 0 without flats."""
         self._spots_more: list[Condition] = []
         self._maps_more: dict[tuple[str, str], tuple[MapShare, ...]] = {}
         fluxes = [float(c.axes["flux"].max()) for c in fit.channels if c.word == "spot"]
         self.brightest_spot = max(fluxes, default=0.0)
-        """Flux of the brightest spots [e-]."""
+        """Flux of the campaign's brightest spots [e-]; 0 without spots."""
 
     def _usual(self) -> Condition:
-        """Condition of most flats, or of most of what there is."""
+        """Condition of most covariances of flats, else of most spots, else of most values."""
         for words in (("flat_cov",), ("spot",), ()):
             count = Counter[Condition]()
             for channel in self.fit.channels:
@@ -87,7 +91,7 @@ class Forecaster:
         return Condition()
 
     def condition(self, planned: Planned) -> Condition:
-        """Condition of planned exposures."""
+        """Condition of planned exposures; settings that are nan are the campaign's usual ones."""
         given = planned.wavelength, planned.back_bias, planned.temperature
         return condition_at(
             own if np.isnan(v) else round(float(v), 2)
@@ -106,12 +110,12 @@ class Forecaster:
         return planned.lamp if np.isfinite(planned.lamp) else self._lamp
 
     def _rates(self, condition: Condition) -> FloatArray:
-        """Light by amplifier [ADU/s for a lamp of 1]; nan where it was never recorded."""
+        """Light by amplifier [ADU/s at a lamp reading of 1]; nan where it was not recorded."""
         names = [self._known(f"light {a} {label_of(condition)}") for a in range(self.amps)]
         return np.array([self.values.get(n, np.nan) for n in names])
 
     def _known(self, name: str) -> str:
-        """Fitted parameter that stands for one that is not: light of the same wavelength."""
+        """The parameter itself, or for light that was not fitted, that of the same wavelength."""
         if name in self.values or not name.startswith("light "):
             return name
         start = name.split("/", 1)[0] + "/"
@@ -123,7 +127,7 @@ class Forecaster:
         Raises
         ------
         DiagnosisError
-            A kind that is none, or spots of a light whose width without charge is not known.
+            An unknown kind, or spots of a wavelength and temperature that the campaign lacks.
         """
         makers = {"flat": self._flats, "dark": self._darks, "bias": self._biases}
         out: list[Forecast] = []
@@ -134,14 +138,16 @@ class Forecaster:
             elif one.kind in makers:
                 out += makers[one.kind](one)
             else:
-                raise DiagnosisError(f"kind={one.kind}: one of spot, {', '.join(makers)}")
-        # A ladder at once: it is grown to its brightest and read on the way.
+                raise DiagnosisError(
+                    f"kind={one.kind} must be one of spot, {', '.join(makers)}"
+                )
+        # All fluxes of a condition together: the spot is grown once, up to the brightest.
         for ladder in spots.values():
             out += self._spots(ladder)
         return out
 
     def same(self, forecasts: Sequence[Forecast], other: Forecaster) -> list[Forecast]:
-        """Predict the channels that another forecaster has made."""
+        """Predict, by this model, the channels that another forecaster predicted."""
         self._extend(other._spots_more, other._maps_more)
         return [self.forecast(f.channel) for f in forecasts]
 
@@ -155,14 +161,14 @@ class Forecaster:
         self._maps_more.update(maps)
 
     def predicted(self, channel: Channel) -> FloatArray:
-        """What a channel reads, linear parameters included where the fit has them."""
+        """Prediction of a channel, with the linear parameters that were fitted."""
         out = self.predictor.predict(channel, self.point)
         for name, column in self.predictor.linear(channel).items():
             out = out + self.values.get(self._known(name), 0.0) * column
         return out
 
     def forecast(self, channel: Channel) -> Forecast:
-        """Values and derivatives of a channel whose axes and errors are set."""
+        """Predict values and derivatives of a channel with given axes and errors."""
         predictor = self.predictor
         here = predictor.predict(channel, self.point)
         count = len(predictor.names)
@@ -189,8 +195,8 @@ class Forecaster:
         lit = bool(np.isfinite(rate).all() and np.isfinite(seconds))
         if not lit and not np.isfinite(planned.level):
             raise DiagnosisError(
-                f"flats at {say_condition(condition)}: the campaign has none, so their light is not "
-                "known; give level= [e-] instead of seconds="
+                f"flats at {say_condition(condition)}: the campaign has none, so that their light is "
+                "unknown; give level= [e-] instead of seconds= [s]"
             )
         if lit:
             mean = self._mean(planned, condition, seconds)
@@ -207,7 +213,7 @@ class Forecaster:
         return out
 
     def _mean(self, planned: Planned, condition: Condition, seconds: float) -> Forecast:
-        """Mean of the exposures together: a row for each amplifier."""
+        """Mean level of all planned exposures together, one value for each amplifier."""
         noise = np.nan_to_num(np.array(self.measured.read_noise))
         pixels = np.array([s.rows * s.columns for s in self.measured.segments], float)
         error = planned.lamp_error if np.isfinite(planned.lamp_error) else LAMP_ERROR
@@ -289,7 +295,7 @@ class Forecaster:
         levels: FloatArray,
         seconds: float,
     ) -> list[Forecast]:
-        """Flats of another condition over those of the usual one, where both are predicted."""
+        """Ratio of flats at another condition to flats at the usual one, against position."""
         if not any(c.word == "flat_map" for c in self.fit.channels):
             return []
         shares = tuple(
@@ -297,7 +303,7 @@ class Forecaster:
             for sign, where in ((1.0, condition), (-1.0, self.usual))
         )
         ny, nx = self.measured.shape
-        # Photon noise of both: the usual condition's flats are at least as many.
+        # Photon noise of both flats, taking as many of the usual condition as are planned.
         noise = 2 / (float((levels * self.gains).mean()) * planned.count)
         name = f"{MAP} {len(self._maps_more)}"
         side = block_side((ny, nx))
@@ -319,7 +325,7 @@ class Forecaster:
         return [self.forecast(channel)]
 
     def _spots(self, ladder: Sequence[Planned]) -> list[Forecast]:
-        """Spots of one condition, with errors of recorded ones of the nearest flux."""
+        """Spots of one condition, with the errors of recorded spots of the nearest flux."""
         condition = self.condition(ladder[0])
         like = next((c for c in self.fit.channels if c.word == "spot"), None)
         if like is None:
@@ -344,7 +350,7 @@ class Forecaster:
         return [self.forecast(channel)]
 
     def _spot_light(self, condition: Condition) -> float:
-        """Electrons of a spot for a second of a lamp of 1."""
+        """Flux of a spot per second at a lamp reading of 1 [e-/s]; nan without spots."""
         names = [n for n in self.values if n.startswith("spot flux ")]
         own = f"spot flux {label_of(condition)}"
         colour = label_of(condition).split("/")[0]
@@ -353,7 +359,7 @@ class Forecaster:
         return self.values[chosen] if chosen else np.nan
 
     def _darks(self, planned: Planned) -> list[Forecast]:
-        """Levels and columns of darks, all of them together."""
+        """Levels and columns of the mean of all planned darks."""
         if not self.measured.segments or not self.amps:
             return []
         condition, axes, blocks = self.condition(planned), Axes(), []
@@ -372,7 +378,7 @@ class Forecaster:
         return [self.forecast(channel)]
 
     def _biases(self, planned: Planned) -> list[Forecast]:
-        """Those that were taken, so many instead of what there are."""
+        """Channels of the recorded biases, with errors scaled to the planned number."""
         taken = max(self.measured.counts.get("bias", 0), 1)
         out = []
         for channel in self.fit.channels:
@@ -383,7 +389,7 @@ class Forecaster:
 
 
 def say_condition(condition: Condition) -> str:
-    """Condition as it is asked for, temperature in deg C."""
+    """Condition as text such as 'wavelength=620, back_bias=-60', with temperature in deg C."""
     wavelength, back_bias, temperature = numbers_of(condition)
     told = dict(zip(NUMBERS, (wavelength, back_bias, to_celsius(temperature)), strict=True))
     parts = [f"{name}={v:g}" for name, v in told.items() if np.isfinite(v)]

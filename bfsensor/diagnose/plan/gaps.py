@@ -1,4 +1,4 @@
-"""Questions that a campaign cannot answer: what is missing, and which recording would bring it."""
+"""Classes of effects that a campaign is not sensitive to, and the recordings that would show them."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 
 
 class Need(NamedTuple):
-    """What a class needs to be seen: any of some channels, and variety or a lamp beside.
+    """Requirements for a class of effects to be detectable.
 
     Attributes
     ----------
     channels : tuple of str
-        Any of them will do.
+        Channels, of which one is enough.
     recording : str
-        What would bring it, in words.
+        Recording that would show the class, in words.
     vary : str
-        Condition of which two values are needed; '' for none.
+        Setting of which two values are needed; '' for none.
     lamp : bool
-        Whether light must be measured.
+        Whether the light must be measured by a lamp monitor.
     amplifiers : int
-        How many are needed.
+        Least number of amplifiers.
     """
 
     channels: tuple[str, ...]
@@ -49,7 +49,7 @@ NEEDS: Mapping[str, Need] = {
     "correlated_noise": Need(("bias_cov", "amp_cross"), "at least two biases"),
     "bias_instability": Need(("bias_level",), "at least four biases"),
     "gain_nonlinearity": Need(("flat_mean",), _LADDER, lamp=True),
-    "adc_bits": Need(("code_hist",), "raw codes of flats"),
+    "adc_bits": Need(("code_hist",), "flats as raw integer codes"),
     "gain_drift": Need(("flat_mean",), _LADDER, lamp=True),
     "bf_nonlinear": Need(("flat_cov", "spot"), _PAIRS),
     "bf_chromatic": Need(("flat_cov", "spot"), "pairs of flats at a second wavelength",
@@ -68,45 +68,52 @@ NEEDS: Mapping[str, Need] = {
     "persistence": Need(("dark_map",), "short darks after bright flats"),
     "shutter_timing": Need(("flat_mean",), _LADDER, lamp=True),
     "dark_hot": Need(("dark_map",), "long darks"),
-    "saturation": Need(("flat_cov", "spot"), "flats and spots beyond 100,000 electrons"),
-    "fringing": Need(("flat_map",), "flats beyond 900 nm beside others", vary="wavelength"),
+    "saturation": Need(("flat_cov", "spot"), "flats and spots above 100,000 e- per pixel"),
+    "fringing": Need(("flat_map",), "flats above 900 nm, and at a shorter wavelength",
+                     vary="wavelength"),
     "psf_wings": Need(("spot",), _SPOTS),
     "cosmic_rays": Need(("dark_map",), "long darks"),
     "illumination_turbulence": Need(("flat_cov",), _PAIRS),
 }  # fmt: skip
-"""By class: channels it shows in at all, one of which must be there."""
+"""Requirements by class.  Derived from the channels that each class of the library changes; numbers
+in the recordings' words are chosen advice, on which no result depends."""
 
 
 class Untested(NamedTuple):
-    """A class that recordings cannot show, why, and what would."""
+    """A class that recordings cannot show: its name, the reason, and a recording that would."""
 
     word: str
     because: str
     recording: str
 
     def to_report(self) -> dict[str, str]:
-        """Give the entry of 'not_tested' in report.json."""
+        """Make the entry of 'not_tested' in report.json."""
         return {"class": self.word, "because": self.because, "recording": self.recording}
 
 
 ALWAYS = (
     Untested(
         "outside_library",
-        "noise of the light beyond Poisson's in proportion to it (Fano noise, several electrons a "
-        "photon) is the same as another gain",
-        "exposures of Fe55, which tell the gain by themselves",
+        "noise of the light in excess of Poisson noise and proportional to it (Fano noise, several "
+        "electrons per photon) has the same effect as a different gain",
+        "exposures of Fe55, whose line measures the gain independently",
     ),
 )
-"""What flats and spots alone never tell."""
+"""Questions that flats and spots alone cannot answer."""
 
 
 def find_untested(measured: MeasuredChannels) -> tuple[Untested, ...]:
-    """Classes of effects that a campaign's recordings cannot show.
+    """Find the classes of effects that a campaign's recordings cannot show.
 
     Parameters
     ----------
     measured : MeasuredChannels
-        Its channels.
+        Channels of the campaign.
+
+    Returns
+    -------
+    tuple of Untested
+        Classes with the reason and a recording that would show them.
     """
     out = []
     for word, need in NEEDS.items():
@@ -117,7 +124,7 @@ def find_untested(measured: MeasuredChannels) -> tuple[Untested, ...]:
 
 
 def _missing(measured: MeasuredChannels, need: Need) -> str:
-    """What a class lacks; '' for nothing."""
+    """Requirement that is not met, in words; '' if all are."""
     channels = [c for c in measured.channels if c.word in need.channels and len(c)]
     if not channels:
         return "no " + " or ".join(need.channels)
@@ -129,6 +136,7 @@ def _missing(measured: MeasuredChannels, need: Need) -> str:
         values = np.concatenate([np.asarray(c.axes[need.vary], float) for c in channels])
         known = np.unique(values[np.isfinite(values)])
         if len(known) < 2:
-            told = f" ({known[0]:g})" if len(known) else ""
+            unit = {"wavelength": " nm", "back_bias": " V"}.get(need.vary, "")
+            told = f" ({known[0]:g}{unit})" if len(known) else ""
             return f"one {need.vary.replace('_', ' ')}{told}"
     return ""

@@ -1,4 +1,4 @@
-"""Exposures that could be taken: what they are, what a fit says of them, what they would tell."""
+"""Planned exposures, forecasts of their channels, and the power of these to separate two models."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ from bfsensor.typing import FloatArray
 
 @dataclass(frozen=True)
 class Planned:
-    """Exposures of one kind and condition; what is nan is as in the campaign.
+    """Planned exposures of one kind and condition; settings that are nan are the campaign's.
 
     Attributes
     ----------
     kind : str
         'flat', 'spot', 'dark' or 'bias'.
     count : int
-        Exposures; flats are taken in pairs.
+        Number of exposures; flats are taken in pairs.
     level : float
-        Of flats [e-].
+        Mean level of flats [e-].
     flux : float
-        Of spots [e-].
+        Flux of spots [e-].
     seconds : float
-        Exposure time [s]; of flats instead of the level.
+        Exposure time [s]; for flats in place of the level.
     wavelength, back_bias, temperature : float
-        [nm], [V], [K].
+        Wavelength [nm], back bias [V] and temperature [K].
     lamp : float
-        Reading of the lamp monitor.
+        Reading of the lamp monitor, in the campaign's unit.
     lamp_error : float
-        Its relative error.
+        Relative error of that reading.
     rate : float
-        Light, in units of the campaign's.
+        Light relative to the campaign's.
     overscan : int
         Overscan pixels, serial and parallel; 0: the campaign's.
     after : float
-        Of darks: level of the exposure before [e-].
+        For darks: level of the exposure before [e-].
     special : str
-        What is done otherwise, in words.
+        Instruction that the other settings do not express.
     """
 
     kind: str
@@ -67,11 +67,12 @@ class Forecast:
     Attributes
     ----------
     channel : Channel
-        Values as predicted, errors as the recording would have them.
+        Predicted values, with the errors that the recording would have.
     slopes : ndarray, shape (n, p)
-        Derivatives by the fit's parameters, in the order of its names [unit].
+        Derivatives by the fit's parameters, in the order of its names [the channel's unit].
     free : mapping of str to ndarray, shape (n,)
-        Columns of what nothing recorded so far tells, such as the light of a new condition.
+        Columns of parameters that no present recording constrains, such as the light at a new
+        condition.
     """
 
     channel: Channel
@@ -79,29 +80,29 @@ class Forecast:
     free: Mapping[str, FloatArray]
 
     def covariance(self, fit: BaselineFit) -> FloatArray:
-        """Of the prediction, by the fit's parameters [unit^2], linear in them."""
+        """Covariance of the prediction by the fit's parameters [unit^2], to first order in them."""
         used = np.abs(self.slopes).max(0, initial=0.0) > 0
         slopes = self.slopes[:, used]
         return np.asarray(slopes @ fit.covariance[np.ix_(used, used)] @ slopes.T)
 
 
 class Information:
-    r"""How far recordings that were not taken would set two models apart.
+    r"""Expected power of planned recordings to separate two models.
 
     .. math::
         \Delta\chi^2 = d^T (C + J \Sigma J^T)^{-1} d
 
-    with d the difference of what the two, each fitted to what there is, predict, C the noise of
-    the new recordings, J the derivatives by the parameters of the model that is wrong and
-    :math:`\Sigma` their covariance; what nothing recorded tells yet is fitted to the new
-    recordings alone.
+    with d the difference of the predictions of the two models, each fitted to the present
+    recordings, C the noise of the planned ones, J the derivatives by the parameters of the wrong
+    model and :math:`\Sigma` their covariance.  Parameters that no present recording constrains are
+    fitted to the planned recordings alone.
 
     Parameters
     ----------
     right, wrong : sequence of Forecast
-        The same channels by both models.
+        Forecasts of the same channels by both models.
     fit : BaselineFit
-        Of the wrong one.
+        Fit of the wrong model.
     """
 
     def __init__(
@@ -136,7 +137,7 @@ class Information:
         self._inner, self._cross = design.T @ design, design.T @ away
 
     def delta_chi2(self, times: float = 1.0) -> float:
-        """Expected difference of the chi-squares, the recordings taken so many times."""
+        """Calculate the expected chi-square difference for ``times`` the planned exposures."""
         matrix = np.eye(len(self._cross)) + times * self._inner
         given_way = times**2 * self._cross @ np.linalg.solve(matrix, self._cross)
         return max(float(times * self._square - given_way), 0.0)

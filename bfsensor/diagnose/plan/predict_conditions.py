@@ -1,4 +1,4 @@
-"""What an accepted model predicts for exposures that were not taken: asked for in text, kept as ECSV."""
+"""Predictions of an accepted model for exposures that were not taken: text or ECSV in, ECSV out."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from bfsensor.measure.ecsv import write_ecsv
 from bfsensor.units import to_celsius, to_kelvin
 
 SCHEMA = "bfsensor-predicted-1"
+"""Name of the layout of predicted.ecsv, in its header."""
 
 KEYS = (
     "level",
@@ -33,32 +34,42 @@ KEYS = (
     "lamp",
     "count",
 )
-"""Quantities a condition may give: [e-], [s], [e-], [nm], [V], [C], the monitor's unit, exposures."""
+"""Names of a condition's quantities, in turn in e-, s, e-, nm, V, deg C, the lamp monitor's unit, and
+number of exposures."""
 
 SPOTS = ("sigma_x", "sigma_y", "flux")
+"""Quantities of spots that are written."""
+
 UNITS = {"sigma_x": "pixel", "sigma_y": "pixel", "flux": "electron"}
+"""Their units."""
+
 WRITTEN = ("flat_mean", "flat_cov", "spot")
+"""Channels that are written."""
 
 
 def read_conditions(texts: Sequence[str]) -> list[Planned]:
     """Read conditions of exposures, each a text such as ``level=40000,back_bias=-40`` or a file.
 
-    A condition with ``flux`` (or ``kind=spot``) is one of spots, any other of a pair of flats; what is
-    not given is as in the campaign.
+    A condition with ``flux`` (or ``kind=spot``) describes spots, any other a pair of flats; settings
+    that are not given are the campaign's.
 
     Parameters
     ----------
     texts : sequence of str
-        Texts, or paths of ECSV files with a row for each condition and the same names as columns.
+        Texts of NAME=VALUE separated by commas, or paths of ECSV files with a row for each
+        condition and the same names as columns.  Names: kind (flat or spot), level [e-], seconds
+        [s], flux [e-], wavelength [nm], back_bias [V], temperature [deg C], lamp (the monitor's
+        unit), count (exposures).
 
     Returns
     -------
     planned : list of Planned
+        One for each condition, in order.
 
     Raises
     ------
     DiagnosisError
-        Names the text and what is wrong in it.
+        A name or value is not allowed, or a file cannot be read; names the text and the fault.
 
     Examples
     --------
@@ -99,7 +110,7 @@ def _planned(given: Mapping[str, Any], where: str) -> Planned:
         if name == "kind":
             continue
         if name not in KEYS:
-            raise DiagnosisError(f"{where}: {name} is none of kind, {', '.join(KEYS)}")
+            raise DiagnosisError(f"{where}: {name} must be one of kind, {', '.join(KEYS)}")
         try:
             values[name] = float(value)
         except (TypeError, ValueError):
@@ -109,7 +120,7 @@ def _planned(given: Mapping[str, Any], where: str) -> Planned:
     kind = str(given.get("kind", "spot" if "flux" in values else "flat"))
     count = int(values.pop("count", 2 if kind == "flat" else 1))
     if kind not in ("flat", "spot"):
-        raise DiagnosisError(f"{where}: kind={kind}: flat or spot")
+        raise DiagnosisError(f"{where}: kind={kind} must be flat or spot")
     needed = ("level", "seconds") if kind == "flat" else ("flux", "seconds")
     if not any(name in values for name in needed):
         raise DiagnosisError(f"{where}: {kind}s need {' or '.join(needed)}")
@@ -119,20 +130,27 @@ def _planned(given: Mapping[str, Any], where: str) -> Planned:
 
 
 def refuse_unheld(planned: Sequence[Planned], baseline: Baseline) -> None:
-    """Refuse conditions that a baseline has no boundary shifts for.
+    """Refuse conditions for which a baseline has no boundary shifts.
+
+    Parameters
+    ----------
+    planned : sequence of Planned
+        Conditions to check.
+    baseline : Baseline
+        Baseline with the shifts.
 
     Raises
     ------
     DiagnosisError
-        Names the condition and those that are held.
+        Names the condition, and those of the baseline.
     """
     for one in planned:
         condition = condition_at((one.wavelength, one.back_bias, one.temperature))
         if not baseline.at(condition)[1]:
             held = ", ".join(_told(*key) for key in baseline.edges)
             raise DiagnosisError(
-                f"{say_condition(condition)}: the baseline {baseline.name} holds no boundary shifts "
-                f"there; it holds {held}"
+                f"{say_condition(condition)}: the baseline {baseline.name} has no boundary shifts "
+                f"there; it has them at {held}"
             )
 
 
@@ -143,18 +161,26 @@ def _told(wavelength: float, bias: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What a model predicts for exposures that were not taken.
+    """Predictions of a model for exposures that were not taken.
 
     Attributes
     ----------
     forecasts : tuple of (int, Forecast)
-        Number of the condition, from 1, and one of its channels.
+        Number of the condition, from 1, and the forecast of one of its channels.
     fit : BaselineFit
-        That the parameters come from.
+        Fit of the model, with the covariance of its parameters.
     amplifiers : tuple of str
-        Names.
+        Names of the amplifiers.
     notes : tuple of str
-        What was assumed.
+        Assumptions.
+
+    Examples
+    --------
+    Predict a flat of 40,000 e- with the model of a diagnosis::
+
+        result = diagnose(source, baseline)
+        prediction = predict_conditions(*result.accepted, read_conditions(["level=40000"]))
+        prediction.write("predicted.ecsv")
     """
 
     forecasts: tuple[tuple[int, Forecast], ...]
@@ -163,10 +189,15 @@ class Prediction:
     notes: tuple[str, ...] = ()
 
     def rows(self) -> list[dict[str, Any]]:
-        """Give a row for each value.
+        """Make one row for each predicted value.
 
-        'error' is what the fitted parameters leave open, 'noise' what the exposures themselves
-        would scatter by: a recording is to be held against both.
+        'error' is the standard error by the fitted parameters, 'noise' the standard deviation by
+        which such exposures scatter: compare a recording with both in quadrature.
+
+        Returns
+        -------
+        list of dict
+            Rows with the columns of the file that :meth:`write` writes.
         """
         out = []
         for number, one in self.forecasts:
@@ -190,7 +221,18 @@ class Prediction:
         return out
 
     def write(self, path: str | os.PathLike[str]) -> Path:
-        """Write all rows as ECSV; an existing file is replaced."""
+        """Write all rows as an ECSV table; an existing file is replaced.
+
+        Parameters
+        ----------
+        path : path-like
+            File to write.
+
+        Returns
+        -------
+        Path
+            The same path.
+        """
         rows = self.rows()
         columns = {
             name: ([r[name] for r in rows], unit, text)
@@ -208,6 +250,7 @@ class Prediction:
 
 
 _WHAT = {"flat_mean": "mean", "flat_cov": "covariance"}
+"""Quantity of each channel of flats."""
 
 _COLUMNS: dict[str, tuple[str | None, str]] = {
     "condition": (None, "number of the condition asked for"),
@@ -222,36 +265,47 @@ _COLUMNS: dict[str, tuple[str | None, str]] = {
     "time": ("s", "exposure time"),
     "lamp": (None, "reading of the lamp monitor"),
     "level": (None, "mean of the flat [ADU] that covariances are for"),
-    "flux": ("electron", "of a spot"),
+    "flux": ("electron", "flux of a spot"),
     "value": (None, "prediction, in the unit of its row"),
-    "error": (None, "what the fitted parameters leave open, standard deviation"),
+    "error": (None, "standard error by the fitted parameters"),
     "noise": (None, "scatter of such exposures, standard deviation"),
-    "unit": (None, "of value, error and noise"),
+    "unit": (None, "unit of value, error and noise"),
 }
+"""Unit and description of each column."""
 
 
 def predict_conditions(
     predictor: Predictor, fit: BaselineFit, planned: Sequence[Planned]
 ) -> Prediction:
-    """Predict means and covariances of flats and sizes of spots that were not taken.
+    """Predict means and covariances of flats, and widths and fluxes of spots, that were not taken.
 
-    Errors are linear in the fit's parameters, all of its covariance included.
+    Errors are propagated from the full covariance of the fit's parameters to first order.
 
     Parameters
     ----------
-    predictor, fit
-        The accepted model: baseline and effects found.
+    predictor : Predictor
+        Accepted model, such as the first of ``Diagnosis.accepted``: baseline and effects found.
+    fit : BaselineFit
+        Its fit.
     planned : sequence of Planned
-        From :func:`read_conditions`.
+        Conditions, from :func:`read_conditions`.
 
     Returns
     -------
     Prediction
+        Values with errors and noise.
 
     Raises
     ------
     DiagnosisError
-        A condition that the baseline does not hold, or whose light was never recorded.
+        The baseline has no boundary shifts at a condition, or its light was not recorded.
+
+    Examples
+    --------
+    Predict a spot of 5e5 e- with the model of a diagnosis::
+
+        result = diagnose(source, baseline)
+        prediction = predict_conditions(*result.accepted, read_conditions(["flux=5e5"]))
     """
     refuse_unheld(planned, predictor.baseline)
     forecaster = Forecaster(predictor, fit)
@@ -267,18 +321,19 @@ def predict_conditions(
         found = [f for f in forecaster.forecasts([one]) if f.channel.word in WRITTEN]
         if not found:
             raise DiagnosisError(
-                f"condition {number}: the campaign has no {one.kind}s to predict others from"
+                f"condition {number}: the campaign has no {one.kind}s that others could be predicted "
+                "from"
             )
         for f in found:
             if any(n.startswith("light ") for n in f.free):
                 notes.append(
-                    f"condition {number}: the light of {wavelength:g} nm is taken from "
+                    f"condition {number}: the light at {wavelength:g} nm is taken from recordings at "
                     "other voltages or temperatures"
                 )
         if one.kind == "flat" and not any(f.channel.word == "flat_mean" for f in found):
             notes.append(
-                f"condition {number}: no flat of {wavelength:g} nm was recorded, so the "
-                "mean is the level asked for, at no known exposure time"
+                f"condition {number}: no flat at {wavelength:g} nm was recorded: covariances are for "
+                "the level given, and no mean is predicted for an exposure time"
             )
         out += [(number, f) for f in found]
     return Prediction(

@@ -1,18 +1,28 @@
-"""An attribution as report.json has it, and in plain words."""
+"""An attribution as keys of report.json, and in sentences for the report."""
 
 from __future__ import annotations
 
 from typing import Any
 
+from bfsensor.diagnose.detect.model_error import ACCURACY, OUTSIDE_ALARM
 from bfsensor.diagnose.explain.attribution import Attribution, Found
 from bfsensor.diagnose.model.exchanged_axes import AxesExchanged, says_exchanged
+from bfsensor.diagnose.report.class_words import (
+    CLASS_WORDS,
+    NAMES,
+    PARAMETER_WORDS,
+    said_family_p,
+    said_interval,
+    said_value,
+)
 from bfsensor.diagnose.report.nonparametric_words import reported_freely, said_freely
 
 OUTSIDE = "outside_library"
+"""Class of a mismatch that no effect of the library explains, in report.json."""
 
 
 def reported(attribution: Attribution | None) -> dict[str, Any]:
-    """Keys of report.json that say what explains a mismatch."""
+    """Make the keys of report.json that state the effects found in a mismatch."""
     if attribution is None:
         return {
             "effects": [],
@@ -45,57 +55,77 @@ def _effect(found: Found) -> dict[str, Any]:
 
 
 def said_of(attribution: Attribution) -> list[str]:
-    """Sentences: what explains it, what would as well, what is left, what it does to new data."""
+    """Sentences: effects with their parameters, what is left, and chi-squares of held-out data."""
     out = []
+    left = attribution.mismatch
+    # An effect "explains" a mismatch only where it does so alone, and nothing that stands out is left.
+    alone = len(attribution.found) == 1 and not (left.detected or attribution.open_world)
+    verb = "explains it" if alone else "explains part of it"
     for found in attribution.found:
         if isinstance(found.effect, AxesExchanged):
             out.append(
                 says_exchanged(found.effect["amp"], found.errors.get("amp", 0.0)) + "."
             )
             continue
-        values = ", ".join(
-            f"{name} = {_value(told)}" for name, told in found.intervals().items()
-        )
-        text = f"{found.effect.word} explains it: {values}"
-        others = [w for w in found.tied if w != found.effect.word]
-        if others:
-            text += f"; these recordings cannot tell it from {' or '.join(others)}"
-        out.append(text + ".")
+        out.append(f"{_said_effect(found, verb)}.")
+    if attribution.found and attribution.free_form is None:
+        out.append(_said_left(attribution))
     named = any(f.effect.word == OUTSIDE for f in attribution.found)
     if attribution.open_world and not (named and attribution.free_form is None):
-        what = "what is left" if attribution.found else "it"
+        what = "the rest" if attribution.found else "it"
         out.append(f"No effect of the library explains {what}.")
-    elif not attribution.found and attribution.mismatch.detected:
+    elif not attribution.found and left.detected:
         out.append(
-            "No effect explains it; it is too faint to be called outside the library."
+            "No effect of the library explains it; it is too weak to be called outside the "
+            f"library, which takes a family-wise p below {OUTSIDE_ALARM:g}."
         )
     if attribution.free_form is not None:
-        out.append(said_freely(attribution.free_form))
+        # The residuals are those with the nonparametric terms.
+        out += [said_freely(attribution.free_form), _said_left(attribution)]
     before, after = attribution.chi2dof()
     if (attribution.found or attribution.free_form is not None) and before == before:
+        way = "falls" if after < before else "rises"
         out.append(
-            f"On recordings that were not fitted chi-square per value goes from {before:.2f} to "
+            f"On recordings that were not fitted, chi-square per value {way} from {before:.2f} to "
             f"{after:.2f}."
         )
         for word in attribution.fails_in:
             worse, better, n = (attribution.heldout[word][k] for k in (1, 0, 2))
             out.append(
-                f"There it fails in the channel {word!r} (from {better / n:.2f} to {worse / n:.4g}): "
-                "parameters of effects that act on it are not to be relied on."
+                f"There it rises in one channel, {NAMES.get(word, word)} (from {better / n:.2f} to "
+                f"{worse / n:.4g}): do not rely on parameters of effects that act on it."
             )
     return out
 
 
-def _value(told: dict[str, Any]) -> str:
-    if "lo68" not in told:
-        return f"{told['value']:g}"
-    low, high = f"{told['lo68']:.3g}", f"{told['hi68']:.3g}"
-    open_ = told.get("open68", ())
-    text = f"{low} to {high}"
-    if len(open_) == 2:
-        text = "any"
-    elif open_:
-        text = f"above {low}" if "hi" in open_ else f"below {high}"
-    if told.get("stopped68"):
-        text += f", followed from {low} to {high} only"
-    return f"{told['value']:.3g} ({text})"
+def _said_effect(found: Found, verb: str) -> str:
+    """One effect: class, meaning, parameters with units, and the classes that fit as well."""
+    word = found.effect.word
+    units = {p.name: p.unit for p in found.effect.parameters}
+    words = PARAMETER_WORDS.get(word, {})
+    values = []
+    for name, told in found.intervals().items():
+        # A device's own quantities are in the unit of its file, which the effect does not know.
+        unit = f" {units[name]}" if units[name] and name in words else ""
+        interval = said_interval(told, "68")
+        interval = f"68 %: {interval}" if name in found.errors else interval
+        values.append(
+            f"{words.get(name, name)} = {said_value(word, name, told['value'])}{unit} ({interval})"
+        )
+    text = f"{word} ({CLASS_WORDS.get(word, word)}) {verb}: {', '.join(values)}"
+    others = [w for w in found.tied if w != word]
+    if others:
+        text += f"; these recordings do not distinguish it from {' or '.join(others)}"
+    return text
+
+
+def _said_left(attribution: Attribution) -> str:
+    """State whether residuals with the effects still stand out, by their p-value."""
+    left = attribution.mismatch
+    p = said_family_p(left.p_value)
+    if not left.detected:
+        return f"Nothing else stands out (family-wise p {p})."
+    text = f"What is left still stands out (family-wise p {p})"
+    if not attribution.open_world and left.p_value < OUTSIDE_ALARM:
+        text += f", but within the {100 * ACCURACY:g} % to which effects are predicted"
+    return f"{text}."

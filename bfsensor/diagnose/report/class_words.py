@@ -1,41 +1,210 @@
-"""What each class of effects is, in plain words."""
+"""Plain words for channels, classes of effects, their parameters and scans, and printed p-values."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
+from bfsensor.diagnose.detect.locate import FAMILY, SMALLEST
+from bfsensor.diagnose.detect.scans import DEVICE, DEVICE_SCAN
+
+NAMES = {
+    DEVICE: "device's parameters",
+    "flat_cov": "covariances of flats", "flat_mean": "mean of flats against the lamp",
+    "flat_map": "flats against position", "serial_overscan": "serial overscan",
+    "parallel_overscan": "parallel overscan", "bias_cov": "noise in readout order",
+    "bias_level": "bias levels", "dark_map": "darks", "spot": "spots",
+    "amp_cross": "amplifiers against one another", "code_hist": "converter codes",
+}  # fmt: skip
+"""Plain words for each channel."""
+
 CLASS_WORDS = {
-    "cti_serial": "charge left behind at each serial transfer",
-    "cti_parallel": "charge left behind at each parallel transfer",
+    "cti_serial": "a fraction of the charge stays behind at each serial transfer",
+    "cti_parallel": "a fraction of the charge stays behind at each parallel transfer",
     "trap_serial": "a trap of fixed size in the serial register",
     "electronic_memory": "the amplifier or its clamp remembers earlier pixels",
-    "interpixel_coupling": "neighbours share signal after collection, at all signals alike",
-    "amp_crosstalk": "a fraction of one amplifier's signal in another",
-    "correlated_noise": "read noise correlated in time or between amplifiers",
-    "bias_instability": "the bias level moves between frames, rows or along rows",
-    "gain_nonlinearity": "the response against signal is curved",
-    "adc_bits": "the converter's code widths are wrong",
+    "interpixel_coupling": "neighbours share signal after collection, in proportion to the signal",
+    "amp_crosstalk": "a fraction of one amplifier's signal appears in another",
+    "correlated_noise": "read noise is correlated in time or between amplifiers",
+    "bias_instability": "the bias level moves between frames, between rows or along rows",
+    "gain_nonlinearity": "the signal in ADU is not proportional to the charge",
+    "adc_bits": "a bit of the analogue-to-digital converter has a wrong weight",
     "gain_drift": "the gain changes with time",
     "bf_nonlinear": "pixel boundaries do not shift in proportion to the stored charge",
-    "bf_chromatic": "the brighter-fatter effect depends on wavelength otherwise than simulated",
-    "bf_anisotropy": "boundaries shift in x and y otherwise than the device allows",
-    "bf_long_range": "boundary shifts fall more slowly with distance than electrostatics says",
-    "device_parameter": "a quantity of the device card is wrong by far more than its spread",
-    "voltage_dependence": "the dependence on back bias is another than simulated",
-    "lateral_diffusion": "electrons diffuse more than simulated",
-    "tree_rings": "circular pattern of pixel areas",
-    "edge_rolloff": "the field bends at the sensor's edge",
-    "mask_stitch": "periodic error of pixel sizes from the mask",
-    "tearing": "the field bends at a boundary between columns",
-    "charge_loss": "light is collected the less, the more charge is there",
-    "persistence": "charge left from earlier exposures",
+    "bf_chromatic": "the brighter-fatter effect changes with wavelength otherwise than simulated",
+    "bf_anisotropy": "the ratio of boundary shifts in x and in y differs from the simulated one",
+    "bf_long_range": "boundary shifts fall off with distance more slowly than electrostatics predicts",
+    "device_parameter": "a quantity of the device differs from its nominal value by far more than "
+    "its uncertainty",
+    "voltage_dependence": "boundary shifts change with back bias otherwise than simulated",
+    "lateral_diffusion": "electrons diffuse sideways more than simulated",
+    "tree_rings": "a circular pattern of pixel areas",
+    "edge_rolloff": "field lines lean outwards or inwards near the sensor's edge",
+    "mask_stitch": "a periodic error of column widths from the mask",
+    "tearing": "columns on either side of a boundary have wrong widths, as with holes redistributed "
+    "in the channel stops",
+    "charge_loss": "the fraction of light that is collected falls with the stored charge",
+    "persistence": "charge is released from earlier exposures",
     "shutter_timing": "exposure times are offset, or unequal over the sensor",
     "dark_hot": "dark current or hot columns",
-    "saturation": "the full well is lower than the card says",
-    "fringing": "interference at long wavelengths",
+    "saturation": "the full well is smaller than the baseline's",
+    "fringing": "light interferes within the sensor at long wavelengths",
     "psf_wings": "spots have an extended halo",
-    "cosmic_rays": "tracks of particles",
+    "cosmic_rays": "tracks of charged particles",
     "illumination_turbulence": "the illumination changes from frame to frame",
-    "free_holes": "holes that move in the channel stops and under the barrier gates",
+    "free_holes": "holes move in the channel stops and under the barrier gates",
     "stop_diffusion": "implants of the channel stops spread sideways",
-    "outside_library": "none of the effects that are known here",
+    "outside_library": "none of the effects in the library",
 }
-"""By class word."""
+"""Plain words for each class of effects of report.json."""
+
+PARAMETER_WORDS: Mapping[str, Mapping[str, str]] = {
+    "cti_serial": {"cti": "fraction left behind per transfer"},
+    "cti_parallel": {"cti": "fraction left behind per transfer"},
+    "trap_serial": {
+        "size": "charge that the trap holds", "tau": "release time constant",
+        "amp": "amplifier (the first is 1)", "reach": "smallest packet that meets the trap",
+    },
+    "electronic_memory": {"alpha": "fraction of the pixel read before"},
+    "interpixel_coupling": {
+        "ax": "fraction given to each neighbour in the row",
+        "ay": "fraction given to each neighbour in the column",
+    },
+    "amp_crosstalk": {"c": "fraction of the other amplifiers' signal"},
+    "correlated_noise": {
+        "rms": "rms of the noise", "corr": "correlation with the pixel read before",
+        "period": "period",
+    },
+    "bias_instability": {
+        "rms": "rms of the level", "amp": "excess at the start of a row",
+        "length": "settling length",
+    },
+    "gain_nonlinearity": {
+        "c2": "relative change of the signal at 1e5 e-, linear in the signal",
+        "c3": "relative change of the signal at 1e5 e-, quadratic in the signal",
+    },
+    "adc_bits": {"delta": "error of the bit's weight", "bit": "bit, the lowest is 0"},
+    "gain_drift": {"slope": "relative growth of the signal"},
+    "bf_nonlinear": {"b": "b in the shift k Q (1 + b Q / 2) of a charge Q"},
+    "bf_chromatic": {"kappa": "relative change of the shifts from 620 to 950 nm"},
+    "bf_anisotropy": {"eps": "excess of the shifts in y over those in x, relative"},
+    "bf_long_range": {
+        "amp": "area change at 1 pixel's distance", "power": "power of the distance",
+    },
+    "voltage_dependence": {"delta": "relative growth of the shifts per 20 V less back bias"},
+    "lateral_diffusion": {"var": "added variance of a spot"},
+    "tree_rings": {
+        "amp": "amplitude", "period": "period", "xc": "centre in x", "yc": "centre in y",
+        "phase": "phase", "chirp": "relative change of the rings' frequency",
+        "sway": "relative modulation of the rings' frequency", "length": "length of the modulation",
+        "sway_phase": "phase of the modulation",
+    },
+    "edge_rolloff": {"amp": "displacement at the edge", "length": "decay length"},
+    "mask_stitch": {
+        "amp": "displacement of the boundaries", "period": "period",
+        "phase": "first displaced boundary",
+    },
+    "tearing": {
+        "amp": "displacement at the boundary", "length": "decay length",
+        "column": "place of the boundary, as a fraction of the sensor's width",
+        "open": "fraction of rows in which the tear never closes",
+    },
+    "charge_loss": {"q": "relative loss of light per stored electron"},
+    "persistence": {"frac": "fraction released", "tau": "decay constant"},
+    "shutter_timing": {
+        "dt": "exposure beyond the commanded time",
+        "shade": "relative change of that from the centre to the last column",
+    },
+    "dark_hot": {"rate": "dark current", "columns": "number of hot columns"}
+    | {f"x{n}": f"hot column {n}" for n in range(1, 7)},
+    "saturation": {"full_well": "full well"},
+    "fringing": {
+        "amp": "relative amplitude", "period": "period along a row at the centre",
+        "tilt": "tilt of the contours", "phase": "phase",
+        "xx": "curvature of the contours, x x", "xy": "curvature of the contours, x y",
+        "yy": "curvature of the contours, y y",
+    },
+    "psf_wings": {"frac": "fraction of the light in the halo", "sigma": "added width of the halo"},
+    "cosmic_rays": {"rate": "tracks on 256 x 256 pixels"},
+    "illumination_turbulence": {
+        "rms": "relative rms of the light", "corr": "correlation length",
+    },
+}  # fmt: skip
+"""Plain words for the parameters of each class, as defined by the class in :mod:`bfsensor.effects`;
+parameters that are not listed are printed by their names."""
+
+SCAN_WORDS = {
+    "chi-square": "chi-square of the channel",
+    FAMILY: "shape of an effect of the library",
+    DEVICE_SCAN: "pull of a device parameter",
+    "lags": "single lag", "lags together": "several lags together",
+    "lag x power": "single lag, by power of the level",
+    "lag x condition": "single lag, one light or voltage alone",
+    "lag x amplifier": "single lag, one amplifier alone",
+    "lag x level": "single lag, one level alone",
+    "own shape x power": "all lags as the baseline has them, by power of the level",
+    "own shape x condition": "all lags as the baseline has them, one light or voltage alone",
+    "mean x power": "mean, by power of the level", "mean x level": "mean, one level alone",
+    "mean, step in time": "mean, step in time", "mean, slope in time": "mean, slope in time",
+    "mean, one exposure": "mean of one exposure",
+    "columns": "single column", "rows": "single row",
+    "column strips": "strip of columns", "row strips": "strip of rows",
+    "column edges": "columns near an edge", "row edges": "rows near an edge",
+    "column waves": "wave along x", "row waves": "wave along y",
+    "column boundaries": "columns beside a boundary", "row boundaries": "rows beside a boundary",
+    "boxes": "rectangle", "rims": "all four edges", "combs": "every n-th column boundary",
+    "rings": "power at one spatial frequency", "texture waves": "wave in the autocorrelation",
+    "chess pattern": "alternating pixels",
+    "overscan pixel x power": "one overscan pixel, by power of the level",
+    "overscan tail x power": "exponential tail, by power of the level",
+    "overscan tail x level": "exponential tail, one level alone",
+    "noise lag": "single lag", "noise tail": "exponential tail", "noise wave": "wave",
+    "bias": "level of all biases", "bias, one exposure": "level of one bias",
+    "dark after light": "dark level after bright exposures",
+    "struck pixels": "number of pixels hit by particles", "dark columns": "single column",
+    "spots x power": "shape or flux, by power of the flux",
+    "spots x condition": "shape or flux, one light or voltage alone",
+    "spots, one exposure": "shape or flux in one exposure",
+    "code bits": "one bit", "codes": "one code", "codes below high bits": "codes below a high bit",
+    "amplifiers": "one pair of amplifiers",
+}  # fmt: skip
+"""Plain words for the scans of report.json ('family')."""
+
+
+def said_p(value: float, floor: float = SMALLEST) -> str:
+    """Print a p-value; at or below the floor of its calculation as '< 1e-30'."""
+    return f"< {floor:.0e}" if value <= floor else f"{value:.2g}"
+
+
+def said_family_p(value: float) -> str:
+    """Print a family-wise p-value, which is twice the smaller one of two families."""
+    return said_p(value, 2 * SMALLEST)
+
+
+def said_number(value: float, digits: int = 3) -> str:
+    """Print a number with a few digits, from a thousand to a million without exponent."""
+    rounded = float(f"{value:.{digits}g}")
+    return f"{rounded:,.0f}" if 1e3 <= abs(rounded) < 1e6 else f"{value:.{digits}g}"
+
+
+def said_interval(told: Mapping[str, Any], level: str) -> str:
+    """Print the interval of a parameter of report.json, '68' or '95'; open ends in words."""
+    if f"lo{level}" not in told:
+        return "chosen, not fitted"
+    low, high = said_number(told[f"lo{level}"]), said_number(told[f"hi{level}"])
+    open_ = told.get(f"open{level}", ())
+    text = f"{low} to {high}"
+    if len(open_) == 2:
+        text = "not constrained"
+    elif open_:
+        text = f"above {low}" if "hi" in open_ else f"below {high}"
+    if told.get(f"stopped{level}"):
+        text += f", calculated between {low} and {high} only"
+    return text
+
+
+def said_value(word: str, name: str, value: float) -> str:
+    """Print a parameter's value; amplifiers are counted from 1, in report.json from 0."""
+    if (word, name) == ("trap_serial", "amp"):
+        return f"{value + 1:g}"
+    return said_number(value)

@@ -1,4 +1,4 @@
-"""What recordings and a baseline say of one another: the diagnosis, as data and in sentences."""
+"""The result of a diagnosis: measured channels, fit, mismatch, effects, as data and in sentences."""
 
 from __future__ import annotations
 
@@ -23,51 +23,64 @@ from bfsensor.diagnose.model.predictor import Predictor, used_channels
 from bfsensor.diagnose.plan.advice import RecordingPlan
 from bfsensor.diagnose.plan.gaps import find_untested
 from bfsensor.diagnose.report.attribution_words import reported, said_of
+from bfsensor.diagnose.report.class_words import NAMES, SCAN_WORDS, said_family_p
 
 SCHEMA = "bfsensor-diagnosis-1"
+"""Name of report.json's layout, under its key 'schema'."""
+
 FARTHEST, OF_EACH = 50, 10
-"""Findings that report.json holds: of all, and of each channel at least."""
+"""Findings that report.json lists: the 50 farthest of all, and at least the 10 farthest of each channel.
+Chosen: with twice as many the file grows by some 10 kB, and no result changes."""
 
 NO_PLAN = RecordingPlan()
-
-NAMES = {
-    DEVICE: "device's parameters",
-    "flat_cov": "covariances of flats", "flat_mean": "mean of flats against the lamp",
-    "flat_map": "flats against position", "serial_overscan": "serial overscan",
-    "parallel_overscan": "parallel overscan", "bias_cov": "noise in readout order",
-    "bias_level": "bias levels", "dark_map": "darks", "spot": "spots",
-    "amp_cross": "amplifiers against one another", "code_hist": "converter codes",
-}  # fmt: skip
+"""Plan without any advice."""
 
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """What recordings and baseline say of one another.
+    """Comparison of a campaign's recordings with a baseline, as :func:`diagnose` returns it.
 
     Attributes
     ----------
     campaign : str
-        Its name.
+        Name of the campaign.
     baseline : str
-        What predicted.
+        Name or path of the baseline that predicted the recordings.
     measured : MeasuredChannels
-        The channels.
+        Channels measured in the recordings.
     fit : BaselineFit
-        The baseline with all that may float.
+        Fit of the baseline's free parameters (gains, lamp, device) without any effect.
     mismatch : Mismatch
-        What is left, and how unlikely that is.
+        Residuals of that fit that stand out, with their family-wise p-values.
     heldout : float
-        Chi-square over degrees of freedom of the fold that was not fitted; nan without one.
+        Chi-square over degrees of freedom of the held-out fold, which was not fitted; nan
+        without one.
     notes : tuple of str
-        What was set aside, warned of or assumed.
+        Exposures set aside, warnings and assumptions.
     read : int
-        How many of them, the first, are of the reading.
+        Number of the first ``notes`` that come from reading the recordings.
     attribution : Attribution, optional
-        What explains it; None where nothing stands out.
+        Effects found in the mismatch; None where nothing stands out, or none were sought.
     plan : RecordingPlan
-        Recordings that tell apart what is tied.
+        Recordings that would separate the classes these ones do not distinguish.
     predictor : Predictor, optional
-        Of the baseline's fit.
+        Model that ``fit`` belongs to.
+
+    Examples
+    --------
+    >>> from bfsensor.diagnose import diagnose_measured
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> from bfsensor.diagnose import free_baseline, measure_reduced
+    >>> from bfsensor.recording.tables.area_changes import AreaChangeTable
+    >>> a = np.zeros((3, 3)); a[0, 0], a[0, 1], a[1, 0] = -1.4e-6, 3e-7, 4e-7
+    >>> errors, independent = np.full((3, 3), 1e-8), np.ones((3, 3), bool)
+    >>> table = AreaChangeTable(Path("drawn"), a, errors, independent)
+    >>> baseline = free_baseline()
+    >>> measured = measure_reduced(table, reach=baseline.reach)
+    >>> result = diagnose_measured(measured, baseline, campaign="drawn")
+    >>> result.to_report()["detected"], result.location()["lags"]
+    (False, [])
     """
 
     campaign: str
@@ -84,18 +97,26 @@ class Diagnosis:
 
     @property
     def accepted(self) -> tuple[Predictor | None, BaselineFit]:
-        """Predictor and fit with the effects found, or of the baseline where none was found."""
+        """Predictor and fit with the effects found, or those of the baseline without attribution."""
         of = self.attribution or self
         return of.predictor, of.fit
 
     @property
     def gain(self) -> float:
-        """Mean gain of the amplifiers [e-/ADU]; nan where there is none."""
+        """Mean fitted gain of the amplifiers [e-/ADU]; nan for a recording without amplifiers."""
         count = len(self.measured.amplifiers)
         return float(np.mean(self.fit.values[:count])) if count else np.nan
 
     def location(self) -> dict[str, Any]:
-        """Where the mismatch is, as report.json has it; empty lists where nothing was found."""
+        """Locate the mismatch: channels, lags, fluxes [e-], columns, rows, amplifiers, exposures.
+
+        Returns
+        -------
+        dict
+            The key 'location' of report.json: 'channels', 'lags' (x, y) [pixel], 'flux_e' [e-],
+            'x' and 'y' (first and one past the last column and row, from 0), 'amps' (counted from
+            1), 'wavelength' [nm], 'exposures'; empty lists where nothing was detected.
+        """
         out: dict[str, Any] = {
             "channels": [], "lags": [], "flux_e": [], "x": [], "y": [], "amps": [],
             "wavelength": [], "exposures": [],
@@ -107,8 +128,9 @@ class Diagnosis:
             placed = place_effects(self.attribution, self.fit, self.measured.shape, count)
             if placed is not None:
                 return placed
-        # Of all that stands out most is shadow of the same: the parts are what makes it up.
-        # Channels cast none on one another: those that no part is in follow by their farthest.
+        # Most findings are templates correlated with the few that make up the residuals: these
+        # parts come first.  Templates of different channels are not correlated, so a channel
+        # without a part is represented by its farthest finding.
         found = [f for f in self.mismatch.findings if f.family != "chi-square"]
         seen = {p.word for p in self.mismatch.parts}
         others = {f.word: f for f in reversed(found) if f.word not in seen}
@@ -150,7 +172,7 @@ class Diagnosis:
         return out
 
     def _heldout(self) -> dict[str, Any]:
-        """Chi-square per value of the held-out recordings, before and after, in all and by channel."""
+        """Chi-square per value of the held-out recordings, without and with effects, by channel."""
         out: dict[str, Any] = {
             "chi2dof_before": _finite(self.heldout), "chi2dof_after": None,
             "values": sum(map(len, used_channels(self.measured.channels, ("held-out",)))),
@@ -169,7 +191,7 @@ class Diagnosis:
         return out
 
     def _all_flux(self, words: list[str]) -> list[float]:
-        """Lowest and highest flux [e-] of the first of channels that has any."""
+        """Lowest and highest flux [e-] in the first of the channels that has a flux or level axis."""
         for word in words:
             name, scale = ("flux", 1.0) if word == "spot" else ("level", self.gain)
             held = [
@@ -181,22 +203,30 @@ class Diagnosis:
         return []
 
     def said(self) -> str:
-        """Give the diagnosis in two or three plain sentences."""
+        """Summarise the diagnosis in a few sentences, as printed and at the top of report.html.
+
+        Returns
+        -------
+        str
+            The key 'said' of report.json.
+        """
         m = self.mismatch
         if not m.detected:
             parts = [
-                "Nothing stands out: the largest of all statistics has a family-wise p of "
-                f"{m.p_value:.2g}.",
-                f"{len(self.fit.residuals)} values in {len(m.chi2)} channels were held against the "
-                "baseline; what these recordings cannot see is not excluded.",
+                "Nothing stands out: noise alone gives a deviation as large as the largest of all "
+                f"tests with a probability (family-wise p) of {said_family_p(m.p_value)}.",
+                f"{len(self.fit.residuals):,} values in {len(m.chi2)} channels were compared with the "
+                "baseline; effects that these recordings are not sensitive to are not excluded.",
             ]  # fmt: skip
         else:
             first = m.findings[0]
             others = self._elsewhere(first)
             parts = [
-                f"The recordings differ from the baseline (family-wise p {m.p_value:.2g}), most in "
-                f"the {NAMES[first.word]} ({first.family}, {abs(first.z):.1f} standard deviations)."
-            ]  # fmt: skip
+                "The recordings differ from the baseline (family-wise p "
+                f"{said_family_p(m.p_value)}), most in the {NAMES[first.word]} "
+                f"({SCAN_WORDS.get(first.family, first.family)}: {abs(first.z):.1f} standard "
+                "deviations)."
+            ]
             if others:
                 parts.append(f"It is also seen in: {', '.join(others)}.")
             if self.attribution is not None:
@@ -204,11 +234,14 @@ class Diagnosis:
         far = {k: v for k, v in self.accepted[1].pulls.items() if abs(v) > 3}
         if far:
             text = ", ".join(f"{k} {v:+.1f}" for k, v in far.items())
-            parts.append(f"Device parameters off the card, in units of its spread: {text}.")
+            parts.append(
+                "Device parameters that the fit moved far from their nominal values, in standard "
+                f"deviations of their priors: {text}."
+            )
         return " ".join(parts)
 
     def _elsewhere(self, first: Finding) -> list[str]:
-        """Channels with findings beside the first's, each with its farthest lags, if it has any."""
+        """Other channels with findings, each with the lags of its farthest one."""
         out = []
         for word in self.location()["channels"]:
             own = [f for f in self.mismatch.findings if f.word == word]
@@ -218,7 +251,13 @@ class Diagnosis:
         return out
 
     def to_report(self) -> dict[str, Any]:
-        """Contents of report.json."""
+        """Make the contents of report.json, as a dictionary of plain Python types.
+
+        Returns
+        -------
+        dict
+            Keys of the layout named by its key 'schema'.
+        """
         fitted = {
             name: {"value": float(v), "error": float(e)}
             for name, v, e in zip(
@@ -268,7 +307,7 @@ class Diagnosis:
 
 
 def _shown(findings: Sequence[Finding]) -> list[Finding]:
-    """The farthest of all, and of each channel: one must not crowd out the others."""
+    """Farthest findings of all and of each channel, so that one channel does not fill the list."""
     out, count = [], Counter[str]()
     for n, finding in enumerate(findings):
         count[finding.word] += 1
@@ -280,7 +319,7 @@ def _shown(findings: Sequence[Finding]) -> list[Finding]:
 def _said_lags(finding: Finding) -> str:
     lags = finding.where["lags"]
     text = f"lag ({lags[0][0]}, {lags[0][1]})" if len(lags) == 1 else f"{len(lags)} lags"
-    return f"{text}, {finding.z:+.1f}"
+    return f"{text}, {finding.z:+.1f} standard deviations"
 
 
 def _finite(value: float) -> float | None:
@@ -288,7 +327,7 @@ def _finite(value: float) -> float | None:
 
 
 def _plain(where: dict[str, Any]) -> dict[str, Any]:
-    """Tuples as lists, numpy's numbers as Python's."""
+    """Copy a mapping for JSON: tuples as lists, numpy scalars as Python numbers."""
 
     def plain(v: Any) -> Any:
         if isinstance(v, list | tuple):

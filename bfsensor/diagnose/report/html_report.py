@@ -1,4 +1,4 @@
-"""report.json and report.html of a diagnosis, written whole or not at all."""
+"""Write a diagnosis to a folder as report.json, report.html and figures."""
 
 from __future__ import annotations
 
@@ -10,26 +10,62 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from bfsensor.diagnose.report.class_words import CLASS_WORDS
-from bfsensor.diagnose.report.diagnosis_result import NAMES, Diagnosis
+from bfsensor.diagnose.report.class_words import (
+    CLASS_WORDS,
+    NAMES,
+    PARAMETER_WORDS,
+    SCAN_WORDS,
+    said_family_p,
+    said_interval,
+    said_p,
+    said_value,
+)
+from bfsensor.diagnose.report.diagnosis_result import Diagnosis
 from bfsensor.diagnose.report.report_figures import Drawn, draw_figures
 from bfsensor.diagnose.report.report_style import STYLE
 
+WHERE_WORDS = {
+    "amp": ("amplifier", ""), "other": ("against amplifier", ""), "lags": ("lags (x, y)", ""),
+    "level": ("level", "ADU"), "power": ("with the level to the power", ""),
+    "set": ("group:", ""), "condition": ("wavelength [nm] / back bias [V] / temperature [C]:", ""),
+    "exposure": ("exposure", ""), "x": ("column", ""), "y": ("row", ""),
+    "map": ("map:", ""), "what": ("values:", ""), "period": ("period", "pixels"),
+    "length": ("decay length", "pixels"), "k": ("", ""), "bit": ("bit of weight", ""),
+    "code": ("code", ""), "device": ("parameter", ""), "effect": ("", ""),
+}  # fmt: skip
+"""Words and unit of the keys that state where a finding is ('where' in report.json)."""
+
 
 def write_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list[Path]:
-    """Write report.json, report.html and, where matplotlib is there, figures.
+    """Write report.json, report.html and, if matplotlib is installed, figures as PNG.
+
+    Each file is written under a temporary name and then renamed, so that an interrupted run
+    leaves no half-written file; existing files are replaced.
 
     Parameters
     ----------
     diagnosis : Diagnosis
-        What was found.
+        Result to report.
     folder : path-like
-        Made if it is not there.
+        Folder of the files, made if it does not exist.
 
     Returns
     -------
     list of Path
-        What was written.
+        Files that were written.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be made or written.
+
+    Examples
+    --------
+    Read a report back and list the classes of effects found::
+
+        write_report(diagnose(source, baseline), "out")
+        report = json.loads(Path("out/report.json").read_text())
+        print([effect["class"] for effect in report["effects"]])
     """
     out = Path(folder)
     out.mkdir(parents=True, exist_ok=True)
@@ -43,7 +79,7 @@ def write_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list[P
 
 
 def to_html(diagnosis: Diagnosis, figures: Sequence[Drawn]) -> str:
-    """One file that needs no other: figures are inside."""
+    """Make the page of a diagnosis as one HTML text with the figures embedded."""
     report = diagnosis.to_report()
     drawn = {f.name: f for f in figures}
     name = _text(diagnosis.campaign or "recordings")
@@ -74,13 +110,15 @@ def to_html(diagnosis: Diagnosis, figures: Sequence[Drawn]) -> str:
 
 
 def _facts(diagnosis: Diagnosis, report: Mapping[str, Any]) -> str:
-    """What was held against what."""
+    """State the baseline, the exposures and the p-values of the comparison."""
     taken = ", ".join(f"{n} {k}" for k, n in report["exposures"].items())
     return (
         f"Baseline: {diagnosis.baseline}. "
-        + (f"Exposures: {taken}. " if taken else "A reduced recording. ")
-        + f"Family-wise p {report['p_value']:.2g} (chi-squares {report['p_chi2']:.2g}, scans "
-        f"{report['p_scans']:.2g}); below {report['alarm']:g} counts as detected. "
+        + (f"Exposures: {taken}. " if taken else "A reduced recording (no exposures). ")
+        + "Probability that noise alone gives a deviation as large in any of all tests (family-wise "
+        f"p): {said_family_p(report['p_value'])} (chi-squares alone {said_p(report['p_chi2'])}, scans "
+        f"alone {said_p(report['p_scans'])}); below {report['alarm']:g} a difference counts as "
+        f"detected. Amplifiers are counted from 1, columns, rows and exposures from 0. "
         f"bfsensor {report['version']}."
     )
 
@@ -88,7 +126,7 @@ def _facts(diagnosis: Diagnosis, report: Mapping[str, Any]) -> str:
 def _effects(
     diagnosis: Diagnosis, report: Mapping[str, Any], drawn: Mapping[str, Drawn]
 ) -> str:
-    """What explains it: each effect with its parameters, and the classes' probabilities."""
+    """List the effects found with their parameters, and the probabilities of the classes."""
     if not report["effects"]:
         return ""
     units: dict[str, Mapping[str, str]] = {}
@@ -97,41 +135,41 @@ def _effects(
             f.effect.word: {p.name: p.unit for p in f.effect.parameters}
             for f in diagnosis.attribution.found
         }
-    cards = []
+    blocks = []
     for effect in report["effects"]:
         word = effect["class"]
         title = word.replace("_", " ")
         if "variant" in effect:
             title += f", {effect['variant']}"
+        words = PARAMETER_WORDS.get(word, {})
         rows = [
-            [name, *(_number(told.get(k)) for k in ("value", "lo68", "hi68", "lo95", "hi95")),
-             units.get(word, {}).get(name, "")]
+            [words.get(name, name), said_value(word, name, told["value"]),
+             said_interval(told, "68"), said_interval(told, "95"),
+             units.get(word, {}).get(name, ""), name]
             for name, told in effect["parameters"].items()
         ]  # fmt: skip
-        cells = [[r[0], r[1], _range(r[2], r[3]), _range(r[4], r[5]), r[6]] for r in rows]
-        table = _table(
-            ["parameter", "value", "68 %", "95 %", "unit"], cells, numbers=(1, 2, 3)
-        )
+        titles = ["parameter", "value", "68 %", "95 %", "unit", "in report.json"]
+        table = _table(titles, rows, numbers=(1, 2, 3))
         others = [w for w in effect.get("tied", ()) if w != word]
         tags = "".join(
             f"<span class='tag tied'>or {_text(w.replace('_', ' '))}</span>" for w in others
         )
         gain = effect.get("gain_chi2")
         if gain is not None and gain == gain:
-            tags += f"<span class=tag>chi-square falls by {gain:,.0f}</span>"
+            tags += f"<span class=tag>lowers chi-square by {gain:,.0f}</span>"
         source = (
             f"<p class=source>{_text(effect['source'])}</p>" if effect.get("source") else ""
         )
         plain = CLASS_WORDS.get(word, word)
-        cards.append(
-            f"<div class=card><h3>{_text(title)}</h3>"
+        blocks.append(
+            f"<div class=effect><h3>{_text(title)}</h3>"
             f"<p>{_text(plain[0].upper() + plain[1:])}.</p>{tags}{table if rows else ''}{source}</div>"
         )
-    return f"<h2>What explains it</h2>{''.join(cards)}{_small(drawn, 'classes')}"
+    return f"<h2>Effects found</h2>{''.join(blocks)}{_small(drawn, 'classes')}"
 
 
 def _advice(report: Mapping[str, Any]) -> str:
-    """Ties, and what to record."""
+    """Recommend recordings that would separate classes these ones do not distinguish."""
     if not report["plan"]:
         return ""
     out = ["<h2>What to record next</h2>"]
@@ -142,26 +180,27 @@ def _advice(report: Mapping[str, Any]) -> str:
         ]  # fmt: skip
         source = block.get("rule", {}).get("source", "")
         more = _table(
-            ["other recordings", "exposures", "expected chi-square difference"],
+            ["other recording", "exposures", "expected chi-square difference"],
             others,
             (1, 2),
         )
         out.append(
             f"<p class=advice>{_text(said)}"
             + (f" <span class=source>({_text(source)})</span>" if source else "")
-            + f"</p><details><summary>What else was weighed</summary>{more}</details>"
+            + f"</p><details><summary>Other recordings that were considered</summary>{more}</details>"
         )
     return "".join(out)
 
 
 def _where(report: Mapping[str, Any]) -> str:
-    """Where the recordings differ."""
+    """Tabulate where the recordings differ from the baseline."""
     if not report["detected"]:
         return ""
     place = report["location"]
     words = {
-        "lags": "lags (x, y)", "flux_e": "flux [e-]", "x": "columns", "y": "rows",
-        "amps": "amplifiers", "wavelength": "wavelength [nm]", "exposures": "exposures",
+        "lags": "lags (x, y) [pixel]", "flux_e": "charge per pixel, or per spot [e-]",
+        "x": "columns", "y": "rows", "amps": "amplifiers", "wavelength": "wavelength [nm]",
+        "exposures": "exposures",
     }  # fmt: skip
     rows = [["channels", ", ".join(NAMES.get(w, w) for w in place["channels"])]]
     for key, title in words.items():
@@ -174,7 +213,9 @@ def _where(report: Mapping[str, Any]) -> str:
         elif key == "amps":
             told = ", ".join(str(v) for v in value)
         elif len(value) == 2:
-            told = f"{_thousands(value[0])} to {_thousands(value[1])}"
+            # The last column and row of a location is one past the end.
+            last = value[1] - 1 if key in "xy" else value[1]
+            told = f"{_thousands(value[0])} to {_thousands(last)}"
         else:
             told = ", ".join(_thousands(v) for v in value)
         rows.append([title, told])
@@ -182,13 +223,13 @@ def _where(report: Mapping[str, Any]) -> str:
 
 
 def _held_out(report: Mapping[str, Any], drawn: Mapping[str, Drawn]) -> str:
-    """Before and after on recordings that were not fitted."""
+    """Compare chi-squares of held-out recordings without and with the effects."""
     held = report["heldout"]
     if held["chi2dof_before"] is None:
         return ""
-    title = "<h2>On recordings that were not fitted</h2>"
+    title = "<h2>Held-out recordings, which were not fitted</h2>"
     if not held["channels"] or held["chi2dof_after"] is None:
-        return f"{title}<p>Chi-square per value {held['chi2dof_before']:.2f}.</p>"
+        return f"{title}<p>Chi-square per value {held['chi2dof_before']:.2f}; noise alone gives 1.</p>"
     rows = [
         [NAMES.get(w, w), f"{r['before']:.2f}", f"{r['after']:.2f}", str(r["values"])]
         for w, r in held["channels"].items()
@@ -197,14 +238,17 @@ def _held_out(report: Mapping[str, Any], drawn: Mapping[str, Drawn]) -> str:
     rows.append(
         ["all", f"{held['chi2dof_before']:.2f}", f"{held['chi2dof_after']:.2f}", str(count)]
     )
-    table = _table(["channel", "baseline", "with the effects", "values"], rows, (1, 2, 3))
+    titles = [
+        "channel", "chi-square per value, baseline", "with the effects", "number of values"
+    ]  # fmt: skip
+    table = _table(titles, rows, (1, 2, 3))
     return f"{title}{_small(drawn, 'heldout')}{table}"
 
 
 def _channels(
     diagnosis: Diagnosis, report: Mapping[str, Any], drawn: Mapping[str, Drawn]
 ) -> str:
-    """Chi-squares of what was fitted."""
+    """Tabulate chi-squares of the fitted recordings by channel."""
     attribution = diagnosis.attribution
     after = {} if attribution is None else attribution.mismatch.chi2
     both = attribution is not None and bool(attribution.found)
@@ -215,24 +259,24 @@ def _channels(
         if both:
             square, dof = after.get(word, (0.0, 0.0))
             cells.append(f"{square / max(dof, 1e-9):.2f}")
-        rows.append([*cells, f"{row['p_value']:.2g}"])
+        rows.append([*cells, said_p(row["p_value"])])
         out.append(row["p_value"] < 1e-4)
-    titles = ["channel", "chi-square", "dof", "ratio"]
-    titles += (["with the effects"] if both else []) + ["p of the channel alone"]
+    titles = ["channel", "chi-square", "degrees of freedom", "their ratio"]
+    titles += (["ratio with the effects"] if both else []) + ["p of the channel, baseline"]
     table = _table(titles, rows, tuple(range(1, len(titles))), out)
-    return f"<h2>Channels as fitted</h2>{table}"
+    return f"<h2>Fitted recordings</h2>{table}"
 
 
 def _residuals(figures: Sequence[Drawn]) -> str:
-    """Figures by channel, the baseline's and with the effects beside it."""
+    """Show the figures by channel, the baseline beside the fit with the effects."""
     shown = [f for f in figures if f.name not in ("classes", "heldout")]
     if not shown:
         return "<p>No figures: matplotlib is not installed.</p>"
     out = ["<h2>Residuals, channel by channel</h2>"]
     if any(f.after for f in shown):
         out.append(
-            "<p>Both figures of a pair have the same scales. Where one stands alone, the effects "
-            "change nothing that could be seen.</p>"
+            "<p>Pull: residual over its standard error. Both figures of a pair have the same scales. "
+            "Where a figure stands alone, the effects change no pull visibly.</p>"
         )
     for figure in shown:
         images = [("Baseline", figure.before)]
@@ -251,23 +295,23 @@ def _residuals(figures: Sequence[Drawn]) -> str:
 
 
 def _findings(report: Mapping[str, Any]) -> str:
-    """What the scans of the baseline's residuals found."""
+    """Tabulate the largest deviations that scans of the baseline's residuals found."""
     rows = [
-        [NAMES.get(f["channel"], f["channel"]), f["family"], f"{f['z']:.1f}",
-         f"{f['p_value']:.1g}", _describe(f["where"])]
+        [NAMES.get(f["channel"], f["channel"]), SCAN_WORDS.get(f["family"], f["family"]),
+         f"{f['z']:.1f}", said_p(f["p_value"]), _describe(f["where"], f["channel"])]
         for f in report["findings"][:15]
     ]  # fmt: skip
     if not rows:
         return ""
-    titles = ["channel", "scan", "deviates", "family-wise p", "where"]
+    titles = ["channel", "scan", "standard deviations", "family-wise p", "where"]
     return (
-        "<h2>What stands out of the baseline</h2><details open><summary>The farthest of all scans"
-        f"</summary>{_table(titles, rows, (2, 3))}</details>"
+        "<h2>Largest deviations from the baseline</h2><details open><summary>At most 15, the largest "
+        f"first</summary>{_table(titles, rows, (2, 3))}</details>"
     )
 
 
 def _not_tested(report: Mapping[str, Any]) -> str:
-    """Classes that the recordings cannot show."""
+    """Tabulate classes that these recordings are not sensitive to."""
     if not report["not_tested"]:
         return ""
     groups: dict[tuple[str, str], list[str]] = {}
@@ -278,7 +322,7 @@ def _not_tested(report: Mapping[str, Any]) -> str:
         [", ".join(words), _missing(because), recording]
         for (because, recording), words in groups.items()
     ]
-    table = _table(["not seen", "because", "what would show it"], rows)
+    table = _table(["class", "reason", "recordings that would show it"], rows)
     return f"<h2>What was not tested</h2>{table}"
 
 
@@ -288,7 +332,7 @@ def _notes(report: Mapping[str, Any]) -> str:
 
 
 def _missing(because: str) -> str:
-    """Reason with channels in plain words."""
+    """Replace the names of channels in a reason by plain words."""
     for word, name in NAMES.items():
         because = because.replace(word, name)
     return because
@@ -300,7 +344,7 @@ def _table(
     numbers: Sequence[int] = (),
     out: Sequence[bool] = (),
 ) -> str:
-    """Rows of plain text; which columns are numbers, which rows stand out."""
+    """Make a table of plain texts; ``numbers``: numeric columns, ``out``: rows to highlight."""
 
     def cells(values: Sequence[str], tag: str) -> str:
         return "".join(
@@ -318,7 +362,7 @@ def _table(
 
 
 def _small(drawn: Mapping[str, Drawn], name: str) -> str:
-    """One figure of the summary."""
+    """Embed one figure of the summary, if it was drawn."""
     if name not in drawn:
         return ""
     caption = drawn[name].caption
@@ -337,29 +381,43 @@ def _text(value: str) -> str:
     return html.escape(str(value))
 
 
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.3g}"
-
-
-def _range(low: str, high: str) -> str:
-    return f"{low} to {high}" if low else "held"
-
-
 def _thousands(value: float) -> str:
-    """Number without needless digits."""
-    return f"{value:,.0f}".replace(",", "\u202f") if abs(value) >= 1000 else f"{value:.4g}"
+    """Print a number without needless digits."""
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
-def _describe(where: Mapping[str, Any]) -> str:
-    """Where a finding is, in a line."""
+def _describe(where: Mapping[str, Any], channel: str) -> str:
+    """Describe in a line where a finding is, with units."""
     parts = []
     for key, value in where.items():
-        if isinstance(value, float):
-            parts.append(f"{key} {value:.4g}")
-        elif isinstance(value, list) and len(value) == 2 and not isinstance(value[0], list):
-            parts.append(f"{key} {value[0]:.4g} to {value[1]:.4g}")
+        title, unit = WHERE_WORDS.get(key, (key, ""))
+        if key == "level" and channel == "spot":
+            title, unit = "flux", "e-"
+        if key == "k":
+            title = "lag in readout order" if channel == "bias_cov" else "overscan pixel"
+        if key in ("amp", "other"):
+            parts.append(
+                "all amplifiers" if value == "all" else f"{title} {int(value) + 1}"
+            )
+        elif key == "power":
+            laws = ("independent of the level", "proportional to the level")
+            parts.append(laws[value] if value < 2 else f"{title} {value}")
+        elif key == "lags":
+            shown = ", ".join(f"({i}, {j})" for i, j in value[:4])
+            parts.append(f"{title} {shown}{' ...' if len(value) > 4 else ''}")
+        elif isinstance(value, list) and len(value) == 2:
+            # The last column and row of a place is one past the end.
+            low, high = value[0], value[1] - 1 if key in "xy" else value[1]
+            span = (
+                _thousands(low)
+                if low == high
+                else f"{_thousands(low)} to {_thousands(high)}"
+            )
+            parts.append(f"{title} {span} {unit}".strip())
+        elif isinstance(value, float):
+            parts.append(f"{title} {_thousands(value)} {unit}".strip())
         else:
-            parts.append(f"{key} {value}")
+            parts.append(f"{title} {value} {unit}".strip())
     return ", ".join(parts)
 
 

@@ -1,4 +1,4 @@
-"""Free-form models in plain words, and as report.json has them."""
+"""Nonparametric terms in sentences for the report, and as the block 'free_form' of report.json."""
 
 from __future__ import annotations
 
@@ -9,19 +9,23 @@ from typing import Any
 import numpy as np
 
 from bfsensor.diagnose.explain.nonparametric import Coefficient, OpenWorld
+from bfsensor.diagnose.report.class_words import said_p
 
 NEAR = 30.0
-"""Angle [degrees] below which a candidate of the library is said to look alike."""
+"""Angle [degrees] between whitened templates below which an effect of the library is printed as similar.
+Chosen, to be derived: cos 30 degrees = 0.87, so a similar effect would take 75 % of the term's
+chi-square; at 60 degrees effects that take only a quarter would be printed as similar."""
 
 TOLD_ALIKE = ("pattern of position", "odd boundary shifts", "mean in time", "mean by level")
-"""Groups whose terms may stand for one another, and are told."""
+"""Groups for which the report also prints terms that fit as well as the first one."""
 
 REFUSED = 1e-3
-"""Probability of a constraint below which it is said to be broken."""
+"""p-value of a constraint below which it is printed as broken.  Chosen, to be derived: with a handful of
+constraints one report in some 200 prints one as broken by chance; twice as large, twice as many."""
 
 
 def said_freely(found: OpenWorld) -> str:
-    """Which models, their shape, range, power, symmetry, size; what is nearest in the library."""
+    """Sentences: each group of terms with sizes, constraints that hold, and similar effects."""
     parts = []
     for group in found.groups:
         own = found.of_group(group)
@@ -30,22 +34,29 @@ def said_freely(found: OpenWorld) -> str:
             parts.append(say(own) + ".")
         if group in TOLD_ALIKE and found.alike.get(group):
             text = "; ".join(f"{name}: {value:.3g}" for name, value in found.alike[group])
-            parts.append(f"In place of the first these recordings allow as well: {text}.")
+            parts.append(
+                f"These recordings fit as well, in place of the first term: {text}."
+            )
     tests = _tests(found.tests)
     if tests:
         parts.append(tests)
     near = [(name, angle) for name, angle in found.nearest if angle < NEAR]
     if near:
-        text = ", ".join(f"{name} ({angle:.0f} degrees off)" for name, angle in near[:2])
-        parts.append(f"Nearest in the library: {text}.")
+        text = ", ".join(f"{name} ({angle:.0f} degrees)" for name, angle in near[:2])
+        parts.append(
+            f"Most similar effects of the library, by the angle between templates: {text}."
+        )
     elif found.nearest:
         name, angle = found.nearest[0]
-        parts.append(f"Nothing in the library is near: {name} is {angle:.0f} degrees off.")
+        parts.append(
+            "No effect of the library is similar: the nearest, by the angle between templates, is "
+            f"{name} ({angle:.0f} degrees)."
+        )
     return " ".join(parts)
 
 
 def reported_freely(found: OpenWorld | None) -> dict[str, Any] | None:
-    """Block ``free_form`` of report.json."""
+    """Make the block 'free_form' of report.json; None where there is no nonparametric model."""
     if found is None:
         return None
     before, after = found.chi2dof()
@@ -84,7 +95,7 @@ def _amount(c: Coefficient, unit: str = "") -> str:
 
 
 def _shifts(own: Sequence[Coefficient]) -> str:
-    """Boundaries: which, which way, with which power of the charge."""
+    """Even boundary shifts: which edges, direction, and power of the charge."""
     powers = sorted({int(c.where["power"]) for c in own})
     law = {
         (0,): "in proportion to the charge", (1,): "with the square of the charge",
@@ -97,25 +108,26 @@ def _shifts(own: Sequence[Coefficient]) -> str:
         else f"along {' and '.join(sorted(axes & {'x', 'y'})) or 'x and y'}"
     )  # fmt: skip
     sizes = "; ".join(
-        f"edges along {'x and y' if c.where['axis'] == 'xy' else c.where['axis']} at "
-        f"({c.where['along']:g}, {c.where['across']}) pixels {_way(c)} by "
+        f"edges {c.where['along']:g} pixels along "
+        f"{'x and y' if c.where['axis'] == 'xy' else c.where['axis']} and {c.where['across']} across "
+        f"{_way(c)} by "
         + _amount(replace(c, value=abs(c.value)), " 1e-8 pixel/e-")
         + (" per 1e5 e-" if c.where["power"] else "")
         for c in own[:4]
     )
     turn = _turning(own)
     return (
-        f"Boundaries of pixels move more or less than in the baseline, {where}, even on both sides, "
-        f"{law}, up to {reach:.1f} pixels away, charge conserved: {sizes}{turn}"
+        f"Pixel boundaries move more or less than in the baseline, {where}, symmetrically on both "
+        f"sides, {law}, up to {reach:.1f} pixels away, charge conserved: {sizes}{turn}"
     )
 
 
 def _way(c: Coefficient) -> str:
-    return "move away from" + " the charge" if c.value > 0 else "move towards the charge"
+    return "move away from the charge" if c.value > 0 else "move towards the charge"
 
 
 def _turning(own: Sequence[Coefficient]) -> str:
-    """Level at which a shift with the charge and its square changes its sign."""
+    """Level [e-] at which a shift with terms in the charge and in its square changes sign."""
     by: dict[tuple[Any, ...], dict[int, float]] = {}
     for c in own:
         key = (c.where["axis"], c.where["along"], c.where["across"])
@@ -123,7 +135,7 @@ def _turning(own: Sequence[Coefficient]) -> str:
     for parts in by.values():
         if 0 in parts and 1 in parts and parts[0] * parts[1] < 0:
             level = -parts[0] / parts[1] * 1e5
-            return f"; the response turns its sign at a level of {level:.2g} e-"
+            return f"; the shift changes sign at a charge of {level:.2g} e-"
     return ""
 
 
@@ -133,19 +145,20 @@ def _odd(own: Sequence[Coefficient]) -> str:
         axis, side = c.where["odd"], "+" if c.value > 0 else "-"
         if c.where.get("shape") == "baseline":
             out.append(
-                f"Edges move by a further {abs(c.value):.3g} +- {c.error:.1g} of their shift towards "
-                f"{side}{axis} on either side of a charge: the kernel is odd in {axis}"
+                f"Edges on both sides of a charge move towards {side}{axis} by a further "
+                f"{abs(c.value):.3g} +- {c.error:.1g} of their shift in the baseline: the "
+                f"kernel is odd in {axis}"
             )
         else:
             out.append(
-                f"edges along {c.where['axis']} at ({c.where['along']:g}, {c.where['across']}) move "
-                f"towards {side}{axis} on either side by {_amount(c, ' 1e-8 pixel/e-')}"
+                f"edges {c.where['along']:g} pixels along {c.where['axis']} and {c.where['across']} "
+                f"across move towards {side}{axis} on both sides by {_amount(c, ' 1e-8 pixel/e-')}"
             )
     text = "; ".join(out)
     return (
         text[0].upper()
         + text[1:]
-        + " (flats see nothing of it; how far it reaches spots do not tell)"
+        + " (flats are not sensitive to it, and spots do not constrain its range)"
     )
 
 
@@ -154,9 +167,10 @@ def _filter(own: Sequence[Coefficient]) -> str:
     texts = []
     for c in main:
         n, p = int(c.where["lag"]), int(c.where["power"])
-        what = "S" if p == 1 else "S^2 / 1e5"
+        what = "S" if p == 1 else "S^2 / 1e5 e-"
         texts.append(
-            f"{_amount(c)} {what} of the pixel read {n} pixel time{'s' * (n > 1)} before"
+            f"{_amount(c)} {what}, S the signal [e-] of the pixel read {n} pixel "
+            f"time{'s' * (n > 1)} before"
         )
     mean = (
         "in proportion to the signal"
@@ -166,7 +180,7 @@ def _filter(own: Sequence[Coefficient]) -> str:
     if len({c.where["power"] for c in main}) > 1:
         mean = "with the signal and its square"
     return (
-        f"An echo in readout order, {mean}: each pixel gets {'; '.join(texts)} (mirrored in "
+        f"An echo in readout order, {mean}: each pixel gains {'; '.join(texts)} (mirrored in "
         "amplifiers that read from the other side)"
     )
 
@@ -174,19 +188,19 @@ def _filter(own: Sequence[Coefficient]) -> str:
 def _parity(own: Sequence[Coefficient]) -> str:
     main = [c for c in own if "parity" in c.where]
     return "; ".join(
-        f"Odd and even pixels differ in a pattern of two-pixel parity ({c.where['parity']}), by "
-        f"{_amount(c)} of the signal" + _power_of(c) for c in main
+        f"Odd and even pixels differ ({c.where['parity']}) by {_amount(c)} of the signal"
+        + _power_of(c) for c in main
     )  # fmt: skip
 
 
 def _power_of(c: Coefficient) -> str:
     if "condition" in c.where:
-        return f" at {c.where['condition']} more than elsewhere"
+        return f" at {c.where['condition']} (nm/V/C) beyond that in other conditions"
     p = int(c.where.get("power", 0))
     return (
-        " at all levels alike",
-        " at 1e5 e- and in proportion to it",
-        " at 1e5 e- and with its square",
+        ", the same at all levels",
+        " at 1e5 e-, in proportion to the level",
+        " at 1e5 e-, with the square of the level",
     )[p]
 
 
@@ -195,7 +209,7 @@ def _places(own: Sequence[Coefficient]) -> str:
     text = "; ".join(
         f"{c.name}: {_amount(c)} of the signal{_power_of(c)}" for c in main[:4]
     )
-    return f"A pattern that stands on the sensor: {text}"
+    return f"A pattern fixed on the sensor: {text}"
 
 
 def _ripple(own: Sequence[Coefficient]) -> str:
@@ -203,15 +217,15 @@ def _ripple(own: Sequence[Coefficient]) -> str:
     size = np.sqrt(max(c.value, 0.0) * 1e-6)
     error = 0.5e-6 * c.error / size if size else np.inf
     return (
-        f"The signal ripples with readout time, in step with the frames: period "
-        f"{c.where['period']:.4g} pixel times, amplitude {size:.3g} +- {error:.1g} of the signal at all "
-        "levels alike"
+        "The signal varies as a sine of the readout time, with the same phase in all frames: period "
+        f"{c.where['period']:.4g} pixel times, amplitude {size:.3g} +- {error:.1g} of the signal, "
+        "the same at all levels"
     )
 
 
 def _by_level(own: Sequence[Coefficient]) -> str:
     text = "; ".join(f"{c.name}: {_amount(c)} of the mean" for c in own[:4])
-    return f"The mean bends with the level (S in 1e5 e-): {text}"
+    return f"The mean is not proportional to the level S (here in units of 1e5 e-): {text}"
 
 
 def _in_time(own: Sequence[Coefficient]) -> str:
@@ -223,16 +237,19 @@ def _in_time(own: Sequence[Coefficient]) -> str:
 def _before(own: Sequence[Coefficient]) -> str:
     main = [c for c in own if "power" in c.where]
     if not main:
-        return "The mean depends on what was taken before exposures that are not given"
+        return (
+            "The mean of flats differs after exposures that are missing from the campaign"
+        )
     words = []
     for c in main:
         of = (
-            "1e5 e- of its mean level"
+            "1e5 e- of that exposure's mean level"
             if c.where["power"] == 1
-            else "square of its mean level in 1e5 e-"
+            else "(1e5 e-)^2 of that exposure's mean level squared"
         )
         words.append(
-            f"{'falls' if c.value < 0 else 'rises'} by {abs(c.value):.3g} +- {c.error:.1g} per {of}"
+            f"{'falls' if c.value < 0 else 'rises'} by {abs(c.value):.3g} +- {c.error:.1g} of itself "
+            f"per {of}"
         )
     return f"The gain depends on the exposure taken before: it {' and '.join(words)}"
 
@@ -240,14 +257,20 @@ def _before(own: Sequence[Coefficient]) -> str:
 def _lags(own: Sequence[Coefficient]) -> str:
     text = "; ".join(
         f"lag ({c.where['lags'][0][0]}, {c.where['lags'][0][1]}): {_amount(c)} e-^2 at 1e5 e-, "
-        f"with the level to the power {c.where['power']}" for c in own[:4]
+        f"growing with the level to the power {c.where['power']}" for c in own[:4]
     )  # fmt: skip
-    return f"Covariances of flats differ at single lags, as no shift of boundaries does: {text}"
+    return (
+        "Covariances of flats differ from the baseline at single lags, which shifts of boundaries "
+        f"cannot cause: {text}"
+    )
 
 
 def _smooth(own: Sequence[Coefficient]) -> str:
     lags = ", ".join(f"({i}, {j})" for i, j in own[0].where["lags"][:6])
-    return f"Covariances of flats differ smoothly with lag and level, in no simple law: most at {lags}"
+    return (
+        "Covariances of flats differ from the baseline smoothly with lag and level, in no simple law: "
+        f"most at lags (x, y) {lags}"
+    )
 
 
 WORDS: Mapping[str, Callable[[Sequence[Any]], str]] = {
@@ -257,29 +280,33 @@ WORDS: Mapping[str, Callable[[Sequence[Any]], str]] = {
     "mean by the exposure before": _before, "covariances by lag": _lags,
     "smooth covariances over lag and level": _smooth,
 }  # fmt: skip
+"""Function that describes the coefficients of each group of nonparametric terms."""
 
 
 def _tests(tests: Mapping[str, Mapping[str, float]]) -> str:
-    """Constraints that hold, and by how much others are broken."""
+    """Constraints that hold, and the size of the violation of those that do not."""
     kept, broken = [], []
     for name, test in tests.items():
         if "p_value" not in test:
             continue
         if test["p_value"] > REFUSED:
-            kept.append(f"{name} (p {test['p_value']:.2g})")
+            kept.append(f"{name} (p {said_p(test['p_value'])})")
         else:
             value = (
                 f" by {test['value']:.2g} +- {test['error']:.1g}" if "value" in test else ""
             )
-            broken.append(f"{name}{value} (p {test['p_value']:.1g})")
+            broken.append(f"{name}{value} (p {said_p(test['p_value'])})")
     parts = []
     if kept:
-        parts.append(f"Kept: {', '.join(kept)}.")
+        parts.append(f"Constraints that hold: {', '.join(kept)}.")
     if broken:
-        parts.append(f"Broken: {', '.join(broken)}.")
+        parts.append(f"Constraints that are violated: {', '.join(broken)}.")
     if "decay" in tests:
         d = tests["decay"]
-        parts.append(f"What is added falls off as r^-{d['value']:.1f} +- {d['error']:.1f}.")
+        parts.append(
+            "The added area changes fall off with distance r as r^-p, p = "
+            f"{d['value']:.1f} +- {d['error']:.1f}."
+        )
     return " ".join(parts)
 
 

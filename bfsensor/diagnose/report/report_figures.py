@@ -1,4 +1,4 @@
-"""The figures of a report: residuals by channel, of the baseline and beside it with the effects."""
+"""Draw the figures of a report: residuals by channel, of the baseline and with the effects."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from bfsensor.diagnose.data.channels import PER_ELECTRON
+from bfsensor.diagnose.explain.attribution import OUTSIDE as UNKNOWN
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
-from bfsensor.diagnose.report.diagnosis_result import NAMES, Diagnosis
+from bfsensor.diagnose.report.class_words import NAMES
+from bfsensor.diagnose.report.diagnosis_result import Diagnosis
 from bfsensor.plots import residuals as show
 
 if TYPE_CHECKING:
@@ -20,16 +22,20 @@ if TYPE_CHECKING:
 
 Draw = Callable[["Axes"], None]
 DOTS = 130
-"""Dots per inch: sharp at half of a page."""
+"""Resolution of the figures [dots per inch].  Chosen: half a page wide they are sharp on screens and
+paper; twice as many make report.html about four times as large."""
 
 VISIBLE = 0.2
-"""Change of a pull that is seen in a figure."""
+"""Change of a pull [standard errors] from which on a second figure, with the effects, is drawn.
+Chosen: a fifth of an error bar is about the size of a mark; twice as large, fewer figures are pairs."""
 
 LAGS = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
+"""Lags (x, y) [pixel] whose pulls are drawn against level.  Chosen: the nearest, where the
+brighter-fatter effect is largest; more lags make the figure unreadable and change no result."""
 
 
 class Picture(NamedTuple):
-    """One figure: its parts one under another, so that a telephone shows them large enough."""
+    """One figure: caption, size (width, height) [inch], and panels drawn one below the other."""
 
     caption: str
     size: tuple[float, float]
@@ -37,16 +43,16 @@ class Picture(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """Files of a figure: of the baseline, and with the effects where there are any.
+    """Files of one figure of a report.
 
     Attributes
     ----------
     name, caption : str
-        Short name and caption.
+        File name without its ending, and caption.
     before : Path
-        The baseline's, or the only one.
+        Figure of the baseline, or the only one.
     after : Path or None
-        With the effects, on the same scales.
+        Figure with the effects, on the same scales; None where they change nothing visible.
     """
 
     name: str
@@ -56,19 +62,19 @@ class Drawn(NamedTuple):
 
     @property
     def files(self) -> list[Path]:
-        """All files."""
+        """Paths of the figures that were drawn, one or two."""
         return [p for p in (self.before, self.after) if p is not None]
 
 
 SAME_PIXELS = (
-    " Maps of all light are of the same pixels, whose own response is the same in all flats: "
-    "that a pattern comes again is no more evidence that it is what it is taken for."
+    " Flats against position are of the same pixels, whose own response is the same in all flats: "
+    "a pattern that held-out flats repeat is real, but not more likely to be the named effect."
 )
-"""What recordings of one sensor do not tell."""
+"""Limit of held-out flats as evidence, added to their figure's caption."""
 
 
 def draw_figures(diagnosis: Diagnosis, folder: Path) -> list[Drawn]:
-    """Draw what the channels allow.  Nothing without matplotlib."""
+    """Draw the figures that the channels allow into a folder; none if matplotlib is not installed."""
     try:
         import matplotlib
     except ImportError:
@@ -84,7 +90,7 @@ def draw_figures(diagnosis: Diagnosis, folder: Path) -> list[Drawn]:
     if attribution is not None and attribution.found:
         after = _pictures(attribution.fit, attribution.mismatch.chi2)
     changed = _changed(diagnosis)
-    # What the effects change comes first.
+    # Figures that the effects change come first.
     for name, picture in sorted(before.items(), key=lambda t: t[0] not in changed):
         other = after.get(name) if name in changed else None
         figures = [_figure(p) for p in (picture, other) if p is not None]
@@ -99,7 +105,7 @@ def draw_figures(diagnosis: Diagnosis, folder: Path) -> list[Drawn]:
 
 
 def _changed(diagnosis: Diagnosis) -> set[str]:
-    """Names of figures that effects change to the eye."""
+    """Names of the figures that the effects change visibly."""
     out = {"channels", "device"}
     attribution = diagnosis.attribution
     if attribution is not None:
@@ -111,7 +117,7 @@ def _changed(diagnosis: Diagnosis) -> set[str]:
 
 
 def _summary(diagnosis: Diagnosis) -> dict[str, Picture]:
-    """Classes, and what effects do to recordings that were not fitted."""
+    """Figures of the summary: probabilities of the classes, and held-out chi-squares."""
     out: dict[str, Picture] = {}
     attribution = diagnosis.attribution
     if attribution is None:
@@ -121,8 +127,9 @@ def _summary(diagnosis: Diagnosis) -> dict[str, Picture]:
         tied = [w for f in attribution.found if len(f.tied) > 1 for w in f.tied]
         height = 0.7 + 0.32 * len(shown)
         out["classes"] = Picture(
-            "Probability of each class to be among what was left out"
-            + ("; classes that these recordings cannot tell apart are in orange." if tied else "."),
+            "Probability that the baseline lacks an effect of each class; at least "
+            f"{100 * UNKNOWN:g} % is kept, by choice, for effects outside the library"
+            + ("; classes that these recordings do not distinguish are in orange." if tied else "."),
             (5.2, height), (lambda ax: show.draw_classes(shown, ax, tied=tied),),
         )  # fmt: skip
     held = {
@@ -131,8 +138,8 @@ def _summary(diagnosis: Diagnosis) -> dict[str, Picture]:
     }  # fmt: skip
     if attribution.found and held:
         out["heldout"] = Picture(
-            "Recordings that no fit has seen: chi-square per value by the baseline and with the "
-            "effects. The grey bars are where noise alone leaves it in 95 of 100 cases."
+            "Held-out recordings: chi-square per value with the baseline and with the effects. Grey "
+            "bars: range of 95 % of cases with noise alone."
             + (SAME_PIXELS if NAMES["flat_map"] in held else ""),
             (6.2, 0.9 + 0.36 * len(held)), (lambda ax: show.draw_held_out(held, ax),),
         )  # fmt: skip
@@ -142,7 +149,7 @@ def _summary(diagnosis: Diagnosis) -> dict[str, Picture]:
 def _pictures(
     fit: BaselineFit, chi2: Mapping[str, tuple[float, float]]
 ) -> dict[str, Picture]:
-    """Residuals of one fit, by channel."""
+    """Figures of the residuals of one fit, by channel."""
     found = {}
     for word in dict.fromkeys(c.word for c in fit.channels):
         parts = [
@@ -153,7 +160,8 @@ def _pictures(
         found[word] = max(parts, key=lambda p: len(p[0]))
     out: dict[str, Picture] = {}
     out["channels"] = Picture(
-        "How far each channel is, all that may float fitted; noise alone stays in the grey band.",
+        "Excess of each channel's chi-square over its degrees of freedom (dof), in standard "
+        "deviations, with all free parameters fitted. Grey band: 3 standard deviations.",
         (5.2, 3.6), (lambda ax: show.draw_channels(_named(chi2), ax),),
     )  # fmt: skip
     errors = {
@@ -162,12 +170,13 @@ def _pictures(
     }  # fmt: skip
     if fit.pulls:
         out["device"] = Picture(
-            "The device's parameters against its card.", (5.2, 0.9 + 0.32 * len(fit.pulls)),
+            "Fitted device parameters less their nominal values, in standard deviations of their "
+            "priors (grey band: 1).", (5.2, 0.9 + 0.32 * len(fit.pulls)),
             (lambda ax: show.draw_parameters(fit.pulls, errors, ax),),
         )  # fmt: skip
     if "flat_cov" in found:
         channel, pulls = found["flat_cov"]
-        caption = "Covariances of flats: pulls by lag"
+        caption = "Covariances of flats: pulls (residual over standard error) by lag"
         panels: list[Draw] = [lambda ax: show.draw_lags(channel.axes, pulls, ax)]
         if channel.unit != PER_ELECTRON:
             caption += ", weighted by the square of the level, and of the nearest lags against level"
@@ -179,7 +188,7 @@ def _pictures(
         channel_m, pulls_m = found["flat_mean"]
         left = channel_m.unwhiten(pulls_m) / np.maximum(channel_m.values, 1e-9)
         out["flat_mean"] = Picture(
-            "Means of flats against exposure time and lamp.", (5.2, 3.4),
+            "Means of flats: residuals [%] against level [1000 ADU].", (5.2, 3.4),
             (lambda ax: show.draw_means(channel_m.axes, left, ax),),
         )  # fmt: skip
     for word in ("serial_overscan", "parallel_overscan"):
@@ -187,13 +196,15 @@ def _pictures(
             channel_o, pulls_o = found[word]
             residual = channel_o.unwhiten(pulls_o)
             out[word] = Picture(
-                f"{NAMES[word].capitalize()}: mean profile behind the brightest flats.", (5.2, 3.4),
+                f"{NAMES[word].capitalize()}: residuals of the mean profile [ADU] of the brightest "
+                "flats.", (5.2, 3.4),
                 (lambda ax, c=channel_o, r=residual: show.draw_overscan(c.axes, r, c.errors, ax),),  # type: ignore[misc]
             )  # fmt: skip
     if "flat_map" in found:
         channel_p, pulls_p = found["flat_map"]
         out["flat_map"] = Picture(
-            "Flats against position, the light's smooth shape taken off: blocks, columns and rows.",
+            "Flats against position, the light's smooth shape removed: pulls of blocks, columns and "
+            "rows.",
             (5.2, 7.0),
             (lambda ax: show.draw_map(channel_p.axes, pulls_p, ax, name="all"),
              lambda ax: show.draw_profile(channel_p.axes, pulls_p, ax, name="all")),
@@ -201,13 +212,14 @@ def _pictures(
     if "spot" in found:
         channel_s, pulls_s = found["spot"]
         out["spot"] = Picture(
-            "Spots: widths, flux, asymmetry and wings.", (5.2, 3.6),
+            "Spots: pulls of widths, flux, asymmetry and wings against flux [million e-].", (5.2, 3.6),
             (lambda ax: show.draw_spots(channel_s.axes, pulls_s, ax),),
         )  # fmt: skip
     if "bias_cov" in found:
         channel_n, pulls_n = found["bias_cov"]
         out["bias_cov"] = Picture(
-            "Noise in readout order.", (5.2, 3.4),
+            "Covariances of the noise in biases: pulls against lag in readout order [pixel].",
+            (5.2, 3.4),
             (lambda ax: show.draw_noise(channel_n.axes, pulls_n, ax),),
         )  # fmt: skip
     return out
@@ -227,7 +239,7 @@ def _figure(picture: Picture) -> Figure:
 
 
 def _share(one: Figure, other: Figure) -> None:
-    """Give both figures the same scales: what is gone is to look gone."""
+    """Give both figures the same scales, so that smaller residuals look smaller."""
     for a, b in zip(one.axes, other.axes, strict=True):
         for image, like in zip(a.images, b.images, strict=True):
             ends = [f(*v) for f, v in zip((min, max), zip(image.get_clim(), like.get_clim(),

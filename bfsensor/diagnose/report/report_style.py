@@ -1,4 +1,4 @@
-"""The look of report.html: text in one column, pairs of figures, for screens, telephones and paper."""
+"""Style sheet of report.html: text in one column and pairs of figures, for screens and paper."""
 
 STYLE = """
 :root { --ink: #222; --soft: #666; --line: #e2e0da; --paper: #fff; --warm: #b6873a; --cool: #2f6f9f; }
@@ -14,9 +14,9 @@ p { max-width: 44rem; }
   border-left: 5px solid var(--warm); padding: .9em 1.2em; }
 .said.clear { border-color: #4a8f5a; background: #eff6f0; }
 .facts, figcaption, .notes, .source { color: var(--soft); font-size: .88rem; overflow-wrap: anywhere; }
-.card { border: 1px solid var(--line); border-radius: 6px; padding: 1em 1.2em; margin: 0 0 1em; }
-.card p { margin: .2em 0 .8em; }
-.card .source { margin: .8em 0 0; }
+.effect { border: 1px solid var(--line); border-radius: 6px; padding: 1em 1.2em; margin: 0 0 1em; }
+.effect p { margin: .2em 0 .8em; }
+.effect .source { margin: .8em 0 0; }
 .tag { display: inline-block; font-size: .78rem; border-radius: 1em; padding: .1em .8em;
   margin: 0 .3em .6em 0; background: #eef3f7; color: var(--cool); }
 .tag.tied { background: #fbf0d9; color: #8a6116; }
@@ -41,6 +41,7 @@ details summary { cursor: pointer; font: .9rem Helvetica, Arial, sans-serif; col
   body { max-width: none; font-size: 11pt; padding: 0; }
   h2, h3 { break-after: avoid; }
   .said, .advice, .tag { -webkit-print-color-adjust: exact; print-color-adjust: exact; }
-  .card, tr { break-inside: avoid; }
+  .effect, tr { break-inside: avoid; }
 }
 """
+"""Cascading style sheet (CSS), put into the head of the page."""

@@ -1,4 +1,4 @@
-"""Attribution: what was left out of a baseline is named, with its parameters, or not named."""
+"""Stepwise attribution: effects that a baseline lacks are named with parameters; nulls name none."""
 
 from __future__ import annotations
 
@@ -52,15 +52,16 @@ def test_an_effect_is_named_with_its_parameters(torn):
     assert abs(told["column"]["value"] * 128 - 0.3 * 128) < 1.0
 
 
-def test_the_valley_about_a_fit_is_that_of_the_fit(torn):
-    """Its lowest place, and errors by what all else takes of one effect's derivatives."""
-    # Fitted once more from its end: chance is then that of the place the valley is about.
+def test_the_likelihood_profile_about_a_fit_has_the_fits_minimum_and_errors(torn):
+    """The profile's minimum and errors are those of the fit, all other parameters refitted."""
+    # Fitted again from its end, so that random effects are linearised where the profile is.
     model = Model(torn.predictor, torn.fit)
     model = model.with_effects(model.effects)
     valley = valley_of(model, 0)
     errors = np.array(list(model.errors(0).values()))
     np.testing.assert_allclose(valley.errors, errors, rtol=0.05)
-    # Steps end where they gain a hundredth; errors that chance widens have their logarithm apart.
+    # Gauss-Newton steps end where they gain a hundredth; the logarithm of errors that random
+    # effects widen is counted apart.
     assert abs(valley.square + model.fit.chance - model.fit.total) < 0.5
     aside = valley.best + 0.5 * errors * [1.0, 0.0, 0.0, 0.0]
     assert (valley.left(aside) ** 2).sum() > valley.square
@@ -77,7 +78,7 @@ def test_recordings_that_were_not_fitted_agree_better(torn):
 
 @pytest.mark.slow
 def test_a_twin_is_in_the_class():
-    """Lost charge bends the mean as a curved response does; eight levels hardly tell them."""
+    """Charge loss and a nonlinear gain have nearly the same mean at eight levels."""
     found = explained(7102, make_effect("charge_loss", {"q": 5e-8})).found
     assert "charge_loss" in {w for f in found for w in f.tied}
     assert len(found) == 1

@@ -1,4 +1,4 @@
-"""Recordings that are nothing like the baseline: a fit that does not settle still tells what is left."""
+"""Recordings far from the baseline: a fit that does not converge still locates the mismatch."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def saturated():
 
 @pytest.mark.slow
 def test_flats_beyond_the_full_well_are_saturated(saturated):
-    """Fainter flats tell the baseline; full ones then tell the full well, and nothing else."""
+    """Faint flats constrain the baseline; saturated ones then constrain the full well alone."""
     found = diagnose_measured(saturated, virtual_baseline())
     assert any("the variance of flats collapses" in n for n in found.notes)
     assert found.mismatch.detected and found.mismatch.findings[0].word.startswith("flat_")
@@ -33,7 +33,7 @@ def test_flats_beyond_the_full_well_are_saturated(saturated):
     assert one.effect.word == "saturation"
     assert one.effect["full_well"] == pytest.approx(FULL, abs=4 * one.errors["full_well"])
     assert one.errors["full_well"] < 0.02 * FULL
-    # Spots of 950 nm, of which only a saturated one is fitted, keep a width that is hardly known.
+    # Spots at 950 nm are left out: only a saturated one is fitted, so their width is hardly known.
     for word in ("flat_cov", "flat_mean"):
         before, after, values = found.attribution.heldout[word]
         assert before > 1e3 * values and after < 1.3 * values
@@ -51,7 +51,7 @@ def test_turn_off_is_where_pixels_are_full(saturated):
     assert find_turn_off(faint) is None
 
 
-def test_a_baseline_that_does_not_settle_is_told(saturated, monkeypatch):
+def test_a_baseline_that_does_not_converge_is_reported(saturated, monkeypatch):
     monkeypatch.setattr(mismatch, "find_turn_off", lambda channels: None)
     found = diagnose_measured(saturated, virtual_baseline(), explain=False)
     assert UNSETTLED in found.notes

@@ -1,4 +1,4 @@
-"""Light that is another one in every flat: noise of maps over many pixels."""
+"""Light that changes from flat to flat: noise of maps that is correlated over many pixels."""
 
 import numpy as np
 import pytest

@@ -56,8 +56,9 @@ def test_the_other_operating_point_is_named_with_its_back_bias(seed):
     assert one.effect.name == f"device_parameter:{BACK_BIAS}"
     # Backgrounds act a little otherwise at the two: a volt of the line between them.
     assert abs(one.effect[BACK_BIAS] + 70.0) < 4 * one.errors[BACK_BIAS] + 1.0
-    assert "device_parameter explains it: operating_point.back_bias = -7" in found.said()
-    # Recorded at the card's own: nothing to be named.
+    assert len(found.attribution.found) == 1
+    assert f"{BACK_BIAS} = {one.effect[BACK_BIAS]:.3g}" in found.said()
+    # Recorded at the nominal back bias there is nothing to name.
     table = recorded("e2v_ccd250", seed=seed)
     found = diagnose_measured(measure_reduced(table, reach=4), baseline)
     assert not found.mismatch.detected
@@ -80,7 +81,7 @@ def test_a_transposed_table_is_named_as_a_whole_exchange(name):
     assert one.effect.name == "outside_library:axes_exchanged"
     # A wrong size of 0.89 was 6 standard deviations off where the background's part stayed.
     assert abs(one.effect["amp"] - 1.0) < 3 * one.errors["amp"]
-    assert "as a whole exchange has it" in found.said()
+    assert f"{one.effect['amp']:.2f} +- {one.errors['amp']:.2f}" in found.said()
     assert not found.attribution.mismatch.detected
 
 

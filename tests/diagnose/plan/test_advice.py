@@ -1,4 +1,4 @@
-"""Plans: information against least squares, rules against pixels, and one tie that is broken."""
+"""Plans: expected chi-squares against least squares, rules against pixels, and a tie broken."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -123,7 +123,7 @@ def test_the_twins_are_tied_and_the_plan_is_one_recording(tied, planned):
     assert set(block["separates"]) == set(tied.tied)
     assert block["expected_delta_chi2"] > ENOUGH
     assert sum(r["count"] for r in block["recipe"]) == block["exposures"]
-    # What goes with the level alone tells as little at any light.
+    # An effect of the level alone is not separated better by another light.
     rest = {n: v for n, _, v in block_others(block)}
     assert "light_rate" not in rest or rest["light_rate"] < ENOUGH
 
@@ -245,4 +245,4 @@ def test_what_cannot_be_seen_is_told(tied):
         for u in find_untested(replace(measured, channels=one))
         if u.word == "bf_chromatic"
     )
-    assert told_.because == "one wavelength (620)"
+    assert told_.because == "one wavelength (620 nm)"

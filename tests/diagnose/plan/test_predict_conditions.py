@@ -1,4 +1,4 @@
-"""Exposures that were not taken, predicted, and then held against those that were kept back."""
+"""Predictions for exposures that were not fitted, compared with those recorded."""
 
 import numpy as np
 import pytest
@@ -157,12 +157,12 @@ def test_spots_of_other_fluxes_grow_as_recorded(campaign):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("colour=3", "colour is none of kind, level"),
+        ("colour=3", "colour must be one of kind, level"),
         ("level", "not NAME=VALUE"),
         ("level=many", "level=many is not a number"),
         ("wavelength=480", "flats need level or seconds"),
         ("seconds=-3", "must be above 0"),
-        ("kind=moon,seconds=3", "kind=moon: flat or spot"),
+        ("kind=moon,seconds=3", "kind=moon must be flat or spot"),
         ("nowhere.ecsv", "nowhere.ecsv: not an ECSV table"),
     ],
 )

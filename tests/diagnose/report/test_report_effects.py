@@ -12,9 +12,18 @@ from bfsensor.diagnose.detect.locate import locate_mismatch
 from bfsensor.diagnose.explain.attribution import FAILS
 from bfsensor.diagnose.fit.baseline_fit import held_out
 from bfsensor.diagnose.plan.advice import plan
-from bfsensor.diagnose.report.class_words import CLASS_WORDS
+from bfsensor.diagnose.report.class_words import (
+    CLASS_WORDS,
+    NAMES,
+    PARAMETER_WORDS,
+    said_interval,
+    said_p,
+    said_value,
+)
 from bfsensor.diagnose.report.diagnosis_result import Diagnosis
 from bfsensor.diagnose.report.html_report import write_report
+from bfsensor.diagnose.report.report_figures import SAME_PIXELS
+from bfsensor.effects.library import LIBRARY
 from bfsensor.plots import residuals as show
 from tests.virtual import (
     EFFECTS,
@@ -77,28 +86,72 @@ def test_report_json_has_plan_advice_and_what_was_not_tested(explained, written)
     assert held["chi2dof_after"] < 1.2 < held["chi2dof_before"]
     assert held["channels"]["flat_mean"]["before"] > 10
     assert held["channels"]["flat_mean"]["after"] < 2
-    assert held["fails_in"] == [] and "fails" not in report["said"]
-    # A channel without values is none of them.
+    assert held["fails_in"] == []
+    # Channels without held-out values are left out.
     assert all(row["values"] > 0 for row in held["channels"].values())
 
 
-def test_what_fails_on_other_recordings_says_so(explained):
+def test_channels_that_get_worse_on_held_out_recordings_are_reported(explained):
     told = explained.attribution
     before, _, n = told.heldout["flat_mean"]
     worse = {**told.heldout, "flat_mean": (before, before + 2 * FAILS, n)}
     astray = replace(explained, attribution=replace(told, heldout=worse))
     assert astray.to_report()["heldout"]["fails_in"] == ["flat_mean"]
-    assert "fails in the channel 'flat_mean'" in astray.said()
-    assert "not to be relied on" in astray.said()
+    assert f"{NAMES['flat_mean']} (from" in astray.said()
+    assert f"{NAMES['flat_mean']} (from" not in explained.said()
+
+
+def test_an_effect_explains_only_where_nothing_is_left(explained):
+    told = explained.attribution
+    assert not told.mismatch.detected
+    whole = explained.said()
+    left = replace(told.mismatch, p_value=1e-30)
+    part = replace(explained, attribution=replace(told, mismatch=left)).said()
+    assert "explains it" in whole and "explains it" not in part
+    outside = replace(told, open_world=True)
+    assert "explains it:" not in replace(explained, attribution=outside).said()
+    assert f"family-wise p {told.mismatch.p_value:.2g}" in whole
+    # A p-value at the floor of its calculation is printed as a bound.
+    assert "family-wise p < 2e-30" in part
+
+
+@pytest.mark.parametrize(
+    ("value", "printed"),
+    [(0.0, "< 1e-30"), (1e-30, "< 1e-30"), (3e-7, "3e-07"), (0.4321, "0.43")],
+)
+def test_p_values_at_the_floor_are_printed_as_bounds(value, printed):
+    assert said_p(value) == printed
+
+
+def test_intervals_state_ends_that_the_data_do_not_constrain():
+    told = {"value": 2.0, "lo68": 1.0, "hi68": 3.0}
+    assert said_interval(told, "68") == "1 to 3"
+    assert said_interval(told | {"open68": ["hi"]}, "68") == "above 1"
+    assert said_interval(told | {"open68": ["lo"]}, "68") == "below 3"
+    both = said_interval(told | {"open68": ["lo", "hi"]}, "68")
+    assert both != said_interval({"value": 2.0}, "68")
+    assert not {"1", "3"} & set(both)
+
+
+def test_amplifiers_are_counted_from_one_in_sentences():
+    # report.json counts the amplifier of a trap from 0.
+    assert said_value("trap_serial", "amp", 0.0) == "1"
+    assert said_value("tree_rings", "amp", 0.01) == "0.01"
+
+
+def test_parameters_with_words_belong_to_their_class():
+    for word, names in PARAMETER_WORDS.items():
+        own = {p.name for kind in LIBRARY if kind.word == word for p in kind.parameters}
+        assert set(names) == own, word
 
 
 def test_the_page_is_whole_and_says_it_all(written):
     page = Page((written[0] / "report.html").read_text())
     assert page.open == []
     assert page.headings == [
-        "What explains it", "What to record next", "Where the recordings differ",
-        "On recordings that were not fitted", "Channels as fitted",
-        "Residuals, channel by channel", "What stands out of the baseline",
+        "Effects found", "What to record next", "Where the recordings differ",
+        "Held-out recordings, which were not fitted", "Fitted recordings",
+        "Residuals, channel by channel", "Largest deviations from the baseline",
         "What was not tested", "Notes",
     ]  # fmt: skip
     text = " ".join(page.words)
@@ -106,8 +159,8 @@ def test_the_page_is_whole_and_says_it_all(written):
     assert "or gain nonlinearity" in text or "or charge loss" in text
     assert "binned by two along the row" in text and "Astier" in text
     assert re.search(r"1\.\d+e-07 to 1\.\d+e-07", text)
-    # What maps of the same pixels that were not fitted are worth.
-    assert "whose own response is the same in all flats" in text
+    # The limit of held-out flats of the same pixels as evidence.
+    assert SAME_PIXELS.strip() in text
 
 
 def test_figures_come_in_pairs_of_one_scale(written):
@@ -116,14 +169,14 @@ def test_figures_come_in_pairs_of_one_scale(written):
     both = {n for n in names if f"{n}_with_effects" in names}
     assert {"channels", "flat_cov", "flat_mean", "spot"} <= both
     assert {"classes", "heldout", "serial_overscan", "flat_map"} <= names
-    # What no effect touches is not shown twice.
+    # Figures that no effect changes are drawn once.
     assert not {"serial_overscan", "flat_map", "bias_cov"} & both
     page = Page((folder / "report.html").read_text())
     assert page.pictures == len(names)
     assert not list(folder.glob("*.tmp*"))
 
 
-def test_what_is_missing_is_told(explained, tmp_path):
+def test_classes_that_were_not_tested_are_listed(explained, tmp_path):
     kept = tuple(
         c for c in explained.measured.channels if c.word not in ("spot", "dark_map")
     )
@@ -141,7 +194,7 @@ def test_what_is_missing_is_told(explained, tmp_path):
 
 
 def test_classes_have_plain_words():
-    # Pieces of the device's physics are classes of their own.
+    # Parts of the simulated physics are classes of their own.
     assert set(CLASS_WORDS) == {*EFFECTS, "free_holes", "stop_diffusion"}
 
 
