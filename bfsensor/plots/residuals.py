@@ -223,7 +223,7 @@ def draw_parameters(
     )
     ax.set_yticks(range(len(names)), names)
     ax.axvspan(-1, 1, color="0.9", zorder=0)
-    ax.set_xlabel("off the card [its spread]")
+    ax.set_xlabel("distance from the nominal value [its uncertainty]")
 
 
 def _legend(ax: Axes, columns: int) -> None:

@@ -22,7 +22,7 @@ OCTAVES = 4
 Chosen: each further width has twice as many strips; with 8, strips of 1/512 of a side are narrower
 than the columns of most maps."""
 
-DEVICE, DEVICE_SCAN = "device", "device parameter off its card"
+DEVICE, DEVICE_SCAN = "device", "device parameter away from its nominal value"
 """Name that stands for a channel, and family, of the scan of the device's parameters."""
 
 DEVICE_SEEN = "flat_cov", "spot"

@@ -254,13 +254,10 @@ def from_photon_transfer(dataset: PhotonTransferDataset, path: Path) -> Covarian
         c = np.asarray(curve["covariances"]) * gain**2
         weights = dataset.columns.get("COVARIANCES_SQRT_WEIGHTS")
         pixels = int(curve.get("pixels", 0))
-        kept = np.atleast_1d(dataset.columns["EXP_ID_MASK"][k]).astype(bool)
-        usable = weights is not None and len(weights[k]) == len(kept)
-        w = (
-            weights[k][kept][: len(c)]
-            if usable and weights is not None
-            else np.zeros_like(c)
-        )
+        kept = dataset.pairs_kept(name)
+        w = np.zeros_like(c)
+        if weights is not None and len(weights[k]) == len(kept):
+            w = weights[k][kept]
         if w.shape == c.shape and np.all(w > 0):
             error = gain**2 / w
         elif pixels:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from astropy.table import Table
+from numpy.typing import NDArray
 
 from bfsensor.errors import RecordingError
 from bfsensor.recording.tables.calibration_tables import (
@@ -144,6 +145,24 @@ class PhotonTransferDataset(CalibrationTable):
             )
         return self.amplifiers.index(amplifier)
 
+    def pairs_kept(self, amplifier: str) -> NDArray[np.bool_]:
+        """Select the pairs that the pipeline kept and whose level and covariances are finite.
+
+        Parameters
+        ----------
+        amplifier : str
+            Name of an amplifier of the dataset.
+
+        Returns
+        -------
+        kept : ndarray of bool, shape (pairs,)
+            In the order of the dataset's pairs.
+        """
+        k = self.row(amplifier)
+        kept = np.atleast_1d(self.columns["EXP_ID_MASK"][k]).astype(bool)
+        finite = np.isfinite(np.atleast_1d(self.columns["RAW_MEANS"][k]))
+        return kept & finite & np.isfinite(self.columns["COVARIANCES"][k]).all(axis=(1, 2))
+
     def curve(self, amplifier: str) -> dict[str, Any]:
         """Give levels and covariances of the pairs that the pipeline kept.
 
@@ -167,8 +186,7 @@ class PhotonTransferDataset(CalibrationTable):
         k = self.row(amplifier)
         levels = np.atleast_1d(self.columns["RAW_MEANS"][k])
         covariances = self.columns["COVARIANCES"][k]
-        kept = np.atleast_1d(self.columns["EXP_ID_MASK"][k]).astype(bool)
-        kept = kept & np.isfinite(levels) & np.isfinite(covariances).all(axis=(1, 2))
+        kept = self.pairs_kept(amplifier)
         out = {"levels": levels[kept], "covariances": covariances[kept],
                "unit": "adu", "region": amplifier}  # fmt: skip
         if "NPIXEL_COVARIANCES" in self.columns:

@@ -181,6 +181,20 @@ def test_photon_transfer_datasets(tmp_path):
     np.testing.assert_allclose(white.error[first][1:], variance / 100)
 
 
+def test_weights_of_photon_transfer_datasets_belong_to_their_pairs(tmp_path):
+    """A pair that was kept but has no covariances is left out together with its weights."""
+    dataset = photon_transfer()
+    columns = {name: np.array(column) for name, column in dataset.columns.items()}
+    columns["EXP_ID_MASK"][0] = True
+    columns["COVARIANCES"][0, 1] = np.nan
+    columns["COVARIANCES_SQRT_WEIGHTS"][0] = np.reshape([0.1, 0.2, 0.3], (3, 1, 1))
+    PhotonTransferDataset(columns).write(tmp_path / "ptc.fits")
+    (found,) = find_reduced(tmp_path)
+    low, high = (found.level == level for level in np.unique(found.level))
+    np.testing.assert_allclose(found.error[low], 1.5**2 / 0.1)
+    np.testing.assert_allclose(found.error[high], 1.5**2 / 0.3)
+
+
 def test_the_sum_rule_makes_the_centre_dependent(tmp_path):
     rows = [(i, j, 1e-7 / (1 + i + j) ** 3, 1e-8) for i in range(4) for j in range(4)]
     others = sum(r[2] * (1 + (r[0] > 0)) * (1 + (r[1] > 0)) for r in rows[1:])
