@@ -136,9 +136,10 @@ def trace_cloud(
     >>> from bfsensor import Device
     >>> from bfsensor.simulate.unit_cell import solve_unit_cell
     >>> tracer = Tracer(solve_unit_cell(Device.load("itl_sta3800c"), 0.0, cells=8))
-    >>> starts = [[1.0, 0.0, 60.0], [-1.0, 0.0, 60.0]]
-    >>> trace_cloud(tracer, starts, seed=8231).pixels.tolist()
-    [[0, 0], [0, 0]]
+    >>> trace_cloud(tracer, [[1.0, 0.0, 60.0]], seed=8231, repulsion=-1.0)
+    Traceback (most recent call last):
+        ...
+    bfsensor.errors.SimulationError: repulsion = -1.0 must be 0 or more
     """
     transport = transport or Transport()
     if not (np.isfinite(repulsion) and repulsion >= 0):

@@ -87,7 +87,7 @@ class SpotPlan(ExposurePlan):
     --------
     >>> from bfsensor import Device
     >>> SpotPlan(Device.load("itl_sta3800c"), peak=50_000.0, sigma=8.0).electrons
-    225866
+    228257
     """
 
     KIND: ClassVar[str] = "spots"

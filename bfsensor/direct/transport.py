@@ -81,6 +81,11 @@ class Transport:
     Beside a full pixel the default steps give the same share of electrons to a well as steps
     a fourth as long within 0.2 % at Einstein's width; at the published width they give
     0.9 % less (errors 0.2 and 0.3 %, ``validation/transport/transport.ipynb``).
+
+    Examples
+    --------
+    >>> Transport(diffusion=PUBLISHED_DIFFUSION).engine
+    'steps'
     """
 
     diffusion: float = 1.0

@@ -21,7 +21,7 @@ large, a column that data distinguish to 2e-10 only would count as a copy."""
 class BoundedSolution(NamedTuple):
     """Solution of a linear least-squares problem with bounds.
 
-    Attributes
+    Parameters
     ----------
     solution : ndarray, shape (p,)
         Parameters at the minimum, 0 for columns that are zero; of equally good solutions the one

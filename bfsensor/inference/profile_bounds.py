@@ -21,7 +21,7 @@ class Bounds(NamedTuple):
     A bound is infinite where the profile does not rise to the level within the values that were
     computed, because the parameter cannot go further or the profile was not taken further.
 
-    Attributes
+    Parameters
     ----------
     low, high : float
         Lower and upper bound [internal unit].

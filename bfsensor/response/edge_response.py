@@ -85,7 +85,7 @@ difference and halves that of the corners' tolerance, 1e-7 um."""
 class EdgeResponse:
     """Shifts of pixel edges per electron by conversion depth, and their derivatives.
 
-    Attributes
+    Parameters
     ----------
     depths : ndarray, shape (nd,)
         Conversion depths as heights above the gates [um], the last one the back surface.

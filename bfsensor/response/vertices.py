@@ -38,7 +38,7 @@ def vertex_fractions(vertices: int) -> FloatArray:
 class Displacements:
     """Displacements (dx, dy) [um] of corners and side vertices at one point of a table.
 
-    Attributes
+    Parameters
     ----------
     corners : ndarray, shape (2 reach + 2, 2 reach + 2, 2)
         Displacements of the corners, [row, column].

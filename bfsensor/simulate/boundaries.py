@@ -98,7 +98,7 @@ far below the tracing error."""
 class PixelBoundaries:
     """Boundary lines around the pixels at offsets up to ``reach`` from pixel (0, 0).
 
-    Attributes
+    Parameters
     ----------
     depths : ndarray, shape (nd,)
         Heights above the gates [um] at which the lines were taken.
@@ -124,7 +124,7 @@ class PixelBoundaries:
     def vertices(
         self, vertices: int, fractions: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Displacements of polygon vertices that keep the area of every pixel.
+        """Fit displacements of polygon vertices to the lines, keeping the area of every pixel.
 
         The vertices of a line are the least-squares polyline through it under the
         condition that the area between line and nominal edge is kept in each pixel.

@@ -60,7 +60,7 @@ finely, at some four times the time of a unit cell."""
 class EdgeField:
     """The potential around one edge of the array.
 
-    Attributes
+    Parameters
     ----------
     device : Device
         Device with the edge that was solved.

@@ -47,7 +47,7 @@ where the field in 100 um of silicon has fallen to exp(-4.2 pi), 2e-6."""
 class FarField:
     """Shift of boundaries far from a unit dipole, ``shift(rho, depth)``, tabulated.
 
-    Attributes
+    Parameters
     ----------
     distances : ndarray, shape (nr,)
         Distances from the dipole [um].

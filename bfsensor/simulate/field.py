@@ -15,7 +15,7 @@ from bfsensor.typing import FloatArray
 class Field:
     """A potential padded beyond the domain, as the kernels interpolate it.
 
-    Attributes
+    Parameters
     ----------
     phi : ndarray, shape (ny', nz', nx')
         Potential [V], [y, z, x].

@@ -91,7 +91,7 @@ class NewtonStep:
 class Potential:
     """A converged solution.
 
-    Attributes
+    Parameters
     ----------
     device : Device
         Device that was solved.
