@@ -130,7 +130,11 @@ def assemble(
     ends: FloatArray,
     surface: float,
 ) -> System:
-    """Links, charges and conductors, summed over the intervals in x."""
+    """Assemble links, charges and conductors of an edge; ``ends`` [um] are those of its strips.
+
+    Each interval in x lies above one strip or above the pixels, and adds half of itself to the
+    nodes on either side.
+    """
     assert device.edge is not None
     nz, nx = len(z), len(x)
     eps_si = device.material.permittivity_silicon * VACUUM_PERMITTIVITY

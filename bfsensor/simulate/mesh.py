@@ -1,7 +1,7 @@
-"""The mesh of a device and its finite-volume coefficients.
+"""The mesh of a device: nodes on its edges and surfaces, finest at the gates, graded in the bulk.
 
-A node-centred tensor mesh: nodes lie exactly on gate edges, channel-stop edges, oxide
-and silicon surfaces, and halving every interval keeps them.
+The mesh is node-centred and the product of nodes in x, y and z: nodes lie exactly on gate edges,
+channel-stop edges, oxide and silicon surfaces, and halving every interval keeps them.
 """
 
 from __future__ import annotations

@@ -153,5 +153,5 @@ class Tangent:
 
 
 def _repeat(values: FloatArray, unit: Potential, mesh: Mesh) -> FloatArray:
-    """Values on the nodes of a unit cell, over the whole array."""
+    """Repeat values on the nodes of a unit cell over the nodes of the whole array."""
     return tile(replace(unit, phi=values), mesh)
