@@ -148,7 +148,7 @@ class EdgeShifts:
 def edge_shifts(
     model: ImageCharge, *, depth: ArrayLike, reach: int = 8, tolerance: float = TOLERANCE
 ) -> EdgeShifts:
-    """Give the mean shift of the edges of all pixels around one that holds an electron.
+    """Compute the mean shift of the edges of all pixels around one that holds an electron.
 
     Parameters
     ----------
@@ -208,7 +208,7 @@ def edge_shifts(
 def area_changes(
     model: ImageCharge, *, depth: ArrayLike, reach: int = 8, tolerance: float = TOLERANCE
 ) -> FloatArray:
-    """Give the relative area change of every pixel per electron in the central one.
+    """Compute the relative area change of every pixel per electron in the central one.
 
     In first order, the coefficients of Astier & Regnault (2023); flats have
     C_ij = a_ij mean^2 in the lowest order.
