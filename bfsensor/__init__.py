@@ -1,9 +1,9 @@
 """Device physics of thick CCDs: from a device file to the brighter-fatter effect.
 
-What is needed most often is here; the rest is in the rooms, ``bfsensor.device``, ``bfsensor.table``,
-``bfsensor.measure`` and so on, each of which lists its public names in ``__all__``.  Whatever is in
-none of these lists may change without notice.  ``bfsensor.diagnose`` is a room: the function of
-this name is ``bfsensor.diagnose.diagnose``.
+The names used most often are here; the others are in the subpackages, ``bfsensor.device``,
+``bfsensor.table``, ``bfsensor.measure`` and so on, each of which lists its public names in
+``__all__``.  A name that is in none of these lists may change without notice.
+``bfsensor.diagnose`` is a subpackage: the function of this name is ``bfsensor.diagnose.diagnose``.
 """
 
 from __future__ import annotations

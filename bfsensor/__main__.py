@@ -1,4 +1,4 @@
-"""``python -m bfsensor COMMAND``."""
+"""Entry point of ``python -m bfsensor COMMAND``, the same commands as ``bfsensor COMMAND``."""
 
 from bfsensor.cli.main import main
 

@@ -22,12 +22,12 @@ def lazy_names(
     package : str
         The package's ``__name__``.
     modules : mapping of str to sequence of str
-        The names of each module, which is given relative to the package.
+        Public names by the module that defines them, its path relative to the package.
 
     Returns
     -------
     getattr_, dir_ : callable
-        The package's ``__getattr__`` and ``__dir__``.
+        Functions to assign to the package's ``__getattr__`` and ``__dir__``.
     """
     origins = {name: f"{package}.{m}" for m, names in modules.items() for name in names}
 

@@ -1,4 +1,4 @@
-"""Importing this lets GalSim's sensor type Silicon mean :class:`bfsensor.SiliconSensor`.
+"""On import, makes GalSim's sensor type Silicon build a :class:`bfsensor.SiliconSensor`.
 
 With ``modules: [bfsensor.as_silicon]`` a configuration that says ``type: Silicon``, such as
 imSim's, needs no other change.

@@ -1,4 +1,4 @@
-"""Errors of bfsensor: each is also the built-in that fits, and all survive pickling."""
+"""Exceptions of bfsensor; each also derives from ValueError or RuntimeError and can be pickled."""
 
 from __future__ import annotations
 
@@ -6,47 +6,47 @@ from collections.abc import Sequence
 
 
 class BFSensorError(Exception):
-    """Base of all errors that bfsensor raises on purpose."""
+    """Base class of all exceptions that bfsensor raises on purpose."""
 
 
 class DeviceError(BFSensorError, ValueError):
-    """A device is wrong, or does not allow what was asked of it."""
+    """A device description is invalid, or the device is outside the range of a method."""
 
 
 class TableError(BFSensorError, ValueError):
-    """A distortion table is wrong, or was asked for something outside it."""
+    """A distortion table is invalid, or a request lies outside its range."""
 
 
 class MeasurementError(BFSensorError, ValueError):
-    """Data do not allow the measurement."""
+    """The given data or settings do not allow a measurement."""
 
 
 class RecordingError(BFSensorError, ValueError):
-    """A recording lacks something, or holds what cannot be read as it says."""
+    """A recording of measured data is incomplete, or its content contradicts its description."""
 
 
 class SensorError(BFSensorError, ValueError):
-    """A sensor for image simulation was given what it cannot use."""
+    """A sensor for image simulation was given an option or data that it cannot use."""
 
 
 class SimulationError(BFSensorError, ValueError):
-    """A simulation of electrons was asked for something it cannot do."""
+    """A simulation of single electrons was given settings or files that it cannot use."""
 
 
 class DiagnosisError(BFSensorError, ValueError):
-    """Recordings and prediction cannot be held against one another as asked."""
+    """Recordings and prediction cannot be compared as requested."""
 
 
 class FitError(BFSensorError, ValueError):
-    """A device cannot be fitted to the measurements as asked."""
+    """A device cannot be fitted to measurements, or an emulator cannot be used, as requested."""
 
 
 class EffectError(BFSensorError, ValueError):
-    """An effect was given parameters or data that it has no meaning for."""
+    """An effect was given parameters or data for which it is not defined."""
 
 
 class SweepError(BFSensorError, ValueError):
-    """Work cannot be spread as asked."""
+    """A sweep over devices cannot be planned, run or read as requested."""
 
 
 class ConvergenceError(BFSensorError, RuntimeError):
@@ -55,9 +55,20 @@ class ConvergenceError(BFSensorError, RuntimeError):
     Parameters
     ----------
     message : str
-        What did not converge.
+        Which iteration did not converge, and how far it came.
     history : sequence of float
-        Residual of each iteration.
+        Size of the residual or of the step in each iteration, in the unit of the message; empty
+        where the method has none.
+
+    Attributes
+    ----------
+    history : tuple of float
+        The same numbers.
+
+    Examples
+    --------
+    >>> ConvergenceError("the potential did not converge", [1.0, 0.5]).history
+    (1.0, 0.5)
     """
 
     def __init__(self, message: str, history: Sequence[float] = ()) -> None:

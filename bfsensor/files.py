@@ -12,13 +12,13 @@ T = TypeVar("T")
 
 
 class Cache:
-    """Values in memory, each made once.
+    """Cache of values in memory, each computed once.
 
     Parameters
     ----------
     most : int, optional
-        How many are held at most: the one that was asked for longest ago is dropped for a
-        new one.  All are held by default.
+        Largest number of values, 1 or more; beyond it the least recently used one is dropped.
+        By default all are held.
 
     Examples
     --------
@@ -32,15 +32,21 @@ class Cache:
         self._values: dict[Hashable, Any] = {}
 
     def get(self, key: Hashable, make: Callable[[], T]) -> T:
-        """Give the value of a key, made if there is none.
+        """Return the value of a key, computed if it is not held.
 
         Parameters
         ----------
         key : hashable
-            What the value belongs to, or a tuple with it.  Objects that are equal only to
-            themselves serve: the cache holds them, so that no other can take their place.
+            Object to which the value belongs, or a tuple with it.  Objects that are equal only
+            to themselves serve: the cache holds them, so that no other can take their identity.
         make : callable
-            Gives the value; what it raises passes, and nothing is kept.
+            Function without arguments that computes the value; its exceptions pass, and
+            nothing is held then.
+
+        Returns
+        -------
+        value : object
+            The value that ``make`` returned for this key.
         """
         if key in self._values:
             value = self._values.pop(key)
@@ -48,7 +54,7 @@ class Cache:
             value = make()
             if self._most is not None and len(self._values) >= self._most:
                 del self._values[next(iter(self._values))]
-        # Asked for last, dropped last.
+        # A dict keeps the order of insertion: the least recently used key comes first.
         self._values[key] = value
         return value
 
@@ -56,35 +62,35 @@ class Cache:
 def refuse_existing(
     path: str | os.PathLike[str], overwrite: bool, error: type[Exception]
 ) -> None:
-    """Raise the error if there is a file and it is not to be replaced."""
+    """Raise the given error if the file exists and ``overwrite`` is False."""
     if Path(path).exists() and not overwrite:
         raise error(f"{path} exists; say overwrite to replace it")
 
 
 @contextlib.contextmanager
 def written_whole(path: str | os.PathLike[str], error: type[Exception]) -> Iterator[Path]:
-    """Give a path beside a file to write to; it is renamed once all is written.
+    """Yield a temporary path beside a file; it is renamed to the file once all is written.
 
-    A reader finds the old file or the new one, whatever happens; processes that write the
-    same file do not meet, for the name holds the number of the process.
+    A reader finds the old file or the new one, never a part; processes that write the same file
+    do not disturb one another, because the temporary name holds the number of the process.
 
     Parameters
     ----------
     path : path-like
-        The file to be.
+        File to write; one that exists is replaced.
     error : type
-        Raised with the name of the file where it cannot be written.
+        Exception class to raise, with the name of the file, where it cannot be written.
 
     Yields
     ------
     beside : Path
-        Where to write.
+        Temporary path to write to.
 
     Raises
     ------
     Exception
-        The kind asked for, in place of an ``OSError``.  Any other error passes, and no
-        file is left behind.
+        The given class, in place of an ``OSError``.  Any other exception passes unchanged; the
+        temporary file is removed in both cases.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""GalSim's configuration learns our sensor types, without importing GalSim for it.
+"""Registration of bfsensor's sensor types with GalSim's configuration, without importing GalSim.
 
 ``modules: [bfsensor]`` in a configuration only imports bfsensor.  Where GalSim's
 configuration is loaded already the types are registered at once.  Where it is not, a finder
@@ -21,7 +21,7 @@ _WATCHED = "galsim.config.sensor"
 
 
 class _Builder:
-    """Builds a sensor of a class that is imported when it is first needed."""
+    """Builder of a sensor type; the class of the sensor is imported when it is first needed."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -45,7 +45,7 @@ def register(*, silicon: bool = False) -> None:
 
 
 class _Loader(importlib.abc.Loader):
-    """Loads GalSim's module, then registers."""
+    """Loader that executes GalSim's module and then registers the sensor types."""
 
     def __init__(self, loader: Any) -> None:
         self.loader = loader
@@ -59,7 +59,7 @@ class _Loader(importlib.abc.Loader):
 
 
 class _Watch(importlib.abc.MetaPathFinder):
-    """Waits for GalSim's registry of sensors to be imported, once."""
+    """Finder that hooks the first import of GalSim's registry of sensors, and then removes itself."""
 
     def find_spec(
         self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -74,7 +74,7 @@ class _Watch(importlib.abc.MetaPathFinder):
 
 
 def register_when_loaded() -> None:
-    """Register now if GalSim's registry is loaded, else when it is."""
+    """Register now if GalSim's registry is loaded, else as soon as it is imported."""
     if _WATCHED in sys.modules:
         register()
     else:

@@ -1,4 +1,4 @@
-"""Types of arrays that signatures name; shapes and units stand in the docstrings."""
+"""Array types for signatures; shapes and units are in the docstrings of their users."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
-"""Double-precision numbers."""
+"""Array of double-precision numbers."""
 
 Edges = tuple[FloatArray, FloatArray]
-"""Shifts of right and of upper edges, each [row, column] with (0, 0) in the middle."""
+"""Shifts of the right and of the upper edge of each pixel, each [row, column]; the pixel that holds
+the charge is in the middle."""

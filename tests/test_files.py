@@ -74,7 +74,7 @@ def test_a_value_is_made_once_for_each_owner():
         asked.append(channel)
         return channel.values.sum()
 
-    # Equal in all they hold: that they are two is all that tells them apart.
+    # Both hold equal values; only their identity differs.
     one, other = make_channel(), make_channel()
     for channel in (one, other, one, other):
         assert cache.get(("sum", channel), lambda c=channel: make(c)) == 1.0

@@ -1,6 +1,6 @@
-"""Areas of all pixels: by convolution, or polygons through the displaced points.
+"""Areas of all pixels, by convolution or as polygons through the displaced points.
 
-Of polygons the area is the contour integral of -y dx; every side is integrated once, about its
+The area of a polygon is the contour integral of -y dx; every side is integrated once, about its
 nominal place.  Shifts of one point of all sides of a line are found together, so that the
 inner loop runs along the row.
 """
@@ -16,7 +16,7 @@ GAUSS = 0.5 - 0.5 / np.sqrt(3.0)
 
 @numba.njit(cache=True, fastmath={"contract"}, _nrt=False)
 def _add_rows(weights, start, lanes, rows, columns, charges, at, stride, out, count):
-    """Add to ``out`` the weighted charges of the window that begins at ``at``, and on."""
+    """Add to ``out`` the weighted charges of ``count`` windows, the first of which begins at ``at``."""
     for r in range(rows):
         row = np.uint64(at + r * stride)
         first = start + r * lanes
@@ -139,10 +139,10 @@ def _join(x0, y0, x1, y1):
 
 @numba.njit(cache=True, nogil=True)
 def pixel_areas(edges, charges, pattern, flux, low, low_second, first_row, last_row, out):
-    """Areas [nominal area] of the rows ``first_row`` to ``last_row``, to ``out`` [ny, nx].
+    """Write the areas [nominal area] of the rows ``first_row`` to ``last_row`` to ``out`` [ny, nx].
 
-    ``low``, ``low_second``: charges taken off, a uniform charge moves nothing.  With
-    ``flux`` False only the fixed pattern counts.
+    ``low`` and ``low_second`` are subtracted from the charges, for a uniform charge moves no
+    boundary.  With ``flux`` False only the fixed pattern moves boundaries.
     """
     nx = charges.nx
     now = np.zeros((2, nx + 1), np.float32)
@@ -204,13 +204,13 @@ def convolved_areas(
     row,
     out,
 ):
-    """Areas [nominal area] by convolution with the first ``count`` kernels.
+    """Write areas [nominal area] by convolution with the first ``count`` kernels to ``out``.
 
-    Of the rows ``bottom`` to ``top`` and the columns ``left`` to ``right``.
+    Only the rows ``bottom`` to ``top`` and the columns ``left`` to ``right`` are written.
 
-    ``first`` [1 + kernels, width, width] and ``second`` (5 x 5; width 0: none), flat,
-    begin with the linear kernel; the squares of the other sums count by ``values``.
-    ``row``: room for a row.
+    ``first`` [1 + kernels, width, width] and ``second`` (5 x 5; width 0: none) begin with the
+    linear kernel; the squares of the other sums are added with the factors ``values``.
+    ``row`` is scratch for one row.
     """
     width = first.shape[1]
     near = second.shape[1]

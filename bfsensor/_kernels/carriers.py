@@ -11,6 +11,9 @@ import math
 import numba
 
 _NEGLIGIBLE = -80.0
+"""Exponent below which a density of electrons counts as 0, relative to the reference level.
+
+Derived: exp(-80) = 2e-35 of the density at the level, far below round-off of any sum."""
 
 
 @numba.njit(cache=True)

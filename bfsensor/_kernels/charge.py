@@ -1,9 +1,10 @@
-"""Charge: electrons into pixels, spilling, and the charge that moves the boundaries.
+"""Deposit of electrons in pixels, spilling, and the frozen charge that moves the boundaries.
 
-The image is the truth.  While a block of photons lasts, the charge that moves boundaries
+The image holds the charge.  While a block of photons lasts, the charge that moves boundaries
 is frozen; electrons go into the image at once, in the order of the photons, and the first
-in a pixel notes it in a list.  When the block ends the listed pixels are taken over, with
-half of what they gained in the block added again: the mean charge of the next one.
+in a pixel enters the pixel in a list.  When the block ends the charge of the listed pixels is
+updated, with half of what they gained in the block added again: the expected mean charge of the
+next block.
 """
 
 from typing import NamedTuple
@@ -14,25 +15,41 @@ import numpy as np
 from bfsensor._kernels.hot import cool, heat
 
 TILE = 16
-REFRESH = 256
-"""Changes of a tile's pixels after which its range is found anew: once for its size."""
-STALE = np.float32(512.0)
-"""Electrons [e-] a pixel may gain before the background of its neighbours is found anew."""
+"""Side of the square tiles for which bounds of the charge are kept [pixel].
 
-# Counters, int64.
+Chosen: a power of two, for ``edges`` and ``hot`` have it written out as 16 and as shifts by 4 bits;
+twice as large, a bound covers four times as many pixels and more electrons are decided at the
+edges themselves."""
+REFRESH = 256
+"""Number of changes of a tile's pixels after which its range of charges is found again.
+
+Derived: :data:`TILE` squared, so that a search over a tile costs one pixel per change."""
+STALE = np.float32(512.0)
+"""Charge that a pixel may gain before the background of its neighbours is found again [e-].
+
+Chosen: the background of a pixel, the mean of eight neighbours, is then out of date by less than
+this; twice as large, by twice as much, and the search is made half as often."""
+
+# Indices of the counters, int64: numbers of listed pixels in this block and in the last, whether
+# the list is full in this block and was in the last, flagged tiles, photons, pixels beyond the
+# response, photons when the block began, full pixels that were met.
 (
     LISTED, LISTED_BEFORE, DENSE, DENSE_BEFORE, FLAGGED, PHOTONS, BEYOND, OPENED, STRUCK,
 ) = range(9)  # fmt: skip
 N_COUNTERS = 9
-# Sums, float64.
+"""Number of counters, by definition that of the names above."""
+# Indices of the sums [e-], float64: flux of this block, of the last and of the exposure; what was
+# added, spilled, spilled off the image, crossed the silicon, fell outside, and was lost.
 IN_BLOCK, BEFORE, TOTAL, ADDED, SPILLED, SPILLED_OFF, CROSSED, OFF_IMAGE, LOST = range(9)
 N_SUMS = 9
+"""Number of sums, by definition that of the names above."""
 
 
 class Response(NamedTuple):
-    """Effective charge of both modes against charge and background, on equal steps.
+    """Effective charge of both modes by charge and background, on equal steps [e-].
 
-    Sizes 0 for a sensor that is linear: the effective charge is the charge.
+    Arrays of size 0 stand for a linear sensor, whose effective charge is the charge.
+    ``last_charge`` and ``last_background`` are the ends of the grid, in steps.
     """
 
     first: np.ndarray
@@ -44,10 +61,15 @@ class Response(NamedTuple):
 
 
 class Ledger(NamedTuple):
-    """What an exposure keeps: see the module.  Arrays are changed in place.
+    """State of an exposure, see the module; arrays are changed in place.
 
-    ``strikes`` [rows, columns] counts the electrons that met a full pixel in the block,
-    ``struck`` lists these pixels.
+    ``charge`` is the frozen charge of each pixel [e-], ``carry`` [rows, columns] what single
+    precision loses of the image, ``listed`` the pixels that gained charge in the block and
+    ``gained`` how much, ``listed_before`` those of the last block.  ``high_*`` are the largest
+    effective charges by tile, ``changes`` the number of changes since they were found, ``flags``
+    and ``flagged`` the tiles whose bounds are out of date.  ``spill_from`` and ``spill_to`` [side,
+    column] is where a column was full when it last spilled.  ``strikes`` [rows, columns] counts
+    the electrons that met a full pixel in the block, ``struck`` lists these pixels.
     """
 
     charge: np.ndarray
@@ -102,7 +124,7 @@ def _flag(ledger, tile):
 
 @numba.njit(cache=True, inline="always")
 def _set_pixel(charges, ledger, response, j, i, ahead):
-    """Find the effective charge of a pixel anew, ``ahead`` electrons on."""
+    """Update the effective charge of a pixel, with ``ahead`` electrons added to its charge."""
     at = np.uint64((j + charges.pad) * charges.stride + i + charges.pad)
     q = ledger.charge[at]
     second = np.float32(0.0)
@@ -133,7 +155,7 @@ def _set_pixel(charges, ledger, response, j, i, ahead):
 
 @numba.njit(cache=True, _nrt=False)
 def _find_range(charges, ledger, tile):
-    """Find the lowest and highest effective charge of a tile; outside the image is 0."""
+    """Find the lowest and highest effective charge of a tile; it is 0 outside the image."""
     tiles_x = (charges.nx + TILE - 1) // TILE
     tiles_y = (charges.ny + TILE - 1) // TILE
     row = tile // tiles_x
@@ -260,7 +282,7 @@ def _respond(response, charge, first, second, stride, start, count):
 
 @numba.njit(cache=True, nogil=True, _nrt=False)
 def take_image(image, charges, ledger, response, edges, ahead):
-    """Take the charge of the whole image over, ``ahead`` of each pixel's gain in advance."""
+    """Update the frozen charge from the whole image; ``ahead`` times each pixel's gain is added."""
     modes = response.first.size > 0
     first = charges.first
     charge = ledger.charge
@@ -309,7 +331,7 @@ def take_image(image, charges, ledger, response, edges, ahead):
 
 @numba.njit(cache=True, _nrt=False)
 def _heat_pixel(edges, charges, hot, j, i, electrons, crowd):
-    """Note the edges of a pixel as hot if ``crowd`` electrons come near one."""
+    """Mark the edges of a pixel as hot if ``crowd`` electrons come near one of them."""
     margin = charges.margins[(j // TILE) * ((charges.nx + TILE - 1) // TILE) + i // TILE]
     if electrons * min(np.float32(4.0) * margin, np.float32(1.0)) >= crowd:
         heat(edges, charges, hot, 0, i, j)
@@ -320,10 +342,10 @@ def _heat_pixel(edges, charges, hot, j, i, electrons, crowd):
 
 @numba.njit(cache=True, nogil=True, _nrt=False)
 def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_photon):
-    """Take over what the block brought, ``ahead`` of each pixel's gain in advance.
+    """Update the charge with what the block brought; ``ahead`` times each pixel's gain is added.
 
-    The edges of pixels where ``crowd`` electrons or more came near one are noted as
-    hot; ``per_photon``: electrons per photon.
+    The edges of pixels where ``crowd`` electrons or more came near one are marked as
+    hot; ``per_photon`` is the number of electrons per photon.
     """
     cool(hot)
     if ledger.counters[DENSE] or ledger.counters[DENSE_BEFORE]:
@@ -398,7 +420,7 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_
 
 @numba.njit(cache=True, inline="always")
 def _put(image, charge, carry, listed, counters, at, nx, j, i, flux):
-    """Add electrons to a pixel; what single precision loses is carried."""
+    """Add electrons to a pixel; what single precision loses is kept in ``carry``."""
     before = image[j, i]
     if np.float32(before) == charge[np.uint64(at)] and counters[DENSE] == 0:
         count = counters[LISTED]
@@ -422,7 +444,7 @@ def _put(image, charge, carry, listed, counters, at, nx, j, i, flux):
 
 @numba.njit(cache=True, _nrt=False)
 def _spill(image, charges, ledger, j, i, flux, full_well, along_y, up):
-    """Fill a pixel, then those beyond it along its column; returns what stays inside."""
+    """Fill a pixel, then those beyond it along its column; returns the flux that stays inside [e-]."""
     charge, carry = ledger.charge, ledger.carry
     listed, counters = ledger.listed, ledger.counters
     corner = charges.pad * charges.stride + charges.pad
@@ -486,7 +508,7 @@ def _strike(ledger, j, i, nx):
 def deposit(
     image, charges, ledger, flux, first, i, j, z, words, lo, hi, full_well, along_y, loss
 ):
-    """Put the electrons lo to hi into the image in their order; returns what stays.
+    """Add the electrons lo to hi to the image in their order; returns the flux that stays [e-].
 
     ``flux`` is indexed from ``first``, all else from 0.  An electron is lost with
     probability 1 - exp(-loss Q), Q [e-] the charge that it meets.

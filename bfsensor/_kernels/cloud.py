@@ -1,8 +1,8 @@
-"""Electrons of one cloud on their way together: drift, diffusion, mutual repulsion.
+"""Simultaneous transport of the electrons of one cloud: drift, diffusion, mutual repulsion.
 
-The repulsion is that of a cloud whose charge depends on the distance from its middle
-alone: an electron feels the charge nearer to the middle, as if it sat there.  Sorted by
-distance that is a sum of N log N operations; ``pair_field`` sums over all pairs.
+The repulsion is that of a cloud whose charge depends only on the distance from its middle:
+an electron feels the charge nearer to the middle, as if it sat there.  Sorted by distance that
+sum takes N log N operations; ``pair_field`` sums over all pairs.
 """
 
 import numba
@@ -23,9 +23,10 @@ from bfsensor._kernels.transport import (
 
 @numba.njit(cache=True)
 def shell_field(p, active, strength, out):
-    """Field [V/um] of a cloud on its electrons, each as if the others lay on shells.
+    """Write the field [V/um] of a round cloud on its electrons to ``out``; returns the rms radius [um].
 
-    ``strength`` [V um]: field of one electron times the distance squared.
+    Electrons are taken as spread over shells.  ``strength`` [V um] is the field of one electron
+    times the distance squared.
     """
     count = 0
     middle = np.zeros(3)
@@ -63,7 +64,7 @@ def shell_field(p, active, strength, out):
 
 @numba.njit(cache=True)
 def pair_field(p, active, strength, softening, out):
-    """The same summed over all pairs, softened within ``softening`` [um]."""
+    """Write the field [V/um] summed over all pairs, softened within ``softening`` [um], to ``out``."""
     out[:] = 0.0
     for n in range(p.shape[0]):
         if not active[n]:
@@ -89,10 +90,12 @@ def drift_together(
     phi, xs, ys, zs, room, pace, kt, law, strength, pairs, starts, numbers, key0, key1, out,
     out_fate,
 ):  # fmt: skip
-    """Trace the electrons of a cloud to the wells, all in the same time.
+    """Trace the electrons of a cloud to the wells, in steps of the same time for all.
 
-    ``law`` of the mobility; ``strength`` as in ``shell_field``, 0: no repulsion; ``pairs``:
-    softening [um] of the sum over pairs, negative: shells.  ``out`` (n, 3), ``out_fate``.
+    ``kt`` [V] is the temperature of the diffusion and ``law`` that of the mobility; ``strength``
+    is as in ``shell_field``, 0 for no repulsion; ``pairs`` is the softening [um] of the sum over
+    pairs, negative for shells.  ``out`` (n, 3) gets the last positions, ``out_fate`` (n,) the
+    fates.
     """
     total = starts.shape[0]
     cell = np.ones(3, np.int64)

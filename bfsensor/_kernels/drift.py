@@ -1,4 +1,4 @@
-"""Field lines in an interpolated potential.
+"""Field lines in an interpolated potential: wells that electrons reach, and boundaries between them.
 
 The potential is interpolated by cubic Hermite polynomials in each direction, slopes at
 the nodes from the parabola through three neighbours (non-uniform mesh): the field is
@@ -59,7 +59,7 @@ def _weights(nodes, i, value, w, d):
 
 @numba.njit(cache=True)
 def gradient(phi, xs, ys, zs, x, y, z, cell, weights, out):
-    """Gradient of the potential [V/um] at a point, to ``out``; ``cell`` remembers the place."""
+    """Write the gradient of the potential [V/um] at a point to ``out``; ``cell`` keeps the interval."""
     i = _cell(xs, x, cell[0])
     j = _cell(ys, y, cell[1])
     k = _cell(zs, z, cell[2])
@@ -111,15 +111,23 @@ def _slope_along(phi, xs, ys, zs, p, sign, cell, weights, g, out):
 
 
 ANY_TURN = 3.0
-"""More than the difference of two unit vectors: steps are not shortened."""
+"""Limit on the turn within a step that no step exceeds, so that steps are not shortened.
+
+Derived: the difference of two unit vectors is at most 2."""
 
 SHORTEST = 0.1
-"""Part of its usual length to which a step is shortened: where the field is weak and turns
-everywhere a path would else take minutes."""
+"""Length, relative to the usual one, below which a step is not halved further.
+
+Chosen: where the field is weak and turns everywhere a path would take minutes without this limit;
+twice as large, a step is halved three times instead of four."""
 
 
 LEAVE = 0.5
-"""Off an edge [um] a path does not come back to it: boundaries shift by less."""
+"""Distance from an edge beyond which a path is not followed in the first bisection [um].
+
+Chosen: boundaries shift by less, so that a path does not come back; the last two points are followed
+all the way, and a wrong decision leads to a second bisection.  Twice as large gives the same
+boundaries in more time."""
 
 
 @numba.njit(cache=True, inline="always")
@@ -228,7 +236,7 @@ def _bisect(
     phi, xs, ys, zs, point, axis, edge, a, b, tolerance, zone, coarseness, max_steps, scratch,
     cell, turn, leave,
 ):  # fmt: skip
-    """Ends of the interval that is left, nan where there is no watershed."""
+    """Ends of the last interval of the bisection, nan where both ends reach the same side."""
     end = np.zeros(3)
     found = False
     for _ in range(8):
@@ -383,7 +391,7 @@ def trace_up(phi, xs, ys, zs, seeds, depths, ratio, out):
 
 @numba.njit(cache=True)
 def trace_down(phi, xs, ys, zs, starts, zone, coarseness, max_steps, out_path, out_length):
-    """Follow electrons down and keep every point: ``out_path`` (n, max_steps, 3)."""
+    """Follow electrons down; ``out_path`` (n, max_steps, 3) gets the points, ``out_length`` how many."""
     scratch = np.zeros((13, 4))
     cell = np.ones(3, np.int64)
     p = np.zeros(3)

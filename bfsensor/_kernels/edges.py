@@ -1,14 +1,14 @@
-"""Which pixel collects an electron: the displaced boundaries, evaluated where it lands.
+"""Assignment of electrons to pixels by the displaced boundaries, evaluated where they land.
 
-Boundaries are kept nowhere.  The shift of a point of an edge is the sum of weights times
+Boundaries are not stored.  The shift of a point of an edge is the sum of weights times
 effective charges in a window of pixels around the edge; edges are polylines through their
 displaced points.
 
 Most electrons are further from any edge than edges can move (``margins``, a bound from
 the range of charges nearby) and stay in the pixel they land in.  Next to an edge the
 normal shift of the nearest point decides, unless the electron is closer than the error of
-that (``Edges.doubts``, a bound as well); then the polyline itself does.  The result is that of
-the polylines in all cases.
+that shift (``Edges.doubts``, a bound as well); then the polyline itself decides.  The result is
+that of the polylines in all cases.
 
 Lines are numbered as in :mod:`bfsensor._kernels.shifts`.
 """
@@ -33,7 +33,7 @@ def _crossing(weights, sums, points, nearest, first, second, g, upright, layer, 
               along, limit, scale, low_first, low_second):  # fmt: skip
     """Normal shift [pixel] of the polyline ``line`` where it passes ``along`` [pixel].
 
-    The edges of a line follow one another; the walk starts where the tangential shift of
+    The edges of a line follow one another; the search starts where the tangential shift of
     the nearest point suggests and goes to the segment whose displaced ends enclose
     ``along``.
     """
@@ -102,9 +102,9 @@ def _crossing(weights, sums, points, nearest, first, second, g, upright, layer, 
 
 @numba.njit(cache=True, nogil=True, _nrt=False)
 def collect(edges, charges, hot, x, y, z, lo, hi, near_x, near_y, out_i, out_j):
-    """Pixel (i, j) of the electrons lo to hi; i = -1 for those outside the image or lost.
+    """Find the pixels (i, j) of the electrons lo to hi; i = -1 for those outside the image or lost.
 
-    ``near_x`` and ``near_y``: room for hi - lo indices.
+    ``near_x`` and ``near_y`` are scratch for hi - lo indices.
     """
     nx, ny = charges.nx, charges.ny
     margins = charges.margins
@@ -143,7 +143,7 @@ def collect(edges, charges, hot, x, y, z, lo, hi, near_x, near_y, out_i, out_j):
 
 @numba.njit(cache=True, inline="always")
 def _nearest_line(across, along, upright, columns, rows):
-    """Line next to an electron, how far beyond that it is, its row or column, its tile."""
+    """Line nearest to an electron, its distance beyond it, its row or column, and its tile."""
     line = np.int64(across + 1.5) - 1
     beyond = across - line
     other = np.int64(along + 1.0) - 1

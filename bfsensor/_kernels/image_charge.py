@@ -2,7 +2,7 @@
 
 Units: lengths [um]; fields are those of one positive unit charge times 4 pi epsilon
 [1/um^2].  All rectangles have their sides along x and y and their centre at x = y = 0.
-What lies beyond the summed images enters as the two lowest terms of their potential,
+The images that are not summed enter through the two lowest terms of their potential,
 ``tail[0] z + tail[1] (z^3 - 1.5 z rho^2)``, averaged over the rectangle.
 """
 
@@ -12,7 +12,7 @@ from numba import njit
 
 @njit(cache=True, error_model="numpy")
 def across(u, v, h, half_u, half_v):
-    """Field along u, a side's direction, at (u, v) and ``h`` above a rectangle, times its area.
+    """Field along u, the direction of a side, at (u, v) and ``h`` above a rectangle, times its area.
 
     One logarithm for the four corners.  v + r loses digits where v < 0: the field is even
     in v, so only the near corner can be there, and it is rewritten.

@@ -11,6 +11,7 @@ TEXT = (
     "compiling kernels, which happens once: about 35 s for a first image, 10 s for a first "
     "table; `bfsensor warm` does it ahead of use"
 )
+"""Text of the notice."""
 
 
 class CompilationNotice(event.Listener):
@@ -22,14 +23,14 @@ class CompilationNotice(event.Listener):
     Attributes
     ----------
     given : bool
-        Whether it was logged; True beforehand keeps it silent.
+        Whether the notice was logged; set to True beforehand, it is never logged.
     """
 
     def __init__(self):
         self.given = False
 
     def on_start(self, event):
-        """Log the notice unless it was, or this is a worker whose parent does."""
+        """Log the notice unless it was logged, or this is a worker whose parent process logs it."""
         kernel = event.data["dispatcher"].py_func.__module__
         if self.given or not kernel.startswith("bfsensor._kernels"):
             return
@@ -38,7 +39,7 @@ class CompilationNotice(event.Listener):
             logging.getLogger("bfsensor").warning(TEXT)
 
     def on_end(self, event):
-        """Nothing is said when a kernel is finished."""
+        """Do nothing when a kernel is finished; numba's interface asks for this method."""
 
 
 notice = CompilationNotice()

@@ -1,9 +1,9 @@
-"""How field lines, and the boundary between two wells, move when the potential changes.
+"""Derivatives of field lines, and of the boundary between two wells, by changes of the potential.
 
-The linearised equations of the paths of :mod:`bfsensor._kernels.drift`, with the same steps.
-``phi`` and its nodes are as there.  What changes comes in two kinds, in this order: changes of
-the potential on nodes that stay, and potentials a small step of a quantity further, on nodes
-that moved with it.
+The linearised equations of the paths of :mod:`bfsensor._kernels.drift` are integrated with the same
+steps.  ``phi`` and its nodes are as there.  Changes come in two kinds, in this order: derivatives of
+the potential on nodes that stay, and potentials of a device with a quantity changed by a small
+step, on nodes that moved with it.
 """
 
 from typing import NamedTuple
@@ -15,11 +15,11 @@ from bfsensor._kernels.drift import SHORTEST, _cell, _weights, gradient, turns
 
 
 class Changes(NamedTuple):
-    """Changes of a potential.
+    """Changes of a potential by several quantities of the device.
 
-    ``still`` is ``[y, z, x, change]`` [V a unit], padded as the potential; ``moved``
-    ``[change, y, z, x]`` [V] are the potentials ``steps`` further, ``x``, ``y``, ``z``
-    ``[change, node]`` [um] their nodes.
+    ``still`` ``[y, z, x, change]`` are derivatives [V per unit], padded as the potential; ``moved``
+    ``[change, y, z, x]`` are potentials [V] where a quantity is changed by ``steps`` [unit], and
+    ``x``, ``y``, ``z`` ``[change, node]`` the positions of their nodes [um].
     """
 
     still: np.ndarray
@@ -54,7 +54,7 @@ def _bends(nodes, i, value, b):
 
 @numba.njit(cache=True)
 def _field_and_changes(phi, changes, xs, ys, zs, p, cell, weights, g, hess, out):
-    """Gradient and its derivatives (xx, xy, xz, yy, yz, zz), gradients of the changes (n, 3)."""
+    """Write the gradient, its derivatives (xx, xy, xz, yy, yz, zz) and the changes' gradients (n, 3)."""
     i = _cell(xs, p[0], cell[0])
     j = _cell(ys, p[1], cell[1])
     k = _cell(zs, p[2], cell[2])
@@ -165,14 +165,14 @@ def boundary_changes(
     out_early,
     out,
 ):
-    """Shift along ``axis`` of points ``seeds`` (n, 3) of a boundary, to ``out`` (n, changes).
+    """Write the shifts along ``axis`` of boundary points ``seeds`` (n, 3) to ``out`` (n, changes).
 
-    An electron that starts on the boundary must stay on it: of its deviation some way down,
-    the part that a shift of the start makes cancels that which the change of the potential
-    makes.  The first grows on the way; what is further down counts with its inverse, and
-    beyond a ``growth`` of 1e3 for next to nothing; ``out_early`` gets what was found when it
-    had grown by ``early``.  Steps are those with which the seeds were found, for on the boundary
-    of another step the deviation would leave before it has grown.
+    An electron that starts on the boundary must stay on it: some way down, the deviation that a
+    shift of the start makes cancels the deviation that the change of the potential makes.  The
+    first grows on the way; changes of the potential further down count with the inverse of its
+    growth, so that the descent ends at ``growth``; ``out_early`` gets the shift found when it had
+    grown by ``early``.  Steps are those with which the seeds were found: with other steps the
+    boundary lies a little elsewhere, and the path would leave it before the deviation has grown.
     """
     n = out.shape[1]
     p = np.zeros(3)
@@ -266,7 +266,7 @@ def _ascent(phi, changes, xs, ys, zs, p, delta, cell, weights, g, hess, push, ou
 def trace_changes_up(
     phi, changes, xs, ys, zs, seeds, first, axis, depths, ratio, out, out_slopes
 ):
-    """Carry shifts of seeds along ``axis``, ``first`` (n, changes), up field lines.
+    """Carry shifts of seeds along ``axis``, ``first`` (n, changes), up the field lines.
 
     ``out`` (n, depths, changes, 2) gets the shifts in x and y at each depth, ``out_slopes``
     (n, depths, 2) the slopes dx/dz and dy/dz there; steps are those of

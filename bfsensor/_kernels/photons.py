@@ -1,4 +1,4 @@
-"""From photons at the surface to electrons above the wells: depth, angle, diffusion.
+"""Conversion of photons at the surface to electrons above the wells: depth, angle, diffusion.
 
 Positions out are in pixels from the lower left corner of the image: pixel (j, i) holds
 x from i to i + 1 and y from j to j + 1.
@@ -12,14 +12,33 @@ import numpy as np
 from bfsensor._kernels.counter_rng import deviates, words
 
 BUFFER = 1024
+"""Number of photons in a buffer of deviates.
+
+Chosen: four buffers of single precision, 16 kB, stay in the first-level cache; twice as large gives
+the same bits."""
 LOST = np.float32(-1.0)
+"""Height of a photon that crossed the silicon, by definition below the gates."""
 _ORIGIN_STEPS = 64
-_FLATTEST, _STEEPEST = 0.02, 50.0  # relative areas of pixels
-_ORIGIN_TOLERANCE = 1e-6  # pixel
+"""Largest number of steps of the search for the origin of a shifted point; the last one counts.
+
+Chosen: rings take four steps; twice as many change only points where pixels overlap."""
+_FLATTEST, _STEEPEST = 0.02, 50.0
+"""Bounds on the slope of a secant step, the relative size of pixels under a shift.
+
+Chosen: pixels next to a guard ring are several times too large or small, well inside; with a range
+twice as wide a step may go further in the wrong place."""
+_ORIGIN_TOLERANCE = 1e-6
+"""Largest distance between a point and its shifted origin at which the search ends [pixel].
+
+Chosen: half of the 2e-6 pixel by which bounds of edges are widened for rounding; twice as large,
+origins may be off by as much as that."""
 
 
 class Light(NamedTuple):
-    """What the photons bring; arrays that are not allocated have size 0."""
+    """Photons: positions [pixel], flux [e-], slopes dx/dz and dy/dz, wavelengths [nm].
+
+    Arrays that the photons do not have are of size 0.
+    """
 
     x: np.ndarray
     y: np.ndarray
@@ -30,12 +49,13 @@ class Light(NamedTuple):
 
 
 class Medium(NamedTuple):
-    """The silicon: heights in um above the gates.
+    """The silicon: thickness [um], pitch [um], absorption lengths and diffusion.
 
-    ``lengths`` [um] at wavelengths ``wavelength_0 + n wavelength_step`` [nm], the ends held
-    beyond; ``variance`` [um^2] of the diffusion at heights ``n thickness / (size - 1)``.
-    ``kept_path`` [um]: deeper photons convert there (inf: they are lost); with
-    ``kept_slanted`` only those that carry angles do.
+    ``lengths`` are absorption lengths [um] at wavelengths ``wavelength_0 + n wavelength_step`` [nm],
+    held at the ends beyond them; ``variance`` is that of the diffusion [um^2] at heights
+    ``n thickness / (size - 1)``.  ``surface_path`` is the depth [um] at which photons without
+    wavelength convert.  Photons that would convert deeper than ``kept_path`` [um] convert there
+    (inf: they are lost); with ``kept_slanted`` this holds only for photons with angles.
     """
 
     thickness: float

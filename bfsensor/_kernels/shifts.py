@@ -1,6 +1,6 @@
 """Shifts of the points of pixel edges: sums of weights times charges in a window.
 
-Boundaries are kept nowhere: what moves them is evaluated where it is needed.
+Boundaries are not stored: their shifts are evaluated where they are needed.
 
 A vertical edge runs along y between two pixels of a row, a horizontal edge along x.  The
 line of vertical edges ``line`` lies left of the pixels in column ``line``.
@@ -15,7 +15,9 @@ from bfsensor._kernels.counter_rng import log_single
 from bfsensor._kernels.window import sum_8, sum_16, two_sums_8, two_sums_16
 
 NORMAL = 0
+"""Index of the shift across an edge, by definition of the layout of ``Edges.weights``."""
 TANGENTIAL = 1
+"""Index of the shift along an edge, by definition of the layout of ``Edges.weights``."""
 
 
 class Edges(NamedTuple):
@@ -78,7 +80,7 @@ class Charges(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """The numbers that say where a window lies: all that is not an array."""
+    """Sizes and offsets from which the place of a window follows, apart from the arrays."""
 
     reach: int
     lanes: int
@@ -95,6 +97,7 @@ class Grid(NamedTuple):
 
 @numba.njit(cache=True, inline="always")
 def grid(edges, charges):
+    """Collect the sizes and offsets of edges and charges."""
     return Grid(
         edges.reach, edges.lanes, edges.layers, edges.modes, charges.stride, charges.pad,
         edges.starts[0], edges.starts[1], edges.starts[2], edges.starts[3],
@@ -104,7 +107,7 @@ def grid(edges, charges):
 
 @numba.njit(cache=True, inline="always")
 def _places(g, upright, layer, point, component, line, other):
-    """Where the weights of a point and its window begin, in both modes, and their rows."""
+    """First indices of a point's weights and of its window, and their rows, in both modes."""
     q = g.reach
     side = 0 if upright else 1
     place = (layer * 2 + component) * g.points + point

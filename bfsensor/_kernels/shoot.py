@@ -1,4 +1,4 @@
-"""Photons into an image: land, find pixels, deposit, block by block.
+"""Accumulation of photons in an image: landing, pixels and deposit, block by block.
 
 A block ends with the photon at which the flux since its start reaches its size.  Blocks
 depend on the photons' order and flux alone.
@@ -25,14 +25,23 @@ from bfsensor._kernels.hot import evaluate, fence
 from bfsensor._kernels.photons import land
 
 BATCH = 65536
+"""Number of photons that land together while those of the batch before are deposited.
+
+Chosen: buffers of a few MB; twice as large takes twice that and gives the same bits."""
 PIECE = 2048
+"""Smallest share of a batch that is worth a thread [photon].
+
+Chosen: at some 40 ns a photon a share takes 0.1 ms, far more than to wake a thread; twice as large,
+small batches are spread over fewer shares, with the same bits."""
 
 
 class Plan(NamedTuple):
-    """How the charge is frozen: block size [e-] (0: never renewed), predicted or not.
+    """Settings of an exposure: blocks of frozen charge, full well, spilling, random numbers.
 
-    With prediction blocks start at 1/64 of the size and double.  ``loss`` [1/e-]: see
-    :func:`deposit`.
+    ``block`` is the size of a block [e-] (0: the charge is never updated); with ``predict`` the
+    charge is extrapolated to the middle of the next block, and blocks start at 1/64 of the size and
+    double.  ``full_well`` [e-]; ``x0``, ``y0`` [pixel] is the lower left corner of the image;
+    ``loss`` [1/e-] is explained in :func:`deposit`.
     """
 
     block: float
@@ -56,7 +65,7 @@ def _size(plan, total):
 
 @numba.njit(cache=True, nogil=True)
 def finish_block(image, plan, edges, charges, hot, ledger, response):
-    """End the open block: its charge is taken over, hot edges are noted."""
+    """End the open block: update the frozen charge and mark hot edges."""
     ahead = np.float32(0.0)
     if plan.predict and ledger.sums[IN_BLOCK] > 0:
         ahead = np.float32(0.5)
@@ -77,7 +86,7 @@ def finish_block(image, plan, edges, charges, hot, ledger, response):
 
 @numba.njit(cache=True, nogil=True)
 def renew(image, plan, edges, charges, hot, ledger, response):
-    """End the open block by hand."""
+    """End the open block between two calls, and evaluate the hot edges."""
     finish_block(image, plan, edges, charges, hot, ledger, response)
     evaluate(edges, charges, hot, 0, hot.used[1])
     fence(edges, charges, hot, 0, hot.used[1])

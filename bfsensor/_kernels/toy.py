@@ -1,4 +1,4 @@
-"""Darts at pixels whose areas follow the charge, one electron after the other.
+"""Toy model: random darts at pixels whose areas follow the charge, one electron after the other.
 
 Random words are counted (:mod:`bfsensor._kernels.counter_rng`) by dart and realisation, so
 that a realisation is the same whatever others are thrown with it.  Chances are compared
@@ -11,9 +11,12 @@ import numpy as np
 from bfsensor._kernels.counter_rng import philox
 
 LANES = 64
-"""Realisations thrown abreast: the compiler makes vector code of them."""
+"""Number of realisations that are computed side by side, so that the compiler makes vector code.
 
-_HALF = 2147483648.0  # 2^31: the word below which a fair coin falls
+Chosen: a multiple of all vector lengths; twice as large gives the same bits."""
+
+_HALF = 2147483648.0
+"""Exact: 2^31, half the range of a random word, below which it lies with probability 1/2."""
 
 
 @numba.njit(cache=True, inline="always")

@@ -1,10 +1,10 @@
-"""Electrons on their way to the wells: drift and diffusion, one at a time.
+"""Transport of electrons to the wells, one at a time: drift and diffusion.
 
-``walk`` takes large steps.  Drift and diffusion both scale with the mobility (Einstein), so
-in the time ``ds = mobility dt`` an electron obeys ``dX = E ds + sqrt(2 kT) dW``: where it ends
-does not depend on the mobility, and the noise is additive.  Heun's method is then of second
-order in the mean.  ``scatter`` flies freely between collisions, at constant speed in random
-directions, with the drift velocity of the field on top.
+The first of two engines takes large steps.  Drift and diffusion both scale with the mobility
+(Einstein), so in the time ``ds = mobility dt`` an electron obeys ``dX = E ds + sqrt(2 kT) dW``: its
+last position does not depend on the mobility, and the noise is additive.  Heun's method is then of
+second order in the mean.  The second, ``scatter``, takes free flights between collisions, at
+constant speed in random directions, with the drift velocity of the field on top.
 
 Random numbers are counted by electron and step, and so do not depend on threads or on
 what else is traced.  Positions are in um; ``phi, xs, ys, zs`` as in ``_kernels.drift``.
@@ -19,17 +19,17 @@ from bfsensor._kernels.counter_rng import log_uniform, philox, sine_cosine
 from bfsensor._kernels.drift import gradient
 
 ARRIVED, ABSORBED, LOST = 0, 1, 2
-"""What became of an electron: in a well, taken by the back surface, out of steps."""
+"""Fates of an electron: collected by a well, lost at the back surface, or out of steps."""
 
 
 class Room(NamedTuple):
-    """Where electrons may go.
+    """Limits of the domain and of the silicon.
 
-    ``box``: lowest x, highest x, lowest y, highest y [um] of the domain; beyond them it goes
-    on periodically or as in a mirror.  ``thickness`` [um]: electrons are reflected
-    there, or absorbed with the probability ``absorbed`` at each visit.  ``surface``: height of
-    the silicon in the channel and in the channel stop [um], half width of the stop, width
-    of the taper [um], pitch in x [um]; reflects as well.  ``zone`` as in ``drift.find_well``.
+    ``box`` is lowest x, highest x, lowest y, highest y [um] of the domain; beyond them it is
+    continued periodically or mirrored.  At ``thickness`` [um] electrons are reflected, or absorbed
+    with the probability ``absorbed`` at each visit.  ``surface`` holds the height of the silicon
+    in the channel and in the channel stop, the half width of the stop, the width of the taper and
+    the pitch in x [um]; it reflects as well.  ``zone`` is as in ``drift.find_well``.
     """
 
     box: np.ndarray
@@ -42,7 +42,7 @@ class Room(NamedTuple):
 
 
 class Pace(NamedTuple):
-    """Steps of ``walk``: a part of the height above the silicon, within bounds [um], so many."""
+    """Lengths of large steps: a part of the height above the silicon, bounds [um], largest number."""
 
     part: float
     shortest: float

@@ -1,4 +1,4 @@
-"""The sum at the heart of the sensor: weights times the charges in a window of pixels.
+"""Vector code for the innermost sum of the sensor: weights times the charges in a pixel window.
 
 LLVM does not vectorise these short rows by itself; written out with vectors of eight
 floats the sum is four times as fast.  Eight partial sums are added pairwise, always in
@@ -13,6 +13,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 _EIGHT = ir.VectorType(ir.FloatType(), 8)
+"""Type of eight single-precision numbers, by definition what AVX registers of 256 bits hold."""
 
 
 def _make(blocks, streams):

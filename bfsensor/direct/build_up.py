@@ -1,11 +1,11 @@
-"""The direct simulation: electrons one by one, charge fed back into Poisson's equation.
+"""Build-up of an exposure electron by electron, the charge fed back into Poisson's equation.
 
 A spot is built up in steps (Lage, Bradshaw & Tyson 2017, section 4): solve for the charge
 that is there, send the next electrons through that field, add them to the wells they
 reach, solve again.  The same electrons, with the same random numbers, also go through the
 field of the empty sensor: differences between both images are the brighter-fatter effect,
-with a fraction of the noise of either.  Flats are held against the field of evenly filled wells:
-what is left is the effect of the pixels' differences alone.
+with a fraction of the noise of either.  Flats are compared with the field of evenly filled wells
+instead: the difference is the effect of the pixels' unequal charges alone.
 
 The charge that the field is solved for is that of the middle of the step, half of what
 the step brings to the empty sensor added: without it the field lags behind the charge by
@@ -32,8 +32,10 @@ if TYPE_CHECKING:
     from bfsensor.device.device import Device
 
 TOLERANCE = 1e-4
-"""Iteration error [V] of a step's field: 3 % of what 100 electrons do to the level of a well,
-which sinks by some 3e-5 V an electron."""
+"""Iteration error of the potential of a step [V].
+
+Chosen: 3 % of the change that 100 electrons make in the level of a well, which falls by some 3e-5 V
+per electron; twice as large, the error is that of 7 electrons."""
 
 
 def build_up(
@@ -53,22 +55,23 @@ def build_up(
     Parameters
     ----------
     device : Device
-        The sensor.
+        Sensor at its operating point.
     step_ends : ndarray of int, shape (steps + 1,)
-        How many electrons have come after each step, from 0.
+        Number of electrons that have come before the first and after each step, from 0.
     starts : callable
-        Gives where the electrons of consecutive numbers are set free, shape (n, 3) [um].
+        Function from consecutive electron numbers to the positions (x, y, z) where they are set
+        free, shape (n, 3) [um].
     pixels, cells : int
-        Period of the array [pixel], odd, and mesh cells a pixel.
+        Period of the array [pixel], odd, and mesh cells per pixel.
     transport : Transport
-        How electrons move.
+        Model of drift and diffusion.
     seed : int
-        Of their random numbers.
+        Seed of the electrons' random numbers.
     reference : {'empty', 'even'}
-        Field without the effect: of the empty sensor, or in each step of wells that all hold
-        the mean charge.
+        Field without the effect: that of the empty sensor, or in each step that of wells that all
+        hold the mean charge.
     progress : callable, optional
-        Called with the number of the step that is done.
+        Function that is called with the number of the step just finished, from 1.
 
     Returns
     -------
@@ -79,7 +82,7 @@ def build_up(
     Raises
     ------
     ConvergenceError
-        From the solver or the tracer.
+        A potential did not converge, or an electron found no well.
     """
     sensor = Sensor(device, pixels, cells)
     solver, empty, plain_tracer = empty_sensor(sensor)
@@ -99,7 +102,8 @@ def build_up(
         plain_image = _image(plain, pixels)
         start = empty.phi if not past else past[-1]
         if len(past) == 2:
-            # Charge grows steadily, and so does its potential.
+            # Charge grows in equal steps and the potential nearly so: a linear extrapolation
+            # saves Newton steps and leaves the solution as it is, within its tolerance.
             start = 2.0 * past[-1] - past[-2]
         potential = solver.solve(
             collected + 0.5 * plain_image, start=start, tolerance=TOLERANCE
@@ -119,7 +123,7 @@ def build_up(
 
 @dataclass(frozen=True, eq=False)
 class Sensor:
-    """A device on a mesh, known by its text."""
+    """A device on a mesh, hashable by the device's text, as a key of the cache below."""
 
     device: Device
     pixels: int
@@ -137,7 +141,7 @@ class Sensor:
 
 @lru_cache(maxsize=2)
 def empty_sensor(sensor: Sensor) -> tuple[Electrostatics, Potential, Tracer]:
-    """Solve the sensor without charge, once a process."""
+    """Solver, potential and tracer of the sensor without charge; cached for two sensors."""
     mesh = make_mesh(
         sensor.device, pixels=(sensor.pixels, sensor.pixels), cells=sensor.cells,
         symmetric=False,

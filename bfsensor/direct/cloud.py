@@ -1,4 +1,4 @@
-r"""Clouds of electrons that X-rays set free: they repel one another on their way.
+r"""Clouds of electrons set free by X-rays, which repel one another while they drift.
 
 A 5.9 keV photon of Fe55 makes 1620 electrons within some tenths of a micrometre.  Their
 repulsion adds to the diffusion in the first micrometres; the holes leave for the back
@@ -22,10 +22,16 @@ FE55_ELECTRONS = 1620
 """Electrons of a Mn K-alpha photon: 5.898 keV / 3.64 eV a pair (Janesick 2001, chapter 2)."""
 
 FE55_LENGTH = 28.8
-"""Attenuation length of 5.9 keV photons in silicon [um]: an estimate, good to some 5 %, from a mass
-attenuation near 150 cm^2/g (published simulations: 30 um)."""
+"""Attenuation length of 5.9 keV photons in silicon [um].
+
+Chosen: an estimate, good to some 5 %, from a mass attenuation coefficient near 150 cm^2/g (the
+published simulations take 30 um); at twice the length clouds convert twice as deep on average."""
 
 _MOST_STEPS = 20_000
+"""Largest number of common steps of a cloud; beyond it a ConvergenceError is raised.
+
+Chosen: a step is one of the slowest electron of the cloud; twice as many only make a failure take
+twice as long."""
 
 
 def fe55_cloud(
@@ -37,26 +43,39 @@ def fe55_cloud(
     Parameters
     ----------
     seed : int
-        Of the random numbers.
+        Seed of the random numbers, 0 or more.
     place : tuple of float
-        (x, y) [um].
+        Position (x, y) of the photon [um].
     thickness : float
-        Of the silicon [um].
+        Thickness of the silicon [um], above 4.
     radius : float
-        Rms radius of the cloud along an axis [um]; 0.2 as in the published simulations.
+        Rms radius of the cloud along an axis [um], above 0; 0.2 as in the published simulations.
     electrons : int
-        How many.
+        Number of electrons, 1 or more.
     height : float, optional
-        Of the middle above the gates [um]; by default drawn from the attenuation length.
+        Height of the cloud's middle above the gates [um]; by default drawn from the attenuation
+        length, from 4 um on.
 
     Returns
     -------
     starts : ndarray, shape (electrons, 3)
-        [um], within the silicon from 2 um above the gates.
+        Positions (x, y, z) where electrons are set free [um], within the silicon from 2 um above
+        the gates.
+
+    Raises
+    ------
+    SimulationError
+        The radius is not above 0, or there are no electrons.
+
+    Examples
+    --------
+    >>> starts = fe55_cloud(seed=8231, place=(0.0, 0.0), thickness=100.0, height=80.0)
+    >>> starts.shape, bool(abs(starts[:, 2].mean() - 80.0) < 0.05)
+    ((1620, 3), True)
     """
     if not (radius > 0 and electrons >= 1):
         raise SimulationError(
-            f"a cloud needs a radius above 0 and electrons, not {radius} um and {electrons}"
+            f"cloud: radius = {radius} um must be above 0 um and electrons = {electrons} at least 1"
         )
     rng = np.random.default_rng([seed, 55])
     if height is None:
@@ -65,7 +84,7 @@ def fe55_cloud(
             np.log(lowest + rng.random() * (1 - lowest))
         )
     starts = rng.normal((*place, height), radius, (electrons, 3))
-    # What the surfaces cut off is folded back.
+    # The tail beyond the back surface is reflected; near the gates it is held at 2 um.
     starts[:, 2] = thickness - np.abs(thickness - starts[:, 2])
     return np.maximum(starts, (-np.inf, -np.inf, 2.0))
 
@@ -84,29 +103,43 @@ def trace_cloud(
     Parameters
     ----------
     tracer : Tracer
-        Of the solved field.
+        Tracer of the solved field.
     starts : array_like, shape (n, 3)
-        Where they are set free, at the same time [um].
+        Positions (x, y, z) where electrons are set free at the same time [um].
     seed : int
-        Of the random numbers.
+        Seed of the random numbers, 0 to 2^64 - 1.
     transport : Transport, optional
-        Its diffusion, steps and back surface.
+        Model of the transport, of which diffusion, steps and back surface count.
     repulsion : float
-        Relative to Coulomb's law in silicon; 0 switches it off.
+        Strength of the repulsion relative to Coulomb's law in silicon, 0 or more; 0 switches it off.
     softening : float, optional
-        Sum over all pairs, softened within this distance [um]; by default the sum over
-        shells, exact for a cloud that is round, and n / log n times cheaper.
+        Distance within which the force of a pair is softened [um]; all pairs are summed then.  By
+        default electrons feel the charge nearer to the middle, which is exact for a round cloud
+        and n / log n times cheaper.
 
     Returns
     -------
-    Electrons
+    electrons : Electrons
+        Last positions, pixels and fates.
 
     Raises
     ------
+    DeviceError
+        A start is not a number, or not in the silicon.
     SimulationError
-        A repulsion that is negative.
+        The repulsion is negative or not finite.
     ConvergenceError
-        Electrons that found no well.
+        An electron found no well.
+
+    Examples
+    --------
+    >>> from bfsensor import Device
+    >>> from bfsensor.simulate.unit_cell import solve_unit_cell
+    >>> tracer = Tracer(solve_unit_cell(Device.load("itl_sta3800c"), 0.0, cells=8))
+    >>> trace_cloud(tracer, [[1.0, 0.0, 60.0]], seed=8231, repulsion=-1.0)
+    Traceback (most recent call last):
+        ...
+    bfsensor.errors.SimulationError: repulsion = -1.0 must be 0 or more
     """
     transport = transport or Transport()
     if not (np.isfinite(repulsion) and repulsion >= 0):

@@ -1,4 +1,4 @@
-"""What spots and flats of the direct simulation share: plans, their keys, and files."""
+"""Common parts of the direct simulation's spots and flats: plans, their keys, runs and files."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ if TYPE_CHECKING:
 
 
 class ExposurePlan:
-    """What plans of spots and of flats, both frozen dataclasses, have in common."""
+    """Base class of the plans of spots and of flats, which are frozen dataclasses."""
 
     KIND: ClassVar[str]
-    """Word for messages."""
+    """Name of the exposures in messages, ``'spots'`` or ``'flats'``."""
     SCHEMA: ClassVar[str]
-    """First line of what the key is made of, and SCHEMA of the files."""
+    """Name and version of the file format, which is also part of the key."""
     KEYED: ClassVar[tuple[str, ...]]
-    """Fields beside the device in the key, in this order."""
+    """Fields of the plan that enter the key beside the device, in this order."""
     CHARGE: ClassVar[str]
-    """Field with the largest charge of a pixel [e-], to be held against the full well."""
+    """Field with the largest charge of a pixel [e-], which the full well limits."""
 
     device: Device
     steps: int
@@ -55,7 +55,7 @@ class ExposurePlan:
 
     @property
     def key(self) -> str:
-        """What tells the results of one plan from those of another."""
+        """Digest of the device and all settings, equal only for plans with equal results."""
         fields = [f"{name}={getattr(self, name)!r}" for name in self.KEYED]
         text = "\n".join([self.SCHEMA, self.device.to_toml(), *fields])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -64,8 +64,8 @@ class ExposurePlan:
         """Refuse a charge above the full well of the device, on the mesh of the plan.
 
         The field is solved for any charge, but electrons that spill are not followed.
-        The full well is solved once a process for each device and mesh, in 0.4 CPU s at 8 cells
-        a pixel and 1.3 at 16, some 1 % of a spot.  With 8 cells it is 13 % lower than with
+        The full well is solved once per process for each device and mesh, in 0.4 CPU s at 8 cells
+        per pixel and 1.3 at 16, some 1 % of a spot.  With 8 cells it is 13 % lower than with
         16 (ITL and E2V at -50 V), and it is that of a full pixel among empty ones: in a flat
         of that level the barrier is still 0.2 V higher.
 
@@ -74,7 +74,8 @@ class ExposurePlan:
         SimulationError
             The charge is above the full well.
         DeviceError
-            The device has no well to speak of, or cannot be solved.
+            The barrier of the empty well is below the device's spill barrier, or the device
+            cannot be solved.
         """
         charge = getattr(self, self.CHARGE)
         most = _full_well(self.device.to_toml(), self.cells)
@@ -85,9 +86,9 @@ class ExposurePlan:
             )
 
     def _check(self, **limits: tuple[float, float]) -> None:
-        """Refuse values that cannot be, and devices that are not fully depleted.
+        """Refuse values outside their limits, and devices that are not fully depleted.
 
-        Values of both kinds of plan come after the given ones.
+        The given limits are checked first, then those of the fields that both kinds share.
         """
         limits |= {
             "steps": (1, 100_000),
@@ -113,19 +114,19 @@ class ExposurePlan:
 
 @lru_cache(maxsize=16)
 def _full_well(device_text: str, cells: int) -> float:
-    """Full well [e-], solved once a process."""
+    """Full well of a device on a mesh [e-], cached."""
     from bfsensor.device.device import Device
 
     return full_well(Device.from_toml(device_text), cells=cells)
 
 
 def step_ends(electrons: int, steps: int) -> NDArray[np.int64]:
-    """How many electrons have come after each of equal steps, from 0 before the first."""
+    """Number of electrons that have come after each of equal steps, from 0 before the first."""
     return np.round(np.linspace(0, electrons, steps + 1)).astype(np.int64)
 
 
 class Exposed(NamedTuple):
-    """Images with the effect and without, (steps, ny, nx) [e-], and what they took [s]."""
+    """Images with the effect and without, (steps, ny, nx) [e-], and the CPU time they took [s]."""
 
     on: NDArray[np.int32]
     off: NDArray[np.int32]
@@ -148,7 +149,7 @@ def expose(
     SimulationError
         The plan has more charge than the full well.
     ConvergenceError
-        From the solver or the tracer.
+        A potential did not converge, or an electron found no well.
     """
     plan.check_full_well()
     begin = time.process_time()
@@ -166,7 +167,7 @@ def expose(
 def write_exposure(
     path: str | Path,
     schema: str,
-    cards: Mapping[str, Any],
+    keywords: Mapping[str, Any],
     on: NDArray[np.int32],
     off: NDArray[np.int32],
 ) -> None:
@@ -175,13 +176,13 @@ def write_exposure(
     Parameters
     ----------
     path : path-like
-        The file; one that is there is replaced.
+        File to write; one that exists is replaced.
     schema : str
-        What it is.
-    cards : mapping
-        Values, or pairs of value and comment, of the header.
+        Name and version of the file format, the header's SCHEMA.
+    keywords : mapping
+        Values, or pairs of value and comment, by header keyword.
     on, off : ndarray, shape (steps, ny, nx)
-        With the effect and without [e-].
+        Images with the effect and without [e-].
 
     Raises
     ------
@@ -190,7 +191,7 @@ def write_exposure(
     """
     header = fits.Header()
     header["SCHEMA"] = schema
-    for name, value in cards.items():
+    for name, value in keywords.items():
         header[name] = value
     images = [fits.ImageHDU(on, name="ON"), fits.ImageHDU(off, name="OFF")]
     for hdu in images:
@@ -202,34 +203,34 @@ def write_exposure(
 
 
 def read_exposure(
-    path: str | Path, schema: str, cards: Mapping[str, type], what: str
+    path: str | Path, schema: str, keywords: Mapping[str, type], what: str
 ) -> tuple[dict[str, Any], NDArray[np.int32], NDArray[np.int32]]:
-    """Read what :func:`write_exposure` wrote.
+    """Read an exposure that :func:`write_exposure` wrote.
 
     Parameters
     ----------
     path : path-like
-        The file.
+        File to read.
     schema : str
-        What it must be.
-    cards : mapping of str to type
-        What the header must hold.
+        File format that is expected, the header's SCHEMA.
+    keywords : mapping of str to type
+        Types of the header keywords that the file must hold.
     what : str
-        Words for the error, such as 'a spot of the direct simulation'.
+        Name of the content for errors, such as 'a spot of the direct simulation'.
 
     Returns
     -------
-    cards : dict
-        Values of the header.
+    values : dict
+        Values by header keyword.
     on, off : ndarray, shape (steps, ny, nx)
-        [e-].
+        Images with the effect and without [e-].
 
     Raises
     ------
     SimulationError
-        Not such a file, or damaged; names it.
+        The file has another format or is damaged; the message names it.
     """
-    # From memory: a damaged file would else stay open.
+    # The whole file is read first: astropy would keep a damaged one open.
     content = io.BytesIO(Path(path).read_bytes())
     try:
         with warnings.catch_warnings(), fits.open(content, checksum=True) as hdus:
@@ -237,7 +238,7 @@ def read_exposure(
             header = hdus[0].header
             if header.get("SCHEMA") != schema:
                 raise SimulationError(f"{path}: not {what}")
-            values = {name: kind(header[name]) for name, kind in cards.items()}
+            values = {name: kind(header[name]) for name, kind in keywords.items()}
             on, off = (hdus[name].data.astype(np.int32) for name in ("ON", "OFF"))
     except (OSError, KeyError, TypeError, ValueError, AttributeError, UserWarning) as error:
         if isinstance(error, SimulationError):

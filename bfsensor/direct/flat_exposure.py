@@ -1,9 +1,10 @@
 """Flats of the direct simulation: even light on the whole period, charge fed back.
 
 A period holds few pixels; its covariances come from many flats.  The same electrons also go
-through wells that all hold the mean charge, where charges of pixels are independent: what
-moves between both images is the effect of the pixels' differences, and
-:func:`measure_response` finds from it what one electron does to the pixels around it.
+through wells that all hold the mean charge, where charges of pixels are independent: the
+difference of both images is the effect of the pixels' unequal charges, and
+:func:`~bfsensor.measure.pixel_response.measure_response` finds from it the response of the areas of
+neighbouring pixels to one electron.
 """
 
 from __future__ import annotations
@@ -30,34 +31,56 @@ if TYPE_CHECKING:
     from bfsensor.device.device import Device
 
 SCHEMA = "bfsensor flat 2"
+"""Name and version of the file format."""
+
 _FLAT_STREAM = 0xF1A7
+"""Third word of the seed of a flat, which keeps its numbers apart from those of a spot.
+
+Chosen: any other number gives other random numbers of the same distribution."""
 
 
 @dataclass(frozen=True)
 class FlatPlan(ExposurePlan):
-    """Flats to be built up, all alike but for their electrons.
+    """Settings of flats that are built up alike and differ in their electrons alone.
 
     Parameters
     ----------
     device : Device
-        The sensor at its operating point.
+        Sensor at its operating point, fully depleted.
     level : float
-        Electrons a pixel at the end [e-].  At most the full well (:meth:`check_full_well`).
+        Mean number of electrons per pixel at the end [e-], from 1 to 1e6 and at most the full well
+        (:meth:`check_full_well`).
     steps : int
-        Equal steps of charge.
-    pixels, cells : int
-        Period of the array [pixel], odd, and mesh cells a pixel.
+        Number of equal steps of charge, 1 to 100,000, before each of which the field is solved.
+    pixels : int
+        Period of the array [pixel], odd, 3 to 63.
+    cells : int
+        Mesh cells per pixel in x and in y, even, 8 to 64.
     depth : float, optional
-        Height of conversion above the gates [um]; by default 5 um below the back surface.
+        Height of conversion above the gates [um], from 2 to the thickness; by default 5 um below
+        the back surface.
     transport : Transport
-        How electrons move.
+        Model of drift and diffusion.
     seed : int
-        Chooses all random numbers; flats differ by their number.
+        Seed of all random numbers, 0 to 2^63; flats differ by their number.
+
+    Attributes
+    ----------
+    conversion_height : float
+        Height of conversion above the gates [um].
+    key : str
+        Digest of the device and all settings.
 
     Raises
     ------
     DeviceError
-        A value that makes no sense, by name.
+        A value lies outside its limits, or the device is not fully depleted.
+
+    Examples
+    --------
+    >>> from bfsensor import Device
+    >>> FlatPlan(Device.load("itl_sta3800c"), level=40_000.0).conversion_height
+    95.0
     """
 
     KIND: ClassVar[str] = "flats"
@@ -77,25 +100,25 @@ class FlatPlan(ExposurePlan):
     seed: int = 20171
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse values outside their limits."""
         self._check(level=(1.0, 1e6))
 
 
 @dataclass(frozen=True)
 class Flat:
-    """A flat as it grew, with the effect and without.
+    """A simulated flat after each step of charge, with the brighter-fatter effect and without.
 
-    Attributes
+    Parameters
     ----------
     number : int
-        In its plan.
+        Number of the flat in its plan, from 0.
     on, off : ndarray, shape (steps, pixels, pixels)
         Electrons collected up to the end of each step, as periodic images [y, x] [e-]; ``off``
         with evenly filled wells.
     cpu_seconds : float
-        What it took.
+        CPU time of the simulation [s].
     key : str
-        Of the plan; empty where not known.
+        Key of the plan; empty where it is not known.
     """
 
     number: int
@@ -105,7 +128,18 @@ class Flat:
     key: str = ""
 
     def write(self, path: str | Path) -> None:
-        """Write to FITS, whole or not at all."""
+        """Write the flat to a FITS file, whole or not at all.
+
+        Parameters
+        ----------
+        path : path-like
+            File to write; one that exists is replaced.
+
+        Raises
+        ------
+        SimulationError
+            The file cannot be written.
+        """
         cards = {
             "FLAT": (self.number, "number of the flat in its plan"),
             "PLANKEY": (self.key, "of the plan"),
@@ -115,12 +149,22 @@ class Flat:
 
     @classmethod
     def read(cls, path: str | Path) -> Flat:
-        """Read what :meth:`write` wrote.
+        """Read a flat that :meth:`write` wrote.
+
+        Parameters
+        ----------
+        path : path-like
+            File to read.
+
+        Returns
+        -------
+        flat : Flat
+            Flat of the file.
 
         Raises
         ------
         SimulationError
-            Not such a file, or damaged.
+            The file is not a flat of the direct simulation, or is damaged.
         """
         kinds = {"FLAT": int, "PLANKEY": str, "CPU_S": float}
         cards, on, off = read_exposure(
@@ -137,15 +181,15 @@ def simulate_flat(
     Parameters
     ----------
     plan : FlatPlan
-        What to simulate.
+        Settings of the simulation.
     number : int
-        Of the flat, from 0: chooses its electrons, and how many they are.
+        Number of the flat, from 0; it selects the random numbers of its electrons and their count.
     progress : callable, optional
-        Called with the number of the step that is done.
+        Function that is called with the number of the step just finished, from 1.
 
     Returns
     -------
-    Flat
+    flat : Flat
         The same bits for the same plan and number.  The electrons of a whole period are a
         Poisson number.
 
@@ -154,7 +198,7 @@ def simulate_flat(
     SimulationError
         The level is above the full well, see :meth:`FlatPlan.check_full_well`.
     ConvergenceError
-        From the solver or the tracer.
+        A potential did not converge, or an electron found no well.
     """
     rng = np.random.default_rng([plan.seed, number, _FLAT_STREAM])
     seed = int(rng.integers(2**63))
@@ -173,12 +217,12 @@ def simulate_flat(
 
 
 def periodic_covariances(images: NDArray[np.integer]) -> FloatArray:
-    """Covariances of periodic images at all lags, one image after another.
+    """Measure the covariances of periodic images at all lags, image by image.
 
     Parameters
     ----------
     images : ndarray, shape (n, ny, nx)
-        Periodic [e-].
+        Images that continue periodically [e-].
 
     Returns
     -------

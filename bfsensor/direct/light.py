@@ -1,6 +1,6 @@
-"""Where light sets electrons free: spots, flats, fringes, beams and photon lists.
+"""Positions where light sets electrons free: spots, flats, fringes, beams and photon lists.
 
-Photon numbers choose the random numbers: any part of an exposure can be drawn by itself.
+A photon's number selects its random numbers: any part of an exposure can be drawn by itself.
 """
 
 from __future__ import annotations
@@ -19,31 +19,44 @@ if TYPE_CHECKING:
     from bfsensor.device.device import Device
 
 LOWEST = 2.0
-"""Electrons are set free at least so high above the gates [um]: deeper light is not followed."""
+"""Smallest height above the gates at which electrons are set free [um]; photons that come further
+are not converted.
 
-_PLACES, _SLOPES = 11, 12  # streams of random numbers; the transport uses 1 to 3
+Chosen: twice the height of the highest silicon surface of shipped devices, that under the channel
+stops of ITL's; twice as high, light that converts in 2 um more is lost, 2 % of it in 100 um of
+silicon where it is absorbed evenly."""
+
+_PLACES, _SLOPES = 11, 12
+"""Streams of the counted random numbers for positions and for slopes.
+
+Chosen: any that the transport of the same electrons does not use, which has 1 to 3."""
 
 
 def spot(
     numbers: ArrayLike, *, seed: int, centre: tuple[float, float], sigma: float
 ) -> FloatArray:
-    """Places of the photons of a Gaussian spot at the back surface.
+    """Draw the positions of the photons of a Gaussian spot at the back surface.
 
     Parameters
     ----------
     numbers : array_like of int, shape (n,)
         The photons' numbers in the exposure, consecutive.
     seed : int
-        Of the random numbers.
+        Seed of the random numbers, 0 to 2^64 - 1.
     centre : tuple of float
-        (x, y) [um].
+        Centre (x, y) of the spot [um].
     sigma : float
-        Width [um].
+        Standard deviation of the spot along an axis [um], above 0.
 
     Returns
     -------
     places : ndarray, shape (n, 2)
-        [um].
+        Positions (x, y) [um].
+
+    Raises
+    ------
+    SimulationError
+        ``sigma`` is not above 0, or the numbers are not consecutive.
 
     Examples
     --------
@@ -62,7 +75,7 @@ def spot(
 def flat(
     numbers: ArrayLike, *, seed: int, box: tuple[float, float, float, float]
 ) -> FloatArray:
-    """Places of photons that fall evenly on a rectangle.
+    """Draw the positions of photons that fall evenly on a rectangle.
 
     Parameters
     ----------
@@ -74,7 +87,7 @@ def flat(
     Returns
     -------
     places : ndarray, shape (n, 2)
-        [um].
+        Positions (x, y) [um].
     """
     u = _uniforms(numbers, seed, _PLACES)
     _check_box(box)
@@ -93,30 +106,30 @@ def fringes(
     contrast: float = 1.0,
     phase: float = 0.0,
 ) -> FloatArray:
-    r"""Places of photons of a fringe pattern, :math:`1 + c \cos(2 \pi s / p + \phi)`.
+    r"""Draw the positions of photons of a fringe pattern, :math:`1 + c \cos(2 \pi s / p + \phi)`.
 
     Parameters
     ----------
     numbers, seed, box
         As for :func:`flat`.
     period : float
-        Of the fringes [um].
+        Period p of the fringes [um], above 0.
     angle : float
-        From the x axis to the direction s across the fringes [rad].
+        Angle from the x axis to the direction s across the fringes [rad].
     contrast : float
-        c, 0 to 1.
+        Contrast c of the fringes, 0 to 1.
     phase : float
-        At the origin [rad].
+        Phase :math:`\phi` at the origin [rad].
 
     Returns
     -------
     places : ndarray, shape (n, 2)
-        [um]; all photons are kept, those on dark fringes are moved to bright ones.
+        Positions (x, y) [um]; all photons are kept, those on dark fringes are moved to bright ones.
 
     Notes
     -----
-    A photon at phase t of an even light is moved to the phase where the pattern's cumulated
-    light equals t; at the ends of the box it may leave it by less than half a period.
+    A photon at phase t of even light is moved to the phase where the cumulated light of the
+    pattern equals t; at the ends of the box it may leave the box by less than half a period.
     """
     if not (np.isfinite(period) and period > 0):
         raise SimulationError(f"period = {period} um of fringes must be above 0")
@@ -146,23 +159,23 @@ def beam_slopes(
     obscuration: float = 0.0,
     index: float,
 ) -> FloatArray:
-    """Slopes in the silicon of the photons of a converging beam.
+    """Draw the slopes in the silicon of the photons of a converging beam.
 
     Parameters
     ----------
     numbers, seed
         As for :func:`spot`.
     f_number : float
-        Focal length by the diameter of the pupil, above 0.5; 1.2 for the Rubin telescope.
+        Focal length over diameter of the pupil, above 0.5; 1.2 for the Rubin telescope.
     obscuration : float
-        Linear part of the pupil that is dark, 0 to 1.
+        Diameter of the dark middle of the pupil over that of the pupil, 0 to below 1.
     index : float
-        Refractive index of silicon at the wavelength.
+        Refractive index of silicon at the wavelength, 1 or more.
 
     Returns
     -------
     slopes : ndarray, shape (n, 2)
-        dx/dz and dy/dz of the way into the silicon.
+        Slopes dx/dz and dy/dz of the path into the silicon.
     """
     if not f_number > 0.5:
         raise SimulationError(f"f_number = {f_number} must be above 0.5")
@@ -189,36 +202,37 @@ def convert(
     height: float | None = None,
     slopes: ArrayLike | None = None,
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Let photons convert: from places at the back surface to electrons in the silicon.
+    """Convert photons that enter through the back surface to electrons in the silicon.
 
     Parameters
     ----------
     device : Device
-        Thickness and temperature count.
+        Device whose thickness and temperature are used.
     places : array_like, shape (n, 2)
-        Where photons enter [um].
+        Positions (x, y) at which photons enter the back surface [um].
     seed : int
-        Of the random numbers.
+        Seed of the random numbers, 0 to 2^64 - 1.
     numbers : array_like of int, shape (n,), optional
         The photons' numbers in the exposure, consecutive (default: 0, 1, ...).
     wavelengths : array_like, shape (n,) or (), optional
-        [nm]; paths are drawn from the absorption length.
+        Wavelengths [nm]; path lengths are drawn from the absorption length.
     height : float, optional
-        All convert at this height above the gates [um] instead.
+        Height above the gates at which all photons convert [um], in place of wavelengths; from
+        2 um to the thickness.
     slopes : array_like, shape (n, 2), optional
-        dx/dz and dy/dz in the silicon.
+        Slopes dx/dz and dy/dz in the silicon; by default light falls straight.
 
     Returns
     -------
     starts : ndarray, shape (n, 3)
-        Where electrons are set free [um].
+        Positions (x, y, z) where electrons are set free [um].
     converted : ndarray of bool, shape (n,)
-        False for photons that cross the silicon, or all but the lowest 2 um of it.
+        False for photons that reach the lowest 2 um of the silicon.
 
     Raises
     ------
     SimulationError
-        Neither wavelengths nor a height, or both, or arrays that do not fit.
+        Neither wavelengths nor a height are given, or both; or an array does not fit.
     """
     places = np.atleast_2d(np.asarray(places, float))
     count = len(places)
@@ -226,7 +240,7 @@ def convert(
         raise SimulationError("places must be finite numbers of shape (n, 2)")
     if (wavelengths is None) == (height is None):
         raise SimulationError(
-            "give the wavelengths of photons or their height, one of them"
+            "give either wavelengths or a height of conversion of the photons"
         )
     thickness = float(device.silicon.thickness)
     tilt = np.zeros((count, 2))
@@ -252,7 +266,7 @@ def convert(
 
 
 def paths(numbers: ArrayLike, *, seed: int) -> FloatArray:
-    """Ways of photons to their conversion, in absorption lengths: exponential deviates.
+    """Draw the path lengths of photons to their conversion, exponential deviates.
 
     Parameters
     ----------
@@ -262,6 +276,7 @@ def paths(numbers: ArrayLike, *, seed: int) -> FloatArray:
     Returns
     -------
     paths : ndarray, shape (n,)
+        Path lengths in units of the absorption length, above 0.
     """
     return _deviates(numbers, seed)[2].astype(float)
 

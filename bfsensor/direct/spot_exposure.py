@@ -1,4 +1,4 @@
-"""Spots of the direct simulation: what to build up, and what comes of it."""
+"""Spots of the direct simulation: plans, simulation, results and their files."""
 
 from __future__ import annotations
 
@@ -28,42 +28,66 @@ if TYPE_CHECKING:
     from bfsensor.device.device import Device
 
 SCHEMA = "bfsensor spot 1"
+"""Name and version of the file format."""
+
 _SPOT_STREAM = 0x5B0750
+"""Third word of the seed of a spot, which keeps its numbers apart from those of a flat.
+
+Chosen: any other number gives other random numbers of the same distribution."""
 
 
 @dataclass(frozen=True)
 class SpotPlan(ExposurePlan):
-    """Spots to be built up, all alike but for their centres and their electrons.
+    """Settings of spots that are built up alike and differ in their centres and electrons alone.
 
     Parameters
     ----------
     device : Device
-        The sensor at its operating point.
+        Sensor at its operating point, fully depleted.
     peak : float
-        Electrons that the brightest pixel of a spot centred on it would get without
-        diffusion [e-].  At most the full well (:meth:`check_full_well`).
+        Electrons that the brightest pixel of a spot centred on it would collect without
+        diffusion [e-], from 1 to 1e7 and at most the full well (:meth:`check_full_well`).
     sigma : float
-        Width of the spot at the back surface [um].
+        Standard deviation of the spot at the back surface along an axis [um], 0.1 to 1000; the
+        array must hold 3 sigma on either side and the central pixel.
     steps : int
-        Equal steps of charge, after each of which the field is solved again.
+        Number of equal steps of charge, 1 to 100,000, before each of which the field is solved.
     pixels : int
-        Period of the array [pixel], odd; every well is filled by what it collects.
+        Period of the array [pixel], odd, 3 to 63; every well is filled by what it collects.
     cells : int
-        Mesh cells a pixel.
+        Mesh cells per pixel in x and in y, even, 8 to 64.
     depth : float, optional
-        Height of conversion above the gates [um]; by default 5 um below the back surface,
-        as in the published simulations.
+        Height of conversion above the gates [um], from 2 to the thickness; by default 5 um below
+        the back surface, as in the published simulations.
     wavelength : float, optional
-        Of the light [nm]: heights are drawn from the absorption length instead.
+        Wavelength of the light [nm], in place of ``depth``: heights are drawn from the absorption
+        length.
     transport : Transport
-        How electrons move.
+        Model of drift and diffusion.
     seed : int
-        Chooses all random numbers; spots differ by their number.
+        Seed of all random numbers, 0 to 2^63; spots differ by their number.
+
+    Attributes
+    ----------
+    electrons : int
+        Number of electrons of a whole spot.
+    step_ends : ndarray of int, shape (steps + 1,)
+        Number of electrons that have come after each step, from 0 before the first.
+    conversion_height : float
+        Height of conversion above the gates [um].
+    key : str
+        Digest of the device and all settings.
 
     Raises
     ------
     DeviceError
-        A value that makes no sense, by name.
+        A value lies outside its limits, or the device is not fully depleted.
+
+    Examples
+    --------
+    >>> from bfsensor import Device
+    >>> SpotPlan(Device.load("itl_sta3800c"), peak=50_000.0, sigma=8.0).electrons
+    228257
     """
 
     KIND: ClassVar[str] = "spots"
@@ -85,7 +109,7 @@ class SpotPlan(ExposurePlan):
     seed: int = 20170
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse values outside their limits."""
         self._check(peak=(1.0, 1e7), sigma=(0.1, 1000.0))
         pitch = max(self.device.pixel.pitch_x, self.device.pixel.pitch_y)
         if self.pixels * pitch < 6.0 * self.sigma + pitch:
@@ -98,7 +122,7 @@ class SpotPlan(ExposurePlan):
 
     @property
     def electrons(self) -> int:
-        """Electrons in a whole spot."""
+        """Number of electrons of a whole spot."""
         share = 1.0
         for pitch in (self.device.pixel.pitch_x, self.device.pixel.pitch_y):
             share *= float(erf(pitch / 2 / (np.sqrt(2) * self.sigma)))
@@ -106,26 +130,27 @@ class SpotPlan(ExposurePlan):
 
     @property
     def step_ends(self) -> NDArray[np.int64]:
-        """How many electrons have come after each step, from 0 before the first."""
+        """Number of electrons that have come after each step, from 0 before the first."""
         return step_ends(self.electrons, self.steps)
 
 
 @dataclass(frozen=True)
 class Spot:
-    """A spot as it grew, with the effect and without.
+    """A simulated spot after each step of charge, with the brighter-fatter effect and without.
 
-    Attributes
+    Parameters
     ----------
     number : int
-        Of the spot in its plan.
+        Number of the spot in its plan, from 0.
     centre : tuple of float
-        Of the light (x, y) [um] from the middle of the central pixel.
+        Centre of the light (x, y) from the middle of the central pixel [um].
     on, off : ndarray, shape (steps, pixels, pixels)
-        Electrons collected up to the end of each step, as images [y, x] [e-].
+        Electrons collected up to the end of each step, as images [y, x] [e-]; ``off`` with the
+        field of the empty sensor.
     key : str
-        Of the plan.
+        Key of the plan.
     cpu_seconds : float
-        What it took.
+        CPU time of the simulation [s].
     """
 
     number: int
@@ -136,7 +161,18 @@ class Spot:
     cpu_seconds: float
 
     def write(self, path: str | Path) -> None:
-        """Write to FITS, whole or not at all."""
+        """Write the spot to a FITS file, whole or not at all.
+
+        Parameters
+        ----------
+        path : path-like
+            File to write; one that exists is replaced.
+
+        Raises
+        ------
+        SimulationError
+            The file cannot be written.
+        """
         cards = {
             "SPOT": (self.number, "number of the spot in its plan"),
             "CENTRE_X": (self.centre[0], "[um] from the middle of the central pixel"),
@@ -148,12 +184,22 @@ class Spot:
 
     @classmethod
     def read(cls, path: str | Path) -> Spot:
-        """Read what :meth:`write` wrote.
+        """Read a spot that :meth:`write` wrote.
+
+        Parameters
+        ----------
+        path : path-like
+            File to read.
+
+        Returns
+        -------
+        spot : Spot
+            Spot of the file.
 
         Raises
         ------
         SimulationError
-            Not such a file, or damaged.
+            The file is not a spot of the direct simulation, or is damaged.
         """
         kinds = {
             "SPOT": int, "CENTRE_X": float, "CENTRE_Y": float, "PLANKEY": str, "CPU_S": float,
@@ -173,15 +219,16 @@ def simulate_spot(
     Parameters
     ----------
     plan : SpotPlan
-        What to simulate.
+        Settings of the simulation.
     number : int
-        Of the spot, from 0: chooses its centre within the central pixel and its electrons.
+        Number of the spot, from 0; it selects the centre within the central pixel and the random
+        numbers of the electrons.
     progress : callable, optional
-        Called with the number of the step that is done.
+        Function that is called with the number of the step just finished, from 1.
 
     Returns
     -------
-    Spot
+    spot : Spot
         The same bits for the same plan and number.
 
     Raises
@@ -189,7 +236,7 @@ def simulate_spot(
     SimulationError
         The peak is above the full well, see :meth:`SpotPlan.check_full_well`.
     ConvergenceError
-        From the solver or the tracer.
+        A potential did not converge, or an electron found no well.
     """
     centre, seed = _choose(plan, number)
     found = expose(
@@ -203,21 +250,31 @@ def simulate_spot(
 def spot_electrons(
     plan: SpotPlan, number: int, electrons: NDArray[np.int64]
 ) -> tuple[tuple[float, float], FloatArray]:
-    """Give the centre of a spot and where its light sets electrons free.
+    """Draw the centre of a spot and the positions where its light sets electrons free.
 
     Parameters
     ----------
-    plan, number
-        As for :func:`simulate_spot`.
+    plan : SpotPlan
+        Settings of the simulation.
+    number : int
+        Number of the spot in its plan, from 0.
     electrons : ndarray of int, shape (n,)
-        Consecutive numbers of the electrons.
+        Consecutive numbers of the electrons, from 0.
 
     Returns
     -------
     centre : tuple of float
-        (x, y) [um] from the middle of the central pixel.
+        Centre (x, y) from the middle of the central pixel [um].
     starts : ndarray, shape (n, 3)
-        [um].
+        Positions (x, y, z) where the electrons are set free [um].
+
+    Examples
+    --------
+    >>> from bfsensor import Device
+    >>> plan = SpotPlan(Device.load("itl_sta3800c"))
+    >>> centre, starts = spot_electrons(plan, 0, np.arange(100))
+    >>> bool(max(abs(c) for c in centre) < 5.0), starts.shape
+    (True, (100, 3))
     """
     centre, seed = _choose(plan, number)
     return (float(centre[0]), float(centre[1])), _starts(plan, seed, electrons, centre)
@@ -234,7 +291,7 @@ def _choose(plan: SpotPlan, number: int) -> tuple[FloatArray, int]:
 def _starts(
     plan: SpotPlan, seed: int, numbers: NDArray[np.int64], centre: FloatArray
 ) -> FloatArray:
-    """Where the light sets electrons free [um]: a Gaussian spot."""
+    """Positions where the light of a Gaussian spot sets electrons free [um]."""
     out = np.empty((len(numbers), 3))
     out[:, :2] = light.spot(
         numbers, seed=seed, centre=(centre[0], centre[1]), sigma=plan.sigma
@@ -246,7 +303,8 @@ def _starts(
     length = float(
         silicon.absorption_length(plan.wavelength, plan.device.operating_point.temperature)
     )
-    # Light that crosses the silicon is not collected: depths are those of the rest.
+    # Light that crosses the silicon is not collected: depths are drawn from the exponential
+    # truncated at LOWEST, so that the number of electrons stays that of the plan.
     lowest = np.exp(-(thickness - light.LOWEST) / length)
     uniform = np.exp(-light.paths(numbers, seed=seed))
     out[:, 2] = thickness + length * np.log(lowest + uniform * (1.0 - lowest))

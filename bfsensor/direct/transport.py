@@ -1,7 +1,7 @@
-r"""Electrons on their way to the wells, one by one: drift and diffusion in a solved field.
+r"""Transport of single electrons to the wells: drift and diffusion in a solved field.
 
-Two engines.  ``'steps'``, for production: with Einstein's relation an electron obeys, in the
-time :math:`ds = \mu\,dt`,
+There are two engines.  ``'steps'``, for production: with Einstein's relation an electron obeys, in
+the time :math:`ds = \mu\,dt`,
 
 .. math:: dX = E\,ds + \sqrt{2 kT}\,dW,
 
@@ -29,44 +29,63 @@ from bfsensor.typing import FloatArray
 from bfsensor.units import ELECTRON_MASS
 
 PUBLISHED_DIFFUSION = 2.30 * float(np.sqrt(8.0 / (3.0 * np.pi)))
-r"""Width of the published simulations' diffusion relative to Einstein's.
+r"""Width of the diffusion in the published simulations relative to Einstein's relation.
 
-Their multiplier 2.30 counts in mean thermal speeds :math:`\sqrt{8kT/\pi m}`; Einstein's
-relation asks for the root mean square, :math:`\sqrt{3kT/m}`.  4.5 times Einstein's
-coefficient."""
+Derived from the published multiplier 2.30 (Lage, Bradshaw & Tyson 2017), which counts in mean
+thermal speeds :math:`\sqrt{8kT/\pi m}`, where Einstein's relation asks for the root mean square,
+:math:`\sqrt{3kT/m}`.  Its square, the ratio of the diffusion coefficients, is 4.5."""
 
 ARRIVED, ABSORBED = kernels.ARRIVED, kernels.ABSORBED
-"""What became of an electron: collected by a well, or taken by the back surface."""
+"""Fates of an electron: collected by a well, or lost at the back surface."""
 
 _MOST_FLIGHTS = 40_000
+"""Largest number of free flights of a scattering electron; beyond it a ConvergenceError is raised.
+
+Chosen: twice as many only make a failure take twice as long, and kept paths twice the memory."""
+
 _MOST_STEPS = 5000
+"""Largest number of large steps of an electron; beyond it a ConvergenceError is raised.
+
+Chosen: far above the some 100 steps of a straight way; twice as many only make a failure take twice
+as long, and kept paths twice the memory."""
 
 
 @dataclass(frozen=True)
 class Transport:
-    """How electrons move.
+    """Model of drift and diffusion, and the steps with which it is integrated.
 
     Parameters
     ----------
     diffusion : float
-        Width of the diffusion relative to Einstein's relation; 0 switches it off.
+        Width of the diffusion relative to Einstein's relation, 0 or more; 0 switches it off.
     engine : {'steps', 'scattering'}
-        Large steps, or from collision to collision.
-    part, shortest, longest : float
-        A large step is ``part`` of the height above the silicon, from ``shortest`` to
-        ``longest`` [um].
+        Large steps of drift and diffusion, or free flights from collision to collision.
+    part : float
+        Length of a large step relative to the height above the silicon surface, 0.001 to 1.
+    shortest, longest : float
+        Shortest and longest large step [um], 0.001 to 10 and 0.001 to 50.
     free_time : {'local', 'start'}
-        Of scattering electrons: after the mobility where they are, or, as in the published
-        simulations, where they started.
+        Mean free time of scattering electrons: from the mobility at their position, or, as in the
+        published simulations, from that where they started.
     back_absorption : float
-        Probability that an electron which touches the back surface is lost there; else it
-        is reflected.
+        Probability, 0 to 1, that an electron which touches the back surface is lost there; else
+        it is reflected.
+
+    Raises
+    ------
+    DeviceError
+        A value lies outside its limits.
 
     Notes
     -----
     Beside a full pixel the default steps give the same share of electrons to a well as steps
     a fourth as long within 0.2 % at Einstein's width; at the published width they give
     0.9 % less (errors 0.2 and 0.3 %, ``validation/transport/transport.ipynb``).
+
+    Examples
+    --------
+    >>> Transport(diffusion=PUBLISHED_DIFFUSION).engine
+    'steps'
     """
 
     diffusion: float = 1.0
@@ -78,7 +97,7 @@ class Transport:
     back_absorption: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be."""
+        """Refuse values outside their limits."""
         for name, low, high in (
             ("diffusion", 0.0, np.inf),
             ("part", 1e-3, 1.0),
@@ -103,18 +122,18 @@ class Transport:
 
 @dataclass(frozen=True)
 class Electrons:
-    """Where electrons ended.
+    """Traced electrons: last positions, pixels, fates and paths.
 
-    Attributes
+    Parameters
     ----------
     positions : ndarray, shape (n, 3)
-        Last position [um].
-    pixels : ndarray, shape (n, 2)
-        Pixel (i, j) along x and y; meaningless where ``fates`` is not ``ARRIVED``.
-    fates : ndarray, shape (n,)
-        ``ARRIVED`` (0) in a well or ``ABSORBED`` (1) by the back surface.
+        Last positions (x, y, z) [um].
+    pixels : ndarray of int, shape (n, 2)
+        Pixels (i, j) along x and y; without meaning where ``fates`` is not ``ARRIVED``.
+    fates : ndarray of int, shape (n,)
+        ``ARRIVED`` (0), in a well, or ``ABSORBED`` (1), by the back surface.
     paths : tuple of ndarray, each shape (points, 3)
-        Paths [um], where they were asked for.
+        Paths [um]; empty unless they were asked for.
     """
 
     positions: FloatArray
@@ -124,12 +143,21 @@ class Electrons:
 
 
 class Tracer:
-    """Traces electrons in one solved potential.
+    """Tracer of electrons in one solved potential.
 
     Parameters
     ----------
     potential : Potential
-        From :class:`~bfsensor.simulate.poisson.Electrostatics`.
+        Solution of :class:`~bfsensor.simulate.poisson.Electrostatics`.
+
+    Attributes
+    ----------
+    potential : Potential
+        The same solution.
+    field : Field
+        The potential, padded for interpolation.
+    field_arrays : tuple of ndarray
+        Arrays of ``field`` in the order of the kernels' arguments.
 
     Examples
     --------
@@ -170,13 +198,35 @@ class Tracer:
 
     @property
     def field_arrays(self) -> tuple[FloatArray, ...]:
-        """The padded potential and its nodes, as kernels take them."""
+        """Padded potential and positions of its nodes, in the order of the kernels' arguments."""
         return self.field.phi, self.field.x, self.field.y, self.field.z
 
     def prepare(
         self, starts: ArrayLike, transport: Transport
     ) -> tuple[FloatArray, kernels.Room, float]:
-        """Check starts; give them, the room and kT [V] as kernels take them."""
+        """Check positions and convert them to the arguments of the kernels.
+
+        Parameters
+        ----------
+        starts : array_like, shape (n, 3)
+            Positions (x, y, z) where electrons are set free [um], in the silicon.
+        transport : Transport
+            Model of the transport, of which the absorption at the back surface is used.
+
+        Returns
+        -------
+        starts : ndarray, shape (n, 3)
+            The same positions, contiguous.
+        room : Room
+            Limits of the domain and of the silicon.
+        kt : float
+            Thermal voltage [V].
+
+        Raises
+        ------
+        DeviceError
+            A start is not a number, or not in the silicon.
+        """
         starts = np.ascontiguousarray(np.atleast_2d(starts), float)
         if starts.shape[1] != 3 or not np.isfinite(starts).all():
             raise DeviceError("starts must be finite numbers of shape (n, 3)")
@@ -191,7 +241,18 @@ class Tracer:
         return starts, room, self._kt
 
     def pixels_of(self, positions: FloatArray) -> NDArray[np.int64]:
-        """Pixels (i, j) of positions, shape (n, 2)."""
+        """Find the pixels that hold positions.
+
+        Parameters
+        ----------
+        positions : ndarray, shape (n, 3)
+            Positions (x, y, z) [um].
+
+        Returns
+        -------
+        pixels : ndarray of int, shape (n, 2)
+            Pixels (i, j) along x and y.
+        """
         pitch = np.array(self.potential.mesh.pitch)
         return np.round(positions[:, :2] / pitch).astype(np.int64)
 
@@ -209,25 +270,27 @@ class Tracer:
         Parameters
         ----------
         starts : array_like, shape (n, 3)
-            Where they are set free [um], in the silicon; beyond the domain it is repeated.
+            Positions (x, y, z) where electrons are set free [um], in the silicon; beyond the
+            domain its field is continued periodically or mirrored.
         seed : int
-            Of the random numbers, 0 to 2^64 - 1.
+            Seed of the random numbers, 0 to 2^64 - 1.
         numbers : array_like of int, shape (n,), optional
-            The electrons' numbers in the exposure, which choose their random numbers
+            The electrons' numbers in the exposure, which select their random numbers
             (default: 0, 1, ...).
         transport : Transport, optional
-            How they move.
+            Model of drift and diffusion.
         keep_paths : bool
-            Return the paths.
+            Whether to return the paths.
 
         Returns
         -------
-        Electrons
+        electrons : Electrons
+            Last positions, pixels, fates and, if asked for, paths.
 
         Raises
         ------
         DeviceError
-            A start that is not a number, or not in the silicon.
+            A start is not a number, or not in the silicon.
         ConvergenceError
             An electron found no well.
         """

@@ -1,4 +1,4 @@
-"""Least squares in which some parameters may not leave a box."""
+"""Linear least squares with bounds on some of the parameters."""
 
 from __future__ import annotations
 
@@ -11,24 +11,30 @@ from scipy.optimize import lsq_linear
 from bfsensor.typing import FloatArray
 
 SINGULAR = 1e-10
-"""Of the norm of a column that is left beside the others: less is a direction no data hold."""
+"""Smallest norm of a unit column's part that is orthogonal to the columns before it.
+
+Below it the design counts as singular, and the solution of least norm is taken.  Chosen: it lies
+between round-off, 1e-16 times the number of values, and directions that data constrain; twice as
+large, a column that data distinguish to 2e-10 only would count as a copy."""
 
 
 class BoundedSolution(NamedTuple):
-    """A linear least-squares problem, solved.
+    """Solution of a linear least-squares problem with bounds.
 
-    Attributes
+    Parameters
     ----------
-    solution, errors : ndarray, shape (p,)
-        0 of columns that are zero; in directions that no value depends on the shortest.
-        Errors are those without a box.
+    solution : ndarray, shape (p,)
+        Parameters at the minimum, 0 for columns that are zero; of equally good solutions the one
+        of least norm.
+    errors : ndarray, shape (p,)
+        Standard deviations of the parameters without bounds, for values of unit variance.
     covariance : ndarray, shape (p, p)
-        Without a box.
+        Covariance of the parameters without bounds, for values of unit variance.
     basis : ndarray, shape (n, rank)
-        Orthonormal columns that those of the design span which no end stops: what is left is
-        orthogonal to them.
+        Orthonormal basis of the columns whose parameters are not at a bound; the residuals are
+        orthogonal to it.
     left : ndarray, shape (n,)
-        Target less what the solution makes.
+        Residuals, target less design times solution.
     """
 
     solution: FloatArray
@@ -44,23 +50,24 @@ def solve_within(
     low: FloatArray,
     high: FloatArray,
 ) -> BoundedSolution:
-    """Minimise the square of ``target - design @ x`` with x between two ends.
+    """Minimise the squared norm of ``target - design @ x`` with every x between its bounds.
 
-    Where the free solution leaves the box, the best one inside it is found: clipping would give
-    one that is no improvement where columns are nearly parallel.
+    Where the unbounded solution violates a bound, the bounded minimum is found; clipping would
+    return a point that may be worse than 0 where columns are nearly parallel.
 
     Parameters
     ----------
     design : ndarray, shape (n, p)
-        Columns.
+        Design matrix, one column per parameter, in units of the values' standard deviations.
     target : ndarray, shape (n,)
-        What they should make.
+        Values to reproduce, in the same units.
     low, high : ndarray, shape (p,)
-        Ends, infinite where there are none; 0 lies between them.
+        Lower and upper bounds, infinite where there is none; 0 lies between them.
 
     Returns
     -------
-    BoundedSolution
+    solved : BoundedSolution
+        Parameters, their errors and the residuals.
 
     Examples
     --------
@@ -72,7 +79,8 @@ def solve_within(
     """
     norms = np.sqrt((design**2).sum(0))
     used = np.flatnonzero(norms > 0)
-    # Those with ends last: with the others at their best, a small problem is left of them.
+    # Bounded columns come last: a QR decomposition then leaves a small problem in them alone,
+    # with the unbounded parameters at their best.
     ends = np.isfinite(low[used]) | np.isfinite(high[used])
     used = np.concatenate([used[~ends], used[ends]])
     free, scale = int((~ends).sum()), norms[used]
@@ -99,7 +107,7 @@ def solve_within(
         else:
             x = _inside(q.T @ unit, told, lowest, highest)
         left = target - unit @ x
-        # What an end stops is not fitted: what is left is orthogonal to the others.
+        # A parameter at its bound is not fitted: residuals are orthogonal to the others only.
         stopped = np.isclose(x, lowest, rtol=1e-9) | np.isclose(x, highest, rtol=1e-9)
         q = span(unit[:, ~stopped])
     else:
@@ -113,7 +121,7 @@ def solve_within(
 
 
 def span(unit: FloatArray) -> FloatArray:
-    """Orthonormal columns that those of unit length span."""
+    """Orthonormal basis of the space that unit columns span, without directions below SINGULAR."""
     q, r = np.linalg.qr(unit)
     if (np.abs(np.diag(r)) > SINGULAR).all():
         return q
@@ -127,7 +135,7 @@ def _inside(
     low: FloatArray,
     high: FloatArray,
 ) -> FloatArray:
-    """Best solution between two ends, which may be the same."""
+    """Bounded least-squares solution; parameters whose bounds coincide are held there."""
     held = high - low <= 0
     x = np.where(held, low, 0.0)
     if not held.all():

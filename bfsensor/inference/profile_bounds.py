@@ -9,14 +9,22 @@ import numpy as np
 from bfsensor.typing import FloatArray
 
 LEVELS = {"68 %": 1.0, "95 %": 3.84}
-"""Rise of the minimum at the bounds: quantiles of chi2 with one degree of freedom."""
+"""Rise of chi2 above its minimum at the bounds, by confidence level.
+
+Derived: quantiles of the chi2 distribution with one degree of freedom, 1 at 68.27 % and 3.841 at
+95 % (Wilks 1938)."""
 
 
 class Bounds(NamedTuple):
-    """Interval of a parameter [internal unit].
+    """Confidence interval of a parameter.
 
-    An end is infinite where the profile does not rise as far: at the end of what can be, or of what
-    was asked for.
+    A bound is infinite where the profile does not rise to the level within the values that were
+    computed, because the parameter cannot go further or the profile was not taken further.
+
+    Parameters
+    ----------
+    low, high : float
+        Lower and upper bound [internal unit].
     """
 
     low: float
@@ -24,16 +32,24 @@ class Bounds(NamedTuple):
 
 
 def profile_bounds(values: FloatArray, rise: FloatArray, level: float) -> Bounds:
-    """Where a profile rises to a level.
+    """Find the values on both sides of the minimum at which a likelihood profile rises to a level.
 
-    Between points the root of the rise is taken as straight, which of a parabola it is.
+    Between points the square root of the rise is interpolated linearly, which is exact for a
+    parabola whose minimum is one of the points.
 
     Parameters
     ----------
-    values, rise : ndarray, shape (n,)
-        The profile, values in order.
+    values : ndarray, shape (n,)
+        Values of the parameter [internal unit], ascending.
+    rise : ndarray, shape (n,)
+        Rise of chi2 above its minimum at these values.
     level : float
-        Above the minimum.
+        Rise of chi2 at the bounds (:data:`LEVELS`), above 0.
+
+    Returns
+    -------
+    bounds : Bounds
+        Lower and upper bound, infinite where the profile does not reach the level.
 
     Examples
     --------

@@ -1,8 +1,8 @@
 """The differential response of a device: shifts of pixel edges per electron, and derivatives.
 
-What a small charge on a uniform background does to the edges around it, straight from the
-solution, without a table; and how that changes with any quantity of the device, from the
-linearised system instead of solutions of other devices.
+A small charge on a uniform background is solved for, and the shifts of the edges around it are
+taken from the solution without a table.  Their derivatives with respect to any quantity of the
+device come from the linearised system instead of solutions of other devices.
 """
 
 from __future__ import annotations
@@ -29,45 +29,73 @@ from bfsensor.simulate.unit_cell import tile
 from bfsensor.typing import Edges, FloatArray
 
 LEVEL = 40_000.0
-"""Background about which the response is taken [e-]: the middle of a flat of 80,000 e-."""
+"""Charge in every pixel about which the response is taken [e-].
+
+Chosen: the mean charge while a flat of 80,000 e- is filled, to first order.  The response falls with
+the level: the ITL centre loses 12.8 um^2 per 100,000 e- at 10,000 e- and 11.4 at 130,000
+(``docs/reference/accuracy.md``), so that twice the level gives a somewhat weaker effect."""
 
 CHARGE = 5_000.0
-"""Above the background [e-]: the response is differential, so a small one."""
+"""Charge of the central pixel above the background [e-].
+
+Chosen: the response is differential, and a charge must be small for that; twice as large, the
+second-order part of the shifts doubles and the error of the traced boundaries per electron halves."""
 
 REACH = 4
-"""Of the shifts [pixel]; a ring more holds edges that do not move."""
+"""Largest offset of a pixel whose edges are solved [pixel]; a ring beyond it holds edges that do not
+move.
+
+Chosen: shifts fall as exp(-pi rho / T) with distance; twice the reach needs a longer :data:`PERIOD`
+and more than doubles the time of the boundaries."""
 
 VERTICES = 32
+"""Number of vertices on an edge between corners, over which its mean shift is taken.
+
+Chosen: vertices keep the areas of pixels exactly, so that the number enters only by the trapezoids
+along an edge; twice as many have a quarter of that error."""
 
 PRECISION = 1e-7
-"""Of the bisection of boundaries [um]: with that of tables, 1e-5, derivatives that are small,
-such as by the field oxide, are wrong by up to 25 %."""
+"""Width of the interval at which the bisection of boundary points ends [um].
+
+Chosen: at the 1e-5 um of tables, small derivatives such as that with respect to the field oxide are
+wrong by up to 25 %; twice as large saves one forward trace per point."""
 
 REFINE_Z = 1
-"""Halvings of the mesh in z, from steps of 0.05 um in the front.
+"""Number of times that the mesh in z is halved, from steps of 0.05 um in the front.
 
-The sheet of stored electrons is not thicker than two such steps: without halving a_00 wavers by
-0.4 % as a parameter carries it through them (ITL, field oxide to 0.1 um either way), which ruins
-second derivatives and small first ones; halved once it goes straight to within 0.01 %."""
+Measured (ITL, field oxide changed by up to 0.1 um either way): the sheet of stored electrons is not
+thicker than two such steps, so that without halving a_00 wavers by 0.4 % as a parameter moves it
+through them, which spoils second derivatives and small first ones; halved once a_00 is linear to
+within 0.01 %.  ``docs/reference/accuracy.md`` states the errors of derivatives with and without it."""
 
-_COARSE = 4  # vertices with which the change of the images is found: they are smooth
-_SHIFT = 3e-3  # um, to which derivatives of lines are scaled where edges are differentiated
+_COARSE = 4
+"""Number of vertices on an edge with which the change of the periodic images is found.
+
+Chosen: the field of images half a period away is smooth over a pixel; twice as many change the
+derivative by less than the field changes within a quarter of an edge."""
+
+_SHIFT = 3e-3
+"""Largest displacement to which derivatives of boundary lines are scaled before edges are refitted [um].
+
+Chosen: the fit of edges to lines is nearly linear; twice as large doubles the error of this one-sided
+difference and halves that of the corners' tolerance, 1e-7 um."""
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeResponse:
-    """Shifts of edges per electron by depth of conversion, and their derivatives.
+    """Shifts of pixel edges per electron by conversion depth, and their derivatives.
 
-    Attributes
+    Parameters
     ----------
     depths : ndarray, shape (nd,)
-        [um above the gates], the last one the back surface.
+        Conversion depths as heights above the gates [um], the last one the back surface.
     kx, ky : ndarray, shape (nd, 2 REACH + 3, 2 REACH + 3)
         Mean shifts of right and upper edges per electron [pixel/e-], [depth, row, column].
     dkx, dky : ndarray, shape (changes, nd, 2 REACH + 3, 2 REACH + 3)
-        Their derivatives, at depths that go with the thickness (:func:`response_depths`).
+        Derivatives of ``kx`` and ``ky`` with respect to each changed quantity [pixel/e- per unit],
+        at depths that move with the thickness (:func:`response_depths`).
     seconds : tuple of float
-        CPU time of the solution with its boundaries, and of all derivatives.
+        CPU time [s] of the solution with its boundaries, and of all derivatives.
     """
 
     depths: FloatArray
@@ -78,12 +106,25 @@ class EdgeResponse:
     seconds: tuple[float, float]
 
     def edges(self, wavelength: float | None, temperature: float) -> Edges:
-        """Shifts for light of a wavelength [nm], in silicon of a temperature [K]."""
+        """Average the shifts over the conversion depths of light.
+
+        Parameters
+        ----------
+        wavelength : float or None
+            Wavelength [nm]; None: all light converts at the back surface.
+        temperature : float
+            Temperature of the silicon [K].
+
+        Returns
+        -------
+        kx, ky : ndarray, shape (2 REACH + 3, 2 REACH + 3)
+            Mean shifts of right and upper edges [pixel/e-], [row, column].
+        """
         return mixed(self.kx, self.ky, self.depths, wavelength, temperature)
 
 
 def response_depths(device: Device) -> tuple[float, ...]:
-    """Depths of conversion at which the response is taken [um above the gates]."""
+    """Conversion depths at which the response is taken, heights above the gates [um]."""
     thickness = device.silicon.thickness
     return 5.0, 20.0, 0.5 * thickness, thickness
 
@@ -95,18 +136,23 @@ def mixed(
     wavelength: float | None,
     temperature: float,
 ) -> Edges:
-    """Shifts weighted by where the light converts; the axis of depths is the third last.
+    """Average shifts over the conversion depths of light.
 
     Parameters
     ----------
     kx, ky : ndarray, shape (..., nd, ny, nx)
-        By depth.
+        Shifts of right and upper edges by conversion depth.
     depths : ndarray, shape (nd,)
-        [um], the last one the back surface.
+        Heights above the gates [um], ascending, the last one the back surface.
     wavelength : float or None
-        Of the light [nm]; None: all of it converts at the back surface.
+        Wavelength of the light [nm]; None: all of it converts at the back surface.
     temperature : float
-        Of the silicon [K].
+        Temperature of the silicon [K].
+
+    Returns
+    -------
+    kx, ky : ndarray, shape (..., ny, nx)
+        Mean shifts, in the unit of the given ones.
     """
     if wavelength is None:
         return kx[..., -1, :, :], ky[..., -1, :, :]
@@ -120,7 +166,10 @@ def mixed(
 def conversion_weights(
     depths: FloatArray, thickness: float, wavelength: float, temperature: float
 ) -> FloatArray:
-    """Share of the light that the response at each depth stands for, linear between them."""
+    """Weights of the depths in a mean over converted light; the response is linear between them.
+
+    Light that crosses the silicon is left out: the weights sum to 1.
+    """
     length = float(silicon.absorption_length(wavelength, temperature))
     z = np.linspace(0.0, thickness, 4001)
     light = np.exp(-(thickness - z) / length)
@@ -132,18 +181,27 @@ def conversion_weights(
 
 
 def area_matrix(kx: FloatArray, ky: FloatArray) -> FloatArray:
-    """Change of the areas per electron [1/e-], from the shifts of right and upper edges.
+    """Compute the relative change of pixel areas per electron from the shifts of their edges.
 
     Parameters
     ----------
-    kx, ky : ndarray
-        Shifts of the right and of the upper edge of each pixel per electron, in fractions of the
-        pixel pitch, [row, column].
+    kx, ky : ndarray, shape (..., ny, nx)
+        Shifts of the right and of the upper edge of each pixel per electron [pixel/e-],
+        [row, column].
 
     Returns
     -------
-    areas : ndarray
-        Relative change of each pixel's area.
+    areas : ndarray, shape (..., ny, nx)
+        Relative change of each pixel's area [1/e-].  The first column and row take the last
+        ones as their neighbours.
+
+    Examples
+    --------
+    >>> kx = np.zeros((3, 3))
+    >>> kx[1, 1] = -1e-6  # the right edge of the middle pixel moves inwards
+    >>> areas = area_matrix(kx, np.zeros((3, 3)))
+    >>> float(areas[1, 1]), float(areas[1, 2])
+    (-1e-06, 1e-06)
     """
     return kx - np.roll(kx, 1, -1) + ky - np.roll(ky, 1, -2)
 
@@ -164,36 +222,47 @@ def solve_response(
     Parameters
     ----------
     device : Device
-        Mirror-symmetric.
+        Mirror-symmetric device.
     level : float
-        Electrons in every pixel [e-].
+        Electrons in every pixel [e-], 0 or more.
     cells : int
-        Of the mesh, a pixel.
+        Mesh cells per pixel in x and in y, even, at least 8.
     refine_z : int
-        Halvings of its steps in z (:data:`REFINE_Z`).
+        Number of times that the mesh in z is halved (:data:`REFINE_Z`), 0 or more.
     period : int
         Pixels from a charge to its periodic image, even, above 2 REACH + 2; half of them are
-        solved, between mirrors.
+        solved, between mirror planes.
     laid_for : Device, optional
-        A device near to it for which the mesh is laid before it is moved
+        Device near to this one whose mesh is made and then moved
         (:func:`~bfsensor.simulate.moved_mesh.move_mesh`), so that the two compare without the
         error of the mesh; by default the device itself.
     changed : sequence of (Device, float)
-        Devices with one quantity changed by a small step, and that step
-        (:meth:`~bfsensor.simulate.tangent.Tangent.change`): what to differentiate by.
+        Quantities to differentiate by: for each the device with that quantity changed by a small
+        step, and the step (:meth:`~bfsensor.simulate.tangent.Tangent.change`).
     tolerance : float
-        Of the linear systems of the derivatives.
+        Relative error of the linear systems of the derivatives, in the energy norm.
 
     Returns
     -------
-    EdgeResponse
+    response : EdgeResponse
+        Shifts by depth, and one derivative for each of ``changed``.
 
     Raises
     ------
-    DeviceError, ConvergenceError
-        The device has no mirror planes, or no such solution.
+    DeviceError
+        The device has no mirror planes, or is not depleted.
+    ConvergenceError
+        A potential did not converge, or a boundary was not found.
     TableError
-        The period is odd, or the images are among the edges.
+        The period is odd, or so short that images lie among the edges.
+
+    Examples
+    --------
+    >>> from bfsensor import Device
+    >>> solve_response(Device.load("itl_sta3800c"), period=10)
+    Traceback (most recent call last):
+        ...
+    bfsensor.errors.TableError: period = 10 pixels must be even and above 10
     """
     if period % 2 or period <= 2 * REACH + 2:
         raise TableError(f"period = {period} pixels must be even and above {2 * REACH + 2}")
@@ -244,7 +313,7 @@ def solve_response(
 
 @dataclass(frozen=True, eq=False)
 class _Edges:
-    """From boundary lines to mean shifts of edges [pixel/e-], without periodic images."""
+    """Conversion of boundary lines to mean shifts of edges [pixel/e-], periodic images removed."""
 
     far: FarField
     images: Images
@@ -265,7 +334,7 @@ class _Edges:
         return lines.vertices(VERTICES, vertex_fractions(VERTICES))
 
     def mean(self, moved: tuple[FloatArray, ...]) -> Edges:
-        """Mean shifts, images taken off."""
+        """Mean shifts of edges, periodic images removed."""
         return self._mean(self.images.taken_off(moved)[0])
 
     def line_change(

@@ -1,6 +1,6 @@
-r"""The differential response around a device, without solving it again.
+r"""Emulator of the differential response of devices near a given one, without solving them.
 
-To second order in the parameters about the device's values, in units of their spreads:
+It is of second order in the parameters about the device's values, in units of their spreads:
 
 .. math::
     k(t) = k_0 + \sum_n g_n t_n + \tfrac12 \sum_{nm} H_{nm} t_n t_m
@@ -41,29 +41,38 @@ from bfsensor.response.expansion import EmulatorCheck, ExpandedResponse, Expansi
 from bfsensor.typing import FloatArray
 
 SCHEMA = "bfsensor emulator 1"
+"""Name and version of the file format."""
+
 VOLTAGES = ("back_bias", "gate_high", "gate_low", "temperature")
-"""Of the operating point, which conditions may state."""
+"""Quantities of the operating point that a condition may state."""
 
 _BY_DEPTH = ("silicon.thickness", "operating_point.temperature")
 
 
 class DeviceEmulator:
-    """Response of a device for any values of its parameters near its own.
+    """Emulated response of devices whose parameters differ a little from a given device's.
 
-    Made by :meth:`build`, or read from a file.
+    It is made by :meth:`build` or :meth:`read`; the constructor takes finished expansions.
+
+    Parameters
+    ----------
+    device : Device
+        Device about which the response is expanded.
+    spreads : mapping of str to float
+        Standard deviations of the parameters by dotted name [internal units], above 0.
+    level : float
+        Electrons in every pixel about which the response is taken [e-].
+    cells, refine_z : int
+        Mesh cells per pixel, and number of times that the mesh in z is halved.
+    expansions : mapping
+        Expansion of the shifts by operating point, in the order of :data:`VOLTAGES`.
 
     Attributes
     ----------
-    device : Device
-        About which it holds.
     parameters : tuple of str
-        Dotted names.
+        Dotted names of the parameters.
     nominal, spread : ndarray, shape (p,)
-        Values and standard deviations [internal units].
-    level : float
-        Electrons in every pixel, about which the response is taken [e-].
-    cells, refine_z : int
-        Of the mesh: cells a pixel, and halvings in z.
+        Values and standard deviations of the parameters [internal units].
     """
 
     def __init__(
@@ -98,39 +107,45 @@ class DeviceEmulator:
     ) -> DeviceEmulator:
         """Solve a device and its neighbours, with all derivatives.
 
+        Each condition takes one solution and up to two per parameter, one spread to either side.
+
         Parameters
         ----------
         device : Device
-            Mirror-symmetric.
+            Mirror-symmetric device.
         parameters : sequence of str, or mapping of str to float
-            Names, whose uncertainties the device states, or names with their spreads; by
-            default all quantities with stated uncertainty.
+            Names whose uncertainties the device states, or names with their spreads [internal
+            units]; by default all quantities with stated uncertainty.
         conditions : sequence of Condition
-            At which responses will be asked for.  What they do not state is the device's own;
-            wavelengths need no solutions of their own.
+            Operating points at which the response will be predicted.  Quantities that a condition
+            does not state are the device's own; wavelengths need no solutions of their own.
         level : float
-            Electrons in every pixel [e-].
+            Electrons in every pixel [e-], 0 or more.
         cells : int
-            Of the mesh, a pixel.
+            Mesh cells per pixel in x and in y, even, at least 8.
         refine_z : int
-            Halvings of its steps in z.
+            Number of times that the mesh in z is halved, 0 or more.
         keep : Path, optional
-            Folder that keeps finished solutions; a run that finds them goes on from there.
+            Folder in which finished solutions are kept; a later run reads them from there.
         executor : Executor, optional
-            Where they are solved; by default here, one after another.
+            Executor that solves the devices; by default this process, one after another.
         progress : callable, optional
-            Called with (solutions made, solutions in all).
+            Function that is called with (solutions made, solutions in all).
 
         Returns
         -------
-        DeviceEmulator
+        emulator : DeviceEmulator
+            Emulator for the conditions.
 
         Raises
         ------
         FitError
-            A parameter without uncertainty, or one that cannot be moved to either side.
-        DeviceError, ConvergenceError
-            The device is not fully depleted at a condition, or there is no solution there.
+            No condition is given, a parameter has no uncertainty, or there is no solution one
+            spread to either side of it.
+        DeviceError
+            The device is not fully depleted at a condition.
+        ConvergenceError
+            There is no solution of the device itself at a condition.
         """
         spreads = _spreads(device, parameters)
         points = list(dict.fromkeys(_point(c) for c in conditions))
@@ -150,7 +165,7 @@ class DeviceEmulator:
                     try:
                         there = change_parameter(here, name, side * spread)
                     except DeviceError:
-                        continue  # the other side tells
+                        continue  # one side is enough for the second derivatives
                     nodes.append(
                         make_node(
                             there, here, level, cells, refine_z, own, (number, n, side)
@@ -168,7 +183,7 @@ class DeviceEmulator:
 
     @property
     def conditions(self) -> tuple[Condition, ...]:
-        """Operating points that it holds."""
+        """Operating points for which the emulator was built."""
         return tuple(
             Condition(back_bias=bias, gate_high=high, gate_low=low, temperature=kelvin)
             for bias, high, low, kelvin in self._expansions
@@ -177,21 +192,26 @@ class DeviceEmulator:
     def predict(
         self, values: ArrayLike, condition: Condition | None = None
     ) -> ExpandedResponse:
-        """Response at values of the parameters.
+        """Predict the response at values of the parameters.
 
         Parameters
         ----------
         values : array_like, shape (p,)
-            [internal units], in the order of ``parameters``; the nominal ones for what the
-            condition states are not looked at.
+            Values in the order of ``parameters`` [internal units], finite; the value of a
+            parameter that the condition states is ignored.
         condition : Condition, optional
-            One of those it was built for, at any wavelength; without a wavelength all light
-            converts at the back surface.  A filter is not looked at.
+            Operating point for which the emulator was built, at any wavelength [nm]; without a
+            wavelength all light converts at the back surface.  A filter is ignored.
+
+        Returns
+        -------
+        response : ExpandedResponse
+            Shifts of edges and area changes per electron, and their derivatives.
 
         Raises
         ------
         FitError
-            Values that are not numbers, or a condition that it was not built for.
+            A value is not a finite number, or the emulator was not built for the condition.
         """
         asked = condition if condition is not None else Condition()
         given = np.asarray(values, float)
@@ -211,7 +231,8 @@ class DeviceEmulator:
         by_depth = np.stack(self._mixed(np.moveaxis(slopes, 1, 0), given, asked), 1)
         derivatives[found.free] = by_depth / self.spread[found.free, None, None, None]
         for n in found.free:
-            # Where light converts changes as well.
+            # Thickness and temperature change the conversion depths as well: differenced, as
+            # the weights of the depths are cheap.
             if self.parameters[n] in _BY_DEPTH and asked.wavelength is not None:
                 step = 1e-3 * self.spread[n] * (np.arange(len(given)) == n)
                 up, down = (
@@ -228,7 +249,7 @@ class DeviceEmulator:
     def _mixed(
         self, shifts: FloatArray, values: FloatArray, condition: Condition
     ) -> tuple[FloatArray, FloatArray]:
-        """Shifts (2, ..., nd, ny, nx) weighted by where the light of a condition converts."""
+        """Average shifts (2, ..., nd, ny, nx) over the conversion depths of a condition's light."""
         device = _operated(self.device, _point(condition))
         for name in _BY_DEPTH:
             if name in self.parameters and not _held(name, _point(condition)):
@@ -240,12 +261,24 @@ class DeviceEmulator:
         )  # fmt: skip
 
     def device_at(self, values: ArrayLike, condition: Condition | None = None) -> Device:
-        """Give the device with values of the parameters, at a condition.
+        """Make the device with given values of the parameters, at a condition.
+
+        Parameters
+        ----------
+        values : array_like, shape (p,)
+            Values in the order of ``parameters`` [internal units].
+        condition : Condition, optional
+            Operating point; quantities that it does not state are the device's own.
+
+        Returns
+        -------
+        device : Device
+            Device with these values.
 
         Raises
         ------
         DeviceError
-            There is no such device.
+            The values are not those of a valid device.
         """
         point = _point(condition if condition is not None else Condition())
         out = _operated(self.device, point)
@@ -265,21 +298,32 @@ class DeviceEmulator:
         remeshed: bool = False,
         progress: Callable[[int, int], None] | None = None,
     ) -> EmulatorCheck:
-        """Solve at random points of the prior volume, and compare.
+        """Compare predictions with full solutions at random points of the prior volume.
 
         Parameters
         ----------
         points : int
-            How many.
+            Number of points, 1 or more.
         seed : int
-            Of their values: normal about the nominal ones, where there is such a device.
+            Seed of the values, which are normal about the nominal ones; values of no valid device
+            are drawn again.
         condition : Condition, optional
-            One of those it was built for.
+            Operating point for which the emulator was built.
         remeshed : bool
-            Whether each device gets a mesh of its own, whose error then counts, or the
-            emulator's, moved.
+            True: each device gets a mesh of its own, whose error then counts; False: each is
+            solved on the emulator's mesh, moved.
         progress : callable, optional
-            Called with (points solved, points).
+            Function that is called with (points solved, points).
+
+        Returns
+        -------
+        check : EmulatorCheck
+            Solved and emulated a_ij of each point.
+
+        Raises
+        ------
+        DeviceError, ConvergenceError
+            More than ten times as many points as asked for have no solution.
         """
         asked = condition if condition is not None else Condition()
         rng = np.random.default_rng(seed)
@@ -316,7 +360,18 @@ class DeviceEmulator:
     # -- files -------------------------------------------------------------------------
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write everything to one file (.npz), whole or not at all."""
+        """Write the emulator to one file, whole or not at all.
+
+        Parameters
+        ----------
+        path : path-like
+            File in the format of numpy's ``.npz``; one that exists is replaced.
+
+        Raises
+        ------
+        FitError
+            The file cannot be written.
+        """
         header = {
             "schema": SCHEMA,
             "version": bfsensor.__version__,
@@ -339,19 +394,24 @@ class DeviceEmulator:
     def read(
         cls, path: str | os.PathLike[str], *, device: Device | None = None
     ) -> DeviceEmulator:
-        """Read what :meth:`write` wrote.
+        """Read an emulator that :meth:`write` wrote.
 
         Parameters
         ----------
         path : path-like
-            The file.
+            File to read.
         device : Device, optional
-            Whose emulator it must be.
+            Device about which the emulator must have been built.
+
+        Returns
+        -------
+        emulator : DeviceEmulator
+            Emulator of the file.
 
         Raises
         ------
         FitError
-            Not such a file, of another version, or of another device.
+            The file is not an emulator, is of another version of bfsensor, or of another device.
         """
         try:
             with open(path, "rb") as stream, np.load(stream) as data:
@@ -359,7 +419,7 @@ class DeviceEmulator:
                 if header["schema"] != SCHEMA or header["version"] != bfsensor.__version__:
                     raise FitError(
                         f"{path}: {header['schema']} of bfsensor {header['version']}, not {SCHEMA} "
-                        f"of {bfsensor.__version__}: build it anew"
+                        f"of {bfsensor.__version__}: build it again"
                     )
                 expansions = {
                     tuple(point): Expansion(
@@ -373,13 +433,14 @@ class DeviceEmulator:
         except FitError:
             raise
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise FitError(f"{path}: not an emulator ({error})") from None
+            raise FitError(f"{path}: not a file of an emulator ({error})") from None
         if (
             device is not None
             and device.physics != Device.from_toml(header["device"]).physics
         ):
             raise FitError(
-                f"{path}: of another device than {device.name}, or of other values"
+                f"{path}: the emulator was built for another device than {device.name}, or for "
+                "other values of its quantities"
             )
         return cls(
             Device.from_toml(header["device"]), header["parameters"], header["level"],
@@ -409,7 +470,7 @@ def _spreads(
 
 
 def _point(condition: Condition) -> tuple[float | None, ...]:
-    """What a condition states of the operating point."""
+    """Operating point that a condition states; None for quantities that it leaves to the device."""
     return tuple(
         None if getattr(condition, v) is None else float(getattr(condition, v))
         for v in VOLTAGES
@@ -436,6 +497,6 @@ def _operated(device: Device, point: tuple[float | None, ...]) -> Device:
 
 
 def _lags(areas: FloatArray) -> FloatArray:
-    """Areas by lag [j, i] from (0, 0), as far as they are complete."""
+    """Area changes at non-negative lags [j, i]; the last ring, which lacks outer edges, is cut off."""
     middle = areas.shape[-1] // 2
     return areas[..., middle:-1, middle:-1]

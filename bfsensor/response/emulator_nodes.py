@@ -20,7 +20,10 @@ from bfsensor.response.edge_response import EdgeResponse, solve_response
 from bfsensor.typing import FloatArray
 
 STEP = 1e-4
-"""Of a parameter, over which the device is differentiated [its spread]."""
+"""Step of a parameter over which the device is differentiated, relative to its spread.
+
+Chosen: only the right-hand side of a linear system is differenced, at a fixed potential; twice as
+large doubles its error of first order and halves that of round-off."""
 
 Solved = tuple[FloatArray, FloatArray]
 """Shifts [pixel/e-], shape (2, nd, ny, nx), and derivatives, shape (p, 2, nd, ny, nx)."""
@@ -28,9 +31,23 @@ Solved = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True)
 class Node:
-    """One device to solve: text, that of the device its mesh is laid for, by what to differentiate.
+    """One device to solve, with the parameters by which it is differentiated; picklable.
 
-    ``at`` tells which it is: the parameter's number (-1: none) and the side it is moved to.
+    Attributes
+    ----------
+    device, laid_for : str
+        Device to solve, and device for which its mesh is made, as text.
+    level : float
+        Electrons in every pixel [e-].
+    cells, refine_z : int
+        Mesh cells per pixel, and number of times that the mesh in z is halved.
+    names : tuple of str
+        Parameters to differentiate by.
+    steps : tuple of float
+        Step of each parameter [internal units].
+    at : tuple of int
+        Number of the condition, number of the parameter that is moved (-1: none) and the side
+        to which it is moved (1, -1; 0: none).
     """
 
     device: str
@@ -84,7 +101,7 @@ def make_node(
 
 
 def solve_node(node: Node) -> EdgeResponse:
-    """Solve one; picklable, for any executor."""
+    """Solve one device; a function of the module, so that any executor can pickle it."""
     device, laid_for = (Device.from_toml(t) for t in (node.device, node.laid_for))
     changed = [
         (change_parameter(device, name, step), step)
@@ -107,14 +124,16 @@ def solve_nodes(
     progress: Callable[[int, int], None] | None,
     executor: Executor | None,
 ) -> dict[tuple[int, int, int], Solved]:
-    """Solve what is not kept; those moved to where there is no solution are missing.
+    """Solve all nodes that are not kept in the folder already.
+
+    A node at which a moved device has no solution is left out of the result.
 
     Raises
     ------
     DeviceError, ConvergenceError
-        There is none at the device itself.
+        The device itself has no solution at a condition.
     FitError
-        A kept file is not whole.
+        A kept file is not a finished solution.
     """
     out: dict[tuple[int, int, int], Solved] = {}
     paths = {n.at: None if keep is None else keep / f"node_{n.key}.npz" for n in nodes}
@@ -156,7 +175,7 @@ def solve_nodes(
 def _solved(
     nodes: list[Node], executor: Executor | None
 ) -> Iterator[tuple[Node, Callable[[], EdgeResponse]]]:
-    """Nodes with what gives their result, here or as an executor has them."""
+    """Pairs of a node and a function that returns its result, as results become available."""
     if executor is None:
         for node in nodes:
             yield node, lambda node=node: solve_node(node)  # type: ignore[misc]

@@ -1,4 +1,4 @@
-"""What an emulator gives, and the expansion in the parameters that it is made of."""
+"""Second-order expansion of edge shifts in a device's parameters, and results of an emulator."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from bfsensor.typing import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class ExpandedResponse:
-    """Response of a flat at one condition.
+    """Response of a device at one condition, with derivatives; n is the largest lag.
 
     Attributes
     ----------
     kx, ky : ndarray, shape (2 n + 3, 2 n + 3)
         Mean shifts of right and upper edges [pixel/e-], [row, column], (0, 0) in the middle.
     areas : ndarray, shape (n + 1, n + 1)
-        a_ij [1/e-], [j, i] from (0, 0): the change of a pixel's area, relative, per electron.
+        a_ij [1/e-], [j, i] from (0, 0): relative change of a pixel's area per electron.
     jacobian : ndarray, shape (p, n + 1, n + 1)
-        Derivatives of the areas by the parameters [1/e- a unit]; 0 by what the condition states.
+        Derivatives of ``areas`` with respect to the parameters [1/e- per internal unit]; 0 for
+        parameters that the condition states.
     dkx, dky : ndarray, shape (p, 2 n + 3, 2 n + 3)
-        Derivatives of the shifts.
+        Derivatives of ``kx`` and ``ky`` with respect to the parameters.
     """
 
     kx: FloatArray
@@ -48,7 +49,7 @@ class EmulatorCheck:
     solved, emulated : ndarray, shape (points, n + 1, n + 1)
         a_ij [1/e-], [j, i].
     unsolved : int
-        Points drawn besides at which the device has no solution, such as silicon that is not
+        Number of further points that were drawn but have no solution, as where the silicon is not
         depleted.
     """
 
@@ -63,15 +64,24 @@ class EmulatorCheck:
         return self.emulated / self.solved - 1.0
 
     def quantile(self, share: float) -> FloatArray:
-        """Size of the relative error below which a share of the points lies, by lag."""
+        """Size of the relative error that a share (0 to 1) of the points does not exceed, by lag."""
         return np.asarray(np.quantile(np.abs(self.relative), share, axis=0))
 
 
 @dataclass(frozen=True, eq=False)
 class Expansion:
-    """Shifts about one operating point: value, first and second derivatives in spreads.
+    """Expansion of the shifts at one operating point, in units of the parameters' spreads.
 
-    ``free`` are the numbers of the parameters that the operating point leaves free.
+    Attributes
+    ----------
+    free : ndarray of int, shape (p,)
+        Numbers of the parameters that the operating point does not state.
+    value : ndarray, shape (2, nd, ny, nx)
+        Shifts of right and upper edges at the nominal values [pixel/e-].
+    first : ndarray, shape (p, 2, nd, ny, nx)
+        First derivatives [pixel/e- per spread].
+    second : ndarray, shape (p, p, 2, nd, ny, nx)
+        Second derivatives [pixel/e- per spread^2].
     """
 
     free: NDArray[np.int64]
@@ -94,7 +104,16 @@ def expand(
     names: Sequence[str],
     spreads: FloatArray,
 ) -> Expansion:
-    """Second derivatives from solutions to either side, or to one, and their derivatives."""
+    """Make the expansion at one operating point from the device and its moved neighbours.
+
+    Second derivatives come from the values and derivatives of the neighbours one spread to either
+    side of each parameter, or to one side where the other has no solution.
+
+    Raises
+    ------
+    FitError
+        A parameter has no solution to either side.
+    """
 
     def scaled(slopes: FloatArray) -> FloatArray:
         return slopes * spreads[:, None, None, None, None]
@@ -119,11 +138,11 @@ def expand(
 
 
 def _agreed(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Of two estimates of one thing the smaller, 0 where they differ in sign.
+    """Smaller one of two estimates of the same derivative, 0 where they differ in sign.
 
     Every second derivative is found twice, from the neighbours of either parameter, and on the
-    diagonal from their values and from their derivatives.  A point of a boundary that was not
-    differentiated well spoils one of them only.
+    diagonal from their values and from their derivatives.  A boundary point that was not
+    differentiated well spoils only one of them, and usually makes it too large.
     """
     smaller = np.where(np.abs(one) < np.abs(other), one, other)
     return np.asarray(np.where(one * other > 0, smaller, 0.0))

@@ -1,4 +1,4 @@
-"""Vertices of pixel boundaries: where they are and how far they move."""
+"""Vertices of the polygons that stand for pixel boundaries: positions and displacements."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bfsensor.typing import FloatArray
 
 
 def vertex_fractions(vertices: int) -> FloatArray:
-    """Nominal positions of the vertices along a side, 0 to 1, denser at the middle.
+    """Compute the nominal positions of the vertices along a side, denser at the middle.
 
     Equal steps of the angle seen from the pixel centre, as in GalSim's tables, so that a
     table can be exported without resampling.
@@ -18,11 +18,12 @@ def vertex_fractions(vertices: int) -> FloatArray:
     Parameters
     ----------
     vertices : int
-        Vertices between the corners.
+        Number of vertices between the corners, 1 or more.
 
     Returns
     -------
     fractions : ndarray, shape (vertices,)
+        Positions as fractions of the side, 0 to 1, ascending; corners are not included.
 
     Examples
     --------
@@ -35,7 +36,17 @@ def vertex_fractions(vertices: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class Displacements:
-    """Displacements (dx, dy) [um] of corners and side vertices at one point of a table."""
+    """Displacements (dx, dy) [um] of corners and side vertices at one point of a table.
+
+    Parameters
+    ----------
+    corners : ndarray, shape (2 reach + 2, 2 reach + 2, 2)
+        Displacements of the corners, [row, column].
+    horizontal : ndarray, shape (2 reach + 2, 2 reach + 1, vertices, 2)
+        Displacements of the vertices on edges between rows.
+    vertical : ndarray, shape (2 reach + 1, 2 reach + 2, vertices, 2)
+        Displacements of the vertices on edges between columns.
+    """
 
     corners: FloatArray
     horizontal: FloatArray

@@ -28,39 +28,77 @@ from bfsensor.simulate.poisson import Potential
 from bfsensor.typing import FloatArray
 
 SPLIT_HEIGHT = 4.0
-"""Boundaries are bisected this far above the silicon surface [um].
+"""Height above the highest silicon surface at which boundaries are bisected [um].
 
-Below it field lines bend sharply towards the wells; above they are smooth, rise steadily
-and a backward trace is stable."""
+Below it field lines curve sharply towards the wells; above it they are smooth and rise steadily,
+so that a backward trace is stable.  Chosen: at 8 um the boundaries at conversion depths up to
+there would each be bisected, which costs more forward traces and finds the same lines within the
+tracing error."""
 
 RIDGE_MARGIN, RIDGE_CLEARANCE = 0.1, 1.5
-"""If the ridge over the stops comes that near to it, boundaries are bisected this far above
-the ridge instead [um]."""
+"""Distances from the ridge of the potential over the channel stops [um].
+
+Where the ridge comes nearer to :data:`SPLIT_HEIGHT` than the margin, boundaries are bisected at
+the clearance above the ridge instead: traced up from below the ridge, single points of the ITL
+device at -30 V were wrong by 0.9 um (``tests/simulate/test_boundaries.py``).  Chosen: with a margin
+twice as large the change comes at a slightly higher back bias; with a clearance twice as large
+more depths are bisected one by one."""
 
 STEEP = 0.15
-"""Part of the mean field above that the weakest one at that height must have, else they are too: at
-0.05 of it (ITL at -30 V) backward traces ran away from some points, at 0.19 (-35 V) none did."""
+"""Smallest vertical field at the height of bisection, relative to the mean field above it.
 
-BISECTION = 1e-5  # um; a thirtieth of the tracing error that is promised
+Where it is weaker anywhere in the pixel, boundaries are bisected above the ridge instead.
+Measured on the ITL device: at 0.05 of the mean field (-30 V) backward traces ran away from some
+points, at 0.19 (-35 V) none did; the value lies between these."""
+
+BISECTION = 1e-5
+"""Width of the interval at which the bisection of a boundary point ends [um].
+
+Derived: a thirtieth of the tracing error of 3e-4 um that is promised, so that it does not count."""
+
 COARSENESS = 0.25
-"""Step of the forward trace relative to the local scale."""
+"""Step of the forward trace relative to the scale of the field, 0.3 um + 0.12 (z - 1 um).
+
+Measured together with :data:`RATIO`: with steps a sixth as long vertices move by less than
+3e-4 um (``tests/simulate/test_boundaries.py``)."""
 
 RATIO = 0.10
-"""Step of the backward trace relative to the height."""
+"""Step of the backward trace relative to the height above the gates.
+
+Measured together with :data:`COARSENESS`: with steps a sixth as long vertices move by less than
+3e-4 um (``tests/simulate/test_boundaries.py``)."""
 
 TURN = 0.3
-"""Of the direction within a step, where steps are not to lead over a saddle."""
+"""Largest change of the unit vector along the drift within a step, for derivatives of boundaries.
+
+A longer step may jump over a saddle of the potential, and the point then lies on another line
+than its neighbours.  Chosen: at 0.6 a step may turn by 35 degrees instead of 17, and more single
+points jump; paths then take fewer steps."""
 
 _MAX_STEPS = 3000
+"""Largest number of steps of a forward trace; beyond it the point reached counts as its end.
+
+Chosen: more than twenty times the some 125 steps of a straight path of 100 um, so that twice as
+many change only paths that are caught where the field is weak."""
+
 _CORNER_PASSES = 20
-_CORNER_TOLERANCE = 1e-7  # um
+"""Largest number of passes in which corners and the lines across them are made consistent.
+
+Chosen: the passes end before, when no corner moves by more than :data:`_CORNER_TOLERANCE`; twice as
+many change only corners that had not settled, which are taken as they are."""
+
+_CORNER_TOLERANCE = 1e-7
+"""Largest move of a corner in the last pass [um].
+
+Chosen: a hundredth of :data:`BISECTION`; at twice the value corners are uncertain by as much more,
+far below the tracing error."""
 
 
 @dataclass(frozen=True)
 class PixelBoundaries:
     """Boundary lines around the pixels at offsets up to ``reach`` from pixel (0, 0).
 
-    Attributes
+    Parameters
     ----------
     depths : ndarray, shape (nd,)
         Heights above the gates [um] at which the lines were taken.
@@ -73,7 +111,7 @@ class PixelBoundaries:
     rows : ndarray, shape (nd, 2 reach + 2, ns, 2)
         Points (x, y) of the lines between rows, ordered along x.
     symmetric : bool
-        Computed in one quadrant and mirrored.
+        Whether the lines were computed in one quadrant and mirrored.
     """
 
     depths: FloatArray
@@ -86,7 +124,7 @@ class PixelBoundaries:
     def vertices(
         self, vertices: int, fractions: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Displacements of polygon vertices that keep the area of every pixel.
+        """Fit displacements of polygon vertices to the lines, keeping the area of every pixel.
 
         The vertices of a line are the least-squares polyline through it under the
         condition that the area between line and nominal edge is kept in each pixel.
@@ -96,18 +134,19 @@ class PixelBoundaries:
         Parameters
         ----------
         vertices : int
-            Vertices a side between the corners.
+            Number of vertices on a side between the corners.
         fractions : ndarray, shape (vertices,)
-            Their nominal positions along the side, 0 to 1.
+            Nominal positions of the vertices along the side, 0 to 1, ascending
+            (:func:`~bfsensor.response.vertices.vertex_fractions`).
 
         Returns
         -------
         corners : ndarray, shape (nd, 2 reach + 2, 2 reach + 2, 2)
-            Displacement (dx, dy) [um] of the corners, rows then columns.
+            Displacements (dx, dy) [um] of the corners, rows then columns.
         horizontal : ndarray, shape (nd, 2 reach + 2, 2 reach + 1, vertices, 2)
-            Of the vertices on edges between rows.
+            Displacements (dx, dy) [um] of the vertices on edges between rows.
         vertical : ndarray, shape (nd, 2 reach + 1, 2 reach + 2, vertices, 2)
-            Of the vertices on edges between columns.
+            Displacements (dx, dy) [um] of the vertices on edges between columns.
 
         Raises
         ------
@@ -249,15 +288,17 @@ def _line_fit(n_pixels: int, vertices: int, fractions: tuple[float, ...]) -> _Li
 
 @dataclass(frozen=True)
 class Feet:
-    """Where the lines across one axis were bisected, of a quadrant if it is mirrored.
+    """Bisected points of the boundary lines across one axis, the start of their derivatives.
+
+    On a mirror-symmetric domain these are the lines of one quadrant.
 
     Attributes
     ----------
     axis : int
         0: lines between columns, 1: between rows.
     below : tuple of (ndarray, ndarray)
-        Points (x, y, z) of the boundary [um], shape (lines, seeds, 3), and which of the depths
-        were reached from them.
+        For each height of bisection the points (x, y, z) of the boundary [um], shape (lines,
+        seeds, 3), and a mask of the conversion depths that were reached from them.
     """
 
     axis: int
@@ -281,35 +322,50 @@ def find_boundaries(
     Parameters
     ----------
     potential : Potential
-        Solved on a domain that holds the pixels up to ``reach`` and one more.
-    depths : array_like
-        Heights above the gates [um], ascending, in the silicon above the stored charge.
+        Solved on a domain that holds the pixels up to ``reach`` and half a pixel more.
+    depths : array_like, shape (nd,)
+        Conversion depths as heights above the gates [um], ascending, in the silicon above the
+        stored charge (:func:`lowest_depth`).
     reach : int
-        Largest pixel offset.
+        Largest pixel offset, 0 or more.
     samples : int
         Points of a line per pixel, denser towards the corners.
     coarseness, ratio : float
-        Step lengths of the forward and backward traces; the defaults give a tracing
-        error below 3e-4 um.
+        Relative steps of the forward and backward traces (:data:`COARSENESS`, :data:`RATIO`);
+        the defaults give a tracing error below 3e-4 um.
     precision : float
-        Of the bisection [um]; differences between devices want a finer one.
+        Width [um] of the interval at which the bisection ends; differences between devices need a
+        finer one than the default.
     turn : float
-        Largest change of direction within a step of the forward traces (of a unit vector); by
-        default any.  Derivatives want :data:`TURN`: a step over a saddle of the potential makes
+        Largest change of the unit vector of direction within a step of the forward traces; by
+        default any.  Derivatives need :data:`TURN`: a step over a saddle of the potential makes
         single points jump.
     feet : list, optional
-        Gets where the lines were bisected, for both axes, which their derivatives start from.
+        Filled with two :class:`Feet`, the bisected points of the lines between columns and of
+        those between rows; :func:`~bfsensor.simulate.boundary_tangent.boundary_changes` needs them.
 
     Returns
     -------
-    PixelBoundaries
+    boundaries : PixelBoundaries
+        Lines between columns and between rows at every depth.
 
     Raises
     ------
     TableError
-        A depth outside the silicon, or the domain is too small.
+        A depth lies outside the silicon, depths do not ascend, the domain is too small for
+        ``reach``, or the mirror planes do not pass through the centre of pixel (0, 0).
     ConvergenceError
-        A boundary was not found (a well that no longer holds its charge).
+        A boundary was not found, because a well no longer holds its charge.
+
+    Examples
+    --------
+    >>> from bfsensor.device.device import Device
+    >>> from bfsensor.simulate.unit_cell import solve_unit_cell
+    >>> empty = solve_unit_cell(Device.load("itl_sta3800c"), 0.0, cells=8)
+    >>> find_boundaries(empty, [0.1])
+    Traceback (most recent call last):
+        ...
+    bfsensor.errors.TableError: conversion depth 0.1 um must lie in the silicon, ...
     """
     mesh = potential.mesh
     levels: FloatArray = np.array(depths, dtype=np.float64, ndmin=1)
@@ -342,7 +398,8 @@ def find_boundaries(
             or seeds[-1] > mesh.period[1 - axis] / 2
         ):
             raise TableError(
-                f"reach = {reach} pixels does not fit a period of {mesh.period} um"
+                f"reach = {reach} pixels does not fit a period of {mesh.period[0]:g} x "
+                f"{mesh.period[1]:g} um"
             )
         traced, below = _trace_lines(
             field, axis, edges, seeds, levels, split, coarseness, ratio, precision, turn
@@ -413,7 +470,7 @@ def _trace_lines(
     precision: float,
     turn: float,
 ) -> tuple[FloatArray, tuple[tuple[FloatArray, NDArray[np.bool_]], ...]]:
-    """Points of the lines across ``axis`` at every depth, (nd, lines, seeds, 2), and feet."""
+    """Points of the lines across ``axis`` at every depth, (nd, lines, seeds, 2), and their feet."""
     shape = (len(edges), len(along))
     out = np.zeros((len(depths), *shape, 2))
     high = depths >= split

@@ -1,4 +1,4 @@
-"""How pixel boundaries move when the potential changes a little.
+"""Derivatives of pixel boundaries with respect to a small change of the potential.
 
 The field lines of a boundary are followed once, with the linearised equations of their
 deviations: as exact as differences of boundaries traced again, at a tenth of the cost.
@@ -26,16 +26,30 @@ from bfsensor.simulate.tangent import PotentialChange
 from bfsensor.typing import FloatArray
 
 GROWTH = 1e3
-"""Of a deviation from a boundary, beyond which the way down is no longer followed."""
+"""Growth of a deviation from a boundary at which the descent of a field line ends.
+
+Derived: what the change of the potential does further down counts with the inverse of the growth,
+here 1e-3 and less of its size at the start."""
 
 EARLY = 30.0
-"""Growth at which the shift of a point is known to some per cent, before saddles are near."""
+"""Growth of a deviation at which a first, early value of the shift is noted.
+
+Derived: what happens further down counts with at most 1/30, so that the shift is known to some
+per cent there, before the path comes near a saddle of the potential."""
 
 JUMP = 0.5
-"""Of a shift after that, relative to itself or the median of its line, which is none of the
-boundary's: a step past a saddle makes deviations of any size.  The earlier value is taken then."""
+"""Largest change of a shift between :data:`EARLY` and :data:`GROWTH` that is believed.
+
+It is relative to the early value of the point or to the median size along its line, whichever is
+larger; beyond it a step has passed a saddle, which makes deviations of any size, and the early
+value is taken.  Chosen: the change that is expected is some 3 %; at 1.0 points whose shift comes
+out twice as large, or as 0, would be kept."""
 
 _MAX_STEPS = 3000
+"""Largest number of steps down a field line; beyond it the last value found is returned.
+
+Chosen: as for the traces of :mod:`bfsensor.simulate.boundaries`, which a path of 100 um needs
+some 125 of; twice as many change only paths that are caught where the field is weak."""
 
 
 def boundary_changes(
@@ -45,24 +59,27 @@ def boundary_changes(
     changes: Sequence[PotentialChange],
     deeper: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Differentiate the points of boundary lines.
+    """Differentiate the points of boundary lines by quantities of the device.
+
+    A unit below is that of the quantity by which a change was differentiated.
 
     Parameters
     ----------
     potential : Potential
-        Whose lines they are.
-    lines, feet
-        From :func:`~bfsensor.simulate.boundaries.find_boundaries`, called with ``feet=[]`` and
-        ``turn=TURN``.
+        Solution in which the lines were found.
+    lines : PixelBoundaries
+        Lines from :func:`~bfsensor.simulate.boundaries.find_boundaries`, called with ``turn=TURN``.
+    feet : sequence of Feet
+        The list that was passed to that call as ``feet``.
     changes : sequence of PotentialChange
-        From :meth:`~bfsensor.simulate.tangent.Tangent.change`.
+        Derivatives of the potential, from :meth:`~bfsensor.simulate.tangent.Tangent.change`.
     deeper : ndarray, shape (changes, nd), optional
-        Change of the depths themselves [um a unit]; by default they stay.
+        Derivatives of the conversion depths themselves [um per unit]; by default depths stay.
 
     Returns
     -------
     columns, rows : ndarray, shape (changes, nd, lines, seeds, 2)
-        Shifts (x, y) of the points [um a unit], at depths that move by ``deeper``.
+        Derivatives (x, y) of the points [um per unit], at depths that move by ``deeper``.
     """
     field = Field.of(potential)
     order, made = _on_nodes(potential, field, changes)
@@ -105,7 +122,7 @@ def boundary_changes(
 def _on_nodes(
     potential: Potential, field: Field, changes: Sequence[PotentialChange]
 ) -> tuple[list[int], path_changes.Changes]:
-    """Changes as the kernels want them, and in which order they stand there."""
+    """Order in which the changes are passed to the kernels (nodes that stay first), and arrays."""
     still = [n for n, c in enumerate(changes) if not c.moves]
     moving = [n for n, c in enumerate(changes) if c.moves]
     padded = [Field.of(replace(potential, phi=changes[n].at_nodes)).phi for n in still]

@@ -21,45 +21,67 @@ from bfsensor.typing import FloatArray
 from bfsensor.units import VACUUM_PERMITTIVITY
 
 TOLERANCE = 1e-14
-"""Largest error of the image series [V/um per electron]; 100,000 e- make it 1e-9 V/um."""
+"""Largest error of the image series [V/um per electron].
+
+Chosen: 100,000 e- make it 1e-9 V/um beside a drift field of some 0.5 V/um; twice as large, that
+error doubles and about a tenth of the images is saved, as the bound falls with their sixth power."""
 
 _TAIL_TERMS = 15
+"""Number of odd orders, l = 1, 3, ..., 29, of the potential of all further images.
+
+The first two are added to the field, the others bound its error.  Derived: sizes more than halve
+from term to term, so that the orders left out add less than 2^-12 to the bound."""
+
 _MOST_PAIRS = 1000
+"""Largest number of image pairs; a tolerance that needs more is refused.
+
+Chosen: twice as many would reach points twice as far away (in gaps of the planes), at twice the
+time of every field."""
 
 
 @dataclass(frozen=True)
 class ImageCharge:
-    """Parameters of the analytic engine, all in um and V/um; heights are above the gates.
+    """Parameters of the analytic engine: a charged rectangle between two conducting planes.
+
+    All heights are above the gates.
+
+    Parameters
+    ----------
+    charge_height : float
+        Height :math:`z_q` of the stored charge [um], above the lower plane.
+    row_height, column_height : float
+        Heights :math:`z_{sh}`, :math:`z_{sv}` [um] at which boundaries between rows and between
+        columns are sealed, above the charge and below the back surface.  The lower one moves
+        more: rows in CCDs.
+    half_width_x, half_width_y : float
+        Half sides a, b of the charged rectangle [um], above 0 and at most half a pitch.  The
+        closed form loses digits as 1 / (a b): 1e-3 um each leave 1e-13 V/um of round-off.
+    thickness : float
+        Height of the back surface, the upper plane [um].
+    pitch_x, pitch_y : float
+        Pixel pitch [um].
+    drift_field : float or sequence of (height, field)
+        Field that carries electrons down [V/um], above 0: uniform, or pairs of height [um]
+        and field, heights ascending, linear in between, from the lower sealed height or below to
+        the back surface or above.  Silicon of uniform doping needs two pairs.
+    permittivity : float
+        Relative permittivity of silicon, at least 1; the default is that of a device file.
+    plane_height : float
+        Height of the lower plane [um], which stands for gates, oxide and the holes of channel
+        stops together.  An oxide alone puts it below the gates (negative), holes above
+        them.  Zero in Astier & Regnault (2023).
 
     Attributes
     ----------
-    charge_height : float
-        Height :math:`z_q` of the stored charge, above the effective plane.
-    row_height, column_height : float
-        Heights :math:`z_{sh}`, :math:`z_{sv}` at which boundaries between rows and between
-        columns are sealed, above the charge.  The lower one moves more: rows in CCDs.
-    half_width_x, half_width_y : float
-        Half sides a, b of the charged rectangle, at most half a pitch.  The closed form loses
-        digits as 1 / (a b): 1e-3 um each leave 1e-13 V/um of round-off.
-    thickness : float
-        Height of the back surface, the upper plane.
-    pitch_x, pitch_y : float
-        Pixel pitch.
-    drift_field : float or sequence of (height, field)
-        Field that carries electrons down, above 0 V/um: uniform, or by height [um],
-        ascending, linear in between, from the lower sealed height to the back surface.
-        Silicon of uniform doping needs two pairs.
-    permittivity : float
-        Relative permittivity of silicon; the default is that of a device file.
-    plane_height : float
-        Height of the lower plane, which stands for gates, oxide and the holes of channel
-        stops together.  An oxide alone puts it below the gates (negative), holes above
-        them.  Zero in Astier & Regnault (2023).
+    gap : float
+        Distance T of the two planes [um].
+    unit_field : float
+        Field of one electron 1 um away without planes [V/um].
 
     Raises
     ------
     DeviceError
-        A value that is not allowed; names it and the limit.
+        A parameter is not allowed; the message names it and its limit.
 
     References
     ----------
@@ -160,7 +182,18 @@ class ImageCharge:
             )
 
     def drift_at(self, heights: ArrayLike) -> FloatArray:
-        """Give the drift field [V/um] at heights [um]."""
+        """Interpolate the drift field at given heights.
+
+        Parameters
+        ----------
+        heights : array_like, any shape
+            Heights above the gates [um]; beyond given pairs the field of the last one is held.
+
+        Returns
+        -------
+        field : ndarray, shape of ``heights``
+            Drift field [V/um], positive where it carries electrons down.
+        """
         z = np.asarray(heights, float)
         if isinstance(self.drift_field, tuple):
             return np.interp(z, *np.array(self.drift_field).T)
@@ -198,7 +231,7 @@ def _tail_terms(model: ImageCharge, pairs: int) -> FloatArray:
 
 
 def _bound(model: ImageCharge, pairs: int, distance: float) -> float:
-    """Error of the field [V/um per electron] within ``distance`` of the origin."""
+    """Bound on the error of the field [V/um per electron] within ``distance`` of the origin."""
     radius = distance + np.hypot(model.half_width_x, model.half_width_y)
     if radius >= (pairs + 1) * model.gap:
         return np.inf  # kept away from 2 (pairs + 1) T - z_q, where the tail diverges
@@ -241,9 +274,9 @@ def _sum_images(model: ImageCharge, pairs: int) -> ImageSeries:
 
 
 def sum_field(model: ImageCharge, points: FloatArray, series: ImageSeries) -> FloatArray:
-    """Field of one stored electron at points (n, 3) [V/um], towards it; nothing is checked.
+    """Field of one stored electron at points (n, 3) [V/um], towards it; points are not checked.
 
-    Without the drift field; the centre of the charge is at x = y = 0.
+    The drift field is not included; the centre of the charge is at x = y = 0.
     """
     points = points - np.array([0.0, 0.0, model.plane_height])
     out = np.zeros_like(points)
@@ -253,9 +286,9 @@ def sum_field(model: ImageCharge, points: FloatArray, series: ImageSeries) -> Fl
 
 
 def farthest(points: FloatArray, model: ImageCharge) -> float:
-    """Largest distance from the lower plane's origin of a place or the back above it [um].
+    """Largest distance from the lower plane's origin of a place or of the back above it [um].
 
-    Rounded up to a pitch, for the sake of the series that are kept.
+    The lateral part is rounded up to a pitch, so that neighbouring places share a cached series.
     """
     if not points.size:
         return model.gap

@@ -3,12 +3,12 @@ r"""The field at the edge of the pixel array: strips, guard rings, undepleted si
 Along an edge nothing changes, so two dimensions do: the distance :math:`x` from the end of
 the array (pixels at :math:`x > 0`, strips at :math:`x < 0`) and the height :math:`z`.
 
-The pixels themselves are not resolved.  A change of the field above them is felt by a
-laterally averaged pixel as by a conducting plane: the mean potential of the unit cell is
+The pixels themselves are not resolved.  A laterally averaged pixel responds to a change of the
+field above it as a conducting plane does: the mean potential of the unit cell is
 :math:`\bar\phi(z) = a + b z - N z^2 / 2 \epsilon` above its implants, and at the height
 :math:`z_g` where it does not depend on the back bias the pixels hold it.  The field of an
-edge varies over :math:`T / \pi` (80 um in 250 um of silicon), what is left out over
-:math:`p / 2 \pi` (2 um).
+edge varies over :math:`T / \pi` (80 um in 250 um of silicon), the structure of the pixels that
+is left out over :math:`p / 2 \pi` (2 um).
 
 In the bulk holes are in equilibrium with the back contact,
 :math:`p = |N| e^{(V_b - \phi) / kT}`, so that silicon which the field does not deplete stays
@@ -43,20 +43,29 @@ from bfsensor.units import VACUUM_PERMITTIVITY
 if TYPE_CHECKING:
     from bfsensor.device.device import Device
 
-_BIAS_STEP = 0.04  # of the drop across the silicon, to find the height of the plane
+_BIAS_STEP = 0.04
+"""Step of the back bias over which the front plane is found, relative to the drop in the silicon.
+
+Chosen: the mean potential of depleted silicon is linear in the back bias but for the wells, so that
+twice as large a step finds the same plane up to their response of second order."""
+
 _CELLS = 16
+"""Mesh cells per pixel of the unit cells of which the front plane is found.
+
+Chosen: the default of :func:`~bfsensor.simulate.mesh.make_mesh`; twice as many solve the wells more
+finely, at some four times the time of a unit cell."""
 
 
 @dataclass(frozen=True)
 class EdgeField:
     """The potential around one edge of the array.
 
-    Attributes
+    Parameters
     ----------
     device : Device
-        With its edge.
+        Device with the edge that was solved.
     front : FrontPlane
-        What stands for the pixels.
+        Conducting plane that stands for the pixels.
     x : ndarray, shape (nx,)
         Distance from the end of the array [um], pixels at x > 0.
     z : ndarray, shape (nz,)
@@ -64,11 +73,12 @@ class EdgeField:
     phi : ndarray, shape (nz, nx)
         Potential [V].
     neutral : ndarray of bool, shape (nz, nx)
-        Where the holes of the bulk hold at least half of the background doping.
+        Whether free holes balance more than half of the background doping at a node.
     pitch : float
-        Of the pixels across the edge [um].
+        Pixel pitch across the edge [um].
     pixels : int
-        Pixels in the domain; a mirror plane follows the last, as the last strip.
+        Number of pixels in the domain.  The domain ends in a mirror plane beyond the last pixel
+        and in another beyond the last strip.
     steps : tuple of float
         Largest step [V] of each of Newton's iterations.
     """
@@ -93,13 +103,14 @@ def front_plane(device: Device, *, charge: float = 0.0) -> FrontPlane:
     Parameters
     ----------
     device : Device
-        Its edge, if it has one, is left aside.
+        Mirror-symmetric device; its edge, if it has one, is ignored.
     charge : float
-        Electrons in every pixel [e-].
+        Electrons in every pixel [e-], 0 or more.
 
     Returns
     -------
-    FrontPlane
+    plane : FrontPlane
+        Height and potential of the plane.
 
     Raises
     ------
@@ -166,27 +177,28 @@ def solve_edge(
     Parameters
     ----------
     device : Device
-        With an edge.
+        Device that describes an edge.
     pixels : int, optional
-        Pixels from the edge inward; by default as many as six thicknesses hold, where the
-        field of the edge has fallen to :math:`e^{-6 \pi}`, at least 40.
+        Pixels from the edge inward, at least 4; by default as many as six thicknesses hold, where
+        the field of the edge has fallen to :math:`e^{-6 \pi}`, and at least 40.
     charge : float
-        Electrons in every pixel [e-].
+        Electrons in every pixel [e-], 0 or more; unused where ``front`` is given.
     refine : int
-        How often every interval of the mesh is halved.
+        Number of times that every interval of the mesh is halved, 0 or more.
     front : FrontPlane, optional
-        What stands for the pixels, by default found with :func:`front_plane`.
+        Conducting plane that stands for the pixels, by default found with :func:`front_plane`.
 
     Returns
     -------
-    EdgeField
+    edge : EdgeField
+        Potential between the last strip and the last pixel of the domain.
 
     Raises
     ------
     DeviceError
-        The device has no edge, or one that this model cannot hold: see Notes.
+        The device has no edge, or one outside the validity of this model: see Notes.
     ConvergenceError
-        Newton did not get there; carries the steps.
+        Newton's method did not converge; the error holds its steps [V] as ``history``.
 
     Notes
     -----
@@ -226,7 +238,8 @@ def solve_edge(
     phi, holes, steps = relax_holes(device, system)
     shape = (len(z), len(x))
     phi, free = phi.reshape(shape), system.free.reshape(shape)
-    # Below the strips' surface there is nothing: no field there, for those who interpolate.
+    # Below the surface of the strips nothing is solved; the potential of the surface is
+    # repeated there, so that an interpolation across it sees no field of its own.
     row = int(np.argmin(np.abs(z - surface)))
     phi[:row, x < 0] = phi[row, x < 0]
     edge = EdgeField(

@@ -19,13 +19,40 @@ if TYPE_CHECKING:
     from bfsensor.device.device import Device
 
 TOLERANCE = 1e-7
-"""Largest last step of Newton's method [V]."""
+"""Largest last step of Newton's method [V].
 
-FINEST_X = 0.2  # um, at the ends of strips; a jump of voltage is misplaced by half of it
-FINEST_Z = 0.1  # um, at the surface, where the implants are
+Chosen: steps shrink quadratically near the solution, so that the error left is far smaller; at
+twice the value at most one step less is made."""
+
+FINEST_X = 0.2
+"""Interval of the mesh in x at the ends of strips [um].
+
+Chosen: a jump of voltage is misplaced by half of it; twice as large, by 0.2 um, which is the
+error of first order in ``tests/simulate/test_edge_field.py``."""
+
+FINEST_Z = 0.1
+"""Interval of the mesh in z at the surface and at the front plane [um].
+
+Chosen: implants are integrated over the cells, so that their dose is kept on any mesh; twice as
+large, the depth of a dose is resolved half as well."""
+
 _GROWTH = 1.15
-_COARSEST = 1.0 / 50  # of the thickness
+"""Ratio of neighbouring intervals of the mesh, away from its finest places.
+
+Chosen: with intervals that grow twice as much (1.3) the mesh has about half as many nodes, and
+the error of its interpolation between them grows with the difference of neighbours."""
+
+_COARSEST = 1.0 / 50
+"""Longest interval of the mesh relative to the thickness.
+
+Chosen: the field of an edge varies over the thickness / pi, some 16 such intervals; twice as long,
+the error of second order is four times as large in the bulk."""
+
 _MAX_NEWTON = 200
+"""Largest number of Newton steps; beyond it a ConvergenceError is raised.
+
+Chosen: damped steps move by a few kT / q at a time where holes spread, each of which costs one
+factorisation; twice as many only make a failure take twice as long."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +74,7 @@ class FrontPlane:
 def grade_nodes(
     ends: list[float], thickness: float, finest: float, refine: int
 ) -> FloatArray:
-    """Nodes through all ends, fine there but for the last one, and graded."""
+    """Graded nodes that pass through all ends, finest at each of them but the last."""
     coarsest = _COARSEST * thickness
     out = [float(ends[0])]
     for n, (a, b) in enumerate(pairwise(ends)):
@@ -72,7 +99,21 @@ def grade_nodes(
 
 @dataclass(frozen=True)
 class System:
-    """Matrix [e-/V per um], fixed charge [e- per um] and who is free; flat over (z, x)."""
+    """The linear system of an edge per um along it; arrays are flat over (z, x).
+
+    Attributes
+    ----------
+    matrix : sparse matrix
+        Links between nodes [e-/(V um)].
+    charge : ndarray
+        Fixed charge of dopants, and of gates through their oxide [e-/um].
+    held : ndarray
+        Potentials of the nodes that are conductors [V], 0 elsewhere.
+    free : ndarray of bool
+        Whether the potential of a node is unknown.
+    acceptors : ndarray
+        Acceptors of the background doping in each cell [e-/um], above 0 in p-type silicon.
+    """
 
     matrix: csc_matrix
     charge: FloatArray
@@ -89,7 +130,11 @@ def assemble(
     ends: FloatArray,
     surface: float,
 ) -> System:
-    """Links, charges and conductors, summed over the intervals in x."""
+    """Assemble links, charges and conductors of an edge; ``ends`` [um] are those of its strips.
+
+    Each interval in x lies above one strip or above the pixels, and adds half of itself to the
+    nodes on either side.
+    """
     assert device.edge is not None
     nz, nx = len(z), len(x)
     eps_si = device.material.permittivity_silicon * VACUUM_PERMITTIVITY
@@ -131,7 +176,8 @@ def assemble(
                 to_gate[row, node] += link
                 charge[row, node] += link * strip.voltage
     acceptors = -device.silicon.background_doping * volume
-    # Nodes in the oxide under the strips belong to nobody.
+    # Nodes in the oxide under the strips have no volume: a fixed potential keeps the matrix
+    # regular.
     held[(volume == 0) & np.isnan(held)] = bias
     free = np.isnan(held).ravel()
     return System(
@@ -164,7 +210,7 @@ def _link_nodes(across: FloatArray, along: FloatArray, to_gate: FloatArray) -> c
 def relax_holes(
     device: Device, system: System
 ) -> tuple[FloatArray, FloatArray, list[float]]:
-    """Potential [V] and holes [e- per um] of all nodes, and the steps on the way."""
+    """Solve for the potential [V] and the holes [e-/um] of all nodes; returns Newton's steps too."""
     kt = device.material.thermal_voltage(device.operating_point.temperature)
     bias = device.operating_point.back_bias
     free = system.free

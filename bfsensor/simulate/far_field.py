@@ -5,8 +5,8 @@ on a grounded plane, facing the back contact at the other end of the silicon.  I
 lateral field is the mode sum (Jackson, Classical Electrodynamics, section 3.11)
 
 .. math::
-    E_\\rho(\\rho, z) = C \\sum_n \\kappa_n^2 \\sin(\\kappa_n (T - z)) K_1(\\kappa_n \\rho)
-    (-1)^{n + 1}, \\qquad \\kappa_n = n \\pi / (T - z_0),
+    E_\rho(\rho, z) = C \sum_n \kappa_n^2 \sin(\kappa_n (T - z)) K_1(\kappa_n \rho)
+    (-1)^{n + 1}, \qquad \kappa_n = n \pi / (T - z_0),
 
 and shifts a boundary by the integral of :math:`E_\\rho / E_z` over the path of the
 electrons.  A solution with periodic sides is the sum over all images; those at other
@@ -25,15 +25,29 @@ from bfsensor.simulate.poisson import Potential
 from bfsensor.typing import FloatArray
 
 _MODES = 40
+"""Number of modes of the sum.
+
+Derived: mode n falls as exp(-n pi rho / (T - z_0)); at the smallest distance, 20 um in 100 um of
+silicon, the 40th is exp(-25)."""
+
 _STEPS = 200
+"""Number of heights between the front structure and the back at which a path is integrated.
+
+Chosen: steps are 0.5 um in 100 um of silicon; with twice as many the error of the trapezoids, of
+second order, is a quarter, and the depths are interpolated on a grid half as wide."""
+
 _IMAGES = 3
+"""Number of periods to either side of which images are summed.
+
+Derived: the next image of a period of 12 pixels of 10 um is at least 420 um away from a pixel,
+where the field in 100 um of silicon has fallen to exp(-4.2 pi), 2e-6."""
 
 
 @dataclass(frozen=True)
 class FarField:
     """Shift of boundaries far from a unit dipole, ``shift(rho, depth)``, tabulated.
 
-    Attributes
+    Parameters
     ----------
     distances : ndarray, shape (nr,)
         Distances from the dipole [um].
@@ -51,19 +65,24 @@ class FarField:
     def of(
         cls, unit: Potential, depths: FloatArray, ground: float, reach: float
     ) -> FarField:
-        """Compute for the mean field of a unit cell.
+        """Tabulate the far field for the mean drift field of a unit cell.
 
         Parameters
         ----------
         unit : Potential
-            The uniform array without the charge; its laterally averaged field carries
-            the electrons.
-        depths : ndarray
-            Heights above the gates [um].
+            Solution of the uniform array without the charge; its laterally averaged field
+            carries the electrons.
+        depths : ndarray, shape (nd,)
+            Conversion depths as heights above the gates [um].
         ground : float
             Height of the effective grounded plane [um]: the silicon surface.
         reach : float
-            Largest distance wanted [um].
+            Largest distance in the table [um]; at least 40 um are tabulated.
+
+        Returns
+        -------
+        far : FarField
+            Shifts from 20 um to ``reach``; beyond both ends the last value is held.
         """
         mesh = unit.mesh
         weight_x = np.gradient(mesh.x)
@@ -92,7 +111,20 @@ class FarField:
         return cls(distances, np.asarray(depths, float), shifts)
 
     def vectors(self, points: FloatArray, depth: int) -> FloatArray:
-        """Outward shift vectors at ``points`` (..., 2) relative to the dipole."""
+        """Interpolate the outward shifts at points around the dipole.
+
+        Parameters
+        ----------
+        points : ndarray, shape (..., 2)
+            Positions (x, y) relative to the dipole [um], not at 0.
+        depth : int
+            Index into ``depths``.
+
+        Returns
+        -------
+        shifts : ndarray, shape (..., 2)
+            Shifts (x, y) away from the dipole, in the arbitrary unit of ``shifts``.
+        """
         rho = np.hypot(points[..., 0], points[..., 1])
         size = np.exp(
             np.interp(

@@ -13,7 +13,18 @@ from bfsensor.typing import FloatArray
 
 @dataclass(frozen=True)
 class Field:
-    """A potential padded for interpolation: ``phi`` [y, z, x] and its node positions."""
+    """A potential padded beyond the domain, as the kernels interpolate it.
+
+    Parameters
+    ----------
+    phi : ndarray, shape (ny', nz', nx')
+        Potential [V], [y, z, x].
+    x, y, z : ndarray
+        Positions of the nodes [um].
+    zone : ndarray, shape (5,)
+        Space in which an electron counts as collected [um]: pitch in x and y, half width and
+        half height around a pixel's centre, and greatest height above the gates.
+    """
 
     phi: FloatArray
     x: FloatArray
@@ -23,7 +34,19 @@ class Field:
 
     @classmethod
     def of(cls, potential: Potential) -> Field:
-        """Pad a potential by its symmetry in x and y and by extrapolation in z."""
+        """Pad a potential by its symmetry in x and y and by extrapolation in z.
+
+        Parameters
+        ----------
+        potential : Potential
+            Solved potential.
+
+        Returns
+        -------
+        field : Field
+            The same potential with a pixel more on every side in x and y, and two planes more at
+            either end in z.
+        """
         mesh = potential.mesh
         phi = np.moveaxis(potential.phi, 0, 1)
         phi, y = _pad(phi, mesh.y, 0, mesh.side_y, mesh.period[1], mesh.cells)
@@ -33,6 +56,8 @@ class Field:
         surfaces = Surfaces.of(device)
         channel = mesh.pitch[0] / 2 - surfaces.stop_half_width - surfaces.taper
         collecting = max(device.gates.edges_y(mesh.pitch[1]))
+        # The zone lies inside the well, a tenth off the borders of the channel and of the
+        # collecting gates, so that no path that passes near a border ends too early.
         zone = np.array(
             [
                 mesh.pitch[0],

@@ -3,12 +3,12 @@ r"""Non-linear electrostatics of a sensor: potential, free holes, stored electro
 Solves, in electron per node,
 
 .. math::
-    A \\phi = Q_{fixed} + p(\\phi) - n(\\phi)
+    A \phi = Q_{fixed} + p(\phi) - n(\phi)
 
-with holes :math:`p = n_i V e^{(\\phi_h - \\phi)/kT}` at one quasi-Fermi level and, in every
-pixel, electrons :math:`n = N e^{\\phi/kT} / \\sum e^{\\phi/kT}` of the prescribed number N.
-Newton's method; each linear system by conjugate gradients with one multigrid cycle as
-preconditioner.
+with holes :math:`p = n_i V e^{(\phi_h - \phi)/kT}` at one quasi-Fermi level and, in every
+pixel, electrons :math:`n = N e^{\phi/kT} / \sum e^{\phi/kT}` of the prescribed number N.
+The equations are solved by Newton's method, each of its linear systems by conjugate gradients with
+one multigrid cycle as preconditioner.
 """
 
 from __future__ import annotations
@@ -33,23 +33,53 @@ if TYPE_CHECKING:
 TOLERANCE = 1e-6
 """Iteration error [V] at which a solution counts as converged.
 
-In the worst case 1e-3 um^2 of an area, see :data:`AREA_PER_VOLT`."""
+Derived: with :data:`AREA_PER_VOLT` at most 1e-3 um^2 of an area, of changes of some 10 um^2."""
 
 AREA_PER_VOLT = 800.0
-"""Bound on the area error [um^2] that an iteration error of 1 V can make.
+"""Bound on the area error that an iteration error of 1 V can make [um^2/V].
 
-A field error of 1 V over a pixel (10 um), along the whole way of the electrons (100 um) in
+Derived: a field error of 1 V over a pixel (10 um), along the whole way of the electrons (100 um) in
 0.5 V/um, moves a boundary by 20 um; four of them of 10 um move an area by 800 um^2."""
 
 _MAX_NEWTON = 60
+"""Largest number of Newton steps; beyond it a ConvergenceError is raised.
+
+Chosen: twice as many only make a failure take twice as long."""
+
 _MAX_CG = 200
-_DENSE = 10.0  # carriers/um^3 above which a Newton step is damped: far below any doping
-_WELL_PER_ELECTRON = 3.0e-5  # V; how far a well's level sinks, only to start the iteration
+"""Largest number of conjugate-gradient iterations of a Newton step; the next step goes on from there.
+
+Chosen: a multigrid cycle about halves the error, so that the factor of 1e3 that is asked for takes
+some ten; twice as many change only systems that hardly converge."""
+
+_DENSE = 10.0
+"""Density of electrons or holes above which a Newton step is damped [1/um^3].
+
+Chosen: it is far below the density of stored electrons and implants, and of the order of the
+background doping; at twice the value carriers may grow further in a step before they are damped.
+The solution does not depend on it."""
+
+_WELL_PER_ELECTRON = 3.0e-5
+"""Fall of the quasi-Fermi level of a well per stored electron, only to start the iteration [V].
+
+Chosen: about what the wells of shipped devices do; at twice the value the iteration starts further
+from the solution, which does not depend on it."""
 
 
 @dataclass(frozen=True)
 class NewtonStep:
-    """One line of a convergence history."""
+    """One step of Newton's method in a convergence history.
+
+    Attributes
+    ----------
+    asked, taken : float
+        Largest change of the potential that the linear system asks for, and that was made after
+        damping [V].
+    linear_iterations : int
+        Number of conjugate-gradient iterations.
+    residual : float
+        Norm of the unbalanced charge before the step [e-].
+    """
 
     asked: float
     taken: float
@@ -61,10 +91,12 @@ class NewtonStep:
 class Potential:
     """A converged solution.
 
-    Attributes
+    Parameters
     ----------
-    device, mesh : Device, Mesh
-        What was solved, and where.
+    device : Device
+        Device that was solved.
+    mesh : Mesh
+        Mesh on which it was solved.
     charges : ndarray, shape (pixels in y, pixels in x)
         Electrons stored in each (whole) pixel of the domain [e-].
     phi : ndarray, shape (nz, ny, nx)
@@ -78,7 +110,7 @@ class Potential:
     error_volts : float
         Bound on the iteration error that is left [V].
     history : tuple of NewtonStep
-        How it converged.
+        Steps of Newton's method, in order.
     """
 
     device: Device
@@ -107,11 +139,27 @@ class Electrostatics:
     Parameters
     ----------
     device : Device
-        The sensor.
+        Device without an edge.
     mesh : Mesh
-        From :func:`~bfsensor.simulate.mesh.make_mesh`.
+        Mesh of the device, from :func:`~bfsensor.simulate.mesh.make_mesh`.
     n_front : int, optional
-        Planes that may hold carriers; by default those up to the end of the deepest implant.
+        Number of planes from the gates up that may hold free carriers; by default those up to the
+        end of the deepest implant.
+
+    Raises
+    ------
+    DeviceError
+        The device has an edge.
+
+    Examples
+    --------
+    >>> from bfsensor.device.device import Device
+    >>> from bfsensor.simulate.mesh import make_mesh
+    >>> device = Device.load("itl_sta3800c")
+    >>> solver = Electrostatics(device, make_mesh(device, pixels=(1, 1), cells=8))
+    >>> solution = solver.solve(20_000.0)
+    >>> bool(solution.error_volts < TOLERANCE)
+    True
     """
 
     def __init__(self, device: Device, mesh: Mesh, *, n_front: int | None = None) -> None:
@@ -163,23 +211,26 @@ class Electrostatics:
         Parameters
         ----------
         charges : array_like, shape ``pixel_shape`` or scalar
-            Electrons in each pixel [e-], counted for the whole pixel even where a mirror
-            plane cuts it.
+            Electrons in each pixel [e-], 0 or more, counted for the whole pixel even where a
+            mirror plane cuts it.
         start : ndarray, shape (nz, ny, nx), optional
-            Potential to start from [V]; by default an empty pixel, solved and repeated.
+            Potential to start from [V]; by default the linear solution without carriers, held
+            above the level of the holes.
         tolerance : float
-            Iteration error that may be left [V].
+            Iteration error that may be left [V], above 0.
 
         Returns
         -------
-        Potential
+        solution : Potential
+            Potential and carriers, converged to ``tolerance``.
 
         Raises
         ------
         ConvergenceError
-            Newton did not get there; carries the history.
+            Newton's method did not converge; the error holds its steps [V] as ``history``.
         DeviceError
-            A negative number of electrons, or free holes at the end of their region.
+            A number of electrons is negative, or free holes reach the end of their region because
+            the silicon above is not depleted.
         """
         charges = np.array(np.broadcast_to(np.asarray(charges, float), self.pixel_shape))
         if not np.all(charges >= 0):
@@ -221,7 +272,7 @@ class Electrostatics:
         )
 
     def imbalance(self, phi: FloatArray, charges: ArrayLike) -> FloatArray:
-        """Charge that a potential leaves unbalanced [e-], node by node.
+        """Compute the charge that a potential leaves unbalanced, node by node.
 
         Parameters
         ----------
@@ -233,7 +284,7 @@ class Electrostatics:
         Returns
         -------
         residual : ndarray, shape (ny + 2, nz, nx + 2)
-            With halo; :meth:`respond` takes it.
+            Unbalanced charge [e-], ``[y, z, x]`` with halo, as :meth:`respond` takes it.
         """
         self._linearised = None
         padded, count = self._padded(phi), self._counts(charges)
@@ -260,25 +311,27 @@ class Electrostatics:
         start: FloatArray | None = None,
         tolerance: float = 1e-3,
     ) -> tuple[FloatArray, int]:
-        """Change of a solution for a small charge that unbalances it: J^-1 of it.
+        """Find the change of a solution that balances a small charge, to first order.
+
+        It is the solution of the linear system of Newton's last step, J^-1 times the charge.
 
         Parameters
         ----------
         at : Potential
-            A solution of this solver, about which is linearised.
+            Solution of this solver about which the equations are linearised.
         unbalanced : ndarray, shape (ny + 2, nz, nx + 2)
-            Charge [e-], as :meth:`imbalance` gives it.
+            Charge [e-], as :meth:`imbalance` returns it.
         start : ndarray, shape (nz, ny, nx), optional
-            What is known of the change [V].
+            Approximate change [V]; only the rest is solved for.
         tolerance : float
-            Error of what ``start`` leaves to be found, relative, in the norm of the energy.
+            Error of that rest, relative to it, in the energy norm of the linear system.
 
         Returns
         -------
         change : ndarray, shape (nz, ny, nx)
-            Of the potential [V].
+            Change of the potential [V].
         iterations : int
-            Of the conjugate gradients.
+            Number of conjugate-gradient iterations.
         """
         c = self.coefficients
         count = self._counts(at.charges)
@@ -313,7 +366,7 @@ class Electrostatics:
         return np.asarray(whole * self._share_y[:, None] * self._share_x[None, :]).ravel()
 
     def _padded(self, a: FloatArray) -> FloatArray:
-        """A field as the kernels want it: ``[y, z, x]`` with halo."""
+        """Copy a field ``[z, y, x]`` into the layout of the kernels, ``[y, z, x]`` with halo."""
         out = np.zeros(self._shape)
         out[1:-1, :, 1:-1] = np.moveaxis(a, 0, 1)
         self._fill_halo(out)
@@ -355,10 +408,11 @@ class Electrostatics:
         return np.moveaxis(phi[1:-1, :, 1:-1], 1, 0).copy()
 
     def _open_wells(self, phi: FloatArray, charges: FloatArray) -> FloatArray | None:
-        """Make room in wells that the start has empty; their levels, or None if none is new.
+        """Lower the potential, in place, of wells that are to be filled but are empty in the start.
 
-        An empty well's maximum lies far above any electron level.  The potential is cut
-        where a plausible number of electrons would hold it.
+        The maximum of an empty well lies far above any electron level.  The potential is cut
+        where a plausible number of electrons would hold it.  Returns the quasi-Fermi levels [V]
+        to start from, or None if there is no such well.
         """
         c = self.coefficients
         n_px = len(self._share_x)
@@ -471,7 +525,8 @@ class Electrostatics:
             history.append(NewtonStep(asked, taken, iterations, norm))
             if not np.isfinite(asked):
                 break
-            # What is left: the linear system's error, and the quadratic term of Newton.
+            # Two errors are left: that of the linear system, and Newton's quadratic term.  The
+            # exponentials of the carriers change on the scale of kT, which sets the second.
             error = asked * max(forcing, asked / self._kt)
             if error < tolerance:
                 return error

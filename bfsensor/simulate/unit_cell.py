@@ -23,18 +23,32 @@ def solve_unit_cell(
     Parameters
     ----------
     device : Device
-        A mirror-symmetric device.
+        Mirror-symmetric device.
     charge : float
-        Electrons in every pixel [e-].
+        Electrons in every pixel [e-], 0 or more.
     cells : int
-        Cells a pixel.
+        Mesh cells per pixel in x and in y, even, at least 8.
     refine_z : int
-        Halvings of the z mesh.
+        Number of times that every interval of the mesh in z is halved, 0 or more.
 
     Returns
     -------
-    Potential
-        On a quarter pixel.
+    solution : Potential
+        Solution on a quarter of a pixel between mirror planes.
+
+    Raises
+    ------
+    DeviceError
+        The device has no mirror planes, or is not depleted.
+    ConvergenceError
+        Newton's method did not converge.
+
+    Examples
+    --------
+    >>> from bfsensor.device.device import Device
+    >>> empty = solve_unit_cell(Device.load("itl_sta3800c"), 0.0, cells=8)
+    >>> empty.phi.shape[1:], bool(empty.electrons.any())
+    ((5, 5), False)
     """
     mesh = make_mesh(device, pixels=(1, 1), cells=cells, refine_z=refine_z, symmetric=True)
     solver = Electrostatics(device, mesh)
@@ -48,14 +62,22 @@ def tile(unit: Potential, mesh: Mesh) -> FloatArray:
     Parameters
     ----------
     unit : Potential
-        From :func:`solve_unit_cell`, same device and cells.
+        Solution of :func:`solve_unit_cell` for the same device and cells per pixel.
     mesh : Mesh
-        Where the potential is wanted.
+        Mesh of many pixels on which the potential is wanted.
 
     Returns
     -------
     phi : ndarray, shape (nz, ny, nx)
-        Potential [V].
+        Potential at the nodes of ``mesh`` [V].
+
+    Examples
+    --------
+    >>> from bfsensor.device.device import Device
+    >>> device = Device.load("itl_sta3800c")
+    >>> empty = solve_unit_cell(device, 0.0, cells=8)
+    >>> tile(empty, make_mesh(device, pixels=(4, 4), cells=8)).shape[1:]
+    (17, 17)
     """
 
     def index(nodes: FloatArray, pitch: float, cell: FloatArray) -> NDArray[np.int64]:

@@ -16,7 +16,16 @@ if TYPE_CHECKING:
     from bfsensor.device.device import Device
 
 _PERIOD = 4
-_LARGEST_WELL = 2e6  # e-: no pixel of a science CCD holds more
+"""Period of the array in which one pixel is filled [pixel]; one more without mirror planes.
+
+Chosen: the images of the full pixel are four pixels away; at eight they would act on its barrier by
+less still, at four times the time of a solution."""
+
+_LARGEST_WELL = 2e6
+"""Charge above which the search for a full well ends with an error [e-].
+
+Chosen: more than the pixels of science CCDs hold; twice as large changes nothing but how late a
+device without an end of its well is refused."""
 
 
 def barrier(potential: Potential) -> float:
@@ -28,12 +37,21 @@ def barrier(potential: Potential) -> float:
     Parameters
     ----------
     potential : Potential
-        On a domain that holds half of pixel (0, 0) and of pixel (0, 1) at least.
+        Solution on a domain that holds half of pixel (0, 0) and of pixel (0, 1) at least.
 
     Returns
     -------
     height : float
-        Barrier [V]; zero or less where the well overflows.
+        Barrier [V]; 0 or less where the well overflows.
+
+    Examples
+    --------
+    >>> from bfsensor.device.device import Device
+    >>> device = Device.load("itl_sta3800c")
+    >>> mesh = make_mesh(device, pixels=(2, 2), cells=8)
+    >>> empty = tile(solve_unit_cell(device, 0.0, cells=8), mesh)
+    >>> bool(barrier(Electrostatics(device, mesh).solve(0.0, start=empty)) > 1.0)
+    True
     """
     mesh = potential.mesh
     n_front = potential.silicon.shape[0]
@@ -48,7 +66,7 @@ def barrier(potential: Potential) -> float:
 
 
 def surface_barrier(potential: Potential) -> float:
-    """Height that keeps the electrons of pixel (0, 0) off the oxide [V].
+    """Height of the barrier that keeps the electrons of pixel (0, 0) off the oxide [V].
 
     The potential of the well less the highest at the interface of silicon and oxide in the
     same pixel.  Electrons in equilibrium are there less dense than in the middle of the cloud
@@ -57,12 +75,12 @@ def surface_barrier(potential: Potential) -> float:
     Parameters
     ----------
     potential : Potential
-        On a domain that holds part of pixel (0, 0).
+        Solution on a domain that holds part of pixel (0, 0).
 
     Returns
     -------
     height : float
-        Barrier [V]; zero where the electrons lie at the interface.
+        Barrier [V]; 0 where the electrons lie at the interface.
     """
     mesh = potential.mesh
     own_x = np.abs(mesh.x) <= mesh.pitch[0] / 2 + 1e-9
@@ -76,17 +94,17 @@ def surface_barrier(potential: Potential) -> float:
 
 
 def full_well(device: Device, *, cells: int = 16) -> float:
-    """Charge at which the barrier along the column falls to the spill barrier [e-].
+    """Find the charge at which the barrier along the column falls to the spill barrier.
 
-    One pixel is filled and its neighbours are empty, as in a bright star on dark sky.  Of a
+    One pixel is filled and its neighbours are empty, as in a bright star on dark sky.  In a
     device without mirror planes it is the pixel in the middle of a whole period.
 
     Parameters
     ----------
     device : Device
-        Its ``well.spill_barrier`` sets the height [V].
+        Device whose ``well.spill_barrier`` [V] is the barrier at which electrons spill.
     cells : int
-        Cells a pixel.
+        Mesh cells per pixel in x and in y, even, at least 8.
 
     Returns
     -------
@@ -97,6 +115,14 @@ def full_well(device: Device, *, cells: int = 16) -> float:
     ------
     DeviceError
         The empty well is already shallower than the spill barrier.
+    ConvergenceError
+        The well holds more than 2e6 e-, or a potential does not converge.
+
+    Examples
+    --------
+    >>> from bfsensor.device.device import Device
+    >>> bool(full_well(Device.load("itl_sta3800c"), cells=8) > 1e5)
+    True
     """
     mirrored = device.is_mirror_symmetric
     period = _PERIOD if mirrored else _PERIOD + 1

@@ -120,7 +120,7 @@ def test_x_rays_convert_along_their_attenuation_length():
 def test_refuses_what_is_no_cloud(tracer):
     with pytest.raises(SimulationError, match="repulsion = -1"):
         trace_cloud(tracer, [[0, 0, 50.0]], seed=1, repulsion=-1)
-    with pytest.raises(SimulationError, match="radius above 0"):
+    with pytest.raises(SimulationError, match=r"radius = 0\.0 um .* electrons = 1620"):
         fe55_cloud(seed=1, place=(0, 0), thickness=100.0, radius=0.0)
     lone = trace_cloud(tracer, [[1.0, 1.0, 50.0]], seed=1, transport=Transport(diffusion=0))
     assert lone.pixels.tolist() == [[0, 0]]

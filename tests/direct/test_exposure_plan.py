@@ -1,4 +1,4 @@
-"""What spots and flats share: keys that stay, the full well, files."""
+"""Common parts of spots and flats: keys that stay, the full well, files."""
 
 import dataclasses
 

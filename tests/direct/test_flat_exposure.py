@@ -1,4 +1,4 @@
-"""Flats of the direct simulation: conserved, repeatable, and evened out by the effect."""
+"""Flats of the direct simulation: conserved, repeatable, and relaxed by brighter-fatter feedback."""
 
 import numpy as np
 import pytest
@@ -32,9 +32,9 @@ def test_electrons_are_conserved_and_poisson(flat):
 
 @pytest.mark.slow
 def test_pixels_that_are_ahead_fall_behind(flat):
-    """What a pixel loses is half the level times a_ij times the charges ahead, summed.
+    """A pixel loses half the level times the sum of a_ij times the charges ahead of the mean.
 
-    Without diffusion, whose noise hides it in so few pixels.
+    Diffusion is switched off: its noise would hide the loss in so few pixels.
     """
     off = flat.off[-1].astype(float)
     ahead = off - off.mean()

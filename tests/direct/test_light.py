@@ -96,7 +96,7 @@ def test_photons_have_their_own_numbers():
         (lambda: light.fringes([0], seed=1, box=BOX, period=1, contrast=2), "contrast = 2"),
         (lambda: light.beam_slopes([0], seed=1, f_number=0.4, index=4), "f_number = 0.4"),
         (lambda: light.beam_slopes([0], seed=1, f_number=1, index=0.5), "index = 0.5"),
-        (lambda: light.convert(DEVICE, [[0, 0]], seed=1), "one of them"),
+        (lambda: light.convert(DEVICE, [[0, 0]], seed=1), "wavelengths or a height"),
         (lambda: light.convert(DEVICE, [[0, 0]], seed=1, height=300.0), "height = 300 um"),
         (lambda: light.convert(DEVICE, [[0, np.nan]], seed=1, height=50.0), "finite"),
     ],

@@ -278,7 +278,7 @@ class Truth:
         return out
 
     def agrees(self, i, j):
-        """Tell whether pixels (-1: none) are those of the polygons."""
+        """Whether pixels (-1: none) are those of the polygons."""
         place = 3 * (j - self.j0 + 1) + i - self.i0 + 1
         none = i < 0
         row = np.arange(len(i))

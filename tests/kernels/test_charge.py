@@ -146,7 +146,7 @@ def throw(exposure, image, count, seed, flux=(1.0, 0.5, 3.0, -0.25)):
 
 
 def same_charges(exposure, fresh):
-    """Tell whether two exposures hold the same charges, bit for bit."""
+    """Whether two exposures hold the same charges, bit for bit."""
     a, b = exposure.charges, fresh.charges
     return (
         np.array_equal(exposure.ledger.charge, fresh.ledger.charge)
@@ -319,7 +319,7 @@ some 2; four products of 1.5e5 at 2^-24, each rounded thrice [e-]."""
 
 
 STALE = 512.0
-"""Charge [e-] a pixel gains before its neighbours have its background anew: a choice."""
+"""Charge that a pixel gains before the background of its neighbours is found again [e-]: chosen."""
 
 
 def tolerance_of(sensor, mode):

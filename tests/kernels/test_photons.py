@@ -60,7 +60,7 @@ def random_numbers(count, number=1000):
 
 
 def plain(light, medium, n, normal_x, normal_y, path):
-    """Where one photon lands: x, y [pixel], height [um]."""
+    """Landing position of one photon: x, y [pixel], height [um]."""
     coloured, slanted = light.wavelength.size > 0, light.slope_x.size > 0
     way = medium.surface_path
     if coloured:

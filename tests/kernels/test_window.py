@@ -90,7 +90,7 @@ def test_two_sums(function, lanes, first, step, start, stride, rows, seed):
 
 @pytest.mark.parametrize(("function", "lanes"), [(sum_8, 8), (sum_16, 16)])
 def test_every_lane_counts_once(function, lanes):
-    # Powers of two tell which numbers were multiplied: all sums are exact.
+    # Powers of two show which numbers were multiplied: all sums are exact.
     rows, stride, start, first = 3, lanes + 3, 5, 2
     for r in range(rows):
         for lane in range(lanes):

@@ -1,4 +1,4 @@
-"""An emulator that is straight in the parameters, of given arrays."""
+"""An emulator that is linear in the parameters, made of given arrays."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class LinearResponse:
 
 @dataclass(frozen=True)
 class LinearEmulator:
-    """Shifts straight in the parameters; areas are those of the shifts."""
+    """Shifts linear in the parameters; areas are those of the shifts."""
 
     parameters: tuple[str, ...]
     nominal: NDArray

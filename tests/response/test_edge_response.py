@@ -45,9 +45,7 @@ def test_the_patch_is_large_enough():
 
 @pytest.mark.parametrize("period", [13, 10])
 def test_periods_are_refused_whose_images_are_among_the_edges(period):
-    with pytest.raises(
-        TableError, match=f"period = {period} pixels must be even and above 10"
-    ):
+    with pytest.raises(TableError, match=f"period = {period} pixels .* 10"):
         solve_response(Device.load("itl_sta3800c"), period=period)
 
 
@@ -91,6 +89,6 @@ def test_points_that_jump_past_a_saddle_keep_their_earlier_derivative(monkeypatc
         own = np.stack([found.dkx[0, -1], found.dky[0, -1]])
         return np.sqrt(np.sum((own - wanted) ** 2) / np.sum(wanted**2))
 
-    assert error() < 0.03  # 0.015 found; differences over 0.2 spreads are bent by less
+    assert error() < 0.03  # 0.015 found; second order over 0.2 spreads is less
     monkeypatch.setattr(boundary_tangent, "JUMP", np.inf)
     assert error() > 1.0

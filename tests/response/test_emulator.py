@@ -1,5 +1,6 @@
 """The emulator: full solutions around a device, derivatives, what is kept and refused."""
 
+import re
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -113,13 +114,13 @@ def test_finished_solutions_are_not_made_again(emulator, kept, tmp_path):
         40_000.0,
     )
     other = change_parameter(emulator.device, "silicon.thickness", 1.0)
-    with pytest.raises(FitError, match="of another device than itl_sta3800c"):
+    with pytest.raises(FitError, match=f"{re.escape(str(path))}: .*itl_sta3800c"):
         DeviceEmulator.read(path, device=other)
     path.write_bytes(b"half")
-    with pytest.raises(FitError, match="not an emulator"):
+    with pytest.raises(FitError, match=re.escape(str(path))):
         DeviceEmulator.read(path)
     paths[0].write_bytes(b"half")
-    with pytest.raises(FitError, match="not a finished solution; delete it"):
+    with pytest.raises(FitError, match=re.escape(str(paths[0]))):
         DeviceEmulator.build(emulator.device, NAMES, **MESH, keep=kept)
     paths[0].unlink()
 
@@ -144,7 +145,7 @@ def test_conditions_hold_what_they_state():
     assert (
         found.predict(moved, warm).areas[0, 0] < found.predict(moved - 2, warm).areas[0, 0]
     )
-    with pytest.raises(FitError, match="not built for back bias -70 V; it was for"):
+    with pytest.raises(FitError, match=r"back bias -70 V.*back bias -60 V"):
         found.predict(moved, Condition(back_bias=-70.0))
 
 
@@ -162,9 +163,9 @@ def test_a_side_without_such_a_device():
 @pytest.mark.parametrize(
     ("parameters", "words"),
     [
-        (["silicon.thicknes"], "states no uncertainty for 'silicon.thicknes'; it does for"),
-        ({"silicon.thicknes": 1.0}, "no quantity 'silicon.thicknes' in the device"),
-        ({"silicon.thickness": 0.0}, "spread of silicon.thickness = 0 must be above 0"),
+        (["silicon.thicknes"], "'silicon.thicknes'.*channel"),
+        ({"silicon.thicknes": 1.0}, "'silicon.thicknes'"),
+        ({"silicon.thickness": 0.0}, "silicon.thickness = 0"),
     ],
 )
 def test_parameters_that_it_refuses(parameters, words):
@@ -174,9 +175,9 @@ def test_parameters_that_it_refuses(parameters, words):
 
 def test_values_that_it_refuses(emulator):
     for values in ([100.0], [100.0, np.nan]):
-        with pytest.raises(FitError, match=r"must be 2 finite numbers: silicon\.thickness"):
+        with pytest.raises(FitError, match=r"values = \[100\.0.* 2 .*silicon\.thickness"):
             emulator.predict(values)
-    with pytest.raises(FitError, match="an emulator needs a condition"):
+    with pytest.raises(FitError, match=r"Condition\(\)"):
         DeviceEmulator.build(emulator.device, NAMES, conditions=())
     assert solve_nodes([], keep=None, progress=None, executor=None) == {}
 

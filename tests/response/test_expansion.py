@@ -43,7 +43,7 @@ def test_second_order_is_found():
 
 @pytest.mark.parametrize("lost", [0, 1])
 def test_one_bad_derivative_of_a_neighbour_adds_nothing(lost):
-    """Of both estimates the smaller: what is 100 too large in one of them is as if it were not."""
+    """The smaller of both estimates is taken: one that is 100 too large has no influence."""
     value, first, second = polynomial()
     solved = solutions(value, first, second)
     solved[0, 1][1][lost, 0, 0, 1, 1] += 100.0

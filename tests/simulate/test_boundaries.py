@@ -69,7 +69,7 @@ def test_a_line_without_points_on_a_side_is_told(lines):
     folded[1, 2, beside, 0] = 4.0
     with pytest.raises(
         ConvergenceError,
-        match=r"between rows at z = 10 um has no point on the side of a pixel, x from ",
+        match=r"between rows at z = 10 um .* x from ",
     ):
         table_of(dataclasses.replace(lines, rows=folded))
 
@@ -193,15 +193,13 @@ def test_lowest_depth_is_where_the_charge_is(solution):
 
 
 def test_refusals(solution):
-    with pytest.raises(
-        TableError, match=r"conversion depth 0.1 um must lie in the silicon"
-    ):
+    with pytest.raises(TableError, match=r"conversion depth 0\.1 um .* 100 um"):
         find_boundaries(solution, [0.1], reach=1)
     with pytest.raises(TableError, match=r"conversion depth 101 um"):
         find_boundaries(solution, [50.0, 101.0], reach=1)
-    with pytest.raises(TableError, match="must ascend"):
+    with pytest.raises(TableError, match=r"\[50\.0, 20\.0\] um"):
         find_boundaries(solution, [50.0, 20.0], reach=1)
-    with pytest.raises(TableError, match="does not fit a period"):
+    with pytest.raises(TableError, match=r"reach = 4 pixels .*80 x 80 um"):
         find_boundaries(solution, [50.0], reach=4)
 
 

@@ -274,7 +274,7 @@ def test_rays_follow_the_whole_field():
 
 
 def test_the_far_field_of_the_poisson_engine_has_the_same_shape():
-    """Of a dipole on the plane, here a charge just above it, shifts by distance and depth."""
+    """A dipole on the plane, here a charge just above it, shifts boundaries by distance and depth."""
     z = np.linspace(0.0, T, 2001)
     half_cell = np.array([0.0, 1.0])
     mesh = SimpleNamespace(x=half_cell, y=half_cell, z=z)

@@ -317,19 +317,19 @@ def test_a_doping_ripple_is_solved_on_the_whole_period():
     eps = device.material.permittivity_silicon * VACUUM_PERMITTIVITY
     k2 = (2 * np.pi / 40.0) ** 2
     assert wave == pytest.approx(-2.4 * 0.1 / (eps * k2), rel=0.03)
-    with pytest.raises(DeviceError, match="leave no mirror planes"):
+    with pytest.raises(DeviceError, match=r"ripples.*symmetric=False"):
         make_mesh(rippled, pixels=(4, 4), cells=8)
 
 
 def test_refusals():
     device = Device.load("itl_sta3800c")
     solver = Electrostatics(device, make_mesh(device, pixels=(1, 1), cells=8))
-    with pytest.raises(DeviceError, match="must not be negative"):
+    with pytest.raises(DeviceError, match=r"-5 e-"):
         solver.solve(-5.0)
-    with pytest.raises(DeviceError, match=r"cells = 7 must be an even number"):
+    with pytest.raises(DeviceError, match=r"cells = 7 "):
         make_mesh(device, cells=7)
     edged = dataclasses.replace(device, edge=Edge("x", (EdgeStrip(20.0, voltage=5.0),)))
-    with pytest.raises(DeviceError, match=r"are solved by bfsensor\.simulate\.edge_field"):
+    with pytest.raises(DeviceError, match=r"bfsensor\.simulate\.edge_field\.solve_edge"):
         discretise(edged, make_mesh(edged, pixels=(2, 2), cells=8, symmetric=False))
     shallow = device.with_value("back_bias", "-1 V")
     with pytest.raises(DeviceError, match="free holes reach"):
@@ -340,6 +340,6 @@ def test_an_unconverged_answer_is_never_returned(monkeypatch):
     monkeypatch.setattr(poisson, "_MAX_NEWTON", 3)
     device = Device.load("itl_sta3800c")
     solver = Electrostatics(device, make_mesh(device, pixels=(1, 1), cells=8))
-    with pytest.raises(ConvergenceError, match="did not converge") as caught:
+    with pytest.raises(ConvergenceError, match=r"1e-06 V .* 3 Newton steps") as caught:
         solver.solve(0.0)
     assert len(caught.value.history) == 3

@@ -172,12 +172,10 @@ def test_meshes_that_cannot_move():
     wide = dataclasses.replace(
         device, pixel=dataclasses.replace(device.pixel, pitch_x=12.0)
     )
-    with pytest.raises(DeviceError, match="of one pitch and gate pattern only"):
+    with pytest.raises(DeviceError, match=r"itl_sta3800c: .* pitch and gate pattern"):
         move_mesh(mesh, device, wide)
     equal = dataclasses.replace(
         device, gates=dataclasses.replace(device.gates, field_oxide_taper=0.0)
     )
-    with pytest.raises(
-        DeviceError, match=r"along x surfaces or edges at .* not in the order"
-    ):
+    with pytest.raises(DeviceError, match=r"along x .* at \[0\.0, .*\] um"):
         move_mesh(mesh, device, equal)
