@@ -254,3 +254,35 @@ class Edge:
 
     side: Literal["x", "y"]
     strips: tuple[EdgeStrip, ...] = ()
+
+
+CHOICES: dict[tuple[type, str], tuple[str, ...]] = {
+    (Ripple, "kind"): ("plane", "radial"),
+    (Implant, "shape"): ("gaussian", "box"),
+    (EdgeStrip, "oxide"): ("none", "gate", "field"),
+    (Edge, "side"): ("x", "y"),
+}
+"""Words that a key of a part may have, by part and key."""
+
+LISTS: dict[tuple[type, str], tuple[str, type]] = {
+    (Silicon, "ripples"): ("ripple", Ripple),
+    (BuriedChannel, "implants"): ("implant", Implant),
+    (ChannelStop, "implants"): ("implant", Implant),
+    (ChannelStopDots, "implants"): ("implant", Implant),
+    (EdgeStrip, "implants"): ("implant", Implant),
+    (Edge, "strips"): ("strip", EdgeStrip),
+}
+"""Name of one entry in device files and its type, by the part and field that hold the tuple."""
+
+SECTIONS: dict[str, type] = {
+    "pixel": Pixel,
+    "material": Material,
+    "silicon": Silicon,
+    "gates": GateStack,
+    "channel": BuriedChannel,
+    "channel_stop": ChannelStop,
+    "operating_point": OperatingPoint,
+    "well": Well,
+    "edge": Edge,
+}
+"""Type of each section of a device file, in the order in which files are written."""
