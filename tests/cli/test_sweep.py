@@ -142,7 +142,7 @@ def test_a_level_above_the_full_well_is_a_reason(tmp_path):
         (
             ["--over", "bias=-30V"],
             1,
-            "no quantity 'bias' to sweep over; there are wavelength",
+            "no quantity 'bias' to sweep over",
         ),
         (["--over", "back_bias=-30"], 1, "operating_point.back_bias: '-30' has no unit"),
         (["--over", "back_bias=-30V:-40V"], 1, "first:last:number of values"),
