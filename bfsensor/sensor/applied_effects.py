@@ -134,8 +134,8 @@ class AppliedEffects:
         law = self.law
         if not (law.loss >= 0 and np.isfinite(law.bend) and law.full_well > 0):
             raise SensorError(
-                f"effects: {law} must be finite, with a loss of at least 0 and a full well above "
-                "0 e-"
+                f"effects: {law} must have a finite growth with charge, a loss of at least 0 and "
+                "a full well above 0 e-"
             )
         # Each effect acts once on a small empty sensor, so that a missing condition is refused
         # here and not after hours of photons.

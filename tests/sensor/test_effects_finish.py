@@ -172,7 +172,7 @@ def test_rings_do_not_act_twice():
     class Rings(Rough):
         word = "tree_rings"
 
-    with pytest.raises(SensorError, match="tree_rings.*treering_func"):
+    with pytest.raises(SensorError, match=r"tree_rings.*treering_func"):
         sensor_with(Rings({"amp": 0.01}), treering_func=RINGS, layout={"shape": (9, 9)})
 
 

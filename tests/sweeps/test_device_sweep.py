@@ -219,7 +219,7 @@ def test_figure_shows_every_answer(swept):
     assert any(
         np.allclose(y, [0, 100 * (made.a[1, 0, 0] / made.a[0, 0, 0] - 1)]) for y in changes
     )
-    with pytest.raises(SweepError, match="'gate_low' was not swept.*back_bias, wave"):
+    with pytest.raises(SweepError, match=r"'gate_low' was not swept.*back_bias, wave"):
         draw_sweep(made, ax, against="gate_low")
 
 
