@@ -86,6 +86,15 @@ def draw_potential_profiles(
     ------
     BFSensorError
         Matplotlib is missing.
+
+    Examples
+    --------
+    >>> from bfsensor import Device
+    >>> potential = solve_unit_cell(Device.load("itl_sta3800c"), 50000.0, cells=8)
+    >>> figure = new_figure(13.0, 7.5)
+    >>> draw_potential_profiles(potential, figure.subplots(2, 3))
+    >>> [ax.get_title() for ax in figure.axes[:3]]
+    ['collecting gate, +2 V', 'channel stop', 'barrier gate, -8 V']
     """
     import_matplotlib()
     mesh, point = potential.mesh, potential.device.operating_point
@@ -184,6 +193,15 @@ def draw_charge_cross_sections(
     ------
     BFSensorError
         Matplotlib is missing.
+
+    Examples
+    --------
+    >>> from bfsensor import Device
+    >>> potential = solve_unit_cell(Device.load("itl_sta3800c"), 50000.0, cells=8)
+    >>> figure = new_figure(11.0, 10.0)
+    >>> draw_charge_cross_sections(potential, figure)
+    >>> len(figure.axes)
+    5
     """
     import_matplotlib()
     from matplotlib.cm import ScalarMappable

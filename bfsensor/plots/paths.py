@@ -77,6 +77,17 @@ def draw_electron_paths(
     ------
     BFSensorError
         Matplotlib is missing, or ``plane`` is neither.
+
+    Examples
+    --------
+    >>> from bfsensor import Device
+    >>> from bfsensor.plots.style import new_figure
+    >>> from bfsensor.simulate.unit_cell import solve_unit_cell
+    >>> potential = solve_unit_cell(Device.load("itl_sta3800c"), 0.0, cells=8)
+    >>> ax = new_figure(5.0, 8.0).add_subplot()
+    >>> draw_electron_paths(potential, ax)
+    >>> len(ax.collections[0].get_paths())
+    8
     """
     import_matplotlib()
     from matplotlib.collections import LineCollection
@@ -160,6 +171,17 @@ def draw_collected_paths(
     ------
     BFSensorError
         Matplotlib is missing, or ``plane`` is neither.
+
+    Examples
+    --------
+    >>> from bfsensor import Device
+    >>> from bfsensor.plots.style import new_figure
+    >>> from bfsensor.simulate.unit_cell import solve_unit_cell
+    >>> potential = solve_unit_cell(Device.load("itl_sta3800c"), 0.0, cells=8)
+    >>> ax = new_figure(5.0, 8.0).add_subplot()
+    >>> draw_collected_paths(potential, ax, paths=8)
+    >>> len(ax.collections[0].get_paths())
+    8
     """
     import_matplotlib()
     from matplotlib.collections import LineCollection

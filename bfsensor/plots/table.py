@@ -104,6 +104,16 @@ def draw_pixel_boundaries(
         Matplotlib is missing.
     TableError
         A charge, background, depth or reach that the table does not hold.
+
+    Examples
+    --------
+    >>> from bfsensor import DistortionTable
+    >>> from bfsensor.plots.style import new_figure
+    >>> ax = new_figure(5.0, 5.0).add_subplot()
+    >>> table = DistortionTable.load("itl_sta3800c")
+    >>> draw_pixel_boundaries(table, ax, charge=80000.0, depth=95.0, exaggerate=5.0)
+    >>> len(ax.texts)
+    25
     """
     import_matplotlib()
     from matplotlib.collections import LineCollection, PolyCollection
@@ -177,6 +187,15 @@ def draw_response(table: DistortionTable, ax: Axes, *, depth: float) -> None:
         Matplotlib is missing.
     TableError
         The depth is outside the table.
+
+    Examples
+    --------
+    >>> from bfsensor import DistortionTable
+    >>> from bfsensor.plots.style import new_figure
+    >>> ax = new_figure(5.0, 5.0).add_subplot()
+    >>> draw_response(DistortionTable.load("itl_sta3800c"), ax, depth=95.0)
+    >>> ax.get_xlabel()
+    'source charge [10³ e⁻]'
     """
     import_matplotlib()
     from matplotlib.lines import Line2D
@@ -256,6 +275,15 @@ def draw_depth_response(table: DistortionTable, ax: Axes, *, charge: float) -> N
     Notes
     -----
     GalSim scales one table by ``tanh(z / 12 um)``, an empirical function, drawn for comparison.
+
+    Examples
+    --------
+    >>> from bfsensor import DistortionTable
+    >>> from bfsensor.plots.style import new_figure
+    >>> ax = new_figure(5.0, 5.0).add_subplot()
+    >>> draw_depth_response(DistortionTable.load("itl_sta3800c"), ax, charge=80000.0)
+    >>> ax.get_xlabel()
+    'conversion depth above the gates [µm]'
     """
     import_matplotlib()
     nominal = table.pitch[0] * table.pitch[1]
@@ -321,6 +349,15 @@ def draw_area_changes(
         Matplotlib is missing.
     TableError
         A charge, background or depth outside the table.
+
+    Examples
+    --------
+    >>> from bfsensor import DistortionTable
+    >>> from bfsensor.plots.style import new_figure
+    >>> ax = new_figure(5.0, 5.0).add_subplot()
+    >>> draw_area_changes(DistortionTable.load("itl_sta3800c"), ax, charge=80000.0, depth=95.0)
+    >>> len(ax.texts)
+    81
     """
     import_matplotlib()
     from matplotlib.colors import SymLogNorm
@@ -374,6 +411,12 @@ def figure_for_table(table: DistortionTable) -> Figure:
     ------
     BFSensorError
         Matplotlib is missing.
+
+    Examples
+    --------
+    >>> from bfsensor import DistortionTable
+    >>> len(figure_for_table(DistortionTable.load("itl_sta3800c")).axes)
+    4
     """
     figure = new_figure(13.0, 12.0)
     axes = figure.subplots(2, 2)

@@ -124,6 +124,13 @@ class PointResponse:
         Reason of a refusal; empty where there is a response.
     table : DistortionTable, optional
         Table from which ``a`` was taken; it is written beside and never read back.
+
+    Examples
+    --------
+    >>> a = np.full((2, LAGS, LAGS), -1e-6)
+    >>> found = PointResponse(np.array([1.0, 100.0]), a, 0 * a, 1.5e5, 2.0, 1e-10)
+    >>> found.in_light(None, 173.0)[0].shape
+    (3, 3)
     """
 
     depths: FloatArray

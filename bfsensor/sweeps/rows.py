@@ -60,6 +60,12 @@ class SweepRow(NamedTuple):
         Bound on the error of an a_ij by the solver's iteration [1/e-].
     reason : str
         Reason of a refusal; empty where there is a response.
+
+    Examples
+    --------
+    >>> zeros = np.zeros((LAGS, LAGS))
+    >>> SweepRow(zeros, zeros, 1.5e5, 2.0, 1e-10, "").full_well
+    150000.0
     """
 
     a: FloatArray
