@@ -1,4 +1,4 @@
-"""What a sensor is made of and how it is operated: devices, their quantities, laws of silicon."""
+"""Devices (geometry, doping, voltages), their quantities with priors, and laws of silicon."""
 
 from typing import TYPE_CHECKING
 

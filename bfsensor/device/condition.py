@@ -1,4 +1,4 @@
-"""Conditions that exposures are taken under: light, temperature, voltages."""
+"""Condition of an exposure: wavelength or filter, sensor temperature and voltages."""
 
 from __future__ import annotations
 
@@ -7,18 +7,27 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Condition:
-    """Light and operating point that exposures share; None where not known, or the device's own.
+    """Light and operating point that exposures share.
+
+    None stands for a value that is not known; predictions then take the device's own.
 
     Attributes
     ----------
     wavelength : float or None
-        Of the light [nm].
-    temperature : float or None
-        Of the sensor [K].
-    back_bias, gate_high, gate_low : float or None
-        Back bias, collecting and barrier gates [V].
+        Vacuum wavelength of the light [nm].
     filter : str or None
-        Name of a filter.
+        Name of the filter.
+    temperature : float or None
+        Temperature of the sensor [K].
+    back_bias : float or None
+        Back bias [V], signed as in device files.
+    gate_high, gate_low : float or None
+        Voltages of the collecting and of the barrier gates [V].
+
+    Examples
+    --------
+    >>> print(Condition(wavelength=620.0, back_bias=-50.0))
+    620 nm, back bias -50 V
     """
 
     wavelength: float | None = None

@@ -1,4 +1,4 @@
-r"""Depletion: the back bias that a device needs, and the depth that its own bias depletes.
+r"""Full-depletion voltage and depletion depth of a device, estimated without solving it.
 
 Above the implants of the front the mean potential of a uniform array obeys
 :math:`\epsilon \phi'' = -N`, with N the background doping (acceptors negative).  Let
@@ -31,33 +31,43 @@ if TYPE_CHECKING:
     from bfsensor.device.parts import BuriedChannel, ChannelStop, ChannelStopDots, Implant
 
 _COLUMNS = 32
-"""Columns of a pixel in x and in y; 48 move the voltage of the built-in devices by 0.4 V at most."""
+"""Columns of a pixel in x and in y.
+
+Chosen while looking at the Poisson solver's voltages of 31 variants of the built-in devices:
+it has not converged.  With 64 the voltage of the built-in devices falls by 0.1 to 0.6 V, and
+the estimate takes some 40 times as long."""
 
 _HOLES = 1e5
-"""Density of holes in undepleted acceptors [1/um^3]: ten times as many sink their potential by
-kT ln 10, 0.03 V at 173 K."""
+"""Density of holes in undepleted acceptors [1/um^3].
+
+Chosen, of the order of the acceptors' peak density in channel stops (5e4 in itl_sta3800c).  The
+holes' potential falls
+by kT ln 2 = 0.01 V at 173 K with twice as many, the voltage of the built-in devices by as
+much at most."""
 
 _END_SIGMA = 1.5
-"""End of a Gaussian implant [sigma beyond its peak]: holes of the channel stops reach there, the
-last 7 % of the dose are depleted.  Chosen; 1 or 2 move the voltage of the built-in devices by
-0.3 V at most."""
+"""End of a Gaussian implant [sigma beyond its peak], to which holes fill the channel stops.
+
+Chosen while looking at the Poisson solver's voltages of 31 variants of the built-in devices.
+Beyond it lies the last 7 % of the dose, which is taken as depleted.  At 1 the voltage of the
+built-in devices rises by 0.2 to 0.3 V, at 2 it falls by 0.2 to 0.3 V, at 3 by 0.5 to 0.8 V."""
 
 
 @dataclass(frozen=True)
 class Depletion:
-    """How far the back bias depletes the silicon of a device.
+    """Full-depletion voltage of a device, and the silicon that its own back bias depletes.
 
     Attributes
     ----------
     full_depletion_voltage : float
         Back bias at and below which all of the silicon is depleted [V].
     depth : float
-        Thickness of the depleted silicon, at most from the end of the implants to the back [um].
+        Thickness of the depleted silicon between the end of the implants and the back [um].
     lowest, highest : float
         Heights above the gates between which the silicon is depleted [um]: from 0 for acceptors,
         up to the back for donors.
     front_potential : float
-        Mean potential at the end of the implants [V], all of the silicon just depleted.
+        Mean potential [V] at the end of the implants when all of the silicon is just depleted.
     """
 
     full_depletion_voltage: float
@@ -82,11 +92,12 @@ def find_depletion(device: Device) -> Depletion:
     Parameters
     ----------
     device : Device
-        Its pixels are taken as empty, its edge and ripples of the doping are left aside.
+        Any.  Pixels are taken as empty; edge strips and ripples of the doping are ignored.
 
     Returns
     -------
     Depletion
+        Voltage and depths; within 1 V of the Poisson solver for the devices of the notes.
 
     Notes
     -----
@@ -97,24 +108,33 @@ def find_depletion(device: Device) -> Depletion:
             + \sum_i \frac{Q_i d_i}{\epsilon} + \frac{N s\, (L - s / 2)}{\epsilon},
 
     with gate voltage, oxide, doses :math:`Q_i` (donors positive, charge at the interface
-    included) of mean depth :math:`d_i`, the silicon s below :math:`z_0` and the silicon L whose
-    charge the gate holds, all of it for acceptors.  Neither the surface nor a column falls
-    below :math:`\phi_h - kT \ln (p / n_i)`, where free holes hold it; columns that would (channel
-    stops) stay at that potential.  The others share their charge through the field between
-    them: half-space above :math:`z_0`, Fourier by Fourier :math:`\epsilon k`, and
-    :math:`\epsilon k^2 h / 3` in the layer of height h below.
+    included) of mean depth :math:`d_i`, the thickness s of the column's silicon below
+    :math:`z_0`, and the thickness L of the silicon whose charge ends at the gate: for acceptors
+    all of it, for donors s.  Neither the surface nor a column falls below
+    :math:`\phi_h - kT \ln (p / n_i)`, where free holes hold it; columns that would (channel
+    stops) stay at that potential.  The others exchange charge through the field between them.
+    A Fourier component of wavenumber k of their potentials draws the charge density
+    :math:`\epsilon k` from the half-space above :math:`z_0` and :math:`\epsilon k^2 h / 3` from
+    the layer of height h below it.
 
-    The voltage lies within 1 V of where the Poisson solver's field vanishes at the back contact
-    (tests): -2.5 to -14.2 V for the built-in devices, and at 200 um, at twice the doping and
-    with gates 4 V higher.  Without stops and holes the formula is exact.  Not covered: stops wider
-    than the channels, implants deeper than a third of the pitch.  1e5 e- in every pixel of
-    10 um take about 1 V from :math:`V_0`.  Not looked at: whether the back bias keeps the holes
-    of the channel stops in them, which the solver refuses itself.
+    For the built-in devices (-2.6 to -14.2 V), and for variants at 200 um, at twice the doping
+    and with gates 4 V higher, the voltage lies within 1 V of the back bias at which the Poisson
+    solver's field vanishes at the back contact (``tests/device/test_depletion.py``).  That is no
+    independent check: two constants were chosen while looking at such devices.  Without channel
+    stops and holes the formula is exact.  It was not tried with stops wider than the channels or
+    implants deeper than a third of the pitch.
+
+    Stored charge lowers :math:`V_0`, and the device then needs a more negative back bias: by the
+    Poisson solver 0.5 V (itl_sta3800c) and 1.1 V (e2v_ccd250) more with 1e5 e- in every pixel,
+    in proportion to the charge.  Whether the back bias keeps the holes of the channel stops in
+    them is not checked here; the solver refuses devices where it does not.
 
     References
     ----------
-    Sze & Ng 2007, Physics of Semiconductor Devices, 3rd ed., section 2.2 (depletion width);
-    Holland et al. 2003, IEEE Trans. Electron Devices 50, 225 (thick CCDs depleted by a back bias).
+    Sze & Ng 2007, Physics of Semiconductor Devices, 3rd ed., section 2.2, for the depletion width
+    of uniform doping; Holland et al. 2003, IEEE Trans. Electron Devices 50, 225, for thick CCDs
+    that a back bias depletes.  The columns, their holes and the field between them are in
+    neither: they are this package's estimate, compared only with its Poisson solver.
 
     Examples
     --------
@@ -143,7 +163,10 @@ def find_depletion(device: Device) -> Depletion:
 
 
 def check_depleted(device: Device, depths: Sequence[float] = ()) -> None:
-    """Refuse a device that its back bias does not fully deplete, in some 10 ms.
+    """Refuse a device that its back bias does not fully deplete.
+
+    The check precedes solutions that take seconds to minutes, and takes 13 to 45 ms of CPU time
+    for the built-in devices.
 
     Parameters
     ----------
@@ -155,9 +178,9 @@ def check_depleted(device: Device, depths: Sequence[float] = ()) -> None:
     Raises
     ------
     TableError
-        One of the depths lies in silicon that is not depleted, where light drifts nowhere.
+        One of the depths lies in undepleted silicon, where no field drives electrons to the gates.
     DeviceError
-        The silicon is not depleted elsewhere.  Both name the back bias, the full-depletion
+        Other silicon is not depleted.  Both messages name the back bias, the full-depletion
         voltage, the thickness and the doping.
     """
     found = find_depletion(device)
@@ -173,13 +196,13 @@ def check_depleted(device: Device, depths: Sequence[float] = ()) -> None:
 
 
 def _reason(device: Device, found: Depletion) -> str:
-    """What a back bias above the full-depletion voltage leaves undepleted, and what to change."""
+    """Say which silicon a back bias above the full-depletion voltage leaves undepleted."""
     silicon = device.silicon
     if silicon.background_doping <= 0:
         where = f"above {found.highest:.3g} um"
     else:
         where = f"below {found.lowest:.3g} um"
-    # To be given below the estimate by what it may be off, not to be refused elsewhere.
+    # 1 to 2 V below the estimate, whose error is about 1 V: the solver then accepts it too.
     wanted = np.floor(found.full_depletion_voltage) - 1
     doping = from_internal(float(f"{silicon.background_doping:.3g}"), "density", "cm-3")
     return (
@@ -211,6 +234,8 @@ def _implant_end(device: Device) -> float:
 def _moments(implants: Sequence[Implant]) -> tuple[float, float]:
     """Dose [e/um^2] of implants and its moment about the surface [e/um]."""
     moment = 0.0
+    # The cumulative dose exists in closed form and ends where the implant is cut; the density
+    # would have to be integrated across that step.
     for implant in implants:
         depth = np.linspace(0.0, implant.reach, 401)
         # int z dQ = Q z - int Q dz
@@ -221,7 +246,7 @@ def _moments(implants: Sequence[Implant]) -> tuple[float, float]:
 
 
 def _front_potential(device: Device, low: float) -> float:
-    """Mean potential [V] at the height where the implants end, the bulk just depleted."""
+    """Mean potential [V] at the height where the implants end, with the bulk just depleted."""
     material, doping = device.material, device.silicon.background_doping
     silicon = material.permittivity_silicon * VACUUM_PERMITTIVITY
     oxide = material.permittivity_oxide * VACUUM_PERMITTIVITY
@@ -252,7 +277,11 @@ def _front_potential(device: Device, low: float) -> float:
 
 @dataclass(frozen=True)
 class _PixelColumns:
-    """Columns of a pixel, arrays ``[y, x]``: gate voltage, oxide, silicon surface, dose, moment."""
+    """Columns of a pixel, arrays ``[y, x]``.
+
+    Gate voltage [V], oxide thickness and height of the silicon surface [um], dose [e/um^2] and
+    its moment about the surface [e/um].
+    """
 
     gate: FloatArray
     oxide: FloatArray
@@ -300,8 +329,9 @@ def _share(
     permittivity: float,
     device: Device,
 ) -> FloatArray:
-    """Potential of every column once neighbours share their charge; ``fixed`` ones keep theirs."""
+    """Potential [V] of every column with the field between columns; ``fixed`` ones keep theirs."""
     free = ~fixed
+    # Equal columns exchange no charge.
     if not fixed.any() and np.ptp(potential) < 1e-6:
         return potential
     layer = float(resistance.mean()) * permittivity
@@ -313,6 +343,7 @@ def _share(
     coupling = np.fft.ifft2(permittivity * (k + layer / 3 * k**2)).real
     rows, cols = np.nonzero(free)
     all_rows, all_cols = np.indices(free.shape).reshape(2, -1)
+    # Negative differences index the periodic pixel from its other end.
     links = coupling[rows[:, None] - all_rows, cols[:, None] - all_cols]
     to_gate = 1.0 / resistance[free]
     matrix = links[:, free.ravel()] + np.diag(to_gate)

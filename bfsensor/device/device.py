@@ -1,7 +1,7 @@
-"""The device: what a sensor is made of and how it is operated.
+"""Device, a sensor's geometry, doping and voltages: its construction, changed copies and TOML file.
 
 A device file is TOML in which every quantity is a string with its unit, or an inline
-table with ``value`` and what is known about it (``uncertainty``, ``origin``, ``source``).
+table with ``value`` and its provenance (``uncertainty``, ``origin``, ``source``).
 Inside, all values are floats: um, V, K, electron/um^3, electron/um^2; doses and densities
 of donors are positive, of acceptors negative.
 """
@@ -21,19 +21,20 @@ from typing import Any
 
 import numpy as np
 
+from bfsensor.device.checks import check_parts, check_range
 from bfsensor.device.parts import (
+    CHOICES,
+    LISTS,
+    SECTIONS,
     BuriedChannel,
     ChannelStop,
     ChannelStopDots,
     Edge,
-    EdgeStrip,
     GateStack,
-    Implant,
     Material,
     OperatingPoint,
     Pixel,
     Provenance,
-    Ripple,
     Silicon,
     Well,
 )
@@ -49,48 +50,51 @@ from bfsensor.errors import DeviceError
 from bfsensor.files import written_whole
 
 ORIGINS = ("measured", "published", "fitted", "guessed")
+"""Values that the key ``origin`` of a quantity may have in a device file."""
 
-
-_CHOICES = {
-    (Ripple, "kind"): ("plane", "radial"),
-    (Implant, "shape"): ("gaussian", "box"),
-    (EdgeStrip, "oxide"): ("none", "gate", "field"),
-    (Edge, "side"): ("x", "y"),
-}
-_LISTS = {
-    (Silicon, "ripples"): ("ripple", Ripple),
-    (BuriedChannel, "implants"): ("implant", Implant),
-    (ChannelStop, "implants"): ("implant", Implant),
-    (ChannelStopDots, "implants"): ("implant", Implant),
-    (EdgeStrip, "implants"): ("implant", Implant),
-    (Edge, "strips"): ("strip", EdgeStrip),
-}
-_SECTIONS: dict[str, type] = {
-    "pixel": Pixel,
-    "material": Material,
-    "silicon": Silicon,
-    "gates": GateStack,
-    "channel": BuriedChannel,
-    "channel_stop": ChannelStop,
-    "operating_point": OperatingPoint,
-    "well": Well,
-    "edge": Edge,
-}
 _OPTIONAL = ("material", "well", "edge")
+"""Sections that a device file may lack: material and well then have their defaults, and there
+is no edge."""
 
 
 @dataclass(frozen=True)
 class Device:
     """A sensor and its operating point.
 
+    Frozen: :meth:`with_value` and :meth:`with_operating_point` return changed copies.  Two
+    devices are equal if names, values and provenance are; their hash leaves the provenance out.
+
     Attributes
     ----------
     name : str
-        Short name, used for files.
-    pixel, material, silicon, gates, channel, channel_stop, operating_point, well, edge
-        The sections of the device file.
+        Short name, used for files; not empty.
+    pixel : Pixel
+        Pitch [um].
+    silicon : Silicon
+        Thickness [um], background doping [e/um^3], ripples.
+    gates : GateStack
+        Clock phases and oxides [um].
+    channel : BuriedChannel
+        Implants and surface charge [e/um^2] of the buried channel.
+    channel_stop : ChannelStop
+        Width [um], implants and surface charge of the channel stop.
+    operating_point : OperatingPoint
+        Voltages [V] and temperature [K].
+    material : Material
+        Permittivities and band structure of silicon and oxide.
+    well : Well
+        Barrier [V] at which a pixel spills.
+    edge : Edge or None
+        Guard ring beyond the last pixel; None for the periodic array.
     provenance : mapping of str to Provenance
-        What is known about single values, by dotted key.
+        Uncertainty, origin and source of the values that state any, by dotted key of the file,
+        such as ``'channel.implant[0].dose'``.
+
+    Raises
+    ------
+    DeviceError
+        A value outside its range, or parts that cannot be built together; the message names
+        section, key and limit.
 
     Examples
     --------
@@ -115,7 +119,7 @@ class Device:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
-        _check(self)
+        check_parts({name: getattr(self, name) for name in SECTIONS})
 
     def __reduce__(self) -> tuple[Any, tuple[str]]:
         return _from_text, (self.to_toml(),)
@@ -136,7 +140,10 @@ class Device:
 
     @property
     def is_mirror_symmetric(self) -> bool:
-        """Whether a pixel's centre lines are mirror planes in x and in y."""
+        """Whether a pixel's centre lines are mirror planes in x and in y.
+
+        False with an edge, with ripples of the doping, or with channel-stop dots off centre.
+        """
         dots = self.channel_stop.dots
         centred = dots is None or abs(dots.centre - self.pixel.pitch_y / 2) < 1e-9
         return self.edge is None and not self.silicon.ripples and centred
@@ -145,10 +152,25 @@ class Device:
     def load(cls, name: str | os.PathLike[str]) -> Device:
         """Read a built-in device by name, or a device file by path.
 
+        Parameters
+        ----------
+        name : str or path-like
+            A name of :func:`builtin_devices`, or a path that ends in ``.toml``.
+
+        Returns
+        -------
+        Device
+
         Raises
         ------
         DeviceError
-            Neither; names the built-in devices.
+            The name is neither a built-in device nor a path to a .toml file (the message lists
+            the built-in devices), or the file cannot be read as a device.
+
+        Examples
+        --------
+        >>> Device.load("e2v_ccd250").silicon.thickness
+        100.0
         """
         text = os.fspath(name)
         if text in builtin_devices():
@@ -165,10 +187,26 @@ class Device:
     def from_toml(cls, source: str | os.PathLike[str]) -> Device:
         """Read a device file, given its path or its text.
 
+        Parameters
+        ----------
+        source : str or path-like
+            Path of the file; a string with a line break is taken as the file's text.
+
+        Returns
+        -------
+        Device
+
         Raises
         ------
         DeviceError
-            Names the file, section, key and limit.
+            The file cannot be read, is not TOML, or describes no device that can be built; the
+            message names the file, section, key and limit.
+
+        Examples
+        --------
+        >>> device = Device.load("itl_sta3800c")
+        >>> Device.from_toml(device.to_toml()) == device
+        True
         """
         if isinstance(source, str) and "\n" in source:
             label, text = "device", source
@@ -189,9 +227,15 @@ class Device:
             raise DeviceError(f"{label}: {error}") from None
 
     def to_toml(self) -> str:
-        """Write as the text of a device file, provenance included."""
+        """Write as the text of a device file, provenance included.
+
+        Returns
+        -------
+        text : str
+            :meth:`from_toml` reads an equal device from it, all floats bit for bit.
+        """
         lines = [f"name = {_string(self.name)}"]
-        for section in _SECTIONS:
+        for section in SECTIONS:
             part = getattr(self, section)
             if part is not None:
                 lines += ["", *_lines(part, section, section, self.provenance)]
@@ -199,25 +243,52 @@ class Device:
 
     @property
     def physics(self) -> str:
-        """Text of all values without name and provenance: what solutions, and caches, depend on."""
+        """Text of the device file with the name 'device' and without provenance.
+
+        Solutions depend on nothing else of a device, so caches use it as their key.
+        """
         return dataclasses.replace(self, name="device", provenance={}).to_toml()
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write a device file (beside, then renamed)."""
+        """Write a device file under a temporary name, then rename it: half a file never exists.
+
+        Parameters
+        ----------
+        path : path-like
+            Where to; an existing file is replaced.
+
+        Raises
+        ------
+        DeviceError
+            The file cannot be written.
+        """
         with written_whole(path, DeviceError) as beside:
             beside.write_text(self.to_toml(), encoding="utf-8")
 
     def with_value(self, key: str, value: str) -> Device:
-        """Give a copy with one quantity changed, without what was known about its old value.
-
-        Caches go by :attr:`physics`, which that does not touch.
+        """Return a copy with one quantity changed and without the provenance of its old value.
 
         Parameters
         ----------
         key : str
-            Dotted (``'operating_point.back_bias'``) or short where that is unique.
+            Dotted name (``'operating_point.back_bias'``), one of :attr:`quantities`, or its last
+            part where that is unique (``'back_bias'``).
         value : str
-            Quantity with unit, as in a device file.
+            Quantity with unit, as in a device file; a plain number for whole numbers.
+
+        Returns
+        -------
+        Device
+
+        Raises
+        ------
+        DeviceError
+            No such quantity, not a quantity of that dimension, or a value outside the range.
+
+        Examples
+        --------
+        >>> Device.load("itl_sta3800c").with_value("thickness", "0.2 mm").silicon.thickness
+        200.0
         """
         section, _, name = self._resolve(key).partition(".")
         part = getattr(self, section)
@@ -235,13 +306,36 @@ class Device:
                 converted = to_internal(value, spec.metadata["kind"])
             except DeviceError as error:
                 raise DeviceError(f"{section}: {name}: {error}") from None
-            _check_range(converted, spec.metadata, section, name, value)
+            check_range(converted, spec.metadata, section, name, value)
         changed = dataclasses.replace(part, **{name: converted})
         kept = {k: v for k, v in self.provenance.items() if k != f"{section}.{name}"}
         return dataclasses.replace(self, **{section: changed}, provenance=kept)
 
     def with_operating_point(self, **values: str) -> Device:
-        """Give a copy with voltages or temperature changed: ``back_bias='-60 V'``."""
+        """Return a copy with voltages or temperature changed.
+
+        Parameters
+        ----------
+        **values : str
+            Quantities with units by their keys in the section ``operating_point``: ``gate_low``,
+            ``gate_high``, ``back_bias``, ``temperature``, ``hole_quasi_fermi_level``.  They are
+            changed in the order given, each as by :meth:`with_value`, and every step must be a
+            device that can be built.
+
+        Returns
+        -------
+        Device
+
+        Raises
+        ------
+        DeviceError
+            As :meth:`with_value`.
+
+        Examples
+        --------
+        >>> Device.load("itl_sta3800c").with_operating_point(back_bias="-60 V", gate_low="-9 V")
+        <Device itl_sta3800c, 100 um of silicon, back bias -60 V, gates -9/2 V>
+        """
         device = self
         for key, value in values.items():
             device = device.with_value(f"operating_point.{key}", value)
@@ -249,17 +343,21 @@ class Device:
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """Dotted names of all that :meth:`with_value` can change."""
+        """Dotted names of all quantities that :meth:`with_value` can change.
+
+        Quantities of implants, ripples, dots and edge strips are not among them;
+        :func:`bfsensor.device.parameters.change_parameter` changes those.
+        """
         return tuple(
             f"{section}.{f.name}"
-            for section, kind in _SECTIONS.items()
+            for section, kind in SECTIONS.items()
             if getattr(self, section) is not None
             for f in dataclasses.fields(kind)
             if f.metadata or f.type == "int"
         )
 
     def unit_of(self, key: str) -> tuple[str, str, str]:
-        """Full name of a quantity, its kind and the unit it is written in.
+        """Return the full name of a quantity, its kind and the unit it is written in.
 
         Parameters
         ----------
@@ -284,7 +382,7 @@ class Device:
         """
         name = self._resolve(key)
         section, _, last = name.partition(".")
-        spec = {f.name: f for f in dataclasses.fields(_SECTIONS[section])}[last]
+        spec = {f.name: f for f in dataclasses.fields(SECTIONS[section])}[last]
         return name, spec.metadata.get("kind", ""), spec.metadata.get("unit", "")
 
     def _resolve(self, key: str) -> str:
@@ -307,12 +405,12 @@ def _from_text(text: str) -> Device:
 
 
 def builtin_devices() -> tuple[str, ...]:
-    """Names of the devices that come with the package.
+    """List the names of the devices that come with the package.
 
     Returns
     -------
     names : tuple of str
-        In alphabetical order, as :meth:`Device.load` takes them.
+        Names in alphabetical order, as :meth:`Device.load` takes them.
 
     Examples
     --------
@@ -326,6 +424,7 @@ def builtin_devices() -> tuple[str, ...]:
 
 
 def _unknown(given: str, allowed: list[str], where: str) -> DeviceError:
+    """Error for an unknown key: the key most like it, or else all that are allowed."""
     close = difflib.get_close_matches(given, allowed, 1)
     hint = (
         f"; did you mean {close[0]!r}?" if close else f"; allowed are {', '.join(allowed)}"
@@ -334,15 +433,16 @@ def _unknown(given: str, allowed: list[str], where: str) -> DeviceError:
 
 
 def _parse(data: dict[str, Any]) -> Device:
+    """Build a device from parsed TOML."""
     provenance: dict[str, Provenance] = {}
-    allowed = ["name", *_SECTIONS]
+    allowed = ["name", *SECTIONS]
     for key in data:
         if key not in allowed:
             raise _unknown(key, allowed, "")
     if not isinstance(data.get("name"), str) or not data["name"]:
         raise DeviceError("name must be given as a string")
     parts: dict[str, Any] = {}
-    for section, kind in _SECTIONS.items():
+    for section, kind in SECTIONS.items():
         if section not in data:
             if section not in _OPTIONAL:
                 raise DeviceError(f"section [{section}] is missing")
@@ -354,13 +454,14 @@ def _parse(data: dict[str, Any]) -> Device:
 def _parse_section(
     kind: type[Any], data: Any, where: str, provenance: dict[str, Provenance]
 ) -> Any:
+    """Build a part of type ``kind`` from its section; adds to ``provenance`` in place."""
     if not isinstance(data, dict):
         raise DeviceError(f"{where} must be a section")
     fields = {f.name: f for f in dataclasses.fields(kind)}
     aliases: dict[str, str] = {
-        entry: name for (owner, name), (entry, _) in _LISTS.items() if owner is kind
+        entry: name for (owner, name), (entry, _) in LISTS.items() if owner is kind
     }
-    allowed = [n for n in fields if (kind, n) not in _LISTS] + list(aliases)
+    allowed = [n for n in fields if (kind, n) not in LISTS] + list(aliases)
     values: dict[str, Any] = {}
     key: str
     for key, given in data.items():
@@ -372,14 +473,14 @@ def _parse_section(
         if key in aliases:
             if not isinstance(given, list):
                 raise DeviceError(f"{where}: {key} must be a list of sections, [[{path}]]")
-            element = _LISTS[kind, name][1]
+            element = LISTS[kind, name][1]
             values[name] = tuple(
                 _parse_section(element, g, f"{path}[{i}]", provenance)
                 for i, g in enumerate(given)
             )
         elif key == "dots":
             values[name] = _parse_section(ChannelStopDots, given, path, provenance)
-        elif (kind, name) in _CHOICES:
+        elif (kind, name) in CHOICES:
             values[name] = given
         elif spec.metadata:
             values[name] = _parse_quantity(given, spec.metadata, where, key, provenance)
@@ -404,6 +505,7 @@ def _parse_quantity(
     key: str,
     provenance: dict[str, Provenance],
 ) -> float:
+    """Convert one quantity to internal units; adds to ``provenance`` in place."""
     text = given
     if isinstance(given, dict):
         for name in given:
@@ -445,33 +547,15 @@ def _parse_quantity(
         value = to_internal(text, metadata["kind"])
     except DeviceError as error:
         raise DeviceError(f"{where}: {key}: {error}") from None
-    _check_range(value, metadata, where, key, text)
+    check_range(value, metadata, where, key, text)
     return value
-
-
-def _check_range(
-    value: float, metadata: Mapping[str, Any], where: str, key: str, given: str
-) -> None:
-    kind, unit = metadata["kind"], metadata["unit"]
-    low, high = metadata["low"], metadata["high"]
-
-    def limit(number: float) -> str:
-        return from_internal(number, kind, unit)
-
-    if not np.isfinite(value):
-        raise DeviceError(f"{where}: {key} = {given!r} must be finite")
-    if low is not None and (value < low or (metadata["above"] and value <= low)):
-        bound = "above" if metadata["above"] else "at least"
-        raise DeviceError(f"{where}: {key} = {given!r} must be {bound} {limit(low)}")
-    if high is not None and value > high:
-        raise DeviceError(f"{where}: {key} = {given!r} must be at most {limit(high)}")
 
 
 # -- writing ---------------------------------------------------------------------------
 
 
 def _string(text: str) -> str:
-    """Write a TOML basic string; JSON's differ only in that they may hold DEL."""
+    """Write a TOML basic string: a JSON string with DEL, which only JSON allows, escaped."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
@@ -483,14 +567,15 @@ def _lines(
     *,
     element: bool = False,
 ) -> list[str]:
+    """Lines of a part and of the parts in it; ``element``: the part is one of a list."""
     out = [f"[[{header}]]" if element else f"[{header}]"]
     nested: list[str] = []
     for spec in dataclasses.fields(part):
         value = getattr(part, spec.name)
         if value is None or value == ():
             continue
-        if (type(part), spec.name) in _LISTS:
-            entry = _LISTS[type(part), spec.name][0]
+        if (type(part), spec.name) in LISTS:
+            entry = LISTS[type(part), spec.name][0]
             for i, item in enumerate(value):
                 nested += [
                     "",
@@ -528,100 +613,3 @@ def _lines(
             text = _string(value) if isinstance(value, str) else str(value)
             out.append(f"{spec.name} = {text}")
     return out + nested
-
-
-# -- checking --------------------------------------------------------------------------
-
-
-def _check(device: Device) -> None:
-    """Refuse what cannot be built; every message names section, key and limit."""
-    for section in _SECTIONS:
-        part = getattr(device, section)
-        if part is not None:
-            _check_part(part, section)
-    pixel, gates, stop = device.pixel, device.gates, device.channel_stop
-    if not 2 <= gates.phases <= 8:
-        raise DeviceError(f"gates: phases = {gates.phases} must be from 2 to 8")
-    if not 1 <= gates.collecting_phases < gates.phases:
-        raise DeviceError(
-            f"gates: collecting_phases = {gates.collecting_phases} must be from 1 to "
-            f"phases - 1 = {gates.phases - 1}"
-        )
-    if gates.field_oxide < gates.gate_oxide:
-        raise DeviceError(
-            f"gates: field_oxide = '{gates.field_oxide:g} um' must be at least "
-            f"gate_oxide = '{gates.gate_oxide:g} um'"
-        )
-    room = pixel.pitch_x / 2
-    for key, extra in (
-        ("field_oxide_taper", gates.field_oxide_taper),
-        ("side_diffusion", stop.side_diffusion),
-    ):
-        if stop.width / 2 + extra >= room:
-            raise DeviceError(
-                f"channel_stop: width / 2 + {key} = {stop.width / 2 + extra:g} um must be "
-                f"below half the pixel, {room:g} um"
-            )
-    if device.operating_point.gate_high <= device.operating_point.gate_low:
-        raise DeviceError(
-            f"operating_point: gate_high = '{device.operating_point.gate_high:g} V' must "
-            f"be above gate_low = '{device.operating_point.gate_low:g} V'"
-        )
-    depth = device.silicon.thickness - gates.field_oxide
-    groups = {
-        "channel.implant": device.channel.implants,
-        "channel_stop.implant": stop.implants,
-    }
-    if stop.dots is not None:
-        groups["channel_stop.dots.implant"] = stop.dots.implants
-        if stop.dots.height >= pixel.pitch_y or stop.dots.centre > pixel.pitch_y:
-            raise DeviceError(
-                f"channel_stop.dots: centre = '{stop.dots.centre:g} um' and height = "
-                f"'{stop.dots.height:g} um' must lie within the pixel, {pixel.pitch_y:g} um"
-            )
-    if device.edge is not None:
-        for k, strip in enumerate(device.edge.strips):
-            groups[f"edge.strip[{k}].implant"] = strip.implants
-    for where, implants in groups.items():
-        for i, implant in enumerate(implants):
-            if implant.reach > depth:
-                raise DeviceError(
-                    f"{where}[{i}]: the implant ends {implant.reach:g} um below the "
-                    f"surface, outside the silicon of {depth:g} um"
-                )
-
-
-def _check_part(part: Any, where: str) -> None:
-    for spec in dataclasses.fields(part):
-        value = getattr(part, spec.name)
-        if value is None:
-            continue
-        if (type(part), spec.name) in _CHOICES:
-            choices = _CHOICES[type(part), spec.name]
-            if value not in choices:
-                raise DeviceError(
-                    f"{where}: {spec.name} = {value!r} must be one of {', '.join(choices)}"
-                )
-        elif isinstance(value, tuple):
-            entry = _LISTS[type(part), spec.name][0]
-            for i, item in enumerate(value):
-                _check_part(item, f"{where}.{entry}[{i}]")
-        elif dataclasses.is_dataclass(value):
-            _check_part(value, f"{where}.{spec.name}")
-        elif spec.metadata:
-            text = (
-                from_internal(value, spec.metadata["kind"], spec.metadata["unit"])
-                if np.isfinite(value)
-                else str(value)
-            )
-            _check_range(value, spec.metadata, where, spec.name, text)
-    if isinstance(part, Implant):
-        needed = ("peak", "sigma") if part.shape == "gaussian" else ("depth",)
-        for name in needed:
-            if getattr(part, name) is None:
-                raise DeviceError(f"{where}: {name} is missing for a {part.shape} implant")
-        for name in sorted({"peak", "sigma", "depth"} - set(needed)):
-            if getattr(part, name) is not None:
-                raise DeviceError(
-                    f"{where}: {name} does not belong to a {part.shape} implant"
-                )

@@ -1,4 +1,4 @@
-"""Quantities of a device by their dotted names, also those of single implants."""
+"""Quantities of a device by dotted name, those of single implants included: read, change, list."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from bfsensor.device.device import Device
 from bfsensor.errors import FitError
 
 UNUSED = ("well.spill_barrier",)
-"""Uncertain quantities that move no boundary."""
+"""Quantities whose uncertainty moves no pixel boundary; they are not among the parameters."""
 
 
 def device_parameters(device: Device) -> dict[str, float]:
-    """Quantities of a device whose file states an uncertainty, with it [internal units].
+    """List the quantities of a device whose file states an uncertainty above 0.
 
     Parameters
     ----------
     device : Device
-        The device.
+        Any.
 
     Returns
     -------
     uncertainties : dict of str to float
-        By dotted name.
+        Standard uncertainties [internal unit] by dotted name, without :data:`UNUSED`.
 
     Examples
     --------
@@ -39,26 +39,35 @@ def device_parameters(device: Device) -> dict[str, float]:
 
 
 def change_parameter(device: Device, key: str, by: float) -> Device:
-    """Give a copy with one quantity, also of an implant, changed by so much [internal units].
+    """Return a copy with a difference added to one quantity.
 
     Parameters
     ----------
     device : Device
-        The device, which stays as it is.
+        Any.
     key : str
-        Dotted name, as :func:`device_parameters` gives it.
+        Dotted name, as :func:`device_parameters` gives it, also of a quantity of an implant,
+        such as ``'channel.implant[0].dose'``.
     by : float
-        What is added to the value [internal unit].
+        Difference that is added [internal unit].
 
     Returns
     -------
     Device
-        Without what was known about the old value.
+        Changed copy; its provenance is that of ``device``, the changed quantity's included.
 
     Raises
     ------
     FitError
         No such quantity.
+    DeviceError
+        The changed value is outside its range.
+
+    Examples
+    --------
+    >>> thicker = change_parameter(Device.load("itl_sta3800c"), "silicon.thickness", 2.5)
+    >>> thicker.silicon.thickness
+    102.5
     """
     try:
         return _changed(device, _steps(device, key), by)
@@ -67,18 +76,19 @@ def change_parameter(device: Device, key: str, by: float) -> Device:
 
 
 def parameter_value(device: Device, key: str) -> float:
-    """Give one quantity, also of an implant [internal units].
+    """Return the value of one quantity.
 
     Parameters
     ----------
     device : Device
-        The device.
+        Any.
     key : str
-        Dotted name, as :func:`device_parameters` gives it.
+        Dotted name, as :func:`device_parameters` gives it, also of a quantity of an implant.
 
     Returns
     -------
     value : float
+        The quantity [internal unit].
 
     Raises
     ------
@@ -101,7 +111,7 @@ def parameter_value(device: Device, key: str) -> float:
 
 
 def _steps(device: Device, key: str) -> list[tuple[str, int | None]]:
-    """Names, and numbers of implants, from the device down to a quantity."""
+    """Split a dotted name into names, each with its index where one stands in brackets."""
     steps = [
         (found[1], None if found[2] is None else int(found[2]))
         for found in (
@@ -115,9 +125,9 @@ def _steps(device: Device, key: str) -> list[tuple[str, int | None]]:
 
 
 def _changed(part: Any, steps: list[tuple[str, int | None]], by: float) -> Any:
-    """Copy of a part of a device with the quantity at the end of a path changed."""
+    """Copy of a part of a device with ``by`` added to the quantity at the end of a path."""
     (name, n), *rest = steps
-    # Files name one implant, Python the tuple of them.
+    # A file's key names one implant, the Python field the tuple of all.
     field = name if n is None else f"{name}s"
     old = getattr(part, field)
     if n is not None:

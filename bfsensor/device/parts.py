@@ -1,7 +1,8 @@
-"""The parts of a device: one frozen record for each section of a device file.
+"""The parts of a device: one frozen dataclass for each section of a device file.
 
 Fields read from quantities carry their kind, written unit and range as metadata; values
-are floats in internal units (um, V, K, electron/um^3, electron/um^2).
+are floats in internal units (um, V, K, electron/um^3, electron/um^2).  The ranges are checked
+when a :class:`~bfsensor.device.device.Device` is made of the parts.
 """
 
 from __future__ import annotations
@@ -33,7 +34,22 @@ def _quantity(
 
 @dataclass(frozen=True)
 class Provenance:
-    """What is known about a value: its uncertainty (internal unit), origin and source."""
+    """Uncertainty, origin and source of a value of a device.
+
+    Attributes
+    ----------
+    uncertainty : float or None
+        Standard uncertainty [internal unit], at least 0; None where the file states none.
+    origin : str or None
+        One of 'measured', 'published', 'fitted', 'guessed'.
+    source : str or None
+        Where the value comes from, in words.
+
+    Examples
+    --------
+    >>> Provenance(5.0, "published").origin
+    'published'
+    """
 
     uncertainty: float | None = None
     origin: str | None = None
@@ -42,7 +58,19 @@ class Provenance:
 
 @dataclass(frozen=True)
 class Pixel:
-    """Pixel pitch along the gates (x) and along the channel stops (y) [um]."""
+    """Pixel pitch.
+
+    Attributes
+    ----------
+    pitch_x, pitch_y : float
+        Pitch along the gates (x, serial) and along the channel stops (y, parallel) [um], above 0
+        up to 200.
+
+    Examples
+    --------
+    >>> Pixel(10.0, 10.0).pitch_x
+    10.0
+    """
 
     pitch_x: float = _quantity("length", "um", 0.0, 200.0, above=True)
     pitch_y: float = _quantity("length", "um", 0.0, 200.0, above=True)
@@ -50,9 +78,25 @@ class Pixel:
 
 @dataclass(frozen=True)
 class Material:
-    """Constants of silicon and oxide; published devices carry those they were tuned with.
+    """Constants of silicon and oxide.
 
-    ``thermal_voltage_300K`` [V], where given, replaces kT/q of CODATA.
+    Published devices carry the constants with which they were tuned.
+
+    Attributes
+    ----------
+    permittivity_silicon, permittivity_oxide : float
+        Relative permittivities, 1 to 100.
+    band_gap : float
+        Band gap of silicon [V], 0.1 to 5.
+    density_of_states : float
+        Density N_s of :meth:`intrinsic_density` [electron/um^3], above 0.
+    thermal_voltage_300K : float or None
+        Thermal voltage at 300 K [V], above 0 up to 1, in place of kT/q of CODATA; None: CODATA.
+
+    Examples
+    --------
+    >>> round(Material().thermal_voltage(300.0), 5)
+    0.02585
     """
 
     permittivity_silicon: float = _quantity("number", "", 1.0, 100.0, default=11.7)
@@ -66,17 +110,19 @@ class Material:
     )
 
     def thermal_voltage(self, temperature: float) -> float:
-        """Thermal voltage kT/q [V] at ``temperature`` [K]."""
+        """Thermal voltage kT/q [V] at a temperature [K]."""
         if self.thermal_voltage_300K is not None:
             return self.thermal_voltage_300K * temperature / 300.0
         return BOLTZMANN * temperature
 
     def intrinsic_density(self, temperature: float) -> float:
-        r"""Intrinsic density [electron/um^3] at ``temperature`` [K].
+        r"""Intrinsic density [electron/um^3] at a temperature [K].
 
-        :math:`n_i = N_s (T/300)^{3/2} e^{-E_g/2kT}`; only its product with the exponential
-        of a quasi-Fermi level matters, so its error is a shift of that level.
+        :math:`n_i = N_s (T/300)^{3/2} e^{-E_g/2kT}`.  Only its product with the exponential
+        of a quasi-Fermi level enters the carriers' densities, so an error of it is a shift of
+        that level.
         """
+        # kT of CODATA even where thermal_voltage_300K is given: see the shift above.
         kt = BOLTZMANN * temperature
         return float(
             self.density_of_states
@@ -87,10 +133,30 @@ class Material:
 
 @dataclass(frozen=True)
 class Ripple:
-    """Relative modulation of the background doping (tree rings).
+    """Relative modulation of the background doping, such as tree rings.
 
-    ``kind`` 'plane': cos(2 pi s / period + phase) with s along ``direction`` from x;
-    'radial': s is the distance from (``centre_x``, ``centre_y``) [um].
+    The doping is multiplied by ``1 + amplitude cos(2 pi s / period + phase)``.
+
+    Attributes
+    ----------
+    kind : {'plane', 'radial'}
+        For 'plane' s is the distance along ``direction``, for 'radial' the distance from
+        (``centre_x``, ``centre_y``).
+    amplitude : float
+        Relative amplitude, 0 to 1.
+    period : float
+        Period [um], above 0.
+    phase : float
+        Phase at s = 0 [rad].
+    direction : float
+        Angle from x towards y [rad], used by 'plane' only.
+    centre_x, centre_y : float
+        Centre of the rings [um], used by 'radial' only.
+
+    Examples
+    --------
+    >>> float(Ripple("plane", 0.01, 80.0).factor(np.array(40.0), np.array(0.0)))
+    0.99
     """
 
     kind: Literal["plane", "radial"]
@@ -102,7 +168,7 @@ class Ripple:
     centre_y: float = _quantity("length", "um", default=0.0)
 
     def factor(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Relative doping at points (x, y) [um]."""
+        """Background doping at points (x, y) [um], relative to its mean; shape of x and y."""
         if self.kind == "plane":
             s = x * np.cos(self.direction) + y * np.sin(self.direction)
         else:
@@ -114,7 +180,22 @@ class Ripple:
 
 @dataclass(frozen=True)
 class Silicon:
-    """Thickness [um], background doping [e/um^3] and its ripples."""
+    """The bulk silicon.
+
+    Attributes
+    ----------
+    thickness : float
+        Height of the back surface above the gates' plane z = 0 [um], 5 to 1000.
+    background_doping : float
+        Doping of the bulk [e/um^3], donors positive, -1e6 to 1e6.
+    ripples : tuple of Ripple
+        Modulations of that doping; their factors multiply.
+
+    Examples
+    --------
+    >>> Silicon(thickness=100.0, background_doping=-2.4).ripples
+    ()
+    """
 
     thickness: float = _quantity("length", "um", 5.0, 1000.0)
     background_doping: float = _quantity("density", "cm-3", -1e6, 1e6)
@@ -123,10 +204,24 @@ class Silicon:
 
 @dataclass(frozen=True)
 class Implant:
-    """Dopants below the silicon surface: ``dose`` [e/um^2], donors positive.
+    """Dopants below the silicon surface.
 
-    'gaussian': peak depth and sigma [um], cut at the surface and at peak + 4 sigma as in
-    the published model, and normalised to the dose; 'box': uniform down to ``depth`` [um].
+    Attributes
+    ----------
+    shape : {'gaussian', 'box'}
+        A Gaussian in depth, cut at the surface and at peak + 4 sigma as in Poisson_CCD and
+        normalised to the dose; or a uniform density down to ``depth``.
+    dose : float
+        Dopants per area [e/um^2], donors positive, acceptors negative.
+    peak, sigma : float or None
+        Depth of the maximum, at least 0, and width, above 0 [um]; for 'gaussian', and only there.
+    depth : float or None
+        Depth [um] down to which the density is uniform, above 0; for 'box', and only there.
+
+    Examples
+    --------
+    >>> Implant("gaussian", dose=-45000.0, peak=0.5, sigma=0.4).reach
+    2.1
     """
 
     shape: Literal["gaussian", "box"]
@@ -173,7 +268,25 @@ class Implant:
 
 @dataclass(frozen=True)
 class GateStack:
-    """Clock phases and the oxides under them [um]."""
+    """Clock phases and the oxides under them.
+
+    Attributes
+    ----------
+    phases : int
+        Gates a pixel, 2 to 8.
+    collecting_phases : int
+        Gates a pixel at the high voltage, 1 to ``phases - 1``, centred on the pixel.
+    gate_oxide, field_oxide : float
+        Thickness of the oxide over the channel and over the channel stop [um], above 0 up to 5;
+        the field oxide is at least as thick as the gate oxide.
+    field_oxide_taper : float
+        Width over which the oxide changes from one to the other [um], 0 to 20.
+
+    Examples
+    --------
+    >>> GateStack(3, 2, gate_oxide=0.1, field_oxide=0.5).edges_y(9.0)
+    (-3.0, 3.0)
+    """
 
     phases: int
     collecting_phases: int
@@ -189,7 +302,20 @@ class GateStack:
 
 @dataclass(frozen=True)
 class BuriedChannel:
-    """The buried channel: implants, and charge at the oxide interface [e/um^2]."""
+    """The buried channel.
+
+    Attributes
+    ----------
+    surface_charge : float
+        Fixed charge at the interface of oxide and silicon [e/um^2], positive as donors.
+    implants : tuple of Implant
+        Implants of the channel; their densities add.
+
+    Examples
+    --------
+    >>> BuriedChannel(implants=(Implant("box", 9000.0, depth=0.4),)).surface_charge
+    0.0
+    """
 
     surface_charge: float = _quantity("dose", "cm-2", default=0.0)
     implants: tuple[Implant, ...] = ()
@@ -197,7 +323,24 @@ class BuriedChannel:
 
 @dataclass(frozen=True)
 class ChannelStopDots:
-    """Implants in part of each channel stop: centre above the pixel's edge, height [um]."""
+    """Implants in part of each channel stop, one dot a pixel.
+
+    Attributes
+    ----------
+    centre : float
+        Middle of the dot along y, from the pixel's lower edge [um], 0 up to the pitch.
+    height : float
+        Length of the dot along y [um], above 0 and below the pitch.
+    surface_charge : float
+        Fixed charge at the interface within the dot [e/um^2].
+    implants : tuple of Implant
+        Implants within the dot, beside those of the channel stop.
+
+    Examples
+    --------
+    >>> ChannelStopDots(centre=5.0, height=3.0).implants
+    ()
+    """
 
     centre: float = _quantity("length", "um", 0.0)
     height: float = _quantity("length", "um", 0.0, above=True)
@@ -207,7 +350,27 @@ class ChannelStopDots:
 
 @dataclass(frozen=True)
 class ChannelStop:
-    """The stop between columns: width centred on the pixel edge, side diffusion [um]."""
+    """The channel stop between columns.
+
+    Attributes
+    ----------
+    width : float
+        Width along x, centred on the pixel edge [um], at least 0.
+    side_diffusion : float
+        Width beyond each side over which its implants fall to 0 [um], at least 0; with half the
+        width, and likewise the oxide's taper, less than half the pitch.
+    surface_charge : float
+        Fixed charge at the interface [e/um^2].
+    implants : tuple of Implant
+        Implants of the stop, acceptors negative.
+    dots : ChannelStopDots or None
+        Further implants in part of it.
+
+    Examples
+    --------
+    >>> ChannelStop(width=2.5).dots is None
+    True
+    """
 
     width: float = _quantity("length", "um", 0.0)
     side_diffusion: float = _quantity("length", "um", 0.0, default=0.0)
@@ -218,7 +381,25 @@ class ChannelStop:
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """Voltages [V] and temperature [K]."""
+    """Voltages and temperature at which a sensor is operated.
+
+    Attributes
+    ----------
+    gate_low, gate_high : float
+        Voltages of the barrier and of the collecting gates [V], -50 to 50; the second is above
+        the first.
+    back_bias : float
+        Voltage of the back surface [V], -500 to 0.
+    temperature : float
+        Temperature of the silicon [K], 77 to 350.
+    hole_quasi_fermi_level : float
+        Quasi-Fermi level of the holes in the channel stops [V], -50 to 50.
+
+    Examples
+    --------
+    >>> OperatingPoint(-8.0, 2.0, -50.0, 173.0).hole_quasi_fermi_level
+    0.0
+    """
 
     gate_low: float = _quantity("potential", "V", -50.0, 50.0)
     gate_high: float = _quantity("potential", "V", -50.0, 50.0)
@@ -229,17 +410,42 @@ class OperatingPoint:
 
 @dataclass(frozen=True)
 class Well:
-    """Barrier along the column [V] at which charge spills."""
+    """The full well of a pixel.
+
+    Attributes
+    ----------
+    spill_barrier : float
+        Height [V] to which the barrier to the next pixel of the column has fallen when charge
+        spills, above 0 up to 10.
+
+    Examples
+    --------
+    >>> Well().spill_barrier
+    1.1
+    """
 
     spill_barrier: float = _quantity("potential", "V", 0.0, 10.0, above=True, default=1.1)
 
 
 @dataclass(frozen=True)
 class EdgeStrip:
-    """A strip beyond the last pixel: at a voltage [V], or field-free where that is None.
+    """A strip beyond the last pixel, such as a guard ring.
 
-    A voltage acts behind the gate or field oxide, or at the silicon itself ('none': a contact).
-    Nothing holds the surface of a field-free strip.
+    Attributes
+    ----------
+    width : float
+        Width [um], above 0.
+    voltage : float or None
+        Voltage of the strip [V]; None: no electrode, the normal field at its surface is 0.
+    oxide : {'none', 'gate', 'field'}
+        Oxide behind which the voltage acts; 'none' is a contact at the silicon itself.
+    implants : tuple of Implant
+        Implants below its surface.
+
+    Examples
+    --------
+    >>> EdgeStrip(width=20.0, voltage=0.0, oxide="none").implants
+    ()
     """
 
     width: float = _quantity("length", "um", 0.0, above=True)
@@ -250,7 +456,52 @@ class EdgeStrip:
 
 @dataclass(frozen=True)
 class Edge:
-    """Strips (a guard ring) beyond the last pixel, along x or y, innermost first."""
+    """The strips beyond the last pixel.
+
+    Attributes
+    ----------
+    side : {'x', 'y'}
+        Axis along which one leaves the array: 'x' has the strips beside the last column.
+    strips : tuple of EdgeStrip
+        The strips, the one next to the array first.
+
+    Examples
+    --------
+    >>> Edge("x", (EdgeStrip(20.0),)).strips[0].oxide
+    'field'
+    """
 
     side: Literal["x", "y"]
     strips: tuple[EdgeStrip, ...] = ()
+
+
+CHOICES: dict[tuple[type, str], tuple[str, ...]] = {
+    (Ripple, "kind"): ("plane", "radial"),
+    (Implant, "shape"): ("gaussian", "box"),
+    (EdgeStrip, "oxide"): ("none", "gate", "field"),
+    (Edge, "side"): ("x", "y"),
+}
+"""Words that a key of a part may have, by part and key."""
+
+LISTS: dict[tuple[type, str], tuple[str, type]] = {
+    (Silicon, "ripples"): ("ripple", Ripple),
+    (BuriedChannel, "implants"): ("implant", Implant),
+    (ChannelStop, "implants"): ("implant", Implant),
+    (ChannelStopDots, "implants"): ("implant", Implant),
+    (EdgeStrip, "implants"): ("implant", Implant),
+    (Edge, "strips"): ("strip", EdgeStrip),
+}
+"""Name of one entry in device files and its type, by the part and field that hold the tuple."""
+
+SECTIONS: dict[str, type] = {
+    "pixel": Pixel,
+    "material": Material,
+    "silicon": Silicon,
+    "gates": GateStack,
+    "channel": BuriedChannel,
+    "channel_stop": ChannelStop,
+    "operating_point": OperatingPoint,
+    "well": Well,
+    "edge": Edge,
+}
+"""Type of each section of a device file, in the order in which files are written."""

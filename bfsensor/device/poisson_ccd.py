@@ -1,4 +1,4 @@
-"""Turn a Poisson_CCD (or GalSim) configuration into a device."""
+"""Reader of Poisson_CCD (and GalSim) sensor configurations as devices."""
 
 from __future__ import annotations
 
@@ -28,11 +28,18 @@ PUBLISHED_MATERIAL = Material(
     density_of_states=2.5e7,
     thermal_voltage_300K=0.026,
 )
-"""Constants compiled into Poisson_CCD (commit 036cbef), with which devices were tuned."""
+"""Constants of silicon and oxide with which the published devices were tuned.
+
+Published: they are compiled into Poisson_CCD (commit 036cbef)."""
 
 _PER_CM2 = 1e-8
+"""1 cm^-2 in um^-2, exact."""
+
 _PER_CM3 = 1e-12
+"""1 cm^-3 in um^-3, exact."""
+
 _LINE = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_]*)\s*=\s*(.*?)\s*$")
+"""A line ``key = value``, comments cut off before."""
 
 
 def read_configuration(path: str | os.PathLike[str]) -> dict[str, str]:
@@ -67,13 +74,16 @@ _DEVICE_KEYS = re.compile(
     r"|Channel(Stop|StopDot)?(Profile|Doping|Depth|SurfaceCharge|(Dose|Peak|Sigma)_\d+)"
     r"|ChannelStop(Width|SideDiff|DotCenter|DotHeight))"
 )
+"""Keys of a configuration that a device takes over."""
+
 _DEVICE_LIKE = re.compile(
     r"(Channel|Gate|Field|Background|Vbb|Vpar|qf|Top|TreeRing|CCDTemp)"
 )
+"""Beginnings of keys that describe a device; such a key that is not known is refused."""
 
 
 def _refuse_unknown(data: dict[str, str]) -> None:
-    """Refuse keys that look like part of the device and are not known."""
+    """Refuse unknown keys that begin as keys of a device do."""
     for key in data:
         if _DEVICE_LIKE.match(key) and not _DEVICE_KEYS.fullmatch(key):
             if key in ("GatePotential", "TopAbsorptionProb", "GateGapPotential"):
@@ -87,9 +97,10 @@ def _refuse_unknown(data: dict[str, str]) -> None:
 def import_poisson_ccd(path: str | os.PathLike[str]) -> Device:
     """Read a Poisson_CCD configuration as a device.
 
-    Taken over: pixel size, thickness, background doping, channel, channel-stop and dot
-    implants, surface charges, oxides, phases, voltages, hole level, temperature.  What
-    steers a run (mesh, filled wells, tracking, output) is not part of a device.
+    The device takes over pixel size, thickness, background doping, implants of channel,
+    channel stop and dots, surface charges, oxides, phases, voltages, quasi-Fermi level of the
+    holes, and temperature.  Keys that steer a run (mesh, filled wells, tracking, output) are
+    ignored.
 
     Parameters
     ----------
@@ -104,7 +115,15 @@ def import_poisson_ccd(path: str | os.PathLike[str]) -> Device:
     Raises
     ------
     DeviceError
-        A key is missing or not a number, or the device cannot be represented.
+        A key is missing or not a number, or the device has a feature that a device file cannot
+        hold (gaps between gates, fixed regions, tree rings, unknown keys).
+
+    Examples
+    --------
+    >>> import galsim
+    >>> folder = Path(galsim.meta_data.share_dir) / "sensors"
+    >>> import_poisson_ccd(folder / "lsst_itl_50_8.cfg").operating_point.back_bias
+    -50.0
     """
     path = Path(path)
     given = _Configuration(read_configuration(path))
@@ -116,12 +135,12 @@ def import_poisson_ccd(path: str | os.PathLike[str]) -> Device:
 
 @dataclass(frozen=True)
 class _Configuration:
-    """The texts of a configuration by key, as numbers and implants."""
+    """A configuration, its texts by key, with methods that convert them."""
 
     texts: dict[str, str]
 
     def number(self, key: str, default: float | None = None) -> float:
-        """Give a number; without a default the key must be there."""
+        """Return the number of a key, ``default`` where it is missing; None: it must be there."""
         if key not in self.texts:
             if default is None:
                 raise DeviceError(f"{key} is missing")
@@ -132,7 +151,7 @@ class _Configuration:
             raise DeviceError(f"{key} = {self.texts[key]!r} is not a number") from None
 
     def whole(self, key: str, default: float | None = None) -> int:
-        """Give a whole number."""
+        """Return the whole number of a key."""
         value = self.number(key, default)
         if not value.is_integer():
             raise DeviceError(f"{key} = {self.texts[key]!r} is not a whole number")
@@ -143,7 +162,7 @@ class _Configuration:
         return self.number(f"{prefix}SurfaceCharge", 0.0) * _PER_CM2
 
     def implants(self, prefix: str) -> tuple[Implant, ...]:
-        """Give the Gaussian implants of a region, or its one of even density."""
+        """Return the Gaussian implants of a region, or its single uniform one (profile 0)."""
         count = self.whole(f"{prefix}Profile", 0.0)
         if count == 0:
             doping = self.number(f"{prefix}Doping", 0.0)
@@ -165,7 +184,7 @@ class _Configuration:
 
 
 def _refuse_unmodelled(given: _Configuration) -> None:
-    """Refuse what a device file says in another way, or cannot say."""
+    """Refuse features that a device file states in another way, or cannot state."""
     for key, why in (
         ("TreeRingAmplitude", "its period lacks a factor 2 pi there; give the ripple in the "
          "device file instead"),

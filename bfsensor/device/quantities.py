@@ -1,4 +1,4 @@
-"""The quantities of a device by dotted name: value, unit, range, prior."""
+"""Quantities of a device by dotted name: value, unit, allowed range, and prior in a fit."""
 
 from __future__ import annotations
 
@@ -14,14 +14,35 @@ from bfsensor.device.written_units import INTERNAL, to_internal
 from bfsensor.errors import DeviceError, FitError
 
 DIFFUSION = "transport.diffusion"
-"""Width of the diffusion over Einstein's: no quantity of a device, yet free with widths."""
+"""Name of a free parameter that no device file holds: the width of the diffusion during drift,
+relative to Einstein's relation."""
 
 DIFFUSION_SPREAD = 0.5
-"""Prior of it: the published simulations have 2.12, Einstein 1; not settled."""
+"""Spread of the prior of that ratio, about 1.
+
+Chosen: the published simulations have 2.12, which is 2.2 spreads above Einstein's 1; with twice
+the spread the prior would hold the ratio half as strongly."""
 
 
 class Quantity(NamedTuple):
-    """One number of a device [internal units] and the range that it may have."""
+    """One quantity of a device and the range that it may have.
+
+    Attributes
+    ----------
+    value : float
+        Its value [internal unit].
+    kind : str
+        A key of :data:`bfsensor.device.written_units.INTERNAL`.
+    unit : str
+        Unit in which device files write it.
+    low, high : float
+        Bounds [internal unit]; a dose or density that is not 0 also keeps its sign.
+
+    Examples
+    --------
+    >>> Quantity(100.0, "length", "um", 5.0, 1e3).number(100.0)
+    100.0
+    """
 
     value: float
     kind: str
@@ -30,7 +51,7 @@ class Quantity(NamedTuple):
     high: float
 
     def text(self, value: float, digits: int = 4) -> str:
-        """Write a value, rounded, with its unit.
+        """Write a value [internal unit] in the unit of device files, rounded to some digits.
 
         Examples
         --------
@@ -40,22 +61,35 @@ class Quantity(NamedTuple):
         return f"{self.number(value):.{digits}g} {self.unit}".rstrip()
 
     def number(self, value: float) -> float:
-        """Give a value in the unit of device files."""
+        """Convert a value [internal unit] to the unit of device files."""
         return float(value * INTERNAL[self.kind].to(self.unit))
 
 
 @dataclasses.dataclass(frozen=True)
 class Prior:
-    """What is known of a free parameter before the fit: a Gaussian within bounds.
+    """Prior of a free parameter of a fit: a Gaussian within bounds.
 
     Attributes
     ----------
     name : str
-        Dotted.
-    mean, spread : float
-        [internal unit].
+        Dotted name of the quantity, or :data:`DIFFUSION`.
+    mean : float
+        Mean [internal unit], within the bounds.
+    spread : float
+        Standard deviation [internal unit], above 0 and finite.
     low, high : float
-        Outside it is no device: thicknesses above 0, doses of one sign.
+        Bounds [internal unit]; beyond them no device can be built (thickness below its range, a
+        dose of the other sign).
+
+    Raises
+    ------
+    FitError
+        The spread is not above 0, or the mean is outside the bounds.
+
+    Examples
+    --------
+    >>> Prior("silicon.thickness", 100.0, 5.0, low=5.0, high=1000.0).spread
+    5.0
     """
 
     name: str
@@ -76,7 +110,7 @@ class Prior:
 
 
 def quantities(device: Device) -> dict[str, Quantity]:
-    """Every number of a device that has a unit, by dotted name.
+    """Collect every quantity of a device that has a value, by dotted name.
 
     Examples
     --------
@@ -92,10 +126,11 @@ def quantities(device: Device) -> dict[str, Quantity]:
 
 
 def _collect(part: Any, path: str, out: dict[str, Quantity]) -> None:
+    """Add the quantities of a part, and of the parts in it, to ``out``."""
     for spec in dataclasses.fields(part):
         value = getattr(part, spec.name)
         if isinstance(value, tuple):
-            # Files name one implant, Python the tuple of them.
+            # A file's key names one implant, the Python field the tuple of all.
             for n, member in enumerate(value):
                 _collect(member, f"{path}.{spec.name[:-1]}[{n}]", out)
         elif dataclasses.is_dataclass(value):
@@ -105,7 +140,7 @@ def _collect(part: Any, path: str, out: dict[str, Quantity]) -> None:
             low = -np.inf if known["low"] is None else float(known["low"])
             high = np.inf if known["high"] is None else float(known["high"])
             if known["kind"] in ("dose", "density") and value:
-                # Acceptors do not become donors.
+                # A fit must not turn acceptors into donors.
                 low, high = (max(low, 0.0), high) if value > 0 else (low, min(high, -0.0))
             out[f"{path}.{spec.name}"] = Quantity(
                 float(value), known["kind"], known["unit"], low, high
@@ -113,7 +148,7 @@ def _collect(part: Any, path: str, out: dict[str, Quantity]) -> None:
 
 
 def describe(name: str) -> str:
-    """Name a quantity as a reader of the device file would.
+    """Name a quantity in words, implants counted from 1.
 
     Examples
     --------
@@ -134,28 +169,31 @@ def describe(name: str) -> str:
 def choose_priors(
     device: Device, asked: tuple[str, ...] = (), *, more: tuple[str, ...] = ()
 ) -> tuple[Prior, ...]:
-    """Priors of the parameters that are to be free.
+    """Choose the free parameters of a fit and their priors.
 
     Parameters
     ----------
     device : Device
-        Values are means, uncertainties spreads.
+        Gives the means (its values) and the spreads (their uncertainties).
     asked : tuple of str
-        Names, dotted or the end of one where that is unique, each with a spread of its own after
-        a colon, such as ``'back_bias:5 V'``, or mean and spread, such as
-        ``'background_doping:-1.7e12 cm-3 +- 0.7e12 cm-3'``; 'all' for all with an uncertainty, except
-        ``well.spill_barrier``, which only saturation sees.  None: those whose origin is 'guessed'.
+        Names of the free parameters, dotted or the end of a dotted name where that is unique.
+        After a colon a name may state its spread, ``'back_bias:5 V'``, or mean and spread,
+        ``'background_doping:-1.7e12 cm-3 +- 0.7e12 cm-3'``.  'all' stands for all quantities
+        with an uncertainty except ``well.spill_barrier``, which only saturation depends on.
+        If empty, the quantities with an uncertainty whose origin is 'guessed' are free.
     more : tuple of str
-        Free besides, if the device states an uncertainty.
+        Dotted names of further free parameters; those without an uncertainty are ignored.
 
     Returns
     -------
     priors : tuple of Prior
+        At least one; means and spreads in internal units.
 
     Raises
     ------
     FitError
-        No such quantity, none with an uncertainty, or a spread that is none.
+        No such quantity, a quantity without an uncertainty and without a stated spread, a
+        spread that is not a quantity of that dimension, or nothing free.
 
     Examples
     --------
@@ -210,8 +248,8 @@ def choose_priors(
             chosen.setdefault(key, spreads[key])
     if not chosen:
         raise FitError(
-            f"{device.name}: nothing is 'guessed', so nothing is free by default; name what is: "
-            f"all, or {', '.join(spreads)}"
+            f"{device.name}: no quantity has the origin 'guessed', so nothing is free by default; "
+            f"name the free parameters: all, or {', '.join(spreads)}"
         )
     return tuple(
         Prior(DIFFUSION, means.get(key, 1.0), spread, 0.0)
@@ -224,7 +262,7 @@ def choose_priors(
 
 
 def _resolve(name: str, known: dict[str, Quantity]) -> str:
-    """Dotted name of a quantity from the end of it."""
+    """Full dotted name of a quantity, given its end."""
     if name in known:
         return name
     ends = [key for key in known if key.endswith(f".{name}")]
@@ -236,18 +274,27 @@ def _resolve(name: str, known: dict[str, Quantity]) -> str:
 
 
 def with_priors(device: Device, priors: tuple[Prior, ...]) -> Device:
-    """Give the device with the priors' spreads as its uncertainties.
+    """Return a copy of the device with the priors' spreads as its uncertainties.
 
     Parameters
     ----------
     device : Device
-        The device, which stays as it is.
+        Any.
     priors : tuple of Prior
-        As :func:`choose_priors` gives them.
+        From :func:`choose_priors`; the prior of :data:`DIFFUSION`, no quantity of a device, is
+        left out.
 
     Returns
     -------
     Device
+        Copy with the same values; uncertainties of quantities without a prior stay.
+
+    Examples
+    --------
+    >>> device = Device.load("itl_sta3800c")
+    >>> priors = choose_priors(device, ("back_bias:5 V",))
+    >>> with_priors(device, priors).provenance["operating_point.back_bias"].uncertainty
+    5.0
     """
     known = dict(device.provenance)
     for prior in priors:

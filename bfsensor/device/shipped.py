@@ -1,4 +1,4 @@
-"""Devices and tables that come with the package."""
+"""Folder of the devices and tables that come with the package, and suggestions for wrong names."""
 
 from __future__ import annotations
 
@@ -10,11 +10,22 @@ from bfsensor.errors import BFSensorError
 
 
 def tables_dir() -> Path:
-    """Find their folder: in a wheel, or beside it in a checkout.
+    """Find the folder of the devices and tables that come with the package.
 
     Returns
     -------
     folder : Path
+        The folder ``tables`` in the installed package, or beside the package in a checkout.
+
+    Raises
+    ------
+    BFSensorError
+        The folder is missing: the installation is incomplete.
+
+    Examples
+    --------
+    >>> (tables_dir() / "itl_sta3800c" / "device.toml").is_file()
+    True
     """
     package = Path(__file__).resolve().parents[1]
     for folder in (package / "tables", package.parent / "tables"):
@@ -26,7 +37,9 @@ def tables_dir() -> Path:
 
 
 def did_you_mean(given: str, known: Iterable[str]) -> str:
-    """Ask, at the end of an error, for the names that a wrong one is like; '' for none.
+    """Return the end of an error message that suggests known names like a wrong one.
+
+    The text is empty where no known name is like it.
 
     Examples
     --------
@@ -35,6 +48,6 @@ def did_you_mean(given: str, known: Iterable[str]) -> str:
     """
     known = list(known)
     close = difflib.get_close_matches(given.lower(), known, 3)
-    # A part of a name, such as 'e2v', is not like the whole by difflib's measure.
+    # difflib's similarity of a part, such as 'e2v', to the whole name is below its cut.
     close = close or [name for name in known if given and given.lower() in name]
     return f"; did you mean {' or '.join(close)}?" if close else ""

@@ -1,4 +1,4 @@
-r"""Laws of silicon: what light and electrons do in it, each with its source and range."""
+r"""Laws of silicon, each with its source and range: absorption length, mobility of electrons."""
 
 from __future__ import annotations
 
@@ -13,10 +13,17 @@ _HC = 1239.841984
 """Photon energy times wavelength [eV nm] (CODATA 2022, exact)."""
 
 _TEMPERATURES = (77.0, 500.0)
-_ROOM = 300.0  # K, of the measured absorption
+"""Lowest and highest temperature [K] of both laws.
 
-# Green (2008), table 1: absorption coefficient [cm^-1] at 300 K, every 10 nm.
+The upper end is published, the end of the range of Rajkanan et al. (1979).  The lower is chosen:
+nitrogen's boiling point, the lowest temperature that a device may have."""
+
+_ROOM = 300.0
+"""Temperature [K] of the measured absorption: Green (2008)."""
+
 _WAVELENGTHS = np.arange(250.0, 1451.0, 10.0)
+"""Vacuum wavelengths of the measured absorption [nm]: Green (2008), table 1."""
+
 _ABSORPTION = np.array([
     1.84e6, 1.97e6, 2.18e6, 2.37e6, 2.29e6, 1.77e6, 1.46e6, 1.30e6, 1.18e6, 1.10e6,
     1.06e6, 1.04e6, 7.37e5, 3.13e5, 1.43e5, 9.30e4, 6.95e4, 5.27e4, 4.02e4, 3.07e4,
@@ -32,17 +39,26 @@ _ABSORPTION = np.array([
     1.7e-6, 9.5e-7, 6.0e-7, 3.8e-7, 2.3e-7, 1.4e-7, 8.5e-8, 5.0e-8, 2.5e-8, 1.8e-8,
     1.2e-8,
 ])  # fmt: skip
+"""Absorption coefficient [cm^-1] at 300 K at those wavelengths: Green (2008), table 1."""
 
-# Rajkanan, Singh & Shewchun (1979): indirect gaps [eV] with strengths [cm^-1 eV^-2],
-# phonons [eV] with couplings, shrinking of the gaps [eV/K, K].
 _GAPS = ((1.1557, 3.231e2), (2.5, 7.237e3))
+"""Indirect gaps at 0 K [eV] with strengths [cm^-1 eV^-2]: Rajkanan et al. (1979)."""
+
 _PHONONS = ((1.827e-2, 5.5), (5.773e-2, 4.0))
+"""Phonon energies [eV] with couplings: Rajkanan et al. (1979)."""
+
 _SHRINK, _SHRINK_TEMPERATURE = 7.021e-4, 1108.0
-_LAST_RATIO = 1100.0  # nm; towards the gap the terms vanish one by one, and so their ratio
+# Coefficients of the shrinking of the gaps [eV/K, K]: Rajkanan et al. (1979).
+
+_LAST_RATIO = 1100.0
+"""Wavelength [nm] beyond which the change of the absorption with temperature is held constant.
+
+Chosen: towards the gap the terms of the law vanish one after another, and with them the ratio of
+two temperatures.  At twice the wavelength, beyond all gaps, the ratio would be 0 / 0."""
 
 
 def absorption_length(wavelength: ArrayLike, temperature: float) -> FloatArray:
-    r"""Give the absorption length of silicon.
+    r"""Return the absorption length of light in silicon.
 
     Measured at 300 K, carried to other temperatures by phonon-assisted transitions:
 
@@ -59,14 +75,15 @@ def absorption_length(wavelength: ArrayLike, temperature: float) -> FloatArray:
     Parameters
     ----------
     wavelength : array_like
-        In vacuum [nm], from 0.  Below 250 nm the length at 250 nm is given.
+        Wavelength in vacuum [nm], at least 0.  Below 250 nm the length at 250 nm is returned.
     temperature : float
-        77 to 500 K.
+        Temperature of the silicon, 77 to 500 K.
 
     Returns
     -------
     length : ndarray
-        [um], shape of ``wavelength``; inf above 1450 nm, where the measurements end.
+        Absorption length [um], shape of ``wavelength``; inf above 1450 nm, where the
+        measurements end.
 
     Raises
     ------
@@ -86,10 +103,10 @@ def absorption_length(wavelength: ArrayLike, temperature: float) -> FloatArray:
     Beyond 1100 nm the ratio at 1100 nm is kept; there, and below 310 nm, the change with
     temperature is an estimate.
 
-    Held against the dispersion model of Franta et al. (2017), lengths agree within a factor
-    1.6 over 400 to 1000 nm from 150 to 400 K; at 1050 nm and 150 K they are shorter by a
-    factor 1.9.  The power law in temperature of Green (2008) departs nearly twice as far
-    from that model at 150 K and below.
+    They agree with the dispersion model of Franta et al. (2017) within a factor 1.6 over 400 to
+    1000 nm from 150 to 400 K; at 1050 nm and 150 K they are shorter by a factor 1.9.  The power
+    law in temperature of Green (2008) departs nearly twice as far from that model at 150 K and
+    below.
 
     References
     ----------
@@ -116,7 +133,7 @@ def absorption_length(wavelength: ArrayLike, temperature: float) -> FloatArray:
 
 
 def _indirect(energy: FloatArray, temperature: float) -> FloatArray:
-    """Absorption [cm^-1] across the indirect gaps by photons of an energy [eV]."""
+    """Absorption coefficient [cm^-1] across the indirect gaps for photons of an energy [eV]."""
     kt = BOLTZMANN * temperature
     shrink = _SHRINK * temperature**2 / (temperature + _SHRINK_TEMPERATURE)
     alpha = np.zeros_like(energy)
@@ -130,6 +147,7 @@ def _indirect(energy: FloatArray, temperature: float) -> FloatArray:
 
 
 def _check_temperature(temperature: float) -> None:
+    """Refuse a temperature [K] outside the range of the laws."""
     low, high = _TEMPERATURES
     if not low <= temperature <= high:
         raise DeviceError(
@@ -138,7 +156,7 @@ def _check_temperature(temperature: float) -> None:
 
 
 def mobility(field: ArrayLike, temperature: float) -> FloatArray:
-    r"""Give the mobility of electrons in pure silicon.
+    r"""Return the mobility of electrons in pure silicon.
 
     .. math:: \mu = \frac{v_m / E_c}{[1 + (E / E_c)^\beta]^{1/\beta}}, \quad
         v_m = 1.53 \times 10^9\, T^{-0.87}, \quad E_c = 1.01\, T^{1.55}, \quad
@@ -149,14 +167,14 @@ def mobility(field: ArrayLike, temperature: float) -> FloatArray:
     Parameters
     ----------
     field : array_like
-        [V/um], from 0.
+        Electric field [V/um], at least 0.
     temperature : float
-        77 to 500 K; the measurements behind the fit end at 430 K.
+        Temperature of the silicon, 77 to 500 K; the measurements behind the fit end at 430 K.
 
     Returns
     -------
     mobility : ndarray
-        [um^2 / (V s)], shape of ``field``.
+        Drift velocity over field [um^2 / (V s)], shape of ``field``.
 
     Raises
     ------
@@ -183,7 +201,12 @@ def mobility(field: ArrayLike, temperature: float) -> FloatArray:
 
 
 def mobility_law(temperature: float) -> tuple[float, float, float]:
-    """Constants of :func:`mobility` at a temperature.
+    """Return the constants of :func:`mobility` at a temperature.
+
+    Parameters
+    ----------
+    temperature : float
+        Temperature of the silicon, 77 to 500 K.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Devices and tables in a few lines of words, as text for a terminal and as HTML for a notebook."""
+"""Summaries of devices and tables, as text for a terminal and as HTML for a notebook."""
 
 from __future__ import annotations
 
@@ -26,10 +26,17 @@ from bfsensor.device.written_units import from_internal
 from bfsensor.units import to_celsius
 
 MOST_LINES = 30
+"""Largest number of lines of a summary; the rest is counted in its last line.
+
+Chosen: a summary of twice as many would not fit a terminal's window."""
+
 WIDTH = 88
+"""Largest width of a line [characters].
+
+Chosen for a terminal's window; at twice the width a device's summary has fewer, longer lines."""
 
 Rows = Sequence[tuple[str, str]]
-"""What is said, and the words and numbers that say it."""
+"""Rows of a summary: label and text."""
 
 
 def format_summary(title: str, rows: Rows) -> str:
@@ -48,7 +55,7 @@ def format_summary(title: str, rows: Rows) -> str:
 
 
 def summary_to_html(title: str, rows: Rows) -> str:
-    """Write the same as a table of HTML."""
+    """Write a title and rows as an HTML table."""
     body = "".join(
         f'<tr><th style="text-align: left">{html.escape(label)}</th>'
         f'<td style="text-align: left">{html.escape(text)}</td></tr>'
@@ -58,7 +65,7 @@ def summary_to_html(title: str, rows: Rows) -> str:
 
 
 def device_title(name: str, silicon: Silicon, point: OperatingPoint) -> str:
-    """Name a device with its thickness and voltages."""
+    """Return a device's name with its thickness and voltages."""
     return (
         f"{name}, {silicon.thickness:g} um of silicon, back bias {point.back_bias:g} V, "
         f"gates {point.gate_low:g}/{point.gate_high:g} V"
@@ -78,7 +85,7 @@ def device_rows(
     edge: Edge | None,
     provenance: Mapping[str, Provenance],
 ) -> list[tuple[str, str]]:
-    """Say what a device is, with the uncertainties that its file states."""
+    """Return the rows of a device's summary, with the uncertainties that its file states."""
 
     def value(part: Any, key: str) -> str:
         """Write a quantity and its uncertainty, by the dotted name of the device file."""
@@ -162,7 +169,7 @@ def device_rows(
         ("temperature", f"{point.temperature:g} K ({to_celsius(point.temperature):.0f} C)"),
         (
             "full well",
-            "where the barrier along the column falls to "
+            "reached when the barrier along the column has fallen to "
             + value(well, "well.spill_barrier"),
         ),
         (

@@ -15,16 +15,27 @@ if TYPE_CHECKING:
 SILICON_CONSUMED = 4.0 / 9.0
 """Share of a grown oxide that lies below the silicon surface it was grown from.
 
-Molar volumes of Si and SiO2 give 0.44 (Deal & Grove 1965, J. Appl. Phys. 36, 3770);
-4/9 puts the gate of the published ITL device at its 0.5 um above the field-oxide top."""
+Derived from the molar volumes of Si and SiO2, which give 0.44 (Deal & Grove 1965, J. Appl. Phys.
+36, 3770); 4/9 puts the gate of the published ITL device at its 0.5 um above the field-oxide top."""
 
 
 @dataclass(frozen=True)
 class Surfaces:
     """Heights of gate and silicon in the channel and in the channel stop [um].
 
-    The field oxide has its top at z = 0; a share :data:`SILICON_CONSUMED` of what it is
-    thicker than the gate oxide lies below the silicon surface of the channel.
+    The field oxide has its top at z = 0; a share :data:`SILICON_CONSUMED` of the difference
+    between field and gate oxide lies below the silicon surface of the channel.
+
+    Attributes
+    ----------
+    gate_channel : float
+        Height of the gate's lower face in the channel [um].
+    silicon_channel, silicon_stop : float
+        Heights of the silicon surface in the channel and in the channel stop [um].
+    stop_half_width : float
+        Half the width of the channel stop [um].
+    taper, side_diffusion : float
+        Widths over which the oxide, and the stop's implants, change beyond that [um].
     """
 
     gate_channel: float
@@ -53,7 +64,7 @@ class Surfaces:
         """Rise from 0 in the channel stop to 1 in the channel, against distance from the edge."""
         beyond = distance - self.stop_half_width
         if width <= 0:
-            # A node on the edge is in the stop whatever its last digit.
+            # Round-off must not decide on which side a mesh node on the edge lies.
             return np.where(beyond > 1e-9, 1.0, 0.0)
         return np.clip(beyond / width, 0.0, 1.0)
 

@@ -1,4 +1,4 @@
-"""Quantities as device files write them, with a unit, and as the package holds them, without."""
+"""Conversion of quantities: text with a unit in device files, plain floats inside the package."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ INTERNAL = {
     "dose": u.um**-2,
     "number": u.dimensionless_unscaled,
 }
-"""The unit of each kind of quantity inside the package."""
+"""Unit of each kind of quantity inside the package, by definition."""
 
 
 def to_internal(text: str, kind: str) -> float:
@@ -35,6 +35,7 @@ def to_internal(text: str, kind: str) -> float:
     Returns
     -------
     value : float
+        The quantity [internal unit].
 
     Raises
     ------
@@ -67,7 +68,7 @@ def to_internal(text: str, kind: str) -> float:
 
 @cache
 def _ratio(given: u.UnitBase, wanted: u.UnitBase) -> tuple[float, float]:
-    """Give the size of a unit in another as a fraction, so that powers of ten are exact.
+    """Return the size of a unit in another as a fraction, so that powers of ten are exact.
 
     1e-8 is not a float, 1e8 is: '1e12 cm-2' becomes 1e4 only by a division.
     """
@@ -79,28 +80,29 @@ def _ratio(given: u.UnitBase, wanted: u.UnitBase) -> tuple[float, float]:
 
 
 def _name(kind: str) -> str:
-    """Give the internal unit of a kind as it is written, e.g. 'um-2'."""
+    """Return the internal unit of a kind as it is written, such as 'um-2'."""
     return str(INTERNAL[kind].to_string(fraction=False))
 
 
 def from_internal(value: float, kind: str, unit: str) -> str:
     """Write a float in internal units as the shortest text that reads as the same float.
 
-    In ``unit``; the few floats that no number in that unit gives back are written in the
-    internal unit.
+    The few floats that no number in ``unit`` gives back bit for bit are written in the internal
+    unit instead.
 
     Parameters
     ----------
     value : float
-        In the internal unit of ``kind``.
+        The quantity [internal unit of ``kind``].
     kind : str
         A key of :data:`INTERNAL`.
     unit : str
-        Unit to write in.
+        Unit to write in, of the dimension of ``kind``.
 
     Returns
     -------
     text : str
+        Number and unit; :func:`to_internal` reads the same float from it.
 
     Examples
     --------

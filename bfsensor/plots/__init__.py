@@ -1,4 +1,4 @@
-"""Figures of devices, distortion tables, paths of electrons, spots and sweeps, drawn into given axes."""
+"""Figures of devices, distortion tables, electron paths, spots and sweeps, drawn into given axes."""
 
 from typing import TYPE_CHECKING
 

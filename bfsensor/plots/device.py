@@ -1,8 +1,7 @@
-"""Figures of a solved device: potentials and carriers under the gates; all pages of a device.
+"""Figures of a solved device: potentials and carriers under the gates, and all pages of a device.
 
 They follow figures 6 and 7 of Lage, Bradshaw & Tyson (2017).  Axes are in um, x serial and
-y parallel, z up from the gates; light comes from the top.  :mod:`bfsensor.plots.table` gives these
-functions together with the figures of tables.
+y parallel, z up from the gates; light comes from the top.
 """
 
 from __future__ import annotations
@@ -43,10 +42,21 @@ if TYPE_CHECKING:
 ELECTRON_COLOUR, HOLE_COLOUR, DOPANT_COLOUR = BLUE, RED, GREEN
 
 _GATE_COLOUR, _OXIDE_COLOUR = "#8C8C8C", "#DDDDDD"
-_GATE_DEPTH = 0.25  # um, to which gates are drawn below z = 0
+_GATE_DEPTH = 0.25
+"""Depth below z = 0 to which gates are drawn [um].
 
-_REACH = 1.5  # pixels to either side of a cross section's middle
-_FAINTEST = 1e2  # carriers/um^3 below which a cross section is left white
+Chosen: room for their voltages; twice as much takes that from the silicon."""
+
+_REACH = 1.5
+"""Half the width of a cross section [pixel].
+
+Chosen: the central pixel and both neighbours; twice as much shows two more on either side."""
+
+_FAINTEST = 1e2
+"""Density of carriers below which a cross section is left white [1/um^3].
+
+Chosen: without it the tails of the clouds would fill the figure; at twice as much clouds are drawn
+a little smaller."""
 
 
 def draw_potential_profiles(
@@ -61,21 +71,30 @@ def draw_potential_profiles(
     Parameters
     ----------
     potential : Potential
-        Solved with charge in pixel (0, 0).
+        Solution with charge in pixel (0, 0).
     axes : array of matplotlib.axes.Axes, shape (2, 3)
-        Above: potentials [V], with an inset to the full thickness; below: densities of
-        dopants, holes and electrons [1/um^3], positive for positive charge.  From the
-        left: centre of the collecting gate, of the channel stop beside it, of the barrier
-        gate.
+        Axes to draw into.  Upper row: potentials [V], with an inset to the full thickness;
+        lower row: densities of dopants, holes and electrons [1/um^3], positive for positive
+        charge.  Columns: centre of the collecting gate, of the channel stop beside it, of the
+        barrier gate.
     empty : Potential, optional
-        The same device without stored charge, drawn dashed under the collecting gate.
+        Solution of the same device without stored charge, drawn dashed under the collecting gate.
     height : float
-        Upper end of z [um].
+        Upper end of z [um], above 0.
 
     Raises
     ------
     BFSensorError
         Matplotlib is missing.
+
+    Examples
+    --------
+    >>> from bfsensor import Device
+    >>> potential = solve_unit_cell(Device.load("itl_sta3800c"), 50000.0, cells=8)
+    >>> figure = new_figure(13.0, 7.5)
+    >>> draw_potential_profiles(potential, figure.subplots(2, 3))
+    >>> [ax.get_title() for ax in figure.axes[:3]]
+    ['collecting gate, +2 V', 'channel stop', 'barrier gate, -8 V']
     """
     import_matplotlib()
     mesh, point = potential.mesh, potential.device.operating_point
@@ -162,18 +181,27 @@ def draw_charge_cross_sections(
     Parameters
     ----------
     potential : Potential
-        Solved with charge in pixel (0, 0).
+        Solution with charge in pixel (0, 0).
     fig : matplotlib.figure.Figure
-        An empty figure; gets three panels (x-z under the collecting gate, x-z under the
-        barrier gate, y-z along the channel) and two colour bars.  Holes are red,
+        Empty figure to draw into; it receives three panels (x-z under the collecting gate, x-z
+        under the barrier gate, y-z along the channel) and two colour bars.  Holes are red,
         electrons blue; gates dark, oxide light grey.
     height : float
-        Upper end of z [um].
+        Upper end of z [um], above 0.
 
     Raises
     ------
     BFSensorError
         Matplotlib is missing.
+
+    Examples
+    --------
+    >>> from bfsensor import Device
+    >>> potential = solve_unit_cell(Device.load("itl_sta3800c"), 50000.0, cells=8)
+    >>> figure = new_figure(11.0, 10.0)
+    >>> draw_charge_cross_sections(potential, figure)
+    >>> len(figure.axes)
+    5
     """
     import_matplotlib()
     from matplotlib.cm import ScalarMappable
@@ -213,18 +241,20 @@ def draw_charge_cross_sections(
 
 @dataclass(frozen=True)
 class _Plane:
-    """A vertical plane through a solution, unfolded to some pixels on either side.
+    """A vertical plane through a solution, continued by symmetry to both sides.
 
     Attributes
     ----------
+    potential : Potential
+        The solution.
     axis : int
-        The plane's own: 0 for x-z, 1 for y-z.
+        Horizontal axis of the plane: 0 for x-z, 1 for y-z.
     node : int
-        Of the mesh along the other axis, where the plane lies.
+        Index of the mesh node on the other axis at which the plane lies.
     along, order : ndarray
-        Places of its nodes [um], and their indices in the mesh.
+        Positions of the plane's nodes [um], and their indices in the mesh.
     extent : float
-        Half its width [um].
+        Half the width of the plane [um].
     """
 
     potential: Potential
@@ -236,7 +266,7 @@ class _Plane:
 
     @classmethod
     def of(cls, potential: Potential, axis: int, position: float) -> _Plane:
-        """Lay the plane at a position [um] on the other axis."""
+        """Make the plane at a position [um] on the other axis."""
         extent = _REACH * potential.mesh.pitch[axis]
         along, order = _unfolded_nodes(potential, axis, extent)
         node = _node(potential, 1 - axis, position)
@@ -253,7 +283,7 @@ class _Plane:
         return plane[:, self.order]
 
     def surfaces(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Fine places, and the heights of gate and silicon surface there [um]."""
+        """Return fine positions along the plane, and heights of gate and silicon there [um]."""
         fine = np.linspace(-self.extent, self.extent, 1201)
         if self.axis == 0:
             distance = self.pitch / 2 - np.abs(
@@ -268,7 +298,7 @@ class _Plane:
 def _draw_carriers(
     ax: Axes, plane: _Plane, density: FloatArray, scale: Normalize, colours: str
 ) -> None:
-    """Draw a density of carriers, white where it is faint."""
+    """Draw a density of carriers, white below ``_FAINTEST``."""
     values = plane.cut(density)
     ax.pcolormesh(
         plane.along, plane.potential.mesh.z[: len(density)],
@@ -313,7 +343,7 @@ def _draw_equipotentials(ax: Axes, plane: _Plane, height: float) -> None:
 def _label_places(
     segments: Sequence[FloatArray], plane: _Plane, height: float
 ) -> list[tuple[float, float]]:
-    """Choose places at the tops of lines, where neighbours are farthest apart."""
+    """Choose label positions at the tops of lines, at a distance from each other."""
     fine, _, silicon = plane.surfaces()
     tops = [line[np.argmax(line[:, 1])] for line in segments]
     places: list[tuple[float, float]] = []
@@ -331,7 +361,7 @@ def _label_places(
 
 
 def _draw_gates(ax: Axes, plane: _Plane) -> None:
-    """Draw where the gates of a y-z plane end, and write their voltages into them."""
+    """Draw the ends of the gates in a y-z plane, and write their voltages into them."""
     device, pitch = plane.potential.device, plane.pitch
     point = device.operating_point
     top = plane.surfaces()[1][0]
@@ -348,28 +378,30 @@ def _draw_gates(ax: Axes, plane: _Plane) -> None:
 
 
 def figure_for_device(device: Device) -> dict[str, Figure]:
-    """Solve an empty and a filled pixel and draw them.
+    """Solve a device with an empty and with a filled pixel, and draw both.
 
     Parameters
     ----------
     device : Device
-        What to solve: a period of 4 pixels of 16 cells, pixel (0, 0) once empty, once with
-        :data:`~bfsensor.plots.style.SHOWN_CHARGE`.
+        Any device; it is solved on a period of 4 pixels with 16 cells a pixel, pixel (0, 0) once
+        empty and once with :data:`~bfsensor.plots.style.SHOWN_CHARGE`.
 
     Returns
     -------
     figures : dict of str to matplotlib.figure.Figure
-        ``profiles``, ``sections``, ``paths`` (drift alone) and ``diffusion`` (drift, with
-        diffusion, with diffusion above a full pixel), each to be written with ``savefig``.
+        ``profiles`` (potentials and densities), ``sections`` (planes), ``paths`` (drift without
+        diffusion) and ``diffusion`` (drift, drift with diffusion, the same above a full pixel),
+        each to be written with ``savefig``.
 
     Raises
     ------
     BFSensorError
         Matplotlib is missing.
     ConvergenceError, DeviceError
-        The device has no such solution.
+        The device cannot be solved with that charge.
     """
-    profiles = new_figure(13.0, 7.5)  # before the solution: matplotlib may be missing
+    # Before the solution, which takes seconds, because matplotlib may be missing.
+    profiles = new_figure(13.0, 7.5)
     mesh = make_mesh(device, pixels=(4, 4), cells=16)
     solver = Electrostatics(device, mesh)
     unit = solve_unit_cell(device, 0.0, cells=16)
@@ -383,7 +415,7 @@ def figure_for_device(device: Device) -> dict[str, Figure]:
     draw_charge_cross_sections(filled, sections)
     paths = new_figure(12.0, 13.0)
     axes = paths.subplots(3, 2)
-    # The lowest part again, empty and filled: that is where the paths bend.
+    # The lowest 12 um once more, empty and filled, because the paths are curved there.
     for row, (solved, height) in enumerate(((filled, None), (empty, 12.0), (filled, 12.0))):
         draw_electron_paths(solved, axes[row, 0], plane="x", paths=16, height=height)
         draw_electron_paths(solved, axes[row, 1], plane="y", paths=16, height=height)
@@ -397,7 +429,7 @@ def figure_for_device(device: Device) -> dict[str, Figure]:
 
 
 def _diffusion_page(empty: Potential, filled: Potential) -> Figure:
-    """Drift, diffusion and repulsion: the whole thickness, and close to the wells."""
+    """Page of paths by drift, diffusion and repulsion, over the thickness and near the wells."""
     figure = new_figure(14.0, 13.5)
     axes = figure.subplots(3, 3)
     still = Transport(diffusion=0.0)
@@ -410,6 +442,7 @@ def _diffusion_page(empty: Potential, filled: Potential) -> Figure:
 
 
 def _write_in_gate(ax: Axes, position: float, top: float, text: str) -> None:
+    """Write a text into the gate at a position [um]."""
     ax.text(
         position, 0.5 * (top - _GATE_DEPTH), text, ha="center", va="center", fontsize=8,
         color="white", zorder=6,
@@ -467,7 +500,7 @@ def _carrier_profiles(
 def _dopant_density(
     device: Device, surfaces: Surfaces, x: float, y: float, z: FloatArray
 ) -> FloatArray:
-    """Give the fixed charge [e/um^3] at heights z [um] of a column; no sheet charges."""
+    """Fixed charge [e/um^3] at heights z [um] of a column, without charge at the interface."""
     pitch_x, pitch_y = device.pixel.pitch_x, device.pixel.pitch_y
     distance = np.array([pitch_x / 2 - abs(x - pitch_x * round(x / pitch_x))])
     depth = np.maximum(z - surfaces.silicon(distance)[0], 0.0)

@@ -1,4 +1,4 @@
-"""Figures of a fit: each drawn from plain arrays into an ``ax``."""
+"""Figures of a device fit, drawn from plain arrays into an ``ax``."""
 
 from __future__ import annotations
 
@@ -23,10 +23,21 @@ def draw_ratios(
     after: FloatArray,
     ax: Axes,
 ) -> None:
-    """Simulated over measured, before and after, with the measured errors about one.
+    """Draw the ratios of simulated to measured values, before and after the fit.
 
-    Numbers with errors of 0.7 of them or more are drawn faint and do not set the axis; a triangle
-    stands where a point lies beyond it.
+    Values with a relative error of 0.7 or more are drawn faint and do not set the range of the
+    axis; triangles at its ends stand for points beyond it.
+
+    Parameters
+    ----------
+    labels : sequence of str, length n
+        Names of the values.
+    values, errors : ndarray, shape (n,)
+        Measured values and their scaled errors, in any unit.
+    before, after : ndarray, shape (n,)
+        Simulated values before and after the fit, in the same unit.
+    ax : matplotlib.axes.Axes
+        Axes to draw into.
     """
     at = np.arange(len(labels))
     part = np.abs(errors / values)
@@ -61,17 +72,37 @@ def draw_ratios(
 
 
 def draw_pulls(names: Sequence[str], pulls: ArrayLike, errors: ArrayLike, ax: Axes) -> None:
-    """Parameters in spreads of their priors, with their posterior errors."""
+    """Draw fitted parameters in units of the spreads of their priors.
+
+    Parameters
+    ----------
+    names : sequence of str, length n
+        Names of the parameters.
+    pulls, errors : array_like, shape (n,)
+        Differences from the prior means and posterior errors, both in spreads.
+    ax : matplotlib.axes.Axes
+        Axes to draw into.
+    """
     at = np.arange(len(names))[::-1]
     ax.axvspan(-1, 1, color="0.92", zorder=0)
     ax.axvline(0, color="0.6", lw=0.8)
     ax.errorbar(np.asarray(pulls), at, xerr=np.asarray(errors), fmt="o", ms=4, color=BLUE)
     ax.set_yticks(at, names, fontsize=8)
-    ax.set(xlabel="off the prior [its spread]", ylim=(-0.7, len(at) - 0.3))
+    ax.set(xlabel="difference from the prior mean [its spread]", ylim=(-0.7, len(at) - 0.3))
 
 
 def draw_data_pulls(labels: Sequence[str], pulls: ArrayLike, ax: Axes) -> None:
-    """Predicted less measured in scaled errors, after the fit."""
+    """Draw the differences of predicted and measured values after the fit.
+
+    Parameters
+    ----------
+    labels : sequence of str, length n
+        Names of the values.
+    pulls : array_like, shape (n,)
+        Predicted less measured values in scaled errors.
+    ax : matplotlib.axes.Axes
+        Axes to draw into.
+    """
     at = np.arange(len(labels))
     ax.axhspan(-1, 1, color="0.92", zorder=0)
     ax.axhline(0, color="0.6", lw=0.8)
@@ -90,9 +121,22 @@ def draw_profile(
     *,
     bounds: Sequence[tuple[float, float]] = (),
 ) -> None:
-    """Rise of the minimum against one parameter, the parabola of its error, and intervals.
+    """Draw the profile of the fit's minimum against one parameter.
 
-    Infinite ends of intervals lie at the last point of the profile.
+    Lines stand at rises of 1 and 3.84, the 68 % and 95 % intervals of one parameter.
+
+    Parameters
+    ----------
+    values, rise : ndarray, shape (n,)
+        Values of the parameter, and rise of chi-square and prior above the minimum.
+    value, error : float
+        Best value and its error, for the parabola that is drawn beside the profile.
+    name : str
+        Label of the parameter with its unit.
+    ax : matplotlib.axes.Axes
+        Axes to draw into.
+    bounds : sequence of (float, float)
+        Intervals that are shaded; infinite ends are drawn at the last point of the profile.
     """
     for low, high in bounds:
         ax.axvspan(

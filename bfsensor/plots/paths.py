@@ -1,4 +1,4 @@
-"""Figures of electrons on their way to the wells: drift, diffusion, repulsion.
+"""Figures of electron paths to the wells: drift, diffusion, repulsion by stored charge.
 
 They follow figure 6 of Lage, Bradshaw & Tyson (2017).  Axes are in um, x serial and y parallel,
 z up from the gates; light comes from the top.
@@ -29,11 +29,25 @@ from bfsensor.simulate.poisson import Potential
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_PATH_STEP = 0.25  # of the local scale, as for finding boundaries
+_PATH_STEP = 0.25
+"""Step of a drift path relative to the local scale.
+
+Chosen: the step with which boundaries are traced; at twice as much paths have half as many
+vertices."""
+
 _MOST_STEPS = 3000
-# Shorter than the default: a path of steps of 5 um would be drawn as a polygon.
+"""Largest number of steps of a drift path; a longer one is drawn up to there.
+
+Chosen: paths of the LSST devices take 130; twice as many double the memory."""
+
 _DRAWN = Transport(part=0.1, longest=0.5)
+"""Transport in steps that are short enough to draw.
+
+Chosen: with the default's longest step of 5 um a path would look like a polygon; at twice 0.5 um the
+figure has half as many points."""
+
 _SEED = 5417
+"""Default seed of the random numbers (chosen: any number serves)."""
 
 
 def draw_electron_paths(
@@ -49,13 +63,13 @@ def draw_electron_paths(
     Parameters
     ----------
     potential : Potential
-        Solved; paths start in the plane of pixel (0, 0), 1 um below the back surface.
+        Solution; paths start in the plane of pixel (0, 0), 1 um below the back surface.
     ax : matplotlib.axes.Axes
-        Where; colours tell in which undistorted pixel a path started.
+        Axes to draw into; colours show in which undistorted pixel a path started.
     plane : {'x', 'y'}
-        Along x (y = 0) or along y (x = 0).
+        Plane that is drawn: along x (at y = 0) or along y (at x = 0).
     paths : int
-        Paths a pixel.
+        Number of paths a pixel, at least 1.
     height : float, optional
         Upper end of the view [um]; by default the back surface.
 
@@ -63,6 +77,17 @@ def draw_electron_paths(
     ------
     BFSensorError
         Matplotlib is missing, or ``plane`` is neither.
+
+    Examples
+    --------
+    >>> from bfsensor import Device
+    >>> from bfsensor.plots.style import new_figure
+    >>> from bfsensor.simulate.unit_cell import solve_unit_cell
+    >>> potential = solve_unit_cell(Device.load("itl_sta3800c"), 0.0, cells=8)
+    >>> ax = new_figure(5.0, 8.0).add_subplot()
+    >>> draw_electron_paths(potential, ax)
+    >>> len(ax.collections[0].get_paths())
+    8
     """
     import_matplotlib()
     from matplotlib.collections import LineCollection
@@ -122,30 +147,41 @@ def draw_collected_paths(
     Parameters
     ----------
     potential : Potential
-        Solved; electrons start in the plane of pixel (0, 0), 1 um below the back surface, and
-        leave that plane as they diffuse: what is drawn is their projection.
+        Solution; electrons start in the plane of pixel (0, 0), 1 um below the back surface, and
+        leave that plane as they diffuse, so that their projection is drawn.
     ax : matplotlib.axes.Axes
-        Where; colours tell which pixel along the plane collects an electron.
+        Axes to draw into; colours show which pixel along the plane collects an electron.
     plane : {'x', 'y'}
-        Along x (y = 0) or along y (x = 0).
+        Plane that is drawn: along x (at y = 0) or along y (at x = 0).
     paths : int
-        Electrons a pixel.
+        Number of electrons a pixel, at least 1.
     height : float, optional
         Upper end of the view [um]; by default the back surface.
     transport : Transport, optional
-        How they move (default: drift and diffusion by Einstein's relation, in steps short
-        enough to draw).
+        Motion of the electrons; by default drift and diffusion by Einstein's relation, in steps
+        that are short enough to draw.
     compare : Potential, optional
-        The same electrons, with the same random numbers, in this potential: drawn in grey
-        below.  Those that it leads to another pixel, in x or in y, are heavy and black, and
-        counted in the title.
+        Another solution, in which the same electrons are traced with the same random numbers and
+        drawn in grey.  Electrons that end in another pixel there, in x or in y, are drawn heavy
+        and black and counted in the title.
     seed : int
-        Of the random numbers.
+        Seed of the random numbers.
 
     Raises
     ------
     BFSensorError
         Matplotlib is missing, or ``plane`` is neither.
+
+    Examples
+    --------
+    >>> from bfsensor import Device
+    >>> from bfsensor.plots.style import new_figure
+    >>> from bfsensor.simulate.unit_cell import solve_unit_cell
+    >>> potential = solve_unit_cell(Device.load("itl_sta3800c"), 0.0, cells=8)
+    >>> ax = new_figure(5.0, 8.0).add_subplot()
+    >>> draw_collected_paths(potential, ax, paths=8)
+    >>> len(ax.collections[0].get_paths())
+    8
     """
     import_matplotlib()
     from matplotlib.collections import LineCollection
@@ -173,12 +209,12 @@ def draw_collected_paths(
         there = Tracer(compare).trace(
             starts, seed=seed, transport=transport, keep_paths=True
         )
-        shadows = [path[:, [axis, 2]] for path in there.paths]
-        ax.add_collection(LineCollection(shadows, colors=GREY, linewidths=0.6, zorder=1.5))
+        behind = [path[:, [axis, 2]] for path in there.paths]
+        ax.add_collection(LineCollection(behind, colors=GREY, linewidths=0.6, zorder=1.5))
         moved = (here.pixels != there.pixels).any(1)
         for n in np.nonzero(moved)[0]:
             colours[n], widths[n] = BLACK, 1.6
-        order = np.argsort(moved, kind="stable")  # the heavy ones on top
+        order = np.argsort(moved, kind="stable")  # heavy lines are drawn last, on top
         title += f"\ngrey: {_content(compare)}; black: {int(moved.sum())} to another pixel"
     drawn = LineCollection(
         [lines[n] for n in order],
@@ -192,7 +228,7 @@ def draw_collected_paths(
 
 
 def _plane(potential: Potential, plane: str) -> tuple[int, float, int]:
-    """Axis, pitch [um] and pixels shown on either side of the centre."""
+    """Axis, pitch [um] and number of pixels shown on either side of the centre."""
     if plane not in ("x", "y"):
         raise BFSensorError(f"plane = {plane!r} must be 'x' or 'y'")
     axis = 0 if plane == "x" else 1
@@ -202,7 +238,7 @@ def _plane(potential: Potential, plane: str) -> tuple[int, float, int]:
 
 
 def _frame(potential: Potential, ax: Axes, plane: str, height: float | None) -> None:
-    """Pixel edges, limits and labels."""
+    """Draw pixel edges; set limits and labels."""
     _, pitch, reach = _plane(potential, plane)
     for edge in np.arange(-reach, reach + 2) - 0.5:
         ax.axvline(edge * pitch, color=GREY, linewidth=0.8, linestyle="--", zorder=1)
@@ -213,6 +249,6 @@ def _frame(potential: Potential, ax: Axes, plane: str, height: float | None) -> 
 
 
 def _content(potential: Potential) -> str:
-    """What the central pixel holds, in words."""
+    """Charge of the central pixel, as text for a title."""
     charge = float(potential.charges[central_pixel(potential)])
     return f"{electrons_text(charge)} in the centre" if charge > 0 else "empty"

@@ -1,4 +1,4 @@
-"""The photon transfer curve of flats: variance and correlations of neighbours against the level."""
+"""Figure of the photon transfer curve: variance and correlations of flats against the level."""
 
 from __future__ import annotations
 
@@ -27,26 +27,35 @@ if TYPE_CHECKING:
 
 _COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE, SKY)
 _NEIGHBOURS = (("C10 (along x)", 0, 1, "o"), ("C01 (along y)", 1, 0, "s"))
+"""Label, lag in y, lag in x and marker of the correlations that are drawn.
+
+Chosen: the nearest lags, whose correlations are the largest."""
 
 
 def figure_for_photon_transfer(
     curves: Mapping[str, CovarianceCurve], fits: Mapping[str, CovarianceFit]
 ) -> Figure:
-    """Draw variances over the level, and correlations of next neighbours, for each amplifier.
+    """Draw variances divided by the level, and correlations of neighbours, for each amplifier.
 
-    Without a brighter-fatter effect both are flat: the variance of shot noise is in proportion
+    Without a brighter-fatter effect both are constant: the variance of shot noise is proportional
     to the level, and pixels are not correlated.
 
     Parameters
     ----------
     curves : mapping of str to CovarianceCurve
-        By amplifier, of one unit.
+        Curves by amplifier, at least one, all in the same unit.
     fits : mapping of str to CovarianceFit
-        Of those that were fitted.
+        Fits of the amplifiers that were fitted, drawn as lines.
 
     Returns
     -------
     matplotlib.figure.Figure
+        Page with two panels.
+
+    Raises
+    ------
+    BFSensorError
+        Matplotlib is missing.
     """
     figure = new_figure(7.0, 7.5)
     above, below = figure.subplots(2, 1, sharex=True)

@@ -1,4 +1,8 @@
-"""Figures of a diagnosis: residuals by channel, each drawn from plain arrays into an ``ax``."""
+"""Figures of a diagnosis: residuals by channel, drawn from plain arrays into an ``ax``.
+
+Functions whose first argument is ``axes`` take the coordinates of a channel's values, arrays of
+one length by name, and one number a value.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,15 @@ Table = Mapping[str, NDArray]
 
 
 def draw_channels(chi2: Mapping[str, tuple[float, float]], ax: Axes) -> None:
-    """Deviate of each channel's chi-square, on a scale that shows both 1 and 1000."""
+    """Draw the deviate of each channel's chi-square, on a scale that shows both 1 and 1000.
+
+    Parameters
+    ----------
+    chi2 : mapping of str to (float, float)
+        Chi-square and degrees of freedom by channel.
+    ax : matplotlib.axes.Axes
+        Axes to draw into; x is (chi-square - dof) / sqrt(2 dof).
+    """
     words = list(chi2)[::-1]
     z = [(s - d) / np.sqrt(2 * max(d, 1e-9)) for s, d in (chi2[w] for w in words)]
     colours = [RED if value > 4 else BLUE for value in z]
@@ -34,7 +46,17 @@ def draw_channels(chi2: Mapping[str, tuple[float, float]], ax: Axes) -> None:
 def draw_classes(
     probability: Mapping[str, float], ax: Axes, *, tied: Sequence[str] = ()
 ) -> None:
-    """Probability of each class, those that cannot be told apart in a colour of their own."""
+    """Draw the probability of each class of effects.
+
+    Parameters
+    ----------
+    probability : mapping of str to float
+        Probability by class, 0 to 1.
+    ax : matplotlib.axes.Axes
+        Axes to draw into.
+    tied : sequence of str
+        Classes that the data do not distinguish, drawn in another colour.
+    """
     words = list(probability)[::-1]
     values = [probability[w] for w in words]
     ax.barh(
@@ -53,7 +75,15 @@ def draw_classes(
 
 
 def draw_held_out(held: Mapping[str, tuple[float, float, int]], ax: Axes) -> None:
-    """Chi-square per value before and after, by channel: name to (before, after, values)."""
+    """Draw chi-square per value of data that was not fitted, without and with the effects.
+
+    Parameters
+    ----------
+    held : mapping of str to (float, float, int)
+        By channel: chi-square per value without and with the effects, and number of values.
+    ax : matplotlib.axes.Axes
+        Axes to draw into; grey bars are the 95 % interval expected of noise.
+    """
     names = list(held)[::-1]
     for n, name in enumerate(names):
         before, after, count = held[name]
@@ -88,7 +118,20 @@ def draw_held_out(held: Mapping[str, tuple[float, float, int]], ax: Axes) -> Non
 
 
 def draw_lags(axes: Table, pulls: FloatArray, ax: Axes) -> None:
-    """Pull of each lag, all levels together by their square, as covariances of flats see it."""
+    """Draw the pull of each lag, averaged over the levels.
+
+    Levels are weighted by their square, in proportion to the signal of a relative change of area
+    in the covariances of flats.
+
+    Parameters
+    ----------
+    axes : mapping of str to ndarray, shape (n,)
+        Lags ``i`` in x and ``j`` in y, and ``level``, of each value.
+    pulls : ndarray, shape (n,)
+        Residuals in units of their errors.
+    ax : matplotlib.axes.Axes
+        Axes to draw into.
+    """
     i, j, level = axes["i"].astype(int), axes["j"].astype(int), axes["level"].astype(float)
     weight = (level / level.max()) ** 2
     image = np.full((j.max() + 1, i.max() + 1), np.nan)
@@ -111,7 +154,19 @@ def draw_lags(axes: Table, pulls: FloatArray, ax: Axes) -> None:
 def draw_lag_levels(
     axes: Table, pulls: FloatArray, ax: Axes, *, lags: Sequence[tuple[int, int]]
 ) -> None:
-    """Pull of some lags against level, amplifiers and conditions as they come."""
+    """Draw the pulls of some lags against level, without regard to amplifier and condition.
+
+    Parameters
+    ----------
+    axes : mapping of str to ndarray, shape (n,)
+        Lags ``i`` and ``j``, and ``level`` [ADU], of each value.
+    pulls : ndarray, shape (n,)
+        Residuals in units of their errors.
+    ax : matplotlib.axes.Axes
+        Axes to draw into.
+    lags : sequence of (int, int)
+        Lags (i, j) that are drawn.
+    """
     for n, (a, b) in enumerate(lags):
         here = (axes["i"] == a) & (axes["j"] == b)
         ax.plot(
@@ -128,7 +183,17 @@ def draw_lag_levels(
 
 
 def draw_means(axes: Table, relative: FloatArray, ax: Axes) -> None:
-    """Relative residual of the means against level."""
+    """Draw the relative residuals of the means against level, by amplifier.
+
+    Parameters
+    ----------
+    axes : mapping of str to ndarray, shape (n,)
+        Index ``amp`` of the amplifier and ``level`` [ADU] of each value.
+    relative : ndarray, shape (n,)
+        Residuals relative to the mean.
+    ax : matplotlib.axes.Axes
+        Axes to draw into; y is in %.
+    """
     for amp in np.unique(axes["amp"]):
         here = axes["amp"] == amp
         ax.plot(
@@ -143,7 +208,19 @@ def draw_means(axes: Table, relative: FloatArray, ax: Axes) -> None:
 
 
 def draw_overscan(axes: Table, values: FloatArray, errors: FloatArray, ax: Axes) -> None:
-    """Residual profile of an overscan for the strongest levels of each amplifier."""
+    """Draw the mean residual of each overscan pixel at the highest levels of each amplifier.
+
+    Levels above 0.7 of an amplifier's highest one are averaged.
+
+    Parameters
+    ----------
+    axes : mapping of str to ndarray, shape (n,)
+        Index ``amp`` of the amplifier, ``level`` and overscan pixel ``k`` of each value.
+    values, errors : ndarray, shape (n,)
+        Residuals and their errors [ADU].
+    ax : matplotlib.axes.Axes
+        Axes to draw into.
+    """
     for n, amp in enumerate(np.unique(axes["amp"])):
         own = axes["amp"] == amp
         top = own & (axes["level"] > 0.7 * axes["level"][own].max())
@@ -165,7 +242,20 @@ def draw_overscan(axes: Table, values: FloatArray, errors: FloatArray, ax: Axes)
 
 
 def draw_map(axes: Table, pulls: FloatArray, ax: Axes, *, name: str) -> None:
-    """Pulls of the blocks of a map."""
+    """Draw the pulls of the blocks of a map.
+
+    Parameters
+    ----------
+    axes : mapping of str to ndarray, shape (n,)
+        Name ``map`` of the map, ``what`` ('block', 'column' or 'row') and centre ``x``, ``y``
+        [pixel] of each value.
+    pulls : ndarray, shape (n,)
+        Residuals in units of their errors.
+    ax : matplotlib.axes.Axes
+        Axes to draw into.
+    name : str
+        Map that is drawn; it has at least two columns of blocks.
+    """
     here = (axes["map"] == name) & (axes["what"] == "block")
     x, y = axes["x"][here].astype(float), axes["y"][here].astype(float)
     columns, rows = np.unique(x), np.unique(y)
@@ -179,7 +269,19 @@ def draw_map(axes: Table, pulls: FloatArray, ax: Axes, *, name: str) -> None:
 
 
 def draw_profile(axes: Table, pulls: FloatArray, ax: Axes, *, name: str) -> None:
-    """Pulls of columns and rows of a map."""
+    """Draw the pulls of the columns and rows of a map.
+
+    Parameters
+    ----------
+    axes : mapping of str to ndarray, shape (n,)
+        Coordinates, as for :func:`draw_map`.
+    pulls : ndarray, shape (n,)
+        Residuals in units of their errors.
+    ax : matplotlib.axes.Axes
+        Axes to draw into.
+    name : str
+        Map that is drawn.
+    """
     for what, axis in (("column", "x"), ("row", "y")):
         here = (axes["map"] == name) & (axes["what"] == what)
         ax.plot(axes[axis][here], pulls[here], ".", ms=3, label=f"{what}s")
@@ -189,7 +291,17 @@ def draw_profile(axes: Table, pulls: FloatArray, ax: Axes, *, name: str) -> None
 
 
 def draw_spots(axes: Table, pulls: FloatArray, ax: Axes) -> None:
-    """Pulls of the spots' numbers against flux."""
+    """Draw the pulls of the measurements of spots against flux.
+
+    Parameters
+    ----------
+    axes : mapping of str to ndarray, shape (n,)
+        Name ``what`` of the measurement and ``flux`` [e-] of each value.
+    pulls : ndarray, shape (n,)
+        Residuals in units of their errors.
+    ax : matplotlib.axes.Axes
+        Axes to draw into.
+    """
     for what in dict.fromkeys(axes["what"]):
         here = axes["what"] == what
         name = str(what).replace("sigma", "width").replace("_", " ")
@@ -200,7 +312,17 @@ def draw_spots(axes: Table, pulls: FloatArray, ax: Axes) -> None:
 
 
 def draw_noise(axes: Table, pulls: FloatArray, ax: Axes) -> None:
-    """Pulls of the noise by lag in readout order."""
+    """Draw the pulls of the noise's correlations by lag in readout order, by amplifier.
+
+    Parameters
+    ----------
+    axes : mapping of str to ndarray, shape (n,)
+        Index ``amp`` of the amplifier and ``lag`` [pixel] of each value.
+    pulls : ndarray, shape (n,)
+        Residuals in units of their errors.
+    ax : matplotlib.axes.Axes
+        Axes to draw into.
+    """
     for amp in np.unique(axes["amp"]):
         here = axes["amp"] == amp
         ax.plot(axes["lag"][here], pulls[here], ".", label=f"amplifier {int(amp) + 1}")
@@ -212,7 +334,15 @@ def draw_noise(axes: Table, pulls: FloatArray, ax: Axes) -> None:
 def draw_parameters(
     pulls: Mapping[str, float], errors: Mapping[str, float], ax: Axes
 ) -> None:
-    """Device parameters in units of their spread."""
+    """Draw device parameters in units of the spreads of their priors.
+
+    Parameters
+    ----------
+    pulls, errors : mapping of str to float
+        Difference from the nominal value, and error, by parameter, both in spreads.
+    ax : matplotlib.axes.Axes
+        Axes to draw into.
+    """
     names = list(pulls)[::-1]
     ax.errorbar(
         [pulls[n] for n in names],
@@ -223,11 +353,11 @@ def draw_parameters(
     )
     ax.set_yticks(range(len(names)), names)
     ax.axvspan(-1, 1, color="0.9", zorder=0)
-    ax.set_xlabel("distance from the nominal value [its uncertainty]")
+    ax.set_xlabel("difference from the nominal value [spread of the prior]")
 
 
 def _legend(ax: Axes, columns: int) -> None:
-    """Above the figure, where nothing lies behind it."""
+    """Put the legend above the axes, where it covers no data."""
     ax.legend(
         frameon=False, fontsize=8, ncol=columns, loc="lower center", bbox_to_anchor=(0.5, 1),
         handletextpad=0.2, columnspacing=1.0, borderaxespad=0.2,
@@ -235,13 +365,14 @@ def _legend(ax: Axes, columns: int) -> None:
 
 
 def _plain(ax: Axes) -> None:
-    """No frame where none is needed."""
+    """Remove the frame except its lower side."""
     for side in ("top", "right", "left"):
         ax.spines[side].set_visible(False)
     ax.tick_params(axis="y", length=0)
 
 
 def _band(ax: Axes) -> None:
+    """Shade pulls from -2 to 2."""
     ax.axhspan(-2, 2, color="0.92", zorder=0)
     ax.axhline(0, color="0.6", lw=0.8)
 
@@ -253,6 +384,7 @@ def _image(
     y: str,
     extent: tuple[float, float, float, float],
 ) -> None:
+    """Draw an image of pulls with symmetric colours, at least from -4 to 4."""
     top = max(4.0, float(np.nanmax(np.abs(image))))
     drawn = ax.imshow(
         image, origin="lower", cmap="RdBu_r", vmin=-top, vmax=top, extent=extent

@@ -1,4 +1,4 @@
-"""Figures of directly simulated spots: growth, the light moved, charge building up."""
+"""Figures of directly simulated spots: growth of the width, displaced light, build-up of charge."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def draw_growth(growth: Growth, ax: Axes) -> None:
     Parameters
     ----------
     growth : Growth
-        From :func:`bfsensor.measure.growth.measure_growth`.
+        Growth from :func:`bfsensor.measure.growth.measure_growth`.
     ax : matplotlib.axes.Axes
-        Where to draw.
+        Axes to draw into; x is the peak without the effect [1000 e-], y the growth [%].
     """
     line = np.array([0.0, growth.peak.max()])
     for n, (axis, colour, marker) in enumerate((("x", BLUE, "o"), ("y", ORANGE, "s"))):
@@ -40,14 +40,14 @@ def draw_growth(growth: Growth, ax: Axes) -> None:
 
 
 def draw_moved_light(spots: Sequence[Spot], ax: Axes) -> None:
-    """Draw what the effect moves at the end, all spots together, in the pixels as they lie.
+    """Draw the electrons that the effect has moved at the end, averaged over all spots.
 
     Parameters
     ----------
     spots : sequence of Spot
-        With the same plan.
+        Spots of the same plan, at least one.
     ax : matplotlib.axes.Axes
-        Where to draw.
+        Axes to draw into; x and y are pixels, colours the electrons gained or lost.
     """
     moved = np.sum([spot.on[-1] - spot.off[-1] for spot in spots], axis=0) / len(spots)
     limit = float(np.abs(moved).max()) or 1.0
@@ -66,11 +66,11 @@ def draw_build_up(spot: Spot, ax: Axes, *, profiles: int = 5) -> None:
     Parameters
     ----------
     spot : Spot
-        One spot.
+        The spot.
     ax : matplotlib.axes.Axes
-        Where to draw.
+        Axes to draw into; x is the pixel, y its charge [1000 e-].
     profiles : int
-        How many levels.
+        Number of levels that are drawn, at least 1.
     """
     row = int(spot.off[-1].sum(1).argmax())
     x = np.arange(spot.on.shape[2]) - spot.on.shape[2] // 2
@@ -90,20 +90,21 @@ def draw_build_up(spot: Spot, ax: Axes, *, profiles: int = 5) -> None:
 
 
 def figure_for_spots(plan: SpotPlan, spots: Sequence[Spot], growth: Growth) -> Figure:
-    """Draw a run of the direct simulation on one page.
+    """Draw growth, displaced light and build-up of a direct simulation on one page.
 
     Parameters
     ----------
     plan : SpotPlan
-        What was simulated.
+        Plan of the simulation.
     spots : sequence of Spot
-        Its spots.
+        Simulated spots, at least one.
     growth : Growth
-        As measured.
+        Measured growth of their widths.
 
     Returns
     -------
     figure : matplotlib.figure.Figure
+        Page with three panels, to be written with ``savefig``.
 
     Raises
     ------

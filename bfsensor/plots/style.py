@@ -1,6 +1,6 @@
-"""What all figures share: colours, sizes, words.
+"""Colours, example charge and helpers that all figures share.
 
-Colours are those of Okabe & Ito (2008), which the colour-blind can tell apart.
+Colours are those of Okabe & Ito (2008), which the colour-blind can distinguish.
 """
 
 from __future__ import annotations
@@ -20,16 +20,22 @@ BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 PURPLE, SKY, BLACK, GREY = "#CC79A7", "#56B4E9", "#222222", "#B5B5B5"
 
 SHOWN_CHARGE = 80_000.0
-"""Stored charge of the example figures [e-], as in the publication."""
+"""Stored charge of the example figures [e-]: published, that of the figures of Lage, Bradshaw &
+Tyson (2017)."""
 
 
 def import_matplotlib() -> Any:
-    """Import matplotlib, or say how to get it.
+    """Import matplotlib.
+
+    Returns
+    -------
+    module
+        The package ``matplotlib``.
 
     Raises
     ------
     BFSensorError
-        Matplotlib is missing.
+        Matplotlib is missing; the message says how to install it.
     """
     try:
         import matplotlib
@@ -41,7 +47,22 @@ def import_matplotlib() -> Any:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """Make an empty figure of a size [inch], not attached to any window."""
+    """Make an empty figure that is not attached to any window.
+
+    Parameters
+    ----------
+    width, height : float
+        Size [inch].
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    BFSensorError
+        Matplotlib is missing.
+    """
     import_matplotlib()
     from matplotlib.figure import Figure
 
@@ -49,11 +70,11 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def electrons_text(charge: float) -> str:
-    """Write a number of electrons as it is read: 80 000 e-."""
+    """Write a number of electrons with thin spaces between thousands, such as 80 000 e-."""
     return f"{charge:,.0f}".replace(",", "\u2009") + " e⁻"
 
 
 def central_pixel(potential: Potential) -> tuple[int, int]:
-    """Place of pixel (0, 0) in ``potential.charges``."""
+    """Return the index (row, column) of pixel (0, 0) in ``potential.charges``."""
     mesh = potential.mesh
     return int(np.argmax(mesh.pixels("y") == 0)), int(np.argmax(mesh.pixels("x") == 0))

@@ -1,4 +1,4 @@
-"""Figures of sweeps: the response of flats against what was swept."""
+"""Figures of device sweeps: the response a_ij of flats against a swept quantity."""
 
 from __future__ import annotations
 
@@ -35,20 +35,24 @@ _SHOWN = (
     ("(2, 0)", 2, 0, PURPLE, "v"),
     ("(0, 2)", 0, 2, SKY, "P"),
 )
+"""Label, lag in x, lag in y, colour and marker of the a_ij that are drawn.
+
+Chosen: the lags within 2 pixels along the axes, and (1, 1)."""
+
 _LINE_STYLES: tuple[Any, ...] = ("-", "--", "-.", ":")
 
 
 class SweepResult(Protocol):
-    """What a figure needs of a sweep, such as :class:`bfsensor.sweeps.rows.DeviceSweep`.
+    """Protocol of a sweep that can be drawn, such as :class:`bfsensor.sweeps.rows.DeviceSweep`.
 
     Attributes
     ----------
     rows : astropy.table.Table
         One row a point, with the swept quantities as columns; ``meta['level']`` in electrons.
     swept : sequence of str
-        Columns that were swept.
+        Names of the swept columns.
     refused : ndarray of bool
-        Points without an answer.
+        Whether each point was refused.
     a, errors : ndarray, shape (points, lags y, lags x)
         a_ij and their numerical errors [1/e-].
     """
@@ -57,11 +61,11 @@ class SweepResult(Protocol):
 
     @property
     def swept(self) -> Sequence[str]:
-        """Columns that were swept."""
+        """Names of the swept columns."""
 
     @property
     def refused(self) -> NDArray[np.bool_]:
-        """Points without an answer."""
+        """Whether each point was refused."""
 
     @property
     def a(self) -> FloatArray:
@@ -69,7 +73,7 @@ class SweepResult(Protocol):
 
     @property
     def errors(self) -> FloatArray:
-        """Their numerical errors [1/e-]."""
+        """Numerical errors of the responses [1/e-]."""
 
 
 def draw_sweep(
@@ -80,22 +84,23 @@ def draw_sweep(
     Parameters
     ----------
     sweep : SweepResult
-        What to draw.  Points without an answer are left out; each set of values of the other
-        swept quantities has a line style of its own.
+        The sweep.  Refused points are left out; each set of values of the other swept quantities
+        has a line style of its own.
     ax : matplotlib.axes.Axes
-        Where; y is the absolute value of a_ij [1e-6/e-], a_00 being negative, with the numerical
-        errors, or the change from the first point of each line [%].
+        Axes to draw into; y is the absolute value of a_ij [1e-6/e-] (a_00 is negative) with its
+        numerical error, or the change from the first point of each line [%].
     against : str, optional
-        A column that was swept; by default the one with most values.
+        Name of the swept column for x; by default the one with most values.
     relative : bool
-        Draw the changes, whose numerical errors are not known: most of those of a_ij is common.
+        Draw the changes.  They are drawn without errors, which are not known: most of the
+        numerical error of an a_ij is common to all points.
 
     Raises
     ------
     BFSensorError
         Matplotlib is missing.
     SweepError
-        ``against`` was not swept, or no point has an answer.
+        ``against`` was not swept, or all points were refused.
     """
     import_matplotlib()
     from matplotlib.lines import Line2D
@@ -105,11 +110,13 @@ def draw_sweep(
         against = max(sweep.swept, key=lambda name: len(np.unique(rows[name])))
     if against not in sweep.swept:
         raise SweepError(
-            f"{against!r} was not swept; there are {', '.join(sweep.swept)} to draw against"
+            f"against = {against!r} was not swept; it must be one of {', '.join(sweep.swept)}"
         )
     good = ~sweep.refused
     if not good.any():
-        raise SweepError(f"no point of the sweep has an answer: {rows['reason'][0]}")
+        raise SweepError(
+            f"all points of the sweep were refused, the first because {rows['reason'][0]}"
+        )
     others = [
         name for name in sweep.swept if name != against and len(np.unique(rows[name])) > 1
     ]
@@ -153,18 +160,19 @@ def draw_sweep(
 
 
 def figure_for_sweep(sweep: SweepResult, *, against: str | None = None) -> Figure:
-    """Draw a sweep on one page: sizes of a_ij, and their changes.
+    """Draw a sweep on one page: absolute values of a_ij, and their changes.
 
     Parameters
     ----------
     sweep : SweepResult
-        What to draw.
+        The sweep.
     against : str, optional
-        A column that was swept; by default the one with most values.
+        Name of the swept column for x; by default the one with most values.
 
     Returns
     -------
     figure : matplotlib.figure.Figure
+        Page with two panels, to be written with ``savefig``.
 
     Raises
     ------

@@ -1,11 +1,10 @@
-"""Figures of tables and solved devices: each takes data and the axes to draw on.
+"""Figures of distortion tables: pixel boundaries, areas, response against charge and depth.
 
-They follow figures 6 to 9 of Lage, Bradshaw & Tyson (2017): potentials and charges under
-the gates, electron paths, distorted pixel boundaries with their areas.  Axes are in um,
-x serial and y parallel, z up from the gates; light comes from the top.
+With the figures of solved devices (:mod:`bfsensor.plots.device`, :mod:`bfsensor.plots.paths`),
+which can be imported from here too, they follow figures 6 to 9 of Lage, Bradshaw & Tyson (2017).
+Axes are in um, x serial and y parallel.
 
-Matplotlib is needed only here (``pip install 'bfsensor[plots]'``).  The figures of solved
-devices are written in :mod:`bfsensor.plots.device` and :mod:`bfsensor.plots.paths`.
+Figures need matplotlib (``pip install 'bfsensor[plots]'``).
 """
 
 from __future__ import annotations
@@ -56,7 +55,8 @@ __all__ = [
 ]
 
 GALSIM_DEPTH_SCALE = 12.0
-"""Scale [um] of GalSim's tanh for the response against conversion depth (Silicon.cpp)."""
+"""Scale [um] of GalSim's tanh for the response against conversion depth: published, in its
+Silicon.cpp."""
 
 _NEAREST = (
     ("(0, 0)", 0, 0, BLACK, "o"),
@@ -64,6 +64,10 @@ _NEAREST = (
     ("(0, 1) along y", 0, 1, BLUE, "^"),
     ("(1, 1)", 1, 1, GREEN, "D"),
 )
+"""Label, offset in x, offset in y, colour and marker of the pixels that are drawn.
+
+Chosen: the source and its nearest neighbours, whose areas change most."""
+
 _LINE_STYLES: tuple[Any, ...] = ("-", "--", "-.", ":")
 
 
@@ -82,18 +86,17 @@ def draw_pixel_boundaries(
     Parameters
     ----------
     table : DistortionTable
-        What to draw.
+        The table.
     ax : matplotlib.axes.Axes
-        Where; x and y are positions [um] relative to the centre of the charged pixel.
+        Axes to draw into; x and y are positions [um] relative to the centre of the charged pixel.
     charge, background : float
-        Charge of pixel (0, 0) and of all others [e-].
+        Charge of pixel (0, 0) and of all others [e-], within the table.
     depth : float
-        Conversion depth [um above the gates].
+        Conversion depth [um above the gates], within the table.
     reach : int
-        Pixel offsets from -reach to reach are drawn, at most those of the table.
+        Largest pixel offset that is drawn, at most that of the table.
     exaggerate : float
-        Factor on the displacements, said in the title.  The areas printed are the true
-        ones.
+        Factor on the drawn displacements, stated in the title; the areas are not exaggerated.
 
     Raises
     ------
@@ -101,6 +104,16 @@ def draw_pixel_boundaries(
         Matplotlib is missing.
     TableError
         A charge, background, depth or reach that the table does not hold.
+
+    Examples
+    --------
+    >>> from bfsensor import DistortionTable
+    >>> from bfsensor.plots.style import new_figure
+    >>> ax = new_figure(5.0, 5.0).add_subplot()
+    >>> table = DistortionTable.load("itl_sta3800c")
+    >>> draw_pixel_boundaries(table, ax, charge=80000.0, depth=95.0, exaggerate=5.0)
+    >>> len(ax.texts)
+    25
     """
     import_matplotlib()
     from matplotlib.collections import LineCollection, PolyCollection
@@ -155,18 +168,18 @@ def draw_pixel_boundaries(
 def draw_response(table: DistortionTable, ax: Axes, *, depth: float) -> None:
     """Draw the area change per charge of the centre and its neighbours, against charge.
 
-    A linear brighter-fatter effect is a set of horizontal lines; their slope is what
-    the effect loses as the cloud of stored electrons grows.
+    The lines of a linear brighter-fatter effect are horizontal; their slope shows how much weaker
+    the effect becomes as the cloud of stored electrons grows.
 
     Parameters
     ----------
     table : DistortionTable
-        What to draw; the levels of source charge are marked.
+        The table; its levels of source charge are marked.
     ax : matplotlib.axes.Axes
-        Where; x is the source charge [10^3 e-], y the area change [um^2] for each 10^5 e-
-        by which the source exceeds the background.
+        Axes to draw into; x is the source charge [10^3 e-], y the area change [um^2] for each
+        10^5 e- by which the source exceeds the background.
     depth : float
-        Conversion depth [um above the gates].
+        Conversion depth [um above the gates], within the table.
 
     Raises
     ------
@@ -174,6 +187,15 @@ def draw_response(table: DistortionTable, ax: Axes, *, depth: float) -> None:
         Matplotlib is missing.
     TableError
         The depth is outside the table.
+
+    Examples
+    --------
+    >>> from bfsensor import DistortionTable
+    >>> from bfsensor.plots.style import new_figure
+    >>> ax = new_figure(5.0, 5.0).add_subplot()
+    >>> draw_response(DistortionTable.load("itl_sta3800c"), ax, depth=95.0)
+    >>> ax.get_xlabel()
+    'source charge [10³ e⁻]'
     """
     import_matplotlib()
     from matplotlib.lines import Line2D
@@ -236,12 +258,12 @@ def draw_depth_response(table: DistortionTable, ax: Axes, *, charge: float) -> N
     Parameters
     ----------
     table : DistortionTable
-        What to draw, on its first background.
+        The table; its first background is taken.
     ax : matplotlib.axes.Axes
-        Where; x is the conversion depth [um above the gates], y the ratio to the deepest
-        level, which is farthest from the gates.
+        Axes to draw into; x is the conversion depth [um above the gates], y the ratio to the
+        level farthest from the gates.
     charge : float
-        Source charge [e-].
+        Source charge [e-], within the table.
 
     Raises
     ------
@@ -252,7 +274,16 @@ def draw_depth_response(table: DistortionTable, ax: Axes, *, charge: float) -> N
 
     Notes
     -----
-    GalSim scales one table by ``tanh(z / 12 um)``, a guess, drawn beside.
+    GalSim scales one table by ``tanh(z / 12 um)``, an empirical function, drawn for comparison.
+
+    Examples
+    --------
+    >>> from bfsensor import DistortionTable
+    >>> from bfsensor.plots.style import new_figure
+    >>> ax = new_figure(5.0, 5.0).add_subplot()
+    >>> draw_depth_response(DistortionTable.load("itl_sta3800c"), ax, charge=80000.0)
+    >>> ax.get_xlabel()
+    'conversion depth above the gates [µm]'
     """
     import_matplotlib()
     nominal = table.pitch[0] * table.pitch[1]
@@ -303,14 +334,14 @@ def draw_area_changes(
     Parameters
     ----------
     table : DistortionTable
-        What to draw.
+        The table.
     ax : matplotlib.axes.Axes
-        Where; x and y are pixel offsets.  Numbers are in 10^-3 um^2; colours grow with
-        the logarithm of the change.
+        Axes to draw into; x and y are pixel offsets.  Numbers are in 10^-3 um^2; colours are
+        logarithmic in the change.
     charge, background : float
-        Charge of pixel (0, 0) and of all others [e-].
+        Charge of pixel (0, 0) and of all others [e-], within the table.
     depth : float
-        Conversion depth [um above the gates].
+        Conversion depth [um above the gates], within the table.
 
     Raises
     ------
@@ -318,6 +349,15 @@ def draw_area_changes(
         Matplotlib is missing.
     TableError
         A charge, background or depth outside the table.
+
+    Examples
+    --------
+    >>> from bfsensor import DistortionTable
+    >>> from bfsensor.plots.style import new_figure
+    >>> ax = new_figure(5.0, 5.0).add_subplot()
+    >>> draw_area_changes(DistortionTable.load("itl_sta3800c"), ax, charge=80000.0, depth=95.0)
+    >>> len(ax.texts)
+    81
     """
     import_matplotlib()
     from matplotlib.colors import SymLogNorm
@@ -359,8 +399,8 @@ def figure_for_table(table: DistortionTable) -> Figure:
     Parameters
     ----------
     table : DistortionTable
-        What to draw, at :data:`SHOWN_CHARGE` or the highest charge below it, on its lowest
-        background and at its depth farthest from the gates.
+        The table; it is drawn at :data:`SHOWN_CHARGE` or its highest charge if that is lower, on
+        its lowest background and at its depth farthest from the gates.
 
     Returns
     -------
@@ -371,6 +411,12 @@ def figure_for_table(table: DistortionTable) -> Figure:
     ------
     BFSensorError
         Matplotlib is missing.
+
+    Examples
+    --------
+    >>> from bfsensor import DistortionTable
+    >>> len(figure_for_table(DistortionTable.load("itl_sta3800c")).axes)
+    4
     """
     figure = new_figure(13.0, 12.0)
     axes = figure.subplots(2, 2)
@@ -405,7 +451,7 @@ def _nominal_polygon(table: DistortionTable, i: int, j: int) -> FloatArray:
 
 
 def _three_digits(value: float) -> str:
-    """Three significant digits with sign, without exponent."""
+    """Write a number with sign, three significant digits and no exponent."""
     if value == 0.0:
         return "0"
     decimals = max(0, 2 - int(np.floor(np.log10(abs(value)))))

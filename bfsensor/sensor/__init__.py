@@ -1,4 +1,4 @@
-"""Sensors for GalSim that apply distortion tables to photons, and flats drawn from areas."""
+"""Sensors for GalSim that apply distortion tables to photons, and flats drawn from pixel areas."""
 
 from typing import TYPE_CHECKING
 

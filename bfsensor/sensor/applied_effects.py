@@ -1,4 +1,4 @@
-"""Effects of a diagnosis while a sensor exposes: what each stage needs of them."""
+"""Effects of a diagnosis, applied to a sensor's light, boundaries and stored charge."""
 
 from __future__ import annotations
 
@@ -22,37 +22,49 @@ from bfsensor.typing import FloatArray
 from bfsensor.units import to_celsius, to_kelvin
 
 _ANYWHERE = (4096, 4096)
-"""Sensor of effects that do not ask for places, where none is given."""
+"""Rows and columns of the sensor that effects are given where the user gave no layout.
+
+Chosen: one amplifier of a common science CCD; effects that depend on the place are refused without
+a layout, and the others take nothing from the size."""
 
 _KEPT, _HALO = 101, 102
-"""Streams of random numbers of photons."""
+"""Streams of random numbers for thinning the light and for its halo.
+
+Chosen: numbers that the kernels do not use for the same photons."""
 
 _BY_PLACE = ("displacements", "light_map", "turbulence")
+"""Methods of effects that depend on the place on the sensor."""
+
 _AT_END = ("store", "shift")
+"""Methods of effects that act once, when an exposure has ended."""
 
 
 class AppliedEffects:
     """Effects of the stages light, collect, store and shift on the images of one sensor.
 
-    What effects say of a device's x and y is turned where the columns run along x.
+    Effects use the x and y of the device; where the columns of an image run along x, their
+    arrays are transposed.
 
     Parameters
     ----------
     effects : sequence of Effect
-        Any; those at their neutral values and those of later stages are left out.
+        Any; effects at their neutral values are left out, and so are, with a warning, those of
+        the readout electronics.
     conditions : mapping
-        What is known of the exposures, of the fields of Shot, but the temperature in deg C.
-    layout : Layout, or None
-        Of the sensor that the effects were found on, in the frame of the device.
+        Known conditions of the exposures: fields of :class:`bfsensor.effects.effect.Shot` by name,
+        the temperature in deg C.
+    layout : Layout or None
+        Sensor that the effects were found on, in the frame of the device.
     usual : mapping
-        Of a layout, where none is given.
+        Fields of a layout that hold where none is given.
     turned : bool
-        Columns run along x in images.
+        Whether the columns of the device run along x in images.
 
     Raises
     ------
     SensorError
-        An effect acts by place and there is no layout, or needs a condition that is not known.
+        An effect depends on the place and there is no layout, or it needs a condition that is not
+        known.
     """
 
     def __init__(
@@ -67,8 +79,8 @@ class AppliedEffects:
         later = [e.name for e in live if e.stage not in STORED]
         if later:
             _warn(
-                f"effects of the readout electronics are not in images: {', '.join(later)} left "
-                "out"
+                "a sensor does not simulate the readout electronics: the effects "
+                f"{', '.join(later)} are left out"
             )
         self.effects = sorted(
             (e for e in live if e.stage in STORED), key=lambda e: STORED.index(e.stage)
@@ -97,13 +109,14 @@ class AppliedEffects:
         return {**self.__dict__, "_stills": None, "_still_map": {}}
 
     def _assumed(self, shape: tuple[int, int] = _ANYWHERE) -> Layout:
+        """Layout that was given, or else one amplifier of a shape."""
         if self.layout is not None:
             return self.layout
         ny, nx = shape
         return Layout(shape, (Segment(0, 0, nx, ny),), **self._usual)
 
     def _overriding(self, *methods: str) -> list[Effect]:
-        """Effects that say something of their own at a step."""
+        """Effects whose class overrides one of some methods of Effect."""
         return [
             e
             for e in self.effects
@@ -111,19 +124,21 @@ class AppliedEffects:
         ]
 
     def _check(self) -> None:
+        """Refuse effects that lack a layout or a condition, or whose parameters are not allowed."""
         placed = self._overriding(*_BY_PLACE)
         if placed and self.layout is None:
             raise SensorError(
-                f"effects: {', '.join(e.name for e in placed)} act by place: the sensor's shape "
-                "is needed, layout={'shape': (rows, columns)}"
+                f"effects: {', '.join(e.name for e in placed)} depend on the place on the sensor: "
+                "give its shape, layout={'shape': (rows, columns)}"
             )
         law = self.law
         if not (law.loss >= 0 and np.isfinite(law.bend) and law.full_well > 0):
             raise SensorError(
-                f"effects: {law} must have a finite bend, a loss of at least 0 and a full well "
-                "above 0 e-"
+                f"effects: {law} must have a finite growth with charge, a loss of at least 0 and "
+                "a full well above 0 e-"
             )
-        # Whether anything is missing shows before hours of photons, on a small sensor.
+        # Each effect acts once on a small empty sensor, so that a missing condition is refused
+        # here and not after hours of photons.
         small = 64, 64
         layout = replace(
             self._assumed(), shape=small, segments=(Segment(0, 0, small[1], small[0]),)
@@ -159,7 +174,7 @@ class AppliedEffects:
             variance += more
             if share:
                 if halo[0]:
-                    raise SensorError("effects: more than one gives light a halo")
+                    raise SensorError("effects: at most one effect may give light a halo")
                 halo = float(share), float(sigma)
         if not (variance >= 0 and 0 <= halo[0] <= 1 and halo[1] > 0):
             raise SensorError(
@@ -169,7 +184,25 @@ class AppliedEffects:
         return variance, halo
 
     def light_map(self, kind: str, rng: np.random.Generator) -> FloatArray | None:
-        """Factor on the light of one exposure by pixel of the sensor, as in images."""
+        """Return the factor on the light of one exposure.
+
+        Parameters
+        ----------
+        kind : str
+            Kind of the exposure, 'spot' or 'flat'.
+        rng : numpy.random.Generator
+            Source of the turbulence.
+
+        Returns
+        -------
+        factor : ndarray or None
+            Factor, at least 0, by pixel of the sensor in the frame of images; None: 1 everywhere.
+
+        Raises
+        ------
+        SensorError
+            The factor is negative or not finite.
+        """
         layout = self._assumed()
         shot = self.shot._replace(kind=kind)
         if kind not in self._still_map:
@@ -186,7 +219,7 @@ class AppliedEffects:
                 total = one if total is None else total * one
         if total is None:
             return None
-        # A factor may come as a row or a column.
+        # Effects may return a factor that varies along one axis only.
         total = np.broadcast_to(total, layout.shape)
         if not (np.isfinite(total).all() and total.min() >= 0):
             raise SensorError("effects: the factor on the light is negative or not finite")
@@ -200,18 +233,26 @@ class AppliedEffects:
         number: int,
         key: tuple[int, int],
     ) -> Light:
-        """Photons less those that a factor takes away, with a share of them in the halo.
+        """Thin photons by a factor on the light, and move a share of them into the halo.
 
         Parameters
         ----------
         light : Light
-            As it comes.
+            Photons before they enter the silicon.
         factor : ndarray, optional
-            By pixel of the sensor, that of the nearest outside; above 1 the flux is scaled.
+            Factor by pixel of the sensor; the nearest pixel's holds outside.  A photon is kept
+            with that probability; where the factor is above 1 its flux is multiplied instead.
         corner : tuple of float
-            What takes positions to the sensor's frame, pixels from its lower left corner.
-        number, key
-            Of the first photon; of the exposure.
+            Offset that is added to positions to count pixels from the sensor's lower left corner.
+        number : int
+            Number of the first photon within the exposure.
+        key : tuple of int
+            Key of the exposure's random numbers.
+
+        Returns
+        -------
+        Light
+            All photons, those that are lost with flux 0.
         """
         deviates = np.empty((light.x.size, 2))
         keys = np.uint32(key[0]), np.uint32(key[1])
@@ -227,7 +268,7 @@ class AppliedEffects:
         if share_of_halo:
             uniforms(number, _HALO, *keys, deviates)
             wide = np.nonzero(deviates[:, 0] < share_of_halo)[0]
-            # The uniform that chose is uniform below the share.
+            # Given that it is below the share, the uniform is uniform up to it: no second draw.
             radius = sigma * np.sqrt(-2 * np.log(deviates[wide, 0] / share_of_halo))
             angle = 2 * np.pi * deviates[wide, 1]
             x, y = light.x.copy(), light.y.copy()
@@ -239,7 +280,22 @@ class AppliedEffects:
     # -- collection --------------------------------------------------------------------
 
     def change_of_edges(self, sides: Sides, points: FloatArray) -> EdgeChange:
-        """What effects do to the shifts of a table's sides, in the frame of the device."""
+        """Return the change of a table's sides by effects, in the frame of the device.
+
+        Warns once of effects that change nothing under the given conditions.
+
+        Parameters
+        ----------
+        sides : pair of ndarray
+            Vertical and horizontal sides, as for
+            :func:`bfsensor.sensor.effect_edges.mean_shifts`.
+        points : ndarray
+            Nominal positions along a side, from 0 to 1.
+
+        Returns
+        -------
+        EdgeChange
+        """
         effects = self._overriding("edges")
         shifts, layout = mean_shifts(sides, points), self._assumed()
         idle = [
@@ -258,16 +314,21 @@ class AppliedEffects:
     def add_stills(
         self, pattern: Pattern, shape: tuple[int, int], corner: tuple[float, float]
     ) -> Pattern:
-        """Pattern with the standing displacements of edges around an image.
+        """Add the displacements of edges that do not depend on charge to an image's pattern.
 
         Parameters
         ----------
         pattern : Pattern
-            Of an image.
+            Fixed shifts of an image.
         shape : tuple of int
-            Of the image.
+            Rows and columns of the image.
         corner : tuple of float
-            Its lower left corner, pixels from that of the sensor.
+            Its lower left corner (x, y), in pixels from that of the sensor.
+
+        Returns
+        -------
+        Pattern
+            With the displacements in the image and around it.
         """
         stills = self._find_stills()
         if stills is None:
@@ -281,7 +342,7 @@ class AppliedEffects:
         )
 
     def _find_stills(self) -> Stills | None:
-        """Displacements of all edges of the sensor [pixel], as in images; kept."""
+        """Fixed displacements of all edges of the sensor [pixel], in the frame of images; cached."""
         if self._stills is None:
             layout = self._assumed()
             for effect in self._overriding("displacements"):
@@ -306,7 +367,7 @@ class AppliedEffects:
 
     @property
     def acts_at_end(self) -> bool:
-        """Whether images change after they are collected."""
+        """Whether any effect acts on stored charge or during its transfer."""
         return bool(self._overriding(*_AT_END))
 
     def finish(
@@ -315,21 +376,33 @@ class AppliedEffects:
         rng: np.random.Generator,
         memory: dict[str, NDArray],
     ) -> FloatArray:
-        """Collected charge [e-] as it is stored and shifted out.
+        """Apply the effects that act on stored charge and during its transfer.
 
         Parameters
         ----------
         charge : ndarray, shape of the sensor
-            As in images.
+            Collected charge [e-], in the frame of images.
         rng : numpy.random.Generator
+            Source of what effects draw at random.
         memory : dict
-            Kept from exposure to exposure.
+            State that effects pass on from exposure to exposure (persistence); changed in place.
+
+        Returns
+        -------
+        charge : ndarray
+            Charge [e-] after transfer, same shape.
+
+        Raises
+        ------
+        SensorError
+            The image has another shape than the layout, or an effect needs a condition that is
+            not known.
         """
         out = charge.T if self.turned else charge
         if self.layout is not None and out.shape != self.layout.shape:
             raise SensorError(
-                f"finish takes the image of the whole sensor, {self.layout.shape} rows and "
-                f"columns, not of {out.shape}"
+                f"finish needs the image of the whole sensor, {self.layout.shape} rows and "
+                f"columns, not {out.shape}"
             )
         layout = self._assumed((out.shape[0], out.shape[1]))
         idle = []
@@ -358,7 +431,7 @@ class AppliedEffects:
 def _shifted(
     effect: Effect, charge: NDArray, amp: int, segment: Segment, layout: Layout
 ) -> NDArray:
-    """One amplifier's pixels after transfer; prescan and overscans are empty and cut off."""
+    """One amplifier's pixels after transfer, with empty prescan and overscans around them."""
     turn = np.s_[:: -1 if segment.flip_y else 1, :: -1 if segment.flip_x else 1]
     frame = np.pad(
         charge[turn],

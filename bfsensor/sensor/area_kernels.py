@@ -1,12 +1,12 @@
-r"""Areas of pixels as convolutions.
+r"""Areas of pixels as convolutions of the charge with kernels.
 
 Every vertex moves in proportion to the effective charges :math:`q` around it, and the area
 of a polygon is quadratic in its vertices, so that
 
 .. math:: A = 1 + a \cdot q + \sum_k \lambda_k (w_k \cdot q)^2
 
-with kernels :math:`a` and :math:`w_k` over the pixels around: as many convolutions as
-matter for the charges at hand.
+with kernels :math:`a` and :math:`w_k` over the pixels around.  The eigenvalues
+:math:`\lambda_k` fall steeply, so that a few convolutions suffice for the charges of an image.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from bfsensor.typing import FloatArray
 
 @dataclass(frozen=True)
 class AreaKernels:
-    """Kernels by row and column of the source, pixel (0, 0) in the middle.
+    """Kernels of the areas, by row and column of the source, pixel (0, 0) in the middle.
 
     Attributes
     ----------
-    linear : pair of ndarray
-        Of both modes [1 / e-]; the second empty where there is none.
+    linear : pair of ndarray, shape (rows, columns)
+        Linear kernels a of both modes [1/e-]; the second is empty where there is one mode.
     values : ndarray, shape (kernels,)
-        Eigenvalues, by falling size.
-    squares : pair of ndarray
-        (kernels, rows, columns) of both modes [1 / e-], unit vectors.
+        Eigenvalues lambda, sorted by falling size [1/e-^2].
+    squares : pair of ndarray, shape (kernels, rows, columns)
+        Kernels w of both modes, unit vectors.
     """
 
     linear: tuple[FloatArray, FloatArray]
@@ -39,12 +39,12 @@ class AreaKernels:
 
 
 def area_kernels(edges: Edges) -> AreaKernels:
-    """Find the kernels of the topmost layer.
+    """Compute the kernels for light that converts in the topmost layer.
 
     Parameters
     ----------
     edges : Edges
-        Of a sensor.
+        Packed shifts of a sensor.
 
     Returns
     -------
@@ -79,6 +79,7 @@ def area_kernels(edges: Edges) -> AreaKernels:
             moves[0, place, first : first + sizes[mode]] = flat[side]
             moves[1, place, first : first + sizes[mode]] = flat[1 - side]
             first += sizes[mode]
+    # The shoelace formula: x_n (y_n+1 - y_n-1) / 2 summed over the vertices.
     ahead = np.roll(np.eye(4 * points), 1, axis=1)
     cross = 0.5 * (ahead - ahead.T)
     linear = moves[0].T @ cross @ nominal[1] + moves[1].T @ cross.T @ nominal[0]

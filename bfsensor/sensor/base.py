@@ -1,4 +1,4 @@
-"""What both sensors share: GalSim's calls, on our engine."""
+"""Base class of both sensors: GalSim's sensor interface on bfsensor's kernels."""
 
 from __future__ import annotations
 
@@ -20,12 +20,24 @@ from bfsensor.sensor.shift_maps import ShiftMap, make_pattern, sample_rings
 from bfsensor.typing import FloatArray
 
 _EMPTY = np.zeros(0)
+"""Array in place of slopes or wavelengths that photons do not carry (by definition empty)."""
+
 _LARGE = 512 * 512
+"""Number of pixels from which areas are summed in single precision.
+
+Chosen: double precision takes twice as long and gains 1e-7 of an area; twice as large keeps it for
+images up to 724 pixels wide."""
+
 _SMALL_AREA = 2e-8
-"""Kernels are left out that matter less [nominal area]; single precision ends at 6e-8."""
+"""Largest contribution to an area [nominal area] for which a kernel is left out.
+
+Chosen: below the resolution of single precision, 6e-8; twice as large leaves out kernels that are
+still below it."""
+
 _RING_AREA = 1e-6
 """Largest error of an area [nominal area] by two points a side; above it polygons are drawn.  Chosen: a
 hundredth of the photon noise of 1e8 electrons; rings of 0.26 pixel a period of 47 leave 4e-8."""
+
 _FROM_CENTRE = 30.0
 """Distance of the rings' centre from an image [pixel] from which a pixel's area follows from the mean
 shifts of its sides.  Derived: with the shift g by radius the stretches across and along the rings vary
@@ -34,9 +46,9 @@ the distance half of that."""
 
 
 class EngineSensor(galsim.SiliconSensor):
-    """GalSim's sensor calls on bfsensor's engine; see the two sensors made of it.
+    """GalSim's sensor interface on bfsensor's kernels, the base of both sensors.
 
-    A subclass sets the attributes of ``galsim.SiliconSensor`` and gives
+    A subclass sets the attributes of ``galsim.SiliconSensor`` and defines
     :meth:`_make_physics` and :meth:`_key`.
     """
 
@@ -46,18 +58,18 @@ class EngineSensor(galsim.SiliconSensor):
     treering_func: Any
     rng: Any
 
-    # -- what a subclass gives ---------------------------------------------------------
+    # -- for subclasses ----------------------------------------------------------------
 
     def _make_physics(self) -> tuple[Physics, FloatArray]:
-        """Give the sensor for the engine and the factor of fixed shifts by height."""
+        """Return the sensor for the kernels and the factor of fixed shifts by height."""
         raise NotImplementedError
 
     def _key(self) -> tuple[Any, ...]:
-        """Give what tells one sensor from another, apart from the generator."""
+        """Return the values that equal sensors share, apart from the random generator."""
         raise NotImplementedError
 
     def _check_charge(self, image: NDArray[np.floating]) -> None:
-        """Refuse charge that the sensor was told to refuse."""
+        """Refuse charge beyond the sensor's range; by default any charge is allowed."""
 
     def _change_light(self, light: Light) -> Light:
         """Change light before it enters the silicon."""
@@ -66,7 +78,7 @@ class EngineSensor(galsim.SiliconSensor):
     # -- set up ------------------------------------------------------------------------
 
     def _init_silicon(self) -> None:
-        """Build what is not pickled."""
+        """Build the parts that are not pickled because they follow from the others."""
         self._physics, self._factor = self._make_physics()
         self._rings = None
         if self._has_rings():
@@ -76,6 +88,7 @@ class EngineSensor(galsim.SiliconSensor):
         self._last_image = None
 
     def _has_rings(self) -> bool:
+        """Whether the user gave a radial pattern of tree rings."""
         return self.treering_func is not None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -103,19 +116,25 @@ class EngineSensor(galsim.SiliconSensor):
     __hash__ = None  # type: ignore[assignment]
 
     def updateRNG(self, rng: galsim.BaseDeviate) -> None:  # noqa: N802
-        """Restart the sensor's generator from another one."""
+        """Restart the sensor's random generator from another one.
+
+        Parameters
+        ----------
+        rng : galsim.BaseDeviate
+            Source of the new seed.
+        """
         self.rng.reset(rng)
 
     @property
     def diagnostics(self) -> dict[str, float]:
-        """What happened since the last call of :meth:`accumulate` without ``resume``.
+        """Counts since the last call of :meth:`accumulate` without ``resume``; empty before it.
 
-        ``photons``: their number; ``spilled`` electrons beyond the full well,
-        ``spilled_off_image`` those of them that left along the column; ``off_image``: flux
-        beside the image; ``crossed``: flux that crossed the silicon unconverted;
-        ``lost``: flux that an effect takes from where charge is;
-        ``beyond_table``: renewals of a pixel with more charge than table and full well
-        reach, for which the response of the last level was held.
+        ``photons``: number of photons; ``spilled``: electrons that spilled along the column
+        beyond the full well; ``spilled_off_image``: those of them that left the image;
+        ``off_image``: flux that landed beside the image; ``crossed``: flux that crossed the
+        silicon without converting; ``lost``: flux that an effect removed where electrons meet
+        charge; ``beyond_table``: renewals of a pixel whose charge exceeded both the table and
+        the full well, for which the response of the last level was used.
         """
         if self._exposure is None:
             return {}
@@ -136,22 +155,23 @@ class EngineSensor(galsim.SiliconSensor):
         Parameters
         ----------
         photons : galsim.PhotonArray
-            Positions [pixel], flux [e-]; wavelengths [nm] and slopes in the silicon count
-            where they are allocated.
+            Photons with positions [pixel] and flux [e-]; wavelengths [nm] and slopes in the
+            silicon are used where they are allocated.
         image : galsim.Image
-            float32 or float64 [e-]; the charge in it acts.
+            Image of float32 or float64 [e-], changed in place; charge that is in it already moves
+            the boundaries.
         orig_center : galsim.PositionI
             Position of (0, 0) in original image coordinates, for rings and maps.
         resume : bool
-            Go on with the image of the last call: the same bits as one call with all
-            photons.
+            Continue with the image of the last call; the result is the same bit for bit as that
+            of one call with all photons.
         recalc : bool
             With ``resume``: renew the boundaries first.
 
         Returns
         -------
         added_flux : float
-            Flux that stays in the image.
+            Flux that was collected in the image [e-].
 
         Raises
         ------
@@ -160,9 +180,10 @@ class EngineSensor(galsim.SiliconSensor):
         galsim.GalSimUndefinedBoundsError
             The image has no bounds.
         TypeError
-            An image of integers.
+            The image is not of float32 or float64.
         SensorError
-            Photons that are not finite.  The image is unchanged after any error.
+            Photons or an image with values that are not finite.  The image is unchanged after
+            any error.
         """
         if resume:
             if self._last_image is None or self._exposure is None:
@@ -196,8 +217,10 @@ class EngineSensor(galsim.SiliconSensor):
         array: NDArray[np.floating],
         orig_center: galsim.PositionI,
     ) -> ImageExposure:
+        """Begin the exposure of an image."""
         origin = (image.bounds.xmin - 0.5, image.bounds.ymin - 0.5)
-        # Drawn once an exposure: chunks of photons continue by count.
+        # Drawn once an exposure; photons are numbered within it, so that resumed calls
+        # continue the same random numbers.
         key = (int(self.rng.raw()) & 0xFFFFFFFF, int(self.rng.raw()) & 0xFFFFFFFF)
         return ImageExposure(
             array, self._physics, self._place_pattern(image, orig_center), origin, key,
@@ -205,6 +228,7 @@ class EngineSensor(galsim.SiliconSensor):
         )  # fmt: skip
 
     def _place_pattern(self, image: galsim.Image, orig_center: galsim.PositionI) -> Any:
+        """Fixed shifts (rings and map) in the frame of an image."""
         corner = (
             image.bounds.xmin - 0.5 + orig_center.x,
             image.bounds.ymin - 0.5 + orig_center.y,
@@ -214,6 +238,8 @@ class EngineSensor(galsim.SiliconSensor):
 
     @staticmethod
     def _check_finite(array: NDArray[np.floating]) -> None:
+        """Refuse an image with nan or inf."""
+        # The sum of finite numbers may overflow; only then is each one looked at.
         with np.errstate(all="ignore"):
             total = array.sum(dtype=float)
         if not np.isfinite(total) and not np.isfinite(array).all():
@@ -227,21 +253,28 @@ class EngineSensor(galsim.SiliconSensor):
         orig_center: galsim.PositionI = galsim.PositionI(0, 0),  # noqa: B008
         use_flux: bool = True,
     ) -> galsim.Image:
-        """Areas of the pixels for photons that convert at the back surface.
+        """Compute the areas of the pixels for photons that convert at the back surface.
 
         Parameters
         ----------
         image : galsim.Image
-            Charge [e-].
+            Charge [e-], float32 or float64.
         orig_center : galsim.PositionI
             Position of (0, 0) in original image coordinates.
         use_flux : bool
-            Let the charge act; otherwise only rings and maps do.
+            Whether the charge moves boundaries; otherwise only rings and maps do.
 
         Returns
         -------
         areas : galsim.Image
-            In units of the nominal area, same bounds and type.
+            Areas relative to the nominal area, with the image's bounds and type.
+
+        Raises
+        ------
+        TypeError
+            The image is not of float32 or float64.
+        SensorError
+            The image holds values that are not finite.
         """
         array = pixels_of(image, write=False)
         self._check_finite(array)
@@ -289,11 +322,12 @@ class EngineSensor(galsim.SiliconSensor):
             float(_inside(charges, charges.second).max(initial=low_second) - low_second),
         )
         ny, nx = out.shape
-        # Single precision is good to 1e-7 and twice as fast; where it costs nothing sums are
-        # in double precision, as GalSim's.
+        # Single precision is good to 1e-7 and twice as fast; small images, where the time hardly
+        # matters, are summed in double precision as GalSim's are.
         kind = np.float64 if out.size < _LARGE else np.float32
         row = np.empty(nx, kind)
-        # Next to the image there is no charge: its border sees a larger spread.
+        # Beyond the image there is no charge, so that pixels near its border see a larger spread
+        # of charge and may need more kernels.
         reach = kernels.linear[0].shape[0] // 2
         y0, x0 = min(reach, ny), min(reach, nx)
         y1, x1 = max(ny - reach, y0), max(nx - reach, x0)
@@ -321,7 +355,7 @@ def _quadrature_error(pattern: Pattern) -> float:
 
 
 def _inside(charges: Charges, array: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Give the pixels of the image of a padded array."""
+    """Cut the pixels of the image out of a padded array."""
     if not array.size:
         return array
     pad, rows = charges.pad, charges.ny + 2 * charges.pad
@@ -336,7 +370,7 @@ def _lowest(charges: Charges) -> tuple[np.float32, np.float32]:
 
 
 def _no_charges(shape: tuple[int, int], physics: Physics) -> Charges:
-    """Give the geometry of an image without room for its charge."""
+    """Geometry of an image with empty arrays for its charge."""
     none = np.zeros(0, np.float32)
     return Charges(
         none, none, 1, 0, shape[1], shape[0], none, none, none, np.zeros(0, np.int64)
@@ -344,7 +378,25 @@ def _no_charges(shape: tuple[int, int], physics: Physics) -> Charges:
 
 
 def pixels_of(image: galsim.Image, *, write: bool = True) -> NDArray[np.floating]:
-    """Give the array of an image that the engine can use."""
+    """Return the array of an image after checks.
+
+    Parameters
+    ----------
+    image : galsim.Image
+        Image with defined bounds, of float32 or float64.
+    write : bool
+        Whether the image must be writeable.
+
+    Returns
+    -------
+    array : ndarray
+        The image's own array.
+
+    Raises
+    ------
+    galsim.GalSimUndefinedBoundsError, galsim.GalSimImmutableError, TypeError
+        Undefined bounds; an image that is not writeable; another type of numbers.
+    """
     if not image.bounds.isDefined():
         raise galsim.GalSimUndefinedBoundsError(
             "the image of a sensor must have defined bounds"
@@ -360,7 +412,7 @@ def pixels_of(image: galsim.Image, *, write: bool = True) -> NDArray[np.floating
 
 
 def _light(photons: galsim.PhotonArray) -> Light:
-    """Take the arrays of photons, refusing what is not finite."""
+    """Arrays of photons; values that are not finite are refused."""
     has_angles = photons.hasAllocatedAngles()
     arrays = {
         "x": photons.x,
@@ -372,12 +424,12 @@ def _light(photons: galsim.PhotonArray) -> Light:
     }
     for name, array in arrays.items():
         arrays[name] = np.ascontiguousarray(array, float)
-        # The sum is finite for nearly all, and costs a tenth of looking at each.
+        # A finite sum means that all are finite, and costs a tenth of looking at each.
         with np.errstate(all="ignore"):
             total = arrays[name].sum()
         if np.isfinite(total):
             continue
-        # Infinitely long waves are not absorbed: a number that means something.
+        # An infinite wavelength is allowed: such light is not absorbed.
         good = ~np.isnan(array) if name == "wavelength" else np.isfinite(array)
         if not good.all():
             first = int(np.argmin(good))
@@ -389,7 +441,18 @@ def _light(photons: galsim.PhotonArray) -> Light:
 
 
 def read_numbers(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a configuration of ``key = value`` lines; numbers become numbers."""
+    """Read a configuration of ``key = value`` lines.
+
+    Parameters
+    ----------
+    path : path-like
+        A .cfg file.
+
+    Returns
+    -------
+    values : dict
+        Values by key: int or float where the text is a number, otherwise the text without quotes.
+    """
     from bfsensor.device.poisson_ccd import read_configuration
 
     out: dict[str, Any] = {}
@@ -399,6 +462,7 @@ def read_numbers(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def _number(text: str) -> Any:
+    """Convert a text to int or float, or strip its quotes."""
     for kind in (int, float):
         try:
             return kind(text)

@@ -1,4 +1,4 @@
-"""Shifts of boundaries for the engine: from a table, and from effects."""
+"""Shifts of pixel boundaries as the kernels take them, from a table and from effects."""
 
 from __future__ import annotations
 
@@ -23,33 +23,39 @@ def make_shifts(
     reach: int,
     applied: AppliedEffects | None = None,
 ) -> tuple[EffectiveCharge, Edges]:
-    """Factor a table, and pack its shifts with what effects make of them.
+    """Factor a table, and pack its shifts for the kernels, changed by effects.
 
     Parameters
     ----------
     table : DistortionTable
-        Keeps what is made of it alone: factoring it takes 0.3 s.
-    charge_response, background, depth, strength, transpose
-        As for :class:`bfsensor.BrighterFatterSensor`.
+        Any; results that depend on the table alone are cached in it, because factoring takes
+        0.3 s.
+    charge_response, background, depth, transpose : bool
+        Switches of :class:`bfsensor.BrighterFatterSensor`.
+    strength : float
+        Factor on all shifts.
     reach : int
-        Sources up to so many pixels away; all of the table's give way to effects that reach
-        farther.
+        Largest distance of a source from an edge [pixel]; where it is the table's own, effects
+        that reach farther extend it.
     applied : AppliedEffects, optional
-        Their bend and what they do to edges.
+        Effects that change the growth of shifts with charge, or the shifts of edges.
 
     Returns
     -------
-    EffectiveCharge, Edges
+    charges : EffectiveCharge
+        Weights and effective charges of the table.
+    edges : Edges
+        The weights, changed by effects and packed for the kernels.
     """
     kept: dict[Any, Any] = table.__dict__.setdefault("_kept_factors", {})
     bend = 0.0 if applied is None else applied.law.bend
     whole = charge_response, background, depth
-    # Of many bends and changes none is likely to come again: they are not kept.
+    # Effects take many values, each once (a fit): only results without effects are cached.
     factors = kept.get(whole) if not bend else None
     if factors is None:
         factors = factor_table(
             table, linear=not charge_response, background=background, top=not depth,
-            bend=bend,
+            growth=bend,
         )  # fmt: skip
         if not bend:
             kept[whole] = factors
@@ -66,7 +72,7 @@ def make_shifts(
         if sides is None:
             continue
         if not change.is_none():
-            # What is added to shifts is in proportion to the first mode's charge.
+            # Effects add shifts in proportion to the charge, which the first mode carries.
             own = change._replace(added=None) if number else change
             sides = change_sides(sides, factors.points, own, reach)
         turned = transpose_sides(*sides) if transpose else sides
@@ -75,7 +81,7 @@ def make_shifts(
         modes[0], modes[1] if len(modes) > 1 else None, factors.points, factors.heights,
         reach,
     )  # fmt: skip
-    # A bend leaves the shifts of the factors as they are.
+    # Growth with charge changes the effective charges only, not the edges.
     if change.is_none():
         kept[key] = edges
     return factors, edges

@@ -1,4 +1,4 @@
-"""The sensor of bfsensor's own tables, with the physics GalSim's lacks."""
+"""BrighterFatterSensor: GalSim sensor that applies a distortion table to photons."""
 
 from __future__ import annotations
 
@@ -35,23 +35,35 @@ from bfsensor.sensor.silicon_sensor import check_rings
 from bfsensor.table.table import DistortionTable
 from bfsensor.typing import FloatArray
 
-_WAVELENGTHS = np.arange(250.0, 1451.0, 1.0)  # nm
-_TRANSPARENT = 1e30  # um; length of light that is not absorbed
-_COVERED = 0.9
-"""Part of the thickness up to which a table must hold depths, or a sensor warns.
+_WAVELENGTHS = np.arange(250.0, 1451.0, 1.0)
+"""Vacuum wavelengths of the table of absorption lengths [nm].
 
-With the shifts of 95, 80 and 30 um in place of those of 100 um, area changes are wrong by up to
-0.03, 0.6 and 17 % at the nearest lags and by 2, 7 and 17 % at (2, 2) (the tables of ITL and E2V)."""
+Chosen: the range of the measured absorption (Green 2008) in steps of 1 nm, ten times finer than its
+own; at 2 nm the linear interpolation between them would be four times worse."""
+
+_TRANSPARENT = 1e30
+"""Absorption length [um] that stands for infinity.
+
+Chosen: any length far above the thickness means that all light crosses; at infinity itself the
+interpolation between wavelengths would give nan."""
+
+_COVERED = 0.9
+"""Part of the thickness that a table's depths must reach; a sensor warns, or refuses, below it.
+
+Chosen: with the shifts of 95, 80 and 30 um in place of those of 100 um, area changes are wrong by
+up to 0.03, 0.6 and 17 % at the nearest lags and by 2, 7 and 17 % at (2, 2) (measured with the tables
+of ITL and E2V)."""
 
 
 class BrighterFatterSensor(EffectSensor):
-    r"""A thick CCD: photons become electrons where the stored charge lets them land.
+    r"""GalSim sensor for thick CCDs with the brighter-fatter effect of a distortion table.
 
-    Every pixel's charge moves the boundaries around it by what the distortion table of the
-    device says for that charge, for the charge of its neighbours, and for the height at
-    which each photon converts.  Boundaries are evaluated where electrons land; nothing but
-    the charge is stored.  The charge used is the one expected in the middle of each block
-    of ``nrecalc`` electrons.  Wavelengths and angles count where photons carry them.
+    The charge of every pixel moves the boundaries around it by the shifts that the distortion
+    table of the device holds for that charge, for the charge of the pixel's neighbours, and for
+    the height at which each photon converts.  Boundaries are evaluated only where electrons
+    land; no state but the charge is stored.  The charge that acts is the one expected in the
+    middle of each block of ``nrecalc`` electrons.  Wavelengths and angles are used where photons
+    carry them.
 
     Every piece of physics can be switched off: ``charge_response=False``,
     ``background=False``, ``depth=False``, ``red='kept'``, ``diffusion_factor=0``,
@@ -63,85 +75,90 @@ class BrighterFatterSensor(EffectSensor):
         A built-in device (``bfsensor devices``) or the path of a table made by
         ``bfsensor table``.
     strength : float
-        Multiplies the shifts.
+        Factor on all shifts.
     rng : galsim.BaseDeviate, optional
         Source of the key of the random numbers.  The same key and photons give the same
-        bits for any number of threads and any chunking with ``resume``.
+        result bit for bit for any number of threads and any chunking with ``resume``.
     diffusion_factor : float
-        Multiplies the width of the diffusion; 0 switches it off.
+        Factor on the width of the diffusion, at least 0; 0 switches it off.
     qdist : int, optional
-        Charge so many pixels away acts; by default all of the table.
+        Largest distance [pixel] at which charge acts, up to the table's reach, the default.
     nrecalc : float
-        Electrons in the image between two renewals of the charge that acts, 0: only by
-        ``recalc``.  Blocks begin at a 64th of it.
+        Electrons in the image between two renewals of the charge that acts, at least 0; 0: it is
+        renewed by ``recalc`` only.  With ``predict`` the first block has a 64th of it, and blocks
+        double up to it.
     treering_func : galsim.LookupTable, optional
         Radial shift of the boundaries [pixel], for conversion at the back surface.
     treering_center : galsim.PositionD
         Centre of the rings in original image coordinates.
     transpose : bool
-        The columns of the device run along x.
+        Whether the columns of the device run along x in images.
     shift_map : ShiftMap or str, optional
         Fixed shifts of any shape, or the file that holds them.
     charge_response : bool
-        The response depends on the charge; otherwise that of a small charge among empty
-        pixels holds for every charge on every background, and ``background`` has no say.
+        Whether the response depends on the charge; otherwise that of a small charge among empty
+        pixels holds for every charge on every background, and ``background`` has no effect.
     background : bool
-        The response depends on the charge of the neighbours.
+        Whether the response depends on the charge of the neighbours.
     depth : bool
-        Shifts depend on the height of conversion; otherwise those of the back surface hold.
+        Whether shifts depend on the height of conversion; otherwise those of the back surface
+        hold for all photons.
     red : {'lost', 'kept'}
         Photons that would cross the silicon are lost, or convert 1 um above the gates.
     absorption : {'law', 'galsim'}
         Absorption length by wavelength and temperature (:mod:`bfsensor.device.silicon`), or
         GalSim's table at one temperature.
     temperature : float, optional
-        [K], by default the device's.
+        Temperature of the silicon [K], 77 to 400; by default the device's.
     diffusion : {'einstein', 'measured'}
-        Width by Einstein's relation in the device's drift field, or 1.92 times that, which
-        Fe55 clusters of LSST sensors ask for (:data:`bfsensor.sensor.drift_field.MEASURED`).
+        Width by Einstein's relation in the device's drift field, or 1.92 times that, with which
+        Fe55 clusters of LSST sensors are reproduced
+        (:data:`bfsensor.sensor.drift_field.MEASURED`).
     full_well : float, optional
-        Electrons at which a pixel spills along its column; by default the table's, inf:
-        never.
+        Charge at which a pixel spills along its column [e-], above 0; by default the table's;
+        inf: never.
     beyond : {'hold', 'error'}
-        More charge than the table and no full well, or a table that ends below nine tenths of the
-        thickness: hold the last level or depth (one warning each, for charge see
-        :attr:`diagnostics`), or refuse.
+        Behaviour where the table ends, for charges beyond it without a full well and for light
+        above its last depth if that is below nine tenths of the thickness: 'hold' uses the last
+        level or depth (one warning each; :attr:`diagnostics` counts), 'error' refuses.
     predict : bool
-        Use the charge expected in the middle of a block instead of that at its start.
+        Whether the charge expected in the middle of a block acts, or that at its start.
     conversion_depth : float
-        Depth below the back surface [um] at which photons without wavelengths convert; 1 um
-        as in GalSim.
+        Depth below the back surface [um] at which photons without wavelengths convert, 0 to the
+        thickness; 1 um as in GalSim.
     threads : int
-        Threads of one call.
+        Number of threads of one call, at least 1; the result does not depend on it.
     table : DistortionTable, optional
         A table in memory, in place of ``name``.
     effects : path-like, mapping or sequence, optional
-        Physics that a diagnosis found missing: the report.json of ``bfsensor diagnose``, what it
-        holds, its list of effects, or :class:`bfsensor.effects.effect.Effect` objects.  See Notes.
+        Effects that a diagnosis found: the report.json of ``bfsensor diagnose``, its content, its
+        list of effects, or :class:`bfsensor.effects.effect.Effect` objects.  See Notes.
     conditions : mapping, optional
-        What effects may ask of the exposures: ``wavelength`` [nm] of the light, ``back_bias`` [V],
-        ``temperature`` [C], ``seconds``, ``hours`` since the first, ``number``, ``kind`` ('spot';
-        'flat' for effects that flats alone show).  By default those of the layout's reference.
+        Conditions of the exposures that effects may depend on: ``wavelength`` of the light [nm],
+        ``back_bias`` [V], ``temperature`` [C], exposure time ``seconds``, ``hours`` since the first
+        exposure, ``number`` of the exposure, ``kind`` ('spot', or 'flat' for effects that only
+        flats show).  By default those of the layout's reference.
     layout : Layout or mapping, optional
         Sensor that the effects were found on, by default the report's: ``shape`` (rows, columns),
-        its first pixel (1, 1) of the original image; ``segments`` (by default one amplifier
-        covers it); ``reference``, wavelength [nm], back bias [V] and temperature [C; of a Layout
-        K] that the effects count from, by default 620 nm and the device's own.
+        its first pixel being (1, 1) of the original image; ``segments`` (by default one amplifier
+        covers it); ``reference``, the wavelength [nm], back bias [V] and temperature [C; of a
+        Layout K] for which the effects' parameters hold, by default 620 nm and the device's own.
 
     Notes
     -----
-    Effects act on photons before they enter the silicon (light is thinned out, or its flux
-    scaled where a factor is above 1; halos), on the boundaries (factors on every vertex of the
-    table, shifts of its edges, standing displacements), on electrons that meet charge (loss) and
-    through the full well in :meth:`accumulate`; what acts once on stored charge and while it is
-    shifted out, in :meth:`finish`.  Photons' own wavelengths change no effect.  Shifts are added
-    up to 7 pixels from a charge, at all heights alike, and saturate as the table's do.  Effects of
-    amplifiers and converters are left out, with one warning.
+    In :meth:`accumulate` effects act on photons before they enter the silicon (light is thinned,
+    or its flux scaled where a factor is above 1; halos), on the boundaries (factors on every
+    vertex of the table, shifts of its edges, fixed displacements), on electrons that meet charge
+    (loss) and through the full well.  Effects that act once on stored charge, or during its
+    transfer, act in :meth:`finish`.  The wavelengths of photons change no effect.  Shifts are added
+    up to 7 pixels from a charge, equally at all heights, and saturate as the table's do.  Effects
+    of amplifiers and converters are left out, with one warning.
 
     Raises
     ------
     SensorError
-        A value that is not allowed; a table that cannot serve.
+        A value that is not allowed, or a table without a device or of too small a depth; the
+        message names the argument and the limit.
 
     Examples
     --------
@@ -156,7 +173,8 @@ class BrighterFatterSensor(EffectSensor):
     >>> bool(1.015 < size(sensor) / size(off) < 1.03)
     True
 
-    What a diagnosis found, carried into an image; ``effects="report.json"`` does the same.
+    An effect that a diagnosis found, carried into an image; ``effects="report.json"`` does the
+    same.
 
     >>> loss = {"class": "charge_loss", "parameters": {"q": {"value": 1e-6}}}
     >>> found = BrighterFatterSensor(effects=[loss], rng=galsim.BaseDeviate(4171))
@@ -241,13 +259,14 @@ class BrighterFatterSensor(EffectSensor):
         self._init_silicon()
 
     def _take_table(self, name: str, table: DistortionTable | None) -> None:
+        """Keep the table, read by name unless it is given."""
         self.name = str(name) if table is None else "table"
-        # Where the table came from: it is pickled by that, not by its 18 MB.
+        # A table that was read is pickled as its path, not as its 18 MB.
         self._source = find_table(name) if table is None else None
         self.table = load_table(*self._source) if self._source else check_table(table)
 
     def _usual(self) -> dict[str, Any]:
-        """What effects count from where nothing else is said."""
+        """Return the fields of a layout that hold where the user gives none."""
         from bfsensor.device.silicon import absorption_length
 
         waves = np.arange(300.0, 1101.0, 10.0)
@@ -263,14 +282,14 @@ class BrighterFatterSensor(EffectSensor):
 
     @property
     def _well(self) -> float:
-        """Full well with that of effects [e-]."""
+        """The lower of the sensor's full well and that of effects [e-]."""
         if self._applied is None:
             return self.full_well
         return min(self.full_well, self._applied.law.full_well)
 
     @property
     def effective_nrecalc(self) -> float:
-        """Electrons between renewals."""
+        """Electrons in the image between two renewals of the charge that acts."""
         return self.nrecalc
 
     def __getstate__(self) -> dict[str, Any]:
@@ -292,7 +311,7 @@ class BrighterFatterSensor(EffectSensor):
             reach=self.qdist, applied=self._applied,
         )  # fmt: skip
         self.residual = factors.residual
-        # Below the lowest height that was traced the wells hold the electrons.
+        # Below the lowest height that was traced the wells hold the electrons: no diffusion.
         start = table.depths[1] if len(table.depths) > 1 else 0.0
         drift = solve_drift(table.device_text, self.temperature, float(start))
         sigma = self.diffusion_factor * (MEASURED if self.diffusion == "measured" else 1.0)
@@ -315,7 +334,7 @@ class BrighterFatterSensor(EffectSensor):
             variance=variance,
             diffuse=sigma > 0 or wider > 0,
         )
-        # Whole electrons, so that images of whole electrons stay such.
+        # A whole number, so that spilling keeps images of whole electrons whole.
         well = math.floor(self._well) if math.isfinite(self._well) else math.inf
         physics = Physics(
             edges, factors.response, medium, float(well), not self.transpose, self.nrecalc,
@@ -338,6 +357,7 @@ class BrighterFatterSensor(EffectSensor):
         self._refuse_beyond(float(image.max(initial=0.0)))
 
     def _refuse_beyond(self, highest: float) -> None:
+        """Refuse, with beyond='error', more charge in a pixel [e-] than the table holds."""
         last = float(self.table.charges[-1])
         if self.beyond == "error" and highest > max(last, self._table_well()):
             raise SensorError(
@@ -346,6 +366,7 @@ class BrighterFatterSensor(EffectSensor):
             )
 
     def _table_well(self) -> float:
+        """Full well of the table [e-], 0 where it is not known."""
         well = self.table.full_well
         return well if math.isfinite(well) else 0.0
 
@@ -357,13 +378,23 @@ class BrighterFatterSensor(EffectSensor):
         resume: bool = False,
         recalc: bool = False,
     ) -> float:
-        """Collect photons in an image; see :meth:`EngineSensor.accumulate`.
+        """Collect photons in an image.
+
+        Parameters
+        ----------
+        photons, image, orig_center, resume, recalc
+            As for :meth:`EngineSensor.accumulate`.
+
+        Returns
+        -------
+        added_flux : float
+            Flux that was collected in the image [e-].
 
         Raises
         ------
         SensorError
-            Besides: with ``beyond='error'``, a pixel would exceed the table; the image is
-            as before.
+            As :meth:`EngineSensor.accumulate`; also, with ``beyond='error'``, if a pixel would
+            hold more charge than the table.  The image is unchanged after any error.
         """
         if self.beyond == "hold":
             added = super().accumulate(photons, image, orig_center, resume, recalc)
@@ -401,6 +432,7 @@ class BrighterFatterSensor(EffectSensor):
         )
 
     def _warn_beyond(self) -> None:
+        """Warn once of pixels with more charge than the table holds."""
         assert self._exposure is not None
         if self._warned or not self._exposure.diagnostics["beyond_table"]:
             return
@@ -409,8 +441,8 @@ class BrighterFatterSensor(EffectSensor):
         self._warned = True
         warnings.warn(
             f"pixels hold more charge than the table of {self.name}, which ends at "
-            f"{max(self.table.charges[-1], self._table_well()):.0f} e-: the last level is held "
-            "(see diagnostics; beyond='error' refuses)",
+            f"{max(self.table.charges[-1], self._table_well()):.0f} e-: the response of the last "
+            "level is used (diagnostics counts such pixels; beyond='error' refuses)",
             galsim.GalSimWarning,
             stacklevel=3,
         )
@@ -436,3 +468,4 @@ _COMPARED = (
     "transpose", "shift_map", "charge_response", "background", "depth", "red", "absorption",
     "temperature", "diffusion", "full_well", "beyond", "predict", "conversion_depth", "threads",
 )  # fmt: skip
+"""Attributes that equal sensors share, in the order of the repr."""

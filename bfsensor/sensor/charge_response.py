@@ -1,20 +1,22 @@
-r"""A distortion table as weights times effective charges.
+r"""Factors of a distortion table: weights of pixels times effective charges.
 
 The table holds the shift :math:`D` of every vertex for one source charge :math:`Q` on a
-uniform background :math:`B`.  It factors, to about half a per cent of the shift, into
+uniform background :math:`B`.  It is approximated by two modes,
 
 .. math:: D = (Q - B)\, [g_1(Q, B)\, K_1 + g_2(Q, B)\, K_2],
 
 where :math:`g_1` is the response far from the source and :math:`K_2` is left out beyond
-the nearest pixels.  In an image every pixel has a charge and a background of its own, the
+the nearest pixels.  The error of an edge's mean shift, relative to the largest shift of its
+level, is at most 1.4 % (itl_sta3800c) and 3.8 % (e2v_ccd250), at any level and depth of the table.
+In an image every pixel has a charge and a background of its own, the
 mean of its eight neighbours.  The shift of an edge is then the sum over pixels of
 :math:`K_1 q_1 + K_2 q_2` with effective charges
 
 .. math:: q_m = \int_0^B g_m(b, b)\, db + (Q - B)\, g_m(Q, B):
 
 a background that varies slowly acts with the differential response at its level, a pixel
-that stands out of it with its own.  For uniform charge nothing moves, for a single pixel
-the table comes back.
+that stands out of it with its own.  Uniform charge moves nothing, and a single pixel on a uniform
+background moves the boundaries as in the table.
 """
 
 from __future__ import annotations
@@ -33,8 +35,21 @@ from bfsensor.table.table import DistortionTable
 from bfsensor.typing import FloatArray
 
 _CHARGE_STEP = 1000.0
+"""Step in charge [e-] of the grid on which effective charges are interpolated linearly.
+
+Chosen: with _BACKGROUND_STEP the error of an effective charge is 1.4 e- at most for the two LSST
+devices, with twice the step 4.4 e-."""
+
 _BACKGROUND_STEP = 2000.0
+"""Step in background [e-] of that grid.
+
+Chosen: twice the step raises the error of an effective charge from 1.4 to 5.9 e- at most."""
+
 _LAYERS = 48
+"""Heights of conversion, in equal steps of the logarithm, at which shifts are kept.
+
+Chosen: half a step changes the shifts of the two LSST devices by 2.7 % of the largest one at most,
+at 6 um above the gates; with twice as many by half of that, in twice the memory."""
 
 
 @dataclass(frozen=True)
@@ -44,16 +59,17 @@ class EffectiveCharge:
     Attributes
     ----------
     first, second : pair of ndarray
-        Vertical and horizontal sides by layer, shifts [pixel per electron].
+        Shifts [pixel per electron] of vertical and of horizontal sides, by layer; the second is
+        None for a linear table.
     heights : ndarray
-        Of the layers [um], equal steps of the logarithm.
+        Heights of the layers [um], in equal steps of the logarithm.
     points : ndarray
         Nominal positions along a side, corners included.
     response : Response
         Effective charges on a grid of charge and background.
     residual : float
-        Largest error of the factors at the table's own levels: of the mean normal shift of
-        any edge, relative to the largest of its level.
+        Largest error of the factors at the table's own levels: error of the mean normal shift of
+        an edge, relative to the largest such shift of its level.
     """
 
     first: tuple[FloatArray, FloatArray]
@@ -70,7 +86,7 @@ def factor_table(
     linear: bool = False,
     background: bool = True,
     top: bool = False,
-    bend: float = 0.0,
+    growth: float = 0.0,
 ) -> EffectiveCharge:
     """Factor a table into weights and effective charges.
 
@@ -79,13 +95,14 @@ def factor_table(
     table : DistortionTable
         Any.
     linear : bool
-        Keep the response of a small charge on an empty background for all charges.
+        Take the response of a small charge on an empty background for all charges.
     background : bool
-        Let the background of a pixel count.
+        Let the response depend on the background of a pixel.
     top : bool
         Use the shifts of the highest depth for all heights.
-    bend : float
-        b [1/e-]: shifts grow by (1 + b Q / 2) besides; of a small charge on a background B by
+    growth : float
+        Further growth b of the response with charge [1/e-]: shifts by one charge on an empty
+        background are multiplied by (1 + b Q / 2), those by a small charge on a background B by
         (1 + b B).
 
     Returns
@@ -104,7 +121,7 @@ def factor_table(
     levels = sides[0].shape[:2]
     step = table.charges[:, None] - table.backgrounds
     weight = np.abs(step).ravel()
-    # What an edge gains is its mean normal shift.
+    # The area that an edge gains is its mean normal shift times its length.
     means = np.concatenate(
         [
             (s[..., n] @ lengths).reshape(*levels, s.shape[2], -1)
@@ -118,19 +135,20 @@ def factor_table(
     g1 = g1 / scale
     flat = means.reshape(len(g1), -1)
     if linear or len(g1) == 1:
-        # The smallest charge on the lowest background speaks for all.
+        # The response of the smallest charge on the lowest background holds for all.
         modes = _Modes(np.ones_like(g1), np.zeros_like(g1), [s[0, 0] for s in sides], None)
     else:
         modes = _split(sides, flat, g1, weight)
     residual = _residual(flat, weight, modes, lengths)
     response = _grid(
         table, modes.g1.reshape(levels), modes.g2.reshape(levels), linear=linear,
-        background=background, bend=bend,
+        background=background, growth=growth,
     )  # fmt: skip
     z = table.depths[-1:] if top else table.depths
     heights = z
     if len(z) > 1:
-        # A layer where light without wavelengths converts; above it nothing changes.
+        # The last layer lies where light without wavelengths converts, 1 um below the back
+        # surface; above it shifts hardly change.
         heights = np.geomspace(z[0], min(z[-1], table.thickness - 1.0), _LAYERS)
     first = _to_layers(z, heights, modes.k1)
     second = None if modes.k2 is None else _to_layers(z, heights, modes.k2)
@@ -139,7 +157,7 @@ def factor_table(
 
 @dataclass(frozen=True)
 class _Modes:
-    """Amplitudes of both modes by level, and their patterns by side; no second of a linear table."""
+    """Amplitudes of both modes by level, and their patterns by side; ``k2`` None if linear."""
 
     g1: FloatArray
     g2: FloatArray
@@ -150,11 +168,11 @@ class _Modes:
 def _split(
     sides: list[FloatArray], flat: FloatArray, g1: FloatArray, weight: FloatArray
 ) -> _Modes:
-    """Add to the far response a second mode, of the nearest edges, that it leaves over."""
+    """Split the response into the far mode and a second mode, of the nearest edges only."""
     rest = flat - np.outer(g1, _project(flat, g1, weight))
     g2 = _leading(rest, weight)
     g2 = g2 / np.sqrt(np.average(g2**2, weights=weight))
-    # The second mode is what the first cannot say where charge and background are 0.
+    # The second mode is the leading pattern of the residuals of the first.
     basis = np.stack([g1, g2], 1)
     k1, k2 = [], []
     for s in sides:
@@ -172,6 +190,7 @@ def _split(
 def _to_layers(
     z: FloatArray, heights: FloatArray, sides: list[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
+    """Interpolate sides from the table's depths to the heights of the layers."""
     if len(z) == 1:
         return sides[0], sides[1]
     out = [PchipInterpolator(np.log(z), s, axis=0)(np.log(heights)) for s in sides]
@@ -187,18 +206,19 @@ def _offsets(shape: tuple[int, ...]) -> tuple[FloatArray, FloatArray]:
 
 
 def _is_far(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Edges that lie 2 pixels or more from the source, where the response has one pattern."""
     rows, columns = _offsets(shape)
     return (np.maximum(rows, columns) > 1.9).ravel()
 
 
 def _is_near(shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Edges in whose window of sources within one pixel the source lies."""
+    """Edges whose window of sources within one pixel holds the source."""
     rows, columns = _offsets(shape)
     return (rows < 1.9) & (columns < 1.9)
 
 
 def _leading(rows: FloatArray, weight: FloatArray) -> FloatArray:
-    """Amplitude by row of the leading pattern; rows of no weight are projected on it."""
+    """Amplitudes, by row, of the leading pattern of the weighted rows; 1 if there are no columns."""
     if rows.shape[1] == 0:
         return np.ones(len(rows))
     pattern = np.linalg.svd(rows * weight[:, None], full_matrices=False)[2][0]
@@ -206,7 +226,7 @@ def _leading(rows: FloatArray, weight: FloatArray) -> FloatArray:
 
 
 def _project(rows: FloatArray, basis: FloatArray, weight: FloatArray) -> FloatArray:
-    """Least-squares patterns of the amplitudes ``basis``."""
+    """Patterns that fit the rows best, by least squares, with the amplitudes ``basis``."""
     b = basis * (weight[:, None] if basis.ndim == 2 else weight)
     if basis.ndim == 1:
         return np.asarray(b @ (rows * weight[:, None]) / (b @ b))
@@ -214,6 +234,7 @@ def _project(rows: FloatArray, basis: FloatArray, weight: FloatArray) -> FloatAr
 
 
 def _at_zero(table: DistortionTable, g: FloatArray) -> float:
+    """Amplitude at the table's lowest charge and background."""
     wq = spline_weights(table.charges, float(table.charges[0]))
     wb = spline_weights(table.backgrounds, float(table.backgrounds[0]))
     return float(wq @ g @ wb)
@@ -222,7 +243,7 @@ def _at_zero(table: DistortionTable, g: FloatArray) -> float:
 def _residual(
     flat: FloatArray, weight: FloatArray, modes: _Modes, lengths: FloatArray
 ) -> float:
-    """Largest error of the modes at the table's levels, relative to each level's largest shift."""
+    """Largest error of the modes at the table's levels, relative to the largest shift of each."""
 
     def mean(k: list[FloatArray]) -> FloatArray:
         parts = [(s[..., n] @ lengths).reshape(s.shape[0], -1) for n, s in enumerate(k)]
@@ -243,10 +264,10 @@ def _grid(
     *,
     linear: bool,
     background: bool,
-    bend: float,
+    growth: float,
 ) -> Response:
     """Effective charges on equal steps of charge and background."""
-    if (linear or len(table.charges) == 1) and not bend:
+    if (linear or len(table.charges) == 1) and not growth:
         empty = np.zeros((0, 0), np.float32)
         return Response(empty, empty, 1.0, 1.0, np.inf, np.inf)
     last = table.charges[-1]
@@ -273,17 +294,18 @@ def _grid(
         if background:
             response = wq @ g @ wb.T
             diagonal = np.einsum("nq,qb,nb->n", fq, g, fb)
-            if bend:
-                # So that of a linear response Q (1 + bend Q / 2) is left.
-                response = response * (1 + 0.5 * bend * (q[:, None] + b))
-                diagonal = diagonal * (1 + bend * fine)
+            if growth:
+                # A linear response then has the effective charge Q (1 + growth Q / 2) on any
+                # background.
+                response = response * (1 + 0.5 * growth * (q[:, None] + b))
+                diagonal = diagonal * (1 + growth * fine)
             steps = 125.0 * (diagonal[1:] + diagonal[:-1])
             integral = np.interp(b, fine, np.concatenate([[0.0], np.cumsum(steps)]))
             grids.append(integral + (q[:, None] - b) * response)
         else:
             alone = wq @ g @ wb[0]
-            if bend:
-                alone = alone * (1 + 0.5 * bend * q)
+            if growth:
+                alone = alone * (1 + 0.5 * growth * q)
             grids.append(np.repeat((q * alone)[:, None], len(b), 1))
     return Response(
         grids[0].astype(np.float32),

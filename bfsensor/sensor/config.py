@@ -1,11 +1,11 @@
-"""Effects in GalSim's configuration: options of the sensor, and the end of an exposure.
+"""GalSim configuration: options of BrighterFatterSensor, and a noise type that ends exposures.
 
 GalSim ends an image by adding sky and noise.  Effects that act on stored charge belong between
-the noise of the light and that of the readout; the noise type here is put around the one of the
-configuration and finishes the image there.  Image types that add noise stamp by stamp (Single,
-and Tiled without overlap) finish each stamp as a sensor of its own.  Sensors that are not built
-by the configuration (type Eval) are finished where ``image.noise`` says so,
-``{type: BrighterFatter, noise: {...}}``, which ``modules: [bfsensor.sensor.config]`` makes known.
+the noise of the light and that of the readout; the noise type of this module wraps the one of the
+configuration and finishes the image between the two.  Image types that add noise stamp by stamp
+(Single, and Tiled without overlap) finish each stamp as a sensor of its own.  For sensors that are
+not built by the configuration (type Eval) write ``image.noise`` as
+``{type: BrighterFatter, noise: {...}}``; ``modules: [bfsensor.sensor.config]`` registers the type.
 """
 
 from __future__ import annotations
@@ -22,20 +22,21 @@ from galsim.errors import GalSimConfigError
 from bfsensor.sensor.effect_sensor import EffectSensor
 
 NOISE = "BrighterFatter"
-"""Noise type: ``noise``, any other of GalSim's, and the sensor's effects in the midst of it."""
+"""Name of the noise type; its ``noise`` is any other of GalSim's."""
 
 _INTERNAL = ("index_key", "rng_num", "rng_index_key")
+"""Keys that GalSim adds to a dict of the configuration."""
 
 
 class EffectSensorBuilder(SimpleSensorBuilder):
     """Builds a sensor from a configuration in which ``effects`` may be a file, dict or list."""
 
     def getKwargs(self, config: Any, base: Any, logger: Any) -> dict[str, Any]:  # noqa: N802
-        """Options of the sensor, with values inside ``conditions`` evaluated."""
+        """Return the options of the sensor, with values inside ``conditions`` evaluated."""
         given = config.get("effects")
         inline = isinstance(given, list | dict) and "type" not in given
         if inline:
-            # Parsed as a value it would be taken for a choice between several.
+            # GalSim would take a list or dict for a description of how to choose the value.
             config = {k: v for k, v in config.items() if k != "effects"}
         kwargs: dict[str, Any] = super().getKwargs(config, base, logger)
         if inline:
@@ -52,7 +53,7 @@ class EffectSensorBuilder(SimpleSensorBuilder):
         return kwargs
 
     def buildSensor(self, config: Any, base: Any, logger: Any) -> Any:  # noqa: N802
-        """Build the sensor; where it acts at the end of exposures see that it will."""
+        """Build the sensor; if it acts at the end of exposures, wrap the image's noise."""
         sensor = super().buildSensor(config, base, logger)
         if isinstance(sensor, EffectSensor) and sensor.acts_at_end:
             image = base.get("image")
@@ -64,20 +65,36 @@ class EffectSensorBuilder(SimpleSensorBuilder):
 
 
 def _plain(given: Any) -> Any:
-    """What was written, less the keys that GalSim adds."""
+    """Copy of a value without the keys that GalSim adds."""
     if isinstance(given, Mapping):
         return {k: _plain(v) for k, v in given.items() if k not in _INTERNAL}
     return [_plain(v) for v in given] if isinstance(given, list | tuple) else given
 
 
 class FinishingNoiseBuilder(NoiseBuilder):
-    """Noise of the light, the effects at the end of an exposure, noise of the readout."""
+    """Noise type that adds noise of the light, effects at the end, and noise of the readout."""
 
     def addNoise(  # noqa: N802
         self, config: Any, base: Any, im: Any, rng: Any, current_var: float,
         draw_method: str, logger: Any,
     ) -> float:  # fmt: skip
-        """Add the configuration's noise to an image, and finish it in between."""
+        """Add the configuration's noise to an image, with the effects between light and readout.
+
+        Parameters
+        ----------
+        config, base, im, rng, current_var, draw_method, logger
+            As for GalSim's noise builders.
+
+        Returns
+        -------
+        var : float
+            Variance of the noise that was added.
+
+        Raises
+        ------
+        galsim.GalSimConfigError
+            The image has no sensor of type BrighterFatter, or the noise type is not known.
+        """
         sensor = base.get("sensor")
         if not isinstance(sensor, EffectSensor):
             raise GalSimConfigError(
@@ -109,7 +126,7 @@ class FinishingNoiseBuilder(NoiseBuilder):
         return var
 
     def getNoiseVariance(self, config: Any, base: Any, full: bool = False) -> Any:  # noqa: N802
-        """Variance of the configuration's noise."""
+        """Return the variance of the configuration's noise."""
         inner = self._inner(config)
         if not inner:
             return 0.0
@@ -126,6 +143,7 @@ class FinishingNoiseBuilder(NoiseBuilder):
 
     @staticmethod
     def _inner(config: Any) -> dict[str, Any]:
+        """Dict of the wrapped noise with its type, empty where there is none."""
         noise = config.get("noise") or {}
         if not isinstance(noise, dict):
             raise GalSimConfigError("image.noise is not a dict.")
@@ -138,6 +156,7 @@ class FinishingNoiseBuilder(NoiseBuilder):
     def _add(
         inner: Any, base: Any, im: Any, rng: Any, var: float, draw_method: str, logger: Any
     ) -> float:
+        """Add the wrapped noise; returns its variance."""
         builder = valid_noise_types[inner["type"]]
         return float(builder.addNoise(inner, base, im, rng, var, draw_method, logger))
 

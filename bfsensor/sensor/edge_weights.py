@@ -1,4 +1,4 @@
-"""Weights of the charges around an edge, and bounds on what they can do."""
+"""Weights of the charges around an edge, packed for the kernels, with bounds on the shifts."""
 
 from __future__ import annotations
 
@@ -9,9 +9,22 @@ from bfsensor._kernels.shifts import Edges
 from bfsensor.typing import FloatArray
 
 _BINS = 128
+"""Bins along an edge by which the nearest point and its error bound are looked up.
+
+Chosen: the bounds decide only which electrons are held against the whole boundary; with twice as
+many bins they are tighter and the tables twice as large."""
+
 _NEAR = 1
+"""Largest distance [pixel] of a source to which the second mode applies.
+
+Chosen: farther away the response is proportional to the first mode; at 2 the window of the second
+mode would hold 25 pixels in place of 9."""
+
 RANGES = np.append(250.0 * 2.0 ** (np.arange(97) / 8), np.inf)
-"""Ranges of effective charge [e-] for which errors are bounded; the last, any range."""
+"""Ranges of effective charge [e-] for which errors are bounded; the last, any range.
+
+Chosen: 250 e- to 1 million e- in steps of 9 %, by which a bound may be too wide.  They decide
+which electrons are held against the whole boundary and where the nearest layer suffices."""
 
 
 def join_sides(
@@ -19,7 +32,7 @@ def join_sides(
     horizontal: FloatArray,
     vertical: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Give every side the corners it ends in.
+    """Join the vertices of every side with the two corners in which it ends.
 
     Parameters
     ----------
@@ -30,6 +43,7 @@ def join_sides(
     Returns
     -------
     vertical, horizontal : ndarray, shapes (..., n, n + 1, v + 2, 2), (..., n + 1, n, v + 2, 2)
+        Shifts of the sides along y and along x, in the unit of the arguments.
     """
     c = corners[..., None, :]
     upright = np.concatenate([c[..., :-1, :, :, :], vertical, c[..., 1:, :, :, :]], -2)
@@ -40,7 +54,7 @@ def join_sides(
 def transpose_sides(
     vertical: FloatArray, horizontal: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Exchange x and y of sides as :func:`join_sides` gives them."""
+    """Exchange x and y of sides as :func:`join_sides` returns them."""
     axes = (*range(horizontal.ndim - 4), -3, -4, -2, -1)
     order = tuple(a % horizontal.ndim for a in axes)
     return (
@@ -60,13 +74,14 @@ def window_weights(
 (layers, n + 1, n, points, 2)
         Shifts (dx, dy) [pixel per electron] around a source in the middle.
     reach : int
-        Sources up to so many pixels away, at most (n - 1) / 2.
+        Largest distance of a source [pixel], at most (n - 1) / 2.
 
     Returns
     -------
     vertical, horizontal : ndarray, shapes (layers, points, 2, 2 reach + 1, 2 reach + 2), \
 (layers, points, 2, 2 reach + 2, 2 reach + 1)
-        Normal and tangential, by row and column of the source.
+        Normal and tangential shift of a point [pixel per electron], by row and column of the
+        source.
     """
     middle = vertical.shape[1] // 2
     q = reach
@@ -86,21 +101,21 @@ def make_edges(
     *,
     scale: FloatArray | None = None,
 ) -> Edges:
-    """Pack the shifts of both modes for the kernels, with bounds of what they can do.
+    """Pack the shifts of both modes for the kernels, with bounds on them.
 
     Parameters
     ----------
     first, second : pair of ndarray
-        Vertical and horizontal sides of each mode as for :func:`window_weights`; of the
-        second only sources within one pixel count.
+        Vertical and horizontal sides of each mode as for :func:`window_weights`; the second
+        mode applies to sources within one pixel only, and may be None.
     points : ndarray
         Nominal positions along a side, from 0 to 1.
     heights : ndarray, shape (layers,)
-        Equal steps of the logarithm [um].
+        Heights of the layers above the gates [um], in equal steps of the logarithm.
     reach : int
-        Sources up to so many pixels away.
+        Largest distance of a source [pixel].
     scale : ndarray, optional
-        Factor of all shifts on equal steps from the gates to the height of the one layer.
+        Factor on all shifts, on equal steps from the gates to the height of the only layer.
 
     Returns
     -------
@@ -146,6 +161,7 @@ def make_edges(
 
 
 def _pack(weights: FloatArray, lanes: int) -> NDArray[np.float32]:
+    """Weights in single precision, rows padded to ``lanes``, points before components."""
     packed = np.zeros((*weights.shape[:-1], lanes), np.float32)
     packed[..., : weights.shape[-1]] = weights
     return packed.swapaxes(1, 2).ravel()
@@ -183,7 +199,8 @@ def _bounds(
                 layer = layer + _largest(0.5 * np.diff(weights[:, :, 0], axis=0))
             gaps = np.diff(points)[:, None, None]
             slope = slope + _largest(np.diff(weights[:, :, 0], axis=1) / gaps)
-            # The next edge of the line: its window lies one row (column) further on.
+            # Where two edges of a line meet their shifts may differ, for the windows of sources
+            # around them do: the next window lies one row (column) further on.
             before, after = [(0, 0), (0, 0), (0, 0)], [(0, 0), (0, 0), (0, 0)]
             before[1 + side], after[1 + side] = (0, 1), (1, 0)
             for c in (0, 1):
@@ -191,7 +208,7 @@ def _bounds(
                 ends += float(_largest(jump[:, None]).max())
         top[side] = normal.max()
         doubts[side, -1] = np.inf
-        # Three edges in a row: what is looked up may lie beyond a corner.
+        # Three edges in a row: tangential shifts may bring a point from beyond a corner here.
         at = np.concatenate([points - 1, points, points + 1])
         move = np.tile(tangential, 3)
         climb = np.concatenate([[*slope, 0.0]] * 3)[:-1]
@@ -204,6 +221,7 @@ def _bounds(
             doubts[side, n] = _doubt(
                 r * between, r * way, r * layer, r * ends, at, points, nearest
             )
+    # Room for the rounding to single precision.
     return 1.00001 * top, 1.00001 * doubts
 
 
@@ -212,8 +230,9 @@ def _alike(
 ) -> NDArray[np.int64]:
     """Row of the first range for which half a step to the next layer is above 5e-5 pixel.
 
-    The mean over the points of an edge counts: next to corners points move along their
-    edge by more, which changes no area.
+    Below it the nearest layer stands for all heights around it.  The mean over the points of an
+    edge is compared: next to corners points move along their edge by more, which changes no
+    area.
     """
     steps = np.zeros(max(len(modes[0][0]) - 1, 1))
     if len(modes[0][0]) > 1:

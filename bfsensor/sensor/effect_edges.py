@@ -1,4 +1,4 @@
-"""Effects on the shifts of edges, carried to the vertices of a table."""
+"""Changes of edge shifts by effects, carried over to the vertices of a table."""
 
 from __future__ import annotations
 
@@ -12,15 +12,22 @@ from bfsensor.errors import SensorError
 from bfsensor.typing import FloatArray
 
 REACH = 7
-"""Farthest charge [pixel] that the engine lets act on an edge."""
+"""Largest distance [pixel] of a charge that acts on an edge.
+
+Derived: the kernels hold 16 lanes, which are 2 reach + 2."""
 
 _SAME = 1e-9
+"""Difference from a factor, relative to the largest shift, below which a change is a factor.
+
+Chosen: above the round-off of products in double precision (1e-16); twice as much changes
+nothing unless an effect departs from a factor by just that."""
 
 Sides = tuple[FloatArray, FloatArray]
+"""Arrays of the vertical and the horizontal edges."""
 
 
 class EdgeChange(NamedTuple):
-    """What effects make of the shifts around a charge: factors, then shifts that are added.
+    """Change of the shifts around a charge by effects: first factors, then added shifts.
 
     Attributes
     ----------
@@ -35,12 +42,12 @@ class EdgeChange(NamedTuple):
     added: Sides | None = None
 
     def is_none(self) -> bool:
-        """Whether nothing changes."""
+        """Whether the change leaves all shifts as they are."""
         return self.x == self.y == 1.0 and self.added is None
 
     @property
     def reach(self) -> int:
-        """Pixels from the charge within which all corners lie that added shifts move."""
+        """Distance [pixel] from the charge within which added shifts move corners."""
         if self.added is None:
             return 0
         half = len(self.added[0]) // 2
@@ -50,7 +57,7 @@ class EdgeChange(NamedTuple):
 
 
 def mean_shifts(sides: Sides, points: FloatArray) -> Sides:
-    """Means along right and upper edges of the topmost layer of sides.
+    """Average the shifts along right and upper edges, for the topmost layer.
 
     Parameters
     ----------
@@ -62,7 +69,8 @@ def mean_shifts(sides: Sides, points: FloatArray) -> Sides:
     Returns
     -------
     kx, ky : ndarray, shape (n + 2, n + 2)
-        ``[row, column]``, with a ring of pixels around those of the sides.
+        Mean normal shifts of right and of upper edges [pixel/e-], ``[row, column]``, with a ring
+        of pixels around those of the sides.
     """
     lengths = _lengths(points)
     n = sides[0].shape[1]
@@ -76,16 +84,21 @@ def mean_shifts(sides: Sides, points: FloatArray) -> Sides:
 def find_change(
     effects: Sequence[Effect], shifts: Sides, shot: Shot, layout: Layout
 ) -> EdgeChange:
-    """Find what effects do to shifts: the factors of each, and what is left is added.
+    """Express the change of shifts by effects as factors and added shifts.
+
+    Each effect is applied to the shifts and to zeros; the answer to zeros is the shift that it
+    adds.  If the rest of its change is a factor, that is taken; otherwise all of it is added.
 
     Parameters
     ----------
     effects : sequence of Effect
-        In the order in which they act.
+        Effects in the order in which they act.
     shifts : pair of ndarray
-        Of right and upper edges without effects [pixel/e-].
-    shot, layout : Shot, Layout
-        Exposure and sensor.
+        Shifts of right and upper edges without effects [pixel/e-].
+    shot : Shot
+        Conditions of the exposure.
+    layout : Layout
+        Sensor.
 
     Returns
     -------
@@ -94,7 +107,8 @@ def find_change(
     Raises
     ------
     SensorError
-        An effect gives shifts that are not finite: it does not know enough of the exposure.
+        An effect returns shifts that are not finite, because a condition of the exposure that it
+        needs is not known.
     """
     factors = [1.0, 1.0]
     now = shifts
@@ -136,26 +150,26 @@ def find_change(
 
 
 def change_sides(sides: Sides, points: FloatArray, change: EdgeChange, reach: int) -> Sides:
-    """Change the sides around a charge, for charges up to ``reach`` pixels away.
+    """Change the sides around a charge, for edges up to ``reach`` pixels away.
 
-    Factors act on every vertex.  A shift that is added moves all vertices of its edge; corners,
-    which belong to four edges, move by the mean of theirs, so that polygons tile the plane as
-    before, and the inner vertices by so much that the mean along the edge is what was asked for.
-    Added shifts are the same at all heights.
+    Factors act on every vertex.  An added shift moves all vertices of its edge: corners,
+    which belong to four edges, move by the mean of these edges' shifts, so that polygons still
+    tile the plane, and the inner vertices by the amount with which the mean along the edge is the
+    added shift.  Added shifts are the same at all heights.
 
     Parameters
     ----------
     sides, points
         As for :func:`mean_shifts`.
     change : EdgeChange
-        Of the shifts.
+        Factors and added shifts.
     reach : int
-        At most :data:`REACH`.
+        Distance from the charge [pixel] to which the sides extend, at most :data:`REACH`.
 
     Returns
     -------
     pair of ndarray
-        Sides of at least 2 reach + 1 pixels.
+        Changed sides, of at least 2 reach + 1 pixels.
     """
     more = max(reach - sides[0].shape[1] // 2, 0)
     width = ((0, 0), (more, more), (more, more), (0, 0), (0, 0))
@@ -182,7 +196,7 @@ def _along(
     normal: int,
     points: FloatArray,
 ) -> FloatArray:
-    """Shifts (..., points, 2) along edges between corners, of the mean normal shift asked for."""
+    """Shifts (..., points, 2) along edges between corners, with a given mean normal shift."""
     t = points[:, None]
     out = start[..., None, :] * (1 - t) + end[..., None, :] * t
     if len(points) > 2:
@@ -194,7 +208,7 @@ def _along(
 
 
 def _lengths(points: FloatArray) -> FloatArray:
-    """Part of an edge that each point stands for, of the line through them."""
+    """Weights of the points for the mean over the polyline through them."""
     out = np.zeros(len(points))
     out[1:] += np.diff(points) / 2
     out[:-1] += np.diff(points) / 2

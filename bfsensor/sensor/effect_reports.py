@@ -1,4 +1,4 @@
-"""Effects as a sensor is given them: a report, its block, or effects."""
+"""Readers of a sensor's arguments ``effects``, ``layout`` and ``conditions``."""
 
 from __future__ import annotations
 
@@ -13,37 +13,40 @@ from bfsensor.errors import EffectError, SensorError
 from bfsensor.units import to_celsius, to_kelvin
 
 SCHEMA = "bfsensor-diagnosis-1"
-"""Of the report.json that ``bfsensor diagnose`` writes."""
+"""Schema of the report.json that ``bfsensor diagnose`` writes."""
 
 STORED = STAGES[:4]
-"""Stages that a sensor applies; what comes later happens in the readout electronics."""
+"""Stages that a sensor applies, by definition all before the readout electronics."""
 
 _INTERNAL = ("type", "index_key", "rng_num", "rng_index_key")
+"""Keys that GalSim's configuration adds to a dict."""
+
 _LAYOUT = ("shape", "segments", "reference", "pixel", "thickness", "front")
 _NUMBERS = tuple(n for n in Shot._fields if n != "kind")
 _KINDS = ("bias", "dark", "flat", "spot")
 
 
 def read_effects(given: Any) -> tuple[tuple[Effect, ...], Mapping[str, Any] | None]:
-    """Read effects as a sensor is given them.
+    """Read the effects of a diagnosis for a sensor.
 
     Parameters
     ----------
     given : path-like, mapping, or sequence
-        A report.json; what it holds, or that much of it that has 'effects'; a list of its
-        entries or of effects.
+        Path of a report.json; a mapping with its key 'effects'; or a list, of entries with 'class'
+        and 'parameters' or of :class:`bfsensor.effects.effect.Effect` objects.
 
     Returns
     -------
     effects : tuple of Effect
-        In the order given.
-    layout : mapping, or None
-        The report's 'layout', where it has one.
+        Effects in the order given.
+    layout : mapping or None
+        The report's 'layout'; None where it has none.
 
     Raises
     ------
     SensorError
-        Not a report of this schema; a class that is not known; parameters that are not its.
+        A file that is no report of this schema, an unknown class, or parameters that the class
+        does not have; the message names file, entry and key.
 
     Examples
     --------
@@ -79,6 +82,7 @@ def read_effects(given: Any) -> tuple[tuple[Effect, ...], Mapping[str, Any] | No
 
 
 def _read_report(path: str) -> dict[str, Any]:
+    """Read a report.json; anything but an object is refused."""
     try:
         report = json.loads(Path(path).read_text())
     except OSError as error:
@@ -91,8 +95,8 @@ def _read_report(path: str) -> dict[str, Any]:
 
 
 def _make(entry: Any, where: str) -> Effect:
-    """Make the effect of an entry; a variant that is not named is known by its parameters."""
-    # Not at the top: 31 classes and scipy's filters, which sensors without effects do not need.
+    """Make the effect of an entry; without a 'variant' the names of the parameters choose it."""
+    # Not at the top: all classes and scipy's filters, which sensors without effects do not need.
     from bfsensor.effects.library import LIBRARY, make_effect
 
     if not isinstance(entry, Mapping) or not isinstance(entry.get("class"), str):
@@ -123,7 +127,7 @@ def _make(entry: Any, where: str) -> Effect:
 
 
 def write_entries(effects: Iterable[Effect]) -> list[dict[str, Any]]:
-    """Entries of a report that say the same as effects."""
+    """Return the entries of a report that :func:`read_effects` reads as these effects."""
     return [
         {
             "class": e.word,
@@ -141,16 +145,20 @@ def make_layout(given: Any, usual: Mapping[str, Any]) -> Layout:
     ----------
     given : Layout or mapping
         'shape' (rows, columns) and any of 'segments', 'reference', 'pixel', 'thickness',
-        'front', as in :class:`bfsensor.effects.effect.Layout`, but for the temperature of a
-        mapping's 'reference', which is in deg C.  Without segments one amplifier covers the
-        sensor.
+        'front', as in :class:`bfsensor.effects.effect.Layout`, except that the temperature of a
+        mapping's 'reference' is in deg C.  Without segments one amplifier covers the sensor.
     usual : mapping
-        What holds where nothing is given, temperature in K.
+        Values for the keys that are not given, temperature in K.
+
+    Returns
+    -------
+    Layout
+        Temperature in K.
 
     Raises
     ------
     SensorError
-        Something that is unknown or has no meaning.
+        An unknown key, a value of another type, or segments outside the sensor.
     """
     if isinstance(given, Layout):
         return given
@@ -194,14 +202,23 @@ def make_layout(given: Any, usual: Mapping[str, Any]) -> Layout:
 
 
 def make_conditions(given: Any) -> dict[str, Any]:
-    """Check what is said of exposures: fields of :class:`bfsensor.effects.effect.Shot`.
+    """Check the conditions of exposures.
 
-    The temperature of a mapping, and of what is given back, is in deg C.
+    Parameters
+    ----------
+    given : mapping, Shot or None
+        Fields of :class:`bfsensor.effects.effect.Shot` by name; the temperature of a mapping is
+        in deg C.
+
+    Returns
+    -------
+    conditions : dict
+        The fields that are given, temperature in deg C; empty for None.
 
     Raises
     ------
     SensorError
-        Something that is unknown or no number.
+        An unknown name, or a value that is no number.
     """
     if given is None:
         return {}

@@ -1,4 +1,4 @@
-"""A sensor that carries the effects of a diagnosis into its images."""
+"""Base class of sensors that apply the effects of a diagnosis to their images."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from bfsensor.units import to_celsius
 
 
 class EffectSensor(EngineSensor):
-    """Takes effects into account where light comes, where it is collected, and at the end.
+    """Sensor that applies effects to light, during collection, and at the end of exposures.
 
-    Effects of light and collection act in :meth:`accumulate`; those that act once an exposure,
-    on what has been stored (coupling, persistence, dark current) and while it is shifted out
-    (charge transfer), act in :meth:`finish`, and nowhere else.
+    Effects on light and on collection act in :meth:`accumulate`.  Effects that act once an
+    exposure, on stored charge (coupling, persistence, dark current) or during its transfer, act in
+    :meth:`finish` only.
     """
 
     effects: tuple[Effect, ...] | None = None
@@ -48,7 +48,7 @@ class EffectSensor(EngineSensor):
         find_usual: Callable[[], dict[str, Any]],
         turned: bool,
     ) -> None:
-        """Read effects; what is usual and ``turned`` as for :class:`AppliedEffects`."""
+        """Read effects, layout and conditions; ``turned`` as for :class:`AppliedEffects`."""
         self._memory = {}
         self._applied = None
         self.effects = self.layout = self.conditions = None
@@ -66,10 +66,11 @@ class EffectSensor(EngineSensor):
         self.effects = found
         if any(e.word == "tree_rings" for e in found) and self._has_rings():
             raise SensorError(
-                "effects hold tree_rings and treering_func is given: rings would act twice"
+                "effects hold tree_rings and treering_func is given: the rings would act twice; "
+                "give one of them"
             )
         applied = AppliedEffects(found, self.conditions or {}, self.layout, usual, turned)
-        # Effects that all are neutral leave the sensor as it is without them.
+        # With nothing but neutral effects the sensor must behave as without, bit for bit.
         self._applied = applied if applied.effects else None
 
     def _init_silicon(self) -> None:
@@ -83,7 +84,7 @@ class EffectSensor(EngineSensor):
         return state
 
     def _effects_repr(self) -> list[str]:
-        """Parts of a repr: what cannot be seen from other options."""
+        """Parts of the repr: effects, layout and conditions, where they are given."""
         out = []
         if self.effects is not None:
             out.append(f"effects={write_entries(self.effects)!r}")
@@ -110,7 +111,23 @@ class EffectSensor(EngineSensor):
         resume: bool = False,
         recalc: bool = False,
     ) -> float:
-        """Collect photons in an image; see :meth:`EngineSensor.accumulate`."""
+        """Collect photons in an image.
+
+        Parameters
+        ----------
+        photons, image, orig_center, resume, recalc
+            As for :meth:`EngineSensor.accumulate`.
+
+        Returns
+        -------
+        added_flux : float
+            Flux that was collected in the image [e-].
+
+        Raises
+        ------
+        galsim.GalSimError
+            ``resume`` after :meth:`finish`, and as for :meth:`EngineSensor.accumulate`.
+        """
         if resume and self._closed:
             raise galsim.GalSimError(
                 "accumulate was called with resume after finish: the exposure is over"
@@ -164,27 +181,27 @@ class EffectSensor(EngineSensor):
 
     @property
     def acts_at_end(self) -> bool:
-        """Whether there are effects for :meth:`finish`."""
+        """Whether :meth:`finish` changes images."""
         return self._applied is not None and self._applied.acts_at_end
 
     def finish(self, image: galsim.Image) -> None:
-        """End the exposure: what acts once on stored charge, and while it is shifted out.
+        """End the exposure: apply the effects on stored charge and during its transfer.
 
-        To be called once for each exposure, with the image of the whole sensor, when all its
-        light is in it (sky and its noise too) and before noise of the readout.  GalSim's
-        configuration does it by itself.  Without effects at these stages the image stays as it
-        is, to the bit.  Persistence remembers the images that were finished by this sensor.
+        Call it once for each exposure, with the image of the whole sensor, when all its
+        light is in it (sky and its noise too) and before the noise of the readout is added.
+        GalSim's configuration calls it by itself.  Without effects at these stages the image
+        stays the same bit for bit.  Persistence acts on later images that this sensor finishes.
 
         Parameters
         ----------
         image : galsim.Image
-            float32 or float64 [e-]; changed in place.  Its first pixel is the sensor's.
+            Image of float32 or float64 [e-], changed in place; its first pixel is the sensor's.
 
         Raises
         ------
         SensorError
-            The image was finished before and has not been exposed anew; values that are not
-            finite; another shape than the layout's.  The image is unchanged.
+            The image was finished before and not exposed again, holds values that are not
+            finite, or has another shape than the layout.  The image is unchanged.
 
         Examples
         --------

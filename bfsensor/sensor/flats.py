@@ -1,4 +1,4 @@
-"""Flats without photons: areas follow charge, charge follows areas, step by step."""
+"""Flats drawn without photons, from the pixel areas of a sensor, in small steps of charge."""
 
 from __future__ import annotations
 
@@ -27,44 +27,46 @@ def draw_flat(
     border: int = 8,
     dtype: type = np.float32,
 ) -> galsim.Image:
-    """Draw a flat with the correlations that the sensor's areas give it.
+    """Draw a flat with the correlations that follow from the sensor's pixel areas.
 
-    In each step every pixel collects a Poisson number of electrons about its area times the
-    step; the areas are those of the charge in the middle of the step, as expected.  All
+    In each step every pixel collects a Poisson number of electrons, whose mean is its area times
+    the step; the areas are those of the charge expected in the middle of the step.  All
     light converts near the back surface; a flat in the far red needs photons.  Effects of the
-    sensor act as on an exposure of the kind 'flat' that begins at its first pixel,
+    sensor act as on an exposure of the kind 'flat' that begins at its first pixel, those of
     :meth:`BrighterFatterSensor.finish` included.
 
     Parameters
     ----------
     sensor : BrighterFatterSensor or SiliconSensor
-        Gives the areas, rings and maps among them.
+        Sensor whose areas are used, with its rings and maps.
     shape : tuple of int
-        Rows and columns of the image.
+        Rows and columns of the image, at least 1.
     level : float
-        Mean electrons a pixel.
+        Mean charge of a pixel [e-], above 0.
     step : float
-        Mean electrons a pixel and step.  What a step's own fluctuations do to it is made up
-        in the next: of n steps the correlations lack 1 / n^2, not 1 / n.
+        Mean charge of a pixel in a step [e-], above 0.  The response to a step's own fluctuations
+        is added in the next step: with n steps the correlations are too small by a part 1 / n^2,
+        not 1 / n.
     rng : galsim.BaseDeviate, optional
         Source of the seed.
-    illumination : ndarray, optional
-        Relative illumination, of the given shape.
+    illumination : ndarray, shape ``shape``, optional
+        Relative illumination, at least 0; by default 1.
     border : int
-        Pixels drawn around the image and cut off: without light from outside the last rows
-        and columns would be too small.
+        Width [pixel] of a frame that is drawn around the image and cut off; without charge
+        outside, pixels of the last rows and columns would be too small.
     dtype : type
-        float32 or float64.
+        Type of the pixels, float32 or float64.
 
     Returns
     -------
     galsim.Image
-        Electrons.
+        The flat [e-], lower left pixel (1, 1).
 
     Raises
     ------
     SensorError
-        A value that is not allowed.
+        A level or step that is not above 0, an illumination of another shape or negative, or
+        pixels that reach the full well of effects.
 
     Examples
     --------
@@ -94,7 +96,7 @@ def iterate_flat(
     border: int = 8,
     dtype: type = np.float32,
 ) -> Iterator[galsim.Image]:
-    """Draw a flat as :func:`draw_flat` does, giving the image after every step.
+    """Draw a flat as :func:`draw_flat` does, with the image after every step.
 
     Parameters
     ----------
@@ -104,8 +106,20 @@ def iterate_flat(
     Yields
     ------
     galsim.Image
-        A view of the image as it is; of the last all charge is collected, and effects at the
-        end of an exposure have not acted.
+        View of the image [e-] after a step; it changes with the next step.  The last one holds
+        all charge, but effects at the end of an exposure have not acted.
+
+    Raises
+    ------
+    SensorError
+        As for :func:`draw_flat`.
+
+    Examples
+    --------
+    >>> from bfsensor import SiliconSensor
+    >>> levels = [flat.array.mean() for flat in iterate_flat(SiliconSensor(), (16, 16), 3000.0)]
+    >>> len(levels)
+    3
     """
     _check_request(shape, level, step, border)
     ny, nx = shape
@@ -120,7 +134,7 @@ def iterate_flat(
     inside = galsim.BoundsI(border + 1, border + nx, border + 1, border + ny)
     steps = int(np.ceil(level / step))
     each = level / steps
-    # Rows of photons' coordinates are those of the image without its border.
+    # Rings and maps are placed by the coordinates of the image without its border.
     centre = galsim.PositionI(-border, -border)
     areas: NDArray[np.floating] = sensor.calculate_pixel_areas(
         whole, centre, use_flux=False
@@ -128,7 +142,8 @@ def iterate_flat(
     excess: FloatArray = np.zeros(light.shape)
     for _ in range(steps):
         middle = whole.copy()
-        # Half of the last step's fluctuations count twice: they were not felt in their own.
+        # The areas of a step do not know its own fluctuations, which on average act during half
+        # of it: the next step counts half of them once more.
         kept = np.exp(-law.loss * whole.array.astype(float)) if law.loss else 1.0
         middle.array[...] += (0.5 * each) * light * areas * kept + 0.5 * excess
         areas = sensor.calculate_pixel_areas(middle, centre).array
@@ -149,13 +164,15 @@ def iterate_flat(
 
 
 def _check_request(shape: tuple[int, int], level: float, step: float, border: int) -> None:
-    """Refuse flats that cannot be."""
+    """Refuse a level or step that is not above 0, an empty shape, and a negative border."""
     if not (level > 0 and np.isfinite(level)):
         raise SensorError(f"level = {level} e- must be a finite number above 0 e-")
     if not (step > 0 and np.isfinite(step)):
         raise SensorError(f"step = {step} e- must be a finite number above 0 e-")
     if min(shape) < 1 or border < 0:
-        raise SensorError(f"shape = {shape} and border = {border} must not be negative")
+        raise SensorError(
+            f"shape = {shape} must be at least (1, 1), border = {border} at least 0"
+        )
 
 
 def _light(

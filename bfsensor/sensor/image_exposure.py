@@ -1,4 +1,4 @@
-"""One image while it collects photons: its charge, and what moves its boundaries."""
+"""Exposure of one image: its charge, the effective charges, and the calls of the kernels."""
 
 from __future__ import annotations
 
@@ -21,29 +21,41 @@ from bfsensor.sensor.threads import threads_to_use
 from bfsensor.typing import FloatArray
 
 _HOT_PAGES, _HOT_EDGES = 256, 4096
+# Room for edges that are evaluated once a block, in tiles and in edges.  Chosen: enough for a few
+# stars; further edges are evaluated electron by electron, which is slower with the same result.
+
 _EMPTY = np.zeros(0, np.float32)
+"""Array in place of one that a sensor does not need (by definition empty)."""
+
 _EMPTY_2 = np.zeros((0, 0), np.float32)
+"""The same with two dimensions (by definition empty)."""
+
 _NO_STRIKES = np.zeros((0, 0), np.int32)
+"""The same of whole numbers (by definition empty)."""
 
 
 @dataclass(frozen=True)
 class Physics:
-    """What a sensor is made of, as the kernels take it.
+    """The parts of a sensor as the kernels take them.
 
     Attributes
     ----------
-    edges, response, medium : Edges, Response, Medium
-        See there.
+    edges : Edges
+        Shifts of edges by effective charge.
+    response : Response
+        Effective charge by charge and background.
+    medium : Medium
+        Silicon: thickness, absorption lengths, diffusion.
     full_well : float
-        Electrons at which a pixel spills along its column; inf where it does not.
+        Charge at which a pixel spills along its column [e-]; inf where it does not.
     spill_along_y : bool
-        Columns run along y.
+        Whether columns run along y.
     block : float
-        Electrons between two renewals of the boundaries, 0: only by hand.
+        Electrons between two renewals of the boundaries; 0: only :meth:`ImageExposure.renew`.
     predict : bool
-        Use the charge expected in the middle of the block.
+        Whether the charge expected in the middle of a block acts, or that at its start.
     loss : float
-        q [1/e-]: an electron is lost with probability 1 - exp(-q Q), Q the charge it meets.
+        q [1/e-]: an electron is lost with probability 1 - exp(-q Q) where it meets charge Q.
     """
 
     edges: Edges
@@ -57,12 +69,12 @@ class Physics:
 
 
 class ImageExposure:
-    """Collects photons in one image.
+    """Exposure that collects photons in one image.
 
     Parameters
     ----------
     image : ndarray, shape (ny, nx)
-        Electrons, float32 or float64, any strides; changed in place.  What is in it moves
+        Charge [e-], float32 or float64, any strides.  Charge that is in it already moves
         the boundaries from the start.
     physics : Physics
         The sensor.
@@ -71,7 +83,7 @@ class ImageExposure:
     origin : tuple of float
         Position (x, y) of that corner in the coordinates of the photons.
     key : tuple of int
-        Two words of 32 bits: the same key, the same random numbers.
+        Key of the random numbers, two words of 32 bits.
     threads : int
         Threads to use; the result does not depend on it.
     """
@@ -87,7 +99,7 @@ class ImageExposure:
     ) -> None:
         self.physics = physics
         self.pattern = pattern
-        # Factor on the light by pixel of the sensor, and what takes positions to its frame.
+        # Factor on the light by pixel of the sensor, and the offset of positions to its frame.
         self.light_factor: FloatArray | None = None
         self.to_sensor = (0.0, 0.0)
         self.threads = threads
@@ -115,7 +127,7 @@ class ImageExposure:
         )  # fmt: skip
 
     def add(self, image: NDArray[np.floating], light: Light) -> float:
-        """Collect photons; returns the flux that stays in the image."""
+        """Collect photons in the image, in place; returns the flux that was collected [e-]."""
         p = self.physics
         with _in_rows(image) as pixels:
             arguments: Any = (
@@ -128,7 +140,7 @@ class ImageExposure:
                 return float(_shoot.shoot_on_threads(*arguments, threads, *self._buffers))
 
     def renew(self, image: NDArray[np.floating]) -> None:
-        """Renew the boundaries now."""
+        """Renew the boundaries from the image's charge now."""
         p = self.physics
         with _in_rows(image) as pixels:
             _shoot.renew(
@@ -136,7 +148,7 @@ class ImageExposure:
             )
 
     def copy(self) -> ImageExposure:
-        """Give an independent copy."""
+        """Return an independent copy."""
         other = copy.copy(self)
         other.charges = Charges(*(_copied(part) for part in self.charges))
         other.hot = Hot(*(part.copy() for part in self.hot))
@@ -147,7 +159,7 @@ class ImageExposure:
 
     @property
     def diagnostics(self) -> dict[str, float]:
-        """Electrons that spilled, left the image, crossed or were lost, and held pixels."""
+        """Counts of the exposure, as in :attr:`bfsensor.sensor.base.EngineSensor.diagnostics`."""
         sums, counters = self.ledger.sums, self.ledger.counters
         return {
             "photons": int(counters[_charge.PHOTONS]),
@@ -162,9 +174,9 @@ class ImageExposure:
 
 @contextmanager
 def _in_rows(image: NDArray[np.floating]) -> Iterator[NDArray[np.floating]]:
-    """Give the image with its pixels one after another, itself or a copy that is written back.
+    """Yield the image as a C-contiguous array: itself, or a copy that is written back.
 
-    Kernels are compiled for each layout of memory, which takes longer than any copy.
+    Kernels are compiled once for each memory layout, which takes longer than any copy.
     """
     if image.flags.c_contiguous:
         yield image
@@ -175,7 +187,7 @@ def _in_rows(image: NDArray[np.floating]) -> Iterator[NDArray[np.floating]]:
 
 
 def _no_hot_edges(edges: Edges, tiles: int) -> Hot:
-    """Make room for hot edges: a few stars' worth."""
+    """Allocate the arrays of edges that are evaluated once a block."""
     pages = min(tiles, _HOT_PAGES)
     return Hot(
         page_of=np.full(tiles, -1, np.int32),
@@ -188,6 +200,7 @@ def _no_hot_edges(edges: Edges, tiles: int) -> Hot:
 
 
 def _copied(part: Any) -> Any:
+    """Copy of an array; anything else itself."""
     return part.copy() if isinstance(part, np.ndarray) else part
 
 
@@ -206,7 +219,7 @@ def _allocate(image: NDArray[np.floating], physics: Physics) -> tuple[Charges, L
         return np.zeros(tiles, kind)
 
     charges = Charges(
-        # A linear sensor that looks at no time ahead needs no effective charge.
+        # A linear sensor that does not predict takes the charge itself as effective charge.
         first=np.zeros(size, np.float32) if modes or physics.predict else charge,
         second=np.zeros(size, np.float32) if modes else _EMPTY,
         stride=stride,
@@ -218,7 +231,7 @@ def _allocate(image: NDArray[np.floating], physics: Physics) -> tuple[Charges, L
         margins=by_tile(),
         ranges=by_tile(np.int64),
     )
-    # A block that touches more pixels is taken over from the whole image.
+    # Pixels that one block may list; if it touches more, all pixels of the image are updated.
     longest = nx * ny // 8 + 65536
     ledger = Ledger(
         charge=charge,
@@ -233,7 +246,7 @@ def _allocate(image: NDArray[np.floating], physics: Physics) -> tuple[Charges, L
         flagged=by_tile(np.int64),
         spill_from=np.full((2, max(nx, ny)), -1, np.int64),
         spill_to=np.full((2, max(nx, ny)), -1, np.int64),
-        # Zeros of which nothing is touched cost no memory.
+        # The system commits the memory of zeros only where they are written.
         strikes=np.zeros((ny, nx), np.int32) if physics.full_well < np.inf else _NO_STRIKES,
         struck=np.empty(_HOT_EDGES, np.int32),
         counters=np.zeros(_charge.N_COUNTERS, np.int64),

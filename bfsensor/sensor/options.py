@@ -1,4 +1,4 @@
-"""What a sensor may be given: tables by name, numbers in a range, words of a list."""
+"""Checks of a sensor's options: tables by name, numbers in a range, words of a list."""
 
 from __future__ import annotations
 
@@ -13,7 +13,26 @@ from bfsensor.table.table import DistortionTable
 
 
 def find_table(name: str) -> tuple[str, int]:
-    """Find a built-in table or a file, and when it was changed."""
+    """Find a built-in table or a .fits file.
+
+    Parameters
+    ----------
+    name : str
+        Name of a built-in device, or a path.
+
+    Returns
+    -------
+    path : str
+        Absolute path of the table.
+    changed : int
+        Time of its last change [ns], 0 where the file does not exist.
+
+    Raises
+    ------
+    SensorError
+        Neither; the message lists the built-in tables, or says what to do with a file of another
+        kind.
+    """
     folder = tables_dir()
     path = Path(name)
     others = path.suffix in (".toml", ".cfg", ".dat")
@@ -30,29 +49,46 @@ def find_table(name: str) -> tuple[str, int]:
 
 
 def _refuse_other_files(name: str) -> None:
-    """Say where a device file or a table of GalSim's belongs, given as a table of ours."""
+    """Refuse device files and GalSim's tables, with the call that takes them."""
     if name.endswith(".toml"):
         raise SensorError(
-            f"{name} is a device file, a sensor needs its distortion table: run `bfsensor table "
+            f"{name} is a device file, and a sensor needs a distortion table: run `bfsensor table "
             f"{name}` and give the .fits file that it writes"
         )
     stem = name.removesuffix(".cfg").removesuffix(".dat")
     if Path(f"{stem}.cfg").is_file() or (galsim_folder() / f"{stem}.cfg").is_file():
         raise SensorError(
-            f"{name} is a table of GalSim's: bfsensor.SiliconSensor takes it, "
+            f"{name} is a table in GalSim's format: give it to bfsensor.SiliconSensor; "
             "BrighterFatterSensor takes tables made by `bfsensor table`"
         )
 
 
 def galsim_folder() -> Path:
-    """Find the folder of the tables that come with GalSim."""
+    """Return the folder of the tables that come with GalSim."""
     import galsim
 
     return Path(galsim.meta_data.share_dir) / "sensors"
 
 
 def load_table(path: str, changed: int) -> DistortionTable:
-    """Read a table; another than when the sensor was made is refused."""
+    """Read a table, once for all sensors of a process while the file stays unchanged.
+
+    Parameters
+    ----------
+    path : str
+        Absolute path of the table.
+    changed : int
+        Time of the file's last change [ns], from :func:`find_table`.
+
+    Returns
+    -------
+    DistortionTable
+
+    Raises
+    ------
+    SensorError
+        The file cannot be read as a table.
+    """
     try:
         table = _read(path, changed)
     except TableError as error:
@@ -61,7 +97,7 @@ def load_table(path: str, changed: int) -> DistortionTable:
 
 
 def check_table(table: DistortionTable | None) -> DistortionTable:
-    """Give a table in memory back; anything else is refused."""
+    """Return a table in memory; refuse anything else."""
     if not isinstance(table, DistortionTable):
         raise SensorError(f"table must be a DistortionTable, not {type(table).__name__}")
     return table
@@ -69,32 +105,31 @@ def check_table(table: DistortionTable | None) -> DistortionTable:
 
 @lru_cache(maxsize=8)
 def _read(path: str, changed: int) -> DistortionTable:
-    """Read a table once for all sensors of a process."""
+    """Read a table; ``changed`` is part of the cache's key, so that a changed file is read again."""
     return DistortionTable.read(path)
 
 
 def read_device(table: DistortionTable, name: str) -> Device:
-    """Give the device in a table; a table without one is refused."""
+    """Return the device in a table; refuse a table without one."""
     if not table.device_text:
         raise SensorError(
-            f"the table of {name} holds no device, which gives drift field and temperature"
+            f"the table of {name} holds no device, from which drift field and temperature are taken"
         )
     return Device.from_toml(table.device_text)
 
 
 def check_reach(qdist: int | None, table: DistortionTable, name: str) -> int:
-    """Give how far charge acts [pixel], by default as far as the table reaches."""
+    """Return the distance at which charge acts [pixel], by default the table's reach."""
     reach = table.reach if qdist is None else int(qdist)
     if not 0 <= reach <= table.reach:
         raise SensorError(
-            f"qdist = {qdist} must be from 0 to {table.reach}: the table of {name} holds "
-            "charge no further away"
+            f"qdist = {qdist} must be from 0 to {table.reach}, the reach of the table of {name}"
         )
     return reach
 
 
 def check_full_well(full_well: float | None, table: DistortionTable) -> float:
-    """Give the full well [e-], by default the table's; inf where there is none."""
+    """Return the full well [e-], by default the table's; inf where there is none."""
     well = table.full_well if full_well is None else float(full_well)
     if not (math.isnan(well) or well > 0):
         raise SensorError(f"full_well = {full_well} must be above 0 e- (inf: none)")
@@ -102,7 +137,7 @@ def check_full_well(full_well: float | None, table: DistortionTable) -> float:
 
 
 def check_threads(threads: int) -> int:
-    """Give a number of threads."""
+    """Return a number of threads; refuse less than 1."""
     if int(threads) < 1:
         raise SensorError(f"threads = {threads} must be at least 1")
     return int(threads)
@@ -111,7 +146,7 @@ def check_threads(threads: int) -> int:
 def check_number(
     name: str, value: float, *, low: float = -math.inf, high: float = math.inf
 ) -> float:
-    """Give a finite number in a range; anything else is refused."""
+    """Return a finite number within a range; refuse anything else."""
     number = float(value)
     if not (math.isfinite(number) and low <= number <= high):
         allowed = f" from {low:g}" if math.isfinite(low) else ""
@@ -121,7 +156,7 @@ def check_number(
 
 
 def check_word(name: str, value: str, allowed: tuple[str, ...]) -> str:
-    """Give one of some words; anything else is refused."""
+    """Return a word of a list; refuse anything else."""
     if value not in allowed:
         raise SensorError(f"{name} = {value!r} must be one of {', '.join(allowed)}")
     return value

@@ -1,4 +1,4 @@
-"""Fixed shifts of pixel boundaries: tree rings, and maps of any shape."""
+"""Shifts of pixel boundaries that do not depend on charge: tree rings, and maps of any shape."""
 
 from __future__ import annotations
 
@@ -16,8 +16,16 @@ from bfsensor.files import refuse_existing, written_whole
 from bfsensor.typing import FloatArray
 
 _FINER = 16
+"""Samples of a ring function on each of its own steps.
+
+Chosen: the kernels interpolate linearly between the samples; twice as many quarter the error and
+double the memory."""
+
 _NOTHING = np.zeros(0)
+"""Array in place of rings that are not there (by definition empty)."""
+
 _NO_MAP = np.zeros((0, 0))
+"""Array in place of a map that is not there (by definition empty)."""
 
 Stills = tuple[NDArray[np.float32], NDArray[np.float32]]
 """Displacements of edges between columns and between rows [pixel], or dx and dy of points."""
@@ -30,14 +38,19 @@ class ShiftMap:
     Attributes
     ----------
     dx, dy : ndarray, shape (ny, nx)
-        Shift of the boundaries [pixel] at pixel corners and between them, linearly
-        interpolated; zero outside.  ``dx[j, i]`` belongs to the corner at
-        (``x0`` + i, ``y0`` + j) in image coordinates, the pixel centres at whole numbers.
+        Shift of the boundaries along x and y [pixel] at pixel corners, interpolated linearly
+        between them and zero outside; at least 2 x 2.  ``dx[j, i]`` belongs to the corner at
+        (``x0`` + i, ``y0`` + j) in image coordinates, in which pixel centres are whole numbers.
     x0, y0 : float
-        Where the map begins, by default at the lower left corner of pixel (1, 1).
+        Image coordinates of ``dx[0, 0]``, by default the lower left corner of pixel (1, 1).
     depth : {'bulk', 'uniform'}
         'bulk': the shift grows with the height of conversion like that of tree rings;
-        'uniform': it is the same for all, as of boundaries that lie elsewhere.
+        'uniform': it is the same for all heights, as for misplaced boundaries.
+
+    Raises
+    ------
+    SensorError
+        Arrays that are not two-dimensional, differ in shape or are not finite, or another depth.
 
     Examples
     --------
@@ -95,17 +108,18 @@ class ShiftMap:
     ) -> ShiftMap:
         """Make the map of a sensor whose boundaries shift near its edges.
 
-        Shifts of opposite edges add up, and those of x and y do not know of each other: the
-        corners of a sensor are not modelled.  Around the sensor the shift of its outermost
-        boundaries is held, so that light beyond the last pixel lands where they say.  The
-        shift grows with the height of conversion like that of long doping ripples ('bulk'):
-        that of a guard ring does so from about three thicknesses / pi on; nearer, light that
-        converts deep is moved too little or too much (``validation/edges/edge_shift.ipynb``).
+        Shifts of opposite edges add up, and those in x and in y are independent: the
+        corners of a sensor are not modelled.  Outside the sensor the shift of its outermost
+        boundaries continues unchanged, so that light beyond the last pixel is shifted by it.  The
+        shift grows with the height of conversion like that of long doping ripples ('bulk').  For
+        a guard ring that holds at distances above about 3 / pi thicknesses from the edge; nearer
+        to it, light that converts deep is moved too little or too much
+        (``validation/edges/edge_shift.ipynb``).
 
         Parameters
         ----------
         shape : tuple of int
-            Rows and columns of the sensor; its first pixel is (1, 1).
+            Rows and columns of the sensor, at least 1; its first pixel is (1, 1).
         x_low, x_high, y_low, y_high : array_like, shape (n + 1,), optional
             Shifts [pixel] of the boundaries at 0, 1, ..., n pixels from that edge for
             conversion at the back surface, positive away from the edge: the last row of
@@ -118,8 +132,8 @@ class ShiftMap:
         Raises
         ------
         SensorError
-            Shifts that are not finite, not one-dimensional, that cross one another, or that
-            end before they have fallen to a hundredth.
+            Shifts that are not finite, not one-dimensional, that make boundaries cross, or whose
+            last value is above a hundredth of the largest.
 
         Examples
         --------
@@ -152,10 +166,19 @@ class ShiftMap:
     def read(cls, path: str | os.PathLike[str]) -> ShiftMap:
         """Read a FITS file with images DX and DY, and X0, Y0 and DEPTH in the header.
 
+        Parameters
+        ----------
+        path : path-like
+            The file; missing keywords have the defaults of the attributes.
+
+        Returns
+        -------
+        ShiftMap
+
         Raises
         ------
         SensorError
-            Not such a file; names it.
+            The file cannot be read as a shift map; the message names it.
         """
         from astropy.io import fits
 
@@ -176,7 +199,20 @@ class ShiftMap:
             ) from None
 
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write what :meth:`read` reads (beside, then renamed)."""
+        """Write a FITS file that :meth:`read` reads, whole or not at all.
+
+        Parameters
+        ----------
+        path : path-like
+            Where to.
+        overwrite : bool
+            Replace an existing file.
+
+        Raises
+        ------
+        SensorError
+            The file exists and ``overwrite`` is not set, or it cannot be written.
+        """
         from astropy.io import fits
 
         refuse_existing(path, overwrite, SensorError)
@@ -193,7 +229,7 @@ class ShiftMap:
 
 
 def _edge_line(name: str, given: ArrayLike | None, pixels: int) -> FloatArray:
-    """Shifts [pixel] at all boundaries of a row or column, from one edge on."""
+    """Shifts [pixel] at all boundaries of a row or column, counted from one edge."""
     out = np.zeros(pixels + 1)
     if given is None:
         return out
@@ -218,13 +254,18 @@ def _edge_line(name: str, given: ArrayLike | None, pixels: int) -> FloatArray:
 def sample_rings(function: Any) -> tuple[FloatArray, float]:
     """Sample a radial LookupTable on equal steps, a sixteenth of its own.
 
+    Parameters
+    ----------
+    function : galsim.LookupTable
+        Radial shift [pixel] by radius [pixel].
+
     Returns
     -------
     values : ndarray
-        Shift [pixel] at radii ``n step``.  The last two are 0: beyond the function's end nothing
-        moves, and within a step of it shifts fall to that.
+        Shift [pixel] at radii ``n step``; 0 before the table's first radius.  The last two are 0:
+        beyond the table's last radius nothing moves, and within a step of it shifts fall to that.
     step : float
-        [pixel]
+        Step of the radius [pixel]; at most 4 million samples are taken.
     """
     x = np.asarray(function.getArgs(), float)
     steps = np.diff(x)
@@ -249,13 +290,13 @@ def make_pattern(
     Parameters
     ----------
     rings : tuple, optional
-        From :func:`sample_rings`.
+        Samples and step from :func:`sample_rings`.
     ring_centre : tuple of float
-        In original image coordinates [pixel].
+        Centre of the rings in original image coordinates [pixel].
     ring_factor : ndarray
-        Size of the shift by height, equal steps from the gates to the back.
+        Factor on the shift by height, in equal steps from the gates to the back.
     shift_map : ShiftMap, optional
-        In original image coordinates.
+        Map in original image coordinates.
     corner : tuple of float
         Original coordinates of the lower left corner of the image.
 
@@ -280,22 +321,24 @@ def make_pattern(
 
 
 def fine_stills(stills: Stills, rows: tuple[int, int], columns: tuple[int, int]) -> Stills:
-    r"""Displacements of edges at two points a pixel, whose means along each edge they are.
+    r"""Sample mean displacements of edges at two points a pixel, with the same means.
 
-    Corners lie at the mean of the edges that meet there, the middle m of an edge of mean e
-    between corners c so that :math:`(c_0 + 2 m + c_1) / 4 = e`.  Around the sensor the rim's are
-    held.
+    Corners are displaced by the mean of the edges that meet there, the middle m of an edge of
+    mean e between corners c so that :math:`(c_0 + 2 m + c_1) / 4 = e`.  Outside the sensor the
+    displacements of its rim continue unchanged.
 
     Parameters
     ----------
     stills : pair of ndarray
-        Of the edges between columns, (ny, nx + 1), and between rows, (ny + 1, nx) [pixel].
+        Mean displacements [pixel] of the edges between columns, shape (ny, nx + 1), and between
+        rows, shape (ny + 1, nx).
     rows, columns : tuple of int
-        Where to begin and end, in pixels from the sensor's corner.
+        First and last row and column line, in pixels from the sensor's corner.
 
     Returns
     -------
     dx, dy : ndarray, shape (2 (rows[1] - rows[0]) + 1, 2 (columns[1] - columns[0]) + 1)
+        Displacements [pixel] at corners and at the middles between them.
     """
     x = _fine(stills[0], rows, columns)
     y = _fine(stills[1].T, columns, rows).T
@@ -305,7 +348,7 @@ def fine_stills(stills: Stills, rows: tuple[int, int], columns: tuple[int, int])
 def _fine(
     edge: NDArray[np.float32], along: tuple[int, int], lines: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """Of the edges of lines, (pixels along, lines)."""
+    """Samples of the normal displacement of edges along lines, (pixels along, lines)."""
     line = np.clip(np.arange(lines[0], lines[1] + 1), 0, edge.shape[1] - 1)
     pixel = np.clip(np.arange(along[0] - 1, along[1] + 1), 0, edge.shape[0] - 1)
     mean = edge[pixel[:, None], line]

@@ -1,4 +1,4 @@
-"""GalSim's SiliconSensor on our engine."""
+"""SiliconSensor: a drop-in for ``galsim.SiliconSensor`` on bfsensor's kernels."""
 
 from __future__ import annotations
 
@@ -23,18 +23,28 @@ from bfsensor.sensor.options import galsim_folder
 from bfsensor.table.galsim_format import read_sides
 from bfsensor.typing import FloatArray
 
-_DEPTH_SCALE = 12.0  # um; GalSim: shifts grow as tanh(z / 12 um), an empirical fit
-_SURFACE_PATH = 1.0  # um; depth of conversion in GalSim where there are no wavelengths
-_EXTRA_COLLECT, _EXTRA_BARRIER = 12.0, 15.0  # V; GalSim's estimates of the channel
+_DEPTH_SCALE = 12.0
+"""Height [um] by which shifts grow as tanh(z / 12 um): published, an empirical fit of GalSim's
+SiliconSensor."""
+
+_SURFACE_PATH = 1.0
+"""Depth of conversion below the back surface [um] of photons without wavelengths: published, that
+of GalSim's SiliconSensor."""
+
+_EXTRA_COLLECT, _EXTRA_BARRIER = 12.0, 15.0
+# Potential of the channel above that of the collecting and of the barrier gates [V]: published,
+# estimates of GalSim's SiliconSensor.
+
 _KEYS = (
     "NumVertices", "PixelBoundaryNx", "PixelBoundaryNy", "PixelSizeX", "SensorThickness",
     "CollectedCharge_0_0", "NumPhases", "CollectingPhases", "ChannelStopWidth",
     "FieldOxideTaper", "Vbb", "Vparallel_lo", "Vparallel_hi", "qfh", "CCDTemperature",
 )  # fmt: skip
+"""Keys that a .cfg file must hold, each with a number."""
 
 
 class SiliconSensor(EngineSensor):
-    r"""A drop-in for ``galsim.SiliconSensor``: its signature, files and documented physics.
+    r"""Drop-in for ``galsim.SiliconSensor`` with its signature, files and documented physics.
 
     Shifts are linear in charge and do not depend on the background; they scale with the
     height of conversion as :math:`\tanh(z / 12\,\mu m)`; boundaries are renewed every
@@ -42,28 +52,38 @@ class SiliconSensor(EngineSensor):
     above the gates, others are lost.  Unlike GalSim's, the edges at the right and the top
     of an image move as well, the depth scaling acts on all photons and on tree rings,
     files are read without evaluating them, and ``qdist`` beyond the table is refused.
-    Random numbers are our own: images agree with GalSim's in distribution.
+    Random numbers differ from GalSim's: images agree with its own in distribution only.
 
     Parameters
     ----------
     name : str
         Stem of the .cfg and .dat files: a path, or one of those shipped with GalSim.
     strength : float
-        Multiplies the shifts.
+        Factor on all shifts.
     rng : galsim.BaseDeviate, optional
         Source of the key of the random numbers.
     diffusion_factor : float
-        Multiplies the diffusion.
+        Factor on the width of the diffusion.
     qdist : int
-        Charge so many pixels away acts, at most what the table holds (4).
+        Largest distance [pixel] at which charge acts, up to the table's reach (4 in GalSim's).
     nrecalc : float
-        Electrons in the image between renewals of the boundaries; 0: only by ``recalc``.
+        Electrons in the image between renewals of the boundaries, divided by ``strength``; 0:
+        they are renewed by ``recalc`` only.
     treering_func : galsim.LookupTable, optional
-        Radial shift of the boundaries [pixel].
+        Radial shift of the boundaries [pixel], by radius [pixel].
     treering_center : galsim.PositionD
         Centre of the rings in original image coordinates.
     transpose : bool
-        Exchange x and y of the table.
+        Whether x and y of the table are exchanged.
+
+    Raises
+    ------
+    OSError
+        The files are missing or cannot be read as a table; the message names them.
+    galsim.GalSimRangeError
+        ``qdist`` is beyond the table.
+    TypeError
+        ``treering_func`` is no LookupTable, or ``treering_center`` no PositionD.
 
     Examples
     --------
@@ -118,6 +138,7 @@ class SiliconSensor(EngineSensor):
         self._init_silicon()
 
     def _read_absorption(self) -> None:
+        """Read GalSim's table of absorption lengths [um] by wavelength [nm]."""
         path = os.path.join(galsim.meta_data.share_dir, "sensors", "abs_length.dat")
         data = np.loadtxt(path, skiprows=1)
         self.abs_length_table = galsim.LookupTable(
@@ -126,13 +147,13 @@ class SiliconSensor(EngineSensor):
 
     @property
     def effective_nrecalc(self) -> float:
-        """Electrons between renewals, for the strength."""
+        """Electrons in the image between renewals: ``nrecalc`` divided by the strength."""
         return self.nrecalc / self.strength if self.strength else self.nrecalc
 
     def _diffusion(self) -> float:
-        """Diffusion of an electron from the back surface [um], with GalSim's estimate.
+        """Width of the diffusion of electrons from the back surface [um], as GalSim estimates it.
 
-        Einstein's relation in a uniform field, times the measured factor.
+        It is Einstein's relation in a uniform field, times the measured factor.
         """
         c = self.config
         stop = (c["ChannelStopWidth"] + 2 * c["FieldOxideTaper"]) / c["PixelSizeX"]
@@ -207,7 +228,7 @@ class SiliconSensor(EngineSensor):
 def _read(
     cfg: str, dat: str, changed: tuple[int, ...]
 ) -> tuple[tuple[FloatArray, FloatArray], FloatArray]:
-    """Read a table once for all sensors of a process."""
+    """Read a table; ``changed`` is part of the cache's key, so that changed files are read again."""
     return read_sides(cfg, dat)
 
 
@@ -216,12 +237,12 @@ def _edges(
     cfg: str, dat: str, changed: tuple[int, ...], per_electron: float, transpose: bool,
     reach: int, thickness: float,
 ) -> Edges:  # fmt: skip
-    """Pack a table for the engine, once for all sensors alike."""
+    """Pack a table for the kernels, once for all sensors with the same arguments."""
     sides, points = _read(cfg, dat, changed)
     if transpose:
         sides = transpose_sides(*sides)
     scale = np.tanh(np.linspace(0.0, 1.0, STEPS + 1) * thickness / _DEPTH_SCALE)
-    # Where it is constant to single precision edges are looked up faster.
+    # Where the factor is 1 to single precision, edges are looked up faster.
     scale[scale > 1 - 5e-7] = 1.0
     return make_edges(
         (per_electron * sides[0][None], per_electron * sides[1][None]), None, points,
@@ -230,7 +251,7 @@ def _edges(
 
 
 def check_rings(function: Any, centre: Any) -> None:
-    """Refuse what is not a ring pattern, as GalSim does."""
+    """Refuse rings that are no LookupTable and centres that are no PositionD, as GalSim does."""
     if function is not None and not isinstance(function, galsim.LookupTable):
         raise TypeError("treering_func must be a galsim.LookupTable")
     if not isinstance(centre, galsim.PositionD):
@@ -250,7 +271,7 @@ def _find(name: str) -> tuple[str, str]:
         or (tables_dir() / name / "table.fits").is_file()
     ):
         raise OSError(
-            f"{name} is a table of bfsensor's: BrighterFatterSensor takes it, SiliconSensor takes "
+            f"{name} is a table of bfsensor: give it to BrighterFatterSensor; SiliconSensor takes "
             "the stem of GalSim's .cfg and .dat files"
         )
     known = sorted(path.stem for path in galsim_folder().glob("*.cfg"))
@@ -260,7 +281,7 @@ def _find(name: str) -> tuple[str, str]:
 
 
 def _defaults(config: dict[str, Any], path: str) -> dict[str, Any]:
-    """Check the keys that count."""
+    """Refuse a configuration in which a key of ``_KEYS`` holds no number."""
     if "PixelSizeX" not in config and "PixelSize" in config:
         config["PixelSizeX"] = config["PixelSize"]
     for key in _KEYS:

@@ -1,4 +1,4 @@
-"""Independent points of work on any executor, and sweeps of a device over its quantities."""
+"""Sweeps of a device over its quantities, and resumable runs of independent points on executors."""
 
 from typing import TYPE_CHECKING
 

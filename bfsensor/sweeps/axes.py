@@ -1,4 +1,4 @@
-"""What a sweep goes over: quantities of a device and the light, with their values."""
+"""Axes of a sweep: quantities of a device, or the wavelength of the light, with their values."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from bfsensor.device.written_units import to_internal
 from bfsensor.errors import DeviceError, SweepError
 
 WAVELENGTH = "wavelength"
-"""Name of the light's wavelength, which is no quantity of a device."""
+"""Name of the axis for the vacuum wavelength of the light, which is no quantity of a device."""
 
 
 @dataclass(frozen=True)
 class Swept:
-    """A quantity and the values it takes.
+    """A swept quantity and the values that it takes.
 
     Attributes
     ----------
@@ -28,9 +28,14 @@ class Swept:
     unit : str
         Unit of ``values``; empty for numbers.
     values : tuple of float
-        In ``unit``, in the order given.
+        Values [``unit``], in the order given.
     texts : tuple of str
         The same with units, as :meth:`bfsensor.device.device.Device.with_value` takes them.
+
+    Examples
+    --------
+    >>> Swept("operating_point.back_bias", "V", (-50.0,), ("-50 V",)).short
+    'back_bias'
     """
 
     name: str
@@ -45,28 +50,31 @@ class Swept:
 
 
 def parse_swept(key: str, text: str, device: Device) -> Swept:
-    """Read what to sweep over.
+    """Read one axis of a sweep from text.
 
     Parameters
     ----------
     key : str
-        Quantity of the device, dotted or short where that is unique, or ``wavelength``.
+        Name of a quantity of the device, dotted, or its last part where that is unique; or
+        ``wavelength``.
     text : str
-        Quantities with units: a list ``-30V,-50V,-70V``, or first, last and number of values
-        equally far from each other, ``-30V:-70V:5``.
+        Values with units: a list ``-30V,-50V,-70V``; or first value, last value and number of
+        equally spaced values, at least 2, ``-30V:-70V:5``.
     device : Device
-        To be swept.
+        The device to be swept.
 
     Returns
     -------
     Swept
+        Values in the unit in which device files write the quantity; wavelengths in nm.
 
     Raises
     ------
     DeviceError
-        No such quantity (the message names all there are); no unit or the wrong one.
+        No such quantity (the message lists all), a missing or wrong unit, a fraction where a
+        whole number is wanted, or a wavelength that is not above 0.
     SweepError
-        Neither a list nor first:last:number.
+        The text is neither a list nor first:last:number.
 
     Examples
     --------
@@ -86,10 +94,10 @@ def parse_swept(key: str, text: str, device: Device) -> Swept:
         if not count.isdecimal() or int(count) < 2 or "," in text:
             raise SweepError(
                 f"{name}: {text!r} is neither a list such as -30V,-50V nor "
-                "first:last:number of values, from 2, such as -30V:-70V:5"
+                "first:last:number of values (at least 2) such as -30V:-70V:5"
             )
         first, last = (_number(name, end, kind, unit) for end in ends[:2])
-        # Twelve digits: -35 V is meant, not -35.00000000000001 V.
+        # Twelve digits remove the round-off of linspace: -35 V, not -35.00000000000001 V.
         numbers = [float(f"{v:.12g}") for v in np.linspace(first, last, int(count))]
     if name == WAVELENGTH and not all(v > 0 for v in numbers):
         raise DeviceError(f"wavelength: {min(numbers):g} nm must be above 0 nm")
@@ -102,26 +110,28 @@ def parse_swept(key: str, text: str, device: Device) -> Swept:
 
 
 def _known(key: str, device: Device) -> tuple[str, str, str]:
-    """Name, kind and unit of a quantity, or all there are."""
+    """Full name, kind and unit of a quantity; the error lists all quantities."""
     if key == WAVELENGTH:
         return WAVELENGTH, "length", "nm"
     try:
         return device.unit_of(key)
     except DeviceError:
         raise DeviceError(
-            f"no quantity {key!r} to sweep over; there are wavelength and, of "
-            f"{device.name}, {', '.join(device.quantities)} (the last part is enough where "
-            "it is unique)"
+            f"no quantity {key!r} to sweep over; allowed are wavelength and the quantities of "
+            f"{device.name}: {', '.join(device.quantities)} (the last part of a name is enough "
+            "where it is unique)"
         ) from None
 
 
 def _number(name: str, text: str, kind: str, unit: str) -> float:
-    """Value of a text with unit, in the unit that is written."""
+    """Value of a text with unit, converted to ``unit``."""
     try:
         if not kind:
             return float(int(text))
-        to_internal(text, kind)  # says what is wrong
-        # Fifteen digits: 0.08 mm are 80 um, not 80.00000000000001 um.
+        # Raises the error that names the fault of the text.
+        to_internal(text, kind)
+        # Fifteen digits remove the round-off of the conversion: 0.08 mm are 80 um, not
+        # 80.00000000000001 um.
         return float(f"{u.Quantity(text).to_value(u.Unit(unit)):.15g}")
     except ValueError as error:
         fault = error if isinstance(error, DeviceError) else f"{text!r} is no whole number"
@@ -129,12 +139,12 @@ def _number(name: str, text: str, kind: str, unit: str) -> float:
 
 
 def combine(swept: Sequence[Swept], *, paired: bool = False) -> list[tuple[int, ...]]:
-    """Give the points of a sweep: for each, the place of the value of every quantity.
+    """Combine the axes of a sweep to points: for each point, an index into every axis's values.
 
     Parameters
     ----------
     swept : sequence of Swept
-        At least one, no quantity twice.
+        At least one axis, no quantity twice.
     paired : bool
         Take the first values together, then the second ones, and so on, instead of every
         value of one with every value of the others.
@@ -142,12 +152,12 @@ def combine(swept: Sequence[Swept], *, paired: bool = False) -> list[tuple[int, 
     Returns
     -------
     list of tuple of int
-        The last quantity varies fastest.
+        One tuple a point; the last axis varies fastest.
 
     Raises
     ------
     SweepError
-        Nothing to sweep over, one quantity twice, or pairs of unlike lengths.
+        No axis, one quantity twice, or paired axes of unequal lengths.
 
     Examples
     --------
@@ -157,7 +167,7 @@ def combine(swept: Sequence[Swept], *, paired: bool = False) -> list[tuple[int, 
     ([(0, 0), (0, 1), (1, 0), (1, 1)], [(0, 0), (1, 1)])
     """
     if not swept:
-        raise SweepError("nothing to sweep over; say for example back_bias=-30V:-70V:5")
+        raise SweepError("nothing to sweep over; give for example back_bias=-30V:-70V:5")
     names = [s.name for s in swept]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
@@ -168,6 +178,6 @@ def combine(swept: Sequence[Swept], *, paired: bool = False) -> list[tuple[int, 
     if len(set(counts)) > 1:
         given = ", ".join(f"{s.short} {len(s.values)}" for s in swept)
         raise SweepError(
-            f"paired quantities must have as many values as each other: {given}"
+            f"paired quantities must have equal numbers of values, not {given}"
         )
     return [(n,) * len(swept) for n in range(counts[0])]

@@ -1,13 +1,13 @@
-r"""How flats respond as a device is operated or made otherwise: a_ij over swept quantities.
+r"""Sweep of a device: the response a_ij of flats as voltages, thickness, doping or light change.
 
-Every point of a sweep is a device of its own, solved anew:
+Every point of a sweep is a device of its own, for which Poisson's equation is solved:
 
 .. math:: a_{ij} = \frac{1}{A} \frac{\Delta A_{ij}(B + q, B)}{q},
 
 the relative area change of the pixel at lag i in x, j in y per electron by which one pixel
 exceeds all others, which hold the background B.  This is the differential response, which flats
-see (C_ij = a_ij mean^2 in the lowest order); a_00 is negative.  Apart from it, and only where
-asked for, stands the area change of one full pixel among empty ones, the seed paper's.
+see (C_ij = a_ij mean^2 in the lowest order); a_00 is negative.  On request a sweep also gives the
+area changes around one full pixel among empty ones.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from bfsensor.sweeps.rows import LAGS, DeviceSweep, SweepRow
 
 
 def partner_cells(cells: int) -> int:
-    """Mesh that is held against one of ``cells`` for its error: twice or half as fine."""
+    """Cells a pixel of the mesh whose result measures the error of ``cells``: twice or half."""
     return 2 * cells if cells < 16 else max(8, 2 * (cells // 4))
 
 
@@ -55,53 +55,57 @@ def sweep_device(
     progress: Callable[[int, int], None] | None = None,
     command: str = "",
 ) -> DeviceSweep:
-    """Sweep over quantities of a device and the light.
+    """Compute the response of flats at every point of a sweep.
 
     Parameters
     ----------
     device : Device
-        Mirror-symmetric.
+        Mirror-symmetric device, fully depleted.
     swept : sequence of Swept
-        From :func:`bfsensor.sweeps.axes.parse_swept`.  Wavelengths cost nothing: one solution serves
-        all.  A temperature changes the heat of carriers and the absorption; the quasi-Fermi
-        level of the holes stays where the device has it.
+        Axes from :func:`bfsensor.sweeps.axes.parse_swept`.  Further wavelengths cost no time: one
+        solution serves all.  A temperature changes the thermal energy of the carriers and the
+        absorption length; the quasi-Fermi level of the holes stays that of the device.
     paired : bool
-        Take the values pairwise instead of all with all.
+        Take the first values of all axes together, then the second ones, and so on, instead of
+        every combination.
     level : float
-        Background about which the response is taken [e-].
+        Charge of all pixels about which the response is taken [e-], at least 0.
     full_pixel : float
-        Charge of the one full pixel among empty ones [e-]; 0: not wanted.
+        Charge of one full pixel among empty ones [e-] for the area changes around it; 0 leaves
+        them out.
     cells : int
-        Of the mesh, a pixel, even, from 8: 0.4 CPU seconds a level at 8, 1.4 at 16, 3.6 at 32,
-        and two levels a point, of which one is the full well; three with a full pixel.
+        Mesh cells a pixel, even, at least 8.  A level takes 0.4 CPU seconds at 8, 1.4 at 16 and
+        3.6 at 32; a point takes two levels, one of them for the full well, and a third with
+        ``full_pixel``.
     work : Path
-        Folder that keeps finished points; a run that finds them goes on from there.
+        Folder that keeps finished points; a run that finds points there does not repeat them.
     tables : Path, optional
-        Folder for the table of the differential response of every point, point_0000.fits for
-        the first row; rows that differ by the wavelength alone share the first one's.
+        Folder for the distortion table of every point, point_0000.fits for the first row; rows
+        that differ in wavelength alone share the first row's.
     executor : Executor, optional
-        Where the points are solved; by default here.
+        Executor that solves the points; by default this process, one after another.
     progress : callable, optional
-        Called with (points done, points in all).
+        Function that is called with (points done, points in all).
     command : str
-        What made it, for the header.
+        Command line that made the sweep, for the header of its file.
 
     Returns
     -------
     DeviceSweep
-        One row a point.  A point that was refused has a reason and no numbers.
+        One row a point.  A point that was refused has a reason and nan for all results.
 
     Raises
     ------
     SweepError
-        Nothing to sweep, quantities that do not pair, a level or mesh that is not allowed.
+        No axis, paired axes of unequal lengths, a charge below 0 or not finite, or a mesh that is
+        not allowed.
 
     Notes
     -----
     The error of an a_ij is that of the mesh: the relative difference, lag by lag, between the
-    device as given at ``cells`` and at a mesh twice as fine (half as fine from 16 cells on),
-    light converting at the back surface.  One estimate serves all rows, and most of it is
-    common to them.
+    device as given at ``cells`` and on a mesh twice as fine (half as fine from 16 cells on),
+    with light that converts at the back surface.  One estimate serves all rows, and most of the
+    error is common to them.
 
     Examples
     --------
@@ -118,7 +122,7 @@ def sweep_device(
     made = [_device_at(device, swept, place) for place in places]
 
     def plan(made: Device) -> SweepPoint:
-        # What is known about a value does not change the answer, and a swept value is new.
+        # Without provenance: it does not change the response, so it must not change the key.
         text = dataclasses.replace(made, provenance={}).to_toml()
         return SweepPoint(text, level, full_pixel, cells, tables is not None)
 
@@ -163,7 +167,8 @@ def _check_request(level: float, full_pixel: float, cells: int) -> None:
         np.isfinite(level) and level >= 0 and np.isfinite(full_pixel) and full_pixel >= 0
     ):
         raise SweepError(
-            f"level = {level:g} e- and full pixel = {full_pixel:g} e- must be finite, from 0 e-"
+            f"level = {level:g} e- and full pixel = {full_pixel:g} e- must be finite and at "
+            "least 0 e-"
         )
     if cells < 8 or cells % 2:
         raise SweepError(
@@ -177,7 +182,7 @@ def _copy_tables(
     work: Path,
     tables: Path,
 ) -> None:
-    """Put the table of every point where it is asked for, of rows alike the first one's."""
+    """Copy every solved point's table once, under the number of the first row that uses it."""
     tables.mkdir(parents=True, exist_ok=True)
     for n, point in enumerate(wanted):
         if point is not None and wanted.index(point) == n and not solved[point].reason:
@@ -187,14 +192,15 @@ def _copy_tables(
 def _device_at(
     device: Device, swept: Sequence[Swept], place: Sequence[int]
 ) -> Device | str:
-    """Device at a point, or why there is none."""
+    """Device at a point, or the reason why it cannot be built."""
     changes = [
         (one.name, one.texts[n])
         for one, n in zip(swept, place, strict=True)
         if one.name != WAVELENGTH
     ]
     reason = ""
-    # Two gates may pass one another on the way; backwards they then do not.
+    # Values are changed one by one, and each step must be a device: with both gates moved, the
+    # low one may pass the high one in one order and not in the other.
     for order in (changes, changes[::-1]):
         try:
             changed = device
@@ -216,6 +222,7 @@ def _wavelength(swept: Sequence[Swept], place: Sequence[int]) -> float | None:
 
 
 def _row(device: Device, found: PointResponse, wavelength: float | None) -> SweepRow:
+    """Row of a point in light of its wavelength [nm]; None: converted at the back surface."""
     a, areas = found.a[0], found.areas[0]
     if not found.reason:
         a, areas = found.in_light(wavelength, device.operating_point.temperature)

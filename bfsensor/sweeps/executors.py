@@ -1,9 +1,9 @@
-"""Independent points of work on any executor, kept as files, resumable.
+"""Runs of independent points on any executor: every result is kept in a file, runs resume.
 
 Any ``concurrent.futures.Executor`` serves: Python's process pool, Dask's
-``Client.get_executor()``, Parsl's ``ParslPoolExecutor``.  What a point gives is written by
-the process that asked for it, whole or not at all, so that workers need no common disk
-and a run that was killed goes on with the points that are missing.
+``Client.get_executor()``, Parsl's ``ParslPoolExecutor``.  The process that calls writes the
+result of each point, whole or not at all: workers need no common disk, and a run that was
+killed continues with the points that are missing.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ Point = TypeVar("Point")
 Result = TypeVar("Result")
 
 EXECUTORS = ("process", "dask", "parsl")
+"""Kinds of executors that :func:`open_executor` opens."""
 
 
 def run_points(
@@ -32,21 +33,25 @@ def run_points(
     executor: Executor | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Result]:
-    """Work through points, keeping what is done.
+    """Compute the results of points, reading those that a file holds and writing the others.
 
     Parameters
     ----------
     task : callable
-        Gives the result of a point; importable by name where the executor needs it.
+        Function that returns the result of a point; importable by name where the executor sends
+        it to other processes.
     points : sequence
-        What to work through.
-    path, read, write : callable
-        Where the result of a point is kept, and how it is read and written.  ``write``
-        leaves a whole file or none.
+        The points.
+    path : callable
+        Function that returns the file of a point's result.
+    read : callable
+        Function that reads a result from a file.
+    write : callable
+        Function that writes a result to a file; it must leave a whole file or none.
     executor : Executor, optional
-        Where to work; by default here, one after another.
+        Executor that runs the tasks; by default this process, one after another.
     progress : callable, optional
-        Called with (points done, points in all).
+        Function that is called with (points done, points in all).
 
     Returns
     -------
@@ -56,7 +61,8 @@ def run_points(
     Raises
     ------
     Exception
-        The first error of a task; results that came before are kept.
+        The first error of a task, unchanged; results that came before are kept, tasks that have
+        not begun are cancelled.
 
     Examples
     --------
@@ -99,23 +105,30 @@ def run_points(
 
 @contextlib.contextmanager
 def open_executor(kind: str, workers: int) -> Iterator[Executor | None]:
-    """Open an executor on this machine.
+    """Open an executor with local workers, for a ``with`` statement.
 
     Parameters
     ----------
     kind : {'process', 'dask', 'parsl'}
         Python's process pool, or local workers of Dask or Parsl (extras of the package).
     workers : int
-        Processes; with one of kind 'process' the work is done here.
+        Number of worker processes, at least 1.
 
     Yields
     ------
     Executor or None
+        None for one worker of kind 'process': :func:`run_points` then works in this process.
 
     Raises
     ------
     SweepError
-        The kind is unknown, or not installed.
+        The kind is unknown, or its package is not installed.
+
+    Examples
+    --------
+    >>> with open_executor("process", 1) as executor:
+    ...     executor is None
+    True
     """
     if kind == "process":
         if workers == 1:
@@ -140,6 +153,7 @@ def open_executor(kind: str, workers: int) -> Iterator[Executor | None]:
 
 @contextlib.contextmanager
 def _dask(workers: int) -> Iterator[Any]:
+    """Executor of a local Dask cluster, one thread a worker."""
     try:
         from distributed import Client, LocalCluster
     except ImportError as error:
@@ -157,6 +171,7 @@ def _dask(workers: int) -> Iterator[Any]:
 
 @contextlib.contextmanager
 def _parsl(workers: int) -> Iterator[Any]:
+    """Executor of local Parsl workers; its run folder is removed at the end."""
     try:
         import parsl
         from parsl.concurrent import ParslPoolExecutor
@@ -171,8 +186,8 @@ def _parsl(workers: int) -> Iterator[Any]:
     import sys
     import tempfile
 
-    # Parsl starts its scripts by bare name: they are found where this Python is, whether or
-    # not its environment was activated.
+    # Parsl starts its scripts by bare name, which fails where the environment is not activated:
+    # name the folder of this Python, which holds them.
     scripts = Path(sys.executable).parent
     with tempfile.TemporaryDirectory(prefix="bfsensor_parsl_") as folder:
         config = Config(

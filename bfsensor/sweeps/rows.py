@@ -1,4 +1,4 @@
-"""What a sweep of a device gives: a table of rows, its file."""
+"""Result of a device sweep: a table with one row a point, and its ECSV file."""
 
 from __future__ import annotations
 
@@ -17,9 +17,13 @@ from bfsensor.sweeps.axes import Swept
 from bfsensor.typing import FloatArray
 
 LAGS = 3
-"""Lags 0 to 2 in x and in y."""
+"""Number of lags in x and in y, from 0.
+
+Chosen: a_ij at larger lags are below 1 % of a_00.  Twice as many would need a table that reaches
+further than the 4 pixels of a point's."""
 
 SCHEMA = "bfsensor-sweep-1"
+"""Name of the file's schema; a file with another one is refused."""
 
 _DEFINITION = (
     "a_ij = (area change of the pixel at lag i in x (serial), j in y (parallel)) / (nominal area) "
@@ -42,7 +46,27 @@ _LIGHT = (
 
 
 class SweepRow(NamedTuple):
-    """Response (3, 3), areas (3, 3), full well, cost, iteration error and reason of a point."""
+    """Results of one point of a sweep.
+
+    Attributes
+    ----------
+    a, areas : ndarray, shape (3, 3)
+        a_ij [1/e-] and area changes around one full pixel [um^2], ``[j, i]``; nan where missing.
+    full_well : float
+        Charge at which a pixel spills [e-].
+    cpu_seconds : float
+        CPU time [s].
+    iteration : float
+        Bound on the error of an a_ij by the solver's iteration [1/e-].
+    reason : str
+        Reason of a refusal; empty where there is a response.
+
+    Examples
+    --------
+    >>> zeros = np.zeros((LAGS, LAGS))
+    >>> SweepRow(zeros, zeros, 1.5e5, 2.0, 1e-10, "").full_well
+    150000.0
+    """
 
     a: FloatArray
     areas: FloatArray
@@ -62,9 +86,9 @@ class DeviceSweep:
         One row a point: the swept quantities under their short names with units; ``a_ij`` and
         ``a_ij_error`` [1/e-] for i, j from 0 to 2; ``area_ij`` [um2] where a full pixel was
         asked for; ``full_well`` [e-]; ``iteration_error``, a bound [1/e-]; ``cpu`` [s];
-        ``reason``, empty where there is an answer.
+        ``reason`` of a refusal, else empty.  The header defines the columns.
     swept : tuple of str
-        Names of the columns that were swept, the last one fastest.
+        Names of the swept columns, the last one varying fastest.
     """
 
     rows: Table
@@ -89,20 +113,24 @@ class DeviceSweep:
         places: Sequence[Sequence[int]],
         meta: Mapping[str, Any],
     ) -> DeviceSweep:
-        """Make the rows of points.
+        """Assemble the table from the results of all points.
 
         Parameters
         ----------
         found : sequence of SweepRow
-            One a point.
+            Results, one a point.
         mesh : ndarray, shape (3, 3)
             Relative error of the a_ij by lag, ``[j, i]``; nan where it is not known.
         swept : sequence of Swept
-            The quantities.
+            The axes.
         places : sequence of sequence of int
-            For each point, the place of the value of every quantity.
+            For each point, an index into every axis's values.
         meta : mapping
-            Entries for the header.
+            Further entries of the header.
+
+        Returns
+        -------
+        DeviceSweep
         """
         shorts = [one.short for one in swept]
         names = [
@@ -134,12 +162,12 @@ class DeviceSweep:
 
     @property
     def a(self) -> FloatArray:
-        """a_ij [1/e-], shape (points, 3, 3), ``[:, j, i]``; nan where refused."""
+        """Responses a_ij [1/e-], shape (points, 3, 3), ``[:, j, i]``; nan where refused."""
         return self._grid("a_{i}{j}")
 
     @property
     def errors(self) -> FloatArray:
-        """Numerical errors of :attr:`a`, same shape."""
+        """Numerical errors of :attr:`a` [1/e-], same shape; nan where not known."""
         return self._grid("a_{i}{j}_error")
 
     @property
@@ -149,20 +177,21 @@ class DeviceSweep:
         Raises
         ------
         SweepError
-            The sweep was made without.
+            The sweep was made without a full pixel.
         """
         if "area_00" not in self.rows.colnames:
             raise SweepError(
-                "the sweep has no areas of a full pixel; ask for them: full_pixel"
+                "the sweep has no area changes around a full pixel; give its charge as full_pixel"
             )
         return self._grid("area_{i}{j}")
 
     @property
     def refused(self) -> NDArray[np.bool_]:
-        """Points without an answer."""
+        """Whether each point was refused, shape (points,)."""
         return np.array([bool(reason) for reason in self.rows["reason"]])
 
     def _grid(self, pattern: str) -> FloatArray:
+        """Columns of all lags as an array ``[:, j, i]``; ``pattern`` holds {i} and {j}."""
         values = [
             [np.asarray(self.rows[pattern.format(i=i, j=j)], float) for i in range(LAGS)]
             for j in range(LAGS)
@@ -171,6 +200,13 @@ class DeviceSweep:
 
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write an ECSV file, whole or not at all.
+
+        Parameters
+        ----------
+        path : path-like
+            Where to.
+        overwrite : bool
+            Replace an existing file.
 
         Raises
         ------
@@ -183,12 +219,21 @@ class DeviceSweep:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> DeviceSweep:
-        """Read what :meth:`write` wrote.
+        """Read the file of a sweep.
+
+        Parameters
+        ----------
+        path : path-like
+            File that :meth:`write` wrote.
+
+        Returns
+        -------
+        DeviceSweep
 
         Raises
         ------
         SweepError
-            No such file, or not of this kind.
+            No such file, not ECSV, or of another schema; the message names the file.
         """
         try:
             rows = Table.read(path, format="ascii.ecsv")
@@ -205,7 +250,7 @@ class DeviceSweep:
 
 
 def _same(one: Column, two: Column) -> bool:
-    """Equal values, nan equal to nan, and units."""
+    """Whether two columns have equal values, nan equal to nan, and equal units."""
     numbers = one.dtype.kind == "f"
     equal = np.array_equal(np.asarray(one), np.asarray(two), equal_nan=numbers)
     return bool(equal) and one.unit == two.unit

@@ -1,4 +1,4 @@
-"""From a plan to its distortion table, by either engine."""
+"""Construction of a distortion table from its plan, by Poisson's equation or image charges."""
 
 from __future__ import annotations
 
@@ -38,40 +38,41 @@ def build_table(
     errors: Callable[[], dict[str, float]] | None = None,
     provenance: dict[str, str] | None = None,
 ) -> DistortionTable:
-    """Make the table of a plan.
+    """Compute the distortion table of a plan.
 
     Parameters
     ----------
     plan : TablePlan
-        From :func:`bfsensor.table.table_plan.plan_table`.
+        Plan from :func:`bfsensor.table.table_plan.plan_table`.
     engine : {'poisson', 'image_charge'}
-        Poisson's equation with the device's implants, gates and carriers, minutes of CPU time;
-        or charge rectangles between conducting planes, 0.3 s, linear in charge, whose
-        parameters no device file holds.
+        'poisson' solves Poisson's equation with the device's implants, gates and carriers, in
+        minutes of CPU time; 'image_charge' takes charge rectangles between conducting planes, in
+        0.3 s, linear in charge, with parameters that no device file holds.
     image_charge : ImageCharge, optional
-        Those parameters, for the engine 'image_charge' and for it only.  Pitch, thickness and
-        permittivity are the device's.  It moves nothing below its sealed heights; conversion
-        depths that begin there (:func:`bfsensor.table.build_image_charge.default_depths`) interpolate
-        better than the plan's default ones.
+        Parameters of the engine 'image_charge', required there and refused elsewhere; pitch,
+        thickness and permittivity must be the device's.  Below its sealed heights nothing moves;
+        conversion depths that begin there
+        (:func:`bfsensor.table.build_image_charge.default_depths`) interpolate better than the
+        plan's default ones.
     executor : Executor, optional
-        Where the levels are solved; by default here, one after another.  This and the next
-        three are for the engine 'poisson'.
+        Executor that solves the levels; by default this process, one after another.  This and
+        the next three are for the engine 'poisson' and refused by the other.
     checkpoint : Path, optional
-        Folder that keeps finished levels; a run that finds them goes on from there.  It
-        is left behind only by an interrupted run.
+        Folder that keeps finished levels; a run that finds levels of the same plan there does
+        not repeat them.  The caller removes it.
     progress : callable, optional
-        Called with (levels done, levels in all).
+        Function that is called with (levels done, levels in all).
     errors : callable, optional
-        Called once all levels are there; gives error estimates for the header, such as
-        :func:`bfsensor.table.assess.assess`.
-    provenance : dict, optional
+        Function that is called when all levels are solved and returns error estimates for the
+        header, such as :func:`bfsensor.table.assess.assess`.
+    provenance : dict of str to str, optional
         Further entries for the header.
 
     Returns
     -------
     DistortionTable
-        Of either engine with the device in it and its full well, which is the Poisson
-        solver's; the header says which engine made the shifts.
+        Table with the device and its full well, which is the Poisson solver's for either engine;
+        the header names the engine that made the shifts.
 
     Raises
     ------
@@ -116,11 +117,11 @@ def _refuse(engine: str, **given: Any) -> None:
     """Refuse options that the engine does not have."""
     wrong = [name for name, value in given.items() if value is not None]
     if wrong:
-        raise TableError(f"{', '.join(wrong)}: not for engine = {engine!r}")
+        raise TableError(f"{', '.join(wrong)}: not an option of engine = {engine!r}")
 
 
 def _check_model(plan: TablePlan, model: ImageCharge) -> None:
-    """Refuse parameters of another sensor."""
+    """Refuse parameters whose pitch, thickness or permittivity are not the device's."""
     device = plan.device
     for name, own in (
         ("pitch_x", device.pixel.pitch_x),
@@ -228,7 +229,7 @@ def _solve_levels(
 
 
 def _effort(plan: TablePlan, levels: Collection[Level]) -> dict[str, str]:
-    """What the solver did, for the header."""
+    """Effort of the solver (nodes, CPU time, steps), for the header."""
     nz, ny, nx = make_mesh(
         plan.device, pixels=(PERIOD, PERIOD), cells=plan.cells, refine_z=plan.refine_z
     ).shape
@@ -241,7 +242,10 @@ def _effort(plan: TablePlan, levels: Collection[Level]) -> dict[str, str]:
 
 
 def peak_memory() -> float:
-    """Largest resident memory of this process and its finished children [GB], nan on Windows."""
+    """Return the largest resident memory of this process and its children [GB].
+
+    Only finished children count; nan on Windows.
+    """
     if sys.platform == "win32":
         return float("nan")
     # Not at the top: Windows has no such module.

@@ -1,7 +1,7 @@
-"""From the parameters of the analytic engine to a distortion table.
+"""Construction of a distortion table from image charges, the analytic engine.
 
-Apart from ``build``, which solves Poisson's equation: the two engines share no code
-but the type of the boundaries and of the table, and so check each other.
+:mod:`bfsensor.table.build` solves Poisson's equation instead.  The two engines share no code
+but the types of the boundaries and of the table, so that each checks the other.
 """
 
 from __future__ import annotations
@@ -23,16 +23,17 @@ from bfsensor.typing import FloatArray
 ENGINE = "image charges (Astier & Regnault 2023), first order: linear in charge"
 
 SMALL_CHARGE = 100.0
-"""Charge [e-] at which vertices are placed.
+"""Charge [e-] at which the vertices of the table are placed.
 
-They keep the areas between displaced lines, to which the corners' own shifts contribute in
-second order: 1.5 % of the shifts at 100,000 e- in LSST's devices, 1e-5 here."""
+Chosen: vertices keep the areas between displaced lines, to which the shifts of the corners
+contribute in second order, 1.5 % of the shifts of LSST's devices at 100,000 e- and so 1.5e-5
+here; twice the charge doubles that."""
 
 
 def default_depths(model: ImageCharge) -> tuple[float, ...]:
-    """Conversion depths [um above the gates] between which shifts are interpolated well.
+    """Return conversion depths [um above the gates] between which shifts interpolate well.
 
-    The sealed heights, then steps that double, and the back surface.
+    They are the sealed heights, steps above them that double, and the back surface.
     """
     low, high = sorted((model.row_height, model.column_height))
     pitch = 0.5 * (model.pitch_x + model.pitch_y)
@@ -50,35 +51,36 @@ def build_image_charge_table(
     vertices: int = 32,
     pixels: int = 9,
 ) -> DistortionTable:
-    """Make a distortion table with the analytic engine.
+    """Compute a distortion table with the analytic engine.
 
-    Displacements are those of one electron times the charge over the background: two
-    charges and one background hold all that this engine knows.
+    Displacements are those of one electron times the charge over the background, so that two
+    charges and one background hold the whole model.
 
     Parameters
     ----------
     model : ImageCharge
-        The parameters.
+        Parameters of the model [um, V/um].
     charges, backgrounds : sequence of float
-        Source charges and charges of all other pixels [e-], ascending.
+        Source charges and charges of all other pixels [e-], at least 0, ascending.
     depths : sequence of float, optional
         Conversion depths [um above the gates], ascending; by default
         :func:`default_depths`.
     vertices : int
-        Vertices a side between the corners.
+        Vertices a side between the corners, at least 2.
     pixels : int
-        Width of the table [pixel], odd.
+        Width of the table [pixel], odd, at least 3.
 
     Returns
     -------
     DistortionTable
-        With the engine and its parameters in the header, and as errors what the first
-        order leaves out at the largest charge, and the bound of the image series.
+        Table with the engine and its parameters in the header; its errors are the terms beyond
+        first order at the largest charge, and the bound of the image series.
 
     Raises
     ------
     TableError
-        Something does not fit; says the limit.
+        ``pixels`` is even or below 3, ``vertices`` is below 2, or the charges are not finite, do
+        not ascend or equal the backgrounds everywhere; the message names the limit.
 
     Examples
     --------
@@ -100,7 +102,8 @@ def build_image_charge_table(
         array / SMALL_CHARGE
         for array in lines.vertices(vertices, vertex_fractions(vertices))
     ]
-    for array in unit:  # round-off of the fit, 1e-12 um
+    # Below the sealed heights nothing moves; the fit of the lines leaves round-off, 1e-12 um.
+    for array in unit:
         array[levels <= model.column_height, ..., 0] = 0.0
         array[levels <= model.row_height, ..., 1] = 0.0
     corners, horizontal, vertical = (
@@ -137,7 +140,7 @@ def build_image_charge_table(
 
 
 def _excess(charges: Sequence[float], backgrounds: Sequence[float]) -> FloatArray:
-    """Charges over the backgrounds [e-], shape (nq, nb), of which one at least is not 0."""
+    """Charges over the backgrounds [e-], shape (nq, nb); at least one must differ from 0."""
     excess = np.subtract.outer(np.array(charges, float), np.array(backgrounds, float))
     if not excess.size or not np.any(excess) or not np.all(np.isfinite(excess)):
         raise TableError(
@@ -150,7 +153,7 @@ def _excess(charges: Sequence[float], backgrounds: Sequence[float]) -> FloatArra
 def _beyond_first_order(
     model: ImageCharge, depths: FloatArray, reach: int, charge: float
 ) -> float:
-    """Largest difference across a boundary to traced field lines [um]; nan where none pass."""
+    """Largest difference of a boundary from traced field lines [um]; nan where tracing fails."""
     first = displace_boundaries(model, depths, charge=charge, reach=reach, samples=4)
     try:
         traced = trace_boundaries(model, depths, charge=charge, reach=reach, samples=4)

@@ -1,4 +1,4 @@
-"""Distortion tables as FITS: the file's layout, its checks, and the quadrant of symmetric ones."""
+"""FITS files of distortion tables: layout, checks, and storage of one quadrant where symmetric."""
 
 from __future__ import annotations
 
@@ -20,14 +20,35 @@ from bfsensor.files import refuse_existing, written_whole
 from bfsensor.typing import FloatArray
 
 SCHEMA = "bfsensor distortion table"
+"""Value of the keyword SCHEMA, which names the kind of file."""
+
 SCHEMA_VERSION = 1
+"""Version of the file's layout, by definition; files of another version are refused."""
 
 ARRAYS = ("corners", "horizontal", "vertical")
+"""Arrays of displacements, each an image extension of that name in capitals."""
+
 AXES = ("charges", "backgrounds", "depths")
+"""Axes of the arrays, each an image extension of that name in capitals."""
 
 
 def write_table(table: Any, path: str | os.PathLike[str], *, overwrite: bool) -> None:
-    """Write a :class:`~bfsensor.table.table.DistortionTable`, see its ``write``."""
+    """Write a distortion table, whole or not at all.
+
+    Parameters
+    ----------
+    table : DistortionTable
+        Any; only one quadrant is stored where it is mirror-symmetric bit for bit.
+    path : path-like
+        Where to.
+    overwrite : bool
+        Replace an existing file.
+
+    Raises
+    ------
+    TableError
+        The file exists and ``overwrite`` is not set, or it cannot be written.
+    """
     refuse_existing(path, overwrite, TableError)
     arrays = {name: getattr(table, name) for name in ARRAYS}
     quadrants = {name: _quadrant(array) for name, array in arrays.items()}
@@ -58,7 +79,8 @@ def write_table(table: Any, path: str | os.PathLike[str], *, overwrite: bool) ->
         datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S"),
         "[UTC] when this file was written",
     )
-    # For people who look at the header; META is what is read back.
+    # HISTORY and COMMENT are for people who look at the header; META is read back, because
+    # header entries are cut and escaped.
     for key, text in table.provenance.items():
         header["HISTORY"] = _printable(f"{key} = {text}")
     for key, error in table.errors.items():
@@ -84,21 +106,31 @@ def write_table(table: Any, path: str | os.PathLike[str], *, overwrite: bool) ->
 
 
 def read_fields(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read the fields of a table, by name.
+    """Read the fields of a distortion table.
+
+    Parameters
+    ----------
+    path : path-like
+        FITS file that :func:`write_table` wrote.
+
+    Returns
+    -------
+    fields : dict of str to object
+        Arguments of :class:`~bfsensor.table.table.DistortionTable` by name.
 
     Raises
     ------
     TableError
-        Not such a file, an unknown schema, or damaged; names the file.
+        The file is missing, of another kind or schema, or damaged; the message names it.
     """
     path = Path(path)
     if not path.exists():
         raise TableError(f"{path}: no such file")
     try:
         with warnings.catch_warnings():
-            # astropy only warns of a wrong checksum or a short file.
+            # astropy only warns of a wrong checksum or a short file; here both are errors.
             warnings.simplefilter("error", AstropyWarning)
-            # Opened here: astropy leaves a file open in whose headers it fails.
+            # Opened here, because astropy does not close a file whose headers it cannot read.
             with open(path, "rb") as stream, fits.open(stream, checksum=True) as hdus:
                 header = hdus[0].header
                 _check_schema(header, path)
@@ -123,6 +155,7 @@ def read_fields(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def _fields(header: Mapping[str, Any], data: dict[str, Any]) -> dict[str, Any]:
+    """Fields of a table from the primary header and the data of the extensions."""
     arrays = {}
     for name in ARRAYS:
         array = np.array(data[name.upper()], float)
@@ -144,7 +177,7 @@ def _fields(header: Mapping[str, Any], data: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_schema(header: Mapping[str, Any], path: Path) -> None:
-    """Refuse what is not a table of the schema that this version reads."""
+    """Refuse a file that is no table of the schema that this version reads."""
     if header.get("SCHEMA") != SCHEMA:
         raise TableError(f"{path}: not a distortion table (no SCHEMA = '{SCHEMA}')")
     if header.get("SCHEMAV") != SCHEMA_VERSION:
@@ -155,27 +188,29 @@ def _check_schema(header: Mapping[str, Any], path: Path) -> None:
 
 
 def _printable(text: str) -> str:
-    """Turn text into what a FITS header may hold."""
+    """Escape text to printable ASCII, the only characters that a FITS header may hold."""
     return text.encode("unicode_escape").decode("ascii")
 
 
 def _text(data: NDArray[np.uint8] | None) -> str:
-    """Decode the text of an extension; none where it has no data."""
+    """Decode the text of an extension; empty where it has no data."""
     return "" if data is None else data.astype(np.uint8).tobytes().decode()
 
 
 def _quadrant(array: FloatArray) -> FloatArray:
-    """Cut out the offsets from the source pixel's centre on."""
+    """Cut out the pixel offsets from 0 on, in x and in y."""
     ny, nx = array.shape[3:5]
     return array[:, :, :, ny // 2 :, nx // 2 :]
 
 
 def _whole(name: str, quadrant: FloatArray) -> FloatArray:
-    """Mirror a quadrant to the whole array; the source's own row and column stay."""
+    """Mirror a quadrant to the whole array; the source's own row and column are not doubled."""
     x, y, vertex = 4, 3, 5
     for axis, sides, sign in ((x, "horizontal", (-1.0, 1.0)), (y, "vertical", (1.0, -1.0))):
         mirrored = np.flip(quadrant, axis) * np.array(sign)
-        if name == sides:  # its vertices run along the axis, and it counts pixels there
+        # These sides have one entry a pixel along the axis, so that the middle one would be
+        # doubled, and their vertices run along it; the others have one entry an edge line.
+        if name == sides:
             mirrored = np.flip(mirrored, vertex)
             mirrored = np.delete(mirrored, -1, axis)
         quadrant = np.concatenate([mirrored, quadrant], axis) + 0.0

@@ -1,6 +1,6 @@
-"""GalSim's (and Poisson_CCD's) vertex tables: STEM.cfg and STEM.dat.
+"""Reading and writing of GalSim's (and Poisson_CCD's) vertex tables, STEM.cfg and STEM.dat.
 
-One charge in the central pixel, no background, one conversion depth.  The ``.dat`` file
+They hold one charge in the central pixel, no background and one conversion depth.  The ``.dat`` file
 lists, pixel by pixel (x slow, y fast), the vertices counter-clockwise from the middle of
 the left side: pixel centre x and y, angle, vertex x and y.
 """
@@ -39,19 +39,19 @@ def write_galsim(
     Parameters
     ----------
     table : DistortionTable
-        With square pixels and an even number of vertices a side.
+        Table with square pixels and an even number of vertices a side.
     stem : path-like
         Path without ending.
     charge : float
-        Source charge [e-]; GalSim scales from it linearly.
+        Source charge [e-], within the table; GalSim scales the shifts linearly from it.
     depth : float
-        Conversion depth [um above the gates].
+        Conversion depth [um above the gates], within the table.
     background : float
-        Charge of all other pixels [e-], below ``charge``.  GalSim adds the shifts of all
-        charges, those of a uniform background cancel: the file holds ``charge -
+        Charge of all other pixels [e-], below ``charge``.  GalSim adds the shifts by the charges
+        of all pixels, in which those of a uniform background cancel: the file holds ``charge -
         background`` as the collected charge.
     device : Device, optional
-        Gives the voltages and gates that GalSim needs for its diffusion; by default the
+        Device with the voltages and gates that GalSim needs for its diffusion; by default the
         one in the table.
     overwrite : bool
         Replace existing files.
@@ -59,12 +59,21 @@ def write_galsim(
     Returns
     -------
     paths : tuple of Path
-        The two files.
+        The .cfg and the .dat file.
 
     Raises
     ------
     TableError
-        What GalSim's format cannot hold, or existing files.
+        The table does not fit GalSim's format (rectangular pixels, an odd number of vertices, a
+        charge that is not above the background, no device), or a file exists.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> table = DistortionTable.load("itl_sta3800c")
+    >>> stem = Path(tempfile.mkdtemp()) / "itl"
+    >>> [path.name for path in write_galsim(table, stem, charge=80000.0, depth=95.0)]
+    ['itl.cfg', 'itl.dat']
     """
     stem = Path(stem)
     paths = (stem.with_name(stem.name + ".cfg"), stem.with_name(stem.name + ".dat"))
@@ -89,10 +98,10 @@ def write_galsim(
 def _check_fits_galsim(
     table: DistortionTable, charge: float, background: float, device: Device | None
 ) -> None:
-    """Refuse what GalSim's format cannot hold."""
+    """Refuse tables and charges that GalSim's format cannot hold."""
     if device is None and not table.device_text:
         raise TableError(
-            "GalSim needs the device for its diffusion, and this table has none"
+            "GalSim needs the device for its diffusion, and this table holds none: give device="
         )
     if not charge > background:
         raise TableError(
@@ -110,7 +119,10 @@ def _check_fits_galsim(
 
 
 def _origin(table: DistortionTable) -> float:
-    """Place of the source pixel's centre in x and in y [um]: a pixel is left at the border."""
+    """Coordinate of the source pixel's centre in x and in y [um].
+
+    The table's first pixel lies one pixel from 0, as in Poisson_CCD's files.
+    """
     return (table.reach + 1.5) * table.pitch[0]
 
 
@@ -126,7 +138,8 @@ def _outlines(
             x0, y0 = origin + i * pitch, origin + j * pitch
             for x, y in points + origin:
                 row = (x0, y0, np.arctan2(y - y0, x - x0), x, y)
-                # Seven decimals: the customary four are 2 % of a shift four pixels away.
+                # Seven decimals: half a unit of the customary fourth is 2 % of a shift four
+                # pixels away.
                 lines.append("".join(f"{value:<15.7f}" for value in row).rstrip())
     return lines
 
@@ -165,7 +178,10 @@ def _settings(
 
 
 def _write_together(files: dict[Path, list[str]]) -> None:
-    """Write all files beside before the first is renamed: no half pair after a failure."""
+    """Write all files under temporary names before the first is renamed.
+
+    A failure then leaves no pair of which one file is missing.
+    """
     with contextlib.ExitStack() as stack:
         for path, lines in files.items():
             beside = stack.enter_context(written_whole(path, TableError))
@@ -175,22 +191,22 @@ def _write_together(files: dict[Path, list[str]]) -> None:
 def read_galsim(stem: str | os.PathLike[str]) -> DistortionTable:
     """Read a GalSim stem as a table of one charge, no background, one depth.
 
-    Of the two copies of a shared side the one of the pixel nearer to the charge counts, as
-    in GalSim.  GalSim keeps two copies of each corner as well, and they differ by up to
-    0.4 um in its own files; here the sides meet at one common corner, the one nearest to
-    those of the inner pixels with which every pixel has the area that GalSim gives it.
+    Of the two copies of a shared side, that of the pixel nearer to the charge is taken, as
+    in GalSim.  GalSim keeps several copies of each corner as well, and they differ by up to
+    0.4 um in its own files.  A table has one: that of the innermost pixel, moved by the least
+    amounts with which every pixel has the area that GalSim gives it.
 
     Parameters
     ----------
     stem : path-like
-        Path without ending, ``STEM.cfg`` and ``STEM.dat``.
+        Path without ending of ``STEM.cfg`` and ``STEM.dat``.
 
     Returns
     -------
     DistortionTable
-        Areas at the charge of the file equal GalSim's (1e-6 um^2, its and our single
-        precision); the centre's is that of its polygon in the file, others differ from
-        theirs where the copies do.
+        Table whose areas at the charge of the file equal GalSim's to single precision
+        (1e-6 um^2).  The central area is that of its polygon in the file; other areas differ from
+        their polygons' where the copies of a side do.
 
     Notes
     -----
@@ -202,7 +218,14 @@ def read_galsim(stem: str | os.PathLike[str]) -> DistortionTable:
     Raises
     ------
     TableError
-        A file is missing, foreign or truncated; names it.
+        A file is missing, of another format or truncated; the message names it.
+
+    Examples
+    --------
+    >>> import galsim
+    >>> folder = Path(galsim.meta_data.share_dir) / "sensors"
+    >>> read_galsim(folder / "lsst_itl_50_8").reach
+    4
     """
     stem = Path(stem)
     cfg, dat = stem.with_name(stem.name + ".cfg"), stem.with_name(stem.name + ".dat")
@@ -217,7 +240,7 @@ def read_galsim(stem: str | os.PathLike[str]) -> DistortionTable:
         empty = DistortionTable(
             charges=np.array([charge]),
             backgrounds=np.zeros(1),
-            # What GalSim's files were traced from where they do not say it.
+            # GalSim's own files were traced from 95 um; some do not state it.
             depths=np.array([number("ElectronZ0Area", 95.0)]),
             pitch=pitch,
             thickness=number("SensorThickness"),
@@ -246,25 +269,25 @@ def read_sides(
 ) -> tuple[tuple[FloatArray, FloatArray], FloatArray]:
     """Read the shifts of all sides of a GalSim table, each with its own copies of the corners.
 
-    Of the two copies of a side the one of the pixel nearer to the charge counts.
+    Of the two copies of a side, that of the pixel nearer to the charge is taken.
 
     Parameters
     ----------
     cfg, dat : path-like
-        The two files.
+        The configuration and the vertex file.
 
     Returns
     -------
     vertical, horizontal : ndarray, shapes (n, n + 1, vertices + 2, 2), \
 (n + 1, n, vertices + 2, 2)
         Shifts (dx, dy) [um] for the charge of the file, by row and column.
-    points : ndarray
+    points : ndarray, shape (vertices + 2,)
         Nominal positions along a side, 0 to 1.
 
     Raises
     ------
     TableError
-        A file is missing, foreign or truncated; names it.
+        A file is missing, of another format or truncated; the message names it.
     """
     numbers = _Numbers(Path(cfg))
     n, nv, pitch = numbers.layout()
@@ -275,7 +298,7 @@ def read_sides(
 
 
 class _Numbers:
-    """The numbers of a configuration, with errors that name it."""
+    """A configuration file with methods that convert its texts; errors name the file."""
 
     def __init__(self, cfg: Path) -> None:
         self.cfg = cfg
@@ -285,6 +308,7 @@ class _Numbers:
             raise TableError(str(error)) from None
 
     def number(self, key: str, default: float | None = None) -> float:
+        """Return the number of a key, ``default`` where it is missing; None: it must be there."""
         if key not in self.data:
             if default is None:
                 raise TableError(f"{self.cfg}: {key} is missing")
@@ -297,6 +321,7 @@ class _Numbers:
             ) from None
 
     def whole(self, key: str) -> int:
+        """Return the whole number, above 0, of a key."""
         value = self.number(key)
         if not value.is_integer() or value < 1:
             raise TableError(
@@ -305,7 +330,7 @@ class _Numbers:
         return int(value)
 
     def layout(self) -> tuple[int, int, tuple[float, float]]:
-        """Give pixels and vertices a side, and the pitch."""
+        """Return the width of the table [pixel], vertices a side, and the pitch in x and y [um]."""
         n, ny, nv = (
             self.whole(k) for k in ("PixelBoundaryNx", "PixelBoundaryNy", "NumVertices")
         )
@@ -335,7 +360,7 @@ def _read_outlines(dat: Path, n: int, nv: int, pitch: tuple[float, float]) -> Fl
     offset = (np.arange(n) - n // 2)[:, None]
     centre = grid[n // 2, n // 2, 0, :2]
     at_x, at_y = (centre[k] + offset * pitch[k] for k in (0, 1))
-    # The files' own decimals are four.
+    # Positions in the files are rounded to four decimals.
     if np.abs(grid[..., 0] - at_x).max() > 1e-3 or (
         np.abs(grid[..., 1] - at_y[:, None]).max() > 1e-3
     ):
@@ -347,7 +372,7 @@ def _read_outlines(dat: Path, n: int, nv: int, pitch: tuple[float, float]) -> Fl
 
 
 def _device_text(cfg: Path) -> str:
-    """Give the device of a configuration, nothing where it holds only what GalSim reads."""
+    """Return the device of a configuration; empty where it holds only the keys GalSim reads."""
     try:
         return import_poisson_ccd(cfg).to_toml()
     except DeviceError:
@@ -365,7 +390,8 @@ def _share(
         closed[:, :, k * side : (k + 1) * side + 1] for k in range(4)
     )
     line = np.arange(n + 1)
-    # Beyond the centre the pixel on the inner side is the nearer one.
+    # Lines beyond the centre take the copy of the pixel before them, the others of that after:
+    # the pixel nearer to the charge.
     beyond = line > n // 2
     own = line - beyond
     along_x = np.where(beyond[:, None, None, None], upper[own, :, ::-1], lower[own])
@@ -381,9 +407,10 @@ def _share(
 def _corner_shifts(
     along_x: FloatArray, along_y: FloatArray, corners: FloatArray
 ) -> FloatArray:
-    """Least shifts of the corners that give pixels the areas within their separate sides.
+    """Least shifts of the corners with which pixels keep the areas within their separate sides.
 
-    Corners are not adjacent in a polygon, so its area is linear in their positions.
+    No two corners are adjacent vertices of a polygon, so its area is linear in their positions
+    and a linear least-squares solution is exact.
     """
     n = len(corners) - 1
     wanted = _ring_areas(_ring(along_x, along_y))
@@ -413,7 +440,7 @@ def _corner_shifts(
 
 
 def _ring(along_x: FloatArray, along_y: FloatArray) -> FloatArray:
-    """Go round every pixel along its four sides."""
+    """Vertices around every pixel, counter-clockwise along its four sides."""
     return np.concatenate(
         [along_x[:-1], along_y[:, 1:], along_x[1:, :, ::-1], along_y[:, :-1, ::-1]], axis=2
     )

@@ -1,4 +1,4 @@
-"""Weights of values at nodes for the value between them."""
+"""Interpolation in a table as weights of its nodes: polynomials and cubic splines."""
 
 from __future__ import annotations
 
@@ -9,14 +9,17 @@ from bfsensor.typing import FloatArray
 
 
 def polynomial_weights(nodes: FloatArray, at: float) -> FloatArray:
-    """Weights of the polynomial through ``nodes`` at ``at``."""
+    """Return the weights, shape of ``nodes``, of the polynomial through the nodes at ``at``."""
     ratios = (at - nodes) / (nodes[:, None] - nodes + np.eye(len(nodes)))
     np.fill_diagonal(ratios, 1.0)
     return np.asarray(ratios.prod(axis=1))
 
 
 def spline_weights(nodes: FloatArray, at: float) -> FloatArray:
-    """Weights of the cubic spline through ``nodes`` at ``at`` (a polynomial below four)."""
+    """Return the weights of the cubic spline through the nodes at ``at``.
+
+    Fewer than four nodes have the polynomial through them instead.
+    """
     if len(nodes) < 4:
         return polynomial_weights(nodes, at)
     return np.asarray(CubicSpline(nodes, np.eye(len(nodes)))(at))

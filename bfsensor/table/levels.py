@@ -31,7 +31,21 @@ from bfsensor.typing import FloatArray
 
 @dataclass(frozen=True)
 class Level:
-    """Displacements of one source charge on one background, all depths, and its cost."""
+    """Displacements by one source charge on one background at all depths, and their cost.
+
+    Attributes
+    ----------
+    corners, horizontal, vertical : ndarray
+        Displacements [um] as in :class:`~bfsensor.table.table.DistortionTable`, by depth.
+    newton, linear_iterations : int
+        Newton steps and linear iterations of the solver.
+    error_volts : float
+        Error of the potential that the iteration leaves [V].
+    cpu_seconds : float
+        CPU time [s].
+    image_share : float
+        Largest share of the displacements that was subtracted as the effect of periodic images.
+    """
 
     corners: FloatArray
     horizontal: FloatArray
@@ -43,13 +57,13 @@ class Level:
     image_share: float
 
     def write(self, path: Path) -> None:
-        """Write it whole or not at all: half a level never exists."""
+        """Write an .npz file, whole or not at all."""
         with written_whole(path, TableError) as beside, open(beside, "wb") as stream:
             np.savez(stream, **self.__dict__)
 
     @classmethod
     def read(cls, path: Path) -> Level:
-        """Read what :meth:`write` wrote."""
+        """Read the file of a level; TableError where it is damaged or of another kind."""
         try:
             with path.open("rb") as stream, np.load(stream) as data:
                 values = {name: data[name] for name in data.files}
@@ -63,7 +77,7 @@ class Level:
 
 @lru_cache(maxsize=1)
 def _workshop(device_text: str, cells: int, refine_z: int) -> tuple[Any, Any, Any]:
-    """Build the device, solver and mesh of a process, once for all its levels."""
+    """Build device, solver and mesh; cached, so that a process does it once for all its levels."""
     from bfsensor.device.device import Device
 
     device = Device.from_toml(device_text)
@@ -77,13 +91,14 @@ def solve_level(plan: TablePlan, charge: float, background: float) -> Level:
     Parameters
     ----------
     plan : TablePlan
-        From :func:`plan_table`.
+        Plan from :func:`~bfsensor.table.table_plan.plan_table`.
     charge, background : float
-        Source charge and charge of all other pixels [e-].
+        Source charge and charge of all other pixels [e-]; where they are equal nothing moves.
 
     Returns
     -------
     Level
+        Displacements at the plan's depths; 0 at and below the height of the stored charge.
     """
     began = time.process_time()
     device, solver, mesh = _workshop(plan.device.to_toml(), plan.cells, plan.refine_z)

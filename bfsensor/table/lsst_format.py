@@ -1,8 +1,8 @@
-r"""Tables as the pipelines of LSST correct with them: kernels and distortion matrices.
+r"""Export of tables as LSST's calibration products: brighter-fatter kernels, distortion matrices.
 
-The mean shifts of all edges by one electron (:mod:`bfsensor.table.quadrant_shifts`) become a distortion
-matrix; their divergence, the a-matrix, becomes a kernel.  Arrays of lags are
-[j, i]; the files have [i][j], which :mod:`bfsensor.recording.tables.lsst_datasets` sees to.
+The mean shifts of all edges by one electron (:mod:`bfsensor.table.quadrant_shifts`) become a
+distortion matrix; their divergence, the a-matrix, becomes a kernel.  Arrays of lags are
+[j, i] here and [i][j] in the files; :mod:`bfsensor.recording.tables.lsst_datasets` transposes.
 """
 
 from __future__ import annotations
@@ -22,32 +22,34 @@ from bfsensor.table.quadrant_shifts import QuadrantShifts
 from bfsensor.typing import FloatArray
 
 _POSITIVE = 0.025
-"""Part of the centre by which a valid kernel may be positive elsewhere, as in cp_pipe."""
+"""Largest positive value of a valid kernel, relative to the size of its negative centre.
+
+Published: the limit in LSST's cp_pipe.  It decides the column VALID only."""
 
 
 def solve_kernel(areas: ArrayLike, *, zero_sum: bool = False) -> FloatArray:
     r"""Solve :math:`\nabla^2 K = -a` for the scalar kernel, zero at its border.
 
-    The five-point Laplacian, solved directly.
+    The Laplacian is the five-point one; its linear system is solved directly.
 
     Parameters
     ----------
     areas : array_like, shape (n, n)
-        a_ij [1/e-] by lag [j, i] from (0, 0), as flats have them: :math:`C_{ij} = a_{ij}
-        \mu^2` less shot noise, to lowest order.
+        Relative area changes a_ij [1/e-] by lag [j, i] from (0, 0); to lowest order the
+        covariances of flats without shot noise are :math:`C_{ij} = a_{ij} \mu^2`.
     zero_sum : bool
-        Take from a_00 the sum over all lags (of all four quadrants) first, so that nothing
+        First subtract from a_00 the sum over all lags of all four quadrants, so that no charge
         crosses the border.
 
     Returns
     -------
     kernel : ndarray, shape (2 n + 1, 2 n + 1)
-        [j, i], centre in the middle.
+        Kernel [pixel^2/e-], ``[j, i]``, lag (0, 0) in the middle.
 
     Raises
     ------
     TableError
-        Not a square array of finite numbers.
+        ``areas`` is not a square array of finite numbers.
 
     References
     ----------
@@ -80,32 +82,32 @@ def make_kernel(
     zero_sum: bool = False,
     meta: Mapping[str, Any] | None = None,
 ) -> BrighterFatterKernel:
-    """Make LSST's BrighterFatterKernel, the same kernel for every amplifier.
+    """Make LSST's BrighterFatterKernel, with the same kernel for every amplifier.
 
     Parameters
     ----------
     shifts : QuadrantShifts
-        From :func:`bfsensor.table.quadrant_shifts.quadrant_shifts`.
+        Shifts from :func:`bfsensor.table.quadrant_shifts.quadrant_shifts`.
     gains : mapping of str to float
-        Gain [e-/ADU] by name of amplifier.
+        Gain [e-/ADU] by name of the amplifier, above 0.
     noises : mapping of str to float, optional
-        Read noise [e-] by amplifier; nan where not given.
+        Read noise [e-] by name of the amplifier; nan where not given.
     zero_sum : bool
-        As for :func:`solve_kernel`.
+        Whether the areas are made to add up to 0 first, as for :func:`solve_kernel`.
     meta : mapping, optional
-        More cards, as ``INSTRUME`` and ``DETECTOR``.
+        Further header keywords, such as ``INSTRUME`` and ``DETECTOR``.
 
     Returns
     -------
     BrighterFatterKernel
-        ``MEAN_XCORRS`` has -a_ij within a rim of zeros.  No flats were measured: one pair
-        of nan, masked, stands for them.  ``VALID`` if the kernel is lowest at its centre and
-        nowhere above 0.025 of that.
+        Its column ``MEAN_XCORRS`` holds -a_ij within a rim of zeros.  No flats were measured: one
+        masked pair of nan takes their place.  ``VALID`` is 1 if the kernel is lowest at its
+        centre and nowhere above 0.025 times the size of that value.
 
     Raises
     ------
     TableError
-        No amplifier, or a gain that is not above 0.
+        No amplifier, or a gain that is not above 0 and finite.
 
     Examples
     --------
@@ -152,29 +154,29 @@ def make_distortion_matrix(
     Parameters
     ----------
     shifts : QuadrantShifts
-        From :func:`bfsensor.table.quadrant_shifts.quadrant_shifts`, for light that converts at
-        the back surface.
+        Shifts from :func:`bfsensor.table.quadrant_shifts.quadrant_shifts` for light that converts
+        at the back surface.
     gains : mapping of str to float
-        Gain [e-/ADU] by name of amplifier.
+        Gain [e-/ADU] by name of the amplifier, above 0.
     filters : mapping of str to QuadrantShifts, optional
-        By the pipeline's name of the physical filter, for its light.  Without any the
-        version is 1.0, which has no such columns.
+        Shifts for the light of each physical filter, by the pipeline's name of the filter.
+        Without filters the version is 1.0, which has no such columns.
     thickness, pitch : float
-        Of the sensor [um], for the record.
+        Thickness and pixel pitch of the sensor [um], stored as fixed parameters; nan: not known.
     meta : mapping, optional
-        More cards.
+        Further header keywords.
 
     Returns
     -------
     DistortionMatrix
-        Shifts come from the table, not from a fit: of fitted parameters only ``thickness``
-        and ``pixelsize`` are named, held; errors, chi-squares and ``ATH``, ``ATH_MINUS_BETA``,
-        whose meaning the pipeline does not say, are nan.
+        Shifts of the table.  Because nothing was fitted, ``thickness`` and ``pixelsize`` are the
+        only parameters, both fixed; errors and chi-squares are nan, and so are ``ATH`` and
+        ``ATH_MINUS_BETA``, whose meaning the pipeline does not document.
 
     Raises
     ------
     TableError
-        No amplifier, a gain that is not above 0, shifts of different size.
+        No amplifier, a gain that is not above 0 and finite, or shifts of different shapes.
 
     Examples
     --------
@@ -223,7 +225,7 @@ def make_distortion_matrix(
 
 
 def _check_gains(gains: Mapping[str, float]) -> int:
-    """Number of amplifiers."""
+    """Number of amplifiers; refuses none, and gains that are not above 0."""
     if not gains:
         raise TableError("a dataset needs at least one amplifier with its gain")
     for name, gain in gains.items():

@@ -1,4 +1,4 @@
-"""Distortion tables: how far every vertex of the pixel boundaries moves.
+"""Distortion table: displacements of the pixels' vertices by charge, background and depth.
 
 The source pixel holds a charge, all other pixels a uniform background, and the light
 converts at some depth; the table holds the total displacement of the vertices around the
@@ -33,9 +33,9 @@ class DistortionTable:
     Attributes
     ----------
     charges : ndarray, shape (nq,)
-        Charge of the source pixel [e-], ascending.
+        Charge of the source pixel [e-], at least 0, ascending.
     backgrounds : ndarray, shape (nb,)
-        Charge of every other pixel [e-], ascending.
+        Charge of every other pixel [e-], at least 0, ascending.
     depths : ndarray, shape (nd,)
         Conversion depths [um above the gates], ascending, above 0 up to the thickness.
     pitch : tuple of float
@@ -45,35 +45,42 @@ class DistortionTable:
     vertices : int
         Vertices a side between the corners, at :func:`vertex_fractions`.
     reach : int
-        Pixel offsets -reach..reach.
+        Largest pixel offset: the table holds offsets -reach to reach.
     corners : ndarray, shape (nq, nb, nd, 2 reach + 2, 2 reach + 2, 2)
         Displacement (dx, dy) [um] of the corners, by edge line in y, then x.
     horizontal : ndarray, shape (nq, nb, nd, 2 reach + 2, 2 reach + 1, vertices, 2)
-        Of vertices on edges along x: edge line in y, pixel in x.
+        Displacement [um] of the vertices on edges along x, by edge line in y, then pixel in x.
     vertical : ndarray, shape (nq, nb, nd, 2 reach + 1, 2 reach + 2, vertices, 2)
-        Of vertices on edges along y: pixel in y, edge line in x.
+        Displacement [um] of the vertices on edges along y, by pixel in y, then edge line in x.
     full_well : float
         Charge at which a pixel spills along its column [e-]; nan where not known.
     errors : mapping of str to float
-        Estimated errors, units in the names; nan where an estimate failed.
+        Estimated errors, with units in the names; nan where an estimate failed.
     provenance : mapping of str to str
-        How it was made.
+        Version, engine and settings that made the table.
     device_text : str
-        The device file, empty where not known.
+        Text of the device file; empty where not known.
     symmetric : bool
-        Whether x and y through the source pixel's centre are mirror lines.
+        Whether the lines in x and in y through the source pixel's centre are mirror lines.
+
+    Raises
+    ------
+    TableError
+        Axes that are not finite or do not ascend, arrays of another shape, displacements where
+        charge and background are equal, or another value that is not allowed.
 
     Notes
     -----
-    Where the source charge equals the background nothing moves.  Between levels the
+    Where the source charge Q equals the background B nothing moves.  Between levels the
     response D / (Q - B) is interpolated and multiplied by Q - B, so that this holds
     everywhere: cubic splines in charge and background (below four levels the polynomial
     through them), monotone cubics in the logarithm of depth.  At a node with Q = B the
-    response is that of the polynomial through the three nearest charges.  Nodes come back
-    to round-off.  A table of one charge is linear in charge from 0 on, as GalSim's are.
+    response is that of the polynomial through the three nearest charges.  At nodes the
+    interpolation returns the table's values to round-off.  A table of one charge is linear in
+    charge from 0 on, as GalSim's are.
 
-    Arrays are kept in single precision (1e-7 of a displacement) so that reading what was
-    written gives the same bits.
+    Arrays are rounded to single precision (1e-7 of a displacement), which the file holds, so that
+    a table reads back equal bit for bit.
 
     Examples
     --------
@@ -149,6 +156,7 @@ class DistortionTable:
         object.__setattr__(self, "provenance", MappingProxyType(provenance))
 
     def _check_numbers(self) -> None:
+        """Convert the scalars to plain numbers and refuse those outside their ranges."""
         for name, low in (("vertices", 1), ("reach", 0)):
             value = getattr(self, name)
             if int(value) != value or value < low:
@@ -173,6 +181,7 @@ class DistortionTable:
             )
 
     def _shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape that each array must have."""
         levels = (len(self.charges), len(self.backgrounds), len(self.depths))
         n, nv = 2 * self.reach + 1, self.vertices
         return {
@@ -220,7 +229,7 @@ class DistortionTable:
         return summary_to_html("DistortionTable", self._rows())
 
     def _rows(self) -> list[tuple[str, str]]:
-        """Say what is in the table, how wrong it may be and how it was made."""
+        """Rows of the summary: contents, errors and provenance."""
         side = 2 * self.reach + 1
         well = "not known" if np.isnan(self.full_well) else f"{self.full_well:,.0f} e-"
         rows = [
@@ -296,23 +305,32 @@ class DistortionTable:
     def displacements(
         self, *, charge: float, background: float = 0.0, depth: float
     ) -> Displacements:
-        """Displacements between the levels of the table.
+        """Interpolate the displacements between the levels of the table.
 
         Parameters
         ----------
         charge, background : float
-            Source charge and charge of all other pixels [e-].
+            Source charge and charge of all other pixels [e-], within the table's levels.
         depth : float
-            Conversion depth [um above the gates].
+            Conversion depth [um above the gates], within the table's depths.
 
         Returns
         -------
         Displacements
+            Displacements (dx, dy) of corners and vertices [um], shapes as in the table without
+            its first three axes.
 
         Raises
         ------
         TableError
-            A value outside the table; names the range, and for the charge the full well.
+            A value outside the table; the message names the range, and for the charge the full
+            well.
+
+        Examples
+        --------
+        >>> table = DistortionTable.load("itl_sta3800c")
+        >>> table.displacements(charge=50000.0, depth=95.0).corners.shape
+        (10, 10, 2)
         """
         low = 0.0 if len(self.charges) == 1 else float(self.charges[0])
         well = "" if np.isnan(self.full_well) else f" (full well {self.full_well:,.0f} e-)"
@@ -337,6 +355,7 @@ class DistortionTable:
 
     @staticmethod
     def _inside(name: str, value: float, low: float, high: float, unit: str) -> None:
+        """Refuse a value outside the table, with a margin for round-off."""
         margin = 1e-9 * max(abs(low), abs(high))
         if not low - margin <= value <= high + margin:
             allowed = f"{low:g}" if low == high else f"from {low:g} to {high:g}"
@@ -345,7 +364,7 @@ class DistortionTable:
             )
 
     def nominal(self) -> Displacements:
-        """Give the positions (x, y) [um] of undistorted vertices, source centre at 0."""
+        """Return the positions (x, y) [um] of undistorted vertices, source centre at 0."""
         return nominal_positions(self.pitch, self.reach, vertex_fractions(self.vertices))
 
     def _outlines(self, moved: Displacements) -> FloatArray:
@@ -365,14 +384,14 @@ class DistortionTable:
     def polygon(
         self, i: int, j: int, *, charge: float, background: float = 0.0, depth: float
     ) -> FloatArray:
-        """Boundary of the pixel at offset (i, j) from the source.
+        """Return the boundary of the pixel at offset (i, j) from the source.
 
         Parameters
         ----------
         i, j : int
             Offset in x and in y [pixel], whole numbers from -reach to reach.
         charge, background, depth : float
-            As in :meth:`displacements`.
+            Charges [e-] and conversion depth [um], as in :meth:`displacements`.
 
         Returns
         -------
@@ -394,12 +413,22 @@ class DistortionTable:
         return np.roll(outline, self.vertices // 2, axis=0)
 
     def areas(self, *, charge: float, background: float = 0.0, depth: float) -> FloatArray:
-        """Areas of all pixels [um^2].
+        """Return the areas of all pixels.
+
+        Parameters
+        ----------
+        charge, background, depth : float
+            Charges [e-] and conversion depth [um], as in :meth:`displacements`.
 
         Returns
         -------
         areas : ndarray, shape (2 reach + 1, 2 reach + 1)
-            ``areas[j + reach, i + reach]`` for offset i in x and j in y.
+            Areas [um^2], ``areas[j + reach, i + reach]`` for offset i in x and j in y.
+
+        Raises
+        ------
+        TableError
+            A value outside the table.
         """
         p = self._outlines(
             self.displacements(charge=charge, background=background, depth=depth)
@@ -412,7 +441,29 @@ class DistortionTable:
     def area_changes(
         self, *, charge: float, background: float = 0.0, depth: float
     ) -> FloatArray:
-        """Areas less the nominal area [um^2], see :meth:`areas`."""
+        """Return the areas of all pixels less the nominal area.
+
+        Parameters
+        ----------
+        charge, background, depth : float
+            Charges [e-] and conversion depth [um], as in :meth:`displacements`.
+
+        Returns
+        -------
+        changes : ndarray, shape (2 reach + 1, 2 reach + 1)
+            Area changes [um^2], ``changes[j + reach, i + reach]``.
+
+        Raises
+        ------
+        TableError
+            A value outside the table.
+
+        Examples
+        --------
+        >>> table = DistortionTable.load("itl_sta3800c")
+        >>> bool(table.area_changes(charge=50000.0, depth=95.0)[4, 4] < 0)
+        True
+        """
         return (
             self.areas(charge=charge, background=background, depth=depth)
             - self.pitch[0] * self.pitch[1]
@@ -421,9 +472,9 @@ class DistortionTable:
     # -- files -------------------------------------------------------------------------
 
     def write(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write a FITS file (beside, then renamed).
+        """Write a FITS file under a temporary name, then rename it: half a file never exists.
 
-        Of a table that is mirror-symmetric bit for bit only a quadrant is stored.
+        Only one quadrant is stored of a table that is mirror-symmetric bit for bit.
 
         Parameters
         ----------
@@ -449,7 +500,7 @@ class DistortionTable:
         Parameters
         ----------
         name : str
-            Of the device, such as 'e2v_ccd250'.
+            Name of the device, such as 'e2v_ccd250'.
 
         Returns
         -------
@@ -458,7 +509,7 @@ class DistortionTable:
         Raises
         ------
         TableError
-            No table of that name; lists all, and the one that was probably meant.
+            No table of that name; the message lists all names and suggests the most similar one.
 
         Examples
         --------
@@ -476,12 +527,21 @@ class DistortionTable:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> DistortionTable:
-        """Read what :meth:`write` wrote.
+        """Read a table from a FITS file.
+
+        Parameters
+        ----------
+        path : path-like
+            File that :meth:`write` wrote.
+
+        Returns
+        -------
+        DistortionTable
 
         Raises
         ------
         TableError
-            Not such a file, an unknown schema, or damaged; names the file.
+            The file is missing, of another kind or schema, or damaged; the message names it.
         """
         from bfsensor.table.fits_format import read_fields
 

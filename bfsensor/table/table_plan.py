@@ -1,4 +1,4 @@
-"""What a distortion table is to hold: checked against the device, defaults filled in."""
+"""Plan of a distortion table: its levels, checked against the device, with defaults filled in."""
 
 from __future__ import annotations
 
@@ -30,22 +30,54 @@ Measured against 64 cells for the two LSST devices
 centre, 0.5 % at (0, 1), 0.1 % at (1, 1), and at (1, 0) 0.1 % (ITL) and 1.1 % (E2V)."""
 
 CHARGE_FRACTIONS = (0.03, 0.15, 0.35, 0.55, 0.75, 0.9)
-"""Source charges of a table in full wells; the response bends most at small charges."""
+"""Source charges of a table beside 0, in full wells.
+
+Chosen: closer at small charges, where the response changes fastest with the charge.  They end
+below the full well; sensors hold the response of the last level up to it."""
 
 BACKGROUND_FRACTIONS = (0.0, 0.25, 0.5, 0.8)
-"""Background charges of a table in full wells."""
+"""Charges of all other pixels in a table, in full wells.
+
+Chosen: the response varies more slowly with the background than with the charge; twice as many
+levels would take twice as long."""
 
 STORAGE_DEPTH = 0.3
 """Depth of the stored charge below the channel's silicon surface [um].
 
-The mean depth of the electrons is 0.25 to 0.36 um in the four built-in devices from 20,000 to
-150,000 e- (tests); a device with deeper implants stores deeper, and its table's lowest level
-is then too low by that much."""
+Measured: the mean depth of the electrons is within 0.07 um of this in the built-in devices at
+20,000 to 150,000 e- (``tests/table/test_build.py``); a device with deeper implants stores deeper,
+and the lowest depth of its table is then too low by the difference."""
 
 
 @dataclass(frozen=True)
 class TablePlan:
-    """Everything that determines a table's numbers."""
+    """Everything that determines the numbers of a table.
+
+    Attributes
+    ----------
+    device : Device
+        Mirror-symmetric device, fully depleted.
+    charges, backgrounds : tuple of float
+        Source charges and charges of all other pixels [e-], ascending, up to the full well.
+    depths : tuple of float
+        Conversion depths [um above the gates], ascending.
+    vertices : int
+        Vertices a side between the corners.
+    reach : int
+        Largest pixel offset.
+    cells : int
+        Mesh cells a pixel.
+    refine_z : int
+        Further halvings of the mesh in z.
+    full_well : float
+        Charge at which a pixel spills along its column [e-].
+
+    Examples
+    --------
+    >>> from bfsensor import Device
+    >>> plan_table(Device.load("itl_sta3800c"), pixels=5).reach
+    2
+    """
 
     device: Device
     charges: tuple[float, ...]
@@ -59,7 +91,7 @@ class TablePlan:
 
     @property
     def key(self) -> str:
-        """Digest that changes with anything that would change a level."""
+        """Digest of all inputs of the levels and of the version, which names checkpoints."""
         text = json.dumps(
             [
                 bfsensor.__version__,
@@ -77,11 +109,12 @@ class TablePlan:
 
 
 def default_depths(device: Device) -> tuple[float, ...]:
-    """Seven conversion depths [um above the gates], from the stored charge to the light side.
+    """Return up to seven conversion depths [um above the gates], from the charge to the back.
 
-    At the first, the height of the charge (0.3 um into the silicon of the channel), nothing
-    moves; the second is the lowest at which every electron's well is well defined.  The
-    response rises over one pixel pitch and is nearly flat beyond four.
+    At the first, the height of the stored charge (:data:`STORAGE_DEPTH` into the silicon of the
+    channel), nothing moves; the second is the lowest from which every electron drifts to one
+    definite well.  The response rises over one pixel pitch and is nearly flat beyond four; in
+    thin devices the depths of two and four pitches are left out.
     """
     surfaces = Surfaces.of(device)
     thickness = device.silicon.thickness
@@ -95,9 +128,9 @@ def default_depths(device: Device) -> tuple[float, ...]:
 
 
 def storage_height(device: Device) -> float:
-    """Height above the gates [um] at and below which boundaries are taken as fixed.
+    """Return the height above the gates [um] at and below which boundaries are taken as fixed.
 
-    Where the charge is stored, :data:`STORAGE_DEPTH` into the silicon of the channel.
+    It is the height of the stored charge, :data:`STORAGE_DEPTH` into the silicon of the channel.
     """
     return Surfaces.of(device).silicon_channel + STORAGE_DEPTH
 
@@ -113,37 +146,49 @@ def plan_table(
     accuracy: float = 0.01,
     refine_z: int = 0,
 ) -> TablePlan:
-    """Check a request against the device and fill in what was left open.
+    """Plan a distortion table: check the levels against the device and fill in defaults.
 
     Parameters
     ----------
     device : Device
-        Mirror-symmetric in x and y.
+        Device that is mirror-symmetric in x and y and fully depleted.
     charges : sequence of float, optional
-        Source charges [e-]; by default zero and :data:`CHARGE_FRACTIONS` of the full well.
+        Source charges [e-], ascending, from 0 to the full well; by default zero and
+        :data:`CHARGE_FRACTIONS` of the full well, rounded to two digits.
     backgrounds : sequence of float, optional
-        Charge of all other pixels [e-]; by default :data:`BACKGROUND_FRACTIONS`.
+        Charges of all other pixels [e-], ascending, from 0 to the full well; by default
+        :data:`BACKGROUND_FRACTIONS` of the full well, rounded to two digits.
     depths : sequence of float, optional
-        Conversion depths [um above the gates]; by default :func:`default_depths`.
+        Conversion depths [um above the gates], ascending, from the height of the stored charge
+        to the thickness; by default :func:`default_depths`.
     vertices : int
-        Vertices a side between the corners.
+        Vertices a side between the corners, at least 2.
     pixels : int
-        Width of the table [pixel], odd.
+        Width of the table [pixel], odd, 3 to 11.
     accuracy : float
-        Wanted accuracy of area changes, relative; sets the mesh (:data:`ACCURACIES`).
+        Wanted relative accuracy of the nearest area changes, at least 0.005; it sets the mesh
+        (:data:`ACCURACIES`).
     refine_z : int
         Further halvings of the mesh in z.
 
     Returns
     -------
     TablePlan
+        Plan with the device's full well, which is solved for here (about 1 s).
 
     Raises
     ------
     TableError
-        Something does not fit; says the limit.
+        A level outside the device, levels that do not ascend, or another value that is not
+        allowed; the message names the limit.
     DeviceError
         The back bias does not fully deplete the device.
+
+    Examples
+    --------
+    >>> from bfsensor import Device
+    >>> plan_table(Device.load("itl_sta3800c"), accuracy=0.02).cells
+    24
     """
     if not device.is_mirror_symmetric:
         raise TableError(
@@ -194,7 +239,7 @@ def plan_table(
 
 
 def _round(charge: float) -> float:
-    """Round to two digits: a table's levels are meant to be read."""
+    """Round a charge to two digits, so that the levels of a table are easy to read."""
     if charge <= 0:
         return 0.0
     digits = 1 - int(np.floor(np.log10(charge)))

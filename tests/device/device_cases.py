@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from bfsensor.device.device import (
-    Device,
-)
+from bfsensor.device.device import Device
 from bfsensor.errors import DeviceError
 
 ITL = Device.load("itl_sta3800c")

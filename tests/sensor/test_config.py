@@ -269,7 +269,7 @@ def test_a_shift_map_comes_from_its_file(tmp_path):
 
 
 def test_forms_of_a_sensor():
-    """What GalSim's documentation allows in place of a dict with the type."""
+    """GalSim's documentation allows other forms than a dict with the type."""
     rng = galsim.BaseDeviate(77)
     direct = bfsensor.BrighterFatterSensor("e2v_ccd250", rng=rng, nrecalc=500)
     first = {"type": "BrighterFatter", "name": "e2v_ccd250", "nrecalc": 500}
@@ -306,7 +306,7 @@ def test_forms_of_a_sensor():
 
 @pytest.mark.parametrize(("by", "fresh"), [("image_num", False), ("obj_num", True)])
 def test_a_sensor_is_kept_by_index_key(by, fresh):
-    """imSim keeps one sensor an image; a sensor of each object is built anew."""
+    """imSim keeps one sensor an image; a sensor of each object is built for it."""
     sensor = {"type": "BrighterFatter", "index_key": by, "strength": "$1.0 + obj_num"}
     base = {"image": {"sensor": sensor}, "image_num": 0, "obj_num": 0, "file_num": 0,
             "rng": galsim.BaseDeviate(77), "image_num_rng": galsim.BaseDeviate(78),

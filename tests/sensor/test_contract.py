@@ -1,4 +1,4 @@
-"""What GalSim and imSim ask of a sensor: objects, generators, drawing, pools."""
+"""Requirements of GalSim and imSim on a sensor: objects, generators, drawing, pools."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What sensors refuse, and that a refusal changes nothing."""
+"""Refusals of sensors: their messages, and that a refusal changes nothing."""
 
 from __future__ import annotations
 
@@ -86,8 +86,8 @@ def test_refusals_change_nothing(kind, options):
 @BOTH
 @pytest.mark.parametrize("values", [(np.inf, -np.inf), (-np.inf, np.inf)])
 def test_infinities_of_both_signs_are_refused_without_warning(kind, values):
-    # FAILS: _light and _check_finite (sensor/base.py) look at sums, and numpy warns of
-    # inf - inf; a caller who turns warnings into errors gets a RuntimeWarning instead.
+    # The checks look at sums first, and numpy would warn of inf - inf: a caller who turns
+    # warnings into errors must get the SensorError.
     bad = photons()
     bad.x[[7, 9]] = values
     with pytest.raises(SensorError, match="photon 7: x"):
@@ -100,7 +100,7 @@ def test_infinities_of_both_signs_are_refused_without_warning(kind, values):
 
 @BOTH
 def test_photons_may_be_as_far_as_numbers_go(kind):
-    # FAILS: as above; the sum of two finite positions overflows, and numpy warns.
+    # The sum of two finite positions overflows: no warning, and no refusal.
     far = galsim.PhotonArray(2, np.full(2, 1.7e308), np.zeros(2), np.ones(2))
     assert make(kind).accumulate(far, blank()) == 0.0
 

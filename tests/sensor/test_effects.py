@@ -156,7 +156,7 @@ def test_added_shifts_move_each_edge_by_their_mean_and_keep_the_area():
 
 
 def test_polygons_tile_under_added_shifts():
-    """What is gained is lost, to all orders: corners stay common to four pixels."""
+    """Areas gained and lost are equal to all orders: corners stay common to four pixels."""
     areas = areas_of(sensor_with(Tail({"amp": 1e-6}), **PLAIN), single(2e4, 25))
     # Shifts of 0.02 pixel: where corners part, 4e-4 of area for each of 170 is lost or gained.
     assert np.abs(areas - 1).max() > 0.03
@@ -184,7 +184,7 @@ def test_transposed_sensors_turn_effects():
     np.testing.assert_allclose(turned, upright.T, atol=1e-6)
 
 
-# -- responses that bend -------------------------------------------------------------------
+# -- responses that grow with charge -------------------------------------------------------
 
 
 @pytest.mark.parametrize("b", [-3e-6, 2e-6])

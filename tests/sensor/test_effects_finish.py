@@ -120,10 +120,10 @@ def test_variants_are_known_by_their_parameters(monkeypatch):
         ),
         ([entry("charge_loss", q=float("nan"))], "q = nan is not finite"),
         ([entry("charge_loss", q=-1e-7)], "a loss of at least 0"),
-        ([entry("tearing")], "tearing act by place.*layout="),
+        ([entry("tearing")], "tearing.*layout="),
         (
             [Shade({"dt": 1.0}), Rough({"amp": 0.1})],
-            "shutter_timing, mask_stitch act by place",
+            "shutter_timing, mask_stitch.*layout=",
         ),
         ([Warm({"rate": 1.0})], "dark_hot cannot act.*'seconds'"),
     ],
@@ -160,11 +160,11 @@ def test_wrong_conditions_and_layouts_are_refused(options, message):
 
 def test_effects_of_the_electronics_are_named_and_left_out():
     bent = make_effect("gain_nonlinearity", {"c2": 0.01, "c3": 0.0})
-    with pytest.warns(galsim.GalSimWarning, match="gain_nonlinearity left out") as caught:
+    with pytest.warns(galsim.GalSimWarning, match="gain_nonlinearity") as caught:
         sensor = sensor_with(bent, COUPLING)
     assert len(caught) == 1
     assert sensor.acts_at_end
-    with pytest.warns(galsim.GalSimWarning, match="gain_nonlinearity left out"):
+    with pytest.warns(galsim.GalSimWarning, match="gain_nonlinearity"):
         assert not sensor_with(bent).acts_at_end
 
 
@@ -172,7 +172,7 @@ def test_rings_do_not_act_twice():
     class Rings(Rough):
         word = "tree_rings"
 
-    with pytest.raises(SensorError, match="rings would act twice"):
+    with pytest.raises(SensorError, match=r"tree_rings.*treering_func"):
         sensor_with(Rings({"amp": 0.01}), treering_func=RINGS, layout={"shape": (9, 9)})
 
 
@@ -278,7 +278,7 @@ def test_what_acts_once_acts_once():
     with pytest.raises(galsim.GalSimError, match="resume after finish"):
         sensor.accumulate(rest, image, resume=True)
     np.testing.assert_array_equal(image.array, kept)
-    # The image is exposed anew, from the charge in it.
+    # The image is exposed again, from the charge in it.
     sensor.accumulate(rest, image)
     sensor.finish(image)
     # GalSim draws on a view of the image.

@@ -59,7 +59,7 @@ def test_wavelengths_share_one_solution(swept):
 
 
 def test_response_is_that_of_a_table_about_the_level(swept):
-    """From the library's own road, light converting at the back surface."""
+    """Against a table that is planned by hand, with light that converts at the back surface."""
     made, _ = swept
     depths = (0.9, 5.0, 20.0, 100.0)
     table = build_table(
@@ -120,7 +120,7 @@ def test_written_and_read_back_equal(swept, tmp_path):
 
 
 def test_what_numpy_refuses_is_a_reason(monkeypatch):
-    """As at -1 V, where lines between pixels are missing where their ends are asked for."""
+    """At -1 V boundary lines between pixels are missing, and numpy refuses to interpolate."""
     import bfsensor.sweeps.points as library
 
     def fail(plan):
@@ -133,13 +133,13 @@ def test_what_numpy_refuses_is_a_reason(monkeypatch):
 
 
 def test_two_gates_may_pass_one_another():
-    """High before low or low before high: whichever is a device all along."""
+    """Gates change one by one, in the order in which every step is a device."""
     from bfsensor.sweeps.device_sweep import _device_at
 
     raised = _device_at(ITL, over("gate_low=3V", "gate_high=12V"), (0, 0))
     assert (raised.operating_point.gate_low, raised.operating_point.gate_high) == (3, 12)
     crossed = _device_at(ITL, over("gate_low=3V", "gate_high=2V"), (0, 0))
-    assert "must be above gate_low" in crossed
+    assert isinstance(crossed, str) and "gate_low" in crossed
 
 
 @pytest.mark.parametrize("wavelength", [400.0, 700.0, 950.0, 1100.0, 1500.0])
@@ -151,7 +151,7 @@ def test_light_weights_are_mean_responses(wavelength):
     assert weights.sum() == pytest.approx(1, abs=1e-12)
     length = min(float(silicon.absorption_length(wavelength, 173.0)), 1e9)
     uniform = np.random.default_rng(771).uniform(size=400_000)
-    # Of what converts in the silicon above the first depth.
+    # Depths of the photons that convert in the silicon above the first depth.
     z = 100.0 + length * np.log1p(-uniform * -np.expm1(-99.0 / length))
     drawn = np.interp(z, depths, response)
     sigma = drawn.std() / np.sqrt(len(drawn))
@@ -167,9 +167,9 @@ def test_temperature_moves_where_light_converts():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"level": -1.0}, "level = -1 e- and full pixel = 0 e- must be finite"),
-        ({"full_pixel": np.nan}, "must be finite"),
-        ({"cells": 7}, "cells = 7 must be an even number of at least 8"),
+        ({"level": -1.0}, "level = -1 e-"),
+        ({"full_pixel": np.nan}, "full pixel = nan e-"),
+        ({"cells": 7}, "cells = 7"),
     ],
 )
 def test_wrong_requests_are_refused(tmp_path, options, message):
@@ -181,7 +181,7 @@ def test_wrong_requests_are_refused(tmp_path, options, message):
 def test_a_damaged_point_is_named(tmp_path):
     point = SweepPoint(ITL.to_toml(), LEVEL, 0.0, 8)
     (tmp_path / f"{point.key}.npz").write_bytes(b"PK\x03\x04 half of it")
-    with pytest.raises(SweepError, match="not a finished point; delete it"):
+    with pytest.raises(SweepError, match=rf"{point.key}\.npz"):
         PointResponse.read(tmp_path / f"{point.key}.npz")
 
 
@@ -219,9 +219,7 @@ def test_figure_shows_every_answer(swept):
     assert any(
         np.allclose(y, [0, 100 * (made.a[1, 0, 0] / made.a[0, 0, 0] - 1)]) for y in changes
     )
-    with pytest.raises(
-        SweepError, match="'gate_low' was not swept; there are back_bias, wave"
-    ):
+    with pytest.raises(SweepError, match=r"'gate_low' was not swept.*back_bias, wave"):
         draw_sweep(made, ax, against="gate_low")
 
 

@@ -76,9 +76,9 @@ def test_symmetry_is_exact_and_files_come_back(table, tmp_path):
 def test_the_header_says_what_it_is(table):
     assert table.provenance["engine"] == ENGINE
     assert "linear in charge" in ENGINE
-    told = json.loads(table.provenance["parameters [um, V/um]"])
-    assert ImageCharge(**told) == MODEL
-    # 0.03 um of 0.6 um at 100,000 e-: the drift field bent by the charge.
+    stated = json.loads(table.provenance["parameters [um, V/um]"])
+    assert ImageCharge(**stated) == MODEL
+    # 0.03 um of 0.6 um at 100,000 e-: the charge deflects the drift field.
     assert 0.002 < table.errors["first order, largest charge [um]"] < 0.1
     assert table.errors["image series, bound [um]"] < 1e-6
     strong = build_image_charge_table(MODEL, charges=(0.0, 1e7), depths=[5.0], pixels=3)

@@ -86,7 +86,7 @@ def test_reading_back_what_was_written_for_galsim(tmp_path):
     again = read_galsim(tmp_path / "ours")
     expected = table.area_changes(charge=70e3, depth=60.0)
     assert expected[4, 4] < -3
-    # Reading fits polygons to lines: it keeps areas up to the bend of a line within a step
+    # Reading fits polygons to lines: it keeps areas up to the curvature of a line within a step
     # of the vertices, about (1.7 um)^2 / 12 x 0.02 / um x 10 um a side at most.
     np.testing.assert_allclose(
         again.area_changes(charge=70e3, depth=60.0), expected, rtol=0, atol=0.05
@@ -106,9 +106,7 @@ def test_what_galsim_cannot_hold_is_refused(exported, tmp_path):
         "GalSim assumes square pixels, not 10 x 12 um"
     )
     bare = dataclasses.replace(exported, device_text="")
-    assert refusal(write_galsim, bare, stem, **where) == (
-        "GalSim needs the device for its diffusion, and this table has none"
-    )
+    assert "device" in refusal(write_galsim, bare, stem, **where)
     assert refusal(write_galsim, exported, stem, charge=70e3, depth=101.0) == (
         "depth = 101 is outside the table, which holds from 1 to 100 um"
     )

@@ -111,7 +111,7 @@ def test_light_converts_where_its_absorption_says():
 
 
 def test_a_kernel_known_in_closed_form():
-    """Of products of sines the discrete Laplacian is a multiple."""
+    """Products of cosines are eigenfunctions of the discrete Laplacian."""
     n = 8
     at = np.arange(-n, n + 1)
     wave = np.cos(np.pi * at / (2 * n))
@@ -210,7 +210,7 @@ def test_what_was_not_measured_is_not_made_up():
             "tail_slope = -0.5 must be below -1",
         ),
         (lambda t: quadrant_shifts(t, background=1e6), "background = 1e\\+06 is outside"),
-        (lambda t: quadrant_shifts(t, photons=[1.0]), "photons need their wavelengths"),
+        (lambda t: quadrant_shifts(t, photons=[1.0]), "photons"),
         (lambda t: quadrant_shifts(t, wavelengths=[500.0]), "the table holds no device"),
         (
             lambda t: quadrant_shifts(
@@ -220,13 +220,13 @@ def test_what_was_not_measured_is_not_made_up():
         ),
         (
             lambda t: quadrant_shifts(t, wavelengths=[1500.0], temperature=173.0),
-            "none of this light converts",
+            r"wavelengths = \[1500",
         ),
         (
             lambda t: quadrant_shifts(
                 t, wavelengths=[500.0], photons=[-1.0], temperature=173.0
             ),
-            "photons must be finite, not negative",
+            "photons must be finite",
         ),
         (lambda t: solve_kernel(np.zeros((2, 3))), r"areas of shape \(2, 3\)"),
         (lambda t: make_kernel(quadrant_shifts(t), {}), "at least one amplifier"),
@@ -246,7 +246,7 @@ def test_refusals(make, message):
 
 
 def test_tables_that_cannot_serve():
-    with pytest.raises(TableError, match="reaches no neighbour"):
+    with pytest.raises(TableError, match="reach = 0"):
         quadrant_shifts(make_table(reach=0))
-    with pytest.raises(TableError, match="one depth knows no wavelengths"):
+    with pytest.raises(TableError, match="one depth"):
         quadrant_shifts(make_table(depths=[50.0]), wavelengths=[500.0], temperature=173.0)
