@@ -23,7 +23,6 @@ extensions = [
     "sphinx_click", "sphinx_gallery.gen_gallery",
 ]  # fmt: skip
 exclude_patterns = [
-    "README.in.md",
     "examples/*",
     "gallery/**/*.ipynb",
     "sg_execution_times.rst",

@@ -3,7 +3,8 @@
 Claims, their sources, criteria, commands and files of results are those of the README.md in each
 folder; commits, dates and CPU seconds are those of the files' headers.  A result is stale where a
 file that its command depends on (:mod:`validation.common.dependencies`) has other code now than at
-the commit that its rows were made at.
+the commit that its rows were made at.  The same marks go into the README.md of each folder, and
+into the pages that quote numbers (:mod:`validation.quoted_numbers`): those are copies of the index.
 """
 
 from __future__ import annotations
@@ -27,10 +28,11 @@ PAGE = ROOT / "validation" / "README.md"
 HEAD = """\
 # Claims and how they were checked
 
-Written by `python -m validation.index`; a test fails where it is not up to date. A folder holds one
-claim or a few of one kind; its README.md states source and criterion of each, and its notebook, if
-it has one, asserts the criterion. Notebooks marked *quick* run with every change, the others take
-minutes. `concealed/` makes campaigns whose truth is sealed, `common/` holds what checks share.
+Written by `python -m validation.index`, as are the lines *Rows* in the README.md of each folder; a
+test fails where they are not up to date. A folder holds one claim or a few of one kind; its README.md
+states source and criterion of each, and its notebook, if it has one, asserts the criterion. Notebooks
+marked *quick* run with every change, the others take minutes. `concealed/` makes campaigns whose truth
+is sealed, `common/` holds what checks share.
 Commands run from the root of a checkout; words in capitals are folders that are not shipped.
 
 ## Claims
@@ -48,14 +50,19 @@ by run, before headers kept each run, name the commit of the last rows only.
 
 A result is stale where any file that its command imports, directly or through others, or a device
 or table that it names, has other code now than when the rows were made. Imports, docstrings and
-comments do not count, nor that a file moved. The commit under *stale since* is the last one with
-the rows' code; `python -m validation.index --why RESULT` lists the files. Stale does not mean wrong,
-for most changes leave numbers as they are, but nobody has made the rows again.
+comments do not count, nor that a file moved. Under *stale since* stand day and commit of the last
+version with the rows' code; `python -m validation.index --why RESULT` lists the files. *Not known*
+is said in a clone that lacks the commit of the rows. Stale does not mean wrong, for most changes
+leave numbers as they are, but nobody has made the rows again.
 {stale} of {results} results are stale.
 
 | result | by | today | commit | date | CPU s | stale since |
 |---|---|---|---|---|---|---|
 """
+
+
+UNKNOWN = "not known"
+"""Of commits that a clone does not have."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +88,24 @@ class Run:
     commit: str
     date: str = ""
     cpu_s: float = np.nan
+
+
+@dataclass(frozen=True)
+class Age:
+    """When a file of results was made, and since when it is stale, as the index says it."""
+
+    commit: str
+    date: str
+    stale: str
+    """Empty where the code is that of the rows; :data:`UNKNOWN` where this cannot be said."""
+
+    def __str__(self) -> str:
+        made = f"made {self.date} ({self.commit})"
+        if self.stale == UNKNOWN:
+            return f"{made}; not known whether stale"
+        if self.stale:
+            return f"{made}; **stale since {self.stale}**: the code behind it has changed"
+        return f"{made}; the code behind it is the same today"
 
 
 @dataclass
@@ -114,7 +139,7 @@ def _claims_of(place: Path) -> Iterator[Claim]:
         for line in lines:
             if line.startswith("- "):
                 name, colon, value = line[2:].partition(": ")
-                if not colon or name not in (*_ITEMS, "Source", "Criterion"):
+                if not colon or name not in (*_ITEMS, "Source", "Criterion", "Rows"):
                     raise ValueError(f"{place}: '{line}' is none of Source, Criterion, "
                                      f"{', '.join(_ITEMS)}")  # fmt: skip
                 values.setdefault(name, []).append(value)
@@ -202,7 +227,7 @@ def format_page(claims: list[Claim], results: list[Result], history: History) ->
     """Text of the index."""
     lines = [_claim_line(claim) for claim in claims]
     made = [_result_line(result, history) for result in results]
-    stale = sum(not line.endswith(("|  |", "| ? |")) for line in made)
+    stale = sum(not line.endswith(("|  |", f"| {UNKNOWN} |")) for line in made)
     runs = RUNS.format(stale=stale, results=len(results))
     return HEAD + "\n".join(lines) + "\n" + runs + "\n".join(made) + "\n"
 
@@ -231,7 +256,7 @@ def _result_line(result: Result, history: History) -> str:
         runs = sorted(runs, key=lambda run: history.seconds(run.commit))
     commits = list(dict.fromkeys(run.commit for run in runs))
     days = sorted(
-        {run.date or (history.date(run.commit) if known else "?") for run in runs}
+        {run.date or (history.date(run.commit) if known else UNKNOWN) for run in runs}
     )
     seconds = np.array([run.cpu_s for run in runs])
     by = {run.command for run in runs}
@@ -245,15 +270,21 @@ def _result_line(result: Result, history: History) -> str:
         + (f" to `{commits[-1]}`, {len(commits)} commits" if commits[1:] else ""),
         " to ".join(dict.fromkeys((days[0], days[-1]))),
         "" if np.isnan(seconds).any() else f"{seconds.sum():.0f}",
-        _stale(commits[0], result, history) if known else "?",
+        _stale(commits[0], result, history) if known else UNKNOWN,
     )
 
 
 def _stale(commit: str, result: Result, history: History) -> str:
     """Since when the code is another one than at the oldest of the runs, empty if it is not."""
     changed = history.changed(commit, _files(result))
-    first = next(changed, None)
-    return f"`{history.last_same(commit, chain([first], changed))}`" if first else ""
+    try:
+        first = next(changed, None)
+        if first is None:
+            return ""
+        last = history.last_same(commit, chain([first], changed))
+        return f"{history.date(last)} (`{last}`)"
+    except LookupError:  # a clone that lacks old files
+        return UNKNOWN
 
 
 def _files(result: Result) -> frozenset[str]:
@@ -262,6 +293,44 @@ def _files(result: Result) -> frozenset[str]:
 
 def _row(*cells: str) -> str:
     return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+
+def read_ages(page: str) -> dict[str, Age]:
+    """Read from the text of the index how old each file of results is, by its name."""
+    rows = re.findall(r"^\| \[([^]]+\.ecsv)\]\([^)]+\) \|(.*)\|$", page, re.M)
+    ages = {}
+    for name, rest in rows:
+        _, _, commit, date, _, stale = (
+            cell.strip() for cell in re.split(r"(?<!\\)\|", rest)
+        )
+        ages[name] = Age(commit, date, stale)
+    return ages
+
+
+def with_ages(text: str, ages: Mapping[str, Age]) -> str:
+    """README.md of a folder with a line for each file of results under the command that writes it."""
+    lines = []
+    for line in text.splitlines():
+        if not line.startswith("- Rows: "):
+            lines.append(line)
+        if line.startswith("- Command: "):
+            lines += [
+                f"- Rows: [{name}](../results/{name}), {ages[name]}"
+                for name in re.findall(r"`([^`]+\.ecsv)`", line)
+            ]
+    return "\n".join(lines) + "\n"
+
+
+def write_pages(claims: list[Claim], results: list[Result], history: History) -> None:
+    """Write the index, and the marks of its results wherever else they stand."""
+    from validation.quoted_numbers import write_quotes
+
+    page = format_page(claims, results, history)
+    PAGE.write_text(page)
+    ages = read_ages(page)
+    for place in PAGE.parent.glob("*/README.md"):
+        place.write_text(with_ages(place.read_text(), ages))
+    write_quotes()
 
 
 def is_quick(notebook: Path) -> bool:
@@ -282,7 +351,7 @@ def main() -> None:
     claims, history = read_claims(), History()
     results = read_results(claims)
     if asked is None:
-        PAGE.write_text(format_page(claims, results, history))
+        write_pages(claims, results, history)
         print(f"{PAGE}: {len(claims)} claims, {len(results)} results")
         return
     if unknown := set(asked) - {result.name for result in results}:

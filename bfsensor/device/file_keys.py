@@ -7,8 +7,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from bfsensor.device.device import _CHOICES, _LISTS, _SECTIONS
 from bfsensor.device.parts import (
+    CHOICES,
+    LISTS,
+    SECTIONS,
     BuriedChannel,
     ChannelStop,
     ChannelStopDots,
@@ -172,7 +174,7 @@ def device_keys() -> tuple[DeviceKey, ...]:
     """
     return tuple(
         key
-        for section, kind in _SECTIONS.items()
+        for section, kind in SECTIONS.items()
         for key in _keys_of(kind, f"[{section}]", section)
     )
 
@@ -184,12 +186,12 @@ def _keys_of(kind: type, section: str, path: str) -> Iterator[DeviceKey]:
         meaning = MEANINGS[kind, spec.name]
         unit, allowed = spec.metadata.get("unit", ""), ""
         key = spec.name
-        if (kind, spec.name) in _LISTS:
-            key, element = _LISTS[kind, spec.name]
+        if (kind, spec.name) in LISTS:
+            key, element = LISTS[kind, spec.name]
             allowed = f"sections [[{path}.{key}]]"
             inside.append((element, f"[[{path}.{key}]]", f"{path}.{key}"))
-        elif (kind, spec.name) in _CHOICES:
-            allowed = ", ".join(f"'{word}'" for word in _CHOICES[kind, spec.name])
+        elif (kind, spec.name) in CHOICES:
+            allowed = ", ".join(f"'{word}'" for word in CHOICES[kind, spec.name])
         elif spec.name == "dots":
             allowed = f"a section [{path}.dots]"
             inside.append((ChannelStopDots, f"[{path}.dots]", f"{path}.dots"))

@@ -12,13 +12,17 @@ from validation.common import dependencies as needs
 from validation.common.dependencies import ROOT, History, code_digest, dependencies
 from validation.index import (
     PAGE,
+    UNKNOWN,
+    Age,
     Result,
     Run,
     format_page,
+    read_ages,
     read_claims,
     read_results,
     read_runs,
     script_of,
+    with_ages,
 )
 
 FOLDER = ROOT / "validation"
@@ -56,7 +60,8 @@ def cells(page, masked=()):
 def test_the_page_is_what_the_folders_and_the_files_say(claims, results, monkeypatch):
     """Run ``python -m validation.index`` if this fails.  A clone need not have every commit."""
     history = History()
-    monkeypatch.setattr(History, "last_same", lambda *_: "0000000")
+    # Which commit it is takes long to find, and another history may have another one.
+    monkeypatch.setattr(History, "last_same", lambda _self, commit, _changed: commit)
     page = format_page(claims, results, history)
     masked = {
         f"[{r.name}](results/{r.name})"
@@ -291,7 +296,65 @@ def test_of_a_clone_without_the_commit_nothing_is_said(checkout, tmp_path):
     for history in (History(checkout.root), History(tmp_path / "..")):
         assert not history.knows("0123abc") and not history.knows("")
         row = index._result_line(result, history)
-        assert row.endswith("| `0123abc` | ? |  | ? |")
+        assert row.endswith("| `0123abc` | not known |  | not known |")
+        (age,) = read_ages(row).values()
+        assert str(age) == "made not known (`0123abc`); not known whether stale"
+
+
+def test_of_a_shallow_clone_and_without_git_nothing_is_said(checkout, monkeypatch):
+    begin = checkout.commit()
+    checkout("bfsensor/far.py", FAR.replace("1", "2"))
+    checkout.commit()
+    shallow = checkout.root / "shallow"
+    words = ["clone", "-q", "--depth", "1", checkout.root.as_uri(), str(shallow)]
+    subprocess.run(["git", *words], check=True)
+    assert History(checkout.root).knows(begin)
+    assert not History(shallow).knows(begin)
+    monkeypatch.setenv("PATH", str(shallow))
+    assert not History(checkout.root).knows(begin)
+
+
+def test_of_a_clone_without_old_files_nothing_is_said(checkout, monkeypatch):
+    begin = checkout.commit()
+    result = Result("a.ecsv", [Run("python -m validation.run", begin)])
+    monkeypatch.setattr(
+        index, "_files", lambda _: dependencies("validation/run.py", checkout.root)
+    )
+    needs._needed.cache_clear()
+    assert index._result_line(result, History(checkout.root)).endswith("|  |")
+    checkout("bfsensor/far.py", FAR.replace("1", "2"))
+    row = index._result_line(result, History(checkout.root))
+    assert re.search(rf"\| \d{{4}}-\d\d-\d\d \(`{begin}`\) \|$", row)
+    git = History._run
+    lost = subprocess.CompletedProcess([], 128, b"", b"missing blob")
+    monkeypatch.setattr(
+        History, "_run", lambda self, *w: lost if "blob" in w else git(self, *w)
+    )
+    assert index._result_line(result, History(checkout.root)).endswith(f"| {UNKNOWN} |")
+
+
+def test_pages_of_the_folders_bear_the_marks_of_the_index():
+    """Run ``python -m validation.index`` if this fails."""
+    ages = read_ages(PAGE.read_text())
+    assert set(ages) == {path.name for path in (FOLDER / "results").glob("*.ecsv")}
+    for place in FOLDER.glob("*/README.md"):
+        assert place.read_text() == with_ages(place.read_text(), ages), place
+
+
+@pytest.mark.parametrize(
+    ("stale", "said"),
+    [
+        ("", "; the code behind it is the same today"),
+        ("2026-11-23 (`c1`)", "; **stale since 2026-11-23 (`c1`)**: the code behind it"),
+    ],
+)
+def test_a_mark_says_since_when_and_goes_when_rows_are_made_again(stale, said):
+    page = "- Command: `python -m a`, rows in `a.ecsv`\n- Rows: of before\n\nEnd.\n"
+    made = with_ages(page, {"a.ecsv": Age("`c0`", "2026-11-22", stale)})
+    first, second, *rest = made.splitlines()
+    assert [first, *rest] == [page.splitlines()[0], "", "End."]
+    begin = "- Rows: [a.ecsv](../results/a.ecsv), made 2026-11-22 (`c0`)"
+    assert second.startswith(begin + said)
 
 
 def test_files_behind_a_result_are_listed_and_unknown_results_refused(monkeypatch, capsys):

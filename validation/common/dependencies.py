@@ -197,7 +197,7 @@ class History:
         return datetime.fromtimestamp(self.seconds(commit), UTC).date().isoformat()
 
     def seconds(self, commit: str) -> int:
-        """When the commit was made."""
+        """When the commit was made [s since 1970]; only of commits that the clone has."""
         return int(self._git("log", "-1", "--format=%ct", commit))
 
     def changed(self, commit: str, files: Collection[str]) -> Iterator[Change]:
@@ -242,13 +242,12 @@ class History:
 
     @cache  # noqa: B019 one object lives as long as the process
     def _digest(self, blob: str, path: str) -> str:
-        on_disk = blob == _ZERO
-        content = (
-            (self.root / path).read_bytes()
-            if on_disk
-            else self._run("cat-file", "blob", blob).stdout
-        )
-        return code_digest(content, path)
+        if blob == _ZERO:  # on disk
+            return code_digest((self.root / path).read_bytes(), path)
+        done = self._run("cat-file", "blob", blob)
+        if done.returncode:
+            raise LookupError(f"this clone does not have {path} as of {blob[:7]}")
+        return code_digest(done.stdout, path)
 
     @cache  # noqa: B019
     def _tracked(self) -> frozenset[str]:
@@ -279,6 +278,8 @@ class History:
         return done.stdout.decode() if done.returncode == 0 else ""
 
     def _run(self, *words: str) -> subprocess.CompletedProcess[bytes]:
-        return subprocess.run(
-            ["git", *words], cwd=self.root, capture_output=True, check=False
-        )
+        command = ["git", *words]
+        try:
+            return subprocess.run(command, cwd=self.root, capture_output=True, check=False)
+        except FileNotFoundError:  # git is not installed
+            return subprocess.CompletedProcess(command, 127, b"", b"")

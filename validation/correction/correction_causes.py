@@ -12,10 +12,14 @@ within
     shifts vary along an edge and the light across what they sweep: sensor, linear response;
 response
     shifts are not in proportion to the charge: sensor, whole response.
+
+``python -m validation.correction.correction_causes`` writes what tables miss because they reach no
+farther than 4 pixels from charge (:func:`share_beyond`).
 """
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable
 
 import numpy as np
@@ -28,9 +32,11 @@ from bfsensor.measure.correct import correct_edges
 from bfsensor.simulate.charge_field import ImageCharge
 from bfsensor.simulate.image_charge import edge_shifts
 from bfsensor.table.quadrant_shifts import QuadrantShifts, quadrant_shifts
+from validation.common.write_results import RESULTS, write_results
 from validation.correction.correction_round_trip import (
     PEAKS,
     SIDE,
+    SIGMAS,
     growth,
     residuals,
     slope,
@@ -149,3 +155,20 @@ def share_beyond(sigma: float, reach: int, *, peak: float = 60e3) -> NDArray[np.
         for s in (near, whole)
     ]
     return 100 * (1 - grown[0] / grown[1])
+
+
+def main() -> None:
+    """Write what tables of 4 pixels miss of the growth of stars, by the width of the star."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
+    rows = []
+    for sigma in SIGMAS:
+        x, y = share_beyond(sigma, 4)
+        rows.append({"sigma_pixel": sigma, "reach": 4, "missed_x": x, "missed_y": y})
+    table = Table(rows)
+    table.pprint()
+    path = RESULTS / "growth_beyond.ecsv"
+    write_results(table, path, "python -m validation.correction.correction_causes")
+
+
+if __name__ == "__main__":
+    main()
