@@ -7,9 +7,9 @@ from collections.abc import Iterable, Iterator
 from importlib.resources import files
 from typing import Any
 
-from bfsensor.device.device import _LISTS, ORIGINS
+from bfsensor.device.device import ORIGINS
 from bfsensor.device.file_keys import SECTION_MEANINGS, DeviceKey, device_keys
-from bfsensor.device.parts import Implant
+from bfsensor.device.parts import LISTS, Implant
 from bfsensor.recording.campaign.file_keys import (
     CAMPAIGN_KEYS,
     FileKey,
@@ -110,7 +110,7 @@ def device_file_page() -> str:
 def _note_of(word: str) -> str:
     """Say how often a section inside another may stand."""
     inner = word.split(".")[-1]
-    many = any(entry == inner for entry, kind in _LISTS.values() if kind is not Implant)
+    many = any(entry == inner for entry, kind in LISTS.values() if kind is not Implant)
     return "The section may stand several times." if many else "The section is optional."
 
 

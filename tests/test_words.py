@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.words import ROOT, dialect, faults
+from tests.words import ROOT, dialect, faults, texts
 
 
 @pytest.mark.parametrize(
@@ -42,3 +42,9 @@ def test_constants_and_openings_are_found(tmp_path, monkeypatch):
         (3, "LIMIT states no origin"),
     ]
     assert ROOT.is_dir()
+
+
+@pytest.mark.parametrize("path", texts(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_texts_of_the_package_and_its_documentation_keep_the_rules(path):
+    """Dialect, texts without a subject, constants without an origin: ``python -m tests.words``."""
+    assert not [str(fault) for fault in faults(path)]

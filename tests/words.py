@@ -51,6 +51,7 @@ its year), chosen (what changes if it is twice as large), defined by a standard,
 
 APART = (
     "docs/glossary.md", "docs/gallery", "docs/reference/generated", "docs/validation",
+    "docs/concepts/effects.md",
 )  # fmt: skip
 """The page that lists the dialect, and pages that are generated."""
 
@@ -163,7 +164,8 @@ def faults(path: Path) -> Iterator[Fault]:
 
 
 def texts(*places: Path) -> list[Path]:
-    """Files of the package and of the documentation under some places."""
+    """Files under some places, by default those of the package and of the documentation."""
+    places = places or (ROOT / "bfsensor", ROOT / "docs", ROOT / "README.md")
     found = [
         path
         for place in places
@@ -174,7 +176,6 @@ def texts(*places: Path) -> list[Path]:
 
 
 if __name__ == "__main__":
-    given = [Path(word).resolve() for word in sys.argv[1:]]
-    for place in texts(*(given or [ROOT / "bfsensor", ROOT / "docs", ROOT / "README.md"])):
+    for place in texts(*(Path(word).resolve() for word in sys.argv[1:])):
         for fault in sorted(set(faults(place)), key=lambda f: f.line):
             print(fault)

@@ -25,8 +25,7 @@ REFERENCE = {
 PAGES = {
     name: path.read_text(encoding="utf-8")
     for path in sorted(DOCS.rglob("*.md"))
-    if path.name != "README.in.md"
-    and not (name := path.relative_to(DOCS).as_posix()).startswith(GENERATED)
+    if not (name := path.relative_to(DOCS).as_posix()).startswith(GENERATED)
     and name not in REFERENCE
 } | REFERENCE
 """Text of the pages, also of those that are written when the site is built."""
