@@ -472,6 +472,7 @@ def _numbers() -> dict[str, Callable[[Rows], str]]:
     for name in (
         "small table",
         "whole table",
+        "first star",
         "star",
         "make campaign",
         "check",

@@ -111,9 +111,9 @@ def test_variants_are_known_by_their_parameters(monkeypatch):
         (["charge_loss"], r"effects\[0\] must be an effect"),
         (
             [entry("charge_loss"), {"class": "gremlins"}],
-            r"effects\[1\]: effect gremlins: one of",
+            r"effects\[1\]: effect gremlins ",
         ),
-        ([{"class": "charge_loss", "parameters": {}}], "parameters none given, q needed"),
+        ([{"class": "charge_loss", "parameters": {}}], r"charge_loss: parameters .*\bq\b"),
         (
             [{"class": "charge_loss", "parameters": {"q": {"lo68": 1}}}],
             "q = .* has no number",
