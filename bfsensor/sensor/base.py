@@ -412,7 +412,7 @@ def pixels_of(image: galsim.Image, *, write: bool = True) -> NDArray[np.floating
 
 
 def _light(photons: galsim.PhotonArray) -> Light:
-    """Arrays of photons; values that are not finite are refused."""
+    """Arrays of photons; those that are not finite are dropped without flux, refused with it."""
     has_angles = photons.hasAllocatedAngles()
     arrays = {
         "x": photons.x,
@@ -422,6 +422,7 @@ def _light(photons: galsim.PhotonArray) -> Light:
         "slope_y": photons.dydz if has_angles else _EMPTY,
         "wavelength": photons.wavelength if photons.hasAllocatedWavelengths() else _EMPTY,
     }
+    kept: NDArray[np.bool_] | None = None
     for name, array in arrays.items():
         arrays[name] = np.ascontiguousarray(array, float)
         # A finite sum means that all are finite, and costs a tenth of looking at each.
@@ -431,12 +432,18 @@ def _light(photons: galsim.PhotonArray) -> Light:
             continue
         # An infinite wavelength is allowed: such light is not absorbed.
         good = ~np.isnan(array) if name == "wavelength" else np.isfinite(array)
-        if not good.all():
-            first = int(np.argmin(good))
+        # GalSim's photon operators mark photons as lost by no flux, such as Refraction at total
+        # reflection, whose slope is nan.
+        wrong = ~good & (photons.flux != 0)
+        if wrong.any():
+            first = int(np.argmax(wrong))
             raise SensorError(
-                f"photon {first}: {name} = {array[first]} is not a finite number "
-                f"({np.count_nonzero(~good)} of {len(array)} photons)"
+                f"photon {first}: {name} = {array[first]} is not a finite number, with flux = "
+                f"{photons.flux[first]} ({np.count_nonzero(wrong)} of {len(array)} photons)"
             )
+        kept = good if kept is None else kept & good
+    if kept is not None:
+        arrays = {name: a[kept] if a.size else a for name, a in arrays.items()}
     return Light(**arrays)
 
 

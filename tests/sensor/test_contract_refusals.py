@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bfsensor import SensorError, SiliconSensor
-from tests.sensor.contract_cases import BOTH, blank, make, part, photons
+from tests.sensor.contract_cases import BOTH, blank, draw, make, part, photons
 
 
 def spoiled(field, value):
@@ -112,3 +112,35 @@ def test_infinite_wavelengths_are_not_absorbed(kind):
     added = make(kind).accumulate(light, blank())
     # Lengths are held at the end of the tables, 1450 nm: 0.1 mm absorb less than 1e-5.
     assert added == 0.0
+
+
+@BOTH
+@pytest.mark.parametrize("field", ["x", "dydz", "wavelength"])
+def test_photons_without_flux_are_dropped_where_they_are_not_finite(kind, field):
+    """As galsim.SiliconSensor does; the others fall as if those had never been there."""
+    whole = photons(full=True)
+    lost = np.zeros(whole.size(), bool)
+    lost[::7] = True
+    marked = part(whole, 0, whole.size())
+    getattr(marked, field)[lost] = np.nan
+    marked.flux[lost] = 0.0
+    others = galsim.PhotonArray(
+        int((~lost).sum()), *(getattr(whole, n)[~lost] for n in ("x", "y", "flux", "dxdz", "dydz")),
+        wavelength=whole.wavelength[~lost],
+    )  # fmt: skip
+    np.testing.assert_array_equal(draw(make(kind), marked), draw(make(kind), others))
+    marked.flux[14] = 1e-9
+    with pytest.raises(SensorError, match=r"photon 14: .*1 of 30000 photons"):
+        draw(make(kind), marked)
+
+
+@BOTH
+def test_total_reflection_loses_photons_and_no_image(kind):
+    """GalSim's Refraction gives such photons no flux and a slope of nan."""
+    light = photons(full=True)
+    light.dxdz[:5000] = 3.0
+    galsim.Refraction(index_ratio=0.5).applyTo(light)
+    assert np.isnan(light.dxdz[:5000]).all() and not light.flux[:5000].any()
+    others = draw(make(kind), part(light, 5000, 30_000))
+    np.testing.assert_array_equal(draw(make(kind), light), others)
+    assert others.sum() > 20_000
