@@ -34,7 +34,7 @@ TASKS = {
 
 def entries(page):
     """Pages that the tables of contents of a page list, relative to docs/."""
-    text = (DOCS / page).read_text(encoding="utf-8")
+    text = PAGES[page]
     found = []
     for tree in re.findall(r"```{toctree}\n(?::[^\n]*\n)*\n(.*?)```", text, re.DOTALL):
         for line in tree.split("\n"):
