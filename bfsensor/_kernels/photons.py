@@ -256,7 +256,7 @@ def _ring_origins(pattern, thickness, z, alike, x, y, to, count, factor, radius,
         rx = x[to + m] - pattern.ring_x
         ry = y[to + m] - pattern.ring_y
         radius[m] = np.sqrt(rx * rx + ry * ry)
-    worst = 0.0
+    far = 0
     for m in range(np.uint64(count)):
         r = radius[m]
         size = factor[m]
@@ -268,12 +268,12 @@ def _ring_origins(pattern, thickness, z, alike, x, y, to, count, factor, radius,
         off = abs(s + size * shift - r)
         origin[m] = s
         factor[m] = off
-        worst = max(worst, off)
-    far = not worst < _ORIGIN_TOLERANCE
+        # Written so that nan, of a step with slope 0, is far as well.
+        far += not off < _ORIGIN_TOLERANCE
     for m in range(np.uint64(count)):
         if z[to + m] < np.float32(0.0):
             continue
-        if far and not factor[m] < _ORIGIN_TOLERANCE:
+        if far > 0 and not factor[m] < _ORIGIN_TOLERANCE:
             part = np.float64(z[to + m]) / thickness
             x[to + m], y[to + m] = find_origin(pattern, x[to + m], y[to + m], part)
             continue

@@ -409,3 +409,21 @@ def test_origins_under_rings_are_found(amplitude, coloured):
         assert abs(x[n] + dx - nominal_x[n]) + abs(y[n] + dy - nominal_y[n]) < 4e-6
         moved += abs(x[n] - nominal_x[n]) > 0.02
     assert moved > 100
+
+
+@pytest.mark.kernels
+@pytest.mark.filterwarnings("ignore:divide by zero", "ignore:invalid value")  # uncompiled
+def test_rings_that_leave_a_pixel_no_width_give_numbers():
+    """Where the shift falls by a pixel a pixel, Newton's step divides by zero."""
+    radius = np.arange(41) * 0.5
+    rings = np.append(np.where(radius < 12, 0.0, np.maximum(12 - radius, -2.0)), [0.0, 0.0])
+    pattern = NO_PATTERN._replace(rings=rings, ring_step=0.5, ring_factor=np.ones(2))
+    light = make_light(200, 7731)._replace(
+        x=np.linspace(10.0, 16.0, 200) + ORIGIN[0], y=np.full(200, ORIGIN[1])
+    )
+    x, y, _, _ = land(light, MEDIUM._replace(diffuse=False), pattern)
+    assert np.isfinite(x).all() and np.isfinite(y).all()
+    # Up to 12 nothing moves; from 14 on the shift is -2.
+    nominal = light.x - ORIGIN[0]
+    assert np.array_equal(x[nominal < 11.9], nominal[nominal < 11.9])
+    assert np.abs(x - nominal - 2)[nominal > 12.1].max() < 1e-5
