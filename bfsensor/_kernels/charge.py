@@ -3,8 +3,8 @@
 The image holds the charge.  While a block of photons lasts, the charge that moves boundaries
 is frozen; electrons go into the image at once, in the order of the photons, and the first
 in a pixel enters the pixel in a list.  When the block ends the charge of the listed pixels is
-updated, with half of what they gained in the block added again: the expected mean charge of the
-next block.
+updated to what it will be, on average, in the next block: the charge now and half of what the
+pixel gained in the last block.
 """
 
 from typing import NamedTuple

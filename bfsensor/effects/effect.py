@@ -286,7 +286,7 @@ class Effect:
     channel, one array for each, with 'level' in electrons.  :meth:`modes` gives the random part of
     an effect that differs from exposure to exposure.
 
-    A subclass overrides only the methods of what it changes; the others change nothing.
+    A subclass overrides the methods of the steps that it changes; the inherited ones change nothing.
 
     Arguments have the same meaning in all methods: ``shot`` is the exposure with its conditions,
     ``layout`` the sensor and campaign, ``axes`` the axes of a channel by name (arrays of one entry

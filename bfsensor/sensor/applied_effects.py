@@ -383,7 +383,7 @@ class AppliedEffects:
         charge : ndarray, shape of the sensor
             Collected charge [e-], in the frame of images.
         rng : numpy.random.Generator
-            Source of what effects draw at random.
+            Random numbers of the effects that differ from exposure to exposure.
         memory : dict
             State that effects pass on from exposure to exposure (persistence); changed in place.
 

@@ -1,1 +1,1 @@
-"""Detection of what a fit leaves: scans and matched filters at one family-wise false-alarm rate."""
+"""Tests of residuals after a fit: scans and matched filters at one family-wise false-alarm rate."""
