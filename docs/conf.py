@@ -10,6 +10,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import effect_figures
 import reference_pages
+from numpydoc.docscrape import NumpyDocString
 
 from bfsensor import __version__
 
@@ -72,12 +73,22 @@ autosummary_context = {"own_methods": own_methods}
 suppress_warnings = ["config.cache"]  # of that function, which cannot be pickled
 
 
+def class_text(kind: type) -> str:
+    """Turn the docstring of a class of effects into Markdown, its example into a code block."""
+    parts = NumpyDocString(inspect.getdoc(kind) or "")
+    texts = [parts["Summary"], parts["Extended Summary"], parts["Notes"]]
+    texts += [parameter.desc for parameter in parts["Parameters"]]
+    lines = [to_markdown("\n".join(text)) for text in texts if any(text)]
+    if parts["Examples"]:
+        lines += ["```pycon\n" + "\n".join(parts["Examples"]).strip() + "\n```"]
+    return "\n\n".join(lines)
+
+
 def to_markdown(text: str) -> str:
-    """Turn a docstring's marks of code, formulae and headings into those of Markdown pages."""
+    """Turn a docstring's marks of code and formulae into those of Markdown pages."""
     text = re.sub(r"``([^`]+)``", r"`\1`", text)
     text = re.sub(r":math:`([^`]+)`", r"{math}`\1`", text)
     text = re.sub(r":\w+:`~?([^`]+)`", r"`\1`", text)
-    text = re.sub(r"^(\w+)\n-+$", r"**\1**\n", text, flags=re.MULTILINE)
     return re.sub(
         r"^\.\. math::((?:\n?[ \t]+.*|\n(?=\n[ \t]))+)",
         lambda found: "```{math}\n" + inspect.cleandoc(found[1]) + "\n```",
@@ -117,7 +128,7 @@ def write_effects() -> None:
         for kind in (k for k in kinds if k.word == word):
             if kind.variant:
                 lines += [f"**{kind.variant}**", ""]
-            lines += [to_markdown(inspect.getdoc(kind) or ""), ""]
+            lines += [class_text(kind), ""]
             if kind.parameters:
                 lines += ["| parameter | unit | from | to |", "|---|---|---|---|"]
                 lines += [
