@@ -13,6 +13,7 @@ import numpy as np
 from bfsensor.device.shipped import did_you_mean
 from bfsensor.errors import SensorError
 from bfsensor.sensor.options import find_table, load_table, read_device
+from bfsensor.typing import FloatArray
 
 CAMERAS: Mapping[str, str] = {
     "LsstCam": "lsstcam",
@@ -220,7 +221,7 @@ def _in_unit(path: Path, column: Any, unit: str) -> Any:
     """Values of a column in another unit, nan where there is none."""
     from astropy import units as u
 
-    values = np.ma.filled(np.ma.asarray(column, float), np.nan)
+    values: FloatArray = np.ma.filled(np.ma.asarray(column, float), np.nan)
     try:
         return u.Quantity(values, column.unit).to_value(unit, u.temperature())
     except u.UnitConversionError:
