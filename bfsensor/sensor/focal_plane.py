@@ -57,12 +57,11 @@ class FocalPlane:
     ``vendor``           ITL or E2V; chooses the table of a SiliconSensor
     ``back_bias``        back bias [V], refused if the table was solved for another
     ``serial``           serial number, for the reader
-    ``temperature``,     options of the sensor of the same name, by default the
-    ``full_well``,       device's own [K, e-]; ``shift_map`` is a file
-    ``strength``,
-    ``diffusion_factor``,
-    ``shift_map``
     ===================  ============================================================
+
+    ``temperature`` [K], ``full_well`` [e-], ``strength``, ``diffusion_factor`` and ``shift_map`` (a
+    file, relative to this one) are options of the sensor of the same name; by default those of the
+    device hold.
 
     Parameters
     ----------

@@ -22,6 +22,7 @@ import pytest
 import yaml
 
 import bfsensor
+from bfsensor.sensor.imsim import choose_options
 from tests.sensor.imsim_stand_in import NoSensor
 
 IMSIM = Path(os.environ.get("IMSIM_DIR", "/nonexistent"))
@@ -123,13 +124,12 @@ def stand_in(monkeypatch, name, **content):
 @pytest.fixture
 def imsim(monkeypatch):
     """Importer of imSim's modules; everything is as before when the test ends."""
-    for registry in (
+    registries = (
         galsim.config.image.valid_image_types, galsim.config.stamp.valid_stamp_types,
         galsim.config.input.valid_input_types, galsim.config.extra.valid_extra_outputs,
-        galsim.config.value.valid_value_types,
-    ):  # fmt: skip
-        for key, value in registry.items():
-            monkeypatch.setitem(registry, key, value)
+        galsim.config.value.valid_value_types, galsim.config.process.valid_templates,
+    )  # fmt: skip
+    saved = [dict(registry) for registry in registries]
     stand_in(monkeypatch, "imsim", __path__=[str(IMSIM / "imsim")])
     nothing = dict.fromkeys(
         ("SkyGradient", "CCD_Fringing", "Vignetting", "BatoidWCSBuilder", "load_telescope",
@@ -156,6 +156,9 @@ def imsim(monkeypatch):
     for name in set(sys.modules) - before:
         if name.startswith("imsim."):
             del sys.modules[name]
+    for registry, content in zip(registries, saved, strict=True):
+        registry.clear()
+        registry.update(content)
 
 
 def shipped(name="imsim-config.yaml"):
@@ -216,6 +219,29 @@ def test_lsst_image_draws_each_vendor_with_its_table_and_rings(imsim, det_name):
         Path(silicon["image"]["sensor"]["name"]).name
         == f"lsst_{VENDORS[det_name].lower()}_50_4"
     )
+
+
+@pytest.mark.parametrize("name", ["imsim-config.yaml", "imsim-config-photon-pooling.yaml"])
+def test_one_line_on_top_of_imsims_configuration_is_enough(imsim, name, monkeypatch):
+    """The lines of the how-to page: the template, and another type of the sensor."""
+    monkeypatch.setattr(
+        galsim.config.value_eval, "eval_base_variables",
+        [*galsim.config.eval_base_variables, "det_name"],
+    )  # fmt: skip
+    path = str(IMSIM / "config" / "imsim-config.yaml")
+    galsim.config.RegisterTemplate("imsim-config", path)
+    config = {
+        "modules": ["imsim", "bfsensor"], "template": str(IMSIM / "config" / name),
+        "image.sensor.type": "BrighterFatter",
+    }  # fmt: skip
+    galsim.config.ProcessTemplate(config, config)
+    config["det_name"] = "R22_S11"
+    sensor = config["image"]["sensor"]
+    assert sensor["type"] == "BrighterFatter" and "bfsensor" in config["modules"]
+    chosen = choose_options(bfsensor.BrighterFatterSensor, sensor, config, None)
+    assert chosen["name"] == "e2v_ccd250" and np.isinf(chosen["full_well"])
+    assert chosen["treering_func"]["type"] == "TreeRingFunc"
+    assert ("nrecalc" in chosen) == ("pooling" in name)
 
 
 def test_photon_pooling_meets_the_charge_of_the_pools_before(imsim):
