@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from bfsensor.sensor.brighter_fatter import BrighterFatterSensor
     from bfsensor.sensor.effect_reports import read_effects
     from bfsensor.sensor.flats import draw_flat, iterate_flat
+    from bfsensor.sensor.focal_plane import FocalPlane
     from bfsensor.sensor.shift_maps import ShiftMap
     from bfsensor.sensor.silicon_sensor import SiliconSensor
 else:
@@ -16,6 +17,7 @@ else:
         {
             "brighter_fatter": ["BrighterFatterSensor"],
             "effect_reports": ["read_effects"],
+            "focal_plane": ["FocalPlane"],
             "flats": ["draw_flat", "iterate_flat"],
             "shift_maps": ["ShiftMap"],
             "silicon_sensor": ["SiliconSensor"],
@@ -24,6 +26,7 @@ else:
 
 __all__ = [
     "BrighterFatterSensor",
+    "FocalPlane",
     "ShiftMap",
     "SiliconSensor",
     "draw_flat",

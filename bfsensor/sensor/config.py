@@ -20,6 +20,7 @@ from galsim.config.value import GetAllParams, ParseValue
 from galsim.errors import GalSimConfigError
 
 from bfsensor.sensor.effect_sensor import EffectSensor
+from bfsensor.sensor.imsim import choose_options
 
 NOISE = "BrighterFatter"
 """Name of the noise type; its ``noise`` is any other of GalSim's."""
@@ -33,6 +34,7 @@ class EffectSensorBuilder(SimpleSensorBuilder):
 
     def getKwargs(self, config: Any, base: Any, logger: Any) -> dict[str, Any]:  # noqa: N802
         """Return the options of the sensor, with values inside ``conditions`` evaluated."""
+        config = choose_options(self.init_func, config, base, logger)
         given = config.get("effects")
         inline = isinstance(given, list | dict) and "type" not in given
         if inline:

@@ -20,6 +20,7 @@ TASKS = {
     "SED, colour": ("colour", r"WavelengthSampler"),
     "switching physics off": ("switch_off", r"charge_response"),
     "configuration files": ("configuration", r"type: BrighterFatter"),
+    "imSim": ("imsim", r"image\.sensor\.type.*focal_plane"),
     "own sensor": ("own_device", r"bfsensor device new"),
     "voltages": ("sweeps", r"bfsensor sweep .*back_bias"),
     "fit": ("fit", r"bfsensor fit "),
