@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bfsensor._kernels.areas import convolved_areas, pixel_areas, times_ring_areas
 from bfsensor._kernels.photons import Light, Pattern
 from bfsensor._kernels.shifts import Charges
-from bfsensor.errors import SensorError
+from bfsensor.errors import SensorError, SensorTypeError
 from bfsensor.sensor.applied_effects import AppliedEffects
 from bfsensor.sensor.area_kernels import AreaKernels, area_kernels
 from bfsensor.sensor.image_exposure import ImageExposure, Physics
@@ -132,7 +132,7 @@ class EngineSensor(galsim.SiliconSensor):
         Raises
         ------
         SensorError
-            Nothing that a generator can be made from.
+            Nothing that a generator can be made from, a SensorTypeError by its type.
         """
         with _named_rng(rng):
             self.rng.reset(rng)
@@ -204,10 +204,10 @@ class EngineSensor(galsim.SiliconSensor):
             ``resume`` without a previous call, with other pixels, or with bounds that were moved.
         galsim.GalSimUndefinedBoundsError
             The image has no bounds.
-        TypeError
-            The image is not of float32 or float64.
+        SensorTypeError
+            The image is not of float32 or float64, or an argument has another type.
         SensorError
-            An argument of another type; photons with flux, or an image, with values that are not
+            Photons with flux, or an image, with values that are not
             finite; photons of negative wavelength.  The image is unchanged after any error.
         """
         resume, recalc = check_flag("resume", resume), check_flag("recalc", recalc)
@@ -308,10 +308,10 @@ class EngineSensor(galsim.SiliconSensor):
 
         Raises
         ------
-        TypeError
-            The image is not of float32 or float64.
+        SensorTypeError
+            The image is not of float32 or float64, or an argument has another type.
         SensorError
-            An argument of another type, or an image that holds values that are not finite.
+            An image that holds values that are not finite.
         """
         _check_position("orig_center", orig_center)
         use_flux = check_flag("use_flux", use_flux)
@@ -433,10 +433,8 @@ def pixels_of(image: galsim.Image, *, write: bool = True) -> NDArray[np.floating
 
     Raises
     ------
-    galsim.GalSimUndefinedBoundsError, galsim.GalSimImmutableError, TypeError
-        Undefined bounds; an image that is not writeable; another type of numbers.
-    SensorError
-        No image.
+    galsim.GalSimUndefinedBoundsError, galsim.GalSimImmutableError, SensorTypeError
+        Undefined bounds; an image that is not writeable; no image, or another type of numbers.
     """
     check_instance("image", image, galsim.Image, "a galsim.Image")
     if not image.bounds.isDefined():
@@ -445,7 +443,7 @@ def pixels_of(image: galsim.Image, *, write: bool = True) -> NDArray[np.floating
         )
     array: NDArray[np.floating] = image.array
     if array.dtype not in (np.float32, np.float64):
-        raise TypeError(
+        raise SensorTypeError(
             f"the image of a sensor must be float32 or float64, not {array.dtype}"
         )
     if write and image.isconst:
@@ -464,8 +462,9 @@ def _named_rng(rng: Any) -> Iterator[None]:
     """Name the argument where GalSim cannot make a generator from it."""
     try:
         yield
-    except (TypeError, ValueError, OverflowError):
-        raise SensorError(
+    except (TypeError, ValueError, OverflowError) as error:
+        kind = SensorTypeError if isinstance(error, TypeError) else SensorError
+        raise kind(
             f"rng = {shown(rng)} must be a galsim.BaseDeviate, a whole number as its seed, or None"
         ) from None
 
@@ -473,20 +472,20 @@ def _named_rng(rng: Any) -> Iterator[None]:
 def check_rings(function: Any, centre: Any) -> None:
     """Refuse rings that are no LookupTable and centres that are no PositionD, as GalSim does."""
     if function is not None and not isinstance(function, galsim.LookupTable):
-        raise TypeError(
+        raise SensorTypeError(
             f"treering_func must be a galsim.LookupTable or None, not {shown(function)}"
         )
     if not isinstance(centre, galsim.PositionD):
-        raise TypeError(f"treering_center must be a galsim.PositionD, not {shown(centre)}")
+        raise SensorTypeError(
+            f"treering_center must be a galsim.PositionD, not {shown(centre)}"
+        )
     _check_position("treering_center", centre)
 
 
 def _check_position(name: str, position: Any) -> None:
     """Refuse what is no finite position."""
-    if (
-        not isinstance(position, galsim.Position)
-        or not np.isfinite([position.x, position.y]).all()
-    ):
+    check_instance(name, position, galsim.Position, "a finite galsim.Position")
+    if not np.isfinite([position.x, position.y]).all():
         raise SensorError(f"{name} = {shown(position)} must be a finite galsim.Position")
 
 

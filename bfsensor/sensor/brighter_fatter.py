@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bfsensor._kernels.photons import Medium
 from bfsensor.effects.effect import Layout
-from bfsensor.errors import SensorError
+from bfsensor.errors import SensorError, SensorTypeError
 from bfsensor.sensor.base import check_rings, make_rng
 from bfsensor.sensor.boundary_shifts import make_shifts
 from bfsensor.sensor.drift_field import MEASURED, STEPS, solve_drift
@@ -165,7 +165,8 @@ class BrighterFatterSensor(EffectSensor):
     ------
     SensorError
         A value that is not allowed, or a table without a device or of too small a depth; the
-        message names the argument and the limit.
+        message names the argument and the limit.  For a value of another type it is a
+        SensorTypeError, which is a TypeError too.
 
     Examples
     --------
@@ -479,7 +480,7 @@ def _read_map(given: Any) -> ShiftMap | None:
     if given is None or isinstance(given, ShiftMap):
         return given
     if not isinstance(given, str | os.PathLike):
-        raise SensorError(
+        raise SensorTypeError(
             f"shift_map = {shown(given)} must be a ShiftMap, the path of its file, or None"
         )
     try:

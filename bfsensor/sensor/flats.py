@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.effects.effect import Law
-from bfsensor.errors import SensorError
+from bfsensor.errors import SensorError, SensorTypeError
 from bfsensor.sensor.applied_effects import AppliedEffects
 from bfsensor.sensor.base import EngineSensor, make_rng
 from bfsensor.sensor.effect_sensor import EffectSensor
@@ -22,6 +22,7 @@ from bfsensor.sensor.options import (
     check_whole,
     shown,
     to_float,
+    wrong_value,
 )
 from bfsensor.typing import FloatArray
 
@@ -198,7 +199,9 @@ def _check_charge(name: str, value: float) -> float:
     """Return a charge [e-]; refuse what is no finite number above 0."""
     charge = to_float(value)
     if not (charge > 0 and np.isfinite(charge)):
-        raise SensorError(f"{name} = {shown(value)} e- must be a finite number above 0 e-")
+        raise wrong_value(
+            value, f"{name} = {shown(value)} e- must be a finite number above 0 e-"
+        )
     return charge
 
 
@@ -207,7 +210,7 @@ def _check_kind(dtype: Any) -> None:
     with contextlib.suppress(TypeError):
         if dtype is not None and np.dtype(dtype) in (np.float32, np.float64):
             return
-    raise SensorError(f"dtype = {shown(dtype)} must be float32 or float64")
+    raise SensorTypeError(f"dtype = {shown(dtype)} must be float32 or float64")
 
 
 def _light(

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from bfsensor.device.device import Device
 from bfsensor.device.shipped import did_you_mean, tables_dir
-from bfsensor.errors import SensorError, TableError
+from bfsensor.errors import SensorError, SensorTypeError, TableError
 from bfsensor.table.table import DistortionTable
 from bfsensor.typing import FloatArray
 
@@ -111,7 +111,9 @@ def load_table(path: str, changed: int) -> DistortionTable:
 def check_table(table: DistortionTable | None) -> DistortionTable:
     """Return a table in memory; refuse anything else."""
     if not isinstance(table, DistortionTable):
-        raise SensorError(f"table must be a DistortionTable, not {type(table).__name__}")
+        raise SensorTypeError(
+            f"table must be a DistortionTable, not {type(table).__name__}"
+        )
     return table
 
 
@@ -136,9 +138,10 @@ def check_reach(qdist: int | None, table: DistortionTable, name: str) -> int:
         return table.reach
     number = to_float(qdist)
     if not (number.is_integer() and 0 <= number <= table.reach):
-        raise SensorError(
+        raise wrong_value(
+            qdist,
             f"qdist = {shown(qdist)} must be from 0 to {table.reach}, the reach of the table of "
-            f"{name}"
+            f"{name}",
         )
     return int(number)
 
@@ -149,7 +152,9 @@ def check_full_well(full_well: float | None, table: DistortionTable) -> float:
         return math.inf if math.isnan(table.full_well) else table.full_well
     well = to_float(full_well)
     if not well > 0:
-        raise SensorError(f"full_well = {shown(full_well)} must be above 0 e- (inf: none)")
+        raise wrong_value(
+            full_well, f"full_well = {shown(full_well)} must be above 0 e- (inf: none)"
+        )
     return well
 
 
@@ -159,9 +164,10 @@ def check_threads(threads: int | None) -> int | None:
         return None
     number = to_float(threads)
     if not (number.is_integer() and number >= 1):
-        raise SensorError(
+        raise wrong_value(
+            threads,
             f"threads = {shown(threads)} must be at least 1, a whole number, or None: as many as "
-            "galsim.get_omp_threads() says"
+            "galsim.get_omp_threads() says",
         )
     return int(number)
 
@@ -178,7 +184,9 @@ def check_number(
     number = to_float(value)
     if not (low <= number <= high and (infinite or math.isfinite(number))):
         kind = "number" if infinite else "finite number"
-        raise SensorError(f"{name} = {shown(value)} must be a {kind}{_range(low, high)}")
+        raise wrong_value(
+            value, f"{name} = {shown(value)} must be a {kind}{_range(low, high)}"
+        )
     return number
 
 
@@ -188,8 +196,8 @@ def check_whole(
     """Return a whole number within a range; refuse anything else."""
     number = to_float(value)
     if not (number.is_integer() and low <= number <= high):
-        raise SensorError(
-            f"{name} = {shown(value)} must be a whole number{_range(low, high)}"
+        raise wrong_value(
+            value, f"{name} = {shown(value)} must be a whole number{_range(low, high)}"
         )
     return int(number)
 
@@ -201,9 +209,10 @@ def check_shape(name: str, value: tuple[int, int]) -> tuple[int, int]:
     except (TypeError, ValueError):
         rows = columns = math.nan
     if not all(n.is_integer() and 1 <= n <= 1e6 for n in (rows, columns)):
-        raise SensorError(
+        raise wrong_value(
+            value,
             f"{name} = {shown(value)} must be rows and columns, at least (1, 1) and at most a "
-            "million each"
+            "million each",
         )
     return int(rows), int(columns)
 
@@ -212,21 +221,23 @@ def check_flag(name: str, value: bool) -> bool:
     """Return True or False; refuse anything but these, 1 and 0."""
     number = math.nan if isinstance(value, str) else to_float(value)
     if number not in (0.0, 1.0):
-        raise SensorError(f"{name} = {shown(value)} must be True or False")
+        raise wrong_value(value, f"{name} = {shown(value)} must be True or False")
     return bool(number)
 
 
 def check_word(name: str, value: str, allowed: tuple[str, ...]) -> str:
     """Return a word of a list; refuse anything else."""
     if not isinstance(value, str) or value not in allowed:
-        raise SensorError(f"{name} = {shown(value)} must be one of {', '.join(allowed)}")
+        raise wrong_value(
+            value, f"{name} = {shown(value)} must be one of {', '.join(allowed)}"
+        )
     return value
 
 
 def check_path(name: str, value: str | os.PathLike[str], what: str) -> str:
     """Return a path as text; refuse anything but text and path-like objects."""
     if not isinstance(value, str | os.PathLike):
-        raise SensorError(f"{name} = {shown(value)} must be {what}")
+        raise SensorTypeError(f"{name} = {shown(value)} must be {what}")
     return str(value)
 
 
@@ -237,13 +248,20 @@ def check_array(name: str, value: ArrayLike) -> FloatArray:
             return np.array(value, float)
     except (TypeError, ValueError, OverflowError):
         pass
-    raise SensorError(f"{name} = {shown(value)} must be an array of real numbers")
+    raise wrong_value(value, f"{name} = {shown(value)} must be an array of real numbers")
 
 
 def check_instance(name: str, value: Any, kind: type, what: str) -> None:
     """Refuse what is no object of a class."""
     if not isinstance(value, kind):
-        raise SensorError(f"{name} = {shown(value)} must be {what}")
+        raise SensorTypeError(f"{name} = {shown(value)} must be {what}")
+
+
+def wrong_value(value: Any, text: str) -> SensorError:
+    """Return the error for a number or text that is not allowed, or for a value of another type."""
+    if isinstance(value, str | int | float | np.number):
+        return SensorError(text)
+    return SensorTypeError(text)
 
 
 def to_float(value: Any) -> float:

@@ -19,6 +19,7 @@ from bfsensor.sensor.options import (
     check_path,
     check_shape,
     shown,
+    wrong_value,
 )
 from bfsensor.typing import FloatArray
 
@@ -93,7 +94,9 @@ class ShiftMap:
         for name in ("x0", "y0"):
             object.__setattr__(self, name, check_number(name, getattr(self, name)))
         if not isinstance(self.depth, str) or self.depth not in ("bulk", "uniform"):
-            raise SensorError(f"depth = {shown(self.depth)} must be 'bulk' or 'uniform'")
+            raise wrong_value(
+                self.depth, f"depth = {shown(self.depth)} must be 'bulk' or 'uniform'"
+            )
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, ShiftMap):

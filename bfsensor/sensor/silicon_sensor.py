@@ -91,13 +91,12 @@ class SiliconSensor(EngineSensor):
     Raises
     ------
     SensorError
-        A value of another type, or outside the range that is stated above.
+        A value outside the range that is stated above; of another type, a SensorTypeError, which is a
+        TypeError too.
     OSError
         The files are missing or cannot be read as a table; the message names them.
     galsim.GalSimRangeError
         ``qdist`` is beyond the table.
-    TypeError
-        ``treering_func`` is no LookupTable, or ``treering_center`` no PositionD.
 
     Examples
     --------
