@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -485,7 +486,7 @@ def check_rings(function: Any, centre: Any) -> None:
 def _check_position(name: str, position: Any) -> None:
     """Refuse what is no finite position."""
     check_instance(name, position, galsim.Position, "a finite galsim.Position")
-    if not np.isfinite([position.x, position.y]).all():
+    if not (math.isfinite(position.x) and math.isfinite(position.y)):
         raise SensorError(f"{name} = {shown(position)} must be a finite galsim.Position")
 
 

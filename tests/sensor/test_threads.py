@@ -10,8 +10,10 @@ import galsim
 import numba
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from bfsensor import BrighterFatterSensor, SensorError
+from bfsensor.cli.main import main
 from bfsensor.sensor import image_exposure
 from bfsensor.sensor.threads import threads_to_use
 from tests.sensor.contract_cases import BOTH, blank, draw, make, part, photons
@@ -74,6 +76,18 @@ def test_python_threads_may_draw_at_once(kind):
         futures = [executor.submit(draw, make(kind, threads=2)) for _ in range(16)]
         for future in futures:
             np.testing.assert_array_equal(future.result(), alone)
+
+
+def test_warm_draws_enough_for_two_threads():
+    """Ten photons would be drawn on one, and leave the kernel to be compiled later."""
+    if numba.config.NUMBA_NUM_THREADS < 2:
+        pytest.skip("this machine has one core")
+    kernel = image_exposure._shoot.shoot_on_threads
+    with mock.patch.object(image_exposure._shoot, "shoot_on_threads", wraps=kernel) as seen:
+        result = CliRunner().invoke(main, ["warm", "--threads"])
+    assert result.exit_code == 0, result.output
+    kinds = {call.args[0].dtype for call in seen.call_args_list}
+    assert kinds == {np.dtype(np.float32), np.dtype(np.float64)}
 
 
 def test_a_second_user_of_threads_gets_one():
