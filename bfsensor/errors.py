@@ -29,6 +29,10 @@ class SensorError(BFSensorError, ValueError):
     """A sensor for image simulation was given an option or data that it cannot use."""
 
 
+class SensorTypeError(SensorError, TypeError):
+    """An argument of a sensor has a type that it cannot use; a TypeError, as GalSim raises one."""
+
+
 class SimulationError(BFSensorError, ValueError):
     """A simulation of single electrons was given settings or files that it cannot use."""
 

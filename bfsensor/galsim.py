@@ -36,10 +36,11 @@ class _Builder:
 
 
 def register(*, silicon: bool = False) -> None:
-    """Register the sensor type BrighterFatter, and with ``silicon`` replace Silicon."""
+    """Register BrighterFatter and BfsensorSilicon, and with ``silicon`` replace Silicon."""
     from galsim.config.sensor import RegisterSensorType
 
     RegisterSensorType("BrighterFatter", _Builder("BrighterFatterSensor"))
+    RegisterSensorType("BfsensorSilicon", _Builder("SiliconSensor"))
     if silicon:
         RegisterSensorType("Silicon", _Builder("SiliconSensor"))
 

@@ -55,10 +55,11 @@ def warm(threads: bool, tables: bool) -> None:
 
 
 def _use_sensors(threads: bool) -> None:
-    """Draw ten photons with each combination of options that has kernels of its own."""
+    """Draw a few photons with each combination of options that has kernels of its own."""
     import galsim
     import numpy as np
 
+    from bfsensor._kernels.shoot import PIECE
     from bfsensor.sensor.brighter_fatter import BrighterFatterSensor
 
     rings = galsim.LookupTable([0.0, 100.0], [0.0, 0.01], interpolant="linear")
@@ -68,7 +69,10 @@ def _use_sensors(threads: bool) -> None:
         for given in options:
             sensor = BrighterFatterSensor(rng=galsim.BaseDeviate(7321), **given)
             image = galsim.Image(9, 9, dtype=kind)
-            photons = galsim.PhotonArray(10, x=np.full(10, 5.0), y=np.full(10, 5.0), flux=1)
+            # Fewer would not be worth a second thread.
+            count = 2 * PIECE if "threads" in given else 10
+            middle = np.full(count, 5.0)
+            photons = galsim.PhotonArray(count, x=middle, y=middle, flux=1)
             sensor.accumulate(photons, image)
             sensor.accumulate(photons, image, resume=True, recalc=True)
             sensor.calculate_pixel_areas(image)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import galsim
@@ -12,11 +15,13 @@ from numpy.typing import NDArray
 from bfsensor._kernels.areas import convolved_areas, pixel_areas, times_ring_areas
 from bfsensor._kernels.photons import Light, Pattern
 from bfsensor._kernels.shifts import Charges
-from bfsensor.errors import SensorError
+from bfsensor.errors import SensorError, SensorTypeError
 from bfsensor.sensor.applied_effects import AppliedEffects
 from bfsensor.sensor.area_kernels import AreaKernels, area_kernels
 from bfsensor.sensor.image_exposure import ImageExposure, Physics
+from bfsensor.sensor.options import check_flag, check_instance, check_threads, shown
 from bfsensor.sensor.shift_maps import ShiftMap, make_pattern, sample_rings
+from bfsensor.sensor.threads import count_threads
 from bfsensor.typing import FloatArray
 
 _EMPTY = np.zeros(0)
@@ -52,7 +57,7 @@ class EngineSensor(galsim.SiliconSensor):
     :meth:`_make_physics` and :meth:`_key`.
     """
 
-    threads: int = 1
+    _threads: int | None = None
     shift_map: ShiftMap | None = None
     _applied: AppliedEffects | None = None
     treering_func: Any
@@ -83,6 +88,8 @@ class EngineSensor(galsim.SiliconSensor):
         self._rings = None
         if self._has_rings():
             self._rings = sample_rings(self.treering_func)
+            if not np.isfinite(self._rings[0]).all():
+                raise SensorError("treering_func holds shifts that are not finite")
         self._kernels: AreaKernels | None = None
         self._exposure: ImageExposure | None = None
         self._last_image = None
@@ -122,8 +129,23 @@ class EngineSensor(galsim.SiliconSensor):
         ----------
         rng : galsim.BaseDeviate
             Source of the new seed.
+
+        Raises
+        ------
+        SensorError
+            Nothing that a generator can be made from, a SensorTypeError by its type.
         """
-        self.rng.reset(rng)
+        with _named_rng(rng):
+            self.rng.reset(rng)
+
+    @property
+    def threads(self) -> int | None:
+        """Largest number of threads of a call; None: as many as ``galsim.get_omp_threads()`` says."""
+        return self._threads
+
+    @threads.setter
+    def threads(self, threads: int | None) -> None:
+        self._threads = check_threads(threads)
 
     @property
     def diagnostics(self) -> dict[str, float]:
@@ -134,7 +156,8 @@ class EngineSensor(galsim.SiliconSensor):
         ``off_image``: flux that landed beside the image; ``crossed``: flux that crossed the
         silicon without converting; ``lost``: flux that an effect removed where electrons meet
         charge; ``beyond_table``: renewals of a pixel whose charge exceeded both the table and
-        the full well, for which the response of the last level was used.
+        the full well, for which the response of the last level was used; ``dropped``: photons
+        without flux whose position, slope or wavelength is not finite, which fall nowhere.
         """
         if self._exposure is None:
             return {}
@@ -161,10 +184,13 @@ class EngineSensor(galsim.SiliconSensor):
             Image of float32 or float64 [e-], changed in place; charge that is in it already moves
             the boundaries.
         orig_center : galsim.PositionI
-            Position of (0, 0) in original image coordinates, for rings and maps.
+            Position of (0, 0) in original image coordinates, for rings and maps; with ``resume``
+            that of the first call holds.
         resume : bool
-            Continue with the image of the last call; the result is the same bit for bit as that
-            of one call with all photons.
+            Continue with the pixels of the last call, as the same image or a view of them with the
+            same bounds; the result is the same bit for bit as that of one call with all photons.
+            Values that something else changed in between act where electrons land later, from the
+            next renewal there; those of other pixels act only after a call without ``resume``.
         recalc : bool
             With ``resume``: renew the boundaries first.
 
@@ -176,31 +202,22 @@ class EngineSensor(galsim.SiliconSensor):
         Raises
         ------
         galsim.GalSimError
-            ``resume`` without a previous call, or with another image.
+            ``resume`` without a previous call, with other pixels, or with bounds that were moved.
         galsim.GalSimUndefinedBoundsError
             The image has no bounds.
-        TypeError
-            The image is not of float32 or float64.
+        SensorTypeError
+            The image is not of float32 or float64, or an argument has another type.
         SensorError
-            Photons or an image with values that are not finite.  The image is unchanged after
-            any error.
+            Photons with flux, or an image, with values that are not
+            finite; photons of negative wavelength.  The image is unchanged after any error.
         """
+        resume, recalc = check_flag("resume", resume), check_flag("recalc", recalc)
+        check_instance("photons", photons, galsim.PhotonArray, "a galsim.PhotonArray")
+        _check_position("orig_center", orig_center)
         if resume:
-            if self._last_image is None or self._exposure is None:
-                raise galsim.GalSimError(
-                    "accumulate was called with resume, but not without it before"
-                )
-            if image is not self._last_image:
-                raise galsim.GalSimError(
-                    "accumulate was called with resume, but with an image other than that of "
-                    "the call before"
-                )
+            self._check_resumed(image)
         array = pixels_of(image)
-        light = _light(photons)
-        if resume and array.shape != (self._exposure.charges.ny, self._exposure.charges.nx):
-            raise galsim.GalSimError(
-                "accumulate was called with resume, but the image has another shape now"
-            )
+        light, dropped = _light(photons)
         if not resume:
             self._check_finite(array)
             self._check_charge(array)
@@ -209,7 +226,27 @@ class EngineSensor(galsim.SiliconSensor):
         assert self._exposure is not None
         if resume and recalc:
             self._exposure.renew(array)
+        self._exposure.threads = count_threads(self.threads)
+        self._exposure.dropped += dropped
         return self._exposure.add(array, self._change_light(light))
+
+    def _check_resumed(self, image: galsim.Image) -> None:
+        """Refuse to continue with an image whose pixels or place are not those of the last call."""
+        if self._last_image is None or self._exposure is None:
+            raise galsim.GalSimError(
+                "accumulate was called with resume, but not without it before"
+            )
+        check_instance("image", image, galsim.Image, "a galsim.Image")
+        if not _same_pixels(image.array, self._exposure.pixels):
+            raise galsim.GalSimError(
+                "accumulate was called with resume, but with an image other than that of the "
+                "call before"
+            )
+        if image.bounds != self._exposure.bounds:
+            raise galsim.GalSimError(
+                f"accumulate was called with resume, but the image was moved: its bounds are "
+                f"{image.bounds}, at the call before {self._exposure.bounds}"
+            )
 
     def _expose(
         self,
@@ -222,10 +259,11 @@ class EngineSensor(galsim.SiliconSensor):
         # Drawn once an exposure; photons are numbered within it, so that resumed calls
         # continue the same random numbers.
         key = (int(self.rng.raw()) & 0xFFFFFFFF, int(self.rng.raw()) & 0xFFFFFFFF)
-        return ImageExposure(
-            array, self._physics, self._place_pattern(image, orig_center), origin, key,
-            self.threads,
-        )  # fmt: skip
+        exposure = ImageExposure(
+            array, self._physics, self._place_pattern(image, orig_center), origin, key
+        )
+        exposure.pixels, exposure.bounds = array, image.bounds
+        return exposure
 
     def _place_pattern(self, image: galsim.Image, orig_center: galsim.PositionI) -> Any:
         """Fixed shifts (rings and map) in the frame of an image."""
@@ -271,11 +309,13 @@ class EngineSensor(galsim.SiliconSensor):
 
         Raises
         ------
-        TypeError
-            The image is not of float32 or float64.
+        SensorTypeError
+            The image is not of float32 or float64, or an argument has another type.
         SensorError
-            The image holds values that are not finite.
+            An image that holds values that are not finite.
         """
+        _check_position("orig_center", orig_center)
+        use_flux = check_flag("use_flux", use_flux)
         array = pixels_of(image, write=False)
         self._check_finite(array)
         pattern = self._place_pattern(image, orig_center)
@@ -394,16 +434,17 @@ def pixels_of(image: galsim.Image, *, write: bool = True) -> NDArray[np.floating
 
     Raises
     ------
-    galsim.GalSimUndefinedBoundsError, galsim.GalSimImmutableError, TypeError
-        Undefined bounds; an image that is not writeable; another type of numbers.
+    galsim.GalSimUndefinedBoundsError, galsim.GalSimImmutableError, SensorTypeError
+        Undefined bounds; an image that is not writeable; no image, or another type of numbers.
     """
+    check_instance("image", image, galsim.Image, "a galsim.Image")
     if not image.bounds.isDefined():
         raise galsim.GalSimUndefinedBoundsError(
             "the image of a sensor must have defined bounds"
         )
     array: NDArray[np.floating] = image.array
     if array.dtype not in (np.float32, np.float64):
-        raise TypeError(
+        raise SensorTypeError(
             f"the image of a sensor must be float32 or float64, not {array.dtype}"
         )
     if write and image.isconst:
@@ -411,8 +452,59 @@ def pixels_of(image: galsim.Image, *, write: bool = True) -> NDArray[np.floating
     return array
 
 
-def _light(photons: galsim.PhotonArray) -> Light:
-    """Arrays of photons; those that are not finite are dropped without flux, refused with it."""
+def make_rng(rng: Any) -> galsim.UniformDeviate:
+    """Make a sensor's generator from what GalSim takes; refuse anything else."""
+    with _named_rng(rng):
+        return galsim.UniformDeviate(rng)
+
+
+@contextmanager
+def _named_rng(rng: Any) -> Iterator[None]:
+    """Name the argument where GalSim cannot make a generator from it."""
+    try:
+        yield
+    except (TypeError, ValueError, OverflowError) as error:
+        kind = SensorTypeError if isinstance(error, TypeError) else SensorError
+        raise kind(
+            f"rng = {shown(rng)} must be a galsim.BaseDeviate, a whole number as its seed, or None"
+        ) from None
+
+
+def check_rings(function: Any, centre: Any) -> None:
+    """Refuse rings that are no LookupTable and centres that are no PositionD, as GalSim does."""
+    if function is not None and not isinstance(function, galsim.LookupTable):
+        raise SensorTypeError(
+            f"treering_func must be a galsim.LookupTable or None, not {shown(function)}"
+        )
+    if not isinstance(centre, galsim.PositionD):
+        raise SensorTypeError(
+            f"treering_center must be a galsim.PositionD, not {shown(centre)}"
+        )
+    _check_position("treering_center", centre)
+
+
+def _check_position(name: str, position: Any) -> None:
+    """Refuse what is no finite position."""
+    check_instance(name, position, galsim.Position, "a finite galsim.Position")
+    if not (math.isfinite(position.x) and math.isfinite(position.y)):
+        raise SensorError(f"{name} = {shown(position)} must be a finite galsim.Position")
+
+
+def _same_pixels(one: NDArray[Any], other: NDArray[Any]) -> bool:
+    """Whether two arrays are the same numbers at the same places in memory."""
+    a, b = one.__array_interface__, other.__array_interface__
+    return (
+        a["data"][0] == b["data"][0]
+        and a["typestr"] == b["typestr"]
+        and (one.shape, one.strides) == (other.shape, other.strides)
+    )
+
+
+def _light(photons: galsim.PhotonArray) -> tuple[Light, int]:
+    """Arrays of photons, and how many were dropped.
+
+    Photons that are not finite are dropped without flux and refused with it.
+    """
     has_angles = photons.hasAllocatedAngles()
     arrays = {
         "x": photons.x,
@@ -442,9 +534,19 @@ def _light(photons: galsim.PhotonArray) -> Light:
                 f"{photons.flux[first]} ({np.count_nonzero(wrong)} of {len(array)} photons)"
             )
         kept = good if kept is None else kept & good
+    dropped = 0
     if kept is not None:
+        dropped = int(np.count_nonzero(~kept))
         arrays = {name: a[kept] if a.size else a for name, a in arrays.items()}
-    return Light(**arrays)
+    if arrays["wavelength"].min(initial=0.0) < 0:
+        wrong = (photons.wavelength < 0) & (photons.flux != 0)
+        if wrong.any():
+            first = int(np.argmax(wrong))
+            raise SensorError(
+                f"photon {first}: wavelength = {photons.wavelength[first]} nm must not be negative "
+                f"({np.count_nonzero(wrong)} of {len(photons)} photons)"
+            )
+    return Light(**arrays), dropped
 
 
 def read_numbers(path: str | os.PathLike[str]) -> dict[str, Any]:

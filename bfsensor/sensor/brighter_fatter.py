@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,24 +15,28 @@ from numpy.typing import NDArray
 
 from bfsensor._kernels.photons import Medium
 from bfsensor.effects.effect import Layout
-from bfsensor.errors import SensorError
+from bfsensor.errors import SensorError, SensorTypeError
+from bfsensor.sensor.base import check_rings, make_rng
 from bfsensor.sensor.boundary_shifts import make_shifts
 from bfsensor.sensor.drift_field import MEASURED, STEPS, solve_drift
 from bfsensor.sensor.effect_sensor import EffectSensor
 from bfsensor.sensor.image_exposure import Physics
 from bfsensor.sensor.options import (
+    LARGEST,
+    check_flag,
     check_full_well,
+    check_instance,
     check_number,
+    check_path,
     check_reach,
     check_table,
-    check_threads,
     check_word,
     find_table,
     load_table,
     read_device,
+    shown,
 )
 from bfsensor.sensor.shift_maps import ShiftMap
-from bfsensor.sensor.silicon_sensor import check_rings
 from bfsensor.table.table import DistortionTable
 from bfsensor.typing import FloatArray
 
@@ -126,8 +131,10 @@ class BrighterFatterSensor(EffectSensor):
     conversion_depth : float
         Depth below the back surface [um] at which photons without wavelengths convert, 0 to the
         thickness; 1 um as in GalSim.
-    threads : int
-        Number of threads of one call, at least 1; the result does not depend on it.
+    threads : int, optional
+        Largest number of threads of one call, at least 1; the result does not depend on it.  By
+        default as many as ``galsim.get_omp_threads()`` says at each call.  Blocks of few photons
+        use fewer.
     table : DistortionTable, optional
         A table in memory, in place of ``name``.
     effects : path-like, mapping or sequence, optional
@@ -158,7 +165,8 @@ class BrighterFatterSensor(EffectSensor):
     ------
     SensorError
         A value that is not allowed, or a table without a device or of too small a depth; the
-        message names the argument and the limit.
+        message names the argument and the limit.  For a value of another type it is a
+        SensorTypeError, which is a TypeError too.
 
     Examples
     --------
@@ -220,26 +228,28 @@ class BrighterFatterSensor(EffectSensor):
         beyond: Literal["hold", "error"] = "hold",
         predict: bool = True,
         conversion_depth: float = 1.0,
-        threads: int = 1,
+        threads: int | None = None,
         table: DistortionTable | None = None,
         effects: Any = None,
         conditions: Mapping[str, Any] | None = None,
         layout: Layout | Mapping[str, Any] | None = None,
     ) -> None:
         self._take_table(name, table)
-        self.strength = check_number("strength", strength)
-        self.rng = galsim.UniformDeviate(rng)
-        self.diffusion_factor = check_number("diffusion_factor", diffusion_factor, low=0.0)
+        self.strength = check_number("strength", strength, low=-LARGEST, high=LARGEST)
+        self.rng = make_rng(rng)
+        self.diffusion_factor = check_number(
+            "diffusion_factor", diffusion_factor, low=0.0, high=LARGEST
+        )
         self.qdist = check_reach(qdist, self.table, self.name)
         self.nrecalc = check_number("nrecalc", nrecalc, low=0.0)
         check_rings(treering_func, treering_center)
         self.treering_func, self.treering_center = treering_func, treering_center
-        self.transpose = bool(transpose)
-        self.shift_map = (
-            ShiftMap.read(shift_map) if isinstance(shift_map, str) else shift_map
-        )
-        self.charge_response, self.background = bool(charge_response), bool(background)
-        self.depth, self.predict = bool(depth), bool(predict)
+        self.transpose = check_flag("transpose", transpose)
+        self.shift_map = _read_map(shift_map)
+        self.charge_response = check_flag("charge_response", charge_response)
+        self.background = check_flag("background", background)
+        self.depth = check_flag("depth", depth)
+        self.predict = check_flag("predict", predict)
         self.red = check_word("red", red, ("lost", "kept"))
         self.absorption = check_word("absorption", absorption, ("law", "galsim"))
         self.diffusion = check_word("diffusion", diffusion, ("einstein", "measured"))
@@ -247,7 +257,7 @@ class BrighterFatterSensor(EffectSensor):
         self.conversion_depth = check_number(
             "conversion_depth", conversion_depth, low=0.0, high=self.table.thickness
         )
-        self.threads = check_threads(threads)
+        self.threads = threads
         self._device = read_device(self.table, self.name)
         if temperature is None:
             temperature = self._device.operating_point.temperature
@@ -260,9 +270,10 @@ class BrighterFatterSensor(EffectSensor):
 
     def _take_table(self, name: str, table: DistortionTable | None) -> None:
         """Keep the table, read by name unless it is given."""
-        self.name = str(name) if table is None else "table"
+        what = "a built-in device or the path of a table"
+        self.name = check_path("name", name, what) if table is None else "table"
         # A table that was read is pickled as its path, not as its 18 MB.
-        self._source = find_table(name) if table is None else None
+        self._source = find_table(self.name) if table is None else None
         self.table = load_table(*self._source) if self._source else check_table(table)
 
     def _usual(self) -> dict[str, Any]:
@@ -400,6 +411,7 @@ class BrighterFatterSensor(EffectSensor):
             added = super().accumulate(photons, image, orig_center, resume, recalc)
             self._warn_beyond()
             return added
+        check_instance("image", image, galsim.Image, "a galsim.Image")
         before = image.array.copy()
         kept = None if self._exposure is None else self._exposure.copy()
         last = self._last_image
@@ -461,6 +473,20 @@ class BrighterFatterSensor(EffectSensor):
         parts.insert(2, f"rng={self.rng!r}")
         parts += self._effects_repr()
         return f"bfsensor.BrighterFatterSensor({', '.join(parts)})"
+
+
+def _read_map(given: Any) -> ShiftMap | None:
+    """Return a map of fixed shifts, read from its file where a path is given."""
+    if given is None or isinstance(given, ShiftMap):
+        return given
+    if not isinstance(given, str | os.PathLike):
+        raise SensorTypeError(
+            f"shift_map = {shown(given)} must be a ShiftMap, the path of its file, or None"
+        )
+    try:
+        return ShiftMap.read(given)
+    except SensorError as error:
+        raise SensorError(f"shift_map: {error}") from None
 
 
 _COMPARED = (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 
 from bfsensor.effects.effect import STAGES, Effect, Layout, Segment, Shot
 from bfsensor.errors import EffectError, SensorError
+from bfsensor.sensor.options import shown, to_float
 from bfsensor.units import to_celsius, to_kelvin
 
 SCHEMA = "bfsensor-diagnosis-1"
@@ -86,7 +88,9 @@ def _read_report(path: str) -> dict[str, Any]:
     try:
         report = json.loads(Path(path).read_text())
     except OSError as error:
-        raise SensorError(f"{path}: cannot be read: {error.strerror or error}") from None
+        raise SensorError(
+            f"effects: {path}: cannot be read: {error.strerror or error}"
+        ) from None
     except ValueError as error:
         raise SensorError(f"{path}: not a report.json: {error}") from None
     if not isinstance(report, dict):
@@ -163,7 +167,7 @@ def make_layout(given: Any, usual: Mapping[str, Any]) -> Layout:
     if isinstance(given, Layout):
         return given
     if not isinstance(given, Mapping):
-        raise SensorError(f"layout must have 'shape', not be {given!r}")
+        raise SensorError(f"layout must have 'shape', not be {shown(given)}")
     values = {k: v for k, v in given.items() if k not in _INTERNAL}
     for name in values:
         if name not in _LAYOUT:
@@ -178,7 +182,7 @@ def make_layout(given: Any, usual: Mapping[str, Any]) -> Layout:
         pixel, thickness, front = (
             float(values.get(k, usual[k])) for k in ("pixel", "thickness", "front")
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise SensorError(f"layout = {values!r} is no layout: {error!r}") from None
     if ny < 1 or nx < 1 or len(reference) != 3:
         raise SensorError(
@@ -226,18 +230,19 @@ def make_conditions(given: Any) -> dict[str, Any]:
         given = given._replace(temperature=to_celsius(given.temperature))
         given = {k: v for k, v in given._asdict().items() if v == v}
     if not isinstance(given, Mapping):
-        raise SensorError(f"conditions must be names and values, not {given!r}")
+        raise SensorError(f"conditions must be names and values, not {shown(given)}")
     out: dict[str, Any] = {}
     for name, value in given.items():
         if name in _INTERNAL:
             continue
-        if name == "kind" and value in _KINDS:
+        number = math.nan if isinstance(value, bool | str) else to_float(value)
+        if name == "kind" and isinstance(value, str) and value in _KINDS:
             out[name] = value
-        elif name in _NUMBERS and not isinstance(value, bool | str):
-            out[name] = int(value) if name == "number" else float(value)
+        elif name in _NUMBERS and math.isfinite(number):
+            out[name] = int(number) if name == "number" else number
         else:
             raise SensorError(
-                f"conditions: {name} = {value!r} must be one of {', '.join(_NUMBERS)} with a "
-                f"number, or kind with one of {', '.join(_KINDS)}"
+                f"conditions: {name} = {shown(value)} must be one of {', '.join(_NUMBERS)} with a "
+                f"finite number, or kind with one of {', '.join(_KINDS)}"
             )
     return out

@@ -22,6 +22,7 @@ from bfsensor.sensor.effect_reports import (
     write_entries,
 )
 from bfsensor.sensor.image_exposure import ImageExposure
+from bfsensor.sensor.options import check_flag
 from bfsensor.units import to_celsius
 
 
@@ -128,6 +129,7 @@ class EffectSensor(EngineSensor):
         galsim.GalSimError
             ``resume`` after :meth:`finish`, and as for :meth:`EngineSensor.accumulate`.
         """
+        resume = check_flag("resume", resume)
         if resume and self._closed:
             raise galsim.GalSimError(
                 "accumulate was called with resume after finish: the exposure is over"
@@ -200,8 +202,8 @@ class EffectSensor(EngineSensor):
         Raises
         ------
         SensorError
-            The image was finished before and not exposed again, holds values that are not
-            finite, or has another shape than the layout.  The image is unchanged.
+            No galsim.Image; or the image was finished before and not exposed again, holds values
+            that are not finite, or has another shape than the layout.  The image is unchanged.
 
         Examples
         --------

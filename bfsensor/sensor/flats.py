@@ -2,18 +2,37 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
+from typing import Any
 
 import galsim
 import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.effects.effect import Law
-from bfsensor.errors import SensorError
+from bfsensor.errors import SensorError, SensorTypeError
 from bfsensor.sensor.applied_effects import AppliedEffects
-from bfsensor.sensor.base import EngineSensor
+from bfsensor.sensor.base import EngineSensor, make_rng
 from bfsensor.sensor.effect_sensor import EffectSensor
+from bfsensor.sensor.options import (
+    check_array,
+    check_instance,
+    check_shape,
+    check_whole,
+    shown,
+    to_float,
+    wrong_value,
+)
 from bfsensor.typing import FloatArray
+
+_HIGHEST = 1e9
+"""Highest level of a flat [e-].  Chosen: a thousand full wells; single precision holds whole
+electrons up to 1.7e7, and at twice as much nothing changes."""
+
+_STEPS = 1e6
+"""Largest number of steps of a flat.  Chosen: a small flat takes minutes with so many, and twice
+as long with twice as many."""
 
 
 def draw_flat(
@@ -42,18 +61,18 @@ def draw_flat(
     shape : tuple of int
         Rows and columns of the image, at least 1.
     level : float
-        Mean charge of a pixel [e-], above 0.
+        Mean charge of a pixel [e-], above 0, at most 1e9.
     step : float
-        Mean charge of a pixel in a step [e-], above 0.  The response to a step's own fluctuations
-        is added in the next step: with n steps the correlations are too small by a part 1 / n^2,
-        not 1 / n.
+        Mean charge of a pixel in a step [e-], above 0; at most a million steps.  The response
+        to a step's own fluctuations is added in the next step: with n steps the correlations are too
+        small by a part 1 / n^2, not 1 / n.
     rng : galsim.BaseDeviate, optional
         Source of the seed.
     illumination : ndarray, shape ``shape``, optional
         Relative illumination, at least 0; by default 1.
     border : int
-        Width [pixel] of a frame that is drawn around the image and cut off; without charge
-        outside, pixels of the last rows and columns would be too small.
+        Width [pixel] of a frame that is drawn around the image and cut off, 0 to 10,000; without
+        charge outside, pixels of the last rows and columns would be too small.
     dtype : type
         Type of the pixels, float32 or float64.
 
@@ -65,8 +84,8 @@ def draw_flat(
     Raises
     ------
     SensorError
-        A level or step that is not above 0, an illumination of another shape or negative, or
-        pixels that reach the full well of effects.
+        An argument of another type, a level or step that is not above 0, an illumination of
+        another shape or negative, or pixels that reach the full well of effects.
 
     Examples
     --------
@@ -121,10 +140,23 @@ def iterate_flat(
     >>> len(levels)
     3
     """
-    _check_request(shape, level, step, border)
-    ny, nx = shape
+    check_instance(
+        "sensor",
+        sensor,
+        EngineSensor,
+        "a BrighterFatterSensor or SiliconSensor of bfsensor",
+    )
+    shape = ny, nx = check_shape("shape", shape)
+    level, step = _check_charge("level", level), _check_charge("step", step)
+    if level > _HIGHEST or level / step > _STEPS:
+        raise SensorError(
+            f"level = {level:g} e- in steps of step = {step:g} e- must be at most {_HIGHEST:g} e-, "
+            f"in {_STEPS:g} steps"
+        )
+    border = check_whole("border", border, low=0, high=10_000)
+    _check_kind(dtype)
     light = _light(shape, illumination, border)
-    seed = galsim.BaseDeviate(rng).raw()
+    seed = make_rng(rng).raw()
     generator = np.random.Generator(np.random.SFC64(seed))
     law = Law()
     if sensor._applied is not None:
@@ -163,16 +195,22 @@ def iterate_flat(
         yield flat
 
 
-def _check_request(shape: tuple[int, int], level: float, step: float, border: int) -> None:
-    """Refuse a level or step that is not above 0, an empty shape, and a negative border."""
-    if not (level > 0 and np.isfinite(level)):
-        raise SensorError(f"level = {level} e- must be a finite number above 0 e-")
-    if not (step > 0 and np.isfinite(step)):
-        raise SensorError(f"step = {step} e- must be a finite number above 0 e-")
-    if min(shape) < 1 or border < 0:
-        raise SensorError(
-            f"shape = {shape} must be at least (1, 1), border = {border} at least 0"
+def _check_charge(name: str, value: float) -> float:
+    """Return a charge [e-]; refuse what is no finite number above 0."""
+    charge = to_float(value)
+    if not (charge > 0 and np.isfinite(charge)):
+        raise wrong_value(
+            value, f"{name} = {shown(value)} e- must be a finite number above 0 e-"
         )
+    return charge
+
+
+def _check_kind(dtype: Any) -> None:
+    """Refuse pixels of another type than float32 and float64."""
+    with contextlib.suppress(TypeError):
+        if dtype is not None and np.dtype(dtype) in (np.float32, np.float64):
+            return
+    raise SensorTypeError(f"dtype = {shown(dtype)} must be float32 or float64")
 
 
 def _light(
@@ -181,13 +219,13 @@ def _light(
     """Relative light on a flat with its border; nearest pixels outside, 1 by default."""
     if illumination is None:
         return np.ones((shape[0] + 2 * border, shape[1] + 2 * border))
-    given = np.asarray(illumination, float)
+    given = check_array("illumination", illumination)
     if given.shape != tuple(shape):
         raise SensorError(
             f"illumination has the shape {given.shape}, the flat {tuple(shape)}"
         )
-    if not np.all(given >= 0):
-        raise SensorError("illumination must not be negative or nan")
+    if not np.all((given >= 0) & np.isfinite(given)):
+        raise SensorError("illumination must be finite, and not negative")
     return np.pad(given, border, mode="edge")
 
 

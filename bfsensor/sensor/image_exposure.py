@@ -24,6 +24,9 @@ _HOT_PAGES, _HOT_EDGES = 256, 4096
 # Room for edges that are evaluated once a block, in tiles and in edges.  Chosen: enough for a few
 # stars; further edges are evaluated electron by electron, which is slower with the same result.
 
+_SHARE = _shoot.PIECE
+"""Number of photons of a block that is worth a thread, by definition the kernel's smallest share."""
+
 _EMPTY = np.zeros(0, np.float32)
 """Array in place of one that a sensor does not need (by definition empty)."""
 
@@ -85,7 +88,7 @@ class ImageExposure:
     key : tuple of int
         Key of the random numbers, two words of 32 bits.
     threads : int
-        Threads to use; the result does not depend on it.
+        Largest number of threads to use; the result does not depend on it.
     """
 
     def __init__(
@@ -102,7 +105,12 @@ class ImageExposure:
         # Factor on the light by pixel of the sensor, and the offset of positions to its frame.
         self.light_factor: FloatArray | None = None
         self.to_sensor = (0.0, 0.0)
+        # The image's own pixels and its place, by which a resumed call knows it again.
+        self.pixels: NDArray[np.floating] = image
+        self.bounds: Any = None
         self.threads = threads
+        # Photons without flux whose numbers are not finite, which fall nowhere.
+        self.dropped = 0
         self.charges, self.ledger = _allocate(image, physics)
         self.hot = _no_hot_edges(physics.edges, self.ledger.flags.size)
         self.plan = _shoot.Plan(
@@ -134,10 +142,16 @@ class ImageExposure:
                 pixels, light, p.medium, self.pattern, self.plan, p.edges, self.charges,
                 self.hot, self.ledger, p.response,
             )  # fmt: skip
-            if self.threads == 1:
-                return float(_shoot.shoot(*arguments, 1, *self._buffers))
-            with threads_to_use(self.threads) as threads:
+            with threads_to_use(self._busy_threads(light.x.size)) as threads:
+                if threads == 1:
+                    return float(_shoot.shoot(*arguments, 1, *self._buffers))
                 return float(_shoot.shoot_on_threads(*arguments, threads, *self._buffers))
+
+    def _busy_threads(self, photons: int) -> int:
+        """Return how many of the threads have a share of each block that is worth waking for."""
+        block = self.physics.block
+        largest = min(photons, block) if block > 0 else photons
+        return max(1, min(self.threads, int(largest // _SHARE)))
 
     def renew(self, image: NDArray[np.floating]) -> None:
         """Renew the boundaries from the image's charge now."""
@@ -169,6 +183,7 @@ class ImageExposure:
             "crossed": float(sums[_charge.CROSSED]),
             "lost": float(sums[_charge.LOST]),
             "beyond_table": int(counters[_charge.BEYOND]),
+            "dropped": self.dropped,
         }
 
 

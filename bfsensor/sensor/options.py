@@ -1,15 +1,27 @@
-"""Checks of a sensor's options: tables by name, numbers in a range, words of a list."""
+"""Checks of the arguments of sensors: tables by name, numbers in a range, words of a list."""
 
 from __future__ import annotations
 
 import math
+import os
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 from bfsensor.device.device import Device
 from bfsensor.device.shipped import did_you_mean, tables_dir
-from bfsensor.errors import SensorError, TableError
+from bfsensor.errors import SensorError, SensorTypeError, TableError
 from bfsensor.table.table import DistortionTable
+from bfsensor.typing import FloatArray
+
+LARGEST = 1e6
+"""Largest strength and factor on the diffusion.
+
+Chosen: ten thousand times the largest strength in use (100); at 1e30 sums of shifts overflow, at
+twice as large nothing changes."""
 
 
 def find_table(name: str) -> tuple[str, int]:
@@ -99,7 +111,9 @@ def load_table(path: str, changed: int) -> DistortionTable:
 def check_table(table: DistortionTable | None) -> DistortionTable:
     """Return a table in memory; refuse anything else."""
     if not isinstance(table, DistortionTable):
-        raise SensorError(f"table must be a DistortionTable, not {type(table).__name__}")
+        raise SensorTypeError(
+            f"table must be a DistortionTable, not {type(table).__name__}"
+        )
     return table
 
 
@@ -120,43 +134,163 @@ def read_device(table: DistortionTable, name: str) -> Device:
 
 def check_reach(qdist: int | None, table: DistortionTable, name: str) -> int:
     """Return the distance at which charge acts [pixel], by default the table's reach."""
-    reach = table.reach if qdist is None else int(qdist)
-    if not 0 <= reach <= table.reach:
-        raise SensorError(
-            f"qdist = {qdist} must be from 0 to {table.reach}, the reach of the table of {name}"
+    if qdist is None:
+        return table.reach
+    number = to_float(qdist)
+    if not (number.is_integer() and 0 <= number <= table.reach):
+        raise wrong_value(
+            qdist,
+            f"qdist = {shown(qdist)} must be from 0 to {table.reach}, the reach of the table of "
+            f"{name}",
         )
-    return reach
+    return int(number)
 
 
 def check_full_well(full_well: float | None, table: DistortionTable) -> float:
     """Return the full well [e-], by default the table's; inf where there is none."""
-    well = table.full_well if full_well is None else float(full_well)
-    if not (math.isnan(well) or well > 0):
-        raise SensorError(f"full_well = {full_well} must be above 0 e- (inf: none)")
-    return math.inf if math.isnan(well) else well
+    if full_well is None:
+        return math.inf if math.isnan(table.full_well) else table.full_well
+    well = to_float(full_well)
+    if not well > 0:
+        raise wrong_value(
+            full_well, f"full_well = {shown(full_well)} must be above 0 e- (inf: none)"
+        )
+    return well
 
 
-def check_threads(threads: int) -> int:
-    """Return a number of threads; refuse less than 1."""
-    if int(threads) < 1:
-        raise SensorError(f"threads = {threads} must be at least 1")
-    return int(threads)
+def check_threads(threads: int | None) -> int | None:
+    """Return a number of threads, or None for GalSim's; refuse less than 1."""
+    if threads is None:
+        return None
+    number = to_float(threads)
+    if not (number.is_integer() and number >= 1):
+        raise wrong_value(
+            threads,
+            f"threads = {shown(threads)} must be at least 1, a whole number, or None: as many as "
+            "galsim.get_omp_threads() says",
+        )
+    return int(number)
 
 
 def check_number(
-    name: str, value: float, *, low: float = -math.inf, high: float = math.inf
+    name: str,
+    value: float,
+    *,
+    low: float = -math.inf,
+    high: float = math.inf,
+    infinite: bool = False,
 ) -> float:
-    """Return a finite number within a range; refuse anything else."""
-    number = float(value)
-    if not (math.isfinite(number) and low <= number <= high):
-        allowed = f" from {low:g}" if math.isfinite(low) else ""
-        allowed += f" to {high:g}" if math.isfinite(high) else ""
-        raise SensorError(f"{name} = {value} must be a finite number{allowed}")
+    """Return a number within a range, finite unless ``infinite``; refuse anything else."""
+    number = to_float(value)
+    if not (low <= number <= high and (infinite or math.isfinite(number))):
+        kind = "number" if infinite else "finite number"
+        raise wrong_value(
+            value, f"{name} = {shown(value)} must be a {kind}{_range(low, high)}"
+        )
     return number
+
+
+def check_whole(
+    name: str, value: int, *, low: float = -math.inf, high: float = math.inf
+) -> int:
+    """Return a whole number within a range; refuse anything else."""
+    number = to_float(value)
+    if not (number.is_integer() and low <= number <= high):
+        raise wrong_value(
+            value, f"{name} = {shown(value)} must be a whole number{_range(low, high)}"
+        )
+    return int(number)
+
+
+def check_shape(name: str, value: tuple[int, int]) -> tuple[int, int]:
+    """Return rows and columns, whole numbers of at least 1; refuse anything else."""
+    try:
+        rows, columns = (to_float(n) for n in value)
+    except (TypeError, ValueError):
+        rows = columns = math.nan
+    if not all(n.is_integer() and 1 <= n <= 1e6 for n in (rows, columns)):
+        raise wrong_value(
+            value,
+            f"{name} = {shown(value)} must be rows and columns, at least (1, 1) and at most a "
+            "million each",
+        )
+    return int(rows), int(columns)
+
+
+def check_flag(name: str, value: bool) -> bool:
+    """Return True or False; refuse anything but these, 1 and 0."""
+    if isinstance(value, bool):
+        return value
+    number = math.nan if isinstance(value, str) else to_float(value)
+    if number not in (0.0, 1.0):
+        raise wrong_value(value, f"{name} = {shown(value)} must be True or False")
+    return bool(number)
 
 
 def check_word(name: str, value: str, allowed: tuple[str, ...]) -> str:
     """Return a word of a list; refuse anything else."""
-    if value not in allowed:
-        raise SensorError(f"{name} = {value!r} must be one of {', '.join(allowed)}")
+    if not isinstance(value, str) or value not in allowed:
+        raise wrong_value(
+            value, f"{name} = {shown(value)} must be one of {', '.join(allowed)}"
+        )
     return value
+
+
+def check_path(name: str, value: str | os.PathLike[str], what: str) -> str:
+    """Return a path as text; refuse anything but text and path-like objects."""
+    if not isinstance(value, str | os.PathLike):
+        raise SensorTypeError(f"{name} = {shown(value)} must be {what}")
+    return str(value)
+
+
+def check_array(name: str, value: ArrayLike) -> FloatArray:
+    """Return a new array of float64; refuse what is no real numbers."""
+    try:
+        if not np.iscomplexobj(value):
+            return np.array(value, float)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise wrong_value(value, f"{name} = {shown(value)} must be an array of real numbers")
+
+
+def check_instance(name: str, value: Any, kind: type, what: str) -> None:
+    """Refuse what is no object of a class."""
+    if not isinstance(value, kind):
+        raise SensorTypeError(f"{name} = {shown(value)} must be {what}")
+
+
+def wrong_value(value: Any, text: str) -> SensorError:
+    """Return the error for a number or text that is not allowed, or for a value of another type."""
+    if isinstance(value, str | int | float | np.number):
+        return SensorError(text)
+    return SensorTypeError(text)
+
+
+def to_float(value: Any) -> float:
+    """Convert a number or its text, as GalSim does; nan stands for anything else."""
+    try:
+        if np.ndim(value) or np.iscomplexobj(value):
+            return math.nan
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
+def shown(value: Any) -> str:
+    """Return a value as messages show it: in one line of at most 60 characters."""
+    kind = type(value)
+    if isinstance(value, int) and abs(value) > 10**300:
+        text = "a huge number"  # beyond 4300 digits Python would refuse to write it
+    elif isinstance(value, np.generic):
+        text = f"{value}"
+    elif kind.__repr__ is object.__repr__:
+        text = f"an object of the class {kind.__qualname__}"
+    else:
+        text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else f"{text[:56]} ..."
+
+
+def _range(low: float, high: float) -> str:
+    """Words for the ends of a range that are finite."""
+    out = f" from {low:g}" if math.isfinite(low) else ""
+    return out + (f" to {high:g}" if math.isfinite(high) else "")

@@ -13,6 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 from bfsensor._kernels.photons import Pattern
 from bfsensor.errors import SensorError
 from bfsensor.files import refuse_existing, written_whole
+from bfsensor.sensor.options import (
+    check_array,
+    check_number,
+    check_path,
+    check_shape,
+    shown,
+    wrong_value,
+)
 from bfsensor.typing import FloatArray
 
 _FINER = 16
@@ -50,7 +58,8 @@ class ShiftMap:
     Raises
     ------
     SensorError
-        Arrays that are not two-dimensional, differ in shape or are not finite, or another depth.
+        Arrays that are not two-dimensional, differ in shape or are not finite, a place that is
+        no finite number, or another depth.
 
     Examples
     --------
@@ -68,7 +77,7 @@ class ShiftMap:
 
     def __post_init__(self) -> None:
         for name in ("dx", "dy"):
-            array = np.array(getattr(self, name), float)
+            array = check_array(f"{name} of a shift map", getattr(self, name))
             if array.ndim != 2 or min(array.shape) < 2:
                 raise SensorError(
                     f"{name} of a shift map has the shape {array.shape}; it must be two-"
@@ -82,8 +91,12 @@ class ShiftMap:
             raise SensorError(
                 f"dx and dy of a shift map have the shapes {self.dx.shape} and {self.dy.shape}"
             )
-        if self.depth not in ("bulk", "uniform"):
-            raise SensorError(f"depth = {self.depth!r} must be 'bulk' or 'uniform'")
+        for name in ("x0", "y0"):
+            object.__setattr__(self, name, check_number(name, getattr(self, name)))
+        if not isinstance(self.depth, str) or self.depth not in ("bulk", "uniform"):
+            raise wrong_value(
+                self.depth, f"depth = {shown(self.depth)} must be 'bulk' or 'uniform'"
+            )
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, ShiftMap):
@@ -142,9 +155,7 @@ class ShiftMap:
         >>> edges.dx.shape, bool(edges.dx[0, 0] == -edges.dx[0, -1])
         ((45, 65), True)
         """
-        ny, nx = shape
-        if ny < 1 or nx < 1:
-            raise SensorError(f"shape = {shape} of a sensor must be at least (1, 1)")
+        ny, nx = check_shape("shape", shape)
         given = {"x_low": x_low, "x_high": x_high, "y_low": y_low, "y_high": y_high}
         lines = {n: _edge_line(n, s, nx if n[0] == "x" else ny) for n, s in given.items()}
         pad = 1 + max(int(np.ceil(np.abs(s).max())) for s in lines.values())
@@ -182,7 +193,7 @@ class ShiftMap:
         """
         from astropy.io import fits
 
-        path = Path(path)
+        path = Path(check_path("path", path, "the path of a file"))
         try:
             with fits.open(path) as hdus:
                 header = hdus[0].header
@@ -215,6 +226,7 @@ class ShiftMap:
         """
         from astropy.io import fits
 
+        path = check_path("path", path, "the path of a file")
         refuse_existing(path, overwrite, SensorError)
         primary = fits.PrimaryHDU()
         primary.header["X0"] = (self.x0, "[pixel] image coordinate of DX[0, 0]")
@@ -233,7 +245,7 @@ def _edge_line(name: str, given: ArrayLike | None, pixels: int) -> FloatArray:
     out = np.zeros(pixels + 1)
     if given is None:
         return out
-    shifts = np.array(given, float)
+    shifts = check_array(name, given)
     if shifts.ndim != 1 or len(shifts) < 2 or not np.all(np.isfinite(shifts)):
         raise SensorError(
             f"{name} must hold the finite shifts of at least two boundaries, not an array of "

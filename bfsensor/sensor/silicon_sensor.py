@@ -15,11 +15,18 @@ from bfsensor._kernels.photons import Medium
 from bfsensor._kernels.shifts import Edges
 from bfsensor.device.shipped import did_you_mean, tables_dir
 from bfsensor.errors import SensorError, TableError
-from bfsensor.sensor.base import EngineSensor, read_numbers
+from bfsensor.sensor.base import EngineSensor, check_rings, make_rng, read_numbers
 from bfsensor.sensor.drift_field import MEASURED, STEPS
 from bfsensor.sensor.edge_weights import make_edges, transpose_sides
 from bfsensor.sensor.image_exposure import Physics
-from bfsensor.sensor.options import galsim_folder
+from bfsensor.sensor.options import (
+    LARGEST,
+    check_flag,
+    check_number,
+    check_path,
+    check_whole,
+    galsim_folder,
+)
 from bfsensor.table.galsim_format import read_sides
 from bfsensor.typing import FloatArray
 
@@ -59,31 +66,37 @@ class SiliconSensor(EngineSensor):
     name : str
         Stem of the .cfg and .dat files: a path, or one of those shipped with GalSim.
     strength : float
-        Factor on all shifts.
+        Factor on all shifts, from -1e6 to 1e6.
     rng : galsim.BaseDeviate, optional
         Source of the key of the random numbers.
     diffusion_factor : float
-        Factor on the width of the diffusion.
+        Factor on the width of the diffusion, at least 0 (GalSim takes negative ones as well).
     qdist : int
         Largest distance [pixel] at which charge acts, up to the table's reach (4 in GalSim's).
     nrecalc : float
-        Electrons in the image between renewals of the boundaries, divided by ``strength``; 0:
-        they are renewed by ``recalc`` only.
+        Electrons in the image between renewals of the boundaries, divided by the size of
+        ``strength``, at least 0 (GalSim takes negative ones as well); 0 or inf: they are renewed by
+        ``recalc`` only.
     treering_func : galsim.LookupTable, optional
         Radial shift of the boundaries [pixel], by radius [pixel].
     treering_center : galsim.PositionD
         Centre of the rings in original image coordinates.
     transpose : bool
         Whether x and y of the table are exchanged.
+    threads : int, optional
+        Largest number of threads of one call, at least 1; the result does not depend on it.  By
+        default as many as ``galsim.get_omp_threads()`` says at each call.  Blocks of few photons
+        use fewer.
 
     Raises
     ------
+    SensorError
+        A value outside the range that is stated above; of another type, a SensorTypeError, which is a
+        TypeError too.
     OSError
         The files are missing or cannot be read as a table; the message names them.
     galsim.GalSimRangeError
         ``qdist`` is beyond the table.
-    TypeError
-        ``treering_func`` is no LookupTable, or ``treering_center`` no PositionD.
 
     Examples
     --------
@@ -96,6 +109,8 @@ class SiliconSensor(EngineSensor):
     True
     """
 
+    _opt_params = {**galsim.SiliconSensor._opt_params, "threads": int}  # noqa: RUF012
+
     def __init__(
         self,
         name: str = "lsst_itl_50_8",
@@ -107,18 +122,23 @@ class SiliconSensor(EngineSensor):
         treering_func: galsim.LookupTable | None = None,
         treering_center: galsim.PositionD = galsim.PositionD(0, 0),  # noqa: B008
         transpose: bool = False,
+        *,
+        threads: int | None = None,
     ) -> None:
-        self.name = name
-        self.strength = float(strength)
-        self.rng = galsim.UniformDeviate(rng)
-        self.diffusion_factor = float(diffusion_factor)
-        self.qdist = int(qdist)
-        self.nrecalc = float(nrecalc)
+        self.name = check_path("name", name, "the stem of a .cfg and a .dat file")
+        self.strength = check_number("strength", strength, low=-LARGEST, high=LARGEST)
+        self.rng = make_rng(rng)
+        self.diffusion_factor = check_number(
+            "diffusion_factor", diffusion_factor, low=0.0, high=LARGEST
+        )
+        self.qdist = check_whole("qdist", qdist)
+        self.nrecalc = check_number("nrecalc", nrecalc, low=0.0, infinite=True)
         check_rings(treering_func, treering_center)
         self.treering_func = treering_func
         self.treering_center = treering_center
-        self.transpose = bool(transpose)
-        self.config_file, self.vertex_file = _find(name)
+        self.transpose = check_flag("transpose", transpose)
+        self.threads = threads
+        self.config_file, self.vertex_file = _find(self.name)
         try:
             self.config = read_numbers(self.config_file)
             self.config.update(_defaults(self.config, self.config_file))
@@ -147,8 +167,8 @@ class SiliconSensor(EngineSensor):
 
     @property
     def effective_nrecalc(self) -> float:
-        """Electrons in the image between renewals: ``nrecalc`` divided by the strength."""
-        return self.nrecalc / self.strength if self.strength else self.nrecalc
+        """Electrons in the image between renewals: ``nrecalc`` over the size of the strength."""
+        return self.nrecalc / abs(self.strength) if self.strength else self.nrecalc
 
     def _diffusion(self) -> float:
         """Width of the diffusion of electrons from the back surface [um], as GalSim estimates it.
@@ -203,7 +223,7 @@ class SiliconSensor(EngineSensor):
     def _key(self) -> tuple[Any, ...]:
         return (
             self.config, self.strength, self.diffusion_factor, self.qdist, self.nrecalc,
-            self.treering_func, self.treering_center, self.transpose,
+            self.treering_func, self.treering_center, self.transpose, self.threads,
         )  # fmt: skip
 
     def __str__(self) -> str:
@@ -218,7 +238,7 @@ class SiliconSensor(EngineSensor):
     def __repr__(self) -> str:
         keys = (
             "name", "strength", "rng", "diffusion_factor", "qdist", "nrecalc",
-            "treering_func", "treering_center", "transpose",
+            "treering_func", "treering_center", "transpose", "threads",
         )  # fmt: skip
         parts = [f"{key}={getattr(self, key)!r}" for key in keys]
         return f"bfsensor.SiliconSensor({', '.join(parts)})"
@@ -248,14 +268,6 @@ def _edges(
         (per_electron * sides[0][None], per_electron * sides[1][None]), None, points,
         np.array([thickness]), reach, scale=scale,
     )  # fmt: skip
-
-
-def check_rings(function: Any, centre: Any) -> None:
-    """Refuse rings that are no LookupTable and centres that are no PositionD, as GalSim does."""
-    if function is not None and not isinstance(function, galsim.LookupTable):
-        raise TypeError("treering_func must be a galsim.LookupTable")
-    if not isinstance(centre, galsim.PositionD):
-        raise TypeError("treering_center must be a galsim.PositionD")
 
 
 def _find(name: str) -> tuple[str, str]:

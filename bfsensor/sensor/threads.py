@@ -10,9 +10,15 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import importlib.metadata
+import threading
 from collections.abc import Iterator
 
+import galsim
 import numba
+
+_BUSY = threading.Lock()
+"""Held while kernels run on several threads: numba's own work queue ends a process that starts
+them from two Python threads at once."""
 
 
 def _load_tbb() -> bool:
@@ -35,6 +41,23 @@ def _choose_layer() -> None:
         numba.config.THREADING_LAYER = "tbb" if _load_tbb() else "workqueue"
 
 
+def count_threads(threads: int | None) -> int:
+    """Return a number of threads, by default that of GalSim's OpenMP.
+
+    Parameters
+    ----------
+    threads : int, optional
+        Number of threads; None: what ``galsim.get_omp_threads()`` says now, which is 1 in the
+        processes that GalSim's configuration starts.
+
+    Returns
+    -------
+    threads : int
+        At least 1.
+    """
+    return max(int(galsim.get_omp_threads()), 1) if threads is None else threads
+
+
 @contextlib.contextmanager
 def threads_to_use(threads: int) -> Iterator[int]:
     """Let numba use some threads within a ``with`` statement.
@@ -47,16 +70,25 @@ def threads_to_use(threads: int) -> Iterator[int]:
     Yields
     ------
     threads : int
-        Number of threads used, at most as many as numba was started with.
+        Number of threads used, at most as many as numba was started with; 1 while another Python
+        thread uses several.
     """
-    _choose_layer()
-    before = numba.get_num_threads()
-    threads = min(threads, numba.config.NUMBA_NUM_THREADS)
-    numba.set_num_threads(threads)
-    # Pieces are handed out one by one, so that a thread that is done takes the next one.
-    chunk = numba.set_parallel_chunksize(1)
+    if min(threads, numba.config.NUMBA_NUM_THREADS) < 2 or not _BUSY.acquire(
+        blocking=False
+    ):
+        yield 1
+        return
     try:
-        yield threads
+        _choose_layer()
+        before = numba.get_num_threads()
+        threads = min(threads, numba.config.NUMBA_NUM_THREADS)
+        numba.set_num_threads(threads)
+        # Pieces are handed out one by one, so that a thread that is done takes the next one.
+        chunk = numba.set_parallel_chunksize(1)
+        try:
+            yield threads
+        finally:
+            numba.set_parallel_chunksize(chunk)
+            numba.set_num_threads(before)
     finally:
-        numba.set_parallel_chunksize(chunk)
-        numba.set_num_threads(before)
+        _BUSY.release()

@@ -77,13 +77,16 @@ def test_campaign_files_are_read(text, tmp_path):
     assert read_settings(tmp_path).remarks == ()
 
 
-def test_configuration_makes_a_sensor():
+def test_configurations_make_sensors():
     import galsim
 
-    (found,) = blocks("howto/configuration.md", "yaml")
-    given = yaml.safe_load(found[1])
-    galsim.config.ImportModules(given)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        sensor = galsim.config.BuildSensor(given["image"], "sensor", {}, None)
-    assert type(sensor).__name__ == "BrighterFatterSensor" and "e2v_ccd250" in repr(sensor)
+    made = []
+    for _, text in blocks("howto/configuration.md", "yaml"):
+        given = yaml.safe_load(text)
+        galsim.config.ImportModules(given)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            made.append(galsim.config.BuildSensor(given["image"], "sensor", {}, None))
+    names = [(type(sensor).__name__, sensor.name) for sensor in made]
+    assert ("BrighterFatterSensor", "e2v_ccd250") in names
+    assert ("SiliconSensor", "lsst_e2v_50_8") in names

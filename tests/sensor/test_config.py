@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -155,7 +156,8 @@ def test_sky_of_silicon_swap_goes_through_areas(tmp_path):
 def test_the_type_works_whichever_comes_first(first):
     code = (
         f"{first}; import galsim.config; "
-        "print('BrighterFatter' in galsim.config.sensor.valid_sensor_types); "
+        "types = galsim.config.sensor.valid_sensor_types; "
+        "print('BrighterFatter' in types and 'BfsensorSilicon' in types); "
         "d = {'sensor': {'type': 'BrighterFatter', 'name': 'e2v_ccd250'}}; "
         "print(galsim.config.BuildSensor(d, 'sensor', {'rng': galsim.BaseDeviate(77)}));"
         "print(galsim.config.sensor.valid_sensor_types['Silicon'].init_func)"
@@ -187,6 +189,69 @@ def test_importing_bfsensor_is_cheap():
 def build(sensor, **others):
     base = {"image": {"sensor": sensor, **others}, "rng": galsim.BaseDeviate(77)}
     return galsim.config.BuildSensor(base["image"], "sensor", base)
+
+
+def test_our_silicon_sensor_has_a_type_of_its_own():
+    """Beside GalSim's, which stays what it is; ``as_silicon`` replaces that one for all."""
+    options = {"name": "lsst_e2v_50_8", "strength": 1.5, "nrecalc": 2000, "threads": 2}
+    sensor = build({"type": "BfsensorSilicon", **options})
+    assert type(sensor) is bfsensor.SiliconSensor
+    assert sensor == bfsensor.SiliconSensor(rng=galsim.BaseDeviate(77), **options)
+    assert build({"type": "BfsensorSilicon"}).threads is None
+    assert build({"type": "BfsensorSilicon", "threads": None}).threads is None
+    theirs = build({"type": "Silicon"})
+    assert type(theirs) is galsim.SiliconSensor
+    with pytest.raises(
+        galsim.GalSimConfigError, match="Could not parse all as a <class 'int'>"
+    ):
+        build({"type": "BfsensorSilicon", "threads": "all"})
+    known = set(bfsensor.SiliconSensor._opt_params)
+    assert known == set(galsim.SiliconSensor._opt_params) | {"threads"}
+
+
+def used_threads(kind, nproc, monkeypatch, tmp_path):
+    """Threads that kernels use while a configuration draws, by process."""
+    from bfsensor.sensor import image_exposure
+
+    inner = image_exposure.threads_to_use
+    folder = tmp_path / f"{kind}{nproc}"
+    folder.mkdir()
+
+    def noted(threads):
+        (folder / f"{os.getpid()}-{threads}").touch()
+        return inner(threads)
+
+    monkeypatch.setattr(image_exposure, "threads_to_use", noted)
+    config = {
+        "modules": ["bfsensor"],
+        "gal": {"type": "Gaussian", "sigma": 0.3, "flux": 4e4},
+        "stamp": {"draw_method": "phot"},
+        "image": {"type": "Tiled", "nx_tiles": 4, "ny_tiles": 1, "stamp_size": 15,
+                  "nproc": nproc, "random_seed": 977, "pixel_scale": 0.2,
+                  "sensor": {"type": kind}},
+    }  # fmt: skip
+    pixels = galsim.config.BuildImage(config).array.copy()
+    monkeypatch.undo()
+    found = [path.name.split("-") for path in folder.iterdir()]
+    return pixels, {int(p) for p, _ in found}, {int(t) for _, t in found}
+
+
+@pytest.mark.parametrize("kind", ["BfsensorSilicon", "BrighterFatter"])
+def test_processes_of_a_configuration_use_one_thread_each(kind, monkeypatch, tmp_path):
+    """By default sensors follow GalSim, which turns threads off where it starts processes."""
+    before = galsim.get_omp_threads()
+    if galsim.set_omp_threads(2) != 2:
+        pytest.skip("GalSim was built without OpenMP")
+    try:
+        alone, processes, threads = used_threads(kind, 1, monkeypatch, tmp_path)
+        assert (processes, threads) == ({os.getpid()}, {2})
+        shared, processes, threads = used_threads(kind, 2, monkeypatch, tmp_path)
+        assert os.getpid() not in processes
+        assert threads == {1}
+        assert galsim.get_omp_threads() == 2
+    finally:
+        galsim.set_omp_threads(before)
+    np.testing.assert_array_equal(alone, shared)
 
 
 def test_options_reach_the_sensor():

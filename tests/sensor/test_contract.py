@@ -12,17 +12,19 @@ import numpy as np
 import pytest
 
 import bfsensor
-from bfsensor import BrighterFatterSensor, SiliconSensor
+from bfsensor import BrighterFatterSensor, SensorError, SiliconSensor
 from tests.sensor.contract_cases import BOTH, RINGS, blank, draw, make, part, photons
 
 
 def test_silicon_sensor_has_the_signature_of_galsim():
-    """BrighterFatterSensor begins with it; its name is of another table, qdist all of it."""
+    """Both begin with it; BrighterFatterSensor has another table and its whole reach."""
     theirs = inspect.signature(galsim.SiliconSensor).parameters
     ours = inspect.signature(SiliconSensor).parameters
     assert {k: p.default for k, p in ours.items()} == {
-        k: p.default for k, p in theirs.items()
-    }
+        **{k: p.default for k, p in theirs.items()}, "threads": None,
+    }  # fmt: skip
+    assert list(ours)[: len(theirs)] == list(theirs)
+    assert ours["threads"].kind is inspect.Parameter.KEYWORD_ONLY
     assert list(inspect.signature(BrighterFatterSensor).parameters)[: len(theirs)] == list(
         theirs
     )
@@ -39,7 +41,7 @@ def test_silicon_sensor_has_the_signature_of_galsim():
 def test_pickle_copy_and_repr(kind):
     for options in (
         {},
-        {"treering_func": RINGS, "treering_center": galsim.PositionD(3, 4)},
+        {"treering_func": RINGS, "treering_center": galsim.PositionD(3, 4), "threads": 3},
     ):
         sensor = make(kind, **options)
         galsim.utilities.check_pickle(sensor)
@@ -77,7 +79,7 @@ def test_copies_begin_a_new_exposure(kind):
 DIFFERENT = {
     "name": "lsst_e2v_50_8", "strength": 2.0, "diffusion_factor": 0.5, "qdist": 2,
     "nrecalc": 7.0, "treering_func": RINGS, "treering_center": galsim.PositionD(1.0, 2.0),
-    "transpose": True,
+    "transpose": True, "threads": 2,
 }  # fmt: skip
 
 
@@ -153,9 +155,11 @@ def test_update_rng_restarts_and_shares(kind):
     np.testing.assert_array_equal(*images)
     np.testing.assert_array_equal(images[0], draw(kind(rng=galsim.BaseDeviate(1234))))
     assert not np.array_equal(draw(sensor), images[0])
+    before = sensor.rng.serialize()
     for wrong in ([3.5], {}, galsim.Sensor()):
-        with pytest.raises(TypeError):
+        with pytest.raises(SensorError, match=r"rng = .* must be a galsim.BaseDeviate"):
             sensor.updateRNG(wrong)
+    assert sensor.rng.serialize() == before
 
 
 @BOTH

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from unittest import mock
 
 import galsim
 import numpy as np
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bfsensor import BrighterFatterSensor, SensorError, SiliconSensor
+from bfsensor.sensor import image_exposure
 from tests.sensor.contract_cases import BOTH, RINGS, blank, draw, make, part, photons
 
 
@@ -29,13 +31,14 @@ def test_pieces_equal_one_call(kind, full, cuts, threads, signs, dtype):
     everything.flux *= np.resize(signs, len(everything))
     whole, pieces = blank(dtype=dtype), blank(dtype=dtype)
     total = make(kind, nrecalc=1500.0).accumulate(everything, whole)
-    sensor = make(kind, nrecalc=1500.0)
-    sensor.threads = threads
+    sensor = make(kind, nrecalc=1500.0, threads=threads)
     at = [0, *sorted(cuts), len(everything)]
-    parts = [
-        sensor.accumulate(part(everything, lo, hi), pieces, resume=n > 0)
-        for n, (lo, hi) in enumerate(pairwise(at))
-    ]
+    # Otherwise blocks of 1500 e- would not be worth a second thread.
+    with mock.patch.object(image_exposure, "_SHARE", 1):
+        parts = [
+            sensor.accumulate(part(everything, lo, hi), pieces, resume=n > 0)
+            for n, (lo, hi) in enumerate(pairwise(at))
+        ]
     np.testing.assert_array_equal(whole.array, pieces.array)
     # Sums of 3e4 numbers in another order: 3e4 eps of their moduli at most.
     assert sum(parts) == pytest.approx(total, abs=3e4 * 2.3e-16 * 55e3)

@@ -75,7 +75,16 @@ def test_refusals_change_nothing(kind, options):
     other.array[...] = 3.0
     message = "an image other than"
     refuse(galsim.GalSimError, message, good, other, resume=True)
-    refuse(galsim.GalSimError, message, good, image.view(), resume=True)
+    refuse(
+        galsim.GalSimError, message, good, image[galsim.BoundsI(-9, 9, -9, 9)], resume=True
+    )
+    refuse(
+        galsim.GalSimImmutableError,
+        "writeable",
+        good,
+        image.view(make_const=True),
+        resume=True,
+    )
     refuse(galsim.GalSimError, message, good, galsim.ImageI(9, 9), resume=True)
     assert np.all(other.array == 3.0)
     sensor.accumulate(part(good, half, len(good)), image, resume=True)
@@ -128,7 +137,19 @@ def test_photons_without_flux_are_dropped_where_they_are_not_finite(kind, field)
         int((~lost).sum()), *(getattr(whole, n)[~lost] for n in ("x", "y", "flux", "dxdz", "dydz")),
         wavelength=whole.wavelength[~lost],
     )  # fmt: skip
-    np.testing.assert_array_equal(draw(make(kind), marked), draw(make(kind), others))
+    sensor = make(kind)
+    np.testing.assert_array_equal(draw(sensor, marked), draw(make(kind), others))
+    # 30,000 photons in steps of 7; those of a resumed call add up.
+    assert sensor.diagnostics["dropped"] == 4286
+    assert sensor.diagnostics["photons"] == 30_000 - 4286
+    sensor, target = make(kind), blank()
+    for n in range(2):
+        half = part(marked, 15_000 * n, 15_000 * (n + 1))
+        sensor.accumulate(half, target, resume=n > 0)
+    np.testing.assert_array_equal(target.array, draw(make(kind), others))
+    assert sensor.diagnostics["dropped"] == 4286
+    draw(sensor)
+    assert sensor.diagnostics["dropped"] == 0
     marked.flux[14] = 1e-9
     with pytest.raises(SensorError, match=r"photon 14: .*1 of 30000 photons"):
         draw(make(kind), marked)
@@ -144,3 +165,90 @@ def test_total_reflection_loses_photons_and_no_image(kind):
     others = draw(make(kind), part(light, 5000, 30_000))
     np.testing.assert_array_equal(draw(make(kind), light), others)
     assert others.sum() > 20_000
+
+
+@BOTH
+def test_negative_wavelengths_are_refused_with_flux(kind):
+    """GalSim takes them for its shortest; without flux they change nothing."""
+    light = photons(full=True)
+    light.wavelength[5:8] = -500.0
+    with pytest.raises(
+        SensorError,
+        match=r"photon 5: wavelength = -500.0 nm must not be negative \(3 of 30000",
+    ):
+        draw(make(kind), light)
+    light.flux[5:8] = 0.0
+    image = draw(make(kind), light)
+    light.wavelength[5:8] = 500.0
+    np.testing.assert_array_equal(image, draw(make(kind), light))
+
+
+# -- the image between resumed calls -------------------------------------------------------
+
+
+@BOTH
+def test_a_view_of_the_same_pixels_continues(kind):
+    """As GalSim's drawing makes one each time; other bounds, or other pixels, are refused."""
+    everything = photons()
+    whole = draw(make(kind), everything)
+    sensor, image = make(kind), blank()
+    sensor.accumulate(part(everything, 0, 10_000), image)
+    sensor.accumulate(part(everything, 10_000, 20_000), image.view(), resume=True)
+    again = galsim.Image(image.array, bounds=image.bounds)
+    sensor.accumulate(part(everything, 20_000, 30_000), again, resume=True)
+    np.testing.assert_array_equal(image.array, whole)
+
+    moved = image.view()
+    moved.setOrigin(1, 1)
+    for other, message in (
+        (moved, r"the image was moved: its bounds are galsim.BoundsI\(1,21,1,21\), at the call "
+                r"before galsim.BoundsI\(-10,10,-10,10\)"),
+        (galsim.Image(image.array[::-1], bounds=image.bounds), "an image other than"),
+        (galsim.Image(image.array.T, bounds=image.bounds), "an image other than"),
+        (image.copy(), "an image other than"),
+    ):  # fmt: skip
+        with pytest.raises(galsim.GalSimError, match=message):
+            sensor.accumulate(everything, other, resume=True)
+    # The same object, moved after the call.
+    image.setOrigin(1, 1)
+    with pytest.raises(galsim.GalSimError, match="the image was moved"):
+        sensor.accumulate(everything, image, resume=True)
+    np.testing.assert_array_equal(image.array, whole)
+    image.setCenter(0, 0)
+    assert sensor.accumulate(everything, image, resume=True) == 30_000
+
+
+@BOTH
+def test_charge_from_outside_acts_where_light_falls_later(kind):
+    """As documented for ``resume``: at once with a new call, else where electrons land."""
+    light = photons(2000, seed=5, width=0.2)
+    shares = {}
+    for how in ("never", "resumed", "new"):
+        sensor, image = make(kind, nrecalc=0), blank(dtype=np.float64)
+        sensor.accumulate(light, image)
+        before = image.array.copy()
+        if how != "never":
+            image[0, 0] += 5e4  # where all the light falls
+        sensor.accumulate(light, image, resume=how == "resumed", recalc=how == "resumed")
+        sensor.accumulate(
+            photons(40_000, seed=6, width=0.5), image, resume=True, recalc=True
+        )
+        shares[how] = image[0, 0] - before[10, 10] - (5e4 if how != "never" else 0.0)
+    # The charge repels some per cent of what falls near its pixel's edges.
+    assert shares["resumed"] < 0.97 * shares["never"]
+    # Poisson of the electrons that change sides, of 20,000 some 1000.
+    assert shares["resumed"] == pytest.approx(shares["new"], abs=5 * np.sqrt(2 * 1000))
+    # A pixel on which nothing falls is not looked at again before a call without resume.
+    areas = []
+    for resume in (True, False):
+        sensor, image = make(kind, nrecalc=0), blank(dtype=np.float64)
+        sensor.accumulate(light, image)
+        image[3, 0] += 5e6
+        sensor.accumulate(light, image, resume=resume, recalc=resume)
+        beside = galsim.PhotonArray(
+            20_000, np.full(20_000, 2.0), np.linspace(-0.5, 0.5, 20_000), np.ones(20_000)
+        )
+        before = image[2, 0]
+        sensor.accumulate(beside, image, resume=True)
+        areas.append(image[2, 0] - before)
+    assert areas[0] != areas[1]
