@@ -21,6 +21,7 @@ TASKS = {
     "switching physics off": ("switch_off", r"charge_response"),
     "configuration files": ("configuration", r"type: BrighterFatter"),
     "own sensor": ("own_device", r"bfsensor device new"),
+    "own camera": ("own_camera", r"bfsensor table --from .*--thickness"),
     "voltages": ("sweeps", r"bfsensor sweep .*back_bias"),
     "fit": ("fit", r"bfsensor fit "),
     "photon transfer curve": ("photon_transfer", r"measure_curve"),
