@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from astropy.table import Table
 
 from bfsensor.device.device import Device
 from bfsensor.errors import MeasurementError, RecordingError
@@ -144,6 +145,24 @@ def test_covariances_of_levels_become_the_a_ij_that_made_them(tmp_path, gain):
     assert found.used.all() and np.all(found.errors > 0)
     naive = c[1, 1, 0] / levels[1] ** 2
     assert abs(naive / a[1, 0] - 1) > 0.03
+
+
+def test_the_output_of_measure_flats_is_read(tmp_path):
+    """Rows by pair and amplifier, as `bfsensor measure flats -o` writes them."""
+    a, rows = truth(2), []
+    for name, noise in (("A", 25.0), ("B", 64.0)):
+        for m in (8e3, 2e4, 4e4, 5e4):
+            c = model_covariances([m], a)[0]
+            c[0, 0] += noise
+            rows += [
+                {"first": "1.fits", "second": "2.fits", "amplifier": name, "unit": "electron",
+                 "level": m, "lag_x": i, "lag_y": j, "covariance": c[j, i], "error": 3.0}
+                for i, j in lags()
+            ]  # fmt: skip
+    Table(rows=rows).write(tmp_path / "flats.ecsv")
+    found = read_camera_areas(tmp_path / "flats.ecsv")
+    assert found.a == pytest.approx(a, rel=1e-3) and found.used.all()
+    assert "4 levels, 8000 to 50000 e-" in found.source
 
 
 def test_one_level_says_nothing_of_a_00(tmp_path):
