@@ -17,7 +17,7 @@ from bfsensor.device.shipped import tables_dir
 ROOT = Path(__file__).resolve().parents[1]
 DEVICES = [
     "e2v_ccd250", "e2v_ccd250_2019", "e2v_ccd250_70",
-    "itl_sta3800c", "itl_sta3800c_2019", "itl_sta3800c_60",
+    "hsc_hamamatsu", "itl_sta3800c", "itl_sta3800c_2019", "itl_sta3800c_60",
 ]  # fmt: skip
 REPORT = """
 import json, bfsensor

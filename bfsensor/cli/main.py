@@ -120,7 +120,10 @@ def _versions() -> str:
 @main.command(short_help="List the built-in devices.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON for a program to read.")
 def devices(as_json: bool) -> None:
-    """List the built-in devices with pixel pitch, thickness and operating point.
+    """List the built-in devices with pixel pitch, thickness, operating point and origin.
+
+    The origin is that of the doping, or 'fitted to covariances': such a device has measured a_ij
+    and their image-charge model, and its doping and voltages stand in from another one.
 
     \b
     Example:
@@ -140,6 +143,7 @@ def devices(as_json: bool) -> None:
                 "gates low/high [V]": f"{point.gate_low:g}/{point.gate_high:g}",
                 "back bias [V]": point.back_bias,
                 "temperature [K]": point.temperature,
+                "origin": loaded.origin,
             }
         )
     if as_json:

@@ -16,13 +16,14 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
+from bfsensor.cli import camera
 from bfsensor.cli.common import (
     check_targets,
-    device_options,
     load_device,
     overwrite_option,
     parse_settings,
     progress_bar,
+    settings_option,
     summary_option,
 )
 from bfsensor.errors import BFSensorError, DeviceError, TableError
@@ -43,12 +44,35 @@ def _numbers(
 
 
 @click.command(short_help="Write the distortion table of a device.")
-@device_options
+@click.argument("device", required=False)
+@settings_option
+@click.option("--from", "covariances", type=click.Path(path_type=Path), metavar="FILE",
+              help="Fit the image-charge engine to a_ij or covariances of flats in FILE (.csv, .ecsv "
+              "or LSST's photon transfer dataset). DEVICE then stands in for what they do not "
+              "say.  [default: DEVICE is solved]")  # fmt: skip
+@click.option("--thickness", metavar="LENGTH",
+              help="Thickness of the silicon, such as 200um; needed with --from, and only for "
+              "it.")  # fmt: skip
+@click.option("--pitch", metavar="LENGTH",
+              help="Pixel pitch in x and y. Only for --from.  [default: DEVICE's]")  # fmt: skip
+@click.option("--lags", default=4, show_default=True, type=click.IntRange(1, 8),
+              help="Largest lag that is fitted, in pixels. Only for --from.")  # fmt: skip
+@click.option("--without", multiple=True, callback=camera.parse_lags, metavar="I,J",
+              help="Do not fit this lag, such as 0,0; repeatable. Only for --from.  [default: all "
+              "are fitted]")  # fmt: skip
+@click.option("--offset", is_flag=True,
+              help="Also fit an offset common to all lags. Only for --from.")  # fmt: skip
+@click.option("--model-error", default=0.05, show_default=True, type=click.FloatRange(0, 1),
+              help="Relative accuracy of the image-charge model, added in quadrature to the errors "
+              "of a_ij. Only for --from.")  # fmt: skip
+@click.option("--exchange-axes", is_flag=True,
+              help="Take i as the lag in y and j as that in x. Only for --from.")  # fmt: skip
 @click.option(
     "--charges",
     callback=_numbers,
     metavar="Q,Q,...",
-    help="Charges of the source pixel [e-].  [default: 0 and 3, 15, 35, 55, 75, 90 % of the full well]",
+    help="Charges of the source pixel [e-].  [default: 0 and 3, 15, 35, 55, 75, 90 % of the full well; "
+    "0 and 200000 for a device fitted to covariances]",
 )
 @click.option("--backgrounds", callback=_numbers, metavar="B,B,...",
               help="Uniform charges of all other pixels [e-].  [default: 0, 25, 50, 80 % of the "
@@ -69,10 +93,11 @@ def _numbers(
     show_default=True,
     help="Width of the table, centred on the source pixel [pixel], odd.",
 )
-@click.option("--engine", default="poisson", show_default=True,
-              type=click.Choice(["poisson", "image_charge"]),
+@click.option("--engine", type=click.Choice(["poisson", "image_charge"]),
               help="'poisson' solves the non-linear Poisson equation; 'image_charge' takes an "
-              "analytic model, linear in charge, of parameters given by --image-charge.")  # fmt: skip
+              "analytic model, linear in charge, of parameters given by --image-charge or in the "
+              "device.  [default: image_charge for devices fitted to covariances, else "
+              "poisson]")  # fmt: skip
 @click.option("--image-charge", "parameters", multiple=True, callback=parse_settings,
               metavar="KEY=VALUE",
               help="Parameter of --engine image_charge with its unit, such as row_height=1.2um; "
@@ -86,7 +111,7 @@ def _numbers(
     "-o",
     "--output",
     type=click.Path(path_type=Path),
-    help="FITS table to write.  [default: DEVICE.fits]",
+    help="FITS table to write.  [default: DEVICE.fits; with --from FILE.fits]",
 )
 @click.option("--galsim", type=click.Path(path_type=Path), metavar="STEM",
               help="Write STEM.cfg and STEM.dat for galsim.SiliconSensor instead of FITS: one "
@@ -108,14 +133,22 @@ def _numbers(
 @click.pass_context
 def table(
     context: click.Context,
-    device: str,
+    device: str | None,
     settings: list[tuple[str, str]],
+    covariances: Path | None,
+    thickness: str | None,
+    pitch: str | None,
+    lags: int,
+    without: tuple[tuple[int, int], ...],
+    offset: bool,
+    model_error: float,
+    exchange_axes: bool,
     charges: tuple[float, ...] | None,
     backgrounds: tuple[float, ...] | None,
     depths: tuple[float, ...] | None,
     vertices: int,
     pixels: int,
-    engine: str,
+    engine: str | None,
     parameters: list[tuple[str, str]],
     accuracy: float,
     workers: int,
@@ -126,16 +159,22 @@ def table(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Solve a DEVICE and write its distortion table.
+    """Solve a DEVICE, or fit covariances, and write a distortion table.
 
     DEVICE is a .toml file or a name of 'bfsensor devices'.  The table holds the displacement of
     every vertex of the pixel boundaries [um] as a function of the charge of a source pixel,
     the uniform charge of all others, and the conversion depth.  Repeat the command to continue an
     interrupted run.
 
+    With --from no doping is needed: FILE has a row for each lag with the columns i (along a row, x),
+    j (along a column, y), a and error [1/e-]; or i, j, mu_e, cov and sigma, the covariances of a flat
+    [e-^2] at its level [e-]; or it is the output of 'bfsensor measure flats -o'.  Beside the table are
+    written the device (.toml), the fit by lag (_fit.ecsv) and its figure (_fit.png).
+
     \b
     Examples:
       bfsensor table itl_sta3800c -o itl.fits
+      bfsensor table --from covariances.csv --thickness 200um --pitch 15um -o camera.fits
       bfsensor table e2v_ccd250 --set back_bias=-70V --galsim sensors/e2v_70
       bfsensor table itl_sta3800c --engine image_charge -o analytic.fits \\
         --image-charge charge_height=0.32um --image-charge row_height=1.21um \\
@@ -146,10 +185,43 @@ def table(
     from bfsensor.device.depletion import check_depleted
 
     began, cpu_began = time.perf_counter(), _cpu_seconds()
-    _check_engine(context, engine, parameters)
-    loaded = load_device(device, settings)
-    model = _image_charge(loaded, parameters) if engine == "image_charge" else None
     levels = _Levels(charges, backgrounds, depths)
+    _check_source(context, device, covariances)
+    if covariances is not None:
+        request = camera.CameraRequest(
+            covariances, thickness, pitch, lags, without, offset, exchange_axes,
+            model_error,
+        )  # fmt: skip
+        target = output or Path(f"{covariances.stem}.fits")
+        camera.check_outputs(target.with_suffix(""), overwrite)
+        check_targets([target], overwrite, TableError)
+        loaded, found = camera.fit_covariances_of(
+            request, device or camera.STAND_IN, settings, target.stem
+        )
+        written = camera.write_fit(loaded, found, target.with_suffix(""), figure)
+        fitted: dict[str, Any] = {"fit": camera.describe(found), "written": written}
+        more = camera.provenance_of(found)
+        _write_fitted(loaded, levels, vertices, pixels, target, figure, fitted, more)
+        _print_fitted(fitted, as_json)
+        return
+    assert device is not None
+    loaded = load_device(device, settings)
+    if engine is None:
+        engine = "image_charge" if loaded.image_charge is not None else "poisson"
+    _check_engine(context, engine, parameters)
+    if engine == "image_charge" and loaded.image_charge is not None and not parameters:
+        if galsim is not None:
+            raise TableError(
+                "--galsim: not for devices fitted to covariances; their table is for "
+                "bfsensor.BrighterFatterSensor"
+            )
+        target = output or Path(f"{loaded.name}.fits")
+        check_targets([target], overwrite, TableError)
+        fitted = {"written": []}
+        _write_fitted(loaded, levels, vertices, pixels, target, figure, fitted, {})
+        _print_fitted(fitted, as_json)
+        return
+    model = _image_charge(loaded, parameters) if engine == "image_charge" else None
     if galsim is not None:
         levels = levels.for_galsim(loaded)
         targets = [galsim.with_name(galsim.name + ending) for ending in (".cfg", ".dat")]
@@ -187,6 +259,79 @@ def table(
         click.echo(json.dumps(summary, indent=1, default=str))
         return
     for key, value in summary.items():
+        click.echo(f"{key:18} {_plain(value)}")
+
+
+def _check_source(
+    context: click.Context, device: str | None, covariances: Path | None
+) -> None:
+    """Refuse a missing device, and options that belong to the other source of the table."""
+
+    def given(*names: str) -> list[str]:
+        return [
+            "--" + name.replace("_", "-")
+            for name in names
+            if context.get_parameter_source(name) == ParameterSource.COMMANDLINE
+        ]
+
+    if covariances is None:
+        if device is None:
+            raise click.UsageError("Missing argument 'DEVICE', or --from FILE.")
+        only = (
+            "thickness",
+            "pitch",
+            "lags",
+            "without",
+            "offset",
+            "exchange_axes",
+            "model_error",
+        )
+        if wrong := given(*only):
+            raise click.UsageError(f"{', '.join(wrong)}: only for --from")
+    elif wrong := given("engine", "accuracy", "workers", "assess", "galsim"):
+        raise click.UsageError(f"{', '.join(wrong)}: not for --from")
+    elif given("parameters"):
+        raise click.UsageError(
+            "--image-charge: not for --from, which fits these parameters"
+        )
+
+
+def _write_fitted(
+    device: Any,
+    levels: _Levels,
+    vertices: int,
+    pixels: int,
+    target: Path,
+    figure: bool,
+    summary: dict[str, Any],
+    provenance: dict[str, str],
+) -> None:
+    """Write the table of a device that was fitted to covariances; adds to the summary in place."""
+    from bfsensor.table.build_image_charge import build_fitted_table
+
+    command = {"command": " ".join(["bfsensor", *sys.argv[1:]])}
+    result = build_fitted_table(
+        device, charges=levels.charges, backgrounds=levels.backgrounds, depths=levels.depths,
+        vertices=vertices, pixels=pixels, provenance={**provenance, **command},
+    )  # fmt: skip
+    result.write(target, overwrite=True)
+    drawn = _draw(result, target.with_suffix(".png")) if figure else []
+    summary["written"] = [str(target), *drawn, *summary["written"]]
+    summary["table"] = {
+        "charges_e": result.charges.tolist(), "backgrounds_e": result.backgrounds.tolist(),
+        "depths_um": [round(float(d), 3) for d in result.depths],
+        "errors": dict(result.errors),
+    }  # fmt: skip
+
+
+def _print_fitted(summary: dict[str, Any], as_json: bool) -> None:
+    """Print what was fitted and written."""
+    if as_json:
+        click.echo(json.dumps(summary, indent=1))
+        return
+    if "fit" in summary:
+        camera.print_fit(summary["fit"])
+    for key, value in (*summary["table"].items(), ("written", summary["written"])):
         click.echo(f"{key:18} {_plain(value)}")
 
 

@@ -14,6 +14,7 @@ from bfsensor.device.parts import (
     BuriedChannel,
     ChannelStop,
     Edge,
+    FittedCharge,
     GateStack,
     Implant,
     OperatingPoint,
@@ -88,6 +89,9 @@ def check_parts(parts: Mapping[str, Any]) -> None:
                 f"channel_stop.dots: centre = '{stop.dots.centre:g} um' and height = "
                 f"'{stop.dots.height:g} um' must lie within the pixel, {pixel.pitch_y:g} um"
             )
+    charge: FittedCharge | None = parts["image_charge"]
+    if charge is not None:
+        _check_charge(charge, pixel, silicon)
     if edge is not None:
         for k, strip in enumerate(edge.strips):
             groups[f"edge.strip[{k}].implant"] = strip.implants
@@ -98,6 +102,27 @@ def check_parts(parts: Mapping[str, Any]) -> None:
                     f"{where}[{i}]: the implant ends {implant.reach:g} um below the "
                     f"surface, outside the silicon of {depth:g} um"
                 )
+
+
+def _check_charge(charge: FittedCharge, pixel: Pixel, silicon: Silicon) -> None:
+    """Check the image-charge model: heights in order, half sides within the pixel."""
+    for name in ("row_height", "column_height"):
+        value = getattr(charge, name)
+        if not charge.charge_height < value < silicon.thickness:
+            raise DeviceError(
+                f"image_charge: {name} = '{value:g} um' must be above charge_height = "
+                f"'{charge.charge_height:g} um' and below thickness = '{silicon.thickness:g} um'"
+            )
+    for axis in "xy":
+        value, pitch = (
+            getattr(charge, f"half_width_{axis}"),
+            getattr(pixel, f"pitch_{axis}"),
+        )
+        if value > pitch / 2:
+            raise DeviceError(
+                f"image_charge: half_width_{axis} = '{value:g} um' must be at most half the "
+                f"pixel, {pitch / 2:g} um"
+            )
 
 
 def _check_part(part: Any, where: str) -> None:

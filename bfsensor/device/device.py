@@ -30,6 +30,7 @@ from bfsensor.device.parts import (
     ChannelStop,
     ChannelStopDots,
     Edge,
+    FittedCharge,
     GateStack,
     Material,
     OperatingPoint,
@@ -52,9 +53,9 @@ from bfsensor.files import written_whole
 ORIGINS = ("measured", "published", "fitted", "guessed")
 """Values that the key ``origin`` of a quantity may have in a device file."""
 
-_OPTIONAL = ("material", "well", "edge")
+_OPTIONAL = ("material", "well", "edge", "image_charge")
 """Sections that a device file may lack: material and well then have their defaults, and there
-is no edge."""
+is no edge and no image-charge model."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,9 @@ class Device:
     provenance : mapping of str to Provenance
         Uncertainty, origin and source of the values that state any, by dotted key of the file,
         such as ``'channel.implant[0].dose'``.
+    image_charge : FittedCharge or None
+        Image-charge model that was fitted to covariances; None for a device whose response is
+        solved from its doping and voltages.
 
     Raises
     ------
@@ -116,6 +120,7 @@ class Device:
     well: Well = field(default_factory=Well)
     edge: Edge | None = None
     provenance: Mapping[str, Provenance] = field(default_factory=dict, hash=False)
+    image_charge: FittedCharge | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
@@ -147,6 +152,14 @@ class Device:
         dots = self.channel_stop.dots
         centred = dots is None or abs(dots.centre - self.pixel.pitch_y / 2) < 1e-9
         return self.edge is None and not self.silicon.ripples and centred
+
+    @property
+    def origin(self) -> str:
+        """Origin of the response: 'fitted to covariances', or that of the bulk's doping."""
+        if self.image_charge is not None:
+            return "fitted to covariances"
+        known = self.provenance.get("silicon.background_doping")
+        return (known.origin if known else None) or "not stated"
 
     @classmethod
     def load(cls, name: str | os.PathLike[str]) -> Device:

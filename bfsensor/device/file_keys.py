@@ -16,6 +16,7 @@ from bfsensor.device.parts import (
     ChannelStopDots,
     Edge,
     EdgeStrip,
+    FittedCharge,
     GateStack,
     Implant,
     Material,
@@ -113,6 +114,23 @@ MEANINGS: dict[tuple[type, str], str] = {
         "Oxide between the voltage and the silicon; with 'none' the strip is a contact."
     ),
     (EdgeStrip, "implants"): "Implants below the strip.",
+    (FittedCharge, "charge_height"): "Height of the stored charge above the gates.",
+    (FittedCharge, "row_height"): (
+        "Height below which boundaries between rows do not move, above that of the charge."
+    ),
+    (FittedCharge, "column_height"): (
+        "Height below which boundaries between columns do not move, above that of the charge."
+    ),
+    (FittedCharge, "half_width_x"): (
+        "Half side of the charged rectangle in x, at most half the pixel."
+    ),
+    (FittedCharge, "half_width_y"): (
+        "Half side of the charged rectangle in y, at most half the pixel."
+    ),
+    (FittedCharge, "drift_field_front"): "Drift field at the gates.",
+    (FittedCharge, "drift_field_back"): (
+        "Drift field at the back surface; it is linear in between."
+    ),
 }
 """Meaning of each entry, by the part of a device that keeps it."""
 
@@ -126,6 +144,9 @@ SECTION_MEANINGS = {
     "operating_point": "Voltages and temperature.",
     "well": "The charge that a pixel holds.",
     "edge": "The sensor beyond its last pixel, for solutions of edges only.",
+    "image_charge": (
+        "A model fitted to covariances, which `bfsensor table` then takes instead of solving."
+    ),
 }
 """Meaning of each section."""
 

@@ -428,6 +428,40 @@ class Well:
 
 
 @dataclass(frozen=True)
+class FittedCharge:
+    """The image-charge model of a sensor whose covariances are known, but not its doping.
+
+    Such a device answers by this model (:mod:`bfsensor.simulate.image_charge`); its gates, implants
+    and bulk then serve only to solve the drift field, from which diffusion follows.
+
+    Attributes
+    ----------
+    charge_height : float
+        Height of the stored charge above the plane of the gates [um].
+    row_height, column_height : float
+        Heights [um] below which the boundaries between rows and between columns do not move, above
+        that of the charge.
+    half_width_x, half_width_y : float
+        Half sides of the charged rectangle [um], at most half a pixel.
+    drift_field_front, drift_field_back : float
+        Drift field at the gates and at the back surface, linear in between [V/um].
+
+    Examples
+    --------
+    >>> FittedCharge(0.5, 1.4, 3.2, 1.5, 3.0, 0.7, 0.4).column_height
+    3.2
+    """
+
+    charge_height: float = _quantity("length", "um", 0.0, above=True)
+    row_height: float = _quantity("length", "um", 0.0, above=True)
+    column_height: float = _quantity("length", "um", 0.0, above=True)
+    half_width_x: float = _quantity("length", "um", 0.0, above=True)
+    half_width_y: float = _quantity("length", "um", 0.0, above=True)
+    drift_field_front: float = _quantity("field", "V/um", 0.0, above=True)
+    drift_field_back: float = _quantity("field", "V/um", 0.0, above=True)
+
+
+@dataclass(frozen=True)
 class EdgeStrip:
     """A strip beyond the last pixel, such as a guard ring.
 
@@ -503,5 +537,6 @@ SECTIONS: dict[str, type] = {
     "operating_point": OperatingPoint,
     "well": Well,
     "edge": Edge,
+    "image_charge": FittedCharge,
 }
 """Type of each section of a device file, in the order in which files are written."""

@@ -13,6 +13,7 @@ from bfsensor.device.parts import (
     BuriedChannel,
     ChannelStop,
     Edge,
+    FittedCharge,
     GateStack,
     Implant,
     Material,
@@ -83,6 +84,7 @@ def device_rows(
     operating_point: OperatingPoint,
     well: Well,
     edge: Edge | None,
+    image_charge: FittedCharge | None,
     provenance: Mapping[str, Provenance],
 ) -> list[tuple[str, str]]:
     """Return the rows of a device's summary, with the uncertainties that its file states."""
@@ -178,6 +180,18 @@ def device_rows(
             f"{material.permittivity_oxide:g} (oxide); band gap {material.band_gap:g} V",
         ),
     ]
+    if image_charge is not None:
+        where, one = "image_charge", image_charge
+        rows.append((
+            "image charges",
+            f"fitted to covariances, in place of what is solved: charge at "
+            f"{value(one, f'{where}.charge_height')}, rows fixed below "
+            f"{value(one, f'{where}.row_height')}, columns below "
+            f"{value(one, f'{where}.column_height')}, half sides "
+            f"{value(one, f'{where}.half_width_x')} (x) and {value(one, f'{where}.half_width_y')} "
+            f"(y), drift field {value(one, f'{where}.drift_field_front')} at the gates, "
+            f"{value(one, f'{where}.drift_field_back')} at the back",
+        ))  # fmt: skip
     if edge is not None:
         widths = ", ".join(f"{strip.width:g} um" for strip in edge.strips)
         rows.append(("edge", f"along {edge.side}, strips of {widths}"))

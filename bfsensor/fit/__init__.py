@@ -5,6 +5,9 @@ from typing import TYPE_CHECKING
 from bfsensor._lazy import lazy_names
 
 if TYPE_CHECKING:
+    from bfsensor.fit.camera_areas import CameraAreas, read_camera_areas
+    from bfsensor.fit.camera_device import drift_model, stand_in_device, with_fit
+    from bfsensor.fit.camera_fit import CameraFit, fit_camera
     from bfsensor.fit.data import DataSet, area_data, data_set, select
     from bfsensor.fit.degeneracies import Combination
     from bfsensor.fit.device_at import fitted_device
@@ -17,6 +20,9 @@ else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
+            "camera_areas": ["CameraAreas", "read_camera_areas"],
+            "camera_device": ["drift_model", "stand_in_device", "with_fit"],
+            "camera_fit": ["CameraFit", "fit_camera"],
             "data": ["DataSet", "area_data", "data_set", "select"],
             "degeneracies": ["Combination"],
             "device_at": ["fitted_device"],
@@ -29,6 +35,8 @@ else:
     )
 
 __all__ = [
+    "CameraAreas",
+    "CameraFit",
     "Combination",
     "CurvedPosterior",
     "DataSet",
@@ -37,10 +45,15 @@ __all__ = [
     "ImageChargeFit",
     "area_data",
     "data_set",
+    "drift_model",
     "figure_for_fit",
+    "fit_camera",
     "fit_device",
     "fit_image_charge",
     "fitted_device",
+    "read_camera_areas",
     "sample_posterior",
     "select",
+    "stand_in_device",
+    "with_fit",
 ]

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from bfsensor._lazy import lazy_names
 
 if TYPE_CHECKING:
+    from bfsensor.plots.camera import figure_for_camera
     from bfsensor.plots.device import (
         draw_charge_cross_sections,
         draw_potential_profiles,
@@ -29,6 +30,7 @@ else:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
+            "camera": ["figure_for_camera"],
             "device": [
                 "draw_charge_cross_sections",
                 "draw_potential_profiles",
@@ -65,6 +67,7 @@ __all__ = [
     "draw_potential_profiles",
     "draw_response",
     "draw_sweep",
+    "figure_for_camera",
     "figure_for_device",
     "figure_for_spots",
     "figure_for_sweep",

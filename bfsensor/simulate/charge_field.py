@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +20,9 @@ from bfsensor.device.parts import Material
 from bfsensor.errors import DeviceError, TableError
 from bfsensor.typing import FloatArray
 from bfsensor.units import VACUUM_PERMITTIVITY
+
+if TYPE_CHECKING:
+    from bfsensor.device.device import Device
 
 TOLERANCE = 1e-14
 """Largest error of the image series [V/um per electron].
@@ -180,6 +184,41 @@ class ImageCharge:
                 f"image charge: drift_field = {self.drift_field} V/um must be finite and above "
                 "0 V/um everywhere"
             )
+
+    @classmethod
+    def of_device(cls, device: Device) -> ImageCharge:
+        """Make the model of a device that has a section ``image_charge``.
+
+        Parameters
+        ----------
+        device : Device
+            Device that was fitted to covariances.
+
+        Returns
+        -------
+        model : ImageCharge
+            Its heights, half sides and drift field, with the device's thickness, pitch and
+            permittivity.
+
+        Raises
+        ------
+        DeviceError
+            The device has no such section.
+        """
+        fitted = device.image_charge
+        if fitted is None:
+            raise DeviceError(
+                f"{device.name} has no section [image_charge]: its response is solved from its "
+                "doping and voltages"
+            )
+        thickness = device.silicon.thickness
+        return cls(
+            fitted.charge_height, fitted.row_height, fitted.column_height,
+            fitted.half_width_x, fitted.half_width_y, thickness, device.pixel.pitch_x,
+            device.pixel.pitch_y,
+            ((0.0, fitted.drift_field_front), (thickness, fitted.drift_field_back)),
+            device.material.permittivity_silicon,
+        )  # fmt: skip
 
     def drift_at(self, heights: ArrayLike) -> FloatArray:
         """Interpolate the drift field at given heights.

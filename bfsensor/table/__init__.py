@@ -6,7 +6,10 @@ from bfsensor._lazy import lazy_names
 
 if TYPE_CHECKING:
     from bfsensor.table.build import build_table
-    from bfsensor.table.build_image_charge import build_image_charge_table
+    from bfsensor.table.build_image_charge import (
+        build_fitted_table,
+        build_image_charge_table,
+    )
     from bfsensor.table.galsim_format import read_galsim, write_galsim
     from bfsensor.table.lsst_format import make_distortion_matrix, make_kernel, solve_kernel
     from bfsensor.table.quadrant_shifts import QuadrantShifts
@@ -17,7 +20,7 @@ else:
         __name__,
         {
             "build": ["build_table"],
-            "build_image_charge": ["build_image_charge_table"],
+            "build_image_charge": ["build_fitted_table", "build_image_charge_table"],
             "galsim_format": ["read_galsim", "write_galsim"],
             "lsst_format": ["make_distortion_matrix", "make_kernel", "solve_kernel"],
             "quadrant_shifts": ["QuadrantShifts"],
@@ -30,6 +33,7 @@ __all__ = [
     "DistortionTable",
     "QuadrantShifts",
     "TablePlan",
+    "build_fitted_table",
     "build_image_charge_table",
     "build_table",
     "make_distortion_matrix",

@@ -47,7 +47,7 @@ def build_table(
     engine : {'poisson', 'image_charge'}
         'poisson' solves Poisson's equation with the device's implants, gates and carriers, in
         minutes of CPU time; 'image_charge' takes charge rectangles between conducting planes, in
-        0.3 s, linear in charge, with parameters that no device file holds.
+        0.3 s, linear in charge, with parameters that are given beside the device.
     image_charge : ImageCharge, optional
         Parameters of the engine 'image_charge', required there and refused elsewhere; pitch,
         thickness and permittivity must be the device's.  Below its sealed heights nothing moves;

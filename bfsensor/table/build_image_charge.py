@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from bfsensor.simulate.image_charge import displace_boundaries, trace_boundaries
 from bfsensor.table.table import DistortionTable
 from bfsensor.typing import FloatArray
 
+if TYPE_CHECKING:
+    from bfsensor.device.device import Device
+
 ENGINE = "image charges (Astier & Regnault 2023), first order: linear in charge"
 
 SMALL_CHARGE = 100.0
@@ -28,6 +32,13 @@ SMALL_CHARGE = 100.0
 Chosen: vertices keep the areas between displaced lines, to which the shifts of the corners
 contribute in second order, 1.5 % of the shifts of LSST's devices at 100,000 e- and so 1.5e-5
 here; twice the charge doubles that."""
+
+
+FITTED_CHARGES = (0.0, 200_000.0)
+"""Source charges [e-] of the table of a device that was fitted to covariances.
+
+Chosen: two hold a response that is linear in charge, and the full wells of 10 and 15 um pixels lie
+below the second; twice as large, nothing changes but the error in the header, which is for it."""
 
 
 def default_depths(model: ImageCharge) -> tuple[float, ...]:
@@ -136,6 +147,53 @@ def build_image_charge_table(
             "parameters [um, V/um]": json.dumps(dataclasses.asdict(model)),
         },
         symmetric=True,
+    )
+
+
+def build_fitted_table(
+    device: Device,
+    *,
+    charges: Sequence[float] | None = None,
+    backgrounds: Sequence[float] | None = None,
+    depths: Sequence[float] | None = None,
+    vertices: int = 32,
+    pixels: int = 9,
+    provenance: Mapping[str, str] | None = None,
+) -> DistortionTable:
+    """Compute the distortion table of a device whose image charges were fitted to covariances.
+
+    Parameters
+    ----------
+    device : Device
+        Device with a section ``image_charge``.
+    charges, backgrounds, depths : sequence of float, optional
+        Levels as for :func:`build_image_charge_table`; by default :data:`FITTED_CHARGES`, an empty
+        background, and :func:`default_depths`.
+    vertices, pixels : int
+        As for :func:`build_image_charge_table`.
+    provenance : mapping of str to str, optional
+        Further entries for the header.
+
+    Returns
+    -------
+    DistortionTable
+        Table with the device.  Its full well is not known: covariances do not say it.
+
+    Raises
+    ------
+    DeviceError
+        The device has no such section.
+    TableError
+        As :func:`build_image_charge_table`.
+    """
+    table = build_image_charge_table(
+        ImageCharge.of_device(device), charges=charges or FITTED_CHARGES,
+        backgrounds=backgrounds or (0.0,), depths=depths, vertices=vertices, pixels=pixels,
+    )  # fmt: skip
+    return dataclasses.replace(
+        table,
+        device_text=device.to_toml(),
+        provenance={**table.provenance, **(provenance or {})},
     )
 
 

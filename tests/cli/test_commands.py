@@ -60,7 +60,7 @@ def test_devices(run):
     assert header.split("  ")[0] == "name"
     assert [row.split()[0] for row in rows] == list(builtin_devices())
     assert rows[builtin_devices().index("itl_sta3800c_60")].split()[1:] == [
-        "10", "100", "-8/3", "-60", "173",
+        "10", "100", "-8/3", "-60", "173", "published",
     ]  # fmt: skip
 
 

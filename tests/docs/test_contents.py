@@ -22,6 +22,7 @@ TASKS = {
     "configuration files": ("configuration", r"type: BrighterFatter"),
     "imSim": ("imsim", r"image\.sensor\.type.*focal_plane"),
     "own sensor": ("own_device", r"bfsensor device new"),
+    "own camera": ("own_camera", r"bfsensor table --from .*--thickness"),
     "voltages": ("sweeps", r"bfsensor sweep .*back_bias"),
     "fit": ("fit", r"bfsensor fit "),
     "photon transfer curve": ("photon_transfer", r"measure_curve"),
