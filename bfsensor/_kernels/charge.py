@@ -32,11 +32,11 @@ this; twice as large, by twice as much, and the search is made half as often."""
 
 # Indices of the counters, int64: numbers of listed pixels in this block and in the last, whether
 # the list is full in this block and was in the last, flagged tiles, photons, pixels beyond the
-# response, photons when the block began, full pixels that were met.
+# response, photons when the block began, full pixels that were met, whether an image was taken.
 (
-    LISTED, LISTED_BEFORE, DENSE, DENSE_BEFORE, FLAGGED, PHOTONS, BEYOND, OPENED, STRUCK,
-) = range(9)  # fmt: skip
-N_COUNTERS = 9
+    LISTED, LISTED_BEFORE, DENSE, DENSE_BEFORE, FLAGGED, PHOTONS, BEYOND, OPENED, STRUCK, TAKEN,
+) = range(10)  # fmt: skip
+N_COUNTERS = 10
 """Number of counters, by definition that of the names above."""
 # Indices of the sums [e-], float64: flux of this block, of the last and of the exposure; what was
 # added, spilled, spilled off the image, crossed the silicon, fell outside, and was lost.
@@ -144,13 +144,17 @@ def _set_pixel(charges, ledger, response, j, i, ahead):
     else:
         first = q + ahead
     charges.first[at] = first
-    tile = (j // TILE) * ((charges.nx + TILE - 1) // TILE) + i // TILE
-    charges.low_first[tile] = min(charges.low_first[tile], first)
-    ledger.high_first[tile] = max(ledger.high_first[tile], first)
-    charges.low_second[tile] = min(charges.low_second[tile], second)
-    ledger.high_second[tile] = max(ledger.high_second[tile], second)
+    tile = np.uint64((j // TILE) * ((charges.nx + TILE - 1) // TILE) + i // TILE)
     ledger.changes[tile] += 1
-    _flag(ledger, tile)
+    # Margins follow from the ranges, most of which a few electrons leave as they were.
+    wider = first < charges.low_first[tile] or first > ledger.high_first[tile]
+    wider = wider or second < charges.low_second[tile] or second > ledger.high_second[tile]
+    if wider or ledger.changes[tile] >= REFRESH:
+        charges.low_first[tile] = min(charges.low_first[tile], first)
+        ledger.high_first[tile] = max(ledger.high_first[tile], first)
+        charges.low_second[tile] = min(charges.low_second[tile], second)
+        ledger.high_second[tile] = max(ledger.high_second[tile], second)
+        _flag(ledger, np.int64(tile))
 
 
 @numba.njit(cache=True, _nrt=False)
@@ -280,52 +284,95 @@ def _respond(response, charge, first, second, stride, start, count):
     return beyond
 
 
+@numba.njit(cache=True, _nrt=False)
+def _any_charge(image, j, first, last):
+    """Whether a part of a row holds charge; without a branch, so that it is read in vectors."""
+    found = False
+    for i in range(np.uint64(first), np.uint64(last)):
+        found |= image[np.uint64(j), i] != 0
+    return found
+
+
+@numba.njit(cache=True, _nrt=False)
+def _take_pixels(image, j, first, last, charges, ledger, ahead, apart):
+    """Take the charge of a part of a row; where it is ``apart``, the gain waits for the response."""
+    start = (j + charges.pad) * charges.stride + charges.pad
+    for i in range(first, last):
+        at = np.uint64(start + i)
+        now = np.float32(image[j, i])
+        if apart:
+            charges.first[at] = ahead * (now - ledger.charge[at])
+        ledger.charge[at] = now
+
+
+@numba.njit(cache=True, _nrt=False)
+def _flag_charge(image, charges, ledger, ahead, apart, fresh):
+    """Take the charge of all tiles that hold some, and flag these and their neighbours.
+
+    Unless the exposure is ``fresh`` they are all tiles.
+    """
+    nx, ny = charges.nx, charges.ny
+    tiles_x = (nx + TILE - 1) // TILE
+    for j in range(ny):
+        # Untouched pages of an empty image cost neither time nor memory.
+        if fresh and not _any_charge(image, j, 0, nx):
+            continue
+        for column in range(tiles_x):
+            first = column * TILE
+            last = min(first + TILE, nx)
+            if fresh and not _any_charge(image, j, first, last):
+                continue
+            _take_pixels(image, j, first, last, charges, ledger, ahead, apart)
+            # Charge at the border of a tile changes the background beyond it.
+            for row in range(max(j - 1, 0) // TILE, min(j + 1, ny - 1) // TILE + 1):
+                for k in range(max(column - 1, 0), min(column + 2, tiles_x)):
+                    ledger.flags[row * tiles_x + k] = True
+
+
+@numba.njit(cache=True, _nrt=False)
+def _respond_flagged(charges, ledger, response):
+    """Find the effective charge of the flagged tiles, whose ``first`` holds what is to be added."""
+    modes = response.first.size > 0
+    tiles_x = (charges.nx + TILE - 1) // TILE
+    for j in range(charges.ny):
+        start = (j + charges.pad) * charges.stride + charges.pad
+        column = 0
+        while column < tiles_x:
+            begin = column
+            while column < tiles_x and ledger.flags[(j // TILE) * tiles_x + column]:
+                column += 1
+            first = begin * TILE
+            last = min(column * TILE, charges.nx)
+            if modes and last > first:
+                ledger.counters[BEYOND] += _respond(
+                    response, ledger.charge, charges.first, charges.second,
+                    np.uint64(charges.stride), np.uint64(start + first), last - first,
+                )  # fmt: skip
+            elif not modes:
+                for i in range(first, last):
+                    charges.first[np.uint64(start + i)] += ledger.charge[
+                        np.uint64(start + i)
+                    ]
+            column += 1
+
+
 @numba.njit(cache=True, nogil=True, _nrt=False)
 def take_image(image, charges, ledger, response, edges, ahead):
     """Update the frozen charge from the whole image; ``ahead`` times each pixel's gain is added."""
-    modes = response.first.size > 0
-    first = charges.first
-    charge = ledger.charge
     # Without a second mode and without prediction the charge itself is the effective one.
-    apart = modes or ledger.listed_before.size > 0
-    anything = False
-    for j in range(charges.ny):
-        start = (j + charges.pad) * charges.stride + charges.pad
-        for i in range(charges.nx):
-            at = np.uint64(start + i)
-            now = np.float32(image[j, i])
-            before = charge[at]
-            if now == np.float32(0.0) and before == np.float32(0.0):
-                # Untouched pages of an empty image cost neither time nor memory.
-                if apart and first[at] != np.float32(0.0):
-                    first[at] = np.float32(0.0)
-                    anything = True
-                continue
-            anything = True
-            if apart:
-                # The gain waits where the effective charge will be.
-                first[at] = ahead * (now - before)
-            charge[at] = now
-    if modes and anything:
-        for j in range(charges.ny):
-            start = np.uint64((j + charges.pad) * charges.stride + charges.pad)
-            ledger.counters[BEYOND] += _respond(
-                response, charge, first, charges.second, np.uint64(charges.stride), start,
-                charges.nx,
-            )  # fmt: skip
-    elif apart and anything:
-        for j in range(charges.ny):
-            start = (j + charges.pad) * charges.stride + charges.pad
-            for i in range(charges.nx):
-                at = np.uint64(start + i)
-                first[at] += charge[at]
+    apart = response.first.size > 0 or ledger.listed_before.size > 0
+    # At first all is zero, and where the image is it may stay so.
+    fresh = ledger.counters[TAKEN] == 0
+    ledger.counters[TAKEN] = 1
+    _flag_charge(image, charges, ledger, ahead, apart, fresh)
+    if apart:
+        _respond_flagged(charges, ledger, response)
     ledger.counters[FLAGGED] = 0
-    tiles = ledger.flags.size
-    for tile in range(tiles):
-        if anything:
+    for tile in range(ledger.flags.size):
+        if ledger.flags[tile]:
             _find_range(charges, ledger, tile)
         ledger.flags[tile] = False
-    for tile in range(tiles):
+    for tile in range(ledger.flags.size):
         _find_margin(charges, ledger, edges, tile)
 
 
