@@ -209,7 +209,7 @@ def colours(count: int) -> Table:
 
 def _colour(name: str, height: float, areas: Any, sensor: EngineSensor, count: int) -> dict:
     """Row of one sensor and height."""
-    found, per_pixel = around(sensor, count, 9403, len(areas) // 2)
+    found, per_pixel = around(sensor, count, 9403 + round(100 * height), len(areas) // 2)
     expected = per_pixel * areas
     chi2 = float(np.sum((found - expected) ** 2 / expected))
     middle = len(areas) // 2
@@ -234,7 +234,7 @@ def main() -> None:
     options = parser.parse_args()
     made, count = {
         "positions": (positions, 100_000), "flats": (flats, 160_000_000),
-        "colours": (colours, 20_000_000),
+        "colours": (colours, 40_000_000),
     }[options.what]  # fmt: skip
     path = options.output or RESULTS / f"light_{options.what}.ecsv"
     write_results(made(options.photons or count), path, f"{COMMAND} {options.what}")
