@@ -1,10 +1,10 @@
 """Deposit of electrons in pixels, spilling, and the frozen charge that moves the boundaries.
 
-The image holds the charge.  While a block of photons lasts, the charge that moves boundaries
-is frozen; electrons go into the image at once, in the order of the photons, and the first
-in a pixel enters the pixel in a list.  When the block ends the charge of the listed pixels is
-updated to what it will be, on average, in the next block: the charge now and half of what the
-pixel gained in the last block.
+The image holds the charge.  While a block of photons lasts, the effective charge that moves
+boundaries is frozen; electrons go into the image at once, in the order of the photons, and the
+first in a pixel marks it and enters it in a list, with the charge it had.  When the block ends
+the effective charge of the listed pixels is updated to what it will be, on average, in the next
+block: by the charge now and half of what the pixel gained in the last block.
 """
 
 from typing import NamedTuple
@@ -32,11 +32,11 @@ this; twice as large, by twice as much, and the search is made half as often."""
 
 # Indices of the counters, int64: numbers of listed pixels in this block and in the last, whether
 # the list is full in this block and was in the last, flagged tiles, photons, pixels beyond the
-# response, photons when the block began, full pixels that were met.
+# response, photons when the block began, full pixels that were met, whether an image was taken.
 (
-    LISTED, LISTED_BEFORE, DENSE, DENSE_BEFORE, FLAGGED, PHOTONS, BEYOND, OPENED, STRUCK,
-) = range(9)  # fmt: skip
-N_COUNTERS = 9
+    LISTED, LISTED_BEFORE, DENSE, DENSE_BEFORE, FLAGGED, PHOTONS, BEYOND, OPENED, STRUCK, TAKEN,
+) = range(10)  # fmt: skip
+N_COUNTERS = 10
 """Number of counters, by definition that of the names above."""
 # Indices of the sums [e-], float64: flux of this block, of the last and of the exposure; what was
 # added, spilled, spilled off the image, crossed the silicon, fell outside, and was lost.
@@ -63,19 +63,23 @@ class Response(NamedTuple):
 class Ledger(NamedTuple):
     """State of an exposure, see the module; arrays are changed in place.
 
-    ``charge`` is the frozen charge of each pixel [e-], ``carry`` [rows, columns] what single
-    precision loses of the image, ``listed`` the pixels that gained charge in the block and
-    ``gained`` how much, ``listed_before`` those of the last block.  ``high_*`` are the largest
+    ``carry`` [rows, columns] is what single precision loses of the image, ``marks`` a bit for each
+    pixel that gained charge in the block, ``listed`` these pixels and ``gained`` the charge that they
+    had, then how much they gained [e-]; ``before`` [pixels] is the charge that those had for which the
+    list has no room, ``listed_before`` are the pixels of the last block.  ``rows`` [3, columns + 2] is
+    room for rows of charge.  ``high_*`` are the largest
     effective charges by tile, ``changes`` the number of changes since they were found, ``flags``
     and ``flagged`` the tiles whose bounds are out of date.  ``spill_from`` and ``spill_to`` [side,
     column] is where a column was full when it last spilled.  ``strikes`` [rows, columns] counts
     the electrons that met a full pixel in the block, ``struck`` lists these pixels.
     """
 
-    charge: np.ndarray
     carry: np.ndarray
+    marks: np.ndarray
     listed: np.ndarray
     gained: np.ndarray
+    before: np.ndarray
+    rows: np.ndarray
     listed_before: np.ndarray
     high_first: np.ndarray
     high_second: np.ndarray
@@ -122,21 +126,32 @@ def _flag(ledger, tile):
         ledger.counters[FLAGGED] += 1
 
 
+@numba.njit(cache=True, _nrt=False)
+def _charge(image, j, i):
+    """Charge of a pixel in single precision; none outside the image."""
+    if 0 <= j < image.shape[0] and 0 <= i < image.shape[1]:
+        return np.float32(image[np.uint64(j), np.uint64(i)])
+    return np.float32(0.0)
+
+
+@numba.njit(cache=True, _nrt=False)
+def _around(image, j, i):
+    """Mean charge of the neighbours of a pixel."""
+    return (
+        (_charge(image, j - 1, i - 1) + _charge(image, j - 1, i) + _charge(image, j - 1, i + 1))
+        + (_charge(image, j, i - 1) + _charge(image, j, i + 1))
+        + (_charge(image, j + 1, i - 1) + _charge(image, j + 1, i) + _charge(image, j + 1, i + 1))
+    ) * np.float32(0.125)  # fmt: skip
+
+
 @numba.njit(cache=True, inline="always")
-def _set_pixel(charges, ledger, response, j, i, ahead):
+def _set_pixel(image, charges, ledger, response, j, i, ahead):
     """Update the effective charge of a pixel, with ``ahead`` electrons added to its charge."""
     at = np.uint64((j + charges.pad) * charges.stride + i + charges.pad)
-    q = ledger.charge[at]
+    q = _charge(image, j, i)
     second = np.float32(0.0)
     if response.first.size > 0:
-        s = np.uint64(charges.stride)
-        one = np.uint64(1)
-        c = ledger.charge
-        around = (
-            (c[at - s - one] + c[at - s] + c[at - s + one])
-            + (c[at - one] + c[at + one])
-            + (c[at + s - one] + c[at + s] + c[at + s + one])
-        ) * np.float32(0.125)
+        around = _around(image, j, i)
         if q + ahead > response.last_charge * response.charge_step:
             ledger.counters[BEYOND] += 1
         first, second = _effective(response, q + ahead, around)
@@ -144,13 +159,17 @@ def _set_pixel(charges, ledger, response, j, i, ahead):
     else:
         first = q + ahead
     charges.first[at] = first
-    tile = (j // TILE) * ((charges.nx + TILE - 1) // TILE) + i // TILE
-    charges.low_first[tile] = min(charges.low_first[tile], first)
-    ledger.high_first[tile] = max(ledger.high_first[tile], first)
-    charges.low_second[tile] = min(charges.low_second[tile], second)
-    ledger.high_second[tile] = max(ledger.high_second[tile], second)
+    tile = np.uint64((j // TILE) * ((charges.nx + TILE - 1) // TILE) + i // TILE)
     ledger.changes[tile] += 1
-    _flag(ledger, tile)
+    # Margins follow from the ranges, most of which a few electrons leave as they were.
+    wider = first < charges.low_first[tile] or first > ledger.high_first[tile]
+    wider = wider or second < charges.low_second[tile] or second > ledger.high_second[tile]
+    if wider or ledger.changes[tile] >= REFRESH:
+        charges.low_first[tile] = min(charges.low_first[tile], first)
+        ledger.high_first[tile] = max(ledger.high_first[tile], first)
+        charges.low_second[tile] = min(charges.low_second[tile], second)
+        ledger.high_second[tile] = max(ledger.high_second[tile], second)
+        _flag(ledger, np.int64(tile))
 
 
 @numba.njit(cache=True, _nrt=False)
@@ -239,8 +258,12 @@ def _find_margins(charges, ledger, edges):
 
 
 @numba.njit(cache=True, _nrt=False)
-def _respond(response, charge, first, second, stride, start, count):
-    """Find the effective charge of a row; ``first`` holds what is to be added ahead."""
+def _respond(response, above, here, below, begin, first, second, start, count):
+    """Find the effective charge of ``count`` pixels of a row from the rows around them.
+
+    ``first`` holds what is to be added ahead; the pixels are at ``start`` there and in ``second``, and
+    at ``begin`` in the rows of charge.
+    """
     f, s = response.first, response.second
     last_q = np.float32(response.last_charge)
     last_b = np.float32(response.last_background)
@@ -254,21 +277,22 @@ def _respond(response, charge, first, second, stride, start, count):
     beyond = 0
     for n in range(np.uint64(count)):
         at = start + n
-        q = (charge[at] + first[at]) * per_q
+        k = begin + n
+        q = (here[k] + first[at]) * per_q
         b = (
-            (charge[at - stride - up] + charge[at - stride] + charge[at - stride + up])
-            + (charge[at - up] + charge[at + up])
-            + (charge[at + stride - up] + charge[at + stride] + charge[at + stride + up])
+            (above[k - up] + above[k] + above[k + up])
+            + (here[k - up] + here[k + up])
+            + (below[k - up] + below[k] + below[k + up])
         ) * per_b
         beyond += q > last_q
         q = min(q, last_q)
         b = min(max(b, zero), last_b)
         m = np.int32(min(max(np.int32(q), np.int32(0)), rows))
-        k = np.int32(min(np.int32(b), columns))
+        level = np.int32(min(np.int32(b), columns))
         u = q - np.float32(m)
-        v = b - np.float32(k)
+        v = b - np.float32(level)
         i = np.uint64(m)
-        j = np.uint64(k)
+        j = np.uint64(level)
         a, c = (one - u) * (one - v), u * (one - v)
         d, e = (one - u) * v, u * v
         first[at] = (
@@ -280,52 +304,128 @@ def _respond(response, charge, first, second, stride, start, count):
     return beyond
 
 
+@numba.njit(cache=True, inline="always")
+def _marked(marks, pixel):
+    """Whether a pixel has gained charge in this block."""
+    bit = np.uint8(1) << np.uint8(pixel & np.uint64(7))
+    return (marks[pixel >> np.uint64(3)] & bit) != 0
+
+
+@numba.njit(cache=True, _nrt=False)
+def _any_charge(image, j, first, last):
+    """Whether a part of a row holds charge; without a branch, so that it is read in vectors."""
+    found = False
+    for i in range(np.uint64(first), np.uint64(last)):
+        found |= image[np.uint64(j), i] != 0
+    return found
+
+
+@numba.njit(cache=True, _nrt=False)
+def _take_pixels(image, j, first, last, charges, ledger, ahead, apart):
+    """Take the charge of a part of a row; where it is ``apart``, the gain waits for the response."""
+    start = (j + charges.pad) * charges.stride + charges.pad
+    for i in range(first, last):
+        at = np.uint64(start + i)
+        now = np.float32(image[j, i])
+        if apart:
+            gain = np.float32(0.0)
+            pixel = np.uint64(j * charges.nx + i)
+            if ledger.before.size > 0 and _marked(ledger.marks, pixel):
+                gain = now - ledger.before[pixel]
+            charges.first[at] = ahead * gain
+        else:
+            charges.first[at] = now
+
+
+@numba.njit(cache=True, _nrt=False)
+def _flag_charge(image, charges, ledger, ahead, apart, fresh):
+    """Take the charge of all tiles that hold some, and flag these and their neighbours.
+
+    Unless the exposure is ``fresh`` they are all tiles.
+    """
+    nx, ny = charges.nx, charges.ny
+    tiles_x = (nx + TILE - 1) // TILE
+    for j in range(ny):
+        # Untouched pages of an empty image cost neither time nor memory.
+        if fresh and not _any_charge(image, j, 0, nx):
+            continue
+        for column in range(tiles_x):
+            first = column * TILE
+            last = min(first + TILE, nx)
+            if fresh and not _any_charge(image, j, first, last):
+                continue
+            _take_pixels(image, j, first, last, charges, ledger, ahead, apart)
+            # Charge at the border of a tile changes the background beyond it.
+            for row in range(max(j - 1, 0) // TILE, min(j + 1, ny - 1) // TILE + 1):
+                for k in range(max(column - 1, 0), min(column + 2, tiles_x)):
+                    ledger.flags[row * tiles_x + k] = True
+
+
+@numba.njit(cache=True, _nrt=False)
+def _load_row(image, j, out):
+    """Copy a row of the image in single precision, from the second place on; none outside."""
+    if not 0 <= j < image.shape[0]:
+        out[:] = np.float32(0.0)
+        return
+    for i in range(np.uint64(image.shape[1])):
+        out[i + np.uint64(1)] = np.float32(image[j, i])
+
+
+@numba.njit(cache=True, _nrt=False)
+def _respond_in_row(charges, ledger, response, j):
+    """Find the effective charge of the flagged tiles in a row, whose ``first`` holds the gain ahead."""
+    rows = ledger.rows
+    above, here, below = rows[(j + 2) % 3], rows[j % 3], rows[(j + 1) % 3]
+    tiles_x = (charges.nx + TILE - 1) // TILE
+    start = (j + charges.pad) * charges.stride + charges.pad
+    column = 0
+    while column < tiles_x:
+        first = column * TILE
+        while column < tiles_x and ledger.flags[(j // TILE) * tiles_x + column]:
+            column += 1
+        count = min(column * TILE, charges.nx) - first
+        if count > 0 and response.first.size > 0:
+            ledger.counters[BEYOND] += _respond(
+                response, above, here, below, np.uint64(first + 1), charges.first,
+                charges.second, np.uint64(start + first), count,
+            )  # fmt: skip
+        for i in range(0 if response.first.size > 0 else count):
+            charges.first[np.uint64(start + first + i)] += here[np.uint64(first + 1 + i)]
+        column += 1
+
+
+@numba.njit(cache=True, _nrt=False)
+def _respond_flagged(image, charges, ledger, response):
+    """Find the effective charge of the flagged tiles."""
+    tiles_x = (charges.nx + TILE - 1) // TILE
+    for row in range((charges.ny + TILE - 1) // TILE):
+        if not ledger.flags[row * tiles_x : (row + 1) * tiles_x].any():
+            continue
+        first = row * TILE
+        _load_row(image, first - 1, ledger.rows[(first + 2) % 3])
+        _load_row(image, first, ledger.rows[first % 3])
+        for j in range(first, min(first + TILE, charges.ny)):
+            _load_row(image, j + 1, ledger.rows[(j + 1) % 3])
+            _respond_in_row(charges, ledger, response, j)
+
+
 @numba.njit(cache=True, nogil=True, _nrt=False)
 def take_image(image, charges, ledger, response, edges, ahead):
     """Update the frozen charge from the whole image; ``ahead`` times each pixel's gain is added."""
-    modes = response.first.size > 0
-    first = charges.first
-    charge = ledger.charge
     # Without a second mode and without prediction the charge itself is the effective one.
-    apart = modes or ledger.listed_before.size > 0
-    anything = False
-    for j in range(charges.ny):
-        start = (j + charges.pad) * charges.stride + charges.pad
-        for i in range(charges.nx):
-            at = np.uint64(start + i)
-            now = np.float32(image[j, i])
-            before = charge[at]
-            if now == np.float32(0.0) and before == np.float32(0.0):
-                # Untouched pages of an empty image cost neither time nor memory.
-                if apart and first[at] != np.float32(0.0):
-                    first[at] = np.float32(0.0)
-                    anything = True
-                continue
-            anything = True
-            if apart:
-                # The gain waits where the effective charge will be.
-                first[at] = ahead * (now - before)
-            charge[at] = now
-    if modes and anything:
-        for j in range(charges.ny):
-            start = np.uint64((j + charges.pad) * charges.stride + charges.pad)
-            ledger.counters[BEYOND] += _respond(
-                response, charge, first, charges.second, np.uint64(charges.stride), start,
-                charges.nx,
-            )  # fmt: skip
-    elif apart and anything:
-        for j in range(charges.ny):
-            start = (j + charges.pad) * charges.stride + charges.pad
-            for i in range(charges.nx):
-                at = np.uint64(start + i)
-                first[at] += charge[at]
+    apart = response.first.size > 0 or ledger.listed_before.size > 0
+    # At first all is zero, and where the image is it may stay so.
+    fresh = ledger.counters[TAKEN] == 0
+    ledger.counters[TAKEN] = 1
+    _flag_charge(image, charges, ledger, ahead, apart, fresh)
+    if apart:
+        _respond_flagged(image, charges, ledger, response)
     ledger.counters[FLAGGED] = 0
-    tiles = ledger.flags.size
-    for tile in range(tiles):
-        if anything:
+    for tile in range(ledger.flags.size):
+        if ledger.flags[tile]:
             _find_range(charges, ledger, tile)
         ledger.flags[tile] = False
-    for tile in range(tiles):
+    for tile in range(ledger.flags.size):
         _find_margin(charges, ledger, edges, tile)
 
 
@@ -349,7 +449,11 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_
     """
     cool(hot)
     if ledger.counters[DENSE] or ledger.counters[DENSE_BEFORE]:
+        if ledger.before.size > 0:
+            for n in range(ledger.counters[LISTED]):
+                ledger.before[ledger.listed[n]] = ledger.gained[n]
         take_image(image, charges, ledger, response, edges, ahead)
+        ledger.marks[:] = 0
         ledger.counters[DENSE_BEFORE] = ledger.counters[DENSE] and ahead > 0
         ledger.counters[DENSE] = 0
         ledger.counters[LISTED_BEFORE] = 0
@@ -365,35 +469,39 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_
     for n in range(ledger.counters[LISTED]):
         j = ledger.listed[n] // nx
         i = ledger.listed[n] - j * nx
-        at = np.uint64((j + charges.pad) * charges.stride + i + charges.pad)
-        now = np.float32(image[j, i])
-        gain = now - ledger.charge[at]
+        # The other pixels of this byte are in the list as well.
+        ledger.marks[np.uint64(ledger.listed[n]) >> np.uint64(3)] = 0
+        gain = np.float32(image[j, i]) - ledger.gained[n]
         if gain == np.float32(0.0):
-            # Listed twice, for negative flux had brought it back; or nothing came of it.
+            # Negative flux had brought it back, or nothing came of it.
             continue
         ledger.listed[count] = ledger.listed[n]
         ledger.gained[count] = gain
-        ledger.charge[at] = now
         count += 1
     for n in range(ledger.counters[LISTED_BEFORE]):
         j = ledger.listed_before[n] // nx
         _set_pixel(
-            charges, ledger, response, j, ledger.listed_before[n] - j * nx, np.float32(0.0)
+            image,
+            charges,
+            ledger,
+            response,
+            j,
+            ledger.listed_before[n] - j * nx,
+            np.float32(0.0),
         )
     if response.first.size > 0:
         for n in range(count):
             j = ledger.listed[n] // nx
             i = ledger.listed[n] - j * nx
-            at = np.uint64((j + charges.pad) * charges.stride + i + charges.pad)
-            now = ledger.charge[at]
+            now = np.float32(image[j, i])
             if np.floor(now / STALE) != np.floor((now - ledger.gained[n]) / STALE):
                 for m in range(max(j - 1, 0), min(j + 2, charges.ny)):
                     for k in range(max(i - 1, 0), min(i + 2, nx)):
-                        _set_pixel(charges, ledger, response, m, k, np.float32(0.0))
+                        _set_pixel(image, charges, ledger, response, m, k, np.float32(0.0))
     for n in range(count):
         j = ledger.listed[n] // nx
         _set_pixel(
-            charges, ledger, response, j, ledger.listed[n] - j * nx,
+            image, charges, ledger, response, j, ledger.listed[n] - j * nx,
             ahead * ledger.gained[n],
         )  # fmt: skip
     ledger.counters[LISTED_BEFORE] = 0
@@ -419,16 +527,22 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_
 
 
 @numba.njit(cache=True, inline="always")
-def _put(image, charge, carry, listed, counters, at, nx, j, i, flux):
+def _put(image, ledger, nx, j, i, flux):
     """Add electrons to a pixel; what single precision loses is kept in ``carry``."""
     before = image[j, i]
-    if np.float32(before) == charge[np.uint64(at)] and counters[DENSE] == 0:
-        count = counters[LISTED]
-        if count < listed.size:
-            listed[np.uint64(count)] = j * nx + i
-            counters[LISTED] = count + 1
+    pixel = np.uint64(j * nx + i)
+    if not _marked(ledger.marks, pixel):
+        ledger.marks[pixel >> np.uint64(3)] |= np.uint8(1) << np.uint8(pixel & np.uint64(7))
+        count = ledger.counters[LISTED]
+        if count < ledger.listed.size:
+            ledger.listed[np.uint64(count)] = pixel
+            ledger.gained[np.uint64(count)] = before
+            ledger.counters[LISTED] = count + 1
         else:
-            counters[DENSE] = 1
+            ledger.counters[DENSE] = 1
+            if ledger.before.size > 0:
+                ledger.before[pixel] = before
+    carry = ledger.carry
     if carry.size > 0:
         carried = carry[j, i]
         total = np.float64(before) + np.float64(carried) + flux
@@ -445,15 +559,11 @@ def _put(image, charge, carry, listed, counters, at, nx, j, i, flux):
 @numba.njit(cache=True, _nrt=False)
 def _spill(image, charges, ledger, j, i, flux, full_well, along_y, up):
     """Fill a pixel, then those beyond it along its column; returns the flux that stays inside [e-]."""
-    charge, carry = ledger.charge, ledger.carry
-    listed, counters = ledger.listed, ledger.counters
-    corner = charges.pad * charges.stride + charges.pad
     room = full_well - image[j, i]
     kept = 0.0
     if room > 0:
         part = min(room, flux)
-        _put(image, charge, carry, listed, counters, corner + j * charges.stride + i,
-             charges.nx, j, i, part)  # fmt: skip
+        _put(image, ledger, charges.nx, j, i, part)
         flux -= part
         kept += part
     ledger.sums[SPILLED] += flux
@@ -476,8 +586,7 @@ def _spill(image, charges, ledger, j, i, flux, full_well, along_y, up):
         room = full_well - image[tj, ti]
         if room > 0:
             part = min(room, flux)
-            _put(image, charge, carry, listed, counters,
-                 corner + tj * charges.stride + ti, charges.nx, tj, ti, part)  # fmt: skip
+            _put(image, ledger, charges.nx, tj, ti, part)
             flux -= part
             kept += part
             if flux <= 0:
@@ -513,10 +622,7 @@ def deposit(
     ``flux`` is indexed from ``first``, all else from 0.  An electron is lost with
     probability 1 - exp(-loss Q), Q [e-] the charge that it meets.
     """
-    charge, carry = ledger.charge, ledger.carry
-    listed, counters = ledger.listed, ledger.counters
-    nx, stride = charges.nx, charges.stride
-    corner = charges.pad * stride + charges.pad
+    nx = charges.nx
     added = 0.0
     crossed = 0.0
     off = 0.0
@@ -547,8 +653,7 @@ def deposit(
                 column = ci if along_y else cj
                 ledger.spill_from[0, column] = -1
                 ledger.spill_from[1, column] = -1
-            _put(image, charge, carry, listed, counters, corner + cj * stride + ci, nx,
-                 cj, ci, w)  # fmt: skip
+            _put(image, ledger, nx, cj, ci, w)
             added += w
     ledger.sums[CROSSED] += crossed
     ledger.sums[OFF_IMAGE] += off

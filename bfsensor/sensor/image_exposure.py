@@ -167,8 +167,6 @@ class ImageExposure:
         other.charges = Charges(*(_copied(part) for part in self.charges))
         other.hot = Hot(*(part.copy() for part in self.hot))
         other.ledger = Ledger(*(part.copy() for part in self.ledger))
-        if self.charges.first is self.ledger.charge:
-            other.charges = other.charges._replace(first=other.ledger.charge)
         return other
 
     @property
@@ -227,15 +225,13 @@ def _allocate(image: NDArray[np.floating], physics: Physics) -> tuple[Charges, L
     stride = nx + 2 * pad + 16
     size = (ny + 2 * pad) * stride + 16
     modes = physics.response.first.size > 0
-    charge = np.zeros(size, np.float32)
     tiles = ((nx + TILE - 1) // TILE) * ((ny + TILE - 1) // TILE)
 
     def by_tile(kind: type = np.float32) -> NDArray:
         return np.zeros(tiles, kind)
 
     charges = Charges(
-        # A linear sensor that does not predict takes the charge itself as effective charge.
-        first=np.zeros(size, np.float32) if modes or physics.predict else charge,
+        first=np.zeros(size, np.float32),
         second=np.zeros(size, np.float32) if modes else _EMPTY,
         stride=stride,
         pad=pad,
@@ -249,10 +245,13 @@ def _allocate(image: NDArray[np.floating], physics: Physics) -> tuple[Charges, L
     # Pixels that one block may list; if it touches more, all pixels of the image are updated.
     longest = nx * ny // 8 + 65536
     ledger = Ledger(
-        charge=charge,
         carry=np.zeros((ny, nx), np.float32) if image.dtype == np.float32 else _EMPTY_2,
+        marks=np.zeros((nx * ny + 7) // 8, np.uint8),
         listed=np.empty(longest, np.int32),
         gained=np.empty(longest, np.float32),
+        # Memory is taken only where it is written: by blocks that touch more pixels than are listed.
+        before=np.empty(nx * ny if physics.predict else 0, np.float32),
+        rows=np.zeros((3, nx + 2), np.float32),
         listed_before=np.empty(longest if physics.predict else 0, np.int32),
         high_first=by_tile(),
         high_second=by_tile(),

@@ -1,171 +1,186 @@
 """Sensors against galsim.SiliconSensor: CPU seconds for the same photons, side by side.
 
-Run ``OMP_NUM_THREADS=1 python tests/benchmarks/bench_sensor.py [--repeats 3] [-o OUT.ecsv]``
-on a quiet machine; each case runs in a process of its own.  Prints the best of the repeats
-and the spread, the ratio, and what the project asks for.
+``OMP_NUM_THREADS=1 python tests/benchmarks/bench_sensor.py [--repeats 3] [--only NAME ...] [--missing]
+[-o OUT.ecsv]``, from the root of the checkout and on a quiet machine; each measurement is a process
+of its own.  ``--only`` runs the jobs whose names begin so, ``--missing`` those that have no row in
+OUT.  Rows are written after each job in place of earlier ones of the same job: best and worst of the
+repeats, the ratio to GalSim, what is asked for, and the load of the machine.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
-import resource
 import subprocess
 import sys
-import time
+import tempfile
+from pathlib import Path
+from typing import Any
 
-import numpy as np
+sys.path.insert(0, str(Path(__file__).parents[2]))
 
-CASES = {
-    # name: (at most, aim) as ratio of CPU seconds to SiliconSensor
-    "star 1e6": (1 / 3, 1 / 6),
-    "star 1e7": (1 / 3, 1 / 6),
-    "star 1e6, wavelengths and angles": (1 / 2, 1 / 4),
-    "flat 512, 1e6 photons": (1 / 100, 1 / 300),
-    "first accumulate 4096": (1 / 50, 1 / 200),
-    "areas 2048": (1 / 20, 1 / 50),
-}
-SENSORS = ("galsim", "silicon", "brighter_fatter")
+from tests.benchmarks.sensor_jobs import JOBS, OURS, PARTS, Job, measure
 
+COMMAND = "python tests/benchmarks/bench_sensor.py"
+NAMES = (
+    "case", "sensor", "cpu_s", "cpu_s_worst", "ratio", "bounded", "limit", "aim", "bytes",
+    "load", "commit",
+)  # fmt: skip
 
-def make_sensor(which: str, threads: int = 1, nrecalc: float = 10_000):
-    """Make one of the three sensors."""
-    import galsim
-
-    rng = galsim.UniformDeviate(31415)
-    if which == "galsim":
-        return galsim.SiliconSensor(rng=rng, nrecalc=nrecalc)
-    import bfsensor
-
-    if which == "silicon":
-        sensor = bfsensor.SiliconSensor(rng=rng, nrecalc=nrecalc)
-        sensor.threads = threads
-        return sensor
-    return bfsensor.BrighterFatterSensor(rng=rng, threads=threads, nrecalc=nrecalc)
+Runs = list[dict[str, Any]]
 
 
-def photons_for(case: str):
-    """Photons and image of a case."""
-    import galsim
-
-    rng = np.random.default_rng(2718)
-    if case.startswith(("star", "pooled")):
-        count = 10_000_000 if "1e7" in case else 1_000_000
-        x, y = rng.normal(0, 1, (2, count))
-        extra = {}
-        if "angles" in case:
-            extra = {
-                "dxdz": rng.normal(0, 0.1, count),
-                "dydz": rng.normal(0, 0.1, count),
-                "wavelength": rng.uniform(550, 690, count),
-            }
-        image = galsim.ImageF(64, 64)
-        image.setCenter(0, 0)
-        return galsim.PhotonArray(count, x, y, np.ones(count), **extra), image
-    if case.startswith("flat"):
-        x, y = rng.uniform(0.5, 512.5, (2, 1_000_000))
-        return galsim.PhotonArray(len(x), x, y, np.ones(len(x))), galsim.ImageF(512, 512)
-    if case.startswith("first"):
-        photons = galsim.PhotonArray(1, np.array([9.0]), np.array([9.0]), np.ones(1))
-        return photons, galsim.ImageF(4096, 4096)
-    return None, galsim.ImageF(rng.poisson(5e4, (2048, 2048)).astype(np.float32))
-
-
-def warm(sensor) -> None:
-    """Compile and load everything once on a small image."""
-    import galsim
-
-    rng = np.random.default_rng(99)
-    x, y = rng.normal(9, 1, (2, 1000))
-    for extra in ({}, {"dxdz": x * 0, "dydz": x * 0, "wavelength": x * 0 + 600.0}):
-        image = galsim.ImageF(17, 17)
-        sensor.accumulate(galsim.PhotonArray(1000, x, y, np.ones(1000), **extra), image)
-    # Small and large images are summed in different precision.
-    for side in (17, 600):
-        sensor.calculate_pixel_areas(galsim.ImageF(side, side))
-
-
-def run(case: str, which: str, threads: int) -> dict[str, float]:
-    """Measure one case once."""
-    # Pooled: boundaries are renewed by hand alone, as imSim does it.
-    sensor = make_sensor(which, threads, 0 if case.startswith("pooled") else 10_000)
-    warm(sensor)
-    photons, image = photons_for(case)
-    image.array[...] += 0  # its pages are there
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    wall, cpu = time.perf_counter(), time.process_time()
-    if photons is None:
-        sensor.calculate_pixel_areas(image)
-    else:
-        sensor.accumulate(photons, image)
-    cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
-    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
-    return {"cpu": cpu, "wall": wall, "bytes per pixel": grown / image.array.size}
-
-
-def once(case: str, which: str, threads: int = 1) -> dict[str, float]:
+def once(case: str, which: str, threads: int = 1) -> dict[str, Any]:
     """Measure in a fresh process."""
     command = [sys.executable, __file__, "--one", case, which, str(threads)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "2"}
-    text = subprocess.run(
-        command, env=environment, capture_output=True, text=True, check=True
-    ).stdout
+    with tempfile.TemporaryDirectory() as folder:
+        if case.startswith("cold"):
+            environment["NUMBA_CACHE_DIR"] = folder
+        text = subprocess.run(
+            command, env=environment, stdout=subprocess.PIPE, text=True, check=True
+        ).stdout
     return json.loads(text.splitlines()[-1])
 
 
+def run_job(case: str, job: Job, repeats: int) -> list[dict[str, Any]]:
+    """Measure a job with all its sensors, by turns; returns its rows."""
+    if job.bounded == "speed-up":
+        return [_on_two_threads(case, job, which, repeats) for which in job.sensors]
+    runs: dict[str, Runs] = {which: [] for which in job.sensors}
+    for _ in range(repeats):
+        for which in job.sensors:
+            runs[which].append(once(case, which))
+    rows = []
+    best = {which: min(r["cpu"] for r in found) for which, found in runs.items()}
+    for which, found in runs.items():
+        ratio = best[which] / best["galsim"] if "galsim" in best else math.nan
+        limit, aim = job.asked.get(which, (math.nan, math.nan))
+        rows.append({
+            "case": case, "sensor": which, "cpu_s": best[which],
+            "cpu_s_worst": max(r["cpu"] for r in found), "ratio": ratio,
+            "bounded": job.bounded, "limit": limit, "aim": aim,
+            "bytes": min(r["bytes"] for r in found),
+        })  # fmt: skip
+    if case in PARTS:
+        rows += [_part(case, which, runs, best) for which in OURS]
+    return rows
+
+
+def _part(case: str, which: str, runs: dict[str, Runs], best: dict[str, float]) -> dict:
+    """Row that follows from a job: its slowest call but the first, or the sensor's share."""
+    name, (limit, aim) = PARTS[case]
+    if "plain" in best:
+        mine, theirs = (best[n] - best["plain"] for n in (which, "galsim"))
+    else:
+        ours, others = (
+            [min(times) for times in zip(*(r["parts"] for r in runs[n]), strict=True)][1:]
+            for n in (which, "galsim")
+        )
+        mine, theirs = max(
+            zip(ours, others, strict=True), key=lambda pair: pair[0] / pair[1]
+        )
+    return {
+        "case": name, "sensor": which, "cpu_s": mine, "cpu_s_worst": mine,
+        "ratio": mine / theirs, "bounded": "ratio", "limit": limit, "aim": aim, "bytes": 0.0,
+    }  # fmt: skip
+
+
+def _on_two_threads(case: str, job: Job, which: str, repeats: int) -> dict[str, Any]:
+    """Row of the gain in time on the clock by a second thread."""
+    times: dict[int, list[float]] = {1: [], 2: []}
+    for _ in range(repeats):
+        for threads, found in times.items():
+            found.append(once(case.removeprefix("two threads, "), which, threads)["wall"])
+    one, two = (min(found) for found in times.values())
+    limit, aim = job.asked[which]
+    return {
+        "case": case, "sensor": which, "cpu_s": two, "cpu_s_worst": max(times[2]),
+        "ratio": one / two, "bounded": job.bounded, "limit": limit, "aim": aim, "bytes": 0.0,
+    }  # fmt: skip
+
+
+def verdict(row: dict[str, Any]) -> str:
+    """Say whether a row reaches what is asked for."""
+    if math.isnan(row["limit"]):
+        return ""
+    faster = row["bounded"] == "speed-up"
+    value = row["ratio" if faster else row["bounded"]]
+    aim, limit = (
+        value >= row[name] if faster else value <= row[name] for name in ("aim", "limit")
+    )
+    return "aim" if aim else "met" if limit else "MISSED"
+
+
+def show(row: dict[str, Any]) -> None:
+    """Print a row."""
+    ratio = row["ratio"]
+    by = f"{ratio:.2f} x" if row["bounded"] == "speed-up" else f"1/{1 / ratio:.2f}"
+    print(
+        f"{row['case']:40s} {row['sensor']:16s} {row['cpu_s']:9.4f} s (to "
+        f"{row['cpu_s_worst']:.4f})  {'' if math.isnan(ratio) else by:10s} "
+        f"{verdict(row):6s} {row['bytes']:6.1f} B/pixel  load {row['load']}",
+        flush=True,
+    )
+
+
+def read_rows(path: str | None) -> list[dict[str, Any]]:
+    """Rows that a file holds already."""
+    if not path or not Path(path).exists():
+        return []
+    from astropy.table import Table
+
+    table = Table.read(path, format="ascii.ecsv")
+    if set(table.colnames) != set(NAMES):
+        print(f"{path} has other columns: its rows are replaced")
+        return []
+    return [dict(zip(table.colnames, row, strict=True)) for row in table]
+
+
+def write_rows(rows: list[dict[str, Any]], path: str, command: str) -> None:
+    """Write the rows in the order of the jobs."""
+    from astropy.table import Table
+
+    from validation.common.write_results import write_results
+
+    order = [name for case in JOBS for name in (case, PARTS.get(case, ("",))[0])]
+    rows = sorted(rows, key=lambda row: order.index(row["case"]))
+    table = Table(rows=[[row[name] for name in NAMES] for row in rows], names=NAMES)
+    write_results(table, path, command, added=True)
+
+
 def main() -> None:
-    """Print the table."""
+    """Run the jobs and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--repeats", type=int, default=3, help="of each measurement")
+    parser.add_argument("--only", nargs="+", default=[""], help="beginnings of jobs' names")
+    parser.add_argument("--missing", action="store_true", help="skip jobs with rows in OUT")
     parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
     parser.add_argument("-o", "--output", help="write the rows to an ECSV file")
     options = parser.parse_args()
     if options.one:
         case, which, threads = options.one
-        print(json.dumps(run(case, which, int(threads))))
+        print(json.dumps(measure(case, which, int(threads))))
         return
-    rows = []
-    load = os.getloadavg()
-    print(f"load {load}, {os.cpu_count()} cores, best of {options.repeats}")
-    for case, (limit, aim) in CASES.items():
-        best = {}
-        for which in SENSORS:
-            runs = [once(case, which) for _ in range(options.repeats)]
-            cpu = [r["cpu"] for r in runs]
-            best[which] = min(cpu)
-            memory = min(r["bytes per pixel"] for r in runs)
-            ratio = best[which] / best["galsim"]
-            verdict = ""
-            if which != "galsim":
-                verdict = "aim" if ratio <= aim else "met" if ratio <= limit else "MISSED"
-            print(
-                f"{case:34s} {which:16s} {best[which]:8.4f} s (to {max(cpu):.4f})  "
-                f"ratio 1/{1 / ratio:<7.1f} {verdict:6s} {memory:6.1f} B/pixel",
-                flush=True,
-            )
-            rows.append((case, which, best[which], max(cpu), ratio, limit, aim, memory))
-    for case in ("star 1e7", "pooled 1e7"):
-        for which in SENSORS[1:]:
-            one, two = (
-                min(once(case, which, threads)["wall"] for _ in range(options.repeats))
-                for threads in (1, 2)
-            )
-            print(
-                f"two threads, {case:21s} {which:16s} {two:8.4f} s wall, {one / two:.2f} x"
-            )
-            rows.append((f"two threads, {case}", which, two, one, one / two, 1.7, 1.9, 0.0))
-    if options.output:
-        from astropy.table import Table
+    from validation.common.run_header import commit_here
 
-        from validation.common.write_results import write_results
-
-        names = ("case", "sensor", "cpu_s", "cpu_s_worst", "ratio", "limit", "aim", "bytes")
-        write_results(
-            Table(rows=rows, names=names), options.output,
-            f"python tests/benchmarks/bench_sensor.py --repeats {options.repeats}",
-            load=[round(x, 2) for x in load],
-        )  # fmt: skip
+    rows = read_rows(options.output)
+    there = {row["case"] for row in rows} if options.missing else set()
+    print(f"{os.cpu_count()} cores, best of {options.repeats}")
+    for case, job in JOBS.items():
+        if case in there or not case.startswith(tuple(options.only)):
+            continue
+        load = round(os.getloadavg()[0], 2)
+        found = run_job(case, job, options.repeats)
+        for row in found:
+            row |= {"load": load, "commit": commit_here()}
+            show(row)
+        names = {row["case"] for row in found}
+        rows = [row for row in rows if row["case"] not in names] + found
+        if options.output:
+            write_rows(rows, options.output, f"{COMMAND} --repeats {options.repeats}")
 
 
 if __name__ == "__main__":
