@@ -13,6 +13,7 @@ from bfsensor.device.parts import (
     BuriedChannel,
     ChannelStop,
     Edge,
+    ElectronTransport,
     GateStack,
     Implant,
     Material,
@@ -82,6 +83,7 @@ def device_rows(
     channel_stop: ChannelStop,
     operating_point: OperatingPoint,
     well: Well,
+    transport: ElectronTransport,
     edge: Edge | None,
     provenance: Mapping[str, Provenance],
 ) -> list[tuple[str, str]]:
@@ -178,6 +180,9 @@ def device_rows(
             f"{material.permittivity_oxide:g} (oxide); band gap {material.band_gap:g} V",
         ),
     ]
+    if transport.diffusion is not None:
+        times = value(transport, "transport.diffusion")
+        rows.append(("diffusion", f"{times} times the width by Einstein's relation"))
     if edge is not None:
         widths = ", ".join(f"{strip.width:g} um" for strip in edge.strips)
         rows.append(("edge", f"along {edge.side}, strips of {widths}"))

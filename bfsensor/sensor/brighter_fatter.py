@@ -16,10 +16,11 @@ from bfsensor._kernels.photons import Medium
 from bfsensor.effects.effect import Layout
 from bfsensor.errors import SensorError
 from bfsensor.sensor.boundary_shifts import make_shifts
-from bfsensor.sensor.drift_field import MEASURED, STEPS, solve_drift
+from bfsensor.sensor.drift_field import STEPS, solve_drift
 from bfsensor.sensor.effect_sensor import EffectSensor
 from bfsensor.sensor.image_exposure import Physics
 from bfsensor.sensor.options import (
+    check_diffusion,
     check_full_well,
     check_number,
     check_reach,
@@ -110,10 +111,10 @@ class BrighterFatterSensor(EffectSensor):
         GalSim's table at one temperature.
     temperature : float, optional
         Temperature of the silicon [K], 77 to 400; by default the device's.
-    diffusion : {'einstein', 'measured'}
-        Width by Einstein's relation in the device's drift field, or 1.92 times that, with which
-        Fe55 clusters of LSST sensors are reproduced
-        (:data:`bfsensor.sensor.drift_field.MEASURED`).
+    diffusion : {'device', 'einstein'} or float
+        Width over that by Einstein's relation in the device's drift field: the one that the device
+        states (``[transport] diffusion``; 1.92 for the devices of LSST, as in GalSim), 1, or a
+        number, at least 0.  A device that states none has Einstein's, which is logged once.
     full_well : float, optional
         Charge at which a pixel spills along its column [e-], above 0; by default the table's;
         inf: never.
@@ -215,7 +216,7 @@ class BrighterFatterSensor(EffectSensor):
         red: Literal["lost", "kept"] = "lost",
         absorption: Literal["law", "galsim"] = "law",
         temperature: float | None = None,
-        diffusion: Literal["einstein", "measured"] = "einstein",
+        diffusion: Literal["device", "einstein"] | float = "device",
         full_well: float | None = None,
         beyond: Literal["hold", "error"] = "hold",
         predict: bool = True,
@@ -242,7 +243,7 @@ class BrighterFatterSensor(EffectSensor):
         self.depth, self.predict = bool(depth), bool(predict)
         self.red = check_word("red", red, ("lost", "kept"))
         self.absorption = check_word("absorption", absorption, ("law", "galsim"))
-        self.diffusion = check_word("diffusion", diffusion, ("einstein", "measured"))
+        self.diffusion = check_diffusion(diffusion)
         self.beyond = check_word("beyond", beyond, ("hold", "error"))
         self.conversion_depth = check_number(
             "conversion_depth", conversion_depth, low=0.0, high=self.table.thickness
@@ -314,7 +315,7 @@ class BrighterFatterSensor(EffectSensor):
         # Below the lowest height that was traced the wells hold the electrons: no diffusion.
         start = table.depths[1] if len(table.depths) > 1 else 0.0
         drift = solve_drift(table.device_text, self.temperature, float(start))
-        sigma = self.diffusion_factor * (MEASURED if self.diffusion == "measured" else 1.0)
+        sigma = self.diffusion_factor and self.diffusion_factor * self._width()
         pitch = table.pitch[::-1] if self.transpose else table.pitch
         lengths, first, step = self._lengths()
         variance, wider = sigma**2 * drift.variance, 0.0
@@ -341,6 +342,12 @@ class BrighterFatterSensor(EffectSensor):
             self.predict, 0.0 if self._applied is None else self._applied.law.loss,
         )  # fmt: skip
         return physics, drift.ripple if self.depth else np.ones(STEPS + 1)
+
+    def _width(self) -> float:
+        """Width of the diffusion over that by Einstein's relation."""
+        if self.diffusion == "device":
+            return self._device.diffusion
+        return 1.0 if self.diffusion == "einstein" else float(self.diffusion)
 
     def _lengths(self) -> tuple[FloatArray, float, float]:
         """Absorption lengths [um] on equal steps of the wavelength [nm]."""

@@ -155,6 +155,22 @@ def check_number(
     return number
 
 
+def check_diffusion(value: str | float) -> str | float:
+    """Return 'device', 'einstein' or a number from 0; a text of a number, as in YAML, is one."""
+    if value in ("device", "einstein"):
+        return value
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not (math.isfinite(number) and number >= 0):
+        raise SensorError(
+            f"diffusion = {value!r} must be 'device', 'einstein', or the width over Einstein's, a "
+            "finite number from 0"
+        )
+    return number
+
+
 def check_word(name: str, value: str, allowed: tuple[str, ...]) -> str:
     """Return a word of a list; refuse anything else."""
     if value not in allowed:

@@ -16,7 +16,7 @@ from bfsensor._kernels.shifts import Edges
 from bfsensor.device.shipped import did_you_mean, tables_dir
 from bfsensor.errors import SensorError, TableError
 from bfsensor.sensor.base import EngineSensor, read_numbers
-from bfsensor.sensor.drift_field import MEASURED, STEPS
+from bfsensor.sensor.drift_field import STEPS
 from bfsensor.sensor.edge_weights import make_edges, transpose_sides
 from bfsensor.sensor.image_exposure import Physics
 from bfsensor.sensor.options import galsim_folder
@@ -34,6 +34,10 @@ of GalSim's SiliconSensor."""
 _EXTRA_COLLECT, _EXTRA_BARRIER = 12.0, 15.0
 # Potential of the channel above that of the collecting and of the barrier gates [V]: published,
 # estimates of GalSim's SiliconSensor.
+
+_WIDTH = 0.27**-0.5
+"""Width of the diffusion over that by Einstein's relation: published, GalSim's SiliconSensor, whose
+factor 0.27 on the mobility was found by hand on X-ray clusters of LSST's sensors."""
 
 _KEYS = (
     "NumVertices", "PixelBoundaryNx", "PixelBoundaryNy", "PixelSizeX", "SensorThickness",
@@ -153,7 +157,7 @@ class SiliconSensor(EngineSensor):
     def _diffusion(self) -> float:
         """Width of the diffusion of electrons from the back surface [um], as GalSim estimates it.
 
-        It is Einstein's relation in a uniform field, times the measured factor.
+        It is Einstein's relation in a uniform field, with GalSim's factor on the variance.
         """
         c = self.config
         stop = (c["ChannelStopWidth"] + 2 * c["FieldOxideTaper"]) / c["PixelSizeX"]
@@ -165,7 +169,7 @@ class SiliconSensor(EngineSensor):
         voltage = max(front - c["Vbb"], 1.0)
         # GalSim's kT/q, 0.026 V at 298 K.
         kt = 0.026 * c["CCDTemperature"] / 298.0
-        return float(MEASURED * np.sqrt(2 * kt / voltage) * c["SensorThickness"])
+        return float(_WIDTH * np.sqrt(2 * kt / voltage) * c["SensorThickness"])
 
     def _make_physics(self) -> tuple[Physics, FloatArray]:
         c = self.config

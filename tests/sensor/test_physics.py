@@ -9,11 +9,18 @@ import galsim
 import numpy as np
 import pytest
 
-from bfsensor import BrighterFatterSensor, DistortionTable, ShiftMap, SiliconSensor
+from bfsensor import (
+    BrighterFatterSensor,
+    Device,
+    DistortionTable,
+    ShiftMap,
+    SiliconSensor,
+)
+from bfsensor.device.parts import ElectronTransport
 from bfsensor.device.shipped import tables_dir
 from bfsensor.device.silicon import absorption_length
 from bfsensor.errors import SensorError
-from bfsensor.sensor.drift_field import MEASURED, solve_drift
+from bfsensor.sensor.drift_field import solve_drift
 
 ITL = DistortionTable.read(tables_dir() / "itl_sta3800c" / "table.fits")
 TOP = float(ITL.depths[-1])
@@ -162,14 +169,17 @@ def test_absorption_follows_temperature():
 
 @pytest.mark.parametrize("height", [20.0, 60.0, 99.0])
 def test_diffusion_comes_from_the_drift_field(height):
-    """Einstein's width from the field by height; the measured one is 1.92 times that."""
+    """Einstein's width from the field by height, times the device's ratio or a given one."""
     count = 100_000
     drift = solve_drift(ITL.device_text, 173.0, float(ITL.depths[1]))
     sigma = np.sqrt(np.interp(height, drift.heights, drift.variance))
     # A uniform field of the mean bulk value gives the same within the doping's gradient.
     mean = np.interp(height, drift.heights, drift.field)
     assert sigma == pytest.approx(np.sqrt(2 * 0.026 * 173 / 300 * height / mean), rel=0.25)
-    for options, factor in (({}, 1.0), ({"diffusion": "measured"}, MEASURED)):
+    for options, factor in (
+        ({}, 1.92), ({"diffusion": "einstein"}, 1.0), ({"diffusion": 1.4}, 1.4),
+        ({"diffusion": 2.8, "diffusion_factor": 0.5}, 1.4),
+    ):  # fmt: skip
         instrument = sensor(
             strength=0.0, conversion_depth=ITL.thickness - height, **options
         )
@@ -190,6 +200,62 @@ def test_diffusion_comes_from_the_drift_field(height):
     photons.x[...] = 0.49
     none.accumulate(photons, image)
     assert image[0, 0] == count
+
+
+def unknown_width(name="a_device_of_unknown_width"):
+    """The table of ITL as one whose device states no width of the diffusion."""
+    device = Device.load("itl_sta3800c")
+    device = dataclasses.replace(device, name=name, transport=ElectronTransport())
+    return dataclasses.replace(ITL, device_text=device.to_toml())
+
+
+def test_a_device_without_a_width_has_einsteins_and_says_so_once(caplog):
+    table = unknown_width()
+    assert "[transport]" not in table.device_text
+    images = []
+    for options in ({}, {"diffusion": "einstein"}, {}):
+        image = galsim.ImageD(9, 9)
+        given = {"table": table} | options
+        sensor(**given).accumulate(uniform_photons(5000, 9, 71), image)
+        images.append(image.array)
+    assert (images[0] == images[1]).all() and (images[2] == images[1]).all()
+    said = [r for r in caplog.records if "a_device_of_unknown_width" in r.getMessage()]
+    assert len(said) == 1 and "Einstein" in said[0].getMessage()
+
+
+def test_a_width_that_does_not_matter_is_not_missed(caplog):
+    """Without diffusion, or with a stated width, nothing is said."""
+    table = unknown_width("another_device_of_unknown_width")
+    for options in ({"diffusion_factor": 0.0}, {"diffusion": 1.5}):
+        sensor(table=table, **options)
+    assert not caplog.records
+
+
+def test_a_faint_star_is_as_wide_as_with_galsims_sensor():
+    """What a swap of the sensor changes is the effect of charge, not the width of the star."""
+    star = galsim.Moffat(beta=3, fwhm=0.7, flux=4e5)
+
+    def trace(instrument):
+        image = star.drawImage(
+            nx=43, ny=43, scale=0.2, method="phot", sensor=instrument,
+            rng=galsim.BaseDeviate(515), poisson_flux=False,
+        )  # fmt: skip
+        return image.FindAdaptiveMom().moments_sigma
+
+    galsims = trace(galsim.SiliconSensor(strength=1e-9, rng=galsim.BaseDeviate(52)))
+    by_width = {
+        width: trace(sensor(strength=0.0, diffusion=width)) / galsims - 1
+        for width in ("device", "einstein")
+    }
+    # 4e5 photons measure a width to 0.1 %; the drift field is not GalSim's even field.
+    assert abs(by_width["device"]) < 0.005
+    assert by_width["einstein"] < -0.025
+
+
+@pytest.mark.parametrize("width", ["measured", -0.1, float("nan"), float("inf"), None])
+def test_a_width_that_is_none_is_refused(width):
+    with pytest.raises(SensorError, match=r"diffusion = .*einstein"):
+        sensor(diffusion=width)
 
 
 def rings(amplitude=0.3, length=2000.0):
