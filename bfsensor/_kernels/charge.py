@@ -13,6 +13,7 @@ import numba
 import numpy as np
 
 from bfsensor._kernels.hot import cool, heat
+from bfsensor._kernels.surroundings import mirror_all, mirror_pixel
 
 TILE = 16
 """Side of the square tiles for which bounds of the charge are kept [pixel].
@@ -69,7 +70,8 @@ class Ledger(NamedTuple):
     effective charges by tile, ``changes`` the number of changes since they were found, ``flags``
     and ``flagged`` the tiles whose bounds are out of date.  ``spill_from`` and ``spill_to`` [side,
     column] is where a column was full when it last spilled.  ``strikes`` [rows, columns] counts
-    the electrons that met a full pixel in the block, ``struck`` lists these pixels.
+    the electrons that met a full pixel in the block, ``struck`` lists these pixels.  ``outside`` holds
+    both effective charges of the pixels beyond the image, unless they are ``mirrored``.
     """
 
     charge: np.ndarray
@@ -88,6 +90,8 @@ class Ledger(NamedTuple):
     struck: np.ndarray
     counters: np.ndarray
     sums: np.ndarray
+    outside: np.ndarray
+    mirrored: bool
 
 
 @numba.njit(cache=True, inline="always")
@@ -141,9 +145,13 @@ def _set_pixel(charges, ledger, response, j, i, ahead):
             ledger.counters[BEYOND] += 1
         first, second = _effective(response, q + ahead, around)
         charges.second[at] = second
+        if ledger.mirrored:
+            mirror_pixel(charges, charges.second, j, i)
     else:
         first = q + ahead
     charges.first[at] = first
+    if ledger.mirrored:
+        mirror_pixel(charges, charges.first, j, i)
     tile = (j // TILE) * ((charges.nx + TILE - 1) // TILE) + i // TILE
     charges.low_first[tile] = min(charges.low_first[tile], first)
     ledger.high_first[tile] = max(ledger.high_first[tile], first)
@@ -155,16 +163,18 @@ def _set_pixel(charges, ledger, response, j, i, ahead):
 
 @numba.njit(cache=True, _nrt=False)
 def _find_range(charges, ledger, tile):
-    """Find the lowest and highest effective charge of a tile; it is 0 outside the image."""
+    """Find the lowest and highest effective charge of a tile, beyond the image included."""
     tiles_x = (charges.nx + TILE - 1) // TILE
     tiles_y = (charges.ny + TILE - 1) // TILE
     row = tile // tiles_x
     column = tile - row * tiles_x
     border = row == 0 or column == 0 or row == tiles_y - 1 or column == tiles_x - 1
-    low = np.float32(0.0 if border else np.inf)
-    high = np.float32(0.0 if border else -np.inf)
-    low_second = low
-    high_second = high
+    # Mirrored charge is that of this tile and of its neighbours.
+    border = border and not ledger.mirrored
+    low = ledger.outside[0] if border else np.float32(np.inf)
+    high = ledger.outside[0] if border else np.float32(-np.inf)
+    low_second = ledger.outside[1] if border else low
+    high_second = ledger.outside[1] if border else high
     for j in range(row * TILE, min((row + 1) * TILE, charges.ny)):
         start = (j + charges.pad) * charges.stride + charges.pad
         for i in range(column * TILE, min((column + 1) * TILE, charges.nx)):
@@ -288,7 +298,8 @@ def take_image(image, charges, ledger, response, edges, ahead):
     charge = ledger.charge
     # Without a second mode and without prediction the charge itself is the effective one.
     apart = modes or ledger.listed_before.size > 0
-    anything = False
+    # Charge beyond the image acts on an empty one, too.
+    anything = ledger.outside[0] != np.float32(0.0)
     for j in range(charges.ny):
         start = (j + charges.pad) * charges.stride + charges.pad
         for i in range(charges.nx):
@@ -306,6 +317,8 @@ def take_image(image, charges, ledger, response, edges, ahead):
                 # The gain waits where the effective charge will be.
                 first[at] = ahead * (now - before)
             charge[at] = now
+    if ledger.mirrored and anything:
+        mirror_all(charges, charge)
     if modes and anything:
         for j in range(charges.ny):
             start = np.uint64((j + charges.pad) * charges.stride + charges.pad)
@@ -319,6 +332,10 @@ def take_image(image, charges, ledger, response, edges, ahead):
             for i in range(charges.nx):
                 at = np.uint64(start + i)
                 first[at] += charge[at]
+    if ledger.mirrored and anything and apart:
+        mirror_all(charges, first)
+        if modes:
+            mirror_all(charges, charges.second)
     ledger.counters[FLAGGED] = 0
     tiles = ledger.flags.size
     for tile in range(tiles):
@@ -374,6 +391,8 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_
         ledger.listed[count] = ledger.listed[n]
         ledger.gained[count] = gain
         ledger.charge[at] = now
+        if ledger.mirrored:
+            mirror_pixel(charges, ledger.charge, j, i)
         count += 1
     for n in range(ledger.counters[LISTED_BEFORE]):
         j = ledger.listed_before[n] // nx

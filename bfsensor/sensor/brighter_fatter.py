@@ -24,11 +24,13 @@ from bfsensor.sensor.options import (
     check_full_well,
     check_number,
     check_reach,
+    check_surroundings,
     check_table,
     check_threads,
     check_word,
     find_table,
     load_table,
+    outside_charge,
     read_device,
 )
 from bfsensor.sensor.shift_maps import ShiftMap
@@ -127,6 +129,11 @@ class BrighterFatterSensor(EffectSensor):
     conversion_depth : float
         Depth below the back surface [um] at which photons without wavelengths convert, 0 to the
         thickness; 1 um as in GalSim.
+    surroundings : {'none', 'mirrored'} or float
+        Charge beyond the image, which moves the boundaries of the pixels near its sides: none; that of
+        the image mirrored at its sides, as it is at each renewal; or the same charge [e-] in every
+        pixel, at least 0, from the beginning to the end of the exposure.  Electrons that land there
+        are lost.  A sky or flat without a frame of small pixels needs 'mirrored', or its level.
     threads : int
         Number of threads of one call, at least 1; the result does not depend on it.
     table : DistortionTable, optional
@@ -193,6 +200,7 @@ class BrighterFatterSensor(EffectSensor):
         "charge_response": bool, "background": bool, "depth": bool, "red": str,
         "absorption": str, "temperature": float, "diffusion": str, "full_well": float,
         "beyond": str, "predict": bool, "conversion_depth": float, "threads": int,
+        "surroundings": str,
         "effects": str, "conditions": dict, "layout": dict,
     }  # fmt: skip
     _takes_rng = True
@@ -221,6 +229,7 @@ class BrighterFatterSensor(EffectSensor):
         beyond: Literal["hold", "error"] = "hold",
         predict: bool = True,
         conversion_depth: float = 1.0,
+        surroundings: Literal["none", "mirrored"] | float = "none",
         threads: int = 1,
         table: DistortionTable | None = None,
         effects: Any = None,
@@ -248,6 +257,7 @@ class BrighterFatterSensor(EffectSensor):
         self.conversion_depth = check_number(
             "conversion_depth", conversion_depth, low=0.0, high=self.table.thickness
         )
+        self.surroundings = check_surroundings(surroundings)
         self.threads = check_threads(threads)
         self._device = read_device(self.table, self.name)
         if temperature is None:
@@ -340,6 +350,7 @@ class BrighterFatterSensor(EffectSensor):
         physics = Physics(
             edges, factors.response, medium, float(well), not self.transpose, self.nrecalc,
             self.predict, 0.0 if self._applied is None else self._applied.law.loss,
+            outside_charge(self.surroundings),
         )  # fmt: skip
         return physics, drift.ripple if self.depth else np.ones(STEPS + 1)
 
@@ -474,5 +485,6 @@ _COMPARED = (
     "strength", "diffusion_factor", "qdist", "nrecalc", "treering_func", "treering_center",
     "transpose", "shift_map", "charge_response", "background", "depth", "red", "absorption",
     "temperature", "diffusion", "full_well", "beyond", "predict", "conversion_depth", "threads",
+    "surroundings",
 )  # fmt: skip
 """Attributes that equal sensors share, in the order of the repr."""

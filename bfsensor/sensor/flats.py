@@ -24,7 +24,7 @@ def draw_flat(
     step: float = 1000.0,
     rng: galsim.BaseDeviate | None = None,
     illumination: FloatArray | None = None,
-    border: int = 8,
+    border: int | None = None,
     dtype: type = np.float32,
 ) -> galsim.Image:
     """Draw a flat with the correlations that follow from the sensor's pixel areas.
@@ -51,9 +51,10 @@ def draw_flat(
         Source of the seed.
     illumination : ndarray, shape ``shape``, optional
         Relative illumination, at least 0; by default 1.
-    border : int
-        Width [pixel] of a frame that is drawn around the image and cut off; without charge
-        outside, pixels of the last rows and columns would be too small.
+    border : int, optional
+        Width [pixel] of a frame that is drawn around the image and cut off.  By default 8, because
+        without charge outside pixels of the last rows and columns would be too small, and 0 with
+        ``surroundings='mirrored'``, by which they are not.
     dtype : type
         Type of the pixels, float32 or float64.
 
@@ -93,7 +94,7 @@ def iterate_flat(
     step: float = 1000.0,
     rng: galsim.BaseDeviate | None = None,
     illumination: FloatArray | None = None,
-    border: int = 8,
+    border: int | None = None,
     dtype: type = np.float32,
 ) -> Iterator[galsim.Image]:
     """Draw a flat as :func:`draw_flat` does, with the image after every step.
@@ -121,6 +122,8 @@ def iterate_flat(
     >>> len(levels)
     3
     """
+    if border is None:
+        border = 0 if sensor.surroundings == "mirrored" else 8
     _check_request(shape, level, step, border)
     ny, nx = shape
     light = _light(shape, illumination, border)

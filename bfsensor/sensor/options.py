@@ -171,6 +171,29 @@ def check_diffusion(value: str | float) -> str | float:
     return number
 
 
+def check_surroundings(value: str | float) -> str | float:
+    """Return 'none', 'mirrored' or a charge from 0; a text of a number, as in YAML, is one."""
+    if value in ("none", "mirrored"):
+        return value
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not (math.isfinite(number) and number >= 0):
+        raise SensorError(
+            f"surroundings = {value!r} must be 'none', 'mirrored', or the charge of every pixel beyond "
+            "the image, a finite number from 0 e-"
+        )
+    return number
+
+
+def outside_charge(surroundings: str | float) -> float:
+    """Charge beyond the image [e-] as kernels take it; nan: mirrored."""
+    if surroundings == "mirrored":
+        return math.nan
+    return 0.0 if surroundings == "none" else float(surroundings)
+
+
 def check_word(name: str, value: str, allowed: tuple[str, ...]) -> str:
     """Return a word of a list; refuse anything else."""
     if value not in allowed:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import galsim
 import numpy as np
@@ -19,7 +19,11 @@ from bfsensor.sensor.base import EngineSensor, read_numbers
 from bfsensor.sensor.drift_field import STEPS
 from bfsensor.sensor.edge_weights import make_edges, transpose_sides
 from bfsensor.sensor.image_exposure import Physics
-from bfsensor.sensor.options import galsim_folder
+from bfsensor.sensor.options import (
+    check_surroundings,
+    galsim_folder,
+    outside_charge,
+)
 from bfsensor.table.galsim_format import read_sides
 from bfsensor.typing import FloatArray
 
@@ -79,6 +83,11 @@ class SiliconSensor(EngineSensor):
         Centre of the rings in original image coordinates.
     transpose : bool
         Whether x and y of the table are exchanged.
+    surroundings : {'none', 'mirrored'} or float
+        Charge beyond the image, which moves the boundaries of the pixels near its sides: none; that of
+        the image mirrored at its sides, as it is at each renewal; or the same charge [e-] in every
+        pixel, at least 0, from the beginning to the end of the exposure.  Electrons that land there
+        are lost.  A sky or flat without a frame of small pixels needs 'mirrored', or its level.
 
     Raises
     ------
@@ -100,6 +109,8 @@ class SiliconSensor(EngineSensor):
     True
     """
 
+    _opt_params = {**galsim.SiliconSensor._opt_params, "surroundings": str}  # noqa: RUF012
+
     def __init__(
         self,
         name: str = "lsst_itl_50_8",
@@ -111,8 +122,11 @@ class SiliconSensor(EngineSensor):
         treering_func: galsim.LookupTable | None = None,
         treering_center: galsim.PositionD = galsim.PositionD(0, 0),  # noqa: B008
         transpose: bool = False,
+        *,
+        surroundings: Literal["none", "mirrored"] | float = "none",
     ) -> None:
         self.name = name
+        self.surroundings = check_surroundings(surroundings)
         self.strength = float(strength)
         self.rng = galsim.UniformDeviate(rng)
         self.diffusion_factor = float(diffusion_factor)
@@ -201,13 +215,14 @@ class SiliconSensor(EngineSensor):
         physics = Physics(
             edges, Response(none, none, 1.0, 1.0, np.inf, np.inf), medium, np.inf,
             not self.transpose, self.effective_nrecalc, False,
+            surroundings=outside_charge(self.surroundings),
         )  # fmt: skip
         return physics, scale
 
     def _key(self) -> tuple[Any, ...]:
         return (
             self.config, self.strength, self.diffusion_factor, self.qdist, self.nrecalc,
-            self.treering_func, self.treering_center, self.transpose,
+            self.treering_func, self.treering_center, self.transpose, self.surroundings,
         )  # fmt: skip
 
     def __str__(self) -> str:
@@ -222,7 +237,7 @@ class SiliconSensor(EngineSensor):
     def __repr__(self) -> str:
         keys = (
             "name", "strength", "rng", "diffusion_factor", "qdist", "nrecalc",
-            "treering_func", "treering_center", "transpose",
+            "treering_func", "treering_center", "transpose", "surroundings",
         )  # fmt: skip
         parts = [f"{key}={getattr(self, key)!r}" for key in keys]
         return f"bfsensor.SiliconSensor({', '.join(parts)})"
