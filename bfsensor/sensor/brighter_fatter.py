@@ -57,6 +57,13 @@ Chosen: with the shifts of 95, 80 and 30 um in place of those of 100 um, area ch
 up to 0.03, 0.6 and 17 % at the nearest lags and by 2, 7 and 17 % at (2, 2) (measured with the tables
 of ITL and E2V)."""
 
+_DEEP = 0.01
+"""Part of the light of a wavelength that may convert below a table's lowest depth; a sensor warns, or
+refuses, above it.
+
+Chosen: where shifts of that part were wrong altogether, those of all the light would be by 1 %, as the
+factors of a table are; a table that begins where charge is stored leaves 0.4 % at most."""
+
 
 class BrighterFatterSensor(EffectSensor):
     r"""GalSim sensor for thick CCDs with the brighter-fatter effect of a distortion table.
@@ -121,9 +128,11 @@ class BrighterFatterSensor(EffectSensor):
         Charge at which a pixel spills along its column [e-], above 0; by default the table's;
         inf: never.
     beyond : {'hold', 'error'}
-        Behaviour where the table ends, for charges beyond it without a full well and for light
-        above its last depth if that is below nine tenths of the thickness: 'hold' uses the last
-        level or depth (one warning each; :attr:`diagnostics` counts), 'error' refuses.
+        Behaviour where the table ends: charges beyond it without a full well; light above its last
+        depth if that is below nine tenths of the thickness; light below its first depth, more than
+        1 % of that of the photons' largest wavelength; wavelengths without absorption length.  'hold'
+        uses the last level, depth or length (one warning each with the number; :attr:`diagnostics`
+        counts charges), 'error' refuses.
     predict : bool
         Whether the charge expected in the middle of a block acts, or that at its start.
     conversion_depth : float
@@ -264,8 +273,8 @@ class BrighterFatterSensor(EffectSensor):
             temperature = self._device.operating_point.temperature
         self.temperature = check_number("temperature", temperature, low=77.0, high=400.0)
         self.full_well = check_full_well(full_well, self.table)
+        self._said: set[str] = set()
         self._check_depths()
-        self._warned = False
         self._init_effects(effects, layout, conditions, self._usual, self.transpose)
         self._init_silicon()
 
@@ -414,6 +423,7 @@ class BrighterFatterSensor(EffectSensor):
             As :meth:`EngineSensor.accumulate`; also, with ``beyond='error'``, if a pixel would
             hold more charge than the table.  The image is unchanged after any error.
         """
+        self._check_light(photons)
         if self.beyond == "hold":
             added = super().accumulate(photons, image, orig_center, resume, recalc)
             self._warn_beyond()
@@ -430,8 +440,73 @@ class BrighterFatterSensor(EffectSensor):
             raise
         return added
 
+    def _outside(self, what: str, text: str, used: str, remedy: str = "") -> None:
+        """Say once what lies outside the table and what is used there; refuse with beyond='error'."""
+        if self.beyond == "error":
+            raise SensorError(text + remedy)
+        if what not in self._said:
+            self._said.add(what)
+            warnings.warn(
+                f"{text}: {used} (beyond='error' refuses)",
+                galsim.GalSimWarning,
+                stacklevel=4,
+            )
+
+    def _check_light(self, photons: galsim.PhotonArray) -> None:
+        """Look for wavelengths without absorption length, and light below the table's first depth."""
+        if not (len(photons) and photons.hasAllocatedWavelengths()):
+            return
+        waves = photons.wavelength
+        low, high = float(waves.min()), float(waves.max())
+        if not (math.isfinite(low) and math.isfinite(high)):
+            # Lost photons may have nan; light of infinite wavelength crosses the silicon.
+            finite = waves[np.isfinite(waves)]
+            if not finite.size:
+                return
+            low, high = float(finite.min()), float(finite.max())
+        medium, thickness = self._physics.medium, self.table.thickness
+        known = medium.wavelength_0 + medium.wavelength_step * np.arange(
+            len(medium.lengths)
+        )
+        if low < known[0] or high > known[-1]:
+            self._outside(
+                "wavelengths",
+                f"photons have wavelengths from {low:g} to {high:g} nm; absorption lengths are known "
+                f"from {known[0]:g} to {known[-1]:g} nm",
+                "those at the ends are used",
+            )
+        first = float(self.table.depths[0])
+        # Light that is kept where it would cross converts 1 um above the gates.
+        if not self.depth or (self.red == "kept" and first <= 1.0):
+            return
+        length = float(np.interp(high, known, medium.lengths))
+        deep = math.exp((first - thickness) / length)
+        deep -= math.exp(-thickness / length) if self.red == "lost" else 0.0
+        if deep > _DEEP:
+            self._outside(
+                "deep light",
+                f"{100 * deep:.2g} % of light of {high:g} nm converts below {first:g} um, the lowest "
+                f"depth of the table of {self.name}",
+                "its shifts are used below it",
+                "; make one with lower depths",
+            )
+
     def _check_depths(self) -> None:
-        """Warn of light far above the table's last depth, or refuse with beyond='error'."""
+        """Look for light without wavelengths below the table's first depth, and far above its last."""
+        height = self.table.thickness - self.conversion_depth
+        first = float(self.table.depths[0])
+        if self.depth and height < first:
+            from bfsensor.table.table_plan import storage_height
+
+            # Where charge is stored nothing moves, and below it neither.
+            if first > storage_height(self._device) + 1.0:
+                self._outside(
+                    "deep light",
+                    f"light converts {height:g} um above the gates; the table of {self.name} begins "
+                    f"at {first:g} um",
+                    "its shifts are used below it",
+                    ": make one with lower depths",
+                )
         last = float(self.table.depths[-1])
         if last >= _COVERED * self.table.thickness:
             return
@@ -439,24 +514,19 @@ class BrighterFatterSensor(EffectSensor):
             f"light converts up to {self.table.thickness:g} um above the gates; the table of "
             f"{self.name} ends at {last:g} um"
         )
-        if self.beyond == "error":
-            raise SensorError(
-                f"{text}: make one with the depth {self.table.thickness:g} um"
-            )
-        warnings.warn(
-            f"{text}, whose shifts are used above it (beyond='error' refuses)",
-            galsim.GalSimWarning,
-            stacklevel=3,
-        )
+        self._outside(
+            "high light", text, "its shifts are used above it",
+            f": make one with the depth {self.table.thickness:g} um",
+        )  # fmt: skip
 
     def _warn_beyond(self) -> None:
         """Warn once of pixels with more charge than the table holds."""
         assert self._exposure is not None
-        if self._warned or not self._exposure.diagnostics["beyond_table"]:
+        if "charge" in self._said or not self._exposure.diagnostics["beyond_table"]:
             return
         if math.isfinite(self._well) and self._well <= self._table_well():
             return
-        self._warned = True
+        self._said.add("charge")
         warnings.warn(
             f"pixels hold more charge than the table of {self.name}, which ends at "
             f"{max(self.table.charges[-1], self._table_well()):.0f} e-: the response of the last "

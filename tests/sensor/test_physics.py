@@ -386,6 +386,82 @@ def test_a_table_that_ends_below_the_light_says_so_once(depths):
         BrighterFatterSensor(table=low, beyond="error")
 
 
+def table_from(depth):
+    """The table of ITL without the depths below one of its own."""
+    kept = slice(ITL.depths.tolist().index(depth), None)
+    return dataclasses.replace(
+        ITL, depths=ITL.depths[kept],
+        **{n: getattr(ITL, n)[:, :, kept] for n in ("corners", "horizontal", "vertical")},
+    )  # fmt: skip
+
+
+def coloured(wavelength, flux=1.0):
+    photons = bright_star(200)
+    photons.wavelength = wavelength
+    photons.flux = flux
+    return photons
+
+
+@pytest.mark.parametrize(
+    ("table", "wavelength", "said"),
+    [
+        (ITL, 0.62, "wavelengths from 0.62 to 0.62 nm.* from 250 to 1450 nm"),
+        (ITL, 1500.0, "wavelengths from 1500 to 1500 nm"),
+        (
+            table_from(20.0),
+            1000.0,
+            r"% of light of 1000 nm converts below 20 um, the lowest",
+        ),
+    ],
+)
+def test_light_outside_the_table_is_said_once_or_refused(table, wavelength, said):
+    instrument = BrighterFatterSensor(table=table)
+    image = galsim.ImageF(21, 21)
+    with pytest.warns(galsim.GalSimWarning, match=said):
+        instrument.accumulate(coloured(wavelength), image)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        instrument.accumulate(coloured(wavelength), image, resume=True)
+        BrighterFatterSensor(table=table).accumulate(coloured(620.0), galsim.ImageF(21, 21))
+    image.array[...] = 7
+    strict = BrighterFatterSensor(table=table, beyond="error")
+    with pytest.raises(SensorError, match=said):
+        strict.accumulate(coloured(wavelength), image)
+    assert np.all(image.array == 7)
+    strict.accumulate(coloured(620.0), image)
+
+
+def test_the_part_of_deep_light_is_what_converts_there():
+    length = float(absorption_length(1000.0, 173.0))
+    part = np.exp(-80.0 / length) - np.exp(-100.0 / length)
+    with pytest.warns(galsim.GalSimWarning, match=f"^{100 * part:.2g} % of light"):
+        BrighterFatterSensor(table=table_from(20.0)).accumulate(
+            coloured(1000.0), galsim.ImageF(21, 21)
+        )
+
+
+def test_light_within_the_table_says_nothing():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for red in ("lost", "kept"):
+            for wavelength in (250.0, 1000.0, 1100.0, 1450.0, np.inf):
+                sensor(red=red).accumulate(coloured(wavelength), galsim.ImageF(21, 21))
+        sensor(table=table_from(20.0), depth=False).accumulate(
+            coloured(1000.0), galsim.ImageF(21, 21)
+        )
+        # A photon that was lost before has no wavelength.
+        sensor(beyond="error").accumulate(coloured(np.nan, flux=0.0), galsim.ImageF(21, 21))
+        sensor(conversion_depth=99.8)
+
+
+def test_light_without_wavelengths_below_the_table_is_said_or_refused():
+    said = "light converts 5 um above the gates; the table of table begins at 20 um"
+    with pytest.warns(galsim.GalSimWarning, match=said):
+        BrighterFatterSensor(table=table_from(20.0), conversion_depth=95.0)
+    with pytest.raises(SensorError, match=said):
+        BrighterFatterSensor(table=table_from(20.0), conversion_depth=95.0, beyond="error")
+
+
 def growth(photons, **options):
     """Second moment (x and y) with the effect over that without, less 1."""
     out = []
