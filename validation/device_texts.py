@@ -1,6 +1,6 @@
 """Write the text of each shipped device file into its table, where no solution depends on the change.
 
-``python -m validation.boundaries.device_texts [NAME ...]``: a table holds the text of the device that
+``python -m validation.device_texts [NAME ...]``: a table holds the text of the device that
 it was made of.  Quantities that move no boundary (``[transport]``), uncertainties, origins and sources
 may change later in ``tables/NAME/device.toml``; this writes them into ``tables/NAME/table.fits``
 and leaves all arrays as they are, bit for bit.  A device with other physics is refused:

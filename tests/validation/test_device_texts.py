@@ -10,7 +10,7 @@ from bfsensor import Device, DistortionTable
 from bfsensor.device.device import builtin_devices
 from bfsensor.device.shipped import tables_dir
 from bfsensor.errors import TableError
-from validation.boundaries.device_texts import write_device_text
+from validation.device_texts import write_device_text
 
 
 @pytest.mark.parametrize("name", builtin_devices())
