@@ -51,15 +51,16 @@ Chosen: any length far above the thickness means that all light crosses; at infi
 interpolation between wavelengths would give nan."""
 
 _COVERED = 0.9
-"""Part of the thickness that a table's depths must reach; a sensor warns, or refuses, below it.
+"""Part of the thickness that a table's depths must reach, and part of the lowest depth to which light
+may convert; a sensor warns, or refuses, below it.
 
 Chosen: with the shifts of 95, 80 and 30 um in place of those of 100 um, area changes are wrong by
 up to 0.03, 0.6 and 17 % at the nearest lags and by 2, 7 and 17 % at (2, 2) (measured with the tables
 of ITL and E2V)."""
 
 _DEEP = 0.01
-"""Part of the light of a wavelength that may convert below a table's lowest depth; a sensor warns, or
-refuses, above it.
+"""Part of the light of a wavelength that may convert too low for a table's lowest depth; a sensor
+warns, or refuses, above it.
 
 Chosen: where shifts of that part were wrong altogether, those of all the light would be by 1 %, as the
 factors of a table are; a table that begins where charge is stored leaves 0.4 % at most."""
@@ -129,10 +130,10 @@ class BrighterFatterSensor(EffectSensor):
         inf: never.
     beyond : {'hold', 'error'}
         Behaviour where the table ends: charges beyond it without a full well; light above its last
-        depth if that is below nine tenths of the thickness; light below its first depth, more than
-        1 % of that of the photons' largest wavelength; wavelengths without absorption length.  'hold'
-        uses the last level, depth or length (one warning each with the number; :attr:`diagnostics`
-        counts charges), 'error' refuses.
+        depth if that is below nine tenths of the thickness; light below nine tenths of its first depth,
+        more than 1 % of that of the photons' largest wavelength; wavelengths without absorption
+        length.  'hold' uses the last level, depth or length (one warning each with the number;
+        :attr:`diagnostics` counts charges), 'error' refuses.
     predict : bool
         Whether the charge expected in the middle of a block acts, or that at its start.
     conversion_depth : float
@@ -480,22 +481,23 @@ class BrighterFatterSensor(EffectSensor):
         if not self.depth or (self.red == "kept" and first <= 1.0):
             return
         length = float(np.interp(high, known, medium.lengths))
-        deep = math.exp((first - thickness) / length)
+        floor = _COVERED * first
+        deep = math.exp((floor - thickness) / length)
         deep -= math.exp(-thickness / length) if self.red == "lost" else 0.0
         if deep > _DEEP:
             self._outside(
                 "deep light",
-                f"{100 * deep:.2g} % of light of {high:g} nm converts below {first:g} um, the lowest "
-                f"depth of the table of {self.name}",
+                f"{100 * deep:.2g} % of light of {high:g} nm converts below {floor:g} um; the lowest "
+                f"depth of the table of {self.name} is {first:g} um",
                 "its shifts are used below it",
-                "; make one with lower depths",
+                ": make one with lower depths",
             )
 
     def _check_depths(self) -> None:
         """Look for light without wavelengths below the table's first depth, and far above its last."""
         height = self.table.thickness - self.conversion_depth
         first = float(self.table.depths[0])
-        if self.depth and height < first:
+        if self.depth and height < _COVERED * first:
             from bfsensor.table.table_plan import storage_height
 
             # Where charge is stored nothing moves, and below it neither.
