@@ -204,10 +204,20 @@ def shear(rows: Rows, model: str | None, part: str, band: str = "r") -> str:
 
 
 def smaller_stars(rows: Rows) -> str:
-    """How much smaller faint stars are than with GalSim's default diffusion [% of their sigma]."""
+    """How much smaller faint stars are by Einstein's relation than in GalSim [% of their sigma]."""
+    return f"{-wider_than_galsims(rows, 'whole'):.0f}"
+
+
+def device_stars(rows: Rows) -> str:
+    """How far the width of faint stars with the device's diffusion is from GalSim's [%]."""
+    return f"{abs(wider_than_galsims(rows, 'wide diffusion')):.1f}"
+
+
+def wider_than_galsims(rows: Rows, model: str) -> float:
+    """How much wider faint stars of a model are than in GalSim [% of their sigma]."""
     table = select(rows("psf_requirement"), peak=1e4, sky=800.0, band="r")
-    trace = [np.mean(select(table, model=model)["trace"]) for model in ("whole", "GalSim")]
-    return f"{100 * (1 - np.sqrt(trace[0] / trace[1])):.0f}"
+    trace = [np.mean(select(table, model=name)["trace"]) for name in (model, "GalSim")]
+    return float(100 * (np.sqrt(trace[0] / trace[1]) - 1))
 
 
 # -- flats, spots, electrons --------------------------------------------------------------------
@@ -400,6 +410,7 @@ def _numbers() -> dict[str, Callable[[Rows], str]]:
         "flats within 1": lambda r: flat_coverage(r, "1"),
         "flats within 2": lambda r: flat_coverage(r, "1.96"),
         "smaller stars": smaller_stars,
+        "device stars": device_stars,
         "shear m": lambda r: shear(r, None, "m"),
         "shear c": lambda r: shear(r, None, "c"),
         "shear m galsim": lambda r: shear(r, "GalSim", "m"),

@@ -13,6 +13,7 @@ import numba
 import numpy as np
 
 from bfsensor._kernels.hot import cool, heat
+from bfsensor._kernels.surroundings import mirror_all, mirror_pixel, within
 
 TILE = 16
 """Side of the square tiles for which bounds of the charge are kept [pixel].
@@ -71,7 +72,8 @@ class Ledger(NamedTuple):
     effective charges by tile, ``changes`` the number of changes since they were found, ``flags``
     and ``flagged`` the tiles whose bounds are out of date.  ``spill_from`` and ``spill_to`` [side,
     column] is where a column was full when it last spilled.  ``strikes`` [rows, columns] counts
-    the electrons that met a full pixel in the block, ``struck`` lists these pixels.
+    the electrons that met a full pixel in the block, ``struck`` lists these pixels.  ``outside`` holds
+    both effective charges and the charge of the pixels beyond the image, unless they are ``mirrored``.
     """
 
     carry: np.ndarray
@@ -92,6 +94,8 @@ class Ledger(NamedTuple):
     struck: np.ndarray
     counters: np.ndarray
     sums: np.ndarray
+    outside: np.ndarray
+    mirrored: bool
 
 
 @numba.njit(cache=True, inline="always")
@@ -127,38 +131,46 @@ def _flag(ledger, tile):
 
 
 @numba.njit(cache=True, _nrt=False)
-def _charge(image, j, i):
-    """Charge of a pixel in single precision; none outside the image."""
-    if 0 <= j < image.shape[0] and 0 <= i < image.shape[1]:
-        return np.float32(image[np.uint64(j), np.uint64(i)])
-    return np.float32(0.0)
+def _charge(image, ledger, j, i):
+    """Charge of a pixel in single precision; outside the image that of its surroundings."""
+    ny, nx = image.shape
+    if not (0 <= j < ny and 0 <= i < nx):
+        if not ledger.mirrored:
+            return ledger.outside[2]
+        j, i = within(j, ny), within(i, nx)
+    return np.float32(image[np.uint64(j), np.uint64(i)])
 
 
 @numba.njit(cache=True, _nrt=False)
-def _around(image, j, i):
+def _around(image, ledger, j, i):
     """Mean charge of the neighbours of a pixel."""
-    return (
-        (_charge(image, j - 1, i - 1) + _charge(image, j - 1, i) + _charge(image, j - 1, i + 1))
-        + (_charge(image, j, i - 1) + _charge(image, j, i + 1))
-        + (_charge(image, j + 1, i - 1) + _charge(image, j + 1, i) + _charge(image, j + 1, i + 1))
-    ) * np.float32(0.125)  # fmt: skip
+    above = _charge(image, ledger, j - 1, i - 1) + _charge(image, ledger, j - 1, i)
+    above += _charge(image, ledger, j - 1, i + 1)
+    here = _charge(image, ledger, j, i - 1) + _charge(image, ledger, j, i + 1)
+    below = _charge(image, ledger, j + 1, i - 1) + _charge(image, ledger, j + 1, i)
+    below += _charge(image, ledger, j + 1, i + 1)
+    return (above + here + below) * np.float32(0.125)
 
 
 @numba.njit(cache=True, inline="always")
 def _set_pixel(image, charges, ledger, response, j, i, ahead):
     """Update the effective charge of a pixel, with ``ahead`` electrons added to its charge."""
     at = np.uint64((j + charges.pad) * charges.stride + i + charges.pad)
-    q = _charge(image, j, i)
+    q = _charge(image, ledger, j, i)
     second = np.float32(0.0)
     if response.first.size > 0:
-        around = _around(image, j, i)
+        around = _around(image, ledger, j, i)
         if q + ahead > response.last_charge * response.charge_step:
             ledger.counters[BEYOND] += 1
         first, second = _effective(response, q + ahead, around)
         charges.second[at] = second
+        if ledger.mirrored:
+            mirror_pixel(charges, charges.second, j, i)
     else:
         first = q + ahead
     charges.first[at] = first
+    if ledger.mirrored:
+        mirror_pixel(charges, charges.first, j, i)
     tile = np.uint64((j // TILE) * ((charges.nx + TILE - 1) // TILE) + i // TILE)
     ledger.changes[tile] += 1
     # Margins follow from the ranges, most of which a few electrons leave as they were.
@@ -174,16 +186,18 @@ def _set_pixel(image, charges, ledger, response, j, i, ahead):
 
 @numba.njit(cache=True, _nrt=False)
 def _find_range(charges, ledger, tile):
-    """Find the lowest and highest effective charge of a tile; it is 0 outside the image."""
+    """Find the lowest and highest effective charge of a tile, beyond the image included."""
     tiles_x = (charges.nx + TILE - 1) // TILE
     tiles_y = (charges.ny + TILE - 1) // TILE
     row = tile // tiles_x
     column = tile - row * tiles_x
     border = row == 0 or column == 0 or row == tiles_y - 1 or column == tiles_x - 1
-    low = np.float32(0.0 if border else np.inf)
-    high = np.float32(0.0 if border else -np.inf)
-    low_second = low
-    high_second = high
+    # Mirrored charge is that of this tile and of its neighbours.
+    border = border and not ledger.mirrored
+    low = ledger.outside[0] if border else np.float32(np.inf)
+    high = ledger.outside[0] if border else np.float32(-np.inf)
+    low_second = ledger.outside[1] if border else low
+    high_second = ledger.outside[1] if border else high
     for j in range(row * TILE, min((row + 1) * TILE, charges.ny)):
         start = (j + charges.pad) * charges.stride + charges.pad
         for i in range(column * TILE, min((column + 1) * TILE, charges.nx)):
@@ -362,13 +376,28 @@ def _flag_charge(image, charges, ledger, ahead, apart, fresh):
 
 
 @numba.njit(cache=True, _nrt=False)
-def _load_row(image, j, out):
-    """Copy a row of the image in single precision, from the second place on; none outside."""
-    if not 0 <= j < image.shape[0]:
-        out[:] = np.float32(0.0)
+def _flag_sides(charges, ledger):
+    """Flag the tiles at the sides of the image, where charge beyond it acts."""
+    tiles_x = (charges.nx + TILE - 1) // TILE
+    tiles_y = (charges.ny + TILE - 1) // TILE
+    for row in range(tiles_y):
+        for column in range(tiles_x):
+            if row in (0, tiles_y - 1) or column in (0, tiles_x - 1):
+                ledger.flags[row * tiles_x + column] = True
+
+
+@numba.njit(cache=True, _nrt=False)
+def _load_row(image, ledger, j, out):
+    """Copy a row of the image in single precision, with a pixel of the surroundings on each side."""
+    ny, nx = image.shape
+    if not (0 <= j < ny or ledger.mirrored):
+        out[:] = ledger.outside[2]
         return
-    for i in range(np.uint64(image.shape[1])):
-        out[i + np.uint64(1)] = np.float32(image[j, i])
+    row = np.uint64(within(j, ny))
+    for i in range(np.uint64(nx)):
+        out[i + np.uint64(1)] = np.float32(image[row, i])
+    out[0] = _charge(image, ledger, j, -1)
+    out[nx + 1] = _charge(image, ledger, j, nx)
 
 
 @numba.njit(cache=True, _nrt=False)
@@ -402,10 +431,10 @@ def _respond_flagged(image, charges, ledger, response):
         if not ledger.flags[row * tiles_x : (row + 1) * tiles_x].any():
             continue
         first = row * TILE
-        _load_row(image, first - 1, ledger.rows[(first + 2) % 3])
-        _load_row(image, first, ledger.rows[first % 3])
+        _load_row(image, ledger, first - 1, ledger.rows[(first + 2) % 3])
+        _load_row(image, ledger, first, ledger.rows[first % 3])
         for j in range(first, min(first + TILE, charges.ny)):
-            _load_row(image, j + 1, ledger.rows[(j + 1) % 3])
+            _load_row(image, ledger, j + 1, ledger.rows[(j + 1) % 3])
             _respond_in_row(charges, ledger, response, j)
 
 
@@ -417,9 +446,15 @@ def take_image(image, charges, ledger, response, edges, ahead):
     # At first all is zero, and where the image is it may stay so.
     fresh = ledger.counters[TAKEN] == 0
     ledger.counters[TAKEN] = 1
+    if fresh and ledger.outside[2] != np.float32(0.0):
+        _flag_sides(charges, ledger)
     _flag_charge(image, charges, ledger, ahead, apart, fresh)
     if apart:
         _respond_flagged(image, charges, ledger, response)
+    if ledger.mirrored:
+        mirror_all(charges, charges.first)
+        if response.first.size > 0:
+            mirror_all(charges, charges.second)
     ledger.counters[FLAGGED] = 0
     for tile in range(ledger.flags.size):
         if ledger.flags[tile]:

@@ -51,9 +51,10 @@ def _spot_path(folder: Path, key: str, number: int) -> Path:
 @click.option("--wavelength", type=float,
               help="Vacuum wavelength of the light [nm]; heights then follow its absorption. Not "
               "with --depth.")  # fmt: skip
-@click.option("--diffusion", default=1.0, show_default=True,
-              help="Factor on the width of the diffusion; 1 is Einstein's relation, 2.12 that of "
-              "the published simulations (Lage et al. 2017).")  # fmt: skip
+@click.option("--diffusion", type=float,
+              help="Width of the diffusion over that by Einstein's relation; 1.92 has the X-ray "
+              "clusters of LSST's sensors, 2.12 the published simulations (Lage et al. 2017).  "
+              "[default: the device's]")  # fmt: skip
 @click.option(
     "--seed",
     default=20170,
@@ -76,7 +77,7 @@ def spots(
     cells: int,
     depth: float | None,
     wavelength: float | None,
-    diffusion: float,
+    diffusion: float | None,
     seed: int,
     workers: int,
     executor: str,

@@ -16,6 +16,7 @@ from bfsensor.device.parts import (
     ChannelStopDots,
     Edge,
     EdgeStrip,
+    ElectronTransport,
     FittedCharge,
     GateStack,
     Implant,
@@ -106,6 +107,9 @@ MEANINGS: dict[tuple[type, str], str] = {
     (Well, "spill_barrier"): (
         "Barrier along the column that is left when stored charge spills to the next pixel."
     ),
+    (ElectronTransport, "diffusion"): (
+        "Width of the diffusion over that by Einstein's relation, which holds where it is missing."
+    ),
     (Edge, "side"): "Direction in which the strips follow the last pixel.",
     (Edge, "strips"): "Strips beyond the last pixel, the innermost first.",
     (EdgeStrip, "width"): "Width of the strip.",
@@ -143,6 +147,7 @@ SECTION_MEANINGS = {
     "channel_stop": "The stop between two columns.",
     "operating_point": "Voltages and temperature.",
     "well": "The charge that a pixel holds.",
+    "transport": "How electrons drift to the gates; no solution depends on it.",
     "edge": "The sensor beyond its last pixel, for solutions of edges only.",
     "image_charge": (
         "A model fitted to covariances, which `bfsensor table` then takes instead of solving."

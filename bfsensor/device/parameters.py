@@ -9,7 +9,7 @@ from typing import Any
 from bfsensor.device.device import Device
 from bfsensor.errors import FitError
 
-UNUSED = ("well.spill_barrier",)
+UNUSED = ("well.spill_barrier", "transport.diffusion")
 """Quantities whose uncertainty moves no pixel boundary; they are not among the parameters."""
 
 

@@ -462,6 +462,25 @@ class FittedCharge:
 
 
 @dataclass(frozen=True)
+class ElectronTransport:
+    """Drift of electrons to the gates, beyond what the electric field determines.
+
+    Attributes
+    ----------
+    diffusion : float or None
+        Width of the diffusion over that by Einstein's relation, 0 to 10; None: not known, and
+        Einstein's relation is used.
+
+    Examples
+    --------
+    >>> ElectronTransport(diffusion=1.92).diffusion
+    1.92
+    """
+
+    diffusion: float | None = _quantity("number", "", 0.0, 10.0, default=None)
+
+
+@dataclass(frozen=True)
 class EdgeStrip:
     """A strip beyond the last pixel, such as a guard ring.
 
@@ -536,6 +555,7 @@ SECTIONS: dict[str, type] = {
     "channel_stop": ChannelStop,
     "operating_point": OperatingPoint,
     "well": Well,
+    "transport": ElectronTransport,
     "edge": Edge,
     "image_charge": FittedCharge,
 }

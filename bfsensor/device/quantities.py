@@ -9,16 +9,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bfsensor.device.device import Device
+from bfsensor.device.parameters import UNUSED
 from bfsensor.device.parts import Provenance
 from bfsensor.device.written_units import INTERNAL, to_internal
 from bfsensor.errors import DeviceError, FitError
 
 DIFFUSION = "transport.diffusion"
-"""Name of a free parameter that no device file holds: the width of the diffusion during drift,
-relative to Einstein's relation."""
+"""Name of the width of the diffusion over that by Einstein's relation, which moves no pixel boundary
+and is a free parameter also of a device whose file does not state it."""
 
 DIFFUSION_SPREAD = 0.5
-"""Spread of the prior of that ratio, about 1.
+"""Spread of the prior of that ratio, about 1, where the device file states none.
 
 Chosen: the published simulations have 2.12, which is 2.2 spreads above Einstein's 1; with twice
 the spread the prior would hold the ratio half as strongly."""
@@ -65,6 +66,11 @@ class Quantity(NamedTuple):
         return float(value * INTERNAL[self.kind].to(self.unit))
 
 
+_EINSTEIN = Quantity(1.0, "number", "", 0.0, 10.0)
+"""The ratio :data:`DIFFUSION` of a device that does not state it: Einstein's, by definition, and the
+range of device files."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Prior:
     """Prior of a free parameter of a fit: a Gaussian within bounds.
@@ -72,7 +78,7 @@ class Prior:
     Attributes
     ----------
     name : str
-        Dotted name of the quantity, or :data:`DIFFUSION`.
+        Dotted name of the quantity.
     mean : float
         Mean [internal unit], within the bounds.
     spread : float
@@ -179,7 +185,8 @@ def choose_priors(
         Names of the free parameters, dotted or the end of a dotted name where that is unique.
         After a colon a name may state its spread, ``'back_bias:5 V'``, or mean and spread,
         ``'background_doping:-1.7e12 cm-3 +- 0.7e12 cm-3'``.  'all' stands for all quantities
-        with an uncertainty except ``well.spill_barrier``, which only saturation depends on.
+        with an uncertainty except ``well.spill_barrier``, which only saturation depends on, and
+        ``transport.diffusion``, which only diffusion widths depend on.
         If empty, the quantities with an uncertainty whose origin is 'guessed' are free.
     more : tuple of str
         Dotted names of further free parameters; those without an uncertainty are ignored.
@@ -205,22 +212,23 @@ def choose_priors(
     >>> choose_priors(device, ("thickness:98 um +- 2 um",))[0].mean
     98.0
     """
-    known = quantities(device)
+    known = {DIFFUSION: _EINSTEIN, **quantities(device)}
     spreads = {
         key: float(known_of.uncertainty)
         for key, known_of in device.provenance.items()
         if known_of.uncertainty
     }
+    by_name = {DIFFUSION: DIFFUSION_SPREAD, **spreads}
     chosen: dict[str, float] = {}
     means: dict[str, float] = {}
     for text in asked:
         name, _, spread = text.partition(":")
         if name == "all":
-            chosen |= {k: s for k, s in spreads.items() if k != "well.spill_barrier"}
+            chosen |= {k: s for k, s in spreads.items() if k not in UNUSED}
             continue
-        key = name if name == DIFFUSION else _resolve(name, known)
+        key = _resolve(name, known)
         if spread:
-            kind = "number" if key == DIFFUSION else known[key].kind
+            kind = known[key].kind
             mean, sign, width = spread.partition("+-")
             try:
                 if sign:
@@ -228,10 +236,8 @@ def choose_priors(
                 chosen[key] = abs(to_internal(spread, kind))
             except DeviceError as error:
                 raise FitError(f"--free {text}: {error}") from None
-        elif key == DIFFUSION:
-            chosen[key] = DIFFUSION_SPREAD
-        elif key in spreads:
-            chosen[key] = spreads[key]
+        elif key in by_name:
+            chosen[key] = by_name[key]
         else:
             raise FitError(
                 f"{device.name} states no uncertainty of {key}: give one, such as "
@@ -242,19 +248,15 @@ def choose_priors(
             k: s for k, s in spreads.items() if device.provenance[k].origin == "guessed"
         }
     for key in more:
-        if key == DIFFUSION:
-            chosen.setdefault(key, DIFFUSION_SPREAD)
-        elif key in spreads:
-            chosen.setdefault(key, spreads[key])
+        if key in by_name:
+            chosen.setdefault(key, by_name[key])
     if not chosen:
         raise FitError(
             f"{device.name}: no quantity has the origin 'guessed', so nothing is free by default; "
             f"name the free parameters: all, or {', '.join(spreads)}"
         )
     return tuple(
-        Prior(DIFFUSION, means.get(key, 1.0), spread, 0.0)
-        if key == DIFFUSION
-        else Prior(
+        Prior(
             key, means.get(key, known[key].value), spread, known[key].low, known[key].high
         )
         for key, spread in chosen.items()
@@ -281,8 +283,8 @@ def with_priors(device: Device, priors: tuple[Prior, ...]) -> Device:
     device : Device
         Any.
     priors : tuple of Prior
-        From :func:`choose_priors`; the prior of :data:`DIFFUSION`, no quantity of a device, is
-        left out.
+        From :func:`choose_priors`; that of :data:`DIFFUSION`, which moves no boundary, is left
+        out.
 
     Returns
     -------

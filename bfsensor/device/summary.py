@@ -13,6 +13,7 @@ from bfsensor.device.parts import (
     BuriedChannel,
     ChannelStop,
     Edge,
+    ElectronTransport,
     FittedCharge,
     GateStack,
     Implant,
@@ -83,6 +84,7 @@ def device_rows(
     channel_stop: ChannelStop,
     operating_point: OperatingPoint,
     well: Well,
+    transport: ElectronTransport,
     edge: Edge | None,
     image_charge: FittedCharge | None,
     provenance: Mapping[str, Provenance],
@@ -180,6 +182,9 @@ def device_rows(
             f"{material.permittivity_oxide:g} (oxide); band gap {material.band_gap:g} V",
         ),
     ]
+    if transport.diffusion is not None:
+        times = value(transport, "transport.diffusion")
+        rows.append(("diffusion", f"{times} times the width by Einstein's relation"))
     if image_charge is not None:
         where, one = "image_charge", image_charge
         rows.append((

@@ -109,7 +109,8 @@ def trace_cloud(
     seed : int
         Seed of the random numbers, 0 to 2^64 - 1.
     transport : Transport, optional
-        Model of the transport, of which diffusion, steps and back surface count.
+        Model of the transport, of which diffusion, steps and back surface count.  Without a width
+        the diffusion is Einstein's: that of a device, found on such clusters, holds their repulsion.
     repulsion : float
         Strength of the repulsion relative to Coulomb's law in silicon, 0 or more; 0 switches it off.
     softening : float, optional
@@ -148,6 +149,7 @@ def trace_cloud(
     count = len(starts)
     device = tracer.potential.device
     permittivity = device.material.permittivity_silicon * VACUUM_PERMITTIVITY
+    width = 1.0 if transport.diffusion is None else float(transport.diffusion)
     pace = transport_kernels.Pace(
         float(transport.part),
         float(transport.shortest),
@@ -157,7 +159,7 @@ def trace_cloud(
     out = np.empty((count, 3))
     fates = np.empty(count, np.int64)
     kernels.drift_together(
-        *tracer.field_arrays, room, pace, kt * transport.diffusion**2,
+        *tracer.field_arrays, room, pace, kt * width**2,
         silicon.mobility_law(device.operating_point.temperature),
         float(repulsion) / (4 * np.pi * permittivity),
         -1.0 if softening is None else float(softening), starts,

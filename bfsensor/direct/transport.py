@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bfsensor._kernels import transport as kernels
 from bfsensor.device import silicon
+from bfsensor.device.device import Device
 from bfsensor.errors import ConvergenceError, DeviceError
 from bfsensor.simulate.field import Field
 from bfsensor.simulate.mesh import Surfaces
@@ -56,8 +57,9 @@ class Transport:
 
     Parameters
     ----------
-    diffusion : float
-        Width of the diffusion relative to Einstein's relation, 0 or more; 0 switches it off.
+    diffusion : float, optional
+        Width of the diffusion over that by Einstein's relation, 0 or more; 0 switches it off.  By
+        default the device's, as in a sensor.
     engine : {'steps', 'scattering'}
         Large steps of drift and diffusion, or free flights from collision to collision.
     part : float
@@ -88,7 +90,7 @@ class Transport:
     'steps'
     """
 
-    diffusion: float = 1.0
+    diffusion: float | None = None
     engine: Literal["steps", "scattering"] = "steps"
     part: float = 0.25
     shortest: float = 0.1
@@ -106,6 +108,8 @@ class Transport:
             ("back_absorption", 0.0, 1.0),
         ):
             value = getattr(self, name)
+            if value is None:
+                continue
             if not low <= value <= high or not np.isfinite(value):
                 raise DeviceError(
                     f"transport: {name} = {value} must be from {low:g} to {high:g}"
@@ -118,6 +122,10 @@ class Transport:
                 raise DeviceError(
                     f"transport: {name} = {getattr(self, name)!r} must be one of {choices}"
                 )
+
+    def width_in(self, device: Device) -> float:
+        """Width of the diffusion in a device over that by Einstein's relation."""
+        return device.diffusion if self.diffusion is None else float(self.diffusion)
 
 
 @dataclass(frozen=True)
@@ -295,6 +303,7 @@ class Tracer:
             An electron found no well.
         """
         transport = transport or Transport()
+        width = transport.width_in(self.potential.device)
         starts, room, kt = self.prepare(starts, transport)
         count = len(starts)
         names = np.arange(count) if numbers is None else np.asarray(numbers)
@@ -313,12 +322,12 @@ class Tracer:
                 float(transport.longest),
                 most,
             )
-            kernels.walk(*field, room, pace, kt * transport.diffusion**2, *tail)
+            kernels.walk(*field, room, pace, kt * width**2, *tail)
         else:
             mass = ELECTRON_MASS
             kernels.scatter(
                 *field, room, most,
-                transport.diffusion * float(np.sqrt(3.0 * kt / mass)), mass,
+                width * float(np.sqrt(3.0 * kt / mass)), mass,
                 silicon.mobility_law(self._temperature), transport.free_time == "start", *tail,
             )  # fmt: skip
         if (fates == kernels.LOST).any():

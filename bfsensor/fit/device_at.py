@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from bfsensor.device.condition import Condition
 from bfsensor.device.device import Device
 from bfsensor.device.parameters import change_parameter
-from bfsensor.device.parts import Provenance
+from bfsensor.device.parts import ElectronTransport, Provenance
 from bfsensor.device.quantities import DIFFUSION, Prior, quantities
 from bfsensor.errors import BFSensorError, FitError
 from bfsensor.typing import FloatArray
@@ -54,10 +54,10 @@ def device_at(
     wanted = {}
     if values is not None:
         wanted = {
-            prior.name: float(value)
-            for prior, value in zip(priors, values, strict=True)
-            if prior.name != DIFFUSION
+            prior.name: float(value) for prior, value in zip(priors, values, strict=True)
         }
+    # A device that does not state it has no value of which the difference could be taken.
+    width = wanted.pop(DIFFUSION, None)
     for key in ("back_bias", "gate_high", "gate_low", "temperature"):
         stated = getattr(condition, key)
         if stated is not None:
@@ -75,6 +75,8 @@ def device_at(
         if len(later) == len(left):
             raise FitError(f"no device has these values: {refused}")
         left = later
+    if width is not None:
+        out = dataclasses.replace(out, transport=ElectronTransport(width))
     return out
 
 
@@ -104,8 +106,7 @@ def fitted_device(
     Returns
     -------
     device : Device
-        Named as the device with ``_fitted``; the diffusion width, no quantity of devices, is left
-        out.
+        Named as the device with ``_fitted``.
 
     Raises
     ------
@@ -124,6 +125,5 @@ def fitted_device(
     out = device_at(device, Condition(), priors, values)
     known = dict(out.provenance)
     for prior, error in zip(priors, errors, strict=True):
-        if prior.name != DIFFUSION:
-            known[prior.name] = Provenance(float(error), "fitted", source)
+        known[prior.name] = Provenance(float(error), "fitted", source)
     return dataclasses.replace(out, name=f"{device.name}_fitted", provenance=known)

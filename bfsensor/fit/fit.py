@@ -9,7 +9,7 @@ import numpy as np
 
 from bfsensor.device.depletion import check_depleted
 from bfsensor.device.device import Device
-from bfsensor.device.quantities import DIFFUSION, Prior
+from bfsensor.device.quantities import Prior
 from bfsensor.errors import BFSensorError, FitError
 from bfsensor.fit.data import UNITS, DataSet
 from bfsensor.fit.degeneracies import find_ties, principal
@@ -326,11 +326,6 @@ def _remarks(result: FitResult, priors: Sequence[Prior]) -> list[str]:
         if min(result.value[k] - prior.low, prior.high - result.value[k]) < near:
             out.append(
                 f"{prior.name} is at a bound, beyond which it has no meaning: its error is too small"
-            )
-        if prior.name == DIFFUSION:
-            out.append(
-                "the diffusion width over Einstein's is no quantity of device files: the fitted device "
-                "does not hold it"
             )
     kinds = {one.kind for one in result.sets}
     if kinds & {"saturation", "diffusion"}:

@@ -189,7 +189,7 @@ def _width_at(
     """Diffusion width of light from the back surface [um], and its derivatives."""
     del cells
     names = [prior.name for prior in priors]
-    times = middle[names.index(DIFFUSION)] if DIFFUSION in names else 1.0
+    times = middle[names.index(DIFFUSION)] if DIFFUSION in names else device.diffusion
 
     def width(values: FloatArray) -> float:
         changed = device_at(device, condition, priors, values)

@@ -158,8 +158,8 @@ def draw_collected_paths(
     height : float, optional
         Upper end of the view [um]; by default the back surface.
     transport : Transport, optional
-        Motion of the electrons; by default drift and diffusion by Einstein's relation, in steps
-        that are short enough to draw.
+        Motion of the electrons; by default drift and the device's diffusion, in steps that are
+        short enough to draw.
     compare : Potential, optional
         Another solution, in which the same electrons are traced with the same random numbers and
         drawn in grey.  Electrons that end in another pixel there, in x or in y, are drawn heavy

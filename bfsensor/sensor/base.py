@@ -58,6 +58,7 @@ class EngineSensor(galsim.SiliconSensor):
     """
 
     _threads: int | None = None
+    surroundings: str | float = "none"
     shift_map: ShiftMap | None = None
     _applied: AppliedEffects | None = None
     treering_func: Any
@@ -323,7 +324,7 @@ class EngineSensor(galsim.SiliconSensor):
         fixed = any(p.size > 0 for p in (pattern.rings, pattern.map_x, pattern.edge_x))
         if use_flux:
             exposure = ImageExposure(array, self._physics, pattern, (0.0, 0.0), (0, 0))
-            self._convolve(exposure.charges, out)
+            self._convolve(exposure.charges, out, float(exposure.ledger.outside[0]))
         else:
             out[...] = 1.0
         # Electrons meet rings and maps on their way, the charge's shifts above the wells: what
@@ -351,8 +352,8 @@ class EngineSensor(galsim.SiliconSensor):
         alone = pattern.map_x.size == 0 and pattern.edge_x.size == 0
         return alone and away > _FROM_CENTRE and _quadrature_error(pattern) < _RING_AREA
 
-    def _convolve(self, charges: Charges, out: FloatArray) -> None:
-        """Areas by convolution, with as many kernels as matter for these charges."""
+    def _convolve(self, charges: Charges, out: FloatArray, outside: float) -> None:
+        """Areas by convolution, with as many kernels as matter for these charges and that outside."""
         if self._kernels is None:
             self._kernels = area_kernels(self._physics.edges)
         kernels = self._kernels
@@ -366,12 +367,15 @@ class EngineSensor(galsim.SiliconSensor):
         # matters, are summed in double precision as GalSim's are.
         kind = np.float64 if out.size < _LARGE else np.float32
         row = np.empty(nx, kind)
-        # Beyond the image there is no charge, so that pixels near its border see a larger spread
+        # Beyond the image there may be no charge, so that pixels near its border see a larger spread
         # of charge and may need more kernels.
         reach = kernels.linear[0].shape[0] // 2
         y0, x0 = min(reach, ny), min(reach, nx)
         y1, x1 = max(ny - reach, y0), max(nx - reach, x0)
-        outer = max(inner, abs(float(low)), float(low) + inner)
+        outer = inner
+        if self.surroundings != "mirrored":
+            above = float(low) - outside
+            outer = max(inner, abs(above), above + inner)
         for spread, area in (
             (inner, (y0, y1, x0, x1)), (outer, (0, y0, 0, nx)), (outer, (y1, ny, 0, nx)),
             (outer, (y0, y1, 0, x0)), (outer, (y0, y1, x1, nx)),

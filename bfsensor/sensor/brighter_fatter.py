@@ -18,21 +18,24 @@ from bfsensor.effects.effect import Layout
 from bfsensor.errors import SensorError, SensorTypeError
 from bfsensor.sensor.base import check_rings, make_rng
 from bfsensor.sensor.boundary_shifts import make_shifts
-from bfsensor.sensor.drift_field import MEASURED, STEPS, solve_drift
+from bfsensor.sensor.drift_field import STEPS, solve_drift
 from bfsensor.sensor.effect_sensor import EffectSensor
 from bfsensor.sensor.image_exposure import Physics
 from bfsensor.sensor.options import (
     LARGEST,
+    check_diffusion,
     check_flag,
     check_full_well,
     check_instance,
     check_number,
     check_path,
     check_reach,
+    check_surroundings,
     check_table,
     check_word,
     find_table,
     load_table,
+    outside_charge,
     read_device,
     shown,
 )
@@ -53,11 +56,19 @@ Chosen: any length far above the thickness means that all light crosses; at infi
 interpolation between wavelengths would give nan."""
 
 _COVERED = 0.9
-"""Part of the thickness that a table's depths must reach; a sensor warns, or refuses, below it.
+"""Part of the thickness that a table's depths must reach, and part of the lowest depth to which light
+may convert; a sensor warns, or refuses, below it.
 
 Chosen: with the shifts of 95, 80 and 30 um in place of those of 100 um, area changes are wrong by
 up to 0.03, 0.6 and 17 % at the nearest lags and by 2, 7 and 17 % at (2, 2) (measured with the tables
 of ITL and E2V)."""
+
+_DEEP = 0.01
+"""Part of the light of a wavelength that may convert too low for a table's lowest depth; a sensor
+warns, or refuses, above it.
+
+Chosen: where shifts of that part were wrong altogether, those of all the light would be by 1 %, as the
+factors of a table are; a table that begins where charge is stored leaves 0.4 % at most."""
 
 
 class BrighterFatterSensor(EffectSensor):
@@ -115,22 +126,29 @@ class BrighterFatterSensor(EffectSensor):
         GalSim's table at one temperature.
     temperature : float, optional
         Temperature of the silicon [K], 77 to 400; by default the device's.
-    diffusion : {'einstein', 'measured'}
-        Width by Einstein's relation in the device's drift field, or 1.92 times that, with which
-        Fe55 clusters of LSST sensors are reproduced
-        (:data:`bfsensor.sensor.drift_field.MEASURED`).
+    diffusion : {'device', 'einstein'} or float
+        Width over that by Einstein's relation in the device's drift field: the one that the device
+        states (``[transport] diffusion``; 1.92 for the devices of LSST, as in GalSim), 1, or a
+        number, at least 0.  A device that states none has Einstein's, which is logged once.
     full_well : float, optional
         Charge at which a pixel spills along its column [e-], above 0; by default the table's;
         inf: never.
     beyond : {'hold', 'error'}
-        Behaviour where the table ends, for charges beyond it without a full well and for light
-        above its last depth if that is below nine tenths of the thickness: 'hold' uses the last
-        level or depth (one warning each; :attr:`diagnostics` counts), 'error' refuses.
+        Behaviour where the table ends: charges beyond it without a full well; light above its last
+        depth if that is below nine tenths of the thickness; light below nine tenths of its first depth,
+        more than 1 % of that of the photons' largest wavelength; wavelengths without absorption
+        length.  'hold' uses the last level, depth or length (one warning each with the number;
+        :attr:`diagnostics` counts charges), 'error' refuses.
     predict : bool
         Whether the charge expected in the middle of a block acts, or that at its start.
     conversion_depth : float
         Depth below the back surface [um] at which photons without wavelengths convert, 0 to the
         thickness; 1 um as in GalSim.
+    surroundings : {'none', 'mirrored'} or float
+        Charge beyond the image, which moves the boundaries of the pixels near its sides: none; that of
+        the image mirrored at its sides, as it is at each renewal; or the same charge [e-] in every
+        pixel, at least 0, from the beginning to the end of the exposure.  Electrons that land there
+        are lost.  A sky or flat without a frame of small pixels needs 'mirrored', or its level.
     threads : int, optional
         Largest number of threads of one call, at least 1; the result does not depend on it.  By
         default as many as ``galsim.get_omp_threads()`` says at each call.  Blocks of few photons
@@ -200,6 +218,7 @@ class BrighterFatterSensor(EffectSensor):
         "charge_response": bool, "background": bool, "depth": bool, "red": str,
         "absorption": str, "temperature": float, "diffusion": str, "full_well": float,
         "beyond": str, "predict": bool, "conversion_depth": float, "threads": int,
+        "surroundings": str,
         "effects": str, "conditions": dict, "layout": dict,
     }  # fmt: skip
     _takes_rng = True
@@ -223,11 +242,12 @@ class BrighterFatterSensor(EffectSensor):
         red: Literal["lost", "kept"] = "lost",
         absorption: Literal["law", "galsim"] = "law",
         temperature: float | None = None,
-        diffusion: Literal["einstein", "measured"] = "einstein",
+        diffusion: Literal["device", "einstein"] | float = "device",
         full_well: float | None = None,
         beyond: Literal["hold", "error"] = "hold",
         predict: bool = True,
         conversion_depth: float = 1.0,
+        surroundings: Literal["none", "mirrored"] | float = "none",
         threads: int | None = None,
         table: DistortionTable | None = None,
         effects: Any = None,
@@ -252,19 +272,20 @@ class BrighterFatterSensor(EffectSensor):
         self.predict = check_flag("predict", predict)
         self.red = check_word("red", red, ("lost", "kept"))
         self.absorption = check_word("absorption", absorption, ("law", "galsim"))
-        self.diffusion = check_word("diffusion", diffusion, ("einstein", "measured"))
+        self.diffusion = check_diffusion(diffusion)
         self.beyond = check_word("beyond", beyond, ("hold", "error"))
         self.conversion_depth = check_number(
             "conversion_depth", conversion_depth, low=0.0, high=self.table.thickness
         )
+        self.surroundings = check_surroundings(surroundings)
         self.threads = threads
         self._device = read_device(self.table, self.name)
         if temperature is None:
             temperature = self._device.operating_point.temperature
         self.temperature = check_number("temperature", temperature, low=77.0, high=400.0)
         self.full_well = check_full_well(full_well, self.table)
+        self._said: set[str] = set()
         self._check_depths()
-        self._warned = False
         self._init_effects(effects, layout, conditions, self._usual, self.transpose)
         self._init_silicon()
 
@@ -325,7 +346,7 @@ class BrighterFatterSensor(EffectSensor):
         # Below the lowest height that was traced the wells hold the electrons: no diffusion.
         start = table.depths[1] if len(table.depths) > 1 else 0.0
         drift = solve_drift(table.device_text, self.temperature, float(start))
-        sigma = self.diffusion_factor * (MEASURED if self.diffusion == "measured" else 1.0)
+        sigma = self.diffusion_factor and self.diffusion_factor * self._width()
         pitch = table.pitch[::-1] if self.transpose else table.pitch
         lengths, first, step = self._lengths()
         variance, wider = sigma**2 * drift.variance, 0.0
@@ -350,8 +371,15 @@ class BrighterFatterSensor(EffectSensor):
         physics = Physics(
             edges, factors.response, medium, float(well), not self.transpose, self.nrecalc,
             self.predict, 0.0 if self._applied is None else self._applied.law.loss,
+            outside_charge(self.surroundings),
         )  # fmt: skip
         return physics, drift.ripple if self.depth else np.ones(STEPS + 1)
+
+    def _width(self) -> float:
+        """Width of the diffusion over that by Einstein's relation."""
+        if self.diffusion == "device":
+            return self._device.diffusion
+        return 1.0 if self.diffusion == "einstein" else float(self.diffusion)
 
     def _lengths(self) -> tuple[FloatArray, float, float]:
         """Absorption lengths [um] on equal steps of the wavelength [nm]."""
@@ -407,6 +435,7 @@ class BrighterFatterSensor(EffectSensor):
             As :meth:`EngineSensor.accumulate`; also, with ``beyond='error'``, if a pixel would
             hold more charge than the table.  The image is unchanged after any error.
         """
+        self._check_light(photons)
         if self.beyond == "hold":
             added = super().accumulate(photons, image, orig_center, resume, recalc)
             self._warn_beyond()
@@ -424,8 +453,74 @@ class BrighterFatterSensor(EffectSensor):
             raise
         return added
 
+    def _outside(self, what: str, text: str, used: str, remedy: str = "") -> None:
+        """Say once what lies outside the table and what is used there; refuse with beyond='error'."""
+        if self.beyond == "error":
+            raise SensorError(text + remedy)
+        if what not in self._said:
+            self._said.add(what)
+            warnings.warn(
+                f"{text}: {used} (beyond='error' refuses)",
+                galsim.GalSimWarning,
+                stacklevel=4,
+            )
+
+    def _check_light(self, photons: galsim.PhotonArray) -> None:
+        """Look for wavelengths without absorption length, and light below the table's first depth."""
+        if not (len(photons) and photons.hasAllocatedWavelengths()):
+            return
+        waves = photons.wavelength
+        low, high = float(waves.min()), float(waves.max())
+        if not (math.isfinite(low) and math.isfinite(high)):
+            # Lost photons may have nan; light of infinite wavelength crosses the silicon.
+            finite = waves[np.isfinite(waves)]
+            if not finite.size:
+                return
+            low, high = float(finite.min()), float(finite.max())
+        medium, thickness = self._physics.medium, self.table.thickness
+        known = medium.wavelength_0 + medium.wavelength_step * np.arange(
+            len(medium.lengths)
+        )
+        if low < known[0] or high > known[-1]:
+            self._outside(
+                "wavelengths",
+                f"photons have wavelengths from {low:g} to {high:g} nm; absorption lengths are known "
+                f"from {known[0]:g} to {known[-1]:g} nm",
+                "those at the ends are used",
+            )
+        first = float(self.table.depths[0])
+        # Light that is kept where it would cross converts 1 um above the gates.
+        if not self.depth or (self.red == "kept" and first <= 1.0):
+            return
+        length = float(np.interp(high, known, medium.lengths))
+        floor = _COVERED * first
+        deep = math.exp((floor - thickness) / length)
+        deep -= math.exp(-thickness / length) if self.red == "lost" else 0.0
+        if deep > _DEEP:
+            self._outside(
+                "deep light",
+                f"{100 * deep:.2g} % of light of {high:g} nm converts below {floor:g} um; the lowest "
+                f"depth of the table of {self.name} is {first:g} um",
+                "its shifts are used below it",
+                ": make one with lower depths",
+            )
+
     def _check_depths(self) -> None:
-        """Warn of light far above the table's last depth, or refuse with beyond='error'."""
+        """Look for light without wavelengths below the table's first depth, and far above its last."""
+        height = self.table.thickness - self.conversion_depth
+        first = float(self.table.depths[0])
+        if self.depth and height < _COVERED * first:
+            from bfsensor.table.table_plan import storage_height
+
+            # Where charge is stored nothing moves, and below it neither.
+            if first > storage_height(self._device) + 1.0:
+                self._outside(
+                    "deep light",
+                    f"light converts {height:g} um above the gates; the table of {self.name} begins "
+                    f"at {first:g} um",
+                    "its shifts are used below it",
+                    ": make one with lower depths",
+                )
         last = float(self.table.depths[-1])
         if last >= _COVERED * self.table.thickness:
             return
@@ -433,24 +528,19 @@ class BrighterFatterSensor(EffectSensor):
             f"light converts up to {self.table.thickness:g} um above the gates; the table of "
             f"{self.name} ends at {last:g} um"
         )
-        if self.beyond == "error":
-            raise SensorError(
-                f"{text}: make one with the depth {self.table.thickness:g} um"
-            )
-        warnings.warn(
-            f"{text}, whose shifts are used above it (beyond='error' refuses)",
-            galsim.GalSimWarning,
-            stacklevel=3,
-        )
+        self._outside(
+            "high light", text, "its shifts are used above it",
+            f": make one with the depth {self.table.thickness:g} um",
+        )  # fmt: skip
 
     def _warn_beyond(self) -> None:
         """Warn once of pixels with more charge than the table holds."""
         assert self._exposure is not None
-        if self._warned or not self._exposure.diagnostics["beyond_table"]:
+        if "charge" in self._said or not self._exposure.diagnostics["beyond_table"]:
             return
         if math.isfinite(self._well) and self._well <= self._table_well():
             return
-        self._warned = True
+        self._said.add("charge")
         warnings.warn(
             f"pixels hold more charge than the table of {self.name}, which ends at "
             f"{max(self.table.charges[-1], self._table_well()):.0f} e-: the response of the last "
@@ -493,5 +583,6 @@ _COMPARED = (
     "strength", "diffusion_factor", "qdist", "nrecalc", "treering_func", "treering_center",
     "transpose", "shift_map", "charge_response", "background", "depth", "red", "absorption",
     "temperature", "diffusion", "full_well", "beyond", "predict", "conversion_depth", "threads",
+    "surroundings",
 )  # fmt: skip
 """Attributes that equal sensors share, in the order of the repr."""

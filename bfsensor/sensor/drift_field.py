@@ -28,13 +28,6 @@ STEPS = 256
 Chosen: twice as many change the variance of the diffusion by less than 0.1 % and the relative shift
 by ripples by less than 2e-4 (the two LSST devices)."""
 
-MEASURED = 0.27**-0.5
-"""Width of the diffusion relative to Einstein's relation, 1.92.
-
-Published: GalSim divides the variance by 0.27, a factor found by hand with which simulated Fe55
-clusters of LSST sensors are as wide as measured ones (GalSim issue 981).  Its physical origin is
-not established."""
-
 
 @dataclass(frozen=True)
 class Drift:

@@ -43,7 +43,7 @@ def draw_flat(
     step: float = 1000.0,
     rng: galsim.BaseDeviate | None = None,
     illumination: FloatArray | None = None,
-    border: int = 8,
+    border: int | None = None,
     dtype: type = np.float32,
 ) -> galsim.Image:
     """Draw a flat with the correlations that follow from the sensor's pixel areas.
@@ -70,9 +70,10 @@ def draw_flat(
         Source of the seed.
     illumination : ndarray, shape ``shape``, optional
         Relative illumination, at least 0; by default 1.
-    border : int
-        Width [pixel] of a frame that is drawn around the image and cut off, 0 to 10,000; without
-        charge outside, pixels of the last rows and columns would be too small.
+    border : int, optional
+        Width [pixel] of a frame that is drawn around the image and cut off, 0 to 10,000.  By
+        default 8, because without charge outside pixels of the last rows and columns would be too
+        small, and 0 with ``surroundings='mirrored'``, by which they are not.
     dtype : type
         Type of the pixels, float32 or float64.
 
@@ -112,7 +113,7 @@ def iterate_flat(
     step: float = 1000.0,
     rng: galsim.BaseDeviate | None = None,
     illumination: FloatArray | None = None,
-    border: int = 8,
+    border: int | None = None,
     dtype: type = np.float32,
 ) -> Iterator[galsim.Image]:
     """Draw a flat as :func:`draw_flat` does, with the image after every step.
@@ -153,6 +154,8 @@ def iterate_flat(
             f"level = {level:g} e- in steps of step = {step:g} e- must be at most {_HIGHEST:g} e-, "
             f"in {_STEPS:g} steps"
         )
+    if border is None:
+        border = 0 if sensor.surroundings == "mirrored" else 8
     border = check_whole("border", border, low=0, high=10_000)
     _check_kind(dtype)
     light = _light(shape, illumination, border)

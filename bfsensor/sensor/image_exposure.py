@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -59,6 +59,9 @@ class Physics:
         Whether the charge expected in the middle of a block acts, or that at its start.
     loss : float
         q [1/e-]: an electron is lost with probability 1 - exp(-q Q) where it meets charge Q.
+    surroundings : float
+        Charge of every pixel beyond the image [e-], at all times; nan: that of the image, mirrored at
+        its sides.
     """
 
     edges: Edges
@@ -69,6 +72,7 @@ class Physics:
     block: float
     predict: bool
     loss: float = 0.0
+    surroundings: float = 0.0
 
 
 class ImageExposure:
@@ -166,7 +170,7 @@ class ImageExposure:
         other = copy.copy(self)
         other.charges = Charges(*(_copied(part) for part in self.charges))
         other.hot = Hot(*(part.copy() for part in self.hot))
-        other.ledger = Ledger(*(part.copy() for part in self.ledger))
+        other.ledger = Ledger(*(_copied(part) for part in self.ledger))
         return other
 
     @property
@@ -217,8 +221,35 @@ def _copied(part: Any) -> Any:
     return part.copy() if isinstance(part, np.ndarray) else part
 
 
+def _outside(physics: Physics) -> tuple[float, float, float]:
+    """Effective charges, and charge, of a pixel whose neighbours hold that of the surroundings."""
+    level = physics.surroundings
+    if level == 0.0 or np.isnan(level):
+        return 0.0, 0.0, 0.0
+    # One pixel among its own mirror images.
+    alone = replace(physics, surroundings=np.nan)
+    image = np.array([[level]])
+    charges, ledger = _allocate(image, alone)
+    _charge.take_image(
+        image, charges, ledger, physics.response, physics.edges, np.float32(0)
+    )
+    second = charges.second[0] if charges.second.size else 0.0
+    return float(charges.first[0]), float(second), level
+
+
+def _surround(array: NDArray[np.float32], value: float, shape: tuple[int, int], pad: int,
+              stride: int) -> None:  # fmt: skip
+    """Fill the padding of an array with a value; that of zeros stays as it is."""
+    if not value or not array.size:
+        return
+    ny, nx = shape
+    rows = array[: (ny + 2 * pad) * stride].reshape(-1, stride)
+    rows[:pad] = rows[pad + ny :] = value
+    rows[:, :pad] = rows[:, pad + nx :] = value
+
+
 def _allocate(image: NDArray[np.floating], physics: Physics) -> tuple[Charges, Ledger]:
-    """Make the arrays of an exposure, all zero."""
+    """Make the arrays of an exposure, zero but for the charge beyond the image."""
     ny, nx = image.shape
     edges = physics.edges
     pad = edges.reach + 3
@@ -265,5 +296,12 @@ def _allocate(image: NDArray[np.floating], physics: Physics) -> tuple[Charges, L
         struck=np.empty(_HOT_EDGES, np.int32),
         counters=np.zeros(_charge.N_COUNTERS, np.int64),
         sums=np.zeros(_charge.N_SUMS),
+        outside=np.array(_outside(physics), np.float32),
+        mirrored=bool(np.isnan(physics.surroundings)),
     )
+    if not ledger.mirrored:
+        for array, value in zip(
+            (charges.first, charges.second), ledger.outside, strict=False
+        ):
+            _surround(array, float(value), (ny, nx), pad, stride)
     return charges, ledger

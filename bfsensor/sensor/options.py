@@ -227,6 +227,41 @@ def check_flag(name: str, value: bool) -> bool:
     return bool(number)
 
 
+def check_diffusion(value: str | float) -> str | float:
+    """Return 'device', 'einstein' or a number from 0; a text of a number, as in YAML, is one."""
+    if isinstance(value, str) and value in ("device", "einstein"):
+        return value
+    number = to_float(value)
+    if not (math.isfinite(number) and number >= 0):
+        raise wrong_value(
+            value,
+            f"diffusion = {shown(value)} must be 'device', 'einstein', or the width over Einstein's, a "
+            "finite number from 0",
+        )
+    return number
+
+
+def check_surroundings(value: str | float) -> str | float:
+    """Return 'none', 'mirrored' or a charge from 0; a text of a number, as in YAML, is one."""
+    if isinstance(value, str) and value in ("none", "mirrored"):
+        return value
+    number = to_float(value)
+    if not (math.isfinite(number) and number >= 0):
+        raise wrong_value(
+            value,
+            f"surroundings = {shown(value)} must be 'none', 'mirrored', or the charge of every pixel "
+            "beyond the image, a finite number from 0 e-",
+        )
+    return number
+
+
+def outside_charge(surroundings: str | float) -> float:
+    """Charge beyond the image [e-] as kernels take it; nan: mirrored."""
+    if surroundings == "mirrored":
+        return math.nan
+    return 0.0 if surroundings == "none" else float(surroundings)
+
+
 def check_word(name: str, value: str, allowed: tuple[str, ...]) -> str:
     """Return a word of a list; refuse anything else."""
     if not isinstance(value, str) or value not in allowed:

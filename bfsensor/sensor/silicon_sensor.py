@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import galsim
 import numpy as np
@@ -16,7 +16,7 @@ from bfsensor._kernels.shifts import Edges
 from bfsensor.device.shipped import did_you_mean, tables_dir
 from bfsensor.errors import SensorError, TableError
 from bfsensor.sensor.base import EngineSensor, check_rings, make_rng, read_numbers
-from bfsensor.sensor.drift_field import MEASURED, STEPS
+from bfsensor.sensor.drift_field import STEPS
 from bfsensor.sensor.edge_weights import make_edges, transpose_sides
 from bfsensor.sensor.image_exposure import Physics
 from bfsensor.sensor.options import (
@@ -24,8 +24,10 @@ from bfsensor.sensor.options import (
     check_flag,
     check_number,
     check_path,
+    check_surroundings,
     check_whole,
     galsim_folder,
+    outside_charge,
 )
 from bfsensor.table.galsim_format import read_sides
 from bfsensor.typing import FloatArray
@@ -41,6 +43,10 @@ of GalSim's SiliconSensor."""
 _EXTRA_COLLECT, _EXTRA_BARRIER = 12.0, 15.0
 # Potential of the channel above that of the collecting and of the barrier gates [V]: published,
 # estimates of GalSim's SiliconSensor.
+
+_WIDTH = 0.27**-0.5
+"""Width of the diffusion over that by Einstein's relation: published, GalSim's SiliconSensor, whose
+factor 0.27 on the mobility was found by hand on X-ray clusters of LSST's sensors."""
 
 _KEYS = (
     "NumVertices", "PixelBoundaryNx", "PixelBoundaryNy", "PixelSizeX", "SensorThickness",
@@ -83,6 +89,11 @@ class SiliconSensor(EngineSensor):
         Centre of the rings in original image coordinates.
     transpose : bool
         Whether x and y of the table are exchanged.
+    surroundings : {'none', 'mirrored'} or float
+        Charge beyond the image, which moves the boundaries of the pixels near its sides: none; that of
+        the image mirrored at its sides, as it is at each renewal; or the same charge [e-] in every
+        pixel, at least 0, from the beginning to the end of the exposure.  Electrons that land there
+        are lost.  A sky or flat without a frame of small pixels needs 'mirrored', or its level.
     threads : int, optional
         Largest number of threads of one call, at least 1; the result does not depend on it.  By
         default as many as ``galsim.get_omp_threads()`` says at each call.  Blocks of few photons
@@ -109,7 +120,9 @@ class SiliconSensor(EngineSensor):
     True
     """
 
-    _opt_params = {**galsim.SiliconSensor._opt_params, "threads": int}  # noqa: RUF012
+    _opt_params = {  # noqa: RUF012
+        **galsim.SiliconSensor._opt_params, "surroundings": str, "threads": int,
+    }  # fmt: skip
 
     def __init__(
         self,
@@ -123,9 +136,11 @@ class SiliconSensor(EngineSensor):
         treering_center: galsim.PositionD = galsim.PositionD(0, 0),  # noqa: B008
         transpose: bool = False,
         *,
+        surroundings: Literal["none", "mirrored"] | float = "none",
         threads: int | None = None,
     ) -> None:
         self.name = check_path("name", name, "the stem of a .cfg and a .dat file")
+        self.surroundings = check_surroundings(surroundings)
         self.strength = check_number("strength", strength, low=-LARGEST, high=LARGEST)
         self.rng = make_rng(rng)
         self.diffusion_factor = check_number(
@@ -173,7 +188,7 @@ class SiliconSensor(EngineSensor):
     def _diffusion(self) -> float:
         """Width of the diffusion of electrons from the back surface [um], as GalSim estimates it.
 
-        It is Einstein's relation in a uniform field, times the measured factor.
+        It is Einstein's relation in a uniform field, with GalSim's factor on the variance.
         """
         c = self.config
         stop = (c["ChannelStopWidth"] + 2 * c["FieldOxideTaper"]) / c["PixelSizeX"]
@@ -185,7 +200,7 @@ class SiliconSensor(EngineSensor):
         voltage = max(front - c["Vbb"], 1.0)
         # GalSim's kT/q, 0.026 V at 298 K.
         kt = 0.026 * c["CCDTemperature"] / 298.0
-        return float(MEASURED * np.sqrt(2 * kt / voltage) * c["SensorThickness"])
+        return float(_WIDTH * np.sqrt(2 * kt / voltage) * c["SensorThickness"])
 
     def _make_physics(self) -> tuple[Physics, FloatArray]:
         c = self.config
@@ -217,13 +232,15 @@ class SiliconSensor(EngineSensor):
         physics = Physics(
             edges, Response(none, none, 1.0, 1.0, np.inf, np.inf), medium, np.inf,
             not self.transpose, self.effective_nrecalc, False,
+            surroundings=outside_charge(self.surroundings),
         )  # fmt: skip
         return physics, scale
 
     def _key(self) -> tuple[Any, ...]:
         return (
             self.config, self.strength, self.diffusion_factor, self.qdist, self.nrecalc,
-            self.treering_func, self.treering_center, self.transpose, self.threads,
+            self.treering_func, self.treering_center, self.transpose, self.surroundings,
+            self.threads,
         )  # fmt: skip
 
     def __str__(self) -> str:
@@ -238,7 +255,7 @@ class SiliconSensor(EngineSensor):
     def __repr__(self) -> str:
         keys = (
             "name", "strength", "rng", "diffusion_factor", "qdist", "nrecalc",
-            "treering_func", "treering_center", "transpose", "threads",
+            "treering_func", "treering_center", "transpose", "surroundings", "threads",
         )  # fmt: skip
         parts = [f"{key}={getattr(self, key)!r}" for key in keys]
         return f"bfsensor.SiliconSensor({', '.join(parts)})"

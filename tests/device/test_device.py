@@ -17,10 +17,12 @@ from bfsensor.device.parts import (
     ChannelStopDots,
     Edge,
     EdgeStrip,
+    ElectronTransport,
     Implant,
     Provenance,
     Ripple,
 )
+from bfsensor.errors import DeviceError
 from tests.device.device_cases import E2V, ITL, refusal
 
 
@@ -200,7 +202,7 @@ def test_with_value_takes_dotted_and_short_names(key):
     assert ITL.with_operating_point(back_bias="-61 V") == changed
 
 
-def test_physics_has_neither_name_nor_provenance():
+def test_physics_has_neither_name_nor_provenance_nor_transport():
     there_and_back = ITL.with_value("back_bias", "-61 V").with_value("back_bias", "-50 V")
     assert there_and_back != ITL and there_and_back.physics == ITL.physics
     renamed = dataclasses.replace(ITL, name="another")
@@ -208,7 +210,10 @@ def test_physics_has_neither_name_nor_provenance():
     assert ITL.with_value("back_bias", "-61 V").physics != ITL.physics
     assert (
         dataclasses.replace(
-            Device.from_toml(ITL.physics), name=ITL.name, provenance=ITL.provenance
+            Device.from_toml(ITL.physics),
+            name=ITL.name,
+            provenance=ITL.provenance,
+            transport=ITL.transport,
         )
         == ITL
     )  # nothing else is left out
@@ -312,3 +317,39 @@ def test_thermal_voltage():
     plain = dataclasses.replace(ITL.material, thermal_voltage_300K=None)
     assert plain.thermal_voltage(300.0) == pytest.approx(0.025852, abs=5e-7)
     assert ITL.material.thermal_voltage(150.0) == pytest.approx(0.013, rel=1e-15)
+
+
+def test_the_width_of_the_diffusion_is_a_quantity_without_part_in_solutions():
+    from bfsensor.device.parameters import device_parameters
+
+    assert ITL.diffusion == ITL.transport.diffusion == 1.92
+    known = ITL.provenance["transport.diffusion"]
+    assert (
+        known.origin == "published"
+        and known.uncertainty == 0.2
+        and "GalSim" in known.source
+    )
+    changed = ITL.with_value("transport.diffusion", "2.12")
+    assert changed.diffusion == 2.12 and changed.physics == ITL.physics
+    assert Device.from_toml(changed.to_toml()) == changed != ITL
+    assert "transport.diffusion" not in device_parameters(ITL)
+    bare = dataclasses.replace(ITL, transport=ElectronTransport(), provenance={})
+    assert "transport" not in bare.to_toml() and bare.diffusion == 1.0
+    assert bare.with_value("transport.diffusion", "1.5").diffusion == 1.5
+    assert "1.92 +- 0.2 times" in str(ITL) and "times the width" not in str(bare)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ('diffusion = "1.92 um"', "expected no unit"),
+        ('diffusion = "-0.1"', "must be at least 0"),
+        ('diffusion = "11"', "must be at most 10"),
+        ("diffusion = 1.92", "must be a string"),
+        ('width = "1.92"', "unknown key 'width'"),
+    ],
+)
+def test_other_widths_of_the_diffusion_are_refused(line, message):
+    text = ITL.to_toml().partition("[transport]")[0] + f"[transport]\n{line}\n"
+    with pytest.raises(DeviceError, match=message):
+        Device.from_toml(text)

@@ -7,7 +7,7 @@ import pytest
 from astropy.io import fits
 
 from bfsensor import Device
-from bfsensor.device.parts import Ripple
+from bfsensor.device.parts import ElectronTransport, Ripple
 from bfsensor.direct import exposure_plan as exposure_base
 from bfsensor.direct.exposure_plan import step_ends
 from bfsensor.direct.flat_exposure import Flat, FlatPlan, simulate_flat
@@ -29,6 +29,12 @@ def fewer(kind, **changes):
     return kind(**{**values, **changes})
 
 
+def without_width(device):
+    """The device as its file was before it stated the width of the diffusion."""
+    known = {k: v for k, v in device.provenance.items() if k != "transport.diffusion"}
+    return dataclasses.replace(device, transport=ElectronTransport(), provenance=known)
+
+
 BOTH = pytest.mark.parametrize(
     ("kind", "charge", "simulate"),
     [(SpotPlan, "peak", simulate_spot), (FlatPlan, "level", simulate_flat)],
@@ -38,8 +44,13 @@ BOTH = pytest.mark.parametrize(
 def test_keys_are_those_of_files_that_exist():
     """As the first version computed them; a file is found by its key."""
     device = ITL.with_operating_point(back_bias="-60 V", gate_high="4 V", gate_low="-8 V")
-    assert SpotPlan(device, steps=40).key == "f537ac8dfdee7cca"
-    assert FlatPlan(Device.load("e2v_ccd250")).key == "8fec91f2750a5049"
+    einstein = {"transport": Transport(diffusion=1.0)}
+    spots = SpotPlan(without_width(device), steps=40, **einstein)
+    assert spots.key == "f537ac8dfdee7cca"
+    flats = FlatPlan(without_width(Device.load("e2v_ccd250")), **einstein)
+    assert flats.key == "8fec91f2750a5049"
+    # With the width that the device states results are others, and so is the key.
+    assert SpotPlan(device, steps=40).key != spots.key
 
 
 @BOTH

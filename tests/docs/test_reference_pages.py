@@ -66,6 +66,7 @@ gate_high = "2 V"
 back_bias = "-50 V"
 temperature = "173 K"
 [well]
+[transport]
 [edge]
 side = "x"
 [[edge.strip]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import replace
 
 import numpy as np
@@ -9,10 +10,11 @@ import pytest
 
 from bfsensor import Device
 from bfsensor.device.condition import Condition
+from bfsensor.device.parts import ElectronTransport
 from bfsensor.device.quantities import DIFFUSION, Prior, choose_priors
 from bfsensor.errors import FitError
 from bfsensor.fit.data import DataSet
-from bfsensor.fit.device_at import device_at
+from bfsensor.fit.device_at import device_at, fitted_device
 from bfsensor.fit.linear_predictors import SPILL, START, make_tangents
 from bfsensor.simulate.edge_field import front_plane
 from bfsensor.simulate.well import full_well
@@ -65,11 +67,35 @@ def test_diffusion_is_einsteins_in_a_nearly_even_field():
     high = mean + bend * (0.5 * length - (START - front.height))
     kt = DEVICE.material.thermal_voltage(173.0)
     expected = np.sqrt(2 * kt / bend * np.log(high / (mean - 0.5 * bend * length)))
-    assert width[0] == pytest.approx(expected, rel=0.01)
-    assert slopes[0, 0] == pytest.approx(width[0])
+    # Times the ratio that the device states, which is a free parameter here.
+    assert middle[0] == DEVICE.transport.diffusion == 1.92
+    assert width[0] == pytest.approx(1.92 * expected, rel=0.01)
+    assert slopes[0, 0] == pytest.approx(width[0] / 1.92)
     # Width goes with the thickness; the stated voltage is not free.
     assert slopes[0, 1] == pytest.approx(width[0] / 98.0, rel=0.15)
     assert slopes[0, 2] == 0.0
+    held = make_tangents(DEVICE)["diffusion"](data("diffusion", at), priors[1:])
+    assert held(middle[1:])[0] == pytest.approx(width)
+
+
+def test_a_device_holds_its_fitted_width():
+    priors = choose_priors(DEVICE, (DIFFUSION,))
+    assert (priors[0].mean, priors[0].spread, priors[0].low) == (1.92, 0.2, 0.0)
+    fitted = fitted_device(DEVICE, priors, np.array([1.6]), np.array([0.1]), "a test")
+    assert fitted.transport.diffusion == 1.6
+    assert Device.from_toml(fitted.to_toml()).provenance[DIFFUSION].uncertainty == 0.1
+    bare = dataclasses.replace(
+        DEVICE, transport=ElectronTransport(),
+        provenance={k: v for k, v in DEVICE.provenance.items() if k != DIFFUSION},
+    )  # fmt: skip
+    unknown = choose_priors(bare, (DIFFUSION,))
+    assert (unknown[0].mean, unknown[0].spread) == (1.0, 0.5)
+    assert (
+        fitted_device(bare, unknown, np.array([1.6]), np.array([0.1]), "a test").diffusion
+        == 1.6
+    )
+    # All quantities with an uncertainty are free by 'all' but those that move no boundary.
+    assert DIFFUSION not in {prior.name for prior in choose_priors(DEVICE, ("all",))}
 
 
 def test_a_device_that_cannot_be_is_refused():

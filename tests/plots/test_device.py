@@ -155,7 +155,7 @@ def test_without_diffusion_each_pixel_collects_what_is_above_it(solved, plane):
         assert matplotlib.colors.to_hex(colour) == (RED, BLUE)[abs(pixel)].lower()
 
 
-def test_diffusion_spreads_paths_as_einstein_says(solved):
+def test_diffusion_spreads_paths_as_the_device_says(solved):
     """Half way down, by the drift in the mean field of the bulk of the same column."""
     empty, _ = solved
     count = 400
@@ -173,13 +173,18 @@ def test_diffusion_spreads_paths_as_einstein_says(solved):
             for path in drawn.get_segments()
         ]
     )
+    wanted *= empty.device.diffusion
     # 3 sigma of 1200 widths: 6 %.
     assert off.std() == pytest.approx(wanted, rel=0.07)
 
 
 def test_a_full_pixel_repels(solved):
     empty, filled = solved
-    ax, (grey, drawn) = collected(filled, compare=empty, paths=100, plane="y")
+    # Wider diffusion brings some that leave a neighbour.
+    einstein = Transport(diffusion=1.0, part=0.1, longest=0.5)
+    ax, (grey, drawn) = collected(
+        filled, compare=empty, paths=100, plane="y", transport=einstein
+    )
     widths = np.array(drawn.get_linewidths())
     moved = widths > 1
     assert moved.any() and f"black: {moved.sum()} to another pixel" in ax.get_title()
@@ -192,7 +197,7 @@ def test_a_full_pixel_repels(solved):
     def kept(axes):
         return int(axes.get_title().split("\n")[1].split()[0])
 
-    hollow, _ = collected(empty, paths=100, plane="y")
+    hollow, _ = collected(empty, paths=100, plane="y", transport=einstein)
     assert kept(ax) < kept(hollow)
     # The same random numbers: in the potential they are compared with, all is the same.
     ax, (grey, drawn) = collected(empty, compare=empty)

@@ -273,8 +273,8 @@ CHANGED = {
     "name": "e2v_ccd250", "strength": 0.5, "diffusion_factor": 0.25, "qdist": 2,
     "nrecalc": 1234.0, "transpose": True, "charge_response": False, "background": False,
     "depth": False, "red": "kept", "absorption": "galsim", "temperature": 190.0,
-    "diffusion": "measured", "full_well": 7e4, "beyond": "error", "predict": False,
-    "conversion_depth": 3.0, "threads": 2,
+    "diffusion": 1.5, "full_well": 7e4, "beyond": "error", "predict": False,
+    "conversion_depth": 3.0, "threads": 2, "surroundings": 2e4,
 }  # fmt: skip
 
 

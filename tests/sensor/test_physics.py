@@ -9,11 +9,18 @@ import galsim
 import numpy as np
 import pytest
 
-from bfsensor import BrighterFatterSensor, DistortionTable, ShiftMap, SiliconSensor
+from bfsensor import (
+    BrighterFatterSensor,
+    Device,
+    DistortionTable,
+    ShiftMap,
+    SiliconSensor,
+)
+from bfsensor.device.parts import ElectronTransport
 from bfsensor.device.shipped import tables_dir
 from bfsensor.device.silicon import absorption_length
 from bfsensor.errors import SensorError
-from bfsensor.sensor.drift_field import MEASURED, solve_drift
+from bfsensor.sensor.drift_field import solve_drift
 
 ITL = DistortionTable.read(tables_dir() / "itl_sta3800c" / "table.fits")
 TOP = float(ITL.depths[-1])
@@ -162,14 +169,17 @@ def test_absorption_follows_temperature():
 
 @pytest.mark.parametrize("height", [20.0, 60.0, 99.0])
 def test_diffusion_comes_from_the_drift_field(height):
-    """Einstein's width from the field by height; the measured one is 1.92 times that."""
+    """Einstein's width from the field by height, times the device's ratio or a given one."""
     count = 100_000
     drift = solve_drift(ITL.device_text, 173.0, float(ITL.depths[1]))
     sigma = np.sqrt(np.interp(height, drift.heights, drift.variance))
     # A uniform field of the mean bulk value gives the same within the doping's gradient.
     mean = np.interp(height, drift.heights, drift.field)
     assert sigma == pytest.approx(np.sqrt(2 * 0.026 * 173 / 300 * height / mean), rel=0.25)
-    for options, factor in (({}, 1.0), ({"diffusion": "measured"}, MEASURED)):
+    for options, factor in (
+        ({}, 1.92), ({"diffusion": "einstein"}, 1.0), ({"diffusion": 1.4}, 1.4),
+        ({"diffusion": 2.8, "diffusion_factor": 0.5}, 1.4),
+    ):  # fmt: skip
         instrument = sensor(
             strength=0.0, conversion_depth=ITL.thickness - height, **options
         )
@@ -190,6 +200,62 @@ def test_diffusion_comes_from_the_drift_field(height):
     photons.x[...] = 0.49
     none.accumulate(photons, image)
     assert image[0, 0] == count
+
+
+def unknown_width(name="a_device_of_unknown_width"):
+    """The table of ITL as one whose device states no width of the diffusion."""
+    device = Device.load("itl_sta3800c")
+    device = dataclasses.replace(device, name=name, transport=ElectronTransport())
+    return dataclasses.replace(ITL, device_text=device.to_toml())
+
+
+def test_a_device_without_a_width_has_einsteins_and_says_so_once(caplog):
+    table = unknown_width()
+    assert "[transport]" not in table.device_text
+    images = []
+    for options in ({}, {"diffusion": "einstein"}, {}):
+        image = galsim.ImageD(9, 9)
+        given = {"table": table} | options
+        sensor(**given).accumulate(uniform_photons(5000, 9, 71), image)
+        images.append(image.array)
+    assert (images[0] == images[1]).all() and (images[2] == images[1]).all()
+    said = [r for r in caplog.records if "a_device_of_unknown_width" in r.getMessage()]
+    assert len(said) == 1 and "Einstein" in said[0].getMessage()
+
+
+def test_a_width_that_does_not_matter_is_not_missed(caplog):
+    """Without diffusion, or with a stated width, nothing is said."""
+    table = unknown_width("another_device_of_unknown_width")
+    for options in ({"diffusion_factor": 0.0}, {"diffusion": 1.5}):
+        sensor(table=table, **options)
+    assert not caplog.records
+
+
+def test_a_faint_star_is_as_wide_as_with_galsims_sensor():
+    """What a swap of the sensor changes is the effect of charge, not the width of the star."""
+    star = galsim.Moffat(beta=3, fwhm=0.7, flux=4e5)
+
+    def trace(instrument):
+        image = star.drawImage(
+            nx=43, ny=43, scale=0.2, method="phot", sensor=instrument,
+            rng=galsim.BaseDeviate(515), poisson_flux=False,
+        )  # fmt: skip
+        return image.FindAdaptiveMom().moments_sigma
+
+    galsims = trace(galsim.SiliconSensor(strength=1e-9, rng=galsim.BaseDeviate(52)))
+    by_width = {
+        width: trace(sensor(strength=0.0, diffusion=width)) / galsims - 1
+        for width in ("device", "einstein")
+    }
+    # 4e5 photons measure a width to 0.1 %; the drift field is not GalSim's even field.
+    assert abs(by_width["device"]) < 0.005
+    assert by_width["einstein"] < -0.025
+
+
+@pytest.mark.parametrize("width", ["measured", -0.1, float("nan"), float("inf"), None])
+def test_a_width_that_is_none_is_refused(width):
+    with pytest.raises(SensorError, match=r"diffusion = .*einstein"):
+        sensor(diffusion=width)
 
 
 def rings(amplitude=0.3, length=2000.0):
@@ -318,6 +384,85 @@ def test_a_table_that_ends_below_the_light_says_so_once(depths):
         BrighterFatterSensor(table=ITL, beyond="error")
     with pytest.raises(SensorError, match="make one with the depth 100 um"):
         BrighterFatterSensor(table=low, beyond="error")
+
+
+def table_from(depth):
+    """The table of ITL without the depths below one of its own."""
+    kept = slice(ITL.depths.tolist().index(depth), None)
+    return dataclasses.replace(
+        ITL, depths=ITL.depths[kept],
+        **{n: getattr(ITL, n)[:, :, kept] for n in ("corners", "horizontal", "vertical")},
+    )  # fmt: skip
+
+
+def coloured(wavelength, flux=1.0):
+    photons = bright_star(200)
+    photons.wavelength = wavelength
+    photons.flux = flux
+    return photons
+
+
+@pytest.mark.parametrize(
+    ("table", "wavelength", "said"),
+    [
+        (ITL, 0.62, "wavelengths from 0.62 to 0.62 nm.* from 250 to 1450 nm"),
+        (ITL, 1500.0, "wavelengths from 1500 to 1500 nm"),
+        (
+            table_from(20.0),
+            1000.0,
+            r"% of light of 1000 nm converts below 18 um; the lowest depth .* is 20",
+        ),
+    ],
+)
+def test_light_outside_the_table_is_said_once_or_refused(table, wavelength, said):
+    instrument = BrighterFatterSensor(table=table)
+    image = galsim.ImageF(21, 21)
+    with pytest.warns(galsim.GalSimWarning, match=said):
+        instrument.accumulate(coloured(wavelength), image)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        instrument.accumulate(coloured(wavelength), image, resume=True)
+        BrighterFatterSensor(table=table).accumulate(coloured(620.0), galsim.ImageF(21, 21))
+    image.array[...] = 7
+    strict = BrighterFatterSensor(table=table, beyond="error")
+    with pytest.raises(SensorError, match=said):
+        strict.accumulate(coloured(wavelength), image)
+    assert np.all(image.array == 7)
+    strict.accumulate(coloured(620.0), image)
+
+
+def test_the_part_of_deep_light_is_what_converts_there():
+    length = float(absorption_length(1000.0, 173.0))
+    part = np.exp(-82.0 / length) - np.exp(-100.0 / length)
+    with pytest.warns(galsim.GalSimWarning, match=f"^{100 * part:.2g} % of light"):
+        BrighterFatterSensor(table=table_from(20.0)).accumulate(
+            coloured(1000.0), galsim.ImageF(21, 21)
+        )
+
+
+def test_light_within_the_table_says_nothing():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for red in ("lost", "kept"):
+            for wavelength in (250.0, 1000.0, 1100.0, 1450.0, np.inf):
+                sensor(red=red).accumulate(coloured(wavelength), galsim.ImageF(21, 21))
+        sensor(table=table_from(20.0), depth=False).accumulate(
+            coloured(1000.0), galsim.ImageF(21, 21)
+        )
+        # A photon that was lost before has no wavelength.
+        sensor(beyond="error").accumulate(coloured(np.nan, flux=0.0), galsim.ImageF(21, 21))
+        sensor(conversion_depth=99.8)
+        # A table of the back surface, with light as blue as it is for.
+        top = BrighterFatterSensor(table=table_from(100.0), beyond="error")
+        top.accumulate(coloured(450.0), galsim.ImageF(21, 21))
+
+
+def test_light_without_wavelengths_below_the_table_is_said_or_refused():
+    said = "light converts 5 um above the gates; the table of table begins at 20 um"
+    with pytest.warns(galsim.GalSimWarning, match=said):
+        BrighterFatterSensor(table=table_from(20.0), conversion_depth=95.0)
+    with pytest.raises(SensorError, match=said):
+        BrighterFatterSensor(table=table_from(20.0), conversion_depth=95.0, beyond="error")
 
 
 def growth(photons, **options):

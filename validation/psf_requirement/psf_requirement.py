@@ -90,7 +90,7 @@ class Model:
         if self.engine is not BrighterFatterSensor:
             # GalSim divides by the strength.
             return self.engine(rng=rng, strength=max(strength, 1e-9), **self.options)
-        options = {
+        options: dict[str, Any] = {"diffusion": "einstein"} | {
             name: value()
             if callable(value) and name in ("table", "treering_func")
             else value
@@ -130,6 +130,7 @@ def rings() -> galsim.LookupTable:
     return galsim.SiliconSensor.simple_treerings(RING[0], RING[1], r_max=1000.0)
 
 
+# All models but 'wide diffusion' have Einstein's width, with which more of the effect is left in a star.
 ALL = ("peaks", "skies", "bands", "range")
 SHEARED = ("whole", "GalSim", "nearest pixels", "E2V")
 """Models whose m and c are measured, at AT on a dark sky in r."""
@@ -145,7 +146,7 @@ MODELS = {
     "no depth": Model({"depth": False}, parts=("peaks", "bands")),
     "GalSim's absorption": Model({"absorption": "galsim"}, parts=("bands",)),
     "no diffusion": Model({"diffusion_factor": 0.0}),
-    "wide diffusion": Model({"diffusion": "measured"}),
+    "wide diffusion": Model({"diffusion": "device"}),
     # Half the charge is in the image before: together with the star it must not spill.
     "no feedback": Model({"nrecalc": 0.0, "full_well": np.inf}, half=True),
     "no prediction": Model({"predict": False}),

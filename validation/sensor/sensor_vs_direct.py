@@ -39,6 +39,7 @@ def draw(
     sensor = BrighterFatterSensor(
         name, rng=galsim.BaseDeviate(4000 + spot.number), strength=strength,
         conversion_depth=plan.device.silicon.thickness - plan.conversion_height,
+        diffusion=plan.transport.width_in(plan.device),
     )  # fmt: skip
     sensor.accumulate(galsim.PhotonArray(electrons, x, y, np.ones(electrons)), image)
     return image.array.astype(float)

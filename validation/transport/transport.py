@@ -33,12 +33,14 @@ from validation.common.write_results import write_results
 START = (4.0, 1.0, 95.0)
 CHARGE = 1e5
 VARIANTS = {
-    "steps 0.5, 10 um": Transport(part=0.5, longest=10.0),
-    "steps 0.25, 5 um": Transport(),
-    "steps 0.12, 3 um": Transport(part=0.12, longest=3.0),
-    "steps 0.06, 1.5 um": Transport(part=0.06, longest=1.5, shortest=0.05),
-    "scattering": Transport(engine="scattering"),
-    "scattering, time of the start": Transport(engine="scattering", free_time="start"),
+    "steps 0.5, 10 um": Transport(diffusion=1.0, part=0.5, longest=10.0),
+    "steps 0.25, 5 um": Transport(diffusion=1.0),
+    "steps 0.12, 3 um": Transport(diffusion=1.0, part=0.12, longest=3.0),
+    "steps 0.06, 1.5 um": Transport(diffusion=1.0, part=0.06, longest=1.5, shortest=0.05),
+    "scattering": Transport(diffusion=1.0, engine="scattering"),
+    "scattering, time of the start": Transport(
+        diffusion=1.0, engine="scattering", free_time="start"
+    ),
     "published width, steps 0.25": Transport(diffusion=PUBLISHED_DIFFUSION),
     "published width, steps 0.06": Transport(
         diffusion=PUBLISHED_DIFFUSION, part=0.06, longest=1.5, shortest=0.05
@@ -131,7 +133,7 @@ def find_widths(electrons: int, output: Path) -> None:
         count = electrons if engine == "steps" else electrons // 10
         # Short steps: between the points of a path its own diffusion is not seen, and steps of
         # 1 um would lack 1.5 % of the width at 90 um.
-        transport = Transport(engine=engine, part=0.06, longest=0.25)  # type: ignore[arg-type]
+        transport = Transport(diffusion=1.0, engine=engine, part=0.06, longest=0.25)  # type: ignore[arg-type]
         places: dict[float, list] = {plane: [] for plane in PLANES}
         for first in range(0, count, 1000):
             numbers = np.arange(first, min(first + 1000, count))

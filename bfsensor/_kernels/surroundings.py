@@ -1,0 +1,44 @@
+"""Charge beyond the image that mirrors the charge within it, in the padding of an exposure's arrays."""
+
+import numba
+import numpy as np
+
+
+@numba.njit(cache=True, inline="always")
+def within(place, size):
+    """Pixel of the image, 0 to ``size`` - 1, that a place beyond it mirrors, at any distance."""
+    place %= 2 * size
+    return place if place < size else 2 * size - 1 - place
+
+
+@numba.njit(cache=True, _nrt=False)
+def mirror_all(charges, array):
+    """Fill the padding of an array with the mirror image of the pixels of the image."""
+    pad, stride = charges.pad, charges.stride
+    nx, ny = charges.nx, charges.ny
+    for j in range(-pad, ny + pad):
+        start = (j + pad) * stride + pad
+        source = (within(j, ny) + pad) * stride + pad
+        for i in range(-pad, 0):
+            array[np.uint64(start + i)] = array[np.uint64(source + within(i, nx))]
+        if source != start:
+            for i in range(nx):
+                array[np.uint64(start + i)] = array[np.uint64(source + i)]
+        for i in range(nx, nx + pad):
+            array[np.uint64(start + i)] = array[np.uint64(source + within(i, nx))]
+
+
+@numba.njit(cache=True, _nrt=False)
+def mirror_pixel(charges, array, j, i):
+    """Copy the value of a pixel of the image to its mirror images in the padding."""
+    pad, stride = charges.pad, charges.stride
+    nx, ny = charges.nx, charges.ny
+    if pad <= j < ny - pad and pad <= i < nx - pad:
+        return
+    value = array[np.uint64((j + pad) * stride + i + pad)]
+    # Its images lie at j and -1 - j, and at every second width of the image from there.
+    for row in (j, -1 - j):
+        for tj in range((row + pad) % (2 * ny), ny + 2 * pad, 2 * ny):
+            for column in (i, -1 - i):
+                for ti in range((column + pad) % (2 * nx), nx + 2 * pad, 2 * nx):
+                    array[np.uint64(tj * stride + ti)] = value
