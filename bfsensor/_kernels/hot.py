@@ -51,6 +51,14 @@ def _place(hot, side, line, other, columns, rows):
     return hot.pages[np.uint64(page), np.uint64(side), np.uint64((j & 15) * 16 + (i & 15))]
 
 
+@numba.njit(cache=True, inline="always")
+def _tile(side, line, other, columns):
+    """Tile of the pixel that an edge belongs to."""
+    i = line if side == 0 else other
+    j = other if side == 0 else line
+    return np.uint64((j >> 4) * (columns + 1) + (i >> 4))
+
+
 @numba.njit(cache=True, _nrt=False)
 def cool(hot):
     """Forget all hot edges."""
@@ -134,53 +142,81 @@ def _tops(edges):
     return top, max(top, np.float32((n + 0.5) / edges.per_um))
 
 
-@numba.njit(cache=True, _nrt=False)
-def _enclose(fences, here, lower, there, upper):
-    """Widen the fences so that they hold a segment; places in steps."""
+@numba.njit(cache=True, inline="always")
+def _bin(edges, height):
+    """Row of ``Edges.change`` for a height [um]."""
+    at = np.int32(height * np.float32(edges.per_change))
+    return np.uint64(min(at, np.int32(edges.change.shape[0] - 1)))
+
+
+@numba.njit(cache=True, inline="always")
+def _enclose(fences, spread, here, lower, there, upper):
+    """Widen the fences so that they hold a segment, wherever within ``spread``; places in steps."""
     if there < here:
         here, there = there, here
         lower, upper = upper, lower
-    if there < np.float32(0.0) or here >= np.float32(FENCES):
-        return
-    first = np.int64(max(here, np.float32(0.0)))
-    last = np.int64(min(there, np.float32(FENCES - 1)))
-    slope = np.float32(0.0)
-    if there > here:
-        slope = (upper - lower) / (there - here)
-    for n in range(first, last + 1):
-        a = lower + slope * (max(np.float32(n), here) - here)
-        b = lower + slope * (min(np.float32(n + 1), there) - here)
-        fences[np.uint64(n), 0] = min(fences[np.uint64(n), 0], min(a, b))
-        fences[np.uint64(n), 1] = max(fences[np.uint64(n), 1], max(a, b))
+    begin = here - spread
+    end = there + spread
+    if end >= np.float32(0.0) and begin < np.float32(FENCES):
+        first = np.int32(max(begin, np.float32(0.0)))
+        last = np.int32(min(end, np.float32(FENCES - 1)))
+        if first == last:
+            at = np.uint64(first)
+            fences[at, 0] = min(fences[at, 0], min(lower, upper))
+            fences[at, 1] = max(fences[at, 1], max(lower, upper))
+        else:
+            slope = np.float32(0.0)
+            if there > here:
+                slope = (upper - lower) / (there - here)
+            for n in range(first, last + 1):
+                at = np.uint64(n)
+                a = max(np.float32(n) - spread, here) - here
+                b = min(np.float32(n + 1) + spread, there) - here
+                a = lower + slope * a
+                b = lower + slope * b
+                fences[at, 0] = min(fences[at, 0], min(a, b))
+                fences[at, 1] = max(fences[at, 1], max(a, b))
 
 
 @numba.njit(cache=True, nogil=True, _nrt=False)
 def fence(edges, charges, hot, first, last):
     """Find the bounds of the shifts of the edges at the places first to last, in steps along them.
 
-    All hot edges must have been evaluated, because a step may reach into the next edge.
+    All hot edges must have been evaluated, because a step may reach into the next edge.  The
+    bounds hold for the points of the topmost layer, each moved along the edge by as much as
+    ``Edges.change`` allows at the lowest height that is decided by them.
     """
     columns = np.int32((charges.nx - 1) >> 4)
     rows = np.int32((charges.ny - 1) >> 4)
     scale = _top_scale(edges.scale)
     steps = np.float32(FENCES)
+    points = np.uint64(edges.points.size)
     for at in range(first, last):
         side = hot.edge[at, 0]
+        line, other = hot.edge[at, 1], hot.edge[at, 2]
         fences = hot.fences[at]
         fences[:, 0] = np.float32(np.inf)
         fences[:, 1] = np.float32(-np.inf)
+        margin = charges.margins[_tile(side, line, other, columns)]
+        spread = steps * margin * edges.change[_bin(edges, np.float32(edges.lowest)), 1]
+        # No point comes further than this along its edge.
+        most = steps * margin * edges.along
         begin = end = here = lower = np.float32(0.0)
         started = False
         for base in range(-1, 2):
-            e = _place(hot, side, hot.edge[at, 1], hot.edge[at, 2] + base, columns, rows)
+            e = _place(hot, side, line, other + base, columns, rows)
             if e < 0:
                 continue
-            for p in range(edges.points.size):
-                place = np.float32(base + edges.points[p])
-                place = steps * (place + scale * hot.lines[e, p, 1])
+            for p in range(points):
+                place = steps * np.float32(base + edges.points[p])
+                if margin < np.float32(0.5) and not (
+                    -most - steps < place < steps + most + steps
+                ):
+                    continue
+                place += steps * scale * hot.lines[e, p, 1]
                 shift = scale * hot.lines[e, p, 0]
                 if started:
-                    _enclose(fences, here, lower, place, shift)
+                    _enclose(fences, spread, here, lower, place, shift)
                 else:
                     begin = place
                     started = True
@@ -192,18 +228,20 @@ def fence(edges, charges, hot, first, last):
             fences[n, 0] = np.float32(0.0)
             # What the polyline does not pass in full is open.
             fences[n, 1] = np.float32(np.inf)
-            if begin <= np.float32(n) and end >= np.float32(n + 1):
+            if begin + spread <= np.float32(n) and end - spread >= np.float32(n + 1):
                 fences[n, 0] = np.float32(0.5) * (lowest + highest)
                 fences[n, 1] = np.float32(0.5) * (highest - lowest) + np.float32(2e-6)
 
 
 @numba.njit(cache=True, _nrt=False)
 def _cross(points, lines, hot, side, at, line, other, place, low, scale, columns, rows):
-    """Shift of a hot polyline at ``place`` along an edge, and whether all of it is hot.
+    """Shift of a hot polyline at ``place`` along an edge, its slope there, and the distance to the
+    nearer end of the segment (below 0: not all of the polyline is hot).
 
     The search starts at the point ``low`` and goes to the segment that encloses the place, if
     need be on the next edge of the line.
     """
+    zero = np.float32(0.0)
     last = points.size - 1
     base = 0
     p = low
@@ -216,10 +254,10 @@ def _cross(points, lines, hot, side, at, line, other, place, low, scale, columns
         if p < 0 or p > last:
             base += 1 if up else -1
             if abs(base) > 1:
-                return np.float32(0.0), False
+                return zero, zero, np.float32(-1.0)
             at = _place(hot, side, line, other + base, columns, rows)
             if at < 0:
-                return np.float32(0.0), False
+                return zero, zero, np.float32(-1.0)
             e = np.uint64(at)
             p = 0 if up else last
         there = np.float32(base + points[np.uint64(p)]) + scale * lines[e, np.uint64(p), 1]
@@ -228,51 +266,74 @@ def _cross(points, lines, hot, side, at, line, other, place, low, scale, columns
             break
         here = there
         lower = upper
-    share = np.float32(0.0)
-    if there != here:
-        share = min(max((place - here) / (there - here), np.float32(0.0)), np.float32(1.0))
-    return scale * (lower + share * (upper - lower)), True
+    if there == here:
+        return scale * lower, zero, zero
+    share = min(max((place - here) / (there - here), zero), np.float32(1.0))
+    slope = scale * (upper - lower) / (there - here)
+    clear = min(abs(place - here), abs(there - place))
+    return scale * (lower + share * (upper - lower)), slope, clear
 
 
 @numba.njit(cache=True, nogil=True, _nrt=False)
 def decide_hot(edges, charges, hot, upright, across, along, z, near, count, out):
     """Decide the electrons in ``near`` that are at hot edges; the others stay listed.
 
-    Returns how many these are.
+    The polylines are those of the topmost layer.  Those of an electron further down differ by
+    no more than ``Edges.change`` says; closer to the polyline than that it stays listed.
+    Returns how many stay.
     """
     scales, per_um = edges.scale, np.float32(edges.per_um)
     points, nearest, lines, fences = edges.points, edges.nearest, hot.lines, hot.fences
+    change = edges.change
     bins = nearest.size
     side = 0 if upright else 1
     columns = np.int32((charges.nx - 1) >> 4)
     rows = np.int32((charges.ny - 1) >> 4)
     top, same = _tops(edges)
+    layered = edges.layers > 1
+    lowest = np.float32(edges.lowest)
+    zero = np.float32(0.0)
     left = 0
     for m in range(np.uint64(count)):
         n = np.uint64(near[m])
         line = np.int64(across[n] + 1.5) - 1
         other = np.int64(along[n] + 1.0) - 1
         at = _place(hot, side, line, other, columns, rows)
-        if at < 0 or z[n] < top:
+        height = z[n]
+        if at < 0 or height < lowest:
             near[np.uint64(left)] = np.int32(n)
             left += 1
             continue
         place = np.float32(along[n] - other)
         beyond = np.float32(across[n] - line)
-        if z[n] >= same:
+        # What the polyline of this height may differ by, across and along the edge.
+        doubt = sway = zero
+        if height < top:
+            margin = charges.margins[_tile(side, line, other, columns)]
+            bin_ = _bin(edges, height)
+            # A margin that is cut off is no bound.
+            margin = margin if margin < np.float32(0.5) else np.float32(np.inf)
+            doubt = margin * change[bin_, 0] + np.float32(2e-6)
+            sway = margin * change[bin_, 1] + np.float32(2e-6)
+        if layered or height >= same:
             step = np.uint64(
                 min(np.int32(place * np.float32(FENCES)), np.int32(FENCES - 1))
             )
             away = beyond - fences[np.uint64(at), step, 0]
             # The side is not predictable, so that a branch would cost more than arithmetic.
-            out[n] = line - np.int64(away <= np.float32(0.0))
-            if abs(away) > fences[np.uint64(at), step, 1]:
+            out[n] = line - np.int64(away <= zero)
+            if abs(away) > fences[np.uint64(at), step, 1] + doubt:
                 continue
-        scale = scale_at(scales, per_um, z[n])
+        scale = scale_at(scales, per_um, height)
         low = nearest[np.uint64(min(int(place * bins), bins - 1))]
-        shift, known = _cross(
+        shift, slope, clear = _cross(
             points, lines, hot, side, at, line, other, place, low, scale, columns, rows
         )
+        if height < top:
+            # In one segment all along the way that the polyline may have moved.
+            known = clear > sway and abs(beyond - shift) > doubt + abs(slope) * sway
+        else:
+            known = clear >= zero
         if known:
             out[n] = line - np.int64(across[n] - line <= shift)
         else:

@@ -38,6 +38,11 @@ class Edges(NamedTuple):
     more than 5e-5 pixel (mean over the points).  Layers lie at heights
     with equal steps of the logarithm, ``log_z0 + n log_step``.  ``scale``: factor of all
     shifts at heights ``n / per_um`` [um], where one layer serves all (size 0: none).
+
+    ``change`` [bins, (normal, tangential)]: bound of the change of a shift from the topmost layer
+    to heights ``n / per_change`` to ``(n + 1) / per_change`` [um]; ``along``: bound of the
+    tangential shift in the topmost layer; both relative to ``normal``.  ``lowest`` [um]: the
+    height down to which the topmost layer is used with that bound.
     """
 
     weights: np.ndarray
@@ -50,6 +55,10 @@ class Edges(NamedTuple):
     doubts: np.ndarray
     alike: np.ndarray
     shares: np.ndarray
+    change: np.ndarray
+    per_change: float
+    along: float
+    lowest: float
     normal: float
     reach: int
     lanes: int
