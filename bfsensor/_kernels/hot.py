@@ -25,7 +25,7 @@ class Hot(NamedTuple):
     A tile with hot edges owns a page: ``page_of`` [tiles] is its number (-1: none); ``pages``
     [page, side, pixel of the tile] is the place of an edge in ``lines`` [place, point, (normal,
     tangential)], -1 where the edge is not hot.  An edge belongs to the pixel right of or above it.
-    ``fences`` [place, step, (middle, half width)] are bounds of its shift [pixel]; ``edge``
+    ``fences`` [place, (middle, half width), step] are bounds of its shift [pixel]; ``edge``
     [place, (side, line, row or column)] names it.  ``used`` holds the numbers of pages and lines in
     use, and then the tiles of the pages.
     """
@@ -102,8 +102,13 @@ def evaluate(edges, charges, hot, first, last):
     """Find the polylines of the hot edges at the places first to last."""
     g = grid(edges, charges)
     tiles_x = (charges.nx + 15) >> 4
-    for place in range(first, last):
+    # One side after the other, so that their weights stay in the first-level cache.
+    count = last - first
+    for n in range(2 * count):
+        place = first + n % count
         side = hot.edge[place, 0]
+        if side != n // count:
+            continue
         line = np.int64(hot.edge[place, 1])
         other = np.int64(hot.edge[place, 2])
         i = line if side == 0 else other
@@ -149,35 +154,6 @@ def _bin(edges, height):
     return np.uint64(min(at, np.int32(edges.change.shape[0] - 1)))
 
 
-@numba.njit(cache=True, inline="always")
-def _enclose(fences, spread, here, lower, there, upper):
-    """Widen the fences so that they hold a segment, wherever within ``spread``; places in steps."""
-    if there < here:
-        here, there = there, here
-        lower, upper = upper, lower
-    begin = here - spread
-    end = there + spread
-    if end >= np.float32(0.0) and begin < np.float32(FENCES):
-        first = np.int32(max(begin, np.float32(0.0)))
-        last = np.int32(min(end, np.float32(FENCES - 1)))
-        if first == last:
-            at = np.uint64(first)
-            fences[at, 0] = min(fences[at, 0], min(lower, upper))
-            fences[at, 1] = max(fences[at, 1], max(lower, upper))
-        else:
-            slope = np.float32(0.0)
-            if there > here:
-                slope = (upper - lower) / (there - here)
-            for n in range(first, last + 1):
-                at = np.uint64(n)
-                a = max(np.float32(n) - spread, here) - here
-                b = min(np.float32(n + 1) + spread, there) - here
-                a = lower + slope * a
-                b = lower + slope * b
-                fences[at, 0] = min(fences[at, 0], min(a, b))
-                fences[at, 1] = max(fences[at, 1], max(a, b))
-
-
 @numba.njit(cache=True, nogil=True, _nrt=False)
 def fence(edges, charges, hot, first, last):
     """Find the bounds of the shifts of the edges at the places first to last, in steps along them.
@@ -190,47 +166,93 @@ def fence(edges, charges, hot, first, last):
     rows = np.int32((charges.ny - 1) >> 4)
     scale = _top_scale(edges.scale)
     steps = np.float32(FENCES)
-    points = np.uint64(edges.points.size)
+    zero, a_half = np.float32(0.0), np.float32(0.5)
+    count = np.int64(edges.points.size)
+    change = edges.change[_bin(edges, np.float32(edges.lowest)), 1]
     for at in range(first, last):
         side = hot.edge[at, 0]
         line, other = hot.edge[at, 1], hot.edge[at, 2]
-        fences = hot.fences[at]
-        fences[:, 0] = np.float32(np.inf)
-        fences[:, 1] = np.float32(-np.inf)
+        middle, half = hot.fences[at, 0], hot.fences[at, 1]
+        # What the polyline does not pass in full is open.
+        middle[:] = zero
+        half[:] = np.float32(np.inf)
         margin = charges.margins[_tile(side, line, other, columns)]
-        spread = steps * margin * edges.change[_bin(edges, np.float32(edges.lowest)), 1]
-        # No point comes further than this along its edge.
-        most = steps * margin * edges.along
-        begin = end = here = lower = np.float32(0.0)
+        spread = steps * margin * change
+        if not spread < np.float32(1.0):
+            continue
+        back = np.float64(2.0 / FENCES + margin * edges.along)
+        # Of the step that the polyline is in: its end, lowest and highest shift, largest slope.
+        border = np.int64(-1)
+        inside = np.int64(0)
+        lowest = highest = steep = zero
+        # Of the two steps before: largest slopes, and the bounds of the last.
+        steep_1 = steep_2 = middle_1 = half_1 = zero
+        # Steps that the polyline makes where two edges meet, or back.
+        jumps = zero
+        here = lower = zero
         started = False
         for base in range(-1, 2):
             e = _place(hot, side, line, other + base, columns, rows)
             if e < 0:
                 continue
-            for p in range(points):
-                place = steps * np.float32(base + edges.points[p])
-                if margin < np.float32(0.5) and not (
-                    -most - steps < place < steps + most + steps
-                ):
-                    continue
-                place += steps * scale * hot.lines[e, p, 1]
-                shift = scale * hot.lines[e, p, 0]
-                if started:
-                    _enclose(fences, spread, here, lower, place, shift)
-                else:
-                    begin = place
+            points = hot.lines[np.uint64(e)]
+            p = np.int64(0)
+            if base < 0 and margin < np.float32(0.5):
+                # Further back no point reaches this edge.
+                p = count - 1
+                while p > 0 and edges.points[p] - 1.0 > -back:
+                    p -= 1
+            joined = started
+            while p < count and border <= FENCES + 1:
+                there = steps * (
+                    np.float32(base + edges.points[np.uint64(p)])
+                    + scale * points[np.uint64(p), 1]
+                )
+                upper = scale * points[np.uint64(p), 0]
+                p += 1
+                if not started:
                     started = True
-                here = place
-                lower = shift
-            end = here
-        for n in range(FENCES):
-            lowest, highest = fences[n, 0], fences[n, 1]
-            fences[n, 0] = np.float32(0.0)
-            # What the polyline does not pass in full is open.
-            fences[n, 1] = np.float32(np.inf)
-            if begin + spread <= np.float32(n) and end - spread >= np.float32(n + 1):
-                fences[n, 0] = np.float32(0.5) * (lowest + highest)
-                fences[n, 1] = np.float32(0.5) * (highest - lowest) + np.float32(2e-6)
+                    border = max(border, np.int64(np.ceil(there)))
+                elif there < here:
+                    if inside > 0 and there < np.float32(border - 1):
+                        # It was in that step before; it is left open with all others.
+                        half[:] = np.float32(np.inf)
+                        border = np.int64(FENCES + 2)
+                        break
+                    jumps += abs(upper - lower)
+                elif inside > 0 or there >= np.float32(border):
+                    slope = (upper - lower) / (there - here) if there > here else zero
+                    if joined:
+                        jumps += abs(upper - lower)
+                    else:
+                        steep = max(steep, abs(slope))
+                    while there >= np.float32(border) and border <= FENCES + 1:
+                        value = lower + slope * (np.float32(border) - here)
+                        lowest = min(lowest, value)
+                        highest = max(highest, value)
+                        n = border - 1
+                        if inside > 0 and spread == zero and 0 <= n < FENCES:
+                            middle[n] = a_half * (lowest + highest)
+                            half[n] = a_half * (highest - lowest) + np.float32(2e-6)
+                        if inside > 2 and spread > zero and 0 < n <= FENCES:
+                            middle[n - 1] = middle_1
+                            half[n - 1] = half_1 + spread * max(steep, steep_1, steep_2)
+                        middle_1 = a_half * (lowest + highest)
+                        half_1 = a_half * (highest - lowest) + np.float32(2e-6)
+                        steep_2 = steep_1
+                        steep_1 = steep
+                        steep = zero if joined else abs(slope)
+                        lowest = highest = value
+                        inside += 1
+                        border += 1
+                if inside > 0:
+                    lowest = min(lowest, upper)
+                    highest = max(highest, upper)
+                joined = False
+                here = there
+                lower = upper
+        if spread > zero:
+            half += jumps
 
 
 @numba.njit(cache=True, _nrt=False)
@@ -319,10 +341,10 @@ def decide_hot(edges, charges, hot, upright, across, along, z, near, count, out)
             step = np.uint64(
                 min(np.int32(place * np.float32(FENCES)), np.int32(FENCES - 1))
             )
-            away = beyond - fences[np.uint64(at), step, 0]
+            away = beyond - fences[np.uint64(at), np.uint64(0), step]
             # The side is not predictable, so that a branch would cost more than arithmetic.
             out[n] = line - np.int64(away <= zero)
-            if abs(away) > fences[np.uint64(at), step, 1] + doubt:
+            if abs(away) > fences[np.uint64(at), np.uint64(1), step] + doubt:
                 continue
         scale = scale_at(scales, per_um, height)
         low = nearest[np.uint64(min(int(place * bins), bins - 1))]
