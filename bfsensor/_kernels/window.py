@@ -15,7 +15,6 @@ from numba.extending import intrinsic
 
 def _make(lanes, streams):
     """Make the sums over rows of ``lanes`` (8 or 16) for several sets of weights at once."""
-
     if numba.config.DISABLE_JIT:
 
         def plain(weights, first, step, charges, start, stride, rows):
@@ -104,3 +103,95 @@ two_sums_8 = _make(8, 2)
 
 two_sums_16 = _make(16, 2)
 """The same with rows of 16 lanes."""
+
+
+def _make_by_point():
+    """Make the sum over a window for 16 points at once, of which each has two weights."""
+    if numba.config.DISABLE_JIT:
+
+        def plain(weights, first, charges, start, stride, rows, pairs, out, at):
+            at, w = int(at), int(first)
+            for r in range(int(rows)):
+                for c in range(2 * int(pairs)):
+                    charge = charges[int(start) + r * int(stride) + c]
+                    out[at : at + 32] += charge * weights[w : w + 32]
+                    w += 32
+
+        return plain
+
+    @intrinsic
+    def compiled(typingctx, weights, first, charges, start, stride, rows, pairs, out, at):
+        whole = types.uint64
+        signature = types.void(
+            weights, whole, charges, whole, whole, whole, whole, out, whole
+        )
+
+        def codegen(context, builder, sig, args):
+            wide = ir.IntType(64)
+            points = ir.VectorType(ir.FloatType(), 16)
+            w, c, o = (
+                context.make_array(sig.args[n])(context, builder, args[n]).data
+                for n in (0, 2, 7)
+            )
+
+            def whole_number(number):
+                return ir.Constant(wide, number)
+
+            def pointer(array, index):
+                return builder.bitcast(builder.gep(array, [index]), points.as_pointer())
+
+            def load(array, index):
+                value = builder.load(pointer(array, index))
+                value.align = 4
+                return value
+
+            undefined = ir.Constant(points, ir.Undefined)
+            all_first = ir.Constant(ir.VectorType(ir.IntType(32), 16), [0] * 16)
+            zero = ir.Constant(points, [0.0] * 16)
+            # Even and odd columns apart: each sum waits for its last addition.
+            sums = [cgutils.alloca_once_value(builder, zero) for _ in range(4)]
+            size_w = builder.mul(args[6], whole_number(64))
+            with cgutils.for_range(builder, args[5], intp=wide) as row:
+                row_w = builder.add(args[1], builder.mul(row.index, size_w))
+                row_c = builder.add(args[3], builder.mul(row.index, args[4]))
+                with cgutils.for_range(builder, args[6], intp=wide) as pair:
+                    at_w = builder.add(row_w, builder.mul(pair.index, whole_number(64)))
+                    at_c = builder.add(row_c, builder.mul(pair.index, whole_number(2)))
+                    for n in (0, 1):
+                        charge = builder.load(
+                            builder.gep(c, [builder.add(at_c, whole_number(n))])
+                        )
+                        charge = builder.insert_element(
+                            undefined, charge, ir.Constant(ir.IntType(32), 0)
+                        )
+                        charge = builder.shuffle_vector(charge, undefined, all_first)
+                        for m in (0, 1):
+                            total = sums[2 * n + m]
+                            weight = load(
+                                w, builder.add(at_w, whole_number(32 * n + 16 * m))
+                            )
+                            product = builder.fmul(weight, charge, flags=("contract",))
+                            builder.store(
+                                builder.fadd(
+                                    product, builder.load(total), flags=("contract",)
+                                ),
+                                total,
+                            )
+            for m in (0, 1):
+                place = builder.add(args[8], whole_number(16 * m))
+                total = builder.fadd(builder.load(sums[m]), builder.load(sums[2 + m]))
+                total = builder.fadd(total, load(o, place))
+                builder.store(total, pointer(o, place)).align = 4
+            return context.get_dummy_value()
+
+        return signature, codegen
+
+    return compiled
+
+
+add_16_points = _make_by_point()
+"""Add to 16 points' shifts: (weights, first, charges, start, stride, rows, pairs, out, at).
+
+``weights`` [rows, 2 pairs, 2, 16] from index ``first`` on, ``charges`` as for :func:`sum_8`;
+``out`` [2, 16] from index ``at`` on is changed.  All flat float32 arrays, indices uint64.
+"""

@@ -150,7 +150,10 @@ def make_edges(
     nearest = np.abs(centres[:, None] - points).argmin(1)
     normal, doubts = _bounds(modes, points, nearest)
     log_step = float(np.log(heights[1] / heights[0])) if len(heights) > 1 else 1.0
-    change, along = _changes(modes, float(heights[-1]), log_step, float(normal.max()))
+    factor = np.ones(2) if scale is None else np.asarray(scale, float)
+    change, along = _changes(
+        modes, float(heights[-1]), log_step, float(normal.max()), factor
+    )
     used = np.flatnonzero(change[:, 0] <= _DEEPEST)
     per_change = _CHANGE_BINS / float(heights[-1])
     return Edges(
@@ -166,10 +169,11 @@ def make_edges(
         shares=(normal / normal.max() if normal.max() > 0 else np.ones(2)).astype(
             np.float32
         ),
+        by_point=_by_point(modes, float(factor[-1])),
         change=change,
         per_change=per_change,
         along=along,
-        lowest=float(used[0] / per_change) if len(heights) > 1 else 0.0,
+        lowest=float(used[0] / per_change),
         normal=float(normal.max()),
         reach=int(reach),
         lanes=lanes,
@@ -185,6 +189,30 @@ def _pack(weights: FloatArray, lanes: int) -> NDArray[np.float32]:
     packed = np.zeros((*weights.shape[:-1], lanes), np.float32)
     packed[..., : weights.shape[-1]] = weights
     return packed.swapaxes(1, 2).ravel()
+
+
+def _by_point(
+    modes: list[tuple[FloatArray, FloatArray]], factor: float
+) -> NDArray[np.float32]:
+    """Weights of the topmost layer with the points side by side, as ``Edges.by_point``."""
+    points = modes[0][0].shape[1]
+    blocks = (points + 15) // 16
+    sides = []
+    for side in (0, 1):
+        weights = [factor * mode[side][-1] for mode in modes]
+        sums = [w.sum((-2, -1))[..., None] for w in weights]
+        if len(sums) == 1:
+            sums.append(np.zeros_like(sums[0]))
+        flat = []
+        for w in weights:
+            size = max(w.shape[-2:])
+            square = np.zeros((points, 2, size, size))
+            square[..., : w.shape[-2], : w.shape[-1]] = w
+            flat.append(square.reshape(points, 2, -1))
+        packed = np.zeros((16 * blocks, 2, 2 + sum(f.shape[-1] for f in flat)))
+        packed[:points] = np.concatenate([*sums, *flat], -1)
+        sides.append(packed.reshape(blocks, 16, 2, -1).transpose(0, 3, 2, 1))
+    return np.stack(sides).astype(np.float32).ravel()
 
 
 def _bounds(
@@ -246,7 +274,11 @@ def _bounds(
 
 
 def _changes(
-    modes: list[tuple[FloatArray, FloatArray]], top: float, log_step: float, normal: float
+    modes: list[tuple[FloatArray, FloatArray]],
+    top: float,
+    log_step: float,
+    normal: float,
+    factor: FloatArray,
 ) -> tuple[NDArray[np.float32], float]:
     """Bounds by which shifts change from the topmost layer to a height, and of those along edges.
 
@@ -254,7 +286,8 @@ def _changes(
     -------
     change : ndarray, shape (bins, 2)
         Bound of the change of the normal and of the tangential shift, relative to ``normal``, in
-        equal bins of height from 0 to ``top`` [um].
+        equal bins of height from 0 to ``top`` [um]; ``factor`` multiplies all shifts, on equal
+        steps of the same height.
     along : float
         Bound of the tangential shift in the topmost layer, relative to ``normal``.
     """
@@ -278,9 +311,16 @@ def _changes(
     # In the lower half between two layers the lower one may be taken in place of both.
     at = np.where(at % 1.0 <= 0.501, np.floor(at), at)
     change = np.stack([np.interp(at, np.arange(layers), c) for c in by_layer.T], 1)
+    per_normal = 1.0 / normal if normal > 0 else 0.0
+    # A factor of the height moves points by what it takes from the whole shift.
+    less = np.abs(factor - factor[-1])
+    less = np.maximum.accumulate(less[::-1])[::-1]
+    part = less[np.arange(_CHANGE_BINS) * (len(less) - 1) // _CHANGE_BINS]
+    change = per_normal * change * np.abs(factor).max() + np.stack(
+        [part, part * per_normal * along], 1
+    )
     # Room for the rounding to single precision.
-    per_normal = 1.0001 / normal if normal > 0 else 0.0
-    return (per_normal * change).astype(np.float32), per_normal * along
+    return (1.0001 * change).astype(np.float32), 1.0001 * per_normal * along
 
 
 def _alike(
