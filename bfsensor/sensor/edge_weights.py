@@ -29,7 +29,7 @@ bounds are tighter by as little."""
 _DEEPEST = 0.03
 """Largest change of shifts, relative to their bound, down to which the topmost layer is used.
 
-Chosen: with it both LSST devices are served down to 34 um below the back surface; electrons within
+Chosen: with it both LSST devices are served down to 35 um below the back surface; electrons within
 the change of an edge are held against their own layers, twice as many at twice as much."""
 
 RANGES = np.append(250.0 * 2.0 ** (np.arange(97) / 8), np.inf)
