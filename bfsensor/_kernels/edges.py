@@ -110,35 +110,80 @@ def collect(edges, charges, hot, x, y, z, lo, hi, near_x, near_y, out_i, out_j):
     margins = charges.margins
     share_x, share_y = edges.shares[0], edges.shares[1]
     tiles_x = (nx + 15) // 16
-    # Not 0, of which numba would make a type and compile all below for it as well.
+    last_i, last_j = np.int32(nx - 1), np.int32(ny - 1)
+    # Loops that write one array each and look nothing up compile to vector code.
+    first, count = np.uint64(lo), np.uint64(hi - lo)
+    left, right, below, above = last_i, np.int32(0), last_j, np.int32(0)
+    for m in range(count):
+        # Truncation is the floor for what is not negative.
+        ax = min(max(x[first + m], -1.0), nx + 1.0)
+        i = np.int32(np.int32(ax + 1.0) - np.int32(1))
+        out_i[first + m] = i
+        left = min(left, i)
+        right = max(right, i)
+    for m in range(count):
+        ay = min(max(y[first + m], -1.0), ny + 1.0)
+        j = np.int32(np.int32(ay + 1.0) - np.int32(1))
+        out_j[first + m] = j
+        below = min(below, j)
+        above = max(above, j)
+    # A margin that holds for all of them, if they are in few tiles.
+    left, right = max(left, np.int32(0)) >> 4, min(right, last_i) >> 4
+    below, above = max(below, np.int32(0)) >> 4, min(above, last_j) >> 4
+    smallest, largest = np.float32(0.0), np.float32(1.0)
+    if 8 * np.int64(right - left + 1) * np.int64(above - below + 1) < 512 + hi - lo:
+        smallest, largest = np.float32(1.0), np.float32(0.0)
+        for row in range(below, above + 1):
+            for column in range(left, right + 1):
+                margin = margins[np.uint64(row * tiles_x + column)]
+                smallest = min(smallest, margin)
+                largest = max(largest, margin)
+    half_x = 0.5 - largest * share_x
+    half_y = 0.5 - largest * share_y
+    for m in range(count):
+        ax = x[first + m]
+        ay = y[first + m]
+        here = (z[first + m] >= np.float32(0.0)) & (ax >= -1.0) & (ay >= -1.0)
+        here = here & (ax < nx + 1.0) & (ay < ny + 1.0)
+        bx = here & (abs(ax - out_i[first + m] - 0.5) > half_x)
+        by = here & (abs(ay - out_j[first + m] - 0.5) > half_y)
+        near_x[m] = np.int32(bx) + np.int32(2) * np.int32(by)
+    # Who is near an edge is listed without a branch.  Not 0, of which numba would make a type and
+    # compile all below for it as well.
     count_x = np.int64(0)
     count_y = np.int64(0)
-    # Where they land; who is near an edge is listed without a branch.
-    for n in range(np.uint64(lo), np.uint64(hi)):
-        ax = x[n]
-        ay = y[n]
-        here = z[n] >= 0.0 and -1.0 <= ax < nx + 1 and -1.0 <= ay < ny + 1
-        ax = ax if here else -1.0
-        ay = ay if here else -1.0
-        # Truncation is the floor for what is not negative.
-        i = np.int32(np.int32(ax + 1.0) - np.int32(1))
-        j = np.int32(np.int32(ay + 1.0) - np.int32(1))
-        out_i[n] = i
-        out_j[n] = j
-        column = min(max(i, np.int32(0)), np.int32(nx - 1)) >> 4
-        row = min(max(j, np.int32(0)), np.int32(ny - 1)) >> 4
-        margin = margins[np.uint64(row * tiles_x + column)]
-        bx = abs(ax - i - 0.5)
-        by = abs(ay - j - 0.5)
-        near_x[np.uint64(count_x)] = n
-        near_y[np.uint64(count_y)] = n
-        count_x += here and bx > 0.5 - margin * share_x
-        count_y += here and by > 0.5 - margin * share_y
+    if smallest >= np.float32(0.5) * largest:
+        for m in range(count):
+            flags = near_x[m]
+            near_x[np.uint64(count_x)] = np.int32(first + m)
+            near_y[np.uint64(count_y)] = np.int32(first + m)
+            count_x += flags & np.int32(1)
+            count_y += flags >> np.int32(1)
+    else:
+        # Each by the margin of its own tile.
+        some = np.int64(0)
+        for m in range(count):
+            flags = near_x[m]
+            near_x[np.uint64(some)] = np.int32(first + m)
+            some += flags != np.int32(0)
+        for m in range(np.uint64(some)):
+            n = np.uint64(near_x[m])
+            i, j = out_i[n], out_j[n]
+            column = min(max(i, np.int32(0)), last_i) >> 4
+            row = min(max(j, np.int32(0)), last_j) >> 4
+            margin = margins[np.uint64(row * tiles_x + column)]
+            near_x[np.uint64(count_x)] = np.int32(n)
+            near_y[np.uint64(count_y)] = np.int32(n)
+            count_x += abs(x[n] - i - 0.5) > 0.5 - margin * share_x
+            count_y += abs(y[n] - j - 0.5) > 0.5 - margin * share_y
     _decide(edges, charges, hot, True, x, y, z, near_x, count_x, out_i)
     _decide(edges, charges, hot, False, y, x, z, near_y, count_y, out_j)
     for n in range(np.uint64(lo), np.uint64(hi)):
-        if not (0 <= out_i[n] < nx and 0 <= out_j[n] < ny):
-            out_i[n] = -1
+        i = out_i[n]
+        j = out_j[n]
+        inside = (i >= np.int32(0)) & (i <= last_i) & (j >= np.int32(0)) & (j <= last_j)
+        inside = inside & (z[n] >= np.float32(0.0))
+        out_i[n] = i if inside else np.int32(-1)
 
 
 @numba.njit(cache=True, inline="always")

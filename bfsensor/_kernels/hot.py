@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from bfsensor._kernels.shifts import both_shifts, grid, scale_at
+from bfsensor._kernels.window import add_16_points
 
 FENCES = 16
 """Number of steps along an edge for which bounds of its shift are stored.
@@ -23,9 +23,11 @@ class Hot(NamedTuple):
     """Store of the hot edges, with their shifts in the topmost layer.
 
     A tile with hot edges owns a page: ``page_of`` [tiles] is its number (-1: none); ``pages``
-    [page, side, pixel of the tile] is the place of an edge in ``lines`` [place, point, (normal,
-    tangential)], -1 where the edge is not hot.  An edge belongs to the pixel right of or above it.
-    ``fences`` [place, step, (middle, half width)] are bounds of its shift [pixel]; ``edge``
+    [page, side, pixel of the tile] is the place of an edge in ``lines`` [place, (16 points at a
+    time, (normal, tangential), point)], -1 where the edge is not hot.  An edge belongs to the pixel
+    right of or above it.  ``fences`` [place, step, 4] are bounds of its shift [pixel]: a line by
+    its value at the beginning of the step and its rise over it, the half width about that line,
+    and what is added to it for electrons below the topmost layer; ``edge``
     [place, (side, line, row or column)] names it.  ``used`` holds the numbers of pages and lines in
     use, and then the tiles of the pages.
     """
@@ -49,6 +51,14 @@ def _place(hot, side, line, other, columns, rows):
     if page < 0:
         return np.int32(-1)
     return hot.pages[np.uint64(page), np.uint64(side), np.uint64((j & 15) * 16 + (i & 15))]
+
+
+@numba.njit(cache=True, inline="always")
+def _tile(side, line, other, columns):
+    """Tile of the pixel that an edge belongs to."""
+    i = line if side == 0 else other
+    j = other if side == 0 else line
+    return np.uint64((j >> 4) * (columns + 1) + (i >> 4))
 
 
 @numba.njit(cache=True, _nrt=False)
@@ -92,190 +102,200 @@ def heat(edges, charges, hot, side, line, other):
 @numba.njit(cache=True, nogil=True, _nrt=False)
 def evaluate(edges, charges, hot, first, last):
     """Find the polylines of the hot edges at the places first to last."""
-    g = grid(edges, charges)
-    tiles_x = (charges.nx + 15) >> 4
-    for place in range(first, last):
-        side = hot.edge[place, 0]
+    q = edges.reach
+    stride = np.uint64(charges.stride)
+    # Blocks of 16 points, each with the sums over all sources and then the sources by row, whose
+    # columns are even in number.
+    blocks = (edges.points.size + 15) // 16
+    pairs = q + 1
+    far = (2 * q + 2) * 2 * pairs
+    size = 32 * (2 + far + (16 if edges.modes == 2 else 0))
+    # One side after the other, so that their weights stay in the first-level cache.
+    count = last - first
+    for n in range(2 * count):
+        place = first + n % count
+        side = np.int64(hot.edge[place, 0])
+        if side != n // count:
+            continue
         line = np.int64(hot.edge[place, 1])
         other = np.int64(hot.edge[place, 2])
-        i = line if side == 0 else other
-        j = other if side == 0 else line
-        tile = (j >> 4) * tiles_x + (i >> 4)
-        for point in range(edges.points.size):
-            normal, tangential = both_shifts(
-                edges.weights, edges.sums, charges.first, charges.second, g, side == 0,
-                edges.layers - 1, point, line, other, charges.low_first[tile],
-                charges.low_second[tile],
+        column, row = (line - q - 1, other - q) if side == 0 else (other - q, line - q - 1)
+        at = (row + charges.pad) * charges.stride + column + charges.pad
+        at_near = at + (q - 1) * (charges.stride + 1)
+        tile = _tile(side, line, other, (charges.nx - 1) >> 4)
+        low = charges.low_first[tile]
+        low_second = charges.low_second[tile]
+        shifts = hot.lines[place]
+        for block in range(blocks):
+            begin = np.uint64((side * blocks + block) * size)
+            to = np.uint64(32 * block)
+            for k in range(np.uint64(32)):
+                shifts[to + k] = (
+                    -edges.by_point[begin + k] * low
+                    - edges.by_point[begin + np.uint64(32) + k] * low_second
+                )
+            add_16_points(
+                edges.by_point, begin + np.uint64(64), charges.first, np.uint64(at), stride,
+                np.uint64(2 * q + 1 + side), np.uint64(pairs), shifts, to,
             )  # fmt: skip
-            hot.lines[place, point, 0] = normal
-            hot.lines[place, point, 1] = tangential
+            if edges.modes == 2:
+                add_16_points(
+                    edges.by_point, begin + np.uint64(64 + 32 * far), charges.second,
+                    np.uint64(at_near), stride, np.uint64(3 + side), np.uint64(2), shifts, to,
+                )  # fmt: skip
 
 
 @numba.njit(cache=True, inline="always")
-def _top_scale(scale):
-    """Factor of the shifts at the back surface."""
-    return scale[scale.size - 1] if scale.size > 0 else np.float32(1.0)
-
-
-@numba.njit(cache=True, _nrt=False)
-def _tops(edges):
-    """Heights [um] above which the shifts are those of the topmost layer, and with the top's factor."""
-    top = np.float32(-1.0)
-    if edges.layers > 1:
-        # Within a thousandth of the step to the topmost layer.
-        top = np.float32(np.exp(edges.log_z0 + (edges.layers - 1.001) * edges.log_step))
-    scale = edges.scale
-    n = scale.size - 1
-    if n < 0:
-        return top, top
-    while n > 0 and scale[n - 1] == scale[scale.size - 1]:
-        n -= 1
-    # Rounding of the place in the table: half a step is plenty.
-    return top, max(top, np.float32((n + 0.5) / edges.per_um))
-
-
-@numba.njit(cache=True, _nrt=False)
-def _enclose(fences, here, lower, there, upper):
-    """Widen the fences so that they hold a segment; places in steps."""
-    if there < here:
-        here, there = there, here
-        lower, upper = upper, lower
-    if there < np.float32(0.0) or here >= np.float32(FENCES):
-        return
-    first = np.int64(max(here, np.float32(0.0)))
-    last = np.int64(min(there, np.float32(FENCES - 1)))
-    slope = np.float32(0.0)
-    if there > here:
-        slope = (upper - lower) / (there - here)
-    for n in range(first, last + 1):
-        a = lower + slope * (max(np.float32(n), here) - here)
-        b = lower + slope * (min(np.float32(n + 1), there) - here)
-        fences[np.uint64(n), 0] = min(fences[np.uint64(n), 0], min(a, b))
-        fences[np.uint64(n), 1] = max(fences[np.uint64(n), 1], max(a, b))
+def _bin(edges, height):
+    """Row of ``Edges.change`` for a height [um]."""
+    at = np.int32(height * np.float32(edges.per_change))
+    return np.uint64(min(at, np.int32(edges.change.shape[0] - 1)))
 
 
 @numba.njit(cache=True, nogil=True, _nrt=False)
 def fence(edges, charges, hot, first, last):
     """Find the bounds of the shifts of the edges at the places first to last, in steps along them.
 
-    All hot edges must have been evaluated, because a step may reach into the next edge.
+    All hot edges must have been evaluated, because a step may reach into the next edge.  The
+    bounds hold for the points of the topmost layer, each moved along the edge by as much as
+    ``Edges.change`` allows at the lowest height that is decided by them.
     """
     columns = np.int32((charges.nx - 1) >> 4)
     rows = np.int32((charges.ny - 1) >> 4)
-    scale = _top_scale(edges.scale)
     steps = np.float32(FENCES)
+    zero, a_half = np.float32(0.0), np.float32(0.5)
+    count = np.int64(edges.points.size)
+    change = edges.change[_bin(edges, np.float32(edges.lowest)), 1]
     for at in range(first, last):
         side = hot.edge[at, 0]
+        line, other = hot.edge[at, 1], hot.edge[at, 2]
         fences = hot.fences[at]
-        fences[:, 0] = np.float32(np.inf)
-        fences[:, 1] = np.float32(-np.inf)
-        begin = end = here = lower = np.float32(0.0)
+        # What the polyline does not pass in full is open.
+        fences[:] = np.float32(np.inf)
+        tile = _tile(side, line, other, columns)
+        margin = charges.margins[tile]
+        spread = steps * margin * change
+        if not spread < np.float32(1.0):
+            continue
+        back = np.float64(2.0 / FENCES + margin * edges.along)
+        # Rounding of the shifts, here and where they are summed for one electron.
+        low = abs(charges.low_first[tile]) + abs(charges.low_second[tile])
+        slack = np.float32(2e-6) + np.float32(1e-5) * (
+            margin + np.float32(edges.normal) * low
+        )
+        # Of the step that the polyline is in: its end, shift and slope where it begins, lowest and
+        # highest shift beside that line, largest slope; then those of the two steps before.
+        border = np.int64(-1)
+        inside = np.int64(0)
+        begin = rise = lowest = highest = steep = steep_1 = steep_2 = zero
+        # Steps that the polyline makes where two edges meet, or back.
+        jumps = zero
+        here = lower = zero
         started = False
         for base in range(-1, 2):
-            e = _place(hot, side, hot.edge[at, 1], hot.edge[at, 2] + base, columns, rows)
+            e = _place(hot, side, line, other + base, columns, rows)
             if e < 0:
                 continue
-            for p in range(edges.points.size):
-                place = np.float32(base + edges.points[p])
-                place = steps * (place + scale * hot.lines[e, p, 1])
-                shift = scale * hot.lines[e, p, 0]
-                if started:
-                    _enclose(fences, here, lower, place, shift)
-                else:
-                    begin = place
+            points = hot.lines[np.uint64(e)]
+            p = np.int64(0)
+            if base < 0 and margin < np.float32(0.5):
+                # Further back no point reaches this edge.
+                p = count - 1
+                while p > 0 and edges.points[p] - 1.0 > -back:
+                    p -= 1
+            joined = started
+            while p < count and border <= FENCES + 1:
+                at_point = np.uint64((p >> 4) * 32 + (p & 15))
+                there = steps * (
+                    np.float32(base + edges.points[np.uint64(p)])
+                    + points[at_point + np.uint64(16)]
+                )
+                upper = points[at_point]
+                p += 1
+                if not started:
                     started = True
-                here = place
-                lower = shift
-            end = here
-        for n in range(FENCES):
-            lowest, highest = fences[n, 0], fences[n, 1]
-            fences[n, 0] = np.float32(0.0)
-            # What the polyline does not pass in full is open.
-            fences[n, 1] = np.float32(np.inf)
-            if begin <= np.float32(n) and end >= np.float32(n + 1):
-                fences[n, 0] = np.float32(0.5) * (lowest + highest)
-                fences[n, 1] = np.float32(0.5) * (highest - lowest) + np.float32(2e-6)
-
-
-@numba.njit(cache=True, _nrt=False)
-def _cross(points, lines, hot, side, at, line, other, place, low, scale, columns, rows):
-    """Shift of a hot polyline at ``place`` along an edge, and whether all of it is hot.
-
-    The search starts at the point ``low`` and goes to the segment that encloses the place, if
-    need be on the next edge of the line.
-    """
-    last = points.size - 1
-    base = 0
-    p = low
-    e = np.uint64(at)
-    here = np.float32(points[np.uint64(p)]) + scale * lines[e, np.uint64(p), 1]
-    lower = lines[e, np.uint64(p), 0]
-    up = here <= place
-    while True:
-        p += 1 if up else -1
-        if p < 0 or p > last:
-            base += 1 if up else -1
-            if abs(base) > 1:
-                return np.float32(0.0), False
-            at = _place(hot, side, line, other + base, columns, rows)
-            if at < 0:
-                return np.float32(0.0), False
-            e = np.uint64(at)
-            p = 0 if up else last
-        there = np.float32(base + points[np.uint64(p)]) + scale * lines[e, np.uint64(p), 1]
-        upper = lines[e, np.uint64(p), 0]
-        if (there > place) if up else (there <= place):
-            break
-        here = there
-        lower = upper
-    share = np.float32(0.0)
-    if there != here:
-        share = min(max((place - here) / (there - here), np.float32(0.0)), np.float32(1.0))
-    return scale * (lower + share * (upper - lower)), True
+                    border = max(border, np.int64(np.ceil(there)))
+                elif there < here:
+                    if inside > 0 and there < np.float32(border - 1):
+                        # It was in that step before; it is left open with all others.
+                        fences[:] = np.float32(np.inf)
+                        border = np.int64(FENCES + 2)
+                        break
+                    jumps += abs(upper - lower)
+                elif inside > 0 or there >= np.float32(border):
+                    slope = (upper - lower) / (there - here) if there > here else zero
+                    if joined:
+                        jumps += abs(upper - lower)
+                    else:
+                        steep = max(steep, abs(slope))
+                    while there >= np.float32(border) and border <= FENCES + 1:
+                        value = lower + slope * (np.float32(border) - here)
+                        lowest = min(lowest, value - begin - rise)
+                        highest = max(highest, value - begin - rise)
+                        n = border - 1
+                        if inside > 0 and 0 <= n < FENCES:
+                            row = np.uint64(n)
+                            fences[row, 0] = begin + a_half * (lowest + highest)
+                            fences[row, 1] = rise
+                            fences[row, 2] = a_half * (highest - lowest) + slack
+                        if inside > 2 and 0 < n <= FENCES:
+                            most = max(steep, steep_1, steep_2)
+                            fences[np.uint64(n - 1), 3] = spread * most
+                        steep_2 = steep_1
+                        steep_1 = steep
+                        rise = zero if joined else slope
+                        steep = abs(rise)
+                        begin = value
+                        lowest = highest = zero
+                        inside += 1
+                        border += 1
+                if inside > 0:
+                    beside = upper - begin - rise * (there - np.float32(border - 1))
+                    lowest = min(lowest, beside)
+                    highest = max(highest, beside)
+                joined = False
+                here = there
+                lower = upper
+        for n in range(np.uint64(FENCES)):
+            fences[n, 3] += jumps
 
 
 @numba.njit(cache=True, nogil=True, _nrt=False)
 def decide_hot(edges, charges, hot, upright, across, along, z, near, count, out):
-    """Decide the electrons in ``near`` that are at hot edges; the others stay listed.
+    """Decide the electrons in ``near`` that are outside the bounds of hot edges.
 
-    Returns how many these are.
+    The bounds are those of the topmost layer.  The polyline of an electron further down differs
+    by no more than ``Edges.change`` says.  Returns how many electrons stay listed.
     """
-    scales, per_um = edges.scale, np.float32(edges.per_um)
-    points, nearest, lines, fences = edges.points, edges.nearest, hot.lines, hot.fences
-    bins = nearest.size
+    fences, change = hot.fences, edges.change
     side = 0 if upright else 1
     columns = np.int32((charges.nx - 1) >> 4)
     rows = np.int32((charges.ny - 1) >> 4)
-    top, same = _tops(edges)
+    lowest = np.float32(edges.lowest)
     left = 0
     for m in range(np.uint64(count)):
         n = np.uint64(near[m])
         line = np.int64(across[n] + 1.5) - 1
         other = np.int64(along[n] + 1.0) - 1
         at = _place(hot, side, line, other, columns, rows)
-        if at < 0 or z[n] < top:
-            near[np.uint64(left)] = np.int32(n)
+        height = z[n]
+        near[np.uint64(left)] = np.int32(n)
+        if at < 0 or height < lowest:
             left += 1
             continue
-        place = np.float32(along[n] - other)
-        beyond = np.float32(across[n] - line)
-        if z[n] >= same:
-            step = np.uint64(
-                min(np.int32(place * np.float32(FENCES)), np.int32(FENCES - 1))
-            )
-            away = beyond - fences[np.uint64(at), step, 0]
-            # The side is not predictable, so that a branch would cost more than arithmetic.
-            out[n] = line - np.int64(away <= np.float32(0.0))
-            if abs(away) > fences[np.uint64(at), step, 1]:
-                continue
-        scale = scale_at(scales, per_um, z[n])
-        low = nearest[np.uint64(min(int(place * bins), bins - 1))]
-        shift, known = _cross(
-            points, lines, hot, side, at, line, other, place, low, scale, columns, rows
-        )
-        if known:
-            out[n] = line - np.int64(across[n] - line <= shift)
-        else:
-            near[np.uint64(left)] = np.int32(n)
-            left += 1
+        place = np.float32(along[n] - other) * np.float32(FENCES)
+        step = np.uint64(min(np.int32(place), np.int32(FENCES - 1)))
+        row = fences[np.uint64(at), step]
+        line_there = row[0] + row[1] * (place - np.float32(step))
+        away = np.float32(across[n] - line) - line_there
+        doubt = row[2]
+        more = change[_bin(edges, height), 0]
+        if more > np.float32(0.0):
+            # A margin that is cut off is no bound.
+            margin = charges.margins[_tile(side, line, other, columns)]
+            more *= margin if margin < np.float32(0.5) else np.float32(np.inf)
+            doubt += more + row[3]
+        # The side is not predictable, so that a branch would cost more than arithmetic.
+        out[n] = line - np.int64(away <= np.float32(0.0))
+        left += not abs(away) > doubt
     return left

@@ -38,6 +38,15 @@ class Edges(NamedTuple):
     more than 5e-5 pixel (mean over the points).  Layers lie at heights
     with equal steps of the logarithm, ``log_z0 + n log_step``.  ``scale``: factor of all
     shifts at heights ``n / per_um`` [um], where one layer serves all (size 0: none).
+
+    ``by_point``: weights of the topmost layer for 16 points at a time, flat: [side, points / 16,
+    source, (normal, tangential), 16].  The first two sources are the sums over all others, by
+    mode; then come those of the first mode, in 2 reach + 2 rows and columns, and those of the
+    second in 4 of each, with zeros where a window is smaller.  ``change`` [bins, (normal,
+    tangential)]: bound of the change of a shift from the topmost layer to heights
+    ``n / per_change`` to ``(n + 1) / per_change`` [um]; ``along``: bound of the tangential shift
+    in the topmost layer; both relative to ``normal``.  ``lowest`` [um]: the height down to which
+    the topmost layer is used with that bound.
     """
 
     weights: np.ndarray
@@ -50,6 +59,11 @@ class Edges(NamedTuple):
     doubts: np.ndarray
     alike: np.ndarray
     shares: np.ndarray
+    by_point: np.ndarray
+    change: np.ndarray
+    per_change: float
+    along: float
+    lowest: float
     normal: float
     reach: int
     lanes: int

@@ -72,12 +72,12 @@ def finish_block(image, plan, edges, charges, hot, ledger, response):
         if plan.block > 0:
             size = _size(plan, ledger.sums[TOTAL])
             ahead = np.float32(0.5 * size / ledger.sums[IN_BLOCK])
-    # As many electrons as make it worth while: an edge costs about so many lookups.
+    # As many electrons as make it worth while: an edge costs about so many lookups (measured).
     photons = ledger.counters[PHOTONS] - ledger.counters[OPENED]
     per_photon = np.float32(np.inf)
     if photons > 0:
         per_photon = np.float32(ledger.sums[IN_BLOCK] / photons)
-    crowd = np.float32(0.05) * per_photon * np.float32(edges.points.size * edges.lanes)
+    crowd = per_photon * np.float32(3.0 + 0.01 * edges.points.size * edges.lanes)
     ledger.counters[OPENED] = ledger.counters[PHOTONS]
     close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_photon)
     ledger.sums[BEFORE] = ledger.sums[IN_BLOCK]

@@ -1,8 +1,8 @@
 """Vector code for the innermost sum of the sensor: weights times the charges in a pixel window.
 
-LLVM does not vectorise these short rows by itself; written out with vectors of eight
-floats the sum is four times as fast.  Eight partial sums are added pairwise, always in
-the same order.
+LLVM does not vectorise these short rows by itself; written out with vectors as long as a
+row the sum is four times as fast.  Partial sums are added pairwise, always in the same
+order.
 """
 
 import numba
@@ -12,14 +12,9 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-_EIGHT = ir.VectorType(ir.FloatType(), 8)
-"""Type of eight single-precision numbers, by definition what AVX registers of 256 bits hold."""
 
-
-def _make(blocks, streams):
-    """Make the sums over rows of ``8 blocks`` lanes for several sets of weights at once."""
-    lanes = 8 * blocks
-
+def _make(lanes, streams):
+    """Make the sums over rows of ``lanes`` (8 or 16) for several sets of weights at once."""
     if numba.config.DISABLE_JIT:
 
         def plain(weights, first, step, charges, start, stride, rows):
@@ -43,37 +38,30 @@ def _make(blocks, streams):
 
         def codegen(context, builder, sig, args):
             wide = ir.IntType(64)
+            row_type = ir.VectorType(ir.FloatType(), lanes)
             w = context.make_array(sig.args[0])(context, builder, args[0]).data
             c = context.make_array(sig.args[3])(context, builder, args[3]).data
-            zero = ir.Constant(_EIGHT, [0.0] * 8)
-            sums = [
-                [cgutils.alloca_once_value(builder, zero) for _ in range(blocks)]
-                for _ in range(streams)
-            ]
+            zero = ir.Constant(row_type, [0.0] * lanes)
+            sums = [cgutils.alloca_once_value(builder, zero) for _ in range(streams)]
             firsts = [args[1]]
             for _ in range(1, streams):
                 firsts.append(builder.add(firsts[-1], args[2]))
 
             def load(pointer, index):
-                at = builder.bitcast(builder.gep(pointer, [index]), _EIGHT.as_pointer())
+                at = builder.bitcast(builder.gep(pointer, [index]), row_type.as_pointer())
                 value = builder.load(at)
                 value.align = 4
                 return value
 
             with cgutils.for_range(builder, args[6], intp=wide) as loop:
                 row_w = builder.mul(loop.index, ir.Constant(wide, lanes))
-                at_c = builder.add(args[4], builder.mul(loop.index, args[5]))
-                for block in range(blocks):
-                    offset = ir.Constant(wide, 8 * block)
-                    charge = load(c, builder.add(at_c, offset))
-                    for stream in range(streams):
-                        at_w = builder.add(builder.add(firsts[stream], row_w), offset)
-                        product = builder.fmul(load(w, at_w), charge, flags=("contract",))
-                        total = builder.fadd(
-                            product, builder.load(sums[stream][block]), flags=("contract",)
-                        )
-                        builder.store(total, sums[stream][block])
-            results = [_total(builder, stream) for stream in sums]
+                charge = load(c, builder.add(args[4], builder.mul(loop.index, args[5])))
+                for first, total in zip(firsts, sums, strict=True):
+                    weight = load(w, builder.add(first, row_w))
+                    product = builder.fmul(weight, charge, flags=("contract",))
+                    added = builder.fadd(product, builder.load(total), flags=("contract",))
+                    builder.store(added, total)
+            results = [_total(builder, builder.load(total), lanes) for total in sums]
             if streams == 1:
                 return results[0]
             return context.make_tuple(builder, sig.return_type, results)
@@ -83,17 +71,15 @@ def _make(blocks, streams):
     return compiled
 
 
-def _total(builder, blocks):
-    """Add eight lanes pairwise."""
+def _total(builder, total, lanes):
+    """Add the lanes pairwise."""
     narrow = ir.IntType(32)
-    total = builder.load(blocks[0])
-    for block in blocks[1:]:
-        total = builder.fadd(total, builder.load(block))
-    for half in (4, 2, 1):
+    while lanes > 1:
+        lanes //= 2
         undefined = ir.Constant(total.type, ir.Undefined)
-        pick = ir.VectorType(narrow, half)
-        low = ir.Constant(pick, list(range(half)))
-        high = ir.Constant(pick, list(range(half, 2 * half)))
+        pick = ir.VectorType(narrow, lanes)
+        low = ir.Constant(pick, list(range(lanes)))
+        high = ir.Constant(pick, list(range(lanes, 2 * lanes)))
         total = builder.fadd(
             builder.shuffle_vector(total, undefined, low),
             builder.shuffle_vector(total, undefined, high),
@@ -101,7 +87,7 @@ def _total(builder, blocks):
     return builder.extract_element(total, ir.Constant(narrow, 0))
 
 
-sum_8 = _make(1, 1)
+sum_8 = _make(8, 1)
 """Sum over rows of 8 lanes: (weights, first, 0, charges, start, stride, rows) -> float32.
 
 ``weights`` [rows, 8] from index ``first`` on, ``charges`` from ``start`` on with
@@ -109,11 +95,103 @@ sum_8 = _make(1, 1)
 checked: both arrays must hold all that is read.
 """
 
-sum_16 = _make(2, 1)
+sum_16 = _make(16, 1)
 """The same with rows of 16 lanes."""
 
-two_sums_8 = _make(1, 2)
+two_sums_8 = _make(8, 2)
 """Two sums with weights ``step`` (third argument) apart; the charges are read once."""
 
-two_sums_16 = _make(2, 2)
+two_sums_16 = _make(16, 2)
 """The same with rows of 16 lanes."""
+
+
+def _make_by_point():
+    """Make the sum over a window for 16 points at once, of which each has two weights."""
+    if numba.config.DISABLE_JIT:
+
+        def plain(weights, first, charges, start, stride, rows, pairs, out, at):
+            at, w = int(at), int(first)
+            for r in range(int(rows)):
+                for c in range(2 * int(pairs)):
+                    charge = charges[int(start) + r * int(stride) + c]
+                    out[at : at + 32] += charge * weights[w : w + 32]
+                    w += 32
+
+        return plain
+
+    @intrinsic
+    def compiled(typingctx, weights, first, charges, start, stride, rows, pairs, out, at):
+        whole = types.uint64
+        signature = types.void(
+            weights, whole, charges, whole, whole, whole, whole, out, whole
+        )
+
+        def codegen(context, builder, sig, args):
+            wide = ir.IntType(64)
+            points = ir.VectorType(ir.FloatType(), 16)
+            w, c, o = (
+                context.make_array(sig.args[n])(context, builder, args[n]).data
+                for n in (0, 2, 7)
+            )
+
+            def whole_number(number):
+                return ir.Constant(wide, number)
+
+            def pointer(array, index):
+                return builder.bitcast(builder.gep(array, [index]), points.as_pointer())
+
+            def load(array, index):
+                value = builder.load(pointer(array, index))
+                value.align = 4
+                return value
+
+            undefined = ir.Constant(points, ir.Undefined)
+            all_first = ir.Constant(ir.VectorType(ir.IntType(32), 16), [0] * 16)
+            zero = ir.Constant(points, [0.0] * 16)
+            # Even and odd columns apart: each sum waits for its last addition.
+            sums = [cgutils.alloca_once_value(builder, zero) for _ in range(4)]
+            size_w = builder.mul(args[6], whole_number(64))
+            with cgutils.for_range(builder, args[5], intp=wide) as row:
+                row_w = builder.add(args[1], builder.mul(row.index, size_w))
+                row_c = builder.add(args[3], builder.mul(row.index, args[4]))
+                with cgutils.for_range(builder, args[6], intp=wide) as pair:
+                    at_w = builder.add(row_w, builder.mul(pair.index, whole_number(64)))
+                    at_c = builder.add(row_c, builder.mul(pair.index, whole_number(2)))
+                    for n in (0, 1):
+                        charge = builder.load(
+                            builder.gep(c, [builder.add(at_c, whole_number(n))])
+                        )
+                        charge = builder.insert_element(
+                            undefined, charge, ir.Constant(ir.IntType(32), 0)
+                        )
+                        charge = builder.shuffle_vector(charge, undefined, all_first)
+                        for m in (0, 1):
+                            total = sums[2 * n + m]
+                            weight = load(
+                                w, builder.add(at_w, whole_number(32 * n + 16 * m))
+                            )
+                            product = builder.fmul(weight, charge, flags=("contract",))
+                            builder.store(
+                                builder.fadd(
+                                    product, builder.load(total), flags=("contract",)
+                                ),
+                                total,
+                            )
+            for m in (0, 1):
+                place = builder.add(args[8], whole_number(16 * m))
+                total = builder.fadd(builder.load(sums[m]), builder.load(sums[2 + m]))
+                total = builder.fadd(total, load(o, place))
+                builder.store(total, pointer(o, place)).align = 4
+            return context.get_dummy_value()
+
+        return signature, codegen
+
+    return compiled
+
+
+add_16_points = _make_by_point()
+"""Add to 16 points' shifts: (weights, first, charges, start, stride, rows, pairs, out, at).
+
+``weights`` [rows, 2 pairs, 2, 16] from index ``first`` on, ``charges`` as for :func:`sum_8`;
+``out`` [2, 16] from index ``at`` on is changed.  All flat float32 arrays, indices uint64.
+"""

@@ -20,6 +20,18 @@ _NEAR = 1
 Chosen: farther away the response is proportional to the first mode; at 2 the window of the second
 mode would hold 25 pixels in place of 9."""
 
+_CHANGE_BINS = 512
+"""Bins of height in which the change of shifts from the topmost layer is bounded.
+
+Chosen: 0.2 um in 100 um of silicon, a twentieth of the depth of red light; with twice as many the
+bounds are tighter by as little."""
+
+_DEEPEST = 0.03
+"""Largest change of shifts, relative to their bound, down to which the topmost layer is used.
+
+Chosen: with it both LSST devices are served down to 35 um below the back surface; electrons within
+the change of an edge are held against their own layers, twice as many at twice as much."""
+
 RANGES = np.append(250.0 * 2.0 ** (np.arange(97) / 8), np.inf)
 """Ranges of effective charge [e-] for which errors are bounded; the last, any range.
 
@@ -137,6 +149,13 @@ def make_edges(
     centres = (np.arange(_BINS) + 0.5) / _BINS
     nearest = np.abs(centres[:, None] - points).argmin(1)
     normal, doubts = _bounds(modes, points, nearest)
+    log_step = float(np.log(heights[1] / heights[0])) if len(heights) > 1 else 1.0
+    factor = np.ones(2) if scale is None else np.asarray(scale, float)
+    change, along = _changes(
+        modes, float(heights[-1]), log_step, float(normal.max()), factor
+    )
+    used = np.flatnonzero(change[:, 0] <= _DEEPEST)
+    per_change = _CHANGE_BINS / float(heights[-1])
     return Edges(
         weights=np.concatenate(blocks),
         scale=np.zeros(0, np.float32) if scale is None else scale.astype(np.float32),
@@ -150,13 +169,18 @@ def make_edges(
         shares=(normal / normal.max() if normal.max() > 0 else np.ones(2)).astype(
             np.float32
         ),
+        by_point=_by_point(modes, float(factor[-1])),
+        change=change,
+        per_change=per_change,
+        along=along,
+        lowest=float(used[0] / per_change),
         normal=float(normal.max()),
         reach=int(reach),
         lanes=lanes,
         layers=len(heights),
         modes=len(modes),
         log_z0=float(np.log(heights[0])),
-        log_step=float(np.log(heights[1] / heights[0])) if len(heights) > 1 else 1.0,
+        log_step=log_step,
     )
 
 
@@ -165,6 +189,30 @@ def _pack(weights: FloatArray, lanes: int) -> NDArray[np.float32]:
     packed = np.zeros((*weights.shape[:-1], lanes), np.float32)
     packed[..., : weights.shape[-1]] = weights
     return packed.swapaxes(1, 2).ravel()
+
+
+def _by_point(
+    modes: list[tuple[FloatArray, FloatArray]], factor: float
+) -> NDArray[np.float32]:
+    """Weights of the topmost layer with the points side by side, as ``Edges.by_point``."""
+    points = modes[0][0].shape[1]
+    blocks = (points + 15) // 16
+    sides = []
+    for side in (0, 1):
+        weights = [factor * mode[side][-1] for mode in modes]
+        sums = [w.sum((-2, -1))[..., None] for w in weights]
+        if len(sums) == 1:
+            sums.append(np.zeros_like(sums[0]))
+        flat = []
+        for w in weights:
+            size = max(w.shape[-2:])
+            square = np.zeros((points, 2, size, size))
+            square[..., : w.shape[-2], : w.shape[-1]] = w
+            flat.append(square.reshape(points, 2, -1))
+        packed = np.zeros((16 * blocks, 2, 2 + sum(f.shape[-1] for f in flat)))
+        packed[:points] = np.concatenate([*sums, *flat], -1)
+        sides.append(packed.reshape(blocks, 16, 2, -1).transpose(0, 3, 2, 1))
+    return np.stack(sides).astype(np.float32).ravel()
 
 
 def _bounds(
@@ -223,6 +271,56 @@ def _bounds(
             )
     # Room for the rounding to single precision.
     return 1.00001 * top, 1.00001 * doubts
+
+
+def _changes(
+    modes: list[tuple[FloatArray, FloatArray]],
+    top: float,
+    log_step: float,
+    normal: float,
+    factor: FloatArray,
+) -> tuple[NDArray[np.float32], float]:
+    """Bounds by which shifts change from the topmost layer to a height, and of those along edges.
+
+    Returns
+    -------
+    change : ndarray, shape (bins, 2)
+        Bound of the change of the normal and of the tangential shift, relative to ``normal``, in
+        equal bins of height from 0 to ``top`` [um]; ``factor`` multiplies all shifts, on equal
+        steps of the same height.
+    along : float
+        Bound of the tangential shift in the topmost layer, relative to ``normal``.
+    """
+    layers = len(modes[0][0])
+    by_layer = np.zeros((layers, 2))
+    along = 0.0
+    for side in (0, 1):
+        moved = np.zeros((layers, 2))
+        tangential = np.zeros(modes[0][0].shape[1])
+        for mode in modes:
+            weights = mode[side]
+            for layer in range(layers - 1):
+                moved[layer] += _largest(weights[layer] - weights[-1])
+            tangential = tangential + _largest(weights[-1:, :, 1])
+        by_layer = np.maximum(by_layer, moved)
+        along = max(along, float(tangential.max()))
+    by_layer = np.maximum.accumulate(by_layer[::-1])[::-1]
+    low = top * np.arange(_CHANGE_BINS) / _CHANGE_BINS
+    at = layers - 1 + np.log(np.maximum(low, 1e-3) / top) / log_step
+    at = np.clip(at, 0, layers - 1)
+    # In the lower half between two layers the lower one may be taken in place of both.
+    at = np.where(at % 1.0 <= 0.501, np.floor(at), at)
+    change = np.stack([np.interp(at, np.arange(layers), c) for c in by_layer.T], 1)
+    per_normal = 1.0 / normal if normal > 0 else 0.0
+    # A factor of the height moves points by what it takes from the whole shift.
+    less = np.abs(factor - factor[-1])
+    less = np.maximum.accumulate(less[::-1])[::-1]
+    part = less[np.arange(_CHANGE_BINS) * (len(less) - 1) // _CHANGE_BINS]
+    change = per_normal * change * np.abs(factor).max() + np.stack(
+        [part, part * per_normal * along], 1
+    )
+    # Room for the rounding to single precision.
+    return (1.0001 * change).astype(np.float32), 1.0001 * per_normal * along
 
 
 def _alike(

@@ -209,8 +209,8 @@ def _no_hot_edges(edges: Edges, tiles: int) -> Hot:
     return Hot(
         page_of=np.full(tiles, -1, np.int32),
         pages=np.empty((pages, 2, TILE * TILE), np.int32),
-        lines=np.empty((_HOT_EDGES, edges.points.size, 2), np.float32),
-        fences=np.empty((_HOT_EDGES, FENCES, 2), np.float32),
+        lines=np.empty((_HOT_EDGES, 32 * ((edges.points.size + 15) // 16)), np.float32),
+        fences=np.empty((_HOT_EDGES, FENCES, 4), np.float32),
         edge=np.empty((_HOT_EDGES, 3), np.int32),
         used=np.zeros(2 + pages, np.int64),
     )

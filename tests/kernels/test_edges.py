@@ -216,7 +216,7 @@ def test_hot_edges_are_the_same_polylines(sensor, name):
     assert count == 2 * (ny - 2) * (nx - 3)
     hot_kernel.evaluate(edges, charges, hot, 0, count)
     hot_kernel.fence(edges, charges, hot, 0, count)
-    z = 99.0 if sensor.layers > 1 else 31.0
+    z = 99.0
     layer = sensor.layers - 1
     sides = draw_sides(sensor, displaced(sensor, image, layer), sensor.factor(z))
     truth, x, y, i, j = check(sensor, image, z, sides, 20000, 61403)
@@ -240,6 +240,40 @@ def test_hot_edges_are_the_same_polylines(sensor, name):
     assert (hot.page_of == -1).all()
     again = find_pixels(sensor, exposure, x, y, np.full(len(x), z))
     assert np.array_equal(again[0], i)
+
+
+@pytest.mark.parametrize("sensor", [silicon_sensor, table_sensor])
+@pytest.mark.parametrize("name", ["random", "bright corner", "bright pixel", "negative"])
+@pytest.mark.parametrize("pedestal", [0.0, 5e4])
+def test_hot_edges_change_nothing_at_any_height(sensor, name, pedestal):
+    sensor = sensor()
+    image = make_image(name) + pedestal
+    exposure = expose(sensor, image)
+    edges, charges, hot = sensor.physics.edges, exposure.charges, exposure.hot
+    ny, nx = image.shape
+    rng = np.random.default_rng(55103)
+    # Some edges are not hot, so that bounds end where a line does.
+    for j, i in np.argwhere(rng.random((ny, nx)) < 0.8):
+        hot_kernel.heat(edges, charges, hot, 0, i, j)
+        hot_kernel.heat(edges, charges, hot, 1, j, i)
+    hot_kernel.evaluate(edges, charges, hot, 0, hot.used[1])
+    hot_kernel.fence(edges, charges, hot, 0, hot.used[1])
+    sides = draw_sides(sensor, displaced(sensor, image, sensor.layers - 1))
+    x, y = scatter(sides, 60000, 90121)
+    z = rng.uniform(20.0, 99.9, len(x)).astype(np.float32)
+    given = find_pixels(sensor, exposure, x, y, z)
+    # The bounds decide most electrons: two thirds of them are at edges whose line is hot.
+    u, v = rng.uniform(0, (nx, ny), (5000, 2)).T
+    all_of_them = np.arange(5000, dtype=np.int32)
+    left = hot_kernel.decide_hot(
+        edges, charges, hot, True, u, v, z[z > 70][:5000], all_of_them, 5000,
+        np.zeros(5000, np.int32),
+    )  # fmt: skip
+    assert left < 2500 or charges.margins.max() >= 0.5
+    hot_kernel.cool(hot)
+    again = find_pixels(sensor, exposure, x, y, z)
+    assert np.array_equal(given[0], again[0])
+    assert np.array_equal(given[1], again[1])
 
 
 def test_electrons_outside_or_lost_have_no_pixel():

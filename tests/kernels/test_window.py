@@ -115,3 +115,31 @@ def test_two_sums_equal_one_sum_each():
         for k in (0, 1):
             alone = one(w, np.uint64(first + k * step), np.uint64(0), *rest)
             assert alone == both[k]
+
+
+@numba.njit
+def add_16_points(w, first, c, start, stride, rows, pairs, out, at):
+    window.add_16_points(w, first, c, start, stride, rows, pairs, out, at)
+
+
+@settings(deadline=None, max_examples=40)
+@given(rows=st.integers(0, 10), pairs=st.integers(1, 5), seed=st.integers(0, 2**32 - 1))
+def test_sums_for_16_points_are_those_of_plain_loops(rows, pairs, seed):
+    rng = np.random.default_rng(seed)
+    first, start, at = (int(n) for n in rng.integers(0, 40, 3))
+    stride = 2 * pairs + int(rng.integers(0, 9))
+    weights = rng.normal(0, 1e-6, first + rows * pairs * 64).astype(np.float32)
+    charges = rng.uniform(-1e3, 1.5e5, start + rows * stride + 2 * pairs).astype(np.float32)
+    before = rng.normal(0, 0.1, at + 32).astype(np.float32)
+    out = before.copy()
+    whole = (np.uint64(n) for n in (first, start, stride, rows, pairs, at))
+    first_, start_, stride_, rows_, pairs_, at_ = whole
+    add_16_points(weights, first_, charges, start_, stride_, rows_, pairs_, out, at_)
+    assert np.array_equal(out[:at], before[:at])
+    w = weights[first:].astype(float).reshape(rows, 2 * pairs, 32)
+    places = start + stride * np.arange(rows)[:, None] + np.arange(2 * pairs)
+    terms = w * charges[places][..., None].astype(float)
+    size = np.abs(terms).sum((0, 1)) + np.abs(before[at:])
+    # One rounding a product and one an addition, at most.
+    limit = (2 * rows * pairs + 3) * 2.0**-24 * size * 1.001
+    assert (np.abs(out[at:] - before[at:] - terms.sum((0, 1))) <= limit).all()
