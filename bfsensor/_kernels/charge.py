@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from bfsensor._kernels.compile_options import INLINED, INNER
 from bfsensor._kernels.hot import cool, heat
 
 TILE = 16
@@ -90,7 +91,7 @@ class Ledger(NamedTuple):
     sums: np.ndarray
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _effective(response, charge, background):
     """Effective charges of a pixel; beyond the grid the last values are held."""
     q = charge / response.charge_step
@@ -114,7 +115,7 @@ def _effective(response, charge, background):
     return first, second
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _flag(ledger, tile):
     if not ledger.flags[tile]:
         ledger.flags[tile] = True
@@ -122,7 +123,7 @@ def _flag(ledger, tile):
         ledger.counters[FLAGGED] += 1
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _set_pixel(charges, ledger, response, j, i, ahead):
     """Update the effective charge of a pixel, with ``ahead`` electrons added to its charge."""
     at = np.uint64((j + charges.pad) * charges.stride + i + charges.pad)
@@ -153,7 +154,7 @@ def _set_pixel(charges, ledger, response, j, i, ahead):
     _flag(ledger, tile)
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _find_range(charges, ledger, tile):
     """Find the lowest and highest effective charge of a tile; it is 0 outside the image."""
     tiles_x = (charges.nx + TILE - 1) // TILE
@@ -185,7 +186,7 @@ def _find_range(charges, ledger, tile):
     ledger.changes[tile] = 0
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _find_margin(charges, ledger, edges, tile):
     """Bound the shift of edges in a tile, and the error of that of the nearest point."""
     tiles_x = (charges.nx + TILE - 1) // TILE
@@ -215,7 +216,7 @@ def _find_margin(charges, ledger, edges, tile):
     charges.ranges[tile] = min(level, edges.doubts.shape[1] - 1)
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _find_margins(charges, ledger, edges):
     """Renew ranges and margins of the flagged tiles and their neighbours."""
     tiles_x = (charges.nx + TILE - 1) // TILE
@@ -238,7 +239,7 @@ def _find_margins(charges, ledger, edges):
     ledger.counters[FLAGGED] = 0
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _respond(response, charge, first, second, stride, start, count):
     """Find the effective charge of a row; ``first`` holds what is to be added ahead."""
     f, s = response.first, response.second
@@ -329,15 +330,15 @@ def take_image(image, charges, ledger, response, edges, ahead):
         _find_margin(charges, ledger, edges, tile)
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _heat_pixel(edges, charges, hot, j, i, electrons, crowd):
     """Mark the edges of a pixel as hot if ``crowd`` electrons come near one of them."""
     margin = charges.margins[(j // TILE) * ((charges.nx + TILE - 1) // TILE) + i // TILE]
     if electrons * min(np.float32(4.0) * margin, np.float32(1.0)) >= crowd:
-        heat(edges, charges, hot, 0, i, j)
-        heat(edges, charges, hot, 0, i + 1, j)
-        heat(edges, charges, hot, 1, j, i)
-        heat(edges, charges, hot, 1, j + 1, i)
+        heat(edges, charges, hot, np.int64(0), i, j)
+        heat(edges, charges, hot, np.int64(0), i + 1, j)
+        heat(edges, charges, hot, np.int64(1), j, i)
+        heat(edges, charges, hot, np.int64(1), j + 1, i)
 
 
 @numba.njit(cache=True, nogil=True, _nrt=False)
@@ -418,7 +419,7 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_
     ledger.counters[STRUCK] = 0
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _put(image, charge, carry, listed, counters, at, nx, j, i, flux):
     """Add electrons to a pixel; what single precision loses is kept in ``carry``."""
     before = image[j, i]
@@ -442,7 +443,7 @@ def _put(image, charge, carry, listed, counters, at, nx, j, i, flux):
         image[j, i] = before + flux
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _spill(image, charges, ledger, j, i, flux, full_well, along_y, up):
     """Fill a pixel, then those beyond it along its column; returns the flux that stays inside [e-]."""
     charge, carry = ledger.charge, ledger.carry
@@ -489,7 +490,7 @@ def _spill(image, charges, ledger, j, i, flux, full_well, along_y, up):
     return kept
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _strike(ledger, j, i, nx):
     """Count an electron that meets a full pixel."""
     if ledger.strikes.size == 0:

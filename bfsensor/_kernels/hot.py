@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from bfsensor._kernels.compile_options import INLINED, INNER
 from bfsensor._kernels.shifts import both_shifts, grid, scale_at
 
 FENCES = 16
@@ -38,7 +39,7 @@ class Hot(NamedTuple):
     used: np.ndarray
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _place(hot, side, line, other, columns, rows):
     """Place of an edge among the hot ones, -1 if it is not."""
     i = line if side == 0 else other
@@ -111,13 +112,13 @@ def evaluate(edges, charges, hot, first, last):
             hot.lines[place, point, 1] = tangential
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _top_scale(scale):
     """Factor of the shifts at the back surface."""
     return scale[scale.size - 1] if scale.size > 0 else np.float32(1.0)
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _tops(edges):
     """Heights [um] above which the shifts are those of the topmost layer, and with the top's factor."""
     top = np.float32(-1.0)
@@ -134,7 +135,7 @@ def _tops(edges):
     return top, max(top, np.float32((n + 0.5) / edges.per_um))
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _enclose(fences, here, lower, there, upper):
     """Widen the fences so that they hold a segment; places in steps."""
     if there < here:
@@ -197,7 +198,7 @@ def fence(edges, charges, hot, first, last):
                 fences[n, 1] = np.float32(0.5) * (highest - lowest) + np.float32(2e-6)
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _cross(points, lines, hot, side, at, line, other, place, low, scale, columns, rows):
     """Shift of a hot polyline at ``place`` along an edge, and whether all of it is hot.
 
@@ -234,7 +235,7 @@ def _cross(points, lines, hot, side, at, line, other, place, low, scale, columns
     return scale * (lower + share * (upper - lower)), True
 
 
-@numba.njit(cache=True, nogil=True, _nrt=False)
+@numba.njit(**INNER)
 def decide_hot(edges, charges, hot, upright, across, along, z, near, count, out):
     """Decide the electrons in ``near`` that are at hot edges; the others stay listed.
 

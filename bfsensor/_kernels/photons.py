@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from bfsensor._kernels.compile_options import INLINED, INNER
 from bfsensor._kernels.counter_rng import deviates, words
 
 BUFFER = 1024
@@ -97,7 +98,7 @@ class Pattern(NamedTuple):
     edge_0y: float = 0.0
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _at(table, position):
     """Linear interpolation at ``position`` in units of the spacing, the ends held."""
     last = table.size - 1
@@ -176,7 +177,7 @@ def fixed_shift(pattern, x, y, part):
     return dx, dy
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _next_place(now, before, excess, excess_before):
     """Secant step, each axis by itself, its slope kept positive: boundaries never cross."""
     moved = now - before
@@ -220,7 +221,7 @@ def find_origin(pattern, x, y, part):
     return px, py
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def ring_shift(rings, last, at):
     """Shift at a radius in steps of the rings, and its change over the step there.
 
@@ -233,7 +234,7 @@ def ring_shift(rings, last, at):
     return low + (at - np.float64(n)) * change, change
 
 
-@numba.njit(cache=True, _nrt=False, error_model="numpy")
+@numba.njit(**INNER, error_model="numpy")
 def _ring_origins(pattern, thickness, z, alike, x, y, to, count, factor, radius, origin):
     """Move electrons to the points whose rings' shifts lead to where they are, in place.
 
@@ -283,7 +284,7 @@ def _ring_origins(pattern, thickness, z, alike, x, y, to, count, factor, radius,
         y[to + m] = pattern.ring_y + scale * (y[to + m] - pattern.ring_y)
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _shift_all(positions, first, spread, normal, origin, out, to, count):
     if spread == 0.0:
         for m in range(np.uint64(count)):
@@ -293,7 +294,7 @@ def _shift_all(positions, first, spread, normal, origin, out, to, count):
             out[to + m] = positions[first + m] - origin + spread * normal[m]
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _absorb(wavelength, first, lengths, start, per_step, path, out, count):
     """Paths [um] from exponential deviates and absorption lengths."""
     last = np.float64(lengths.size - 1)
@@ -305,7 +306,7 @@ def _absorb(wavelength, first, lengths, start, per_step, path, out, count):
         out[m] = np.float32((here + (at - n) * (there - here)) * path[m])
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _tilt(slope_x, slope_y, first, kept, out, count):
     """Depths [um] of paths along the slopes."""
     for m in range(np.uint64(count)):
@@ -314,7 +315,7 @@ def _tilt(slope_x, slope_y, first, kept, out, count):
         out[m] = np.float32(min(out[m] / np.sqrt(1.0 + sx * sx + sy * sy), kept))
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _widths(depth, thickness, variance, out_z, to, out, count):
     """Heights [um], LOST below the gates, and widths of the diffusion [um] from there."""
     last = np.float32(variance.size - 1)
@@ -329,7 +330,7 @@ def _widths(depth, thickness, variance, out_z, to, out, count):
         out[m] = np.sqrt(here + (at - np.float32(n)) * (there - here))
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _place(positions, slopes, slanted, first, depth, width, normal, pitch, origin, out, to,
            count):  # fmt: skip
     """Landing positions along one axis [pixel]."""

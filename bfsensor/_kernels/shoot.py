@@ -20,6 +20,7 @@ from bfsensor._kernels.charge import (
     close_block,
     deposit,
 )
+from bfsensor._kernels.compile_options import INLINED, INNER
 from bfsensor._kernels.edges import collect
 from bfsensor._kernels.hot import evaluate, fence
 from bfsensor._kernels.photons import land
@@ -55,7 +56,7 @@ class Plan(NamedTuple):
     loss: float
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _size(plan, total):
     """Size of the block that starts after ``total`` electrons."""
     if not plan.predict:
@@ -63,8 +64,8 @@ def _size(plan, total):
     return min(plan.block, max(total, plan.block / 64.0))
 
 
-@numba.njit(cache=True, nogil=True)
-def finish_block(image, plan, edges, charges, hot, ledger, response):
+@numba.njit(**INNER)
+def _finish_block(image, plan, edges, charges, hot, ledger, response):
     """End the open block: update the frozen charge and mark hot edges."""
     ahead = np.float32(0.0)
     if plan.predict and ledger.sums[IN_BLOCK] > 0:
@@ -87,12 +88,12 @@ def finish_block(image, plan, edges, charges, hot, ledger, response):
 @numba.njit(cache=True, nogil=True)
 def renew(image, plan, edges, charges, hot, ledger, response):
     """End the open block between two calls, and evaluate the hot edges."""
-    finish_block(image, plan, edges, charges, hot, ledger, response)
+    _finish_block(image, plan, edges, charges, hot, ledger, response)
     evaluate(edges, charges, hot, 0, hot.used[1])
     fence(edges, charges, hot, 0, hot.used[1])
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(**INNER)
 def _settle(
     image, plan, edges, charges, hot, ledger, response, flux, start, z, words, i, j, lo,
     hi, size,
@@ -104,7 +105,7 @@ def _settle(
     )  # fmt: skip
     ledger.counters[PHOTONS] += hi - lo
     if ledger.sums[IN_BLOCK] >= size:
-        finish_block(image, plan, edges, charges, hot, ledger, response)
+        _finish_block(image, plan, edges, charges, hot, ledger, response)
 
 
 def _shoot(
