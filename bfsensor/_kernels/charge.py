@@ -46,6 +46,16 @@ N_SUMS = 9
 """Number of sums, by definition that of the names above."""
 
 
+class Pixels(NamedTuple):
+    """Image [rows, columns] of single or of double precision; the other array is of size 0.
+
+    Both are one type to numba, which compiles once for images of either precision.
+    """
+
+    single: np.ndarray
+    double: np.ndarray
+
+
 class Response(NamedTuple):
     """Effective charge of both modes by charge and background, on equal steps [e-].
 
@@ -89,6 +99,12 @@ class Ledger(NamedTuple):
     struck: np.ndarray
     counters: np.ndarray
     sums: np.ndarray
+
+
+@numba.njit(**INLINED)
+def _charge_of(image, j, i):
+    """Charge of a pixel, in double precision."""
+    return np.float64(image.single[j, i]) if image.single.size > 0 else image.double[j, i]
 
 
 @numba.njit(**INLINED)
@@ -294,7 +310,7 @@ def take_image(image, charges, ledger, response, edges, ahead):
         start = (j + charges.pad) * charges.stride + charges.pad
         for i in range(charges.nx):
             at = np.uint64(start + i)
-            now = np.float32(image[j, i])
+            now = np.float32(_charge_of(image, j, i))
             before = charge[at]
             if now == np.float32(0.0) and before == np.float32(0.0):
                 # Untouched pages of an empty image cost neither time nor memory.
@@ -341,7 +357,7 @@ def _heat_pixel(edges, charges, hot, j, i, electrons, crowd):
         heat(edges, charges, hot, np.int64(1), j + 1, i)
 
 
-@numba.njit(cache=True, nogil=True, _nrt=False)
+@numba.njit(**INNER)
 def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_photon):
     """Update the charge with what the block brought; ``ahead`` times each pixel's gain is added.
 
@@ -367,7 +383,7 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_
         j = ledger.listed[n] // nx
         i = ledger.listed[n] - j * nx
         at = np.uint64((j + charges.pad) * charges.stride + i + charges.pad)
-        now = np.float32(image[j, i])
+        now = np.float32(_charge_of(image, j, i))
         gain = now - ledger.charge[at]
         if gain == np.float32(0.0):
             # Listed twice, for negative flux had brought it back; or nothing came of it.
@@ -422,7 +438,7 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_
 @numba.njit(**INLINED)
 def _put(image, charge, carry, listed, counters, at, nx, j, i, flux):
     """Add electrons to a pixel; what single precision loses is kept in ``carry``."""
-    before = image[j, i]
+    before = _charge_of(image, j, i)
     if np.float32(before) == charge[np.uint64(at)] and counters[DENSE] == 0:
         count = counters[LISTED]
         if count < listed.size:
@@ -432,15 +448,15 @@ def _put(image, charge, carry, listed, counters, at, nx, j, i, flux):
             counters[DENSE] = 1
     if carry.size > 0:
         carried = carry[j, i]
-        total = np.float64(before) + np.float64(carried) + flux
+        total = before + np.float64(carried) + flux
         now = np.float32(total)
-        image[j, i] = now
+        image.single[j, i] = now
         rest = np.float32(total - np.float64(now))
         # Not written where nothing is carried: untouched pages cost no memory.
         if rest != carried:
             carry[j, i] = rest
     else:
-        image[j, i] = before + flux
+        image.double[j, i] = before + flux
 
 
 @numba.njit(**INNER)
@@ -449,7 +465,7 @@ def _spill(image, charges, ledger, j, i, flux, full_well, along_y, up):
     charge, carry = ledger.charge, ledger.carry
     listed, counters = ledger.listed, ledger.counters
     corner = charges.pad * charges.stride + charges.pad
-    room = full_well - image[j, i]
+    room = full_well - _charge_of(image, j, i)
     kept = 0.0
     if room > 0:
         part = min(room, flux)
@@ -474,7 +490,7 @@ def _spill(image, charges, ledger, j, i, flux, full_well, along_y, up):
     while flux > 0 and 0 <= to < last:
         tj = to if along_y else j
         ti = i if along_y else to
-        room = full_well - image[tj, ti]
+        room = full_well - _charge_of(image, tj, ti)
         if room > 0:
             part = min(room, flux)
             _put(image, charge, carry, listed, counters,
@@ -505,7 +521,7 @@ def _strike(ledger, j, i, nx):
     ledger.strikes[j, i] = before + 1
 
 
-@numba.njit(cache=True, nogil=True, _nrt=False)
+@numba.njit(**INNER)
 def deposit(
     image, charges, ledger, flux, first, i, j, z, words, lo, hi, full_well, along_y, loss
 ):
@@ -535,10 +551,10 @@ def deposit(
         if loss > 0.0:
             # The lowest bit says where electrons spill to.
             word = (np.float64(words[n] >> np.uint32(1)) + 0.5) * 2.0**-31
-            if word >= np.exp(-loss * np.float64(image[cj, ci])):
+            if word >= np.exp(-loss * _charge_of(image, cj, ci)):
                 lost += w
                 continue
-        if w > 0 and image[cj, ci] + w > full_well:
+        if w > 0 and _charge_of(image, cj, ci) + w > full_well:
             up = (words[n] & np.uint32(1)) == np.uint32(1)
             _strike(ledger, cj, ci, nx)
             added += _spill(image, charges, ledger, cj, ci, w, full_well, along_y, up)

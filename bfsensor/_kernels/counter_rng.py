@@ -10,7 +10,7 @@ logf, sinf and cosf), which compile to vector code; their error is below 2e-7.
 import numba
 import numpy as np
 
-from bfsensor._kernels.compile_options import INLINED
+from bfsensor._kernels.compile_options import INLINED, INNER
 
 
 @numba.njit(**INLINED)
@@ -106,7 +106,7 @@ def deviates(first, key0, key1, out_x, out_y, out_path, out_word):
         out_word[n] = d
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(**INNER)
 def words(first, key0, key1, out):
     """The word of :func:`deviates` alone, where nothing else is drawn."""
     for n in range(out.size):

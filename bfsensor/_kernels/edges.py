@@ -101,7 +101,7 @@ def _crossing(weights, sums, points, nearest, first, second, g, upright, layer, 
     return lower + share * (upper - lower)
 
 
-@numba.njit(cache=True, nogil=True, _nrt=False)
+@numba.njit(**INNER)
 def collect(edges, charges, hot, x, y, z, lo, hi, near_x, near_y, out_i, out_j):
     """Find the pixels (i, j) of the electrons lo to hi; i = -1 for those outside the image or lost.
 

@@ -52,7 +52,7 @@ def _place(hot, side, line, other, columns, rows):
     return hot.pages[np.uint64(page), np.uint64(side), np.uint64((j & 15) * 16 + (i & 15))]
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def cool(hot):
     """Forget all hot edges."""
     for page in range(hot.used[0]):
@@ -61,7 +61,7 @@ def cool(hot):
     hot.used[1] = 0
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def heat(edges, charges, hot, side, line, other):
     """Mark an edge as hot for the next block; :func:`evaluate` and :func:`fence` must follow."""
     i = line if side == 0 else other
@@ -90,7 +90,7 @@ def heat(edges, charges, hot, side, line, other):
     hot.edge[place, 2] = other
 
 
-@numba.njit(cache=True, nogil=True, _nrt=False)
+@numba.njit(**INNER)
 def evaluate(edges, charges, hot, first, last):
     """Find the polylines of the hot edges at the places first to last."""
     g = grid(edges, charges)
@@ -155,7 +155,7 @@ def _enclose(fences, here, lower, there, upper):
         fences[np.uint64(n), 1] = max(fences[np.uint64(n), 1], max(a, b))
 
 
-@numba.njit(cache=True, nogil=True, _nrt=False)
+@numba.njit(**INNER)
 def fence(edges, charges, hot, first, last):
     """Find the bounds of the shifts of the edges at the places first to last, in steps along them.
 

@@ -108,7 +108,7 @@ def _at(table, position):
     return table[n] + part * (table[n + np.uint64(1)] - table[n])
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def fixed_shift(pattern, x, y, part):
     """Shift (dx, dy) [pixel] of a boundary at (x, y), for ``part`` of the thickness."""
     dx = 0.0
@@ -187,7 +187,7 @@ def _next_place(now, before, excess, excess_before):
     return now - excess / slope
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def find_origin(pattern, x, y, part):
     """Point whose shift leads to (x, y) [pixel], for ``part`` of the thickness.
 
@@ -342,7 +342,7 @@ def _place(positions, slopes, slanted, first, depth, width, normal, pitch, origi
         out[to + m] = x
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(**{**INNER, "_nrt": True})
 def land(
     light,
     medium,

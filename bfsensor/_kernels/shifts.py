@@ -15,9 +15,9 @@ from bfsensor._kernels.compile_options import INLINED, INNER
 from bfsensor._kernels.counter_rng import log_single
 from bfsensor._kernels.window import sum_8, sum_16, two_sums_8, two_sums_16
 
-NORMAL = 0
+NORMAL = np.int64(0)  # of a literal 0 numba makes a type and compiles for it as well
 """Index of the shift across an edge, by definition of the layout of ``Edges.weights``."""
-TANGENTIAL = 1
+TANGENTIAL = np.int64(1)
 """Index of the shift along an edge, by definition of the layout of ``Edges.weights``."""
 
 
@@ -155,7 +155,7 @@ def both_shifts(weights, sums, first, second, g, upright, layer, point, line, ot
           low_second):  # fmt: skip
     """Normal and tangential shift of a point in one layer."""
     begin, at, rows, begin_near, at_near, rows_near, total = _places(
-        g, upright, layer, point, 0, line, other
+        g, upright, layer, point, NORMAL, line, other
     )
     stride = np.uint64(g.stride)
     apart = np.uint64(g.points) * rows * np.uint64(g.lanes)

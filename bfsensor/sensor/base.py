@@ -207,9 +207,7 @@ class EngineSensor(galsim.SiliconSensor):
             self._exposure = self._expose(image, array, orig_center)
             self._last_image = image
         assert self._exposure is not None
-        if resume and recalc:
-            self._exposure.renew(array)
-        return self._exposure.add(array, self._change_light(light))
+        return self._exposure.add(array, self._change_light(light), renew=resume and recalc)
 
     def _expose(
         self,

@@ -16,10 +16,11 @@ from bfsensor._kernels.shifts import Edges
 from bfsensor.device.shipped import did_you_mean, tables_dir
 from bfsensor.errors import SensorError, TableError
 from bfsensor.sensor.base import EngineSensor, read_numbers
-from bfsensor.sensor.drift_field import MEASURED, STEPS
+from bfsensor.sensor.drift_field import MEASURED
 from bfsensor.sensor.edge_weights import make_edges, transpose_sides
 from bfsensor.sensor.image_exposure import Physics
 from bfsensor.sensor.options import galsim_folder
+from bfsensor.simulate.mean_field import STEPS
 from bfsensor.table.galsim_format import read_sides
 from bfsensor.typing import FloatArray
 

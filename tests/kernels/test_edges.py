@@ -5,6 +5,7 @@ import pytest
 
 from bfsensor._kernels import hot as hot_kernel
 from bfsensor._kernels.charge import TILE
+from tests.kernels.from_python import from_python
 from tests.kernels.plain_edges import (
     IMAGES,
     Truth,
@@ -20,6 +21,10 @@ from tests.kernels.plain_edges import (
     scatter,
     silicon_sensor,
     table_sensor,
+)
+
+heat, evaluate, fence, cool = map(
+    from_python, (hot_kernel.heat, hot_kernel.evaluate, hot_kernel.fence, hot_kernel.cool)
 )
 
 
@@ -210,12 +215,12 @@ def test_hot_edges_are_the_same_polylines(sensor, name):
     ny, nx = image.shape
     for j in range(2, ny, 1):
         for i in range(nx - 3):
-            hot_kernel.heat(edges, charges, hot, 0, i, j)
-            hot_kernel.heat(edges, charges, hot, 1, j, i)
+            heat(edges, charges, hot, 0, i, j)
+            heat(edges, charges, hot, 1, j, i)
     count = hot.used[1]
     assert count == 2 * (ny - 2) * (nx - 3)
-    hot_kernel.evaluate(edges, charges, hot, 0, count)
-    hot_kernel.fence(edges, charges, hot, 0, count)
+    evaluate(edges, charges, hot, 0, count)
+    fence(edges, charges, hot, 0, count)
     z = 99.0 if sensor.layers > 1 else 31.0
     layer = sensor.layers - 1
     sides = draw_sides(sensor, displaced(sensor, image, layer), sensor.factor(z))
@@ -229,14 +234,14 @@ def test_hot_edges_are_the_same_polylines(sensor, name):
     assert truth.agrees(*given)[clear].all()
     # They were looked at: with their shifts off the answers are the nominal pixels.
     hot.lines[:] = 0.0
-    hot_kernel.fence(edges, charges, hot, 0, count)
+    fence(edges, charges, hot, 0, count)
     given = find_pixels(sensor, exposure, x, y, np.full(len(x), z))
     inner = (x > 0.5) & (x < nx - 4) & (y > 2.5) & (y < ny - 0.5)
     inner &= (abs(x - np.round(x)) > 1e-4) & (abs(y - np.round(y)) > 1e-4)
     assert np.array_equal(given[0][inner], np.floor(x[inner]))
     assert np.array_equal(given[1][inner], np.floor(y[inner]))
     # Cooled, they are forgotten.
-    hot_kernel.cool(hot)
+    cool(hot)
     assert (hot.page_of == -1).all()
     again = find_pixels(sensor, exposure, x, y, np.full(len(x), z))
     assert np.array_equal(again[0], i)
