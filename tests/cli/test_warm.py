@@ -36,9 +36,9 @@ which takes 0.15 s on average."""
 
 TWO_KERNELS = """
 import numpy as np
-from bfsensor._kernels.counter_rng import uniforms, words
+from bfsensor._kernels.counter_rng import deviates, uniforms
 key = np.uint32(11), np.uint32(12)
-words(0, *key, np.empty(3, np.uint32))
+deviates(0, *key, *np.empty((3, 3), np.float32), np.empty(3, np.uint32))
 uniforms(0, 5, *key, np.empty((3, 2)))
 """
 
@@ -55,7 +55,7 @@ def test_what_warm_compiled_is_not_compiled_again():
             (BrighterFatterSensor("e2v_ccd250", rng=galsim.BaseDeviate(5113)), np.float32),
             (BrighterFatterSensor("e2v_ccd250", treering_func=RINGS), np.float64),
             (SiliconSensor(rng=galsim.BaseDeviate(5113)), np.float64),
-            (SiliconSensor("lsst_e2v_50_4", strength=2.0), np.float32),
+            (SiliconSensor("lsst_e2v_50_32", strength=2.0), np.float32),
         ):
             sensor = made
             image = star.drawImage(
