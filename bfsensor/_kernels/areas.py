@@ -8,13 +8,14 @@ inner loop runs along the row.
 import numba
 import numpy as np
 
+from bfsensor._kernels.compile_options import INLINED, INNER
 from bfsensor._kernels.photons import _at, fixed_shift, ring_shift
 
 GAUSS = 0.5 - 0.5 / np.sqrt(3.0)
 """Place of the first of Gauss's two points of a unit interval; exact for cubic polynomials."""
 
 
-@numba.njit(cache=True, fastmath={"contract"}, _nrt=False)
+@numba.njit(**INNER, fastmath={"contract"})
 def _add_rows(weights, start, lanes, rows, columns, charges, at, stride, out, count):
     """Add to ``out`` the weighted charges of ``count`` windows, the first of which begins at ``at``."""
     for r in range(rows):
@@ -43,7 +44,7 @@ def _add_rows(weights, start, lanes, rows, columns, charges, at, stride, out, co
             c += 1
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _line_shifts(edges, charges, upright, layer, point, line, low, low_second, out):
     """Shifts (x, y) of one point of every side of a row; ``line``: row or line."""
     q = edges.reach
@@ -77,7 +78,7 @@ def _line_shifts(edges, charges, upright, layer, point, line, low, low_second, o
             )  # fmt: skip
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _integrate(edges, charges, pattern, flux, upright, line, low, low_second, now, before,
                out):  # fmt: skip
     """Integral of y dx along every side of a row, and its ends.
@@ -131,7 +132,7 @@ def _integrate(edges, charges, pattern, flux, upright, line, low, low_second, no
             before[1, n] = now[1, n]
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _join(x0, y0, x1, y1):
     """Integral of y dx from one end to the next, where two sides do not quite meet."""
     return 0.5 * (y0 + y1) * (x1 - x0)
@@ -250,7 +251,7 @@ def convolved_areas(
                     out[j, left + i] += value * np.float64(row[i]) * np.float64(row[i])
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _mean_shift(pattern, factor, last, per_step, x, y, along_x, along_y):
     """Mean shift (x, y) by rings of the side from (x, y) to (x + along_x, y + along_y)."""
     dx = 0.0

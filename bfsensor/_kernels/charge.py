@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from bfsensor._kernels.compile_options import INLINED, INNER
 from bfsensor._kernels.hot import cool, heat
 from bfsensor._kernels.surroundings import mirror_all, mirror_pixel, within
 
@@ -44,6 +45,16 @@ N_COUNTERS = 10
 IN_BLOCK, BEFORE, TOTAL, ADDED, SPILLED, SPILLED_OFF, CROSSED, OFF_IMAGE, LOST = range(9)
 N_SUMS = 9
 """Number of sums, by definition that of the names above."""
+
+
+class Pixels(NamedTuple):
+    """Image [rows, columns] of single or of double precision; the other array is of size 0.
+
+    Both are one type to numba, which compiles once for images of either precision.
+    """
+
+    single: np.ndarray
+    double: np.ndarray
 
 
 class Response(NamedTuple):
@@ -98,7 +109,19 @@ class Ledger(NamedTuple):
     mirrored: bool
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
+def _charge_of(image, j, i):
+    """Charge of a pixel, in double precision."""
+    return np.float64(image.single[j, i]) if image.single.size > 0 else image.double[j, i]
+
+
+@numba.njit(**INLINED)
+def _shape(image):
+    """Rows and columns of an image."""
+    return image.single.shape if image.single.size > 0 else image.double.shape
+
+
+@numba.njit(**INLINED)
 def _effective(response, charge, background):
     """Effective charges of a pixel; beyond the grid the last values are held."""
     q = charge / response.charge_step
@@ -122,7 +145,7 @@ def _effective(response, charge, background):
     return first, second
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _flag(ledger, tile):
     if not ledger.flags[tile]:
         ledger.flags[tile] = True
@@ -130,18 +153,18 @@ def _flag(ledger, tile):
         ledger.counters[FLAGGED] += 1
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _charge(image, ledger, j, i):
     """Charge of a pixel in single precision; outside the image that of its surroundings."""
-    ny, nx = image.shape
+    ny, nx = _shape(image)
     if not (0 <= j < ny and 0 <= i < nx):
         if not ledger.mirrored:
             return ledger.outside[2]
         j, i = within(j, ny), within(i, nx)
-    return np.float32(image[np.uint64(j), np.uint64(i)])
+    return np.float32(_charge_of(image, np.uint64(j), np.uint64(i)))
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _around(image, ledger, j, i):
     """Mean charge of the neighbours of a pixel."""
     above = _charge(image, ledger, j - 1, i - 1) + _charge(image, ledger, j - 1, i)
@@ -152,7 +175,7 @@ def _around(image, ledger, j, i):
     return (above + here + below) * np.float32(0.125)
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _set_pixel(image, charges, ledger, response, j, i, ahead):
     """Update the effective charge of a pixel, with ``ahead`` electrons added to its charge."""
     at = np.uint64((j + charges.pad) * charges.stride + i + charges.pad)
@@ -184,7 +207,7 @@ def _set_pixel(image, charges, ledger, response, j, i, ahead):
         _flag(ledger, np.int64(tile))
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _find_range(charges, ledger, tile):
     """Find the lowest and highest effective charge of a tile, beyond the image included."""
     tiles_x = (charges.nx + TILE - 1) // TILE
@@ -218,7 +241,7 @@ def _find_range(charges, ledger, tile):
     ledger.changes[tile] = 0
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _find_margin(charges, ledger, edges, tile):
     """Bound the shift of edges in a tile, and the error of that of the nearest point."""
     tiles_x = (charges.nx + TILE - 1) // TILE
@@ -248,7 +271,7 @@ def _find_margin(charges, ledger, edges, tile):
     charges.ranges[tile] = min(level, edges.doubts.shape[1] - 1)
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _find_margins(charges, ledger, edges):
     """Renew ranges and margins of the flagged tiles and their neighbours."""
     tiles_x = (charges.nx + TILE - 1) // TILE
@@ -271,7 +294,7 @@ def _find_margins(charges, ledger, edges):
     ledger.counters[FLAGGED] = 0
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _respond(response, above, here, below, begin, first, second, start, count):
     """Find the effective charge of ``count`` pixels of a row from the rows around them.
 
@@ -318,29 +341,29 @@ def _respond(response, above, here, below, begin, first, second, start, count):
     return beyond
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _marked(marks, pixel):
     """Whether a pixel has gained charge in this block."""
     bit = np.uint8(1) << np.uint8(pixel & np.uint64(7))
     return (marks[pixel >> np.uint64(3)] & bit) != 0
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _any_charge(image, j, first, last):
     """Whether a part of a row holds charge; without a branch, so that it is read in vectors."""
     found = False
     for i in range(np.uint64(first), np.uint64(last)):
-        found |= image[np.uint64(j), i] != 0
+        found |= _charge_of(image, np.uint64(j), i) != 0.0
     return found
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _take_pixels(image, j, first, last, charges, ledger, ahead, apart):
     """Take the charge of a part of a row; where it is ``apart``, the gain waits for the response."""
     start = (j + charges.pad) * charges.stride + charges.pad
     for i in range(first, last):
         at = np.uint64(start + i)
-        now = np.float32(image[j, i])
+        now = np.float32(_charge_of(image, j, i))
         if apart:
             gain = np.float32(0.0)
             pixel = np.uint64(j * charges.nx + i)
@@ -351,7 +374,7 @@ def _take_pixels(image, j, first, last, charges, ledger, ahead, apart):
             charges.first[at] = now
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _flag_charge(image, charges, ledger, ahead, apart, fresh):
     """Take the charge of all tiles that hold some, and flag these and their neighbours.
 
@@ -375,7 +398,7 @@ def _flag_charge(image, charges, ledger, ahead, apart, fresh):
                     ledger.flags[row * tiles_x + k] = True
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _flag_sides(charges, ledger):
     """Flag the tiles at the sides of the image, where charge beyond it acts."""
     tiles_x = (charges.nx + TILE - 1) // TILE
@@ -386,21 +409,21 @@ def _flag_sides(charges, ledger):
                 ledger.flags[row * tiles_x + column] = True
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _load_row(image, ledger, j, out):
     """Copy a row of the image in single precision, with a pixel of the surroundings on each side."""
-    ny, nx = image.shape
+    ny, nx = _shape(image)
     if not (0 <= j < ny or ledger.mirrored):
         out[:] = ledger.outside[2]
         return
     row = np.uint64(within(j, ny))
     for i in range(np.uint64(nx)):
-        out[i + np.uint64(1)] = np.float32(image[row, i])
+        out[i + np.uint64(1)] = np.float32(_charge_of(image, row, i))
     out[0] = _charge(image, ledger, j, -1)
     out[nx + 1] = _charge(image, ledger, j, nx)
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _respond_in_row(charges, ledger, response, j):
     """Find the effective charge of the flagged tiles in a row, whose ``first`` holds the gain ahead."""
     rows = ledger.rows
@@ -423,7 +446,7 @@ def _respond_in_row(charges, ledger, response, j):
         column += 1
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _respond_flagged(image, charges, ledger, response):
     """Find the effective charge of the flagged tiles."""
     tiles_x = (charges.nx + TILE - 1) // TILE
@@ -464,18 +487,18 @@ def take_image(image, charges, ledger, response, edges, ahead):
         _find_margin(charges, ledger, edges, tile)
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _heat_pixel(edges, charges, hot, j, i, electrons, crowd):
     """Mark the edges of a pixel as hot if ``crowd`` electrons come near one of them."""
     margin = charges.margins[(j // TILE) * ((charges.nx + TILE - 1) // TILE) + i // TILE]
     if electrons * min(np.float32(4.0) * margin, np.float32(1.0)) >= crowd:
-        heat(edges, charges, hot, 0, i, j)
-        heat(edges, charges, hot, 0, i + 1, j)
-        heat(edges, charges, hot, 1, j, i)
-        heat(edges, charges, hot, 1, j + 1, i)
+        heat(edges, charges, hot, np.int64(0), i, j)
+        heat(edges, charges, hot, np.int64(0), i + 1, j)
+        heat(edges, charges, hot, np.int64(1), j, i)
+        heat(edges, charges, hot, np.int64(1), j + 1, i)
 
 
-@numba.njit(cache=True, nogil=True, _nrt=False)
+@numba.njit(**INNER)
 def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_photon):
     """Update the charge with what the block brought; ``ahead`` times each pixel's gain is added.
 
@@ -506,7 +529,7 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_
         i = ledger.listed[n] - j * nx
         # The other pixels of this byte are in the list as well.
         ledger.marks[np.uint64(ledger.listed[n]) >> np.uint64(3)] = 0
-        gain = np.float32(image[j, i]) - ledger.gained[n]
+        gain = np.float32(_charge_of(image, j, i)) - ledger.gained[n]
         if gain == np.float32(0.0):
             # Negative flux had brought it back, or nothing came of it.
             continue
@@ -528,7 +551,7 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_
         for n in range(count):
             j = ledger.listed[n] // nx
             i = ledger.listed[n] - j * nx
-            now = np.float32(image[j, i])
+            now = np.float32(_charge_of(image, j, i))
             if np.floor(now / STALE) != np.floor((now - ledger.gained[n]) / STALE):
                 for m in range(max(j - 1, 0), min(j + 2, charges.ny)):
                     for k in range(max(i - 1, 0), min(i + 2, nx)):
@@ -561,10 +584,10 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_
     ledger.counters[STRUCK] = 0
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _put(image, ledger, nx, j, i, flux):
     """Add electrons to a pixel; what single precision loses is kept in ``carry``."""
-    before = image[j, i]
+    before = _charge_of(image, j, i)
     pixel = np.uint64(j * nx + i)
     if not _marked(ledger.marks, pixel):
         ledger.marks[pixel >> np.uint64(3)] |= np.uint8(1) << np.uint8(pixel & np.uint64(7))
@@ -580,21 +603,21 @@ def _put(image, ledger, nx, j, i, flux):
     carry = ledger.carry
     if carry.size > 0:
         carried = carry[j, i]
-        total = np.float64(before) + np.float64(carried) + flux
+        total = before + np.float64(carried) + flux
         now = np.float32(total)
-        image[j, i] = now
+        image.single[j, i] = now
         rest = np.float32(total - np.float64(now))
         # Not written where nothing is carried: untouched pages cost no memory.
         if rest != carried:
             carry[j, i] = rest
     else:
-        image[j, i] = before + flux
+        image.double[j, i] = before + flux
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _spill(image, charges, ledger, j, i, flux, full_well, along_y, up):
     """Fill a pixel, then those beyond it along its column; returns the flux that stays inside [e-]."""
-    room = full_well - image[j, i]
+    room = full_well - _charge_of(image, j, i)
     kept = 0.0
     if room > 0:
         part = min(room, flux)
@@ -618,7 +641,7 @@ def _spill(image, charges, ledger, j, i, flux, full_well, along_y, up):
     while flux > 0 and 0 <= to < last:
         tj = to if along_y else j
         ti = i if along_y else to
-        room = full_well - image[tj, ti]
+        room = full_well - _charge_of(image, tj, ti)
         if room > 0:
             part = min(room, flux)
             _put(image, ledger, charges.nx, tj, ti, part)
@@ -633,7 +656,7 @@ def _spill(image, charges, ledger, j, i, flux, full_well, along_y, up):
     return kept
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _strike(ledger, j, i, nx):
     """Count an electron that meets a full pixel."""
     if ledger.strikes.size == 0:
@@ -648,7 +671,7 @@ def _strike(ledger, j, i, nx):
     ledger.strikes[j, i] = before + 1
 
 
-@numba.njit(cache=True, nogil=True, _nrt=False)
+@numba.njit(**INNER)
 def deposit(
     image, charges, ledger, flux, first, i, j, z, words, lo, hi, full_well, along_y, loss
 ):
@@ -675,10 +698,10 @@ def deposit(
         if loss > 0.0:
             # The lowest bit says where electrons spill to.
             word = (np.float64(words[n] >> np.uint32(1)) + 0.5) * 2.0**-31
-            if word >= np.exp(-loss * np.float64(image[cj, ci])):
+            if word >= np.exp(-loss * _charge_of(image, cj, ci)):
                 lost += w
                 continue
-        if w > 0 and image[cj, ci] + w > full_well:
+        if w > 0 and _charge_of(image, cj, ci) + w > full_well:
             up = (words[n] & np.uint32(1)) == np.uint32(1)
             _strike(ledger, cj, ci, nx)
             added += _spill(image, charges, ledger, cj, ci, w, full_well, along_y, up)

@@ -10,8 +10,10 @@ logf, sinf and cosf), which compile to vector code; their error is below 2e-7.
 import numba
 import numpy as np
 
+from bfsensor._kernels.compile_options import INLINED, INNER
 
-@numba.njit(cache=True, inline="always")
+
+@numba.njit(**INLINED)
 def philox(c0, c1, c2, c3, k0, k1):
     """Four random words from a counter of four and a key of two (all uint32)."""
     for _ in range(10):
@@ -28,7 +30,7 @@ def philox(c0, c1, c2, c3, k0, k1):
     return c0, c1, c2, c3
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def log_single(x):
     """Natural logarithm of a positive float32."""
     bits = np.float32(x).view(np.int32)
@@ -49,7 +51,7 @@ def log_single(x):
     return np.float32(y + np.float32(exponent) * np.float32(0.69314718056))
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def log_uniform(word):
     """Logarithm of the uniform deviate (word + 1/2) / 2^32, a float32 below zero."""
     # The scale is a power of two; a word that rounds to 2^32 would give 0.
@@ -57,7 +59,7 @@ def log_uniform(word):
     return min(log_single(x), np.float32(-5.9604645e-8))
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def sine_cosine(word):
     """Sine and cosine of the angle 2 pi word / 2^32, float32."""
     shifted = (np.uint64(word) + np.uint64(0x20000000)) & np.uint64(0xFFFFFFFF)
@@ -104,7 +106,7 @@ def deviates(first, key0, key1, out_x, out_y, out_path, out_word):
         out_word[n] = d
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(**INNER)
 def words(first, key0, key1, out):
     """The word of :func:`deviates` alone, where nothing else is drawn."""
     for n in range(out.size):

@@ -16,6 +16,7 @@ Lines are numbered as in :mod:`bfsensor._kernels.shifts`.
 import numba
 import numpy as np
 
+from bfsensor._kernels.compile_options import INLINED, INNER
 from bfsensor._kernels.hot import decide_hot
 from bfsensor._kernels.shifts import (
     NORMAL,
@@ -28,7 +29,7 @@ from bfsensor._kernels.shifts import (
 )
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _crossing(weights, sums, points, nearest, first, second, g, upright, layer, part, line,
               along, limit, scale, low_first, low_second):  # fmt: skip
     """Normal shift [pixel] of the polyline ``line`` where it passes ``along`` [pixel].
@@ -100,7 +101,7 @@ def _crossing(weights, sums, points, nearest, first, second, g, upright, layer, 
     return lower + share * (upper - lower)
 
 
-@numba.njit(cache=True, nogil=True, _nrt=False)
+@numba.njit(**INNER)
 def collect(edges, charges, hot, x, y, z, lo, hi, near_x, near_y, out_i, out_j):
     """Find the pixels (i, j) of the electrons lo to hi; i = -1 for those outside the image or lost.
 
@@ -176,8 +177,8 @@ def collect(edges, charges, hot, x, y, z, lo, hi, near_x, near_y, out_i, out_j):
             near_y[np.uint64(count_y)] = np.int32(n)
             count_x += abs(x[n] - i - 0.5) > 0.5 - margin * share_x
             count_y += abs(y[n] - j - 0.5) > 0.5 - margin * share_y
-    _decide(edges, charges, hot, True, x, y, z, near_x, count_x, out_i)
-    _decide(edges, charges, hot, False, y, x, z, near_y, count_y, out_j)
+    _decide(edges, charges, hot, np.bool_(True), x, y, z, near_x, count_x, out_i)
+    _decide(edges, charges, hot, np.bool_(False), y, x, z, near_y, count_y, out_j)
     for n in range(np.uint64(lo), np.uint64(hi)):
         i = out_i[n]
         j = out_j[n]
@@ -186,7 +187,7 @@ def collect(edges, charges, hot, x, y, z, lo, hi, near_x, near_y, out_i, out_j):
         out_i[n] = i if inside else np.int32(-1)
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _nearest_line(across, along, upright, columns, rows):
     """Line nearest to an electron, its distance beyond it, its row or column, and its tile."""
     line = np.int64(across + 1.5) - 1
@@ -200,7 +201,7 @@ def _nearest_line(across, along, upright, columns, rows):
     return line, beyond, other, np.uint64(row * (columns + 1) + column)
 
 
-@numba.njit(cache=True, nogil=True, _nrt=False)
+@numba.njit(**INNER)
 def _decide(edges, charges, hot, upright, across, along, z, near, count, out):
     """Find the side of the nearest line on which the electrons listed in ``near`` are."""
     nx, ny = charges.nx, charges.ny

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from bfsensor._kernels.compile_options import INLINED, INNER
 from bfsensor._kernels.window import add_16_points
 
 FENCES = 16
@@ -40,7 +41,7 @@ class Hot(NamedTuple):
     used: np.ndarray
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _place(hot, side, line, other, columns, rows):
     """Place of an edge among the hot ones, -1 if it is not."""
     i = line if side == 0 else other
@@ -53,7 +54,7 @@ def _place(hot, side, line, other, columns, rows):
     return hot.pages[np.uint64(page), np.uint64(side), np.uint64((j & 15) * 16 + (i & 15))]
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _tile(side, line, other, columns):
     """Tile of the pixel that an edge belongs to."""
     i = line if side == 0 else other
@@ -61,7 +62,7 @@ def _tile(side, line, other, columns):
     return np.uint64((j >> 4) * (columns + 1) + (i >> 4))
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def cool(hot):
     """Forget all hot edges."""
     for page in range(hot.used[0]):
@@ -70,7 +71,7 @@ def cool(hot):
     hot.used[1] = 0
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def heat(edges, charges, hot, side, line, other):
     """Mark an edge as hot for the next block; :func:`evaluate` and :func:`fence` must follow."""
     i = line if side == 0 else other
@@ -99,7 +100,7 @@ def heat(edges, charges, hot, side, line, other):
     hot.edge[place, 2] = other
 
 
-@numba.njit(cache=True, nogil=True, _nrt=False)
+@numba.njit(**INNER)
 def evaluate(edges, charges, hot, first, last):
     """Find the polylines of the hot edges at the places first to last."""
     q = edges.reach
@@ -145,14 +146,14 @@ def evaluate(edges, charges, hot, first, last):
                 )  # fmt: skip
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _bin(edges, height):
     """Row of ``Edges.change`` for a height [um]."""
     at = np.int32(height * np.float32(edges.per_change))
     return np.uint64(min(at, np.int32(edges.change.shape[0] - 1)))
 
 
-@numba.njit(cache=True, nogil=True, _nrt=False)
+@numba.njit(**INNER)
 def fence(edges, charges, hot, first, last):
     """Find the bounds of the shifts of the edges at the places first to last, in steps along them.
 
@@ -260,7 +261,7 @@ def fence(edges, charges, hot, first, last):
             fences[n, 3] += jumps
 
 
-@numba.njit(cache=True, nogil=True, _nrt=False)
+@numba.njit(**INNER)
 def decide_hot(edges, charges, hot, upright, across, along, z, near, count, out):
     """Decide the electrons in ``near`` that are outside the bounds of hot edges.
 

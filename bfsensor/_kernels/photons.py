@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from bfsensor._kernels.compile_options import INLINED, INNER
 from bfsensor._kernels.counter_rng import deviates, words
 
 BUFFER = 1024
@@ -101,7 +102,7 @@ class Pattern(NamedTuple):
     edge_0y: float = 0.0
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _at(table, position):
     """Linear interpolation at ``position`` in units of the spacing, the ends held."""
     last = table.size - 1
@@ -111,7 +112,7 @@ def _at(table, position):
     return table[n] + part * (table[n + np.uint64(1)] - table[n])
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _between(map_x, map_y, u, v, factor):
     """Shift between the points of a map, u and v steps from its first one, and its changes a step.
 
@@ -151,7 +152,7 @@ def _between(map_x, map_y, u, v, factor):
     )
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _shift_and_slopes(pattern, x, y, ring_factor, map_factor):
     """Shift (dx, dy) [pixel] of a boundary at (x, y), its changes by x, and its changes by y."""
     dx = dy = dx_x = dy_x = dx_y = dy_y = 0.0
@@ -190,7 +191,7 @@ def _shift_and_slopes(pattern, x, y, ring_factor, map_factor):
     return dx, dy, dx_x, dy_x, dx_y, dy_y
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _factors(pattern, part):
     """Factors of rings and map at ``part`` of the thickness."""
     return (
@@ -199,7 +200,7 @@ def _factors(pattern, part):
     )
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def fixed_shift(pattern, x, y, part):
     """Shift (dx, dy) [pixel] of a boundary at (x, y), for ``part`` of the thickness."""
     ring_factor, map_factor = _factors(pattern, part)
@@ -207,7 +208,7 @@ def fixed_shift(pattern, x, y, part):
     return found[0], found[1]
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _next_place(now, before, excess, excess_before):
     """Secant step, each axis by itself, its slope kept positive: boundaries never cross."""
     moved = now - before
@@ -217,7 +218,7 @@ def _next_place(now, before, excess, excess_before):
     return now - excess / slope
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def find_origin(pattern, x, y, part):
     """Point whose shift leads to (x, y) [pixel], for ``part`` of the thickness.
 
@@ -251,7 +252,7 @@ def find_origin(pattern, x, y, part):
     return px, py
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def ring_shift(rings, last, at):
     """Shift at a radius in steps of the rings, and its change over the step there.
 
@@ -264,7 +265,7 @@ def ring_shift(rings, last, at):
     return low + (at - np.float64(n)) * change, change
 
 
-@numba.njit(cache=True, _nrt=False, error_model="numpy")
+@numba.njit(**INNER, error_model="numpy")
 def _ring_origins(pattern, thickness, z, alike, x, y, to, count, factor, radius, origin):
     """Move electrons to the points whose rings' shifts lead to where they are, in place.
 
@@ -314,7 +315,7 @@ def _ring_origins(pattern, thickness, z, alike, x, y, to, count, factor, radius,
         y[to + m] = pattern.ring_y + scale * (y[to + m] - pattern.ring_y)
 
 
-@numba.njit(cache=True, _nrt=False, error_model="numpy")
+@numba.njit(**INNER, error_model="numpy")
 def _origins(pattern, thickness, z, x, y, to, count):
     """Move electrons to the points whose shifts, by rings and maps, lead to where they are, in place.
 
@@ -350,7 +351,7 @@ def _origins(pattern, thickness, z, x, y, to, count):
         y[n] = py
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _shift_all(positions, first, spread, normal, origin, out, to, count):
     if spread == 0.0:
         for m in range(np.uint64(count)):
@@ -360,7 +361,7 @@ def _shift_all(positions, first, spread, normal, origin, out, to, count):
             out[to + m] = positions[first + m] - origin + spread * normal[m]
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _absorb(wavelength, first, lengths, start, per_step, path, out, count):
     """Paths [um] from exponential deviates and absorption lengths."""
     last = np.float64(lengths.size - 1)
@@ -372,7 +373,7 @@ def _absorb(wavelength, first, lengths, start, per_step, path, out, count):
         out[m] = np.float32((here + (at - n) * (there - here)) * path[m])
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _tilt(slope_x, slope_y, first, kept, out, count):
     """Depths [um] of paths along the slopes."""
     for m in range(np.uint64(count)):
@@ -381,7 +382,7 @@ def _tilt(slope_x, slope_y, first, kept, out, count):
         out[m] = np.float32(min(out[m] / np.sqrt(1.0 + sx * sx + sy * sy), kept))
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _widths(depth, thickness, variance, out_z, to, out, count):
     """Heights [um], LOST below the gates, and widths of the diffusion [um] from there."""
     last = np.float32(variance.size - 1)
@@ -396,7 +397,7 @@ def _widths(depth, thickness, variance, out_z, to, out, count):
         out[m] = np.sqrt(here + (at - np.float32(n)) * (there - here))
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def _place(positions, slopes, slanted, first, depth, width, normal, pitch, origin, out, to,
            count):  # fmt: skip
     """Landing positions along one axis [pixel]."""
@@ -408,7 +409,7 @@ def _place(positions, slopes, slanted, first, depth, width, normal, pitch, origi
         out[to + m] = x
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(**{**INNER, "_nrt": True})
 def land(
     light,
     medium,

@@ -11,12 +11,13 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from bfsensor._kernels.compile_options import INLINED, INNER
 from bfsensor._kernels.counter_rng import log_single
 from bfsensor._kernels.window import sum_8, sum_16, two_sums_8, two_sums_16
 
-NORMAL = 0
+NORMAL = np.int64(0)  # of a literal 0 numba makes a type and compiles for it as well
 """Index of the shift across an edge, by definition of the layout of ``Edges.weights``."""
-TANGENTIAL = 1
+TANGENTIAL = np.int64(1)
 """Index of the shift along an edge, by definition of the layout of ``Edges.weights``."""
 
 
@@ -109,7 +110,7 @@ class Grid(NamedTuple):
     points: int
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def grid(edges, charges):
     """Collect the sizes and offsets of edges and charges."""
     return Grid(
@@ -119,7 +120,7 @@ def grid(edges, charges):
     )  # fmt: skip
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _places(g, upright, layer, point, component, line, other):
     """First indices of a point's weights and of its window, and their rows, in both modes."""
     q = g.reach
@@ -143,7 +144,7 @@ def _places(g, upright, layer, point, component, line, other):
     )  # fmt: skip
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def shift_of(weights, sums, first, second, g, upright, layer, point, component, line, other,
            low_first, low_second):  # fmt: skip
     """Shift of a point of an edge in one layer."""
@@ -163,12 +164,12 @@ def shift_of(weights, sums, first, second, g, upright, layer, point, component, 
     return shift
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def both_shifts(weights, sums, first, second, g, upright, layer, point, line, other, low_first,
           low_second):  # fmt: skip
     """Normal and tangential shift of a point in one layer."""
     begin, at, rows, begin_near, at_near, rows_near, total = _places(
-        g, upright, layer, point, 0, line, other
+        g, upright, layer, point, NORMAL, line, other
     )
     stride = np.uint64(g.stride)
     apart = np.uint64(g.points) * rows * np.uint64(g.lanes)
@@ -187,7 +188,7 @@ def both_shifts(weights, sums, first, second, g, upright, layer, point, line, ot
     return normal, tangential
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def point_shift(weights, sums, first, second, g, upright, layer, part, point, line, other,
            scale, low_first, low_second):  # fmt: skip
     """Shift (normal, tangential) of a point, between two layers."""
@@ -205,7 +206,7 @@ def point_shift(weights, sums, first, second, g, upright, layer, part, point, li
     return scale * normal, scale * tangential
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def find_layer(log_z0, per_log, layers, z):
     """Layer below the height ``z`` [um] and the part of the way to the next."""
     if layers == 1:
@@ -216,7 +217,7 @@ def find_layer(log_z0, per_log, layers, z):
     return layer, at - np.float32(layer)
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def scale_at(scale, per_um, z):
     """Factor of the shifts at a height."""
     if scale.size == 0:

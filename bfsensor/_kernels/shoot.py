@@ -20,6 +20,7 @@ from bfsensor._kernels.charge import (
     close_block,
     deposit,
 )
+from bfsensor._kernels.compile_options import INLINED, INNER
 from bfsensor._kernels.edges import collect
 from bfsensor._kernels.hot import evaluate, fence
 from bfsensor._kernels.photons import land
@@ -55,7 +56,7 @@ class Plan(NamedTuple):
     loss: float
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(**INLINED)
 def _size(plan, total):
     """Size of the block that starts after ``total`` electrons."""
     if not plan.predict:
@@ -63,9 +64,22 @@ def _size(plan, total):
     return min(plan.block, max(total, plan.block / 64.0))
 
 
-@numba.njit(cache=True, nogil=True)
-def finish_block(image, plan, edges, charges, hot, ledger, response):
-    """End the open block: update the frozen charge and mark hot edges."""
+@numba.njit(**INNER)
+def _settle(
+    image, plan, edges, charges, hot, ledger, response, flux, start, z, words, i, j, lo,
+    hi, size,
+):  # fmt: skip
+    """Deposit the electrons lo to hi of a batch.
+
+    A block of ``size`` electrons ends: the frozen charge is updated and hot edges are marked.
+    """
+    ledger.sums[ADDED] += deposit(
+        image, charges, ledger, flux, start, i, j, z, words, lo, hi, plan.full_well,
+        plan.spill_along_y, plan.loss,
+    )  # fmt: skip
+    ledger.counters[PHOTONS] += hi - lo
+    if ledger.sums[IN_BLOCK] < size:
+        return
     ahead = np.float32(0.0)
     if plan.predict and ledger.sums[IN_BLOCK] > 0:
         ahead = np.float32(0.5)
@@ -84,40 +98,27 @@ def finish_block(image, plan, edges, charges, hot, ledger, response):
     ledger.sums[IN_BLOCK] = 0.0
 
 
-@numba.njit(cache=True, nogil=True)
-def renew(image, plan, edges, charges, hot, ledger, response):
-    """End the open block between two calls, and evaluate the hot edges."""
-    finish_block(image, plan, edges, charges, hot, ledger, response)
-    evaluate(edges, charges, hot, 0, hot.used[1])
-    fence(edges, charges, hot, 0, hot.used[1])
-
-
-@numba.njit(cache=True, nogil=True)
-def _settle(
-    image, plan, edges, charges, hot, ledger, response, flux, start, z, words, i, j, lo,
-    hi, size,
-):  # fmt: skip
-    """Deposit the electrons lo to hi of a batch; a block that is full ends."""
-    ledger.sums[ADDED] += deposit(
-        image, charges, ledger, flux, start, i, j, z, words, lo, hi, plan.full_well,
-        plan.spill_along_y, plan.loss,
-    )  # fmt: skip
-    ledger.counters[PHOTONS] += hi - lo
-    if ledger.sums[IN_BLOCK] >= size:
-        finish_block(image, plan, edges, charges, hot, ledger, response)
-
-
 def _shoot(
-    image, light, medium, pattern, plan, edges, charges, hot, ledger, response, threads,
-    x, y, z, words, i, j, near_x, near_y,
+    image, light, medium, pattern, plan, edges, charges, hot, ledger, response, renew,
+    threads, x, y, z, words, i, j, near_x, near_y,
 ):  # fmt: skip
     """Accumulate all photons; returns the flux that stays in the image.
 
+    With ``renew`` the open block ends before them.
     ``x`` to ``words`` are pairs of buffers for BATCH photons, ``i`` to ``near_y`` buffers:
     one batch lands while the one before is deposited, which only one thread can do.
     ``image``, ``charges`` and ``ledger`` are changed.
     """
     ledger.sums[ADDED] = 0.0
+    # Not 0, of which numba would make a type and compile all below for it as well.
+    none = np.int64(0)
+    if renew:
+        _settle(
+            image, plan, edges, charges, hot, ledger, response, light.flux, none, z[0],
+            words[0], i, j, none, none, 0.0,
+        )  # fmt: skip
+        evaluate(edges, charges, hot, none, hot.used[1])
+        fence(edges, charges, hot, none, hot.used[1])
     total = light.x.size
     number = ledger.counters[PHOTONS]
     count = min(BATCH, total)
@@ -133,7 +134,7 @@ def _shoot(
         now = start // BATCH % 2
         count = min(BATCH, total - start)
         after = min(BATCH, total - start - count)
-        done = np.int64(0)  # as a literal 0 would have its own code below
+        done = none
         while done < count:
             size = np.inf
             if plan.block > 0:
@@ -182,9 +183,11 @@ def _shoot(
     return ledger.sums[ADDED]
 
 
-shoot = numba.njit(cache=True, nogil=True)(_shoot)
+shoot = numba.njit(cache=True, nogil=True, no_cfunc_wrapper=True)(_shoot)
 # Under a name of its own: numba's cache knows functions by name and line, and would give
 # back the code for one thread.
 _shoot_on_threads = FunctionType(_shoot.__code__, globals(), "_shoot_on_threads")
 _shoot_on_threads.__qualname__ = "_shoot_on_threads"
-shoot_on_threads = numba.njit(cache=True, nogil=True, parallel=True)(_shoot_on_threads)
+shoot_on_threads = numba.njit(cache=True, nogil=True, no_cfunc_wrapper=True, parallel=True)(
+    _shoot_on_threads
+)

@@ -3,15 +3,17 @@
 import numba
 import numpy as np
 
+from bfsensor._kernels.compile_options import INLINED, INNER
 
-@numba.njit(cache=True, inline="always")
+
+@numba.njit(**INLINED)
 def within(place, size):
     """Pixel of the image, 0 to ``size`` - 1, that a place beyond it mirrors, at any distance."""
     place %= 2 * size
     return place if place < size else 2 * size - 1 - place
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def mirror_all(charges, array):
     """Fill the padding of an array with the mirror image of the pixels of the image."""
     pad, stride = charges.pad, charges.stride
@@ -28,7 +30,7 @@ def mirror_all(charges, array):
             array[np.uint64(start + i)] = array[np.uint64(source + within(i, nx))]
 
 
-@numba.njit(cache=True, _nrt=False)
+@numba.njit(**INNER)
 def mirror_pixel(charges, array, j, i):
     """Copy the value of a pixel of the image to its mirror images in the padding."""
     pad, stride = charges.pad, charges.stride

@@ -8,40 +8,45 @@ from typing import Any
 import click
 
 # Measured CPU seconds with an empty cache, on the machine of the notice in bfsensor._kernels.notice:
-# images 33 (32 bits) + 9 (64 bits), areas 8, threads 25, tables 5 of their own and a table of 4.
-_SENSORS, _THREADS, _TABLES = 50, 25, 10
+# images 13, areas 7, threads 11, tables 5 of their own and a table of 4.
+_IMAGES, _AREAS, _THREADS, _TABLES = 13, 7, 11, 10
 
 
 @click.command("warm", short_help="Compile the kernels of the sensors.")
+@click.option("--areas", is_flag=True,
+              help="Also compile the kernels of calculate_pixel_areas, about "
+              f"{_AREAS} CPU s.")  # fmt: skip
 @click.option("--threads", is_flag=True,
               help=f"Also compile the kernels of sensors with threads=2 or more, about "
               f"{_THREADS} CPU s.")  # fmt: skip
 @click.option("--tables", is_flag=True,
               help=f"Also compile the kernels of 'bfsensor table', about {_TABLES} CPU s.")  # fmt: skip
-def warm(threads: bool, tables: bool) -> None:
+@click.option("--all", "everything", is_flag=True, help="All of these.")
+def warm(areas: bool, threads: bool, tables: bool, everything: bool) -> None:
     """Compile the kernels of the sensors now, so that the first image does not wait.
 
     Without this command kernels are compiled on first use.  Compiled kernels are kept on disk, for
     this processor and version, in the folder that is printed (the environment variable
-    NUMBA_CACHE_DIR changes it), and are not compiled again.  Covers images of 32 and 64 bits and
-    pixel areas, with and without tree rings.
+    NUMBA_CACHE_DIR changes it), and are not compiled again.  One set of kernels serves both sensors,
+    images of 32 and 64 bits, light with and without colour, and tree rings.
 
     \b
     Examples:
       bfsensor warm
-      bfsensor warm --threads --tables
+      bfsensor warm --all
     """
     from numba.core import event
 
     from bfsensor._kernels import shoot
     from bfsensor._kernels.notice import notice
 
-    seconds = _SENSORS + _THREADS * threads + _TABLES * tables
+    areas, threads, tables = (part or everything for part in (areas, threads, tables))
+    seconds = _IMAGES + _AREAS * areas + _THREADS * threads + _TABLES * tables
     click.echo(f"compiling the kernels that are missing: about {seconds} s, once", err=True)
     notice.given = True  # said just now
     began = time.perf_counter()
     with event.install_recorder("numba:compile") as recorder:
-        _use_sensors(threads)
+        _use_sensors(areas=areas, threads=threads)
         if tables:
             _use_tables()
     kernels = {
@@ -54,8 +59,8 @@ def warm(threads: bool, tables: bool) -> None:
     click.echo(f"{done}, {took:.0f} s; kept in {shoot.shoot.stats.cache_path}")
 
 
-def _use_sensors(threads: bool) -> None:
-    """Draw a few photons with each combination of options that has kernels of its own."""
+def _use_sensors(*, areas: bool, threads: bool) -> None:
+    """Draw a few photons, and what else is asked for."""
     import galsim
     import numpy as np
 
@@ -63,19 +68,20 @@ def _use_sensors(threads: bool) -> None:
     from bfsensor.sensor.brighter_fatter import BrighterFatterSensor
 
     rings = galsim.LookupTable([0.0, 100.0], [0.0, 0.01], interpolant="linear")
-    options: list[dict[str, Any]] = [{}, {"treering_func": rings}]
+    options: list[dict[str, Any]] = [{}]
+    options += [{"treering_func": rings}] if areas else []
     options += [{"threads": 2}] if threads else []
-    for kind in (np.float32, np.float64):
-        for given in options:
-            sensor = BrighterFatterSensor(rng=galsim.BaseDeviate(7321), **given)
-            image = galsim.Image(9, 9, dtype=kind)
+    for given in options:
+        sensor = BrighterFatterSensor(rng=galsim.BaseDeviate(7321), **given)
+        # Areas of large images are summed in single precision, by code of its own.
+        for side in (9, 512) if areas else (9,):
+            image = galsim.Image(side, side, dtype=np.float32)
             # Fewer would not be worth a second thread.
-            count = 2 * PIECE if "threads" in given else 10
-            middle = np.full(count, 5.0)
-            photons = galsim.PhotonArray(count, x=middle, y=middle, flux=1)
+            middle = np.full(2 * PIECE if "threads" in given else 10, 5.0)
+            photons = galsim.PhotonArray(len(middle), x=middle, y=middle, flux=1)
             sensor.accumulate(photons, image)
-            sensor.accumulate(photons, image, resume=True, recalc=True)
-            sensor.calculate_pixel_areas(image)
+            if areas:
+                sensor.calculate_pixel_areas(image)
 
 
 def _use_tables() -> None:

@@ -225,11 +225,9 @@ class EngineSensor(galsim.SiliconSensor):
             self._exposure = self._expose(image, array, orig_center)
             self._last_image = image
         assert self._exposure is not None
-        if resume and recalc:
-            self._exposure.renew(array)
         self._exposure.threads = count_threads(self.threads)
         self._exposure.dropped += dropped
-        return self._exposure.add(array, self._change_light(light))
+        return self._exposure.add(array, self._change_light(light), renew=resume and recalc)
 
     def _check_resumed(self, image: galsim.Image) -> None:
         """Refuse to continue with an image whose pixels or place are not those of the last call."""

@@ -18,7 +18,7 @@ from bfsensor.effects.effect import Layout
 from bfsensor.errors import SensorError, SensorTypeError
 from bfsensor.sensor.base import check_rings, make_rng
 from bfsensor.sensor.boundary_shifts import make_shifts
-from bfsensor.sensor.drift_field import STEPS, solve_drift
+from bfsensor.sensor.drift_field import solve_drift
 from bfsensor.sensor.effect_sensor import EffectSensor
 from bfsensor.sensor.image_exposure import Physics
 from bfsensor.sensor.options import (
@@ -40,6 +40,7 @@ from bfsensor.sensor.options import (
     shown,
 )
 from bfsensor.sensor.shift_maps import ShiftMap
+from bfsensor.simulate.mean_field import STEPS
 from bfsensor.table.table import DistortionTable
 from bfsensor.typing import FloatArray
 
@@ -345,7 +346,9 @@ class BrighterFatterSensor(EffectSensor):
         self.residual = factors.residual
         # Below the lowest height that was traced the wells hold the electrons: no diffusion.
         start = table.depths[1] if len(table.depths) > 1 else 0.0
-        drift = solve_drift(table.device_text, self.temperature, float(start))
+        drift = solve_drift(
+            table.device_text, self.temperature, float(start), tuple(table.drift_field)
+        )
         sigma = self.diffusion_factor and self.diffusion_factor * self._width()
         pitch = table.pitch[::-1] if self.transpose else table.pitch
         lengths, first, step = self._lengths()

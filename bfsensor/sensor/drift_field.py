@@ -20,18 +20,13 @@ from functools import lru_cache
 import numpy as np
 
 from bfsensor.device.device import Device
+from bfsensor.simulate.mean_field import STEPS, mean_drift_field
 from bfsensor.typing import FloatArray
-
-STEPS = 256
-"""Number of equal steps of height from the gates to the back surface.
-
-Chosen: twice as many change the variance of the diffusion by less than 0.1 % and the relative shift
-by ripples by less than 2e-4 (the two LSST devices)."""
 
 
 @dataclass(frozen=True)
 class Drift:
-    """Diffusion and ripple shift by height of conversion, on :data:`STEPS` equal steps.
+    """Diffusion and ripple shift by height of conversion, on equal steps.
 
     Attributes
     ----------
@@ -52,8 +47,10 @@ class Drift:
 
 
 @lru_cache(maxsize=16)
-def solve_drift(device_text: str, temperature: float, start: float) -> Drift:
-    """Solve the empty device and integrate diffusion and ripple shift over its drift field.
+def solve_drift(
+    device_text: str, temperature: float, start: float, known: tuple[float, ...] = ()
+) -> Drift:
+    """Integrate diffusion and ripple shift over the drift field of the empty device.
 
     Parameters
     ----------
@@ -63,26 +60,17 @@ def solve_drift(device_text: str, temperature: float, start: float) -> Drift:
         Temperature of the silicon [K].
     start : float
         Height below which diffusion is neglected, because the wells hold the electrons [um].
+    known : tuple of float
+        The field [V/um], if it is known (:func:`bfsensor.simulate.mean_field.mean_drift_field`);
+        otherwise the device is solved.
 
     Returns
     -------
     Drift
     """
-    from bfsensor.simulate.unit_cell import solve_unit_cell
-
     device = Device.from_toml(device_text)
-    unit = solve_unit_cell(device, 0.0, cells=8)
-    mesh = unit.mesh
-    mean = np.average(
-        np.average(unit.phi, axis=2, weights=_shares(mesh.x)),
-        axis=1,
-        weights=_shares(mesh.y),
-    )
     heights = np.linspace(0.0, device.silicon.thickness, STEPS + 1)
-    middle = 0.5 * (mesh.z[1:] + mesh.z[:-1])
-    # Electrons drift down where the potential rises towards the gates.
-    slope = -np.diff(mean) / np.diff(mesh.z)
-    field = np.interp(heights, middle, slope)
+    field = np.array(known) if known else mean_drift_field(device)
     above = heights >= start
     inverse = np.zeros_like(field)
     inverse[above] = 1.0 / field[above]
@@ -91,14 +79,6 @@ def solve_drift(device_text: str, temperature: float, start: float) -> Drift:
     pull = heights * (heights[-1] - heights) * inverse
     ripple = _integral(pull, step)
     return Drift(heights, field, 2 * kt * _integral(inverse, step), ripple / ripple[-1])
-
-
-def _shares(nodes: FloatArray) -> FloatArray:
-    """Length of the mesh that belongs to each node."""
-    out = np.zeros(len(nodes))
-    out[1:] += 0.5 * np.diff(nodes)
-    out[:-1] += 0.5 * np.diff(nodes)
-    return out
 
 
 def _integral(values: FloatArray, step: float) -> FloatArray:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bfsensor._kernels import charge as _charge
 from bfsensor._kernels import shoot as _shoot
-from bfsensor._kernels.charge import TILE, Ledger, Response
+from bfsensor._kernels.charge import TILE, Ledger, Pixels, Response
 from bfsensor._kernels.hot import FENCES, Hot
 from bfsensor._kernels.photons import Light, Medium, Pattern
 from bfsensor._kernels.shifts import Charges, Edges
@@ -54,7 +54,8 @@ class Physics:
     spill_along_y : bool
         Whether columns run along y.
     block : float
-        Electrons between two renewals of the boundaries; 0: only :meth:`ImageExposure.renew`.
+        Electrons between two renewals of the boundaries; 0: only by ``renew`` of
+        :meth:`ImageExposure.add`.
     predict : bool
         Whether the charge expected in the middle of a block acts, or that at its start.
     loss : float
@@ -134,17 +135,22 @@ class ImageExposure:
             *(np.empty(batch, np.int32) for _ in range(4)),
         )
         _charge.take_image(
-            np.ascontiguousarray(image), self.charges, self.ledger, physics.response,
+            as_pixels(np.ascontiguousarray(image)), self.charges, self.ledger, physics.response,
             physics.edges, np.float32(0),
         )  # fmt: skip
 
-    def add(self, image: NDArray[np.floating], light: Light) -> float:
-        """Collect photons in the image, in place; returns the flux that was collected [e-]."""
+    def add(
+        self, image: NDArray[np.floating], light: Light, *, renew: bool = False
+    ) -> float:
+        """Collect photons in the image, in place; returns the flux that was collected [e-].
+
+        With ``renew`` the boundaries are renewed first, from the image's charge now.
+        """
         p = self.physics
         with _in_rows(image) as pixels:
             arguments: Any = (
                 pixels, light, p.medium, self.pattern, self.plan, p.edges, self.charges,
-                self.hot, self.ledger, p.response,
+                self.hot, self.ledger, p.response, renew,
             )  # fmt: skip
             with threads_to_use(self._busy_threads(light.x.size)) as threads:
                 if threads == 1:
@@ -156,14 +162,6 @@ class ImageExposure:
         block = self.physics.block
         largest = min(photons, block) if block > 0 else photons
         return max(1, min(self.threads, int(largest // _SHARE)))
-
-    def renew(self, image: NDArray[np.floating]) -> None:
-        """Renew the boundaries from the image's charge now."""
-        p = self.physics
-        with _in_rows(image) as pixels:
-            _shoot.renew(
-                pixels, self.plan, p.edges, self.charges, self.hot, self.ledger, p.response
-            )
 
     def copy(self) -> ImageExposure:
         """Return an independent copy."""
@@ -190,17 +188,24 @@ class ImageExposure:
 
 
 @contextmanager
-def _in_rows(image: NDArray[np.floating]) -> Iterator[NDArray[np.floating]]:
-    """Yield the image as a C-contiguous array: itself, or a copy that is written back.
+def _in_rows(image: NDArray[np.floating]) -> Iterator[Pixels]:
+    """Yield the image as a C-contiguous array: its own, or a copy that is written back.
 
     Kernels are compiled once for each memory layout, which takes longer than any copy.
     """
     if image.flags.c_contiguous:
-        yield image
+        yield as_pixels(image)
         return
     pixels = np.ascontiguousarray(image)
-    yield pixels
+    yield as_pixels(pixels)
     image[...] = pixels
+
+
+def as_pixels(image: NDArray[np.floating]) -> Pixels:
+    """Hand a C-contiguous image of float32 or float64 to the kernels, as one type for both."""
+    if image.dtype == np.float32:
+        return Pixels(image, np.zeros((0, 0)))
+    return Pixels(_EMPTY_2, image)
 
 
 def _no_hot_edges(edges: Edges, tiles: int) -> Hot:

@@ -16,7 +16,6 @@ from bfsensor._kernels.shifts import Edges
 from bfsensor.device.shipped import did_you_mean, tables_dir
 from bfsensor.errors import SensorError, TableError
 from bfsensor.sensor.base import EngineSensor, check_rings, make_rng, read_numbers
-from bfsensor.sensor.drift_field import STEPS
 from bfsensor.sensor.edge_weights import make_edges, transpose_sides
 from bfsensor.sensor.image_exposure import Physics
 from bfsensor.sensor.options import (
@@ -29,6 +28,7 @@ from bfsensor.sensor.options import (
     galsim_folder,
     outside_charge,
 )
+from bfsensor.simulate.mean_field import STEPS
 from bfsensor.table.galsim_format import read_sides
 from bfsensor.typing import FloatArray
 

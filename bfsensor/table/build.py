@@ -15,6 +15,7 @@ import bfsensor
 from bfsensor.errors import TableError
 from bfsensor.response.periodic_images import PERIOD
 from bfsensor.simulate.charge_field import ImageCharge
+from bfsensor.simulate.mean_field import mean_drift_field
 from bfsensor.simulate.mesh import make_mesh
 from bfsensor.simulate.poisson import AREA_PER_VOLT
 from bfsensor.table.build_image_charge import build_image_charge_table
@@ -182,6 +183,7 @@ def _solve_table(
         },
         full_well=plan.full_well,
         symmetric=True,
+        drift_field=mean_drift_field(plan.device),
     )
 
 

@@ -101,8 +101,17 @@ def write_table(table: Any, path: str | os.PathLike[str], *, overwrite: bool) ->
     for name, text in (("META", meta), ("DEVICE", table.device_text)):
         data = np.frombuffer(text.encode(), np.uint8) if text else None
         hdus.append(fits.ImageHDU(data, name=name))
+    if table.drift_field.size:
+        hdus.append(drift_extension(table.drift_field))
     with written_whole(path, TableError) as beside:
         fits.HDUList(hdus).writeto(beside, checksum=True, overwrite=True)
+
+
+def drift_extension(field: FloatArray) -> fits.ImageHDU:
+    """Store the drift field of the empty device [V/um], which files may lack."""
+    hdu = fits.ImageHDU(field, name="DRIFT")
+    hdu.header["BUNIT"] = "V/um"
+    return hdu
 
 
 def read_fields(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -172,6 +181,7 @@ def _fields(header: Mapping[str, Any], data: dict[str, Any]) -> dict[str, Any]:
         "provenance": meta["provenance"],
         "device_text": _text(data["DEVICE"]),
         "symmetric": header["SYMMETRC"],
+        "drift_field": np.array(data.get("DRIFT", ()), float),
         **arrays,
     }
 

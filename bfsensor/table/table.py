@@ -62,6 +62,9 @@ class DistortionTable:
         Text of the device file; empty where not known.
     symmetric : bool
         Whether the lines in x and in y through the source pixel's centre are mirror lines.
+    drift_field : ndarray, shape (n,)
+        Drift field of the empty device, averaged over a pixel [V/um], at the 257 heights of
+        :func:`bfsensor.simulate.mean_field.mean_drift_field`; of size 0 where not known.
 
     Raises
     ------
@@ -107,6 +110,7 @@ class DistortionTable:
     provenance: Mapping[str, str] = field(default_factory=dict, repr=False)
     device_text: str = field(default="", repr=False)
     symmetric: bool = True
+    drift_field: FloatArray = field(default_factory=lambda: np.zeros(0), repr=False)
 
     def __post_init__(self) -> None:
         self._check_numbers()
@@ -150,6 +154,10 @@ class DistortionTable:
                     "nothing moves"
                 )
             _keep(self, name, array)
+        drift = np.array(self.drift_field, float)
+        if drift.ndim != 1 or not np.all(np.isfinite(drift)):
+            raise TableError("drift_field must be a list of finite numbers")
+        _keep(self, "drift_field", drift)
         errors = {str(k): float(v) for k, v in self.errors.items()}
         provenance = {str(k): str(v) for k, v in self.provenance.items()}
         object.__setattr__(self, "errors", MappingProxyType(errors))

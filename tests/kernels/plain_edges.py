@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 
 from bfsensor._kernels import edges as kernel
+from bfsensor._kernels.compile_options import from_python
 from bfsensor._kernels.photons import Pattern
 from bfsensor.device.shipped import tables_dir
 from bfsensor.sensor.charge_response import factor_table
@@ -13,6 +14,8 @@ from bfsensor.sensor.image_exposure import ImageExposure, Physics
 from bfsensor.sensor.silicon_sensor import SiliconSensor
 from bfsensor.table.galsim_format import read_sides
 from bfsensor.table.table import DistortionTable
+
+collect = from_python(kernel.collect)
 
 NEAR = 1
 """Reach of the second mode [pixel]."""
@@ -84,7 +87,7 @@ def find_pixels(sensor, exposure, x, y, z, edges=None, hot=None):
     """Pixels (i, j) of electrons by the kernel."""
     count = len(x)
     room = [np.zeros(count, np.int32) for _ in range(4)]
-    kernel.collect(
+    collect(
         sensor.physics.edges if edges is None else edges, exposure.charges,
         exposure.hot if hot is None else hot, np.ascontiguousarray(x, float),
         np.ascontiguousarray(y, float), np.asarray(z, np.float32), 0, count, *room,

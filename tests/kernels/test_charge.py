@@ -8,6 +8,8 @@ import pytest
 
 from bfsensor._kernels import charge as kernel
 from bfsensor._kernels.charge import TILE
+from bfsensor._kernels.compile_options import from_python
+from bfsensor.sensor.image_exposure import as_pixels
 from tests.kernels.plain_edges import (
     effective_charges,
     expose,
@@ -16,6 +18,8 @@ from tests.kernels.plain_edges import (
     table_sensor,
 )
 
+close_block, deposit = from_python(kernel.close_block), from_python(kernel.deposit)
+
 
 def put(
     exposure, image, i, j, *, flux=1.0, words=None, z=None, full_well=np.inf, along_y=True,
@@ -23,8 +27,8 @@ def put(
 ):  # fmt: skip
     """Deposit electrons in pixels (i, j); returns what stays."""
     count = len(i)
-    return kernel.deposit(
-        image, exposure.charges, exposure.ledger,
+    return deposit(
+        as_pixels(image), exposure.charges, exposure.ledger,
         np.ascontiguousarray(np.broadcast_to(np.asarray(flux, float), count)), 0,
         np.asarray(i, np.int32), np.asarray(j, np.int32),
         np.full(count, 50.0, np.float32) if z is None else np.asarray(z, np.float32),
@@ -35,8 +39,8 @@ def put(
 
 def close(sensor, exposure, image, ahead=0.0, crowd=np.inf):
     p = sensor.physics
-    kernel.close_block(
-        image, exposure.charges, exposure.ledger, p.response, p.edges, exposure.hot,
+    close_block(
+        as_pixels(image), exposure.charges, exposure.ledger, p.response, p.edges, exposure.hot,
         np.float32(ahead), np.float32(crowd), np.float32(1.0),
     )  # fmt: skip
 

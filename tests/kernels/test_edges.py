@@ -5,6 +5,7 @@ import pytest
 
 from bfsensor._kernels import hot as hot_kernel
 from bfsensor._kernels.charge import TILE
+from bfsensor._kernels.compile_options import from_python
 from tests.kernels.plain_edges import (
     IMAGES,
     Truth,
@@ -20,6 +21,11 @@ from tests.kernels.plain_edges import (
     scatter,
     silicon_sensor,
     table_sensor,
+)
+
+heat, evaluate, fence, cool, decide_hot = (
+    from_python(getattr(hot_kernel, name))
+    for name in ("heat", "evaluate", "fence", "cool", "decide_hot")
 )
 
 
@@ -210,12 +216,12 @@ def test_hot_edges_are_the_same_polylines(sensor, name):
     ny, nx = image.shape
     for j in range(2, ny, 1):
         for i in range(nx - 3):
-            hot_kernel.heat(edges, charges, hot, 0, i, j)
-            hot_kernel.heat(edges, charges, hot, 1, j, i)
+            heat(edges, charges, hot, 0, i, j)
+            heat(edges, charges, hot, 1, j, i)
     count = hot.used[1]
     assert count == 2 * (ny - 2) * (nx - 3)
-    hot_kernel.evaluate(edges, charges, hot, 0, count)
-    hot_kernel.fence(edges, charges, hot, 0, count)
+    evaluate(edges, charges, hot, 0, count)
+    fence(edges, charges, hot, 0, count)
     z = 99.0
     layer = sensor.layers - 1
     sides = draw_sides(sensor, displaced(sensor, image, layer), sensor.factor(z))
@@ -229,14 +235,14 @@ def test_hot_edges_are_the_same_polylines(sensor, name):
     assert truth.agrees(*given)[clear].all()
     # They were looked at: with their shifts off the answers are the nominal pixels.
     hot.lines[:] = 0.0
-    hot_kernel.fence(edges, charges, hot, 0, count)
+    fence(edges, charges, hot, 0, count)
     given = find_pixels(sensor, exposure, x, y, np.full(len(x), z))
     inner = (x > 0.5) & (x < nx - 4) & (y > 2.5) & (y < ny - 0.5)
     inner &= (abs(x - np.round(x)) > 1e-4) & (abs(y - np.round(y)) > 1e-4)
     assert np.array_equal(given[0][inner], np.floor(x[inner]))
     assert np.array_equal(given[1][inner], np.floor(y[inner]))
     # Cooled, they are forgotten.
-    hot_kernel.cool(hot)
+    cool(hot)
     assert (hot.page_of == -1).all()
     again = find_pixels(sensor, exposure, x, y, np.full(len(x), z))
     assert np.array_equal(again[0], i)
@@ -254,10 +260,10 @@ def test_hot_edges_change_nothing_at_any_height(sensor, name, pedestal):
     rng = np.random.default_rng(55103)
     # Some edges are not hot, so that bounds end where a line does.
     for j, i in np.argwhere(rng.random((ny, nx)) < 0.8):
-        hot_kernel.heat(edges, charges, hot, 0, i, j)
-        hot_kernel.heat(edges, charges, hot, 1, j, i)
-    hot_kernel.evaluate(edges, charges, hot, 0, hot.used[1])
-    hot_kernel.fence(edges, charges, hot, 0, hot.used[1])
+        heat(edges, charges, hot, 0, i, j)
+        heat(edges, charges, hot, 1, j, i)
+    evaluate(edges, charges, hot, 0, hot.used[1])
+    fence(edges, charges, hot, 0, hot.used[1])
     sides = draw_sides(sensor, displaced(sensor, image, sensor.layers - 1))
     x, y = scatter(sides, 60000, 90121)
     z = rng.uniform(20.0, 99.9, len(x)).astype(np.float32)
@@ -265,12 +271,12 @@ def test_hot_edges_change_nothing_at_any_height(sensor, name, pedestal):
     # The bounds decide most electrons: two thirds of them are at edges whose line is hot.
     u, v = rng.uniform(0, (nx, ny), (5000, 2)).T
     all_of_them = np.arange(5000, dtype=np.int32)
-    left = hot_kernel.decide_hot(
-        edges, charges, hot, True, u, v, z[z > 70][:5000], all_of_them, 5000,
+    left = decide_hot(
+        edges, charges, hot, np.bool_(True), u, v, z[z > 70][:5000], all_of_them, 5000,
         np.zeros(5000, np.int32),
     )  # fmt: skip
     assert left < 2500 or charges.margins.max() >= 0.5
-    hot_kernel.cool(hot)
+    cool(hot)
     again = find_pixels(sensor, exposure, x, y, z)
     assert np.array_equal(given[0], again[0])
     assert np.array_equal(given[1], again[1])

@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 
 from bfsensor._kernels import photons as kernel
+from bfsensor._kernels.compile_options import from_python
 from bfsensor._kernels.counter_rng import deviates
 from bfsensor._kernels.photons import Light, Medium, Pattern
+
+land_photons, find_origin, fixed_shift = map(
+    from_python, (kernel.land, kernel.find_origin, kernel.fixed_shift)
+)
 
 NONE = np.zeros(0)
 KEY = (np.uint32(0xB0A3), np.uint32(0x71))
@@ -48,7 +53,7 @@ def land(light, medium, pattern=NO_PATTERN, lo=0, hi=None, number=1000):
     x, y = np.full((2, hi - lo), np.nan)
     z = np.full(hi - lo, np.nan, np.float32)
     words = np.full(hi - lo, 0xDEADBEEF, np.uint32)
-    kernel.land(light, medium, pattern, lo, hi, number, *KEY, *ORIGIN, x, y, z, words)
+    land_photons(light, medium, pattern, lo, hi, number, *KEY, *ORIGIN, x, y, z, words)
     return x, y, z, words
 
 
@@ -299,7 +304,7 @@ def test_fixed_shifts_equal_their_plain_twin(name):
         [96.75, 20.0],
     ]
     for (x, y), part in zip(points, rng.uniform(0, 1, 40), strict=True):
-        found = kernel.fixed_shift(pattern, x, y, part)
+        found = fixed_shift(pattern, x, y, part)
         # Double precision; a position of 70 in steps of 0.25 is good to 1e-13.
         assert np.allclose(found, plain_shift(pattern, x, y, part), rtol=0, atol=1e-13)
 
@@ -355,7 +360,7 @@ def test_origins_under_large_shifts_are_found():
     places = np.linspace(2.05, 7.15, 103)
     moved = np.arange(9.0) + shift
     for x in places:
-        px, py = kernel.find_origin(pattern, x, 1.3, 1.0)
+        px, py = find_origin(pattern, x, 1.3, 1.0)
         assert px == pytest.approx(np.interp(x, moved[2:], np.arange(2.0, 9.0)), abs=3e-6)
         assert py == 1.3
 
@@ -367,8 +372,8 @@ def test_origins_under_small_shifts_take_four_steps():
     )
     px = 0.5
     for _ in range(4):
-        px = 0.5 - kernel.fixed_shift(pattern, px, 0.5, 1.0)[0]
-    assert kernel.find_origin(pattern, 0.5, 0.5, 1.0)[0] == px
+        px = 0.5 - fixed_shift(pattern, px, 0.5, 1.0)[0]
+    assert find_origin(pattern, 0.5, 0.5, 1.0)[0] == px
 
 
 @pytest.mark.kernels

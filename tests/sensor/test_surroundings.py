@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from bfsensor import BrighterFatterSensor, SiliconSensor, draw_flat
+from bfsensor._kernels import surroundings
+from bfsensor._kernels.compile_options import from_python
 from bfsensor._kernels.shifts import Charges
-from bfsensor._kernels.surroundings import mirror_all, mirror_pixel
 from bfsensor.errors import SensorError
 
 KINDS = pytest.mark.parametrize("kind", [SiliconSensor, BrighterFatterSensor])
@@ -182,6 +183,9 @@ def test_single_pixels_are_mirrored_as_the_whole_image(shape):
     pixels = np.random.default_rng(1).uniform(1, 2, shape).astype(np.float32)
     grid[pad : pad + ny, pad : pad + nx] = pixels
     one = whole.copy()
+    mirror_all, mirror_pixel = map(
+        from_python, (surroundings.mirror_all, surroundings.mirror_pixel)
+    )
     mirror_all(charges, whole)
     np.testing.assert_array_equal(grid, np.pad(pixels, pad, mode="symmetric"))
     for j in range(ny):

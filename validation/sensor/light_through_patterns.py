@@ -28,7 +28,9 @@ import numpy as np
 from astropy.table import Table
 
 from bfsensor import BrighterFatterSensor, DistortionTable, ShiftMap, SiliconSensor
-from bfsensor._kernels.photons import Light, find_origin, fixed_shift, land
+from bfsensor._kernels import photons as kernels
+from bfsensor._kernels.compile_options import from_python
+from bfsensor._kernels.photons import Light
 from bfsensor.device.shipped import tables_dir
 from bfsensor.sensor.base import EngineSensor
 from bfsensor.sensor.shift_maps import make_pattern, sample_rings
@@ -75,6 +77,9 @@ def guard_ring() -> ShiftMap:
 
 def positions(count: int) -> Table:
     """Compare origins by the kernels with those of the iteration."""
+    land, find_origin, fixed_shift = map(
+        from_python, (kernels.land, kernels.find_origin, kernels.fixed_shift)
+    )
     rows = []
     sensor = BrighterFatterSensor(diffusion_factor=0.0)
     medium, factor = sensor._physics.medium, sensor._factor
