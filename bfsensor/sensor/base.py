@@ -77,6 +77,9 @@ class EngineSensor(galsim.SiliconSensor):
     def _check_charge(self, image: NDArray[np.floating]) -> None:
         """Refuse charge beyond the sensor's range; by default any charge is allowed."""
 
+    def _check_light(self, light: Light) -> None:
+        """Warn of light beyond the sensor's range, or refuse it; by default any is allowed."""
+
     def _change_light(self, light: Light) -> Light:
         """Change light before it enters the silicon."""
         return light
@@ -219,6 +222,7 @@ class EngineSensor(galsim.SiliconSensor):
             self._check_resumed(image)
         array = pixels_of(image)
         light, dropped = _light(photons)
+        self._check_light(light)
         if not resume:
             self._check_finite(array)
             self._check_charge(array)

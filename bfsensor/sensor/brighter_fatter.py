@@ -13,7 +13,7 @@ import galsim
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor._kernels.photons import Medium
+from bfsensor._kernels.photons import Light, Medium
 from bfsensor.effects.effect import Layout
 from bfsensor.errors import SensorError, SensorTypeError
 from bfsensor.sensor.base import check_rings, make_rng
@@ -438,7 +438,6 @@ class BrighterFatterSensor(EffectSensor):
             As :meth:`EngineSensor.accumulate`; also, with ``beyond='error'``, if a pixel would
             hold more charge than the table.  The image is unchanged after any error.
         """
-        self._check_light(photons)
         if self.beyond == "hold":
             added = super().accumulate(photons, image, orig_center, resume, recalc)
             self._warn_beyond()
@@ -468,22 +467,22 @@ class BrighterFatterSensor(EffectSensor):
                 stacklevel=4,
             )
 
-    def _check_light(self, photons: galsim.PhotonArray) -> None:
+    def _check_light(self, light: Light) -> None:
         """Look for wavelengths without absorption length, and light below the table's first depth."""
-        if not (len(photons) and photons.hasAllocatedWavelengths()):
+        waves = light.wavelength
+        if not waves.size:
             return
-        waves = photons.wavelength
-        low, high = float(waves.min()), float(waves.max())
-        if not (math.isfinite(low) and math.isfinite(high)):
-            # Lost photons may have nan; light of infinite wavelength crosses the silicon.
-            finite = waves[np.isfinite(waves)]
-            if not finite.size:
-                return
-            low, high = float(finite.min()), float(finite.max())
         medium, thickness = self._physics.medium, self.table.thickness
         known = medium.wavelength_0 + medium.wavelength_step * np.arange(
             len(medium.lengths)
         )
+        low, high = float(waves.min()), float(waves.max())
+        if not (known[0] <= low and high <= known[-1]):
+            # Photons without flux may have any; light of infinite wavelength crosses the silicon.
+            used = waves[np.isfinite(waves) & (light.flux != 0)]
+            if not used.size:
+                return
+            low, high = float(used.min()), float(used.max())
         if low < known[0] or high > known[-1]:
             self._outside(
                 "wavelengths",

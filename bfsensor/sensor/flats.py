@@ -16,6 +16,7 @@ from bfsensor.sensor.applied_effects import AppliedEffects
 from bfsensor.sensor.base import EngineSensor, make_rng
 from bfsensor.sensor.effect_sensor import EffectSensor
 from bfsensor.sensor.options import (
+    HIGHEST_CHARGE,
     check_array,
     check_instance,
     check_shape,
@@ -25,10 +26,6 @@ from bfsensor.sensor.options import (
     wrong_value,
 )
 from bfsensor.typing import FloatArray
-
-_HIGHEST = 1e9
-"""Highest level of a flat [e-].  Chosen: a thousand full wells; single precision holds whole
-electrons up to 1.7e7, and at twice as much nothing changes."""
 
 _STEPS = 1e6
 """Largest number of steps of a flat.  Chosen: a small flat takes minutes with so many, and twice
@@ -149,10 +146,10 @@ def iterate_flat(
     )
     shape = ny, nx = check_shape("shape", shape)
     level, step = _check_charge("level", level), _check_charge("step", step)
-    if level > _HIGHEST or level / step > _STEPS:
+    if level > HIGHEST_CHARGE or level / step > _STEPS:
         raise SensorError(
-            f"level = {level:g} e- in steps of step = {step:g} e- must be at most {_HIGHEST:g} e-, "
-            f"in {_STEPS:g} steps"
+            f"level = {level:g} e- in steps of step = {step:g} e- must be at most "
+            f"{HIGHEST_CHARGE:g} e-, in {_STEPS:g} steps"
         )
     if border is None:
         border = 0 if sensor.surroundings == "mirrored" else 8

@@ -17,6 +17,10 @@ from bfsensor.errors import SensorError, SensorTypeError, TableError
 from bfsensor.table.table import DistortionTable
 from bfsensor.typing import FloatArray
 
+HIGHEST_CHARGE = 1e9
+"""Highest level of a flat and of the charge beyond an image [e-].  Chosen: a thousand full wells; single precision holds whole
+electrons up to 1.7e7, and at twice as much nothing changes."""
+
 LARGEST = 1e6
 """Largest strength and factor on the diffusion.
 
@@ -232,11 +236,11 @@ def check_diffusion(value: str | float) -> str | float:
     if isinstance(value, str) and value in ("device", "einstein"):
         return value
     number = to_float(value)
-    if not (math.isfinite(number) and number >= 0):
+    if not 0.0 <= number <= LARGEST:
         raise wrong_value(
             value,
             f"diffusion = {shown(value)} must be 'device', 'einstein', or the width over Einstein's, a "
-            "finite number from 0",
+            f"number from 0 to {LARGEST:g}",
         )
     return number
 
@@ -246,11 +250,11 @@ def check_surroundings(value: str | float) -> str | float:
     if isinstance(value, str) and value in ("none", "mirrored"):
         return value
     number = to_float(value)
-    if not (math.isfinite(number) and number >= 0):
+    if not 0.0 <= number <= HIGHEST_CHARGE:
         raise wrong_value(
             value,
             f"surroundings = {shown(value)} must be 'none', 'mirrored', or the charge of every pixel "
-            "beyond the image, a finite number from 0 e-",
+            f"beyond the image, a number from 0 to {HIGHEST_CHARGE:g} e-",
         )
     return number
 

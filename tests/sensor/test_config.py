@@ -206,7 +206,7 @@ def test_our_silicon_sensor_has_a_type_of_its_own():
     ):
         build({"type": "BfsensorSilicon", "threads": "all"})
     known = set(bfsensor.SiliconSensor._opt_params)
-    assert known == set(galsim.SiliconSensor._opt_params) | {"threads"}
+    assert known == set(galsim.SiliconSensor._opt_params) | {"surroundings", "threads"}
 
 
 def used_threads(kind, nproc, monkeypatch, tmp_path):

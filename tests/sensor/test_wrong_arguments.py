@@ -35,6 +35,7 @@ TAKEN = {
     "strength": SIGNED, "rng": SEED, "diffusion_factor": NUMBER, "nrecalc": "bool large",
     "transpose": FLAG, "threads": "none bool large", "charge_response": FLAG,
     "background": FLAG, "depth": FLAG, "predict": FLAG, "conversion_depth": NUMBER,
+    "diffusion": NUMBER, "surroundings": NUMBER,
     "full_well": "none bool inf large", "treering_func": "none",
     **dict.fromkeys(["shift_map", "temperature", "table", "effects", "conditions", "layout"],
                     "none"),
@@ -103,7 +104,7 @@ def of_functions(folder: str) -> dict[tuple[str, str], Target]:
     flat = {"sensor": make(SiliconSensor), "shape": (4, 4), "level": 10.0, "step": 5.0,
             "rng": 1, "illumination": None, "border": 2, "dtype": np.float32}  # fmt: skip
     taken = {"level": NUMBER, "step": "bool large", "rng": SEED, "illumination": "none",
-             "border": NUMBER}  # fmt: skip
+             "border": "bool none"}  # fmt: skip
     out: dict[tuple[str, str], Target] = {}
     for name in inspect.signature(draw_flat).parameters:
         out["draw_flat", name] = (
@@ -136,8 +137,8 @@ KEPT = {"name": OSError}
 
 FREE = ("dx", "dy", "rng", "dtype", "shape", "illumination", "photons", "image", "orig_center",
         "treering_func", "treering_center", "table", "effects", "conditions", "layout", "sensor",
-        "shift_map", "name", "path", "red", "absorption", "diffusion", "beyond", "x_low", "x_high",
-        "y_low", "y_high")  # fmt: skip
+        "shift_map", "name", "path", "red", "absorption", "diffusion", "surroundings", "beyond",
+        "x_low", "x_high", "y_low", "y_high")  # fmt: skip
 """Arguments that are no numbers or flags: any other value, a number too, is of a wrong type."""
 
 
