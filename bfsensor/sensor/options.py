@@ -18,7 +18,9 @@ from bfsensor.table.table import DistortionTable
 from bfsensor.typing import FloatArray
 
 HIGHEST_CHARGE = 1e9
-"""Highest level of a flat and of the charge beyond an image [e-].  Chosen: a thousand full wells; single precision holds whole
+"""Highest level of a flat and of the charge beyond an image [e-].
+
+Chosen: a thousand full wells; single precision holds whole
 electrons up to 1.7e7, and at twice as much nothing changes."""
 
 LARGEST = 1e6
