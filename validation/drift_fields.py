@@ -1,6 +1,6 @@
 """Store the drift field of each shipped device in its table, so that a sensor solves nothing.
 
-``python -m validation.boundaries.drift_fields [NAME ...]``: one extension is added to
+``python -m validation.drift_fields [NAME ...]``: one extension is added to
 ``tables/NAME/table.fits``, all that is there stays as it is, byte for byte.  Tables that
 ``bfsensor table`` makes have the extension.
 """
