@@ -16,18 +16,26 @@ from bfsensor._kernels.compile_options import INLINED, INNER
 @numba.njit(**INLINED)
 def philox(c0, c1, c2, c3, k0, k1):
     """Four random words from a counter of four and a key of two (all uint32)."""
+    # In words of 64 bits, of which the upper halves are cut off where they would count: vector code
+    # multiplies the lower halves of such words, and has nothing to repack.
+    low = np.uint64(0xFFFFFFFF)
+    c0, c1, c2, c3 = np.uint64(c0), np.uint64(c1), np.uint64(c2), np.uint64(c3)
+    k0, k1 = np.uint64(k0), np.uint64(k1)
     for _ in range(10):
-        p0 = np.uint64(0xD2511F53) * np.uint64(c0)
-        p1 = np.uint64(0xCD9E8D57) * np.uint64(c2)
-        n0 = np.uint32(np.uint32(p1 >> np.uint64(32)) ^ c1 ^ k0)
-        n2 = np.uint32(np.uint32(p0 >> np.uint64(32)) ^ c3 ^ k1)
-        c0 = n0
-        c1 = np.uint32(p1 & np.uint64(0xFFFFFFFF))
-        c2 = n2
-        c3 = np.uint32(p0 & np.uint64(0xFFFFFFFF))
-        k0 = np.uint32((np.uint64(k0) + np.uint64(0x9E3779B9)) & np.uint64(0xFFFFFFFF))
-        k1 = np.uint32((np.uint64(k1) + np.uint64(0xBB67AE85)) & np.uint64(0xFFFFFFFF))
-    return c0, c1, c2, c3
+        p0 = np.uint64(0xD2511F53) * (c0 & low)
+        p1 = np.uint64(0xCD9E8D57) * (c2 & low)
+        c0 = (p1 >> np.uint64(32)) ^ c1 ^ k0
+        c2 = (p0 >> np.uint64(32)) ^ c3 ^ k1
+        c1 = p1
+        c3 = p0
+        k0 = (k0 + np.uint64(0x9E3779B9)) & low
+        k1 = (k1 + np.uint64(0xBB67AE85)) & low
+    return (
+        np.uint32(c0 & low),
+        np.uint32(c1 & low),
+        np.uint32(c2 & low),
+        np.uint32(c3 & low),
+    )
 
 
 @numba.njit(**INLINED)
@@ -81,16 +89,12 @@ def sine_cosine(word):
     return sine, cosine
 
 
-@numba.njit(cache=True, nogil=True)
-def deviates(first, key0, key1, out_x, out_y, out_path, out_word):
-    """Deviates of the photons first, first + 1, ...: two normal, one exponential, one word.
-
-    Box and Muller's transform gives the normal ones (tails to 6.7 sigma); the exponential
-    one has mean 1.
-    """
-    for n in range(out_x.size):
+@numba.njit(**INNER)
+def draw_words(first, key0, key1, out_a, out_b, out_c, out_d):
+    """Four words (uint32) for each of the photons first, first + 1, ..."""
+    for n in range(np.uint64(out_d.size)):
         count = np.uint64(first) + np.uint64(n)
-        a, b, c, d = philox(
+        out_a[n], out_b[n], out_c[n], out_d[n] = philox(
             np.uint32(count & np.uint64(0xFFFFFFFF)),
             np.uint32(count >> np.uint64(32)),
             np.uint32(0),
@@ -98,27 +102,33 @@ def deviates(first, key0, key1, out_x, out_y, out_path, out_word):
             key0,
             key1,
         )
-        radius = np.sqrt(np.float32(-2) * log_uniform(b))
-        sine, cosine = sine_cosine(a)
-        out_x[n] = radius * cosine
-        out_y[n] = radius * sine
-        out_path[n] = -log_uniform(c)
-        out_word[n] = d
 
 
 @numba.njit(**INNER)
-def words(first, key0, key1, out):
-    """The word of :func:`deviates` alone, where nothing else is drawn."""
-    for n in range(out.size):
-        count = np.uint64(first) + np.uint64(n)
-        out[n] = philox(
-            np.uint32(count & np.uint64(0xFFFFFFFF)),
-            np.uint32(count >> np.uint64(32)),
-            np.uint32(0),
-            np.uint32(0),
-            key0,
-            key1,
-        )[3]
+def normals(word_a, word_b, out_x, out_y):
+    """Two normal deviates from two words each, by Box and Muller (tails to 6.7 sigma)."""
+    for n in range(np.uint64(word_a.size)):
+        radius = np.sqrt(np.float32(-2) * log_uniform(word_b[n]))
+        sine, cosine = sine_cosine(word_a[n])
+        out_x[n] = radius * cosine
+        out_y[n] = radius * sine
+
+
+@numba.njit(**INNER)
+def exponentials(word_c, out):
+    """Exponential deviates of mean 1 from a word each."""
+    for n in range(np.uint64(word_c.size)):
+        out[n] = -log_uniform(word_c[n])
+
+
+@numba.njit(cache=True, nogil=True)
+def deviates(first, key0, key1, out_x, out_y, out_path, out_word):
+    """Deviates of the photons first, first + 1, ...: two normal, one exponential, one word."""
+    words = np.empty((3, out_x.size), np.uint32)
+    # Loops of their own: in one, the processor waits for the ends of long chains of operations.
+    draw_words(first, key0, key1, words[0], words[1], words[2], out_word)
+    normals(words[0], words[1], out_x, out_y)
+    exponentials(words[2], out_path)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -10,7 +10,8 @@ import numba
 import numpy as np
 
 from bfsensor._kernels.compile_options import INLINED, INNER
-from bfsensor._kernels.counter_rng import deviates, words
+from bfsensor._kernels.counter_rng import draw_words, exponentials, normals
+from bfsensor._kernels.lookups import get, looked_up, put
 
 BUFFER = 1024
 """Number of photons in a buffer of deviates.
@@ -105,11 +106,12 @@ class Pattern(NamedTuple):
 @numba.njit(**INLINED)
 def _at(table, position):
     """Linear interpolation at ``position`` in units of the spacing, the ends held."""
-    last = table.size - 1
-    position = min(max(position, 0.0), float(last))
-    n = np.uint64(min(int(position), last - 1))
-    part = position - n
-    return table[n] + part * (table[n + np.uint64(1)] - table[n])
+    last = np.float64(table.size - 1)
+    position = min(max(position, 0.0), last)
+    # Vector code converts to integers of 32 bits.
+    n = np.int32(min(position, last - 1.0))
+    low = looked_up(table, n)
+    return low + (position - n) * (looked_up(table, n + 1) - low)
 
 
 @numba.njit(**INLINED)
@@ -260,19 +262,19 @@ def ring_shift(rings, last, at):
     """
     at = at if at < last else last
     n = np.int32(at)
-    low = rings[np.uint64(n)]
-    change = rings[np.uint64(n) + np.uint64(1)] - low
+    low = looked_up(rings, n)
+    change = looked_up(rings, n + 1) - low
     return low + (at - np.float64(n)) * change, change
 
 
 @numba.njit(**INNER, error_model="numpy")
-def _ring_origins(pattern, thickness, z, alike, x, y, to, count, factor, radius, origin):
+def _ring_origins(pattern, thickness, z, alike, x, y, to, count, factor, radius, scale):
     """Move electrons to the points whose rings' shifts lead to where they are, in place.
 
     Rings are radial, so with ``g`` their shift the radius ``s`` is sought at which
     ``s + g(s)`` is the electron's.  Two of Newton's steps leave 1e-8 pixel where rings of 0.3
     pixel have a period of 50; what is further off than the tolerance goes to :func:`find_origin`.
-    ``factor``, ``radius``, ``origin``: room for ``count`` numbers.  ``alike``: all electrons come
+    ``factor``, ``radius``, ``scale``: room for ``count`` numbers.  ``alike``: all electrons come
     from the height of the first.  Those below the gates (``z`` negative) stay where they are.
     """
     rings = pattern.rings
@@ -283,36 +285,40 @@ def _ring_origins(pattern, thickness, z, alike, x, y, to, count, factor, radius,
         factor[:count] = _at(pattern.ring_factor, np.float64(z[to]) * heights)
     else:
         for m in range(np.uint64(count)):
-            factor[m] = _at(pattern.ring_factor, np.float64(z[to + m]) * heights)
+            put(factor, m, _at(pattern.ring_factor, np.float64(get(z, to + m)) * heights))
     for m in range(np.uint64(count)):
         rx = x[to + m] - pattern.ring_x
         ry = y[to + m] - pattern.ring_y
         radius[m] = np.sqrt(rx * rx + ry * ry)
     far = 0
     for m in range(np.uint64(count)):
-        r = radius[m]
-        size = factor[m]
+        r = get(radius, m)
+        size = get(factor, m)
         shift, change = ring_shift(rings, last, r * per_step)
         s = abs(r - size * shift / (1.0 + size * change * per_step))
         shift, change = ring_shift(rings, last, s * per_step)
         s = abs(s - (s + size * shift - r) / (1.0 + size * change * per_step))
         shift, change = ring_shift(rings, last, s * per_step)
         off = abs(s + size * shift - r)
-        origin[m] = s
-        factor[m] = off
+        # At the centre itself there is no direction, and nothing moves.
+        put(scale, m, s / r if r > 0.0 else 1.0)
+        put(factor, m, off)
         # Written so that nan, of a step with slope 0, is far as well.
         far += not off < _ORIGIN_TOLERANCE
     for m in range(np.uint64(count)):
-        if z[to + m] < np.float32(0.0):
-            continue
-        if far > 0 and not factor[m] < _ORIGIN_TOLERANCE:
+        here_x = x[to + m]
+        here_y = y[to + m]
+        found = factor[m] < _ORIGIN_TOLERANCE and z[to + m] >= np.float32(0.0)
+        there_x = pattern.ring_x + scale[m] * (here_x - pattern.ring_x)
+        there_y = pattern.ring_y + scale[m] * (here_y - pattern.ring_y)
+        x[to + m] = there_x if found else here_x
+        y[to + m] = there_y if found else here_y
+    if far == 0:
+        return
+    for m in range(np.uint64(count)):
+        if not factor[m] < _ORIGIN_TOLERANCE and z[to + m] >= np.float32(0.0):
             part = np.float64(z[to + m]) / thickness
             x[to + m], y[to + m] = find_origin(pattern, x[to + m], y[to + m], part)
-            continue
-        # At the centre itself there is no direction, and nothing moves.
-        scale = origin[m] / radius[m] if radius[m] > 0.0 else 1.0
-        x[to + m] = pattern.ring_x + scale * (x[to + m] - pattern.ring_x)
-        y[to + m] = pattern.ring_y + scale * (y[to + m] - pattern.ring_y)
 
 
 @numba.njit(**INNER, error_model="numpy")
@@ -366,14 +372,15 @@ def _absorb(wavelength, first, lengths, start, per_step, path, out, count):
     """Paths [um] from exponential deviates and absorption lengths."""
     last = np.float64(lengths.size - 1)
     for m in range(np.uint64(count)):
-        at = min(max((wavelength[first + m] - start) * per_step, 0.0), last)
+        at = min(max((get(wavelength, first + m) - start) * per_step, 0.0), last)
         n = np.int32(min(at, last - 1.0))
-        here = lengths[np.uint64(n)]
-        there = lengths[np.uint64(n) + np.uint64(1)]
-        out[m] = np.float32((here + (at - n) * (there - here)) * path[m])
+        here = looked_up(lengths, n)
+        there = looked_up(lengths, n + 1)
+        put(out, m, np.float32((here + (at - n) * (there - here)) * get(path, m)))
 
 
-@numba.njit(**INNER)
+# Division by zero, which cannot happen, is not looked for: that would not be vector code.
+@numba.njit(**INNER, error_model="numpy")
 def _tilt(slope_x, slope_y, first, kept, out, count):
     """Depths [um] of paths along the slopes."""
     for m in range(np.uint64(count)):
@@ -388,13 +395,13 @@ def _widths(depth, thickness, variance, out_z, to, out, count):
     last = np.float32(variance.size - 1)
     per_um = np.float32(last / np.float32(thickness))
     for m in range(np.uint64(count)):
-        z = np.float32(thickness) - depth[m]
-        out_z[to + m] = z if z >= np.float32(0.0) else LOST
+        z = np.float32(thickness) - get(depth, m)
+        put(out_z, to + m, z if z >= np.float32(0.0) else LOST)
         at = min(max(z * per_um, np.float32(0.0)), last)
         n = np.int32(min(at, last - np.float32(1.0)))
-        here = np.float32(variance[np.uint64(n)])
-        there = np.float32(variance[np.uint64(n) + np.uint64(1)])
-        out[m] = np.sqrt(here + (at - np.float32(n)) * (there - here))
+        here = np.float32(looked_up(variance, n))
+        there = np.float32(looked_up(variance, n + 1))
+        put(out, m, np.sqrt(here + (at - np.float32(n)) * (there - here)))
 
 
 @numba.njit(**INNER)
@@ -436,15 +443,18 @@ def land(
     slanted = light.slope_x.size > 0
     fixed = pattern.rings.size > 0 or pattern.map_x.size > 0 or pattern.edge_x.size > 0
     only_rings = pattern.map_x.size == 0 and pattern.edge_x.size == 0 and fixed
-    factor, radius, origin = np.empty((3, BUFFER if only_rings else 0))
+    rooms = np.empty((3, BUFFER if only_rings else 0))
+    # By index: rows that are unpacked are not known to be contiguous.
+    factor, radius, scale = rooms[0], rooms[1], rooms[2]
     kept = np.inf
     if slanted or not medium.kept_slanted:
         kept = medium.kept_path
+    words = np.empty((3, BUFFER), np.uint32)
+    word_a, word_b, word_c = words[0], words[1], words[2]
     normal_x = np.empty(BUFFER, np.float32)
     normal_y = np.empty(BUFFER, np.float32)
     depth = np.empty(BUFFER, np.float32)
     width = np.empty(BUFFER, np.float32)
-    draw = medium.diffuse or coloured
     steps = medium.variance.size - 1
     plain = min(medium.surface_path, kept)
     for start in range(lo, hi, BUFFER):
@@ -452,13 +462,13 @@ def land(
         done = start - lo
         first = np.uint64(start)
         to = np.uint64(done)
-        if draw:
-            deviates(
-                number + done, key0, key1, normal_x[:count], normal_y, depth,
-                out_word[done : done + count],
-            )  # fmt: skip
-        else:
-            words(number + done, key0, key1, out_word[done : done + count])
+        draw_words(
+            number + done, key0, key1, word_a, word_b, word_c, out_word[done : done + count]
+        )
+        if medium.diffuse:
+            normals(word_a[:count], word_b, normal_x, normal_y)
+        if coloured:
+            exponentials(word_c[:count], depth)
         if not coloured and not slanted:
             # All convert at one depth.
             z = medium.thickness - plain
@@ -500,7 +510,7 @@ def land(
         if only_rings:
             _ring_origins(
                 pattern, medium.thickness, out_z, not (coloured or slanted), out_x, out_y, to,
-                count, factor, radius, origin,
+                count, factor, radius, scale,
             )  # fmt: skip
         elif fixed:
             _origins(pattern, medium.thickness, out_z, out_x, out_y, to, count)

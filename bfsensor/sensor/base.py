@@ -521,11 +521,16 @@ def _light(photons: galsim.PhotonArray) -> tuple[Light, int]:
         "wavelength": photons.wavelength if photons.hasAllocatedWavelengths() else _EMPTY,
     }
     kept: NDArray[np.bool_] | None = None
+    lowest = 0.0
     for name, array in arrays.items():
         arrays[name] = np.ascontiguousarray(array, float)
         # A finite sum means that all are finite, and costs a tenth of looking at each.
+        # So does a finite minimum where infinite values are allowed, and the minimum is needed.
         with np.errstate(all="ignore"):
-            total = arrays[name].sum()
+            if name == "wavelength":
+                total = lowest = arrays[name].min(initial=0.0)
+            else:
+                total = arrays[name].sum()
         if np.isfinite(total):
             continue
         # An infinite wavelength is allowed: such light is not absorbed.
@@ -544,7 +549,8 @@ def _light(photons: galsim.PhotonArray) -> tuple[Light, int]:
     if kept is not None:
         dropped = int(np.count_nonzero(~kept))
         arrays = {name: a[kept] if a.size else a for name, a in arrays.items()}
-    if arrays["wavelength"].min(initial=0.0) < 0:
+        lowest = arrays["wavelength"].min(initial=0.0)
+    if lowest < 0:
         wrong = (photons.wavelength < 0) & (photons.flux != 0)
         if wrong.any():
             first = int(np.argmax(wrong))
