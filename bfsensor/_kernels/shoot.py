@@ -16,9 +16,11 @@ from bfsensor._kernels.charge import (
     IN_BLOCK,
     OPENED,
     PHOTONS,
+    TAKEN,
     TOTAL,
     close_block,
     deposit,
+    take_image,
 )
 from bfsensor._kernels.compile_options import INLINED, INNER
 from bfsensor._kernels.edges import collect
@@ -104,7 +106,7 @@ def _shoot(
 ):  # fmt: skip
     """Accumulate all photons; returns the flux that stays in the image.
 
-    With ``renew`` the open block ends before them.
+    With ``renew`` the open block ends before them; charge that is in the image at the first call acts.
     ``x`` to ``words`` are pairs of buffers for BATCH photons, ``i`` to ``near_y`` buffers:
     one batch lands while the one before is deposited, which only one thread can do.
     ``image``, ``charges`` and ``ledger`` are changed.
@@ -112,6 +114,8 @@ def _shoot(
     ledger.sums[ADDED] = 0.0
     # Not 0, of which numba would make a type and compile all below for it as well.
     none = np.int64(0)
+    if ledger.counters[TAKEN] == 0:
+        take_image(image, charges, ledger, response, edges, np.float32(0))
     if renew:
         _settle(
             image, plan, edges, charges, hot, ledger, response, light.flux, none, z[0],
@@ -140,11 +144,14 @@ def _shoot(
             if plan.block > 0:
                 size = _size(plan, ledger.sums[TOTAL] - ledger.sums[IN_BLOCK])
             end = done
-            while end < count and ledger.sums[IN_BLOCK] < size:
+            # In variables of their own: sums in memory wait for each other's stores.
+            in_block, all_flux = ledger.sums[IN_BLOCK], ledger.sums[TOTAL]
+            while end < count and in_block < size:
                 flux = abs(light.flux[np.uint64(start + end)])
-                ledger.sums[IN_BLOCK] += flux
-                ledger.sums[TOTAL] += flux
+                in_block += flux
+                all_flux += flux
                 end += 1
+            ledger.sums[IN_BLOCK], ledger.sums[TOTAL] = in_block, all_flux
             parts = threads * ((end - done + threads * PIECE - 1) // (threads * PIECE))
             for part in numba.prange(parts):
                 lo = done + part * (end - done) // parts
