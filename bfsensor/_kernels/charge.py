@@ -229,7 +229,7 @@ def _around(image, ledger, j, i):
 def _set_pixels(image, charges, ledger, response, count):
     """Update the effective charge of the first ``count`` pixels of the queue.
 
-    One step after the other for all of them, so that many loads from memory are under way at once.
+    One step after the other for all of them, so that many loads are under way at once.
     """
     pixels, first, second = ledger.queue, ledger.ahead[0], ledger.ahead[1]
     width, pad, stride = np.uint64(charges.nx), np.uint64(charges.pad), charges.stride
@@ -683,8 +683,9 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_
 @numba.njit(**INLINED)
 def _put(image, ledger, nx, j, i, flux):
     """Add electrons to a pixel; what single precision loses is kept in ``carry``."""
+    j, i = np.uint64(j), np.uint64(i)
     before = _charge_of(image, j, i)
-    pixel = np.uint64(j * nx + i)
+    pixel = j * np.uint64(nx) + i
     if not _marked(ledger.marks, pixel):
         ledger.marks[pixel >> np.uint64(3)] |= np.uint8(1) << np.uint8(pixel & np.uint64(7))
         count = ledger.counters[LISTED]
@@ -697,21 +698,25 @@ def _put(image, ledger, nx, j, i, flux):
             if ledger.before.size > 0:
                 ledger.before[pixel] = before
     carry = ledger.carry
-    if carry.size > 0:
-        # Not read before anything was written: whole electrons are not lost.
-        carried = np.float32(0.0)
-        if ledger.counters[CARRIED]:
-            carried = carry[j, i]
+    if carry.size == 0:
+        image.double[j, i] = before + flux
+    elif ledger.counters[CARRIED] == 0:
+        # Whole electrons are not lost, and nothing carried is looked up before anything is lost.
+        total = before + flux
+        now = np.float32(total)
+        image.single[j, i] = now
+        if np.float64(now) != total:
+            ledger.counters[CARRIED] = 1
+            carry[j, i] = np.float32(total - np.float64(now))
+    else:
+        carried = carry[j, i]
         total = before + np.float64(carried) + flux
         now = np.float32(total)
         image.single[j, i] = now
         rest = np.float32(total - np.float64(now))
         # Not written where nothing is carried: untouched pages cost no memory.
         if rest != carried:
-            ledger.counters[CARRIED] = 1
             carry[j, i] = rest
-    else:
-        image.double[j, i] = before + flux
 
 
 @numba.njit(**INNER)
@@ -801,7 +806,7 @@ def deposit(
             if word >= np.exp(-loss * _charge_of(image, cj, ci)):
                 lost += w
                 continue
-        if w > 0 and _charge_of(image, cj, ci) + w > full_well:
+        if w > 0 and _charge_of(image, np.uint64(cj), np.uint64(ci)) + w > full_well:
             up = (words[n] & np.uint32(1)) == np.uint32(1)
             _strike(ledger, cj, ci, nx)
             added += _spill(image, charges, ledger, cj, ci, w, full_well, along_y, up)

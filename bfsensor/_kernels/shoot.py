@@ -100,6 +100,41 @@ def _settle(
     ledger.sums[IN_BLOCK] = 0.0
 
 
+@numba.njit(**INNER)
+def _all_one(flux, lo, hi):
+    """Whether each of the photons lo to hi is one electron."""
+    others = 0
+    for n in range(np.uint64(lo), np.uint64(hi)):
+        others += flux[n] != 1.0
+    return others == 0
+
+
+@numba.njit(**INNER)
+def _end_of_block(flux, ledger, start, done, count, size, whole):
+    """Photon of a batch with which a block of ``size`` electrons ends, and the sums up to it.
+
+    Where all are ``whole`` electrons their number is the sum, exactly, for few enough of them.
+    """
+    in_block, total = ledger.sums[IN_BLOCK], ledger.sums[TOTAL]
+    end = done
+    whole = whole and in_block == np.floor(in_block) and total == np.floor(total)
+    if whole and total < 2.0**52 and in_block < size:
+        end = (
+            count
+            if in_block + (count - done) < size
+            else done + np.int64(np.ceil(size - in_block))
+        )
+        in_block += end - done
+        total += end - done
+    while end < count and in_block < size:
+        light = abs(flux[np.uint64(start + end)])
+        in_block += light
+        total += light
+        end += 1
+    ledger.sums[IN_BLOCK], ledger.sums[TOTAL] = in_block, total
+    return end
+
+
 def _shoot(
     image, light, medium, pattern, plan, edges, charges, hot, ledger, response, renew,
     threads, x, y, z, words, i, j, near_x, near_y,
@@ -138,20 +173,13 @@ def _shoot(
         now = start // BATCH % 2
         count = min(BATCH, total - start)
         after = min(BATCH, total - start - count)
+        whole = _all_one(light.flux, start, start + count)
         done = none
         while done < count:
             size = np.inf
             if plan.block > 0:
                 size = _size(plan, ledger.sums[TOTAL] - ledger.sums[IN_BLOCK])
-            end = done
-            # In variables of their own: sums in memory wait for each other's stores.
-            in_block, all_flux = ledger.sums[IN_BLOCK], ledger.sums[TOTAL]
-            while end < count and in_block < size:
-                flux = abs(light.flux[np.uint64(start + end)])
-                in_block += flux
-                all_flux += flux
-                end += 1
-            ledger.sums[IN_BLOCK], ledger.sums[TOTAL] = in_block, all_flux
+            end = _end_of_block(light.flux, ledger, start, done, count, size, whole)
             parts = threads * ((end - done + threads * PIECE - 1) // (threads * PIECE))
             for part in numba.prange(parts):
                 lo = done + part * (end - done) // parts
