@@ -27,10 +27,10 @@ from bfsensor._kernels.edges import collect
 from bfsensor._kernels.hot import evaluate, fence
 from bfsensor._kernels.photons import land
 
-BATCH = 65536
+BATCH = 32768
 """Number of photons that land together while those of the batch before are deposited.
 
-Chosen: buffers of a few MB; twice as large takes twice that and gives the same bits."""
+Chosen: buffers of 2 MB; twice as large takes twice that and gives the same bits."""
 PIECE = 2048
 """Smallest share of a batch that is worth a thread [photon].
 
