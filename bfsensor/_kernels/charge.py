@@ -31,14 +31,25 @@ STALE = np.float32(512.0)
 
 Chosen: the background of a pixel, the mean of eight neighbours, is then out of date by less than
 this; twice as large, by twice as much, and the search is made half as often."""
+QUEUE = 256
+"""Number of pixels whose effective charge is updated together.
+
+Chosen: they take 3 kB, which stay in the first-level cache; twice as many, no less time."""
+MANY = 2048
+"""Number of listed pixels from which they are sorted by row, so that they are near in memory.
+
+Chosen: charge of so many pixels and of their neighbours no longer fits the first-level cache; with
+twice as many small lists are left as they are, with the same bits."""
 
 # Indices of the counters, int64: numbers of listed pixels in this block and in the last, whether
 # the list is full in this block and was in the last, flagged tiles, photons, pixels beyond the
-# response, photons when the block began, full pixels that were met, whether an image was taken.
+# response, photons when the block began, full pixels that were met, whether an image was taken,
+# whether single precision has lost anything.
 (
     LISTED, LISTED_BEFORE, DENSE, DENSE_BEFORE, FLAGGED, PHOTONS, BEYOND, OPENED, STRUCK, TAKEN,
-) = range(10)  # fmt: skip
-N_COUNTERS = 10
+    CARRIED,
+) = range(11)  # fmt: skip
+N_COUNTERS = 11
 """Number of counters, by definition that of the names above."""
 # Indices of the sums [e-], float64: flux of this block, of the last and of the exposure; what was
 # added, spilled, spilled off the image, crossed the silicon, fell outside, and was lost.
@@ -78,8 +89,10 @@ class Ledger(NamedTuple):
     ``carry`` [rows, columns] is what single precision loses of the image, ``marks`` a bit for each
     pixel that gained charge in the block, ``listed`` these pixels and ``gained`` the charge that they
     had, then how much they gained [e-]; ``before`` [pixels] is the charge that those had for which the
-    list has no room, ``listed_before`` are the pixels of the last block.  ``rows`` [3, columns + 2] is
-    room for rows of charge.  ``high_*`` are the largest
+    list has no room, or room for gains row by row, from ``starts`` [rows + 1] on; ``listed_before``
+    are the pixels of the last block.  ``rows`` [3, columns + 2] is room for rows of charge, ``queue``
+    and ``ahead`` [2, QUEUE] for pixels to be updated, what is to be added to their charge and their
+    background, and then both effective charges.  ``high_*`` are the largest
     effective charges by tile, ``changes`` the number of changes since they were found, ``flags``
     and ``flagged`` the tiles whose bounds are out of date.  ``spill_from`` and ``spill_to`` [side,
     column] is where a column was full when it last spilled.  ``strikes`` [rows, columns] counts
@@ -93,6 +106,9 @@ class Ledger(NamedTuple):
     gained: np.ndarray
     before: np.ndarray
     rows: np.ndarray
+    starts: np.ndarray
+    queue: np.ndarray
+    ahead: np.ndarray
     listed_before: np.ndarray
     high_first: np.ndarray
     high_second: np.ndarray
@@ -121,28 +137,36 @@ def _shape(image):
     return image.single.shape if image.single.size > 0 else image.double.shape
 
 
-@numba.njit(**INLINED)
-def _effective(response, charge, background):
-    """Effective charges of a pixel; beyond the grid the last values are held."""
-    q = charge / response.charge_step
-    b = min(
-        max(background, np.float32(0.0)) / response.background_step,
-        response.last_background,
-    )
-    q = min(q, response.last_charge)
-    m = np.uint64(min(max(int(q), 0), response.first.shape[0] - 2))
-    n = np.uint64(min(int(b), response.first.shape[1] - 2))
-    u = np.float32(q - m)
-    v = np.float32(b - n)
-    one = np.float32(1.0)
-    up = np.uint64(1)
-    a, c = (one - u) * (one - v), u * (one - v)
-    d, e = (one - u) * v, u * v
-    f = response.first
-    s = response.second
-    first = a * f[m, n] + c * f[m + up, n] + d * f[m, n + up] + e * f[m + up, n + up]
-    second = a * s[m, n] + c * s[m + up, n] + d * s[m, n + up] + e * s[m + up, n + up]
-    return first, second
+@numba.njit(**INNER)
+def _effective(response, charges, backgrounds, count):
+    """Replace charges and backgrounds of ``count`` pixels by both effective charges.
+
+    Beyond the grid the last values are held.  Returns how many pixels hold more than the grid.
+    """
+    f, s = response.first, response.second
+    per_charge, per_background = response.charge_step, response.background_step
+    last_q, last_b = response.last_charge, response.last_background
+    largest = last_q * per_charge
+    rows, columns = np.int32(f.shape[0] - 2), np.int32(f.shape[1] - 2)
+    zero, one, up = np.float32(0.0), np.float32(1.0), np.uint64(1)
+    beyond = 0
+    for n in range(np.uint64(count)):
+        beyond += charges[n] > largest
+        q = min(charges[n] / per_charge, last_q)
+        b = min(max(backgrounds[n], zero) / per_background, last_b)
+        i = min(np.int32(max(q, 0.0)), rows)
+        j = min(np.int32(b), columns)
+        u, v = np.float32(q - i), np.float32(b - j)
+        m, k = np.uint64(i), np.uint64(j)
+        a, c = (one - u) * (one - v), u * (one - v)
+        d, e = (one - u) * v, u * v
+        charges[n] = (
+            a * f[m, k] + c * f[m + up, k] + d * f[m, k + up] + e * f[m + up, k + up]
+        )
+        backgrounds[n] = (
+            a * s[m, k] + c * s[m + up, k] + d * s[m, k + up] + e * s[m + up, k + up]
+        )
+    return beyond
 
 
 @numba.njit(**INNER)
@@ -164,47 +188,100 @@ def _charge(image, ledger, j, i):
     return np.float32(_charge_of(image, np.uint64(j), np.uint64(i)))
 
 
+@numba.njit(**INLINED)
+def _sum_around(pixels, j, i):
+    """Sum of the neighbours of a pixel that is not at the border, in single precision."""
+    up = np.uint64(1)
+    j, i = np.uint64(j), np.uint64(i)
+    above = np.float32(pixels[j - up, i - up]) + np.float32(pixels[j - up, i])
+    above += np.float32(pixels[j - up, i + up])
+    here = np.float32(pixels[j, i - up]) + np.float32(pixels[j, i + up])
+    below = np.float32(pixels[j + up, i - up]) + np.float32(pixels[j + up, i])
+    below += np.float32(pixels[j + up, i + up])
+    return above + here + below
+
+
 @numba.njit(**INNER)
-def _around(image, ledger, j, i):
-    """Mean charge of the neighbours of a pixel."""
+def _sum_at_border(image, ledger, j, i):
+    """Sum of the neighbours of a pixel, of which some lie outside the image."""
     above = _charge(image, ledger, j - 1, i - 1) + _charge(image, ledger, j - 1, i)
     above += _charge(image, ledger, j - 1, i + 1)
     here = _charge(image, ledger, j, i - 1) + _charge(image, ledger, j, i + 1)
     below = _charge(image, ledger, j + 1, i - 1) + _charge(image, ledger, j + 1, i)
     below += _charge(image, ledger, j + 1, i + 1)
-    return (above + here + below) * np.float32(0.125)
+    return above + here + below
 
 
 @numba.njit(**INLINED)
-def _set_pixel(image, charges, ledger, response, j, i, ahead):
-    """Update the effective charge of a pixel, with ``ahead`` electrons added to its charge."""
-    at = np.uint64((j + charges.pad) * charges.stride + i + charges.pad)
-    q = _charge(image, ledger, j, i)
-    second = np.float32(0.0)
-    if response.first.size > 0:
-        around = _around(image, ledger, j, i)
-        if q + ahead > response.last_charge * response.charge_step:
-            ledger.counters[BEYOND] += 1
-        first, second = _effective(response, q + ahead, around)
-        charges.second[at] = second
-        if ledger.mirrored:
-            mirror_pixel(charges, charges.second, j, i)
+def _around(image, ledger, j, i):
+    """Mean charge of the neighbours of a pixel."""
+    ny, nx = _shape(image)
+    if not (0 < j < ny - 1 and 0 < i < nx - 1):
+        total = _sum_at_border(image, ledger, j, i)
+    elif image.single.size > 0:
+        total = _sum_around(image.single, j, i)
     else:
-        first = q + ahead
-    charges.first[at] = first
-    if ledger.mirrored:
-        mirror_pixel(charges, charges.first, j, i)
-    tile = np.uint64((j // TILE) * ((charges.nx + TILE - 1) // TILE) + i // TILE)
-    ledger.changes[tile] += 1
-    # Margins follow from the ranges, most of which a few electrons leave as they were.
-    wider = first < charges.low_first[tile] or first > ledger.high_first[tile]
-    wider = wider or second < charges.low_second[tile] or second > ledger.high_second[tile]
-    if wider or ledger.changes[tile] >= REFRESH:
-        charges.low_first[tile] = min(charges.low_first[tile], first)
-        ledger.high_first[tile] = max(ledger.high_first[tile], first)
-        charges.low_second[tile] = min(charges.low_second[tile], second)
-        ledger.high_second[tile] = max(ledger.high_second[tile], second)
-        _flag(ledger, np.int64(tile))
+        total = _sum_around(image.double, j, i)
+    return total * np.float32(0.125)
+
+
+@numba.njit(**INNER)
+def _set_pixels(image, charges, ledger, response, count):
+    """Update the effective charge of the first ``count`` pixels of the queue.
+
+    One step after the other for all of them, so that many loads are under way at once.
+    """
+    pixels, first, second = ledger.queue, ledger.ahead[0], ledger.ahead[1]
+    width, pad, stride = np.uint64(charges.nx), np.uint64(charges.pad), charges.stride
+    modes = response.first.size > 0
+    for n in range(np.uint64(count)):
+        pixel = np.uint64(pixels[n])
+        j = pixel // width
+        i = pixel - j * width
+        first[n] += np.float32(_charge_of(image, j, i))
+        if modes:
+            second[n] = _around(image, ledger, np.int64(j), np.int64(i))
+    if modes:
+        ledger.counters[BEYOND] += _effective(response, first, second, count)
+    tiles_x = np.uint64((charges.nx + TILE - 1) // TILE)
+    for n in range(np.uint64(count)):
+        pixel = np.uint64(pixels[n])
+        j = pixel // width
+        i = pixel - j * width
+        at = (j + pad) * np.uint64(stride) + i + pad
+        value = first[n]
+        charges.first[at] = value
+        more = np.float32(0.0)
+        if modes:
+            more = second[n]
+            charges.second[at] = more
+        if ledger.mirrored:
+            mirror_pixel(charges, charges.first, np.int64(j), np.int64(i))
+            if modes:
+                mirror_pixel(charges, charges.second, np.int64(j), np.int64(i))
+        tile = (j >> np.uint64(4)) * tiles_x + (i >> np.uint64(4))
+        ledger.changes[tile] += 1
+        # Margins follow from the ranges, most of which a few electrons leave as they were.
+        wider = value < charges.low_first[tile] or value > ledger.high_first[tile]
+        wider = wider or more < charges.low_second[tile] or more > ledger.high_second[tile]
+        if wider or ledger.changes[tile] >= REFRESH:
+            charges.low_first[tile] = min(charges.low_first[tile], value)
+            ledger.high_first[tile] = max(ledger.high_first[tile], value)
+            charges.low_second[tile] = min(charges.low_second[tile], more)
+            ledger.high_second[tile] = max(ledger.high_second[tile], more)
+            _flag(ledger, np.int64(tile))
+
+
+@numba.njit(**INLINED)
+def _queue(image, charges, ledger, response, waiting, pixel, ahead):
+    """Put a pixel in the queue, with ``ahead`` electrons to add; returns how many wait there."""
+    ledger.queue[np.uint64(waiting)] = pixel
+    ledger.ahead[0, np.uint64(waiting)] = ahead
+    waiting += 1
+    if waiting == QUEUE:
+        _set_pixels(image, charges, ledger, response, waiting)
+        waiting = 0
+    return waiting
 
 
 @numba.njit(**INNER)
@@ -499,6 +576,25 @@ def _heat_pixel(edges, charges, hot, j, i, electrons, crowd):
 
 
 @numba.njit(**INNER)
+def _sort_by_row(ledger, nx, count):
+    """Write the listed pixels to ``listed_before`` and their gains to ``before``, row after row."""
+    starts = ledger.starts
+    starts[:] = 0
+    width = np.uint64(nx)
+    for n in range(np.uint64(count)):
+        starts[np.uint64(ledger.listed[n]) // width + np.uint64(1)] += 1
+    for j in range(1, starts.size):
+        starts[j] += starts[j - 1]
+    for n in range(np.uint64(count)):
+        pixel = np.uint64(ledger.listed[n])
+        row = pixel // width
+        to = np.uint64(starts[row])
+        starts[row] += 1
+        ledger.listed_before[to] = pixel
+        ledger.before[to] = ledger.gained[n]
+
+
+@numba.njit(**INNER)
 def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_photon):
     """Update the charge with what the block brought; ``ahead`` times each pixel's gain is added.
 
@@ -523,50 +619,50 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_
         ledger.counters[STRUCK] = 0
         return
     nx = charges.nx
-    count = 0
+    count = np.int64(0)
+    waiting = np.int64(0)
+    none = np.float32(0.0)
+    modes = response.first.size > 0
     for n in range(ledger.counters[LISTED]):
-        j = ledger.listed[n] // nx
-        i = ledger.listed[n] - j * nx
+        pixel = ledger.listed[n]
+        j = np.int64(np.uint64(pixel) // np.uint64(nx))
+        i = pixel - j * nx
         # The other pixels of this byte are in the list as well.
-        ledger.marks[np.uint64(ledger.listed[n]) >> np.uint64(3)] = 0
-        gain = np.float32(_charge_of(image, j, i)) - ledger.gained[n]
-        if gain == np.float32(0.0):
+        ledger.marks[np.uint64(pixel) >> np.uint64(3)] = 0
+        now = np.float32(_charge_of(image, j, i))
+        gain = now - ledger.gained[n]
+        if gain == none:
             # Negative flux had brought it back, or nothing came of it.
             continue
-        ledger.listed[count] = ledger.listed[n]
+        ledger.listed[count] = pixel
         ledger.gained[count] = gain
         count += 1
+        if modes and np.floor(now / STALE) != np.floor((now - gain) / STALE):
+            for m in range(max(j - 1, 0), min(j + 2, charges.ny)):
+                for k in range(max(i - 1, 0), min(i + 2, nx)):
+                    waiting = _queue(
+                        image, charges, ledger, response, waiting, m * nx + k, none
+                    )
     for n in range(ledger.counters[LISTED_BEFORE]):
-        j = ledger.listed_before[n] // nx
-        _set_pixel(
-            image,
-            charges,
-            ledger,
-            response,
-            j,
-            ledger.listed_before[n] - j * nx,
-            np.float32(0.0),
+        waiting = _queue(
+            image, charges, ledger, response, waiting, ledger.listed_before[n], none
         )
-    if response.first.size > 0:
-        for n in range(count):
-            j = ledger.listed[n] // nx
-            i = ledger.listed[n] - j * nx
-            now = np.float32(_charge_of(image, j, i))
-            if np.floor(now / STALE) != np.floor((now - ledger.gained[n]) / STALE):
-                for m in range(max(j - 1, 0), min(j + 2, charges.ny)):
-                    for k in range(max(i - 1, 0), min(i + 2, nx)):
-                        _set_pixel(image, charges, ledger, response, m, k, np.float32(0.0))
-    for n in range(count):
-        j = ledger.listed[n] // nx
-        _set_pixel(
-            image, charges, ledger, response, j, ledger.listed[n] - j * nx,
-            ahead * ledger.gained[n],
-        )  # fmt: skip
-    ledger.counters[LISTED_BEFORE] = 0
+    pixels, gained = ledger.listed, ledger.gained
     if ahead > 0:
-        for n in range(count):
-            ledger.listed_before[n] = ledger.listed[n]
-        ledger.counters[LISTED_BEFORE] = count
+        pixels = ledger.listed_before
+        if count > MANY:
+            gained = ledger.before
+            _sort_by_row(ledger, nx, count)
+        else:
+            for n in range(count):
+                pixels[n] = ledger.listed[n]
+    # What the block brought acts last: the same pixels may wait already, without it.
+    for n in range(count):
+        waiting = _queue(
+            image, charges, ledger, response, waiting, pixels[n], ahead * gained[n]
+        )
+    _set_pixels(image, charges, ledger, response, waiting)
+    ledger.counters[LISTED_BEFORE] = count if ahead > 0 else 0
     ledger.counters[LISTED] = 0
     _find_margins(charges, ledger, edges)
     for n in range(count):
@@ -587,8 +683,9 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_
 @numba.njit(**INLINED)
 def _put(image, ledger, nx, j, i, flux):
     """Add electrons to a pixel; what single precision loses is kept in ``carry``."""
+    j, i = np.uint64(j), np.uint64(i)
     before = _charge_of(image, j, i)
-    pixel = np.uint64(j * nx + i)
+    pixel = j * np.uint64(nx) + i
     if not _marked(ledger.marks, pixel):
         ledger.marks[pixel >> np.uint64(3)] |= np.uint8(1) << np.uint8(pixel & np.uint64(7))
         count = ledger.counters[LISTED]
@@ -601,7 +698,17 @@ def _put(image, ledger, nx, j, i, flux):
             if ledger.before.size > 0:
                 ledger.before[pixel] = before
     carry = ledger.carry
-    if carry.size > 0:
+    if carry.size == 0:
+        image.double[j, i] = before + flux
+    elif ledger.counters[CARRIED] == 0:
+        # Whole electrons are not lost, and nothing carried is looked up before anything is lost.
+        total = before + flux
+        now = np.float32(total)
+        image.single[j, i] = now
+        if np.float64(now) != total:
+            ledger.counters[CARRIED] = 1
+            carry[j, i] = np.float32(total - np.float64(now))
+    else:
         carried = carry[j, i]
         total = before + np.float64(carried) + flux
         now = np.float32(total)
@@ -610,8 +717,6 @@ def _put(image, ledger, nx, j, i, flux):
         # Not written where nothing is carried: untouched pages cost no memory.
         if rest != carried:
             carry[j, i] = rest
-    else:
-        image.double[j, i] = before + flux
 
 
 @numba.njit(**INNER)
@@ -701,7 +806,7 @@ def deposit(
             if word >= np.exp(-loss * _charge_of(image, cj, ci)):
                 lost += w
                 continue
-        if w > 0 and _charge_of(image, cj, ci) + w > full_well:
+        if w > 0 and _charge_of(image, np.uint64(cj), np.uint64(ci)) + w > full_well:
             up = (words[n] & np.uint32(1)) == np.uint32(1)
             _strike(ledger, cj, ci, nx)
             added += _spill(image, charges, ledger, cj, ci, w, full_well, along_y, up)

@@ -24,7 +24,9 @@ class PausedCollection(event.Listener):
 
     def on_start(self, event):
         """Pause, if this is the outermost kernel and the collection is on."""
-        kernel = event.data["dispatcher"].py_func.__module__ or ""  # none where made by exec
+        kernel = (
+            event.data["dispatcher"].py_func.__module__ or ""
+        )  # none where made by exec
         if self.depth == 0 and not kernel.startswith("bfsensor._kernels"):
             return
         if self.depth == 0:

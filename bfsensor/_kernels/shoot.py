@@ -16,19 +16,21 @@ from bfsensor._kernels.charge import (
     IN_BLOCK,
     OPENED,
     PHOTONS,
+    TAKEN,
     TOTAL,
     close_block,
     deposit,
+    take_image,
 )
 from bfsensor._kernels.compile_options import INLINED, INNER
 from bfsensor._kernels.edges import collect
 from bfsensor._kernels.hot import evaluate, fence
 from bfsensor._kernels.photons import land
 
-BATCH = 65536
+BATCH = 32768
 """Number of photons that land together while those of the batch before are deposited.
 
-Chosen: buffers of a few MB; twice as large takes twice that and gives the same bits."""
+Chosen: buffers of 2 MB; twice as large takes twice that and gives the same bits."""
 PIECE = 2048
 """Smallest share of a batch that is worth a thread [photon].
 
@@ -98,13 +100,48 @@ def _settle(
     ledger.sums[IN_BLOCK] = 0.0
 
 
+@numba.njit(**INNER)
+def _all_one(flux, lo, hi):
+    """Whether each of the photons lo to hi is one electron."""
+    others = 0
+    for n in range(np.uint64(lo), np.uint64(hi)):
+        others += flux[n] != 1.0
+    return others == 0
+
+
+@numba.njit(**INNER)
+def _end_of_block(flux, ledger, start, done, count, size, whole):
+    """Photon of a batch with which a block of ``size`` electrons ends, and the sums up to it.
+
+    Where all are ``whole`` electrons their number is the sum, exactly, for few enough of them.
+    """
+    in_block, total = ledger.sums[IN_BLOCK], ledger.sums[TOTAL]
+    end = done
+    whole = whole and in_block == np.floor(in_block) and total == np.floor(total)
+    if whole and total < 2.0**52 and in_block < size:
+        end = (
+            count
+            if in_block + (count - done) < size
+            else done + np.int64(np.ceil(size - in_block))
+        )
+        in_block += end - done
+        total += end - done
+    while end < count and in_block < size:
+        light = abs(flux[np.uint64(start + end)])
+        in_block += light
+        total += light
+        end += 1
+    ledger.sums[IN_BLOCK], ledger.sums[TOTAL] = in_block, total
+    return end
+
+
 def _shoot(
     image, light, medium, pattern, plan, edges, charges, hot, ledger, response, renew,
     threads, x, y, z, words, i, j, near_x, near_y,
 ):  # fmt: skip
     """Accumulate all photons; returns the flux that stays in the image.
 
-    With ``renew`` the open block ends before them.
+    With ``renew`` the open block ends before them; charge that is in the image at the first call acts.
     ``x`` to ``words`` are pairs of buffers for BATCH photons, ``i`` to ``near_y`` buffers:
     one batch lands while the one before is deposited, which only one thread can do.
     ``image``, ``charges`` and ``ledger`` are changed.
@@ -112,6 +149,8 @@ def _shoot(
     ledger.sums[ADDED] = 0.0
     # Not 0, of which numba would make a type and compile all below for it as well.
     none = np.int64(0)
+    if ledger.counters[TAKEN] == 0:
+        take_image(image, charges, ledger, response, edges, np.float32(0))
     if renew:
         _settle(
             image, plan, edges, charges, hot, ledger, response, light.flux, none, z[0],
@@ -134,17 +173,13 @@ def _shoot(
         now = start // BATCH % 2
         count = min(BATCH, total - start)
         after = min(BATCH, total - start - count)
+        whole = _all_one(light.flux, start, start + count)
         done = none
         while done < count:
             size = np.inf
             if plan.block > 0:
                 size = _size(plan, ledger.sums[TOTAL] - ledger.sums[IN_BLOCK])
-            end = done
-            while end < count and ledger.sums[IN_BLOCK] < size:
-                flux = abs(light.flux[np.uint64(start + end)])
-                ledger.sums[IN_BLOCK] += flux
-                ledger.sums[TOTAL] += flux
-                end += 1
+            end = _end_of_block(light.flux, ledger, start, done, count, size, whole)
             parts = threads * ((end - done + threads * PIECE - 1) // (threads * PIECE))
             for part in numba.prange(parts):
                 lo = done + part * (end - done) // parts

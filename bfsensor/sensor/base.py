@@ -263,8 +263,9 @@ class EngineSensor(galsim.SiliconSensor):
         # continue the same random numbers.
         key = (int(self.rng.raw()) & 0xFFFFFFFF, int(self.rng.raw()) & 0xFFFFFFFF)
         exposure = ImageExposure(
-            array, self._physics, self._place_pattern(image, orig_center), origin, key
-        )
+            array, self._physics, self._place_pattern(image, orig_center), origin, key,
+            taken=False,
+        )  # fmt: skip
         exposure.pixels, exposure.bounds = array, image.bounds
         return exposure
 
@@ -282,7 +283,7 @@ class EngineSensor(galsim.SiliconSensor):
         """Refuse an image with nan or inf."""
         # The sum of finite numbers may overflow; only then is each one looked at.
         with np.errstate(all="ignore"):
-            total = array.sum(dtype=float)
+            total = np.add.reduce(array, axis=None, dtype=float)
         if not np.isfinite(total) and not np.isfinite(array).all():
             raise SensorError("the image holds values that are not finite")
 
@@ -506,6 +507,7 @@ def _same_pixels(one: NDArray[Any], other: NDArray[Any]) -> bool:
     )
 
 
+@np.errstate(all="ignore")
 def _light(photons: galsim.PhotonArray) -> tuple[Light, int]:
     """Arrays of photons, and how many were dropped.
 
@@ -526,12 +528,11 @@ def _light(photons: galsim.PhotonArray) -> tuple[Light, int]:
         arrays[name] = np.ascontiguousarray(array, float)
         # A finite sum means that all are finite, and costs a tenth of looking at each.
         # So does a finite minimum where infinite values are allowed, and the minimum is needed.
-        with np.errstate(all="ignore"):
-            if name == "wavelength":
-                total = lowest = arrays[name].min(initial=0.0)
-            else:
-                total = arrays[name].sum()
-        if np.isfinite(total):
+        if name == "wavelength":
+            total = lowest = arrays[name].min(initial=0.0)
+        else:
+            total = np.add.reduce(arrays[name])
+        if math.isfinite(total):
             continue
         # An infinite wavelength is allowed: such light is not absorbed.
         good = ~np.isnan(array) if name == "wavelength" else np.isfinite(array)

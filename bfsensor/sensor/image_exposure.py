@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -33,8 +34,15 @@ _EMPTY = np.zeros(0, np.float32)
 _EMPTY_2 = np.zeros((0, 0), np.float32)
 """The same with two dimensions (by definition empty)."""
 
+_NO_DOUBLE = np.zeros((0, 0))
+"""The same in double precision (by definition empty)."""
+
 _NO_STRIKES = np.zeros((0, 0), np.int32)
 """The same of whole numbers (by definition empty)."""
+
+
+_SCRATCH = threading.local()
+"""Buffers of each Python thread for the photons under way, which hold nothing between two calls."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +102,9 @@ class ImageExposure:
         Key of the random numbers, two words of 32 bits.
     threads : int
         Largest number of threads to use; the result does not depend on it.
+    taken : bool
+        Whether the charge in the image acts at once; otherwise from the first call of :meth:`add`
+        on, which takes less time.
     """
 
     def __init__(
@@ -104,6 +115,7 @@ class ImageExposure:
         origin: tuple[float, float],
         key: tuple[int, int],
         threads: int = 1,
+        taken: bool = True,
     ) -> None:
         self.physics = physics
         self.pattern = pattern
@@ -129,15 +141,11 @@ class ImageExposure:
             key1=np.uint32(key[1]),
             loss=float(physics.loss),
         )
-        batch = _shoot.BATCH
-        self._buffers = (
-            *(np.empty((2, batch), kind) for kind in (float, float, np.float32, np.uint32)),
-            *(np.empty(batch, np.int32) for _ in range(4)),
-        )
-        _charge.take_image(
-            as_pixels(np.ascontiguousarray(image)), self.charges, self.ledger, physics.response,
-            physics.edges, np.float32(0),
-        )  # fmt: skip
+        if taken:
+            _charge.take_image(
+                as_pixels(np.ascontiguousarray(image)), self.charges, self.ledger,
+                physics.response, physics.edges, np.float32(0),
+            )  # fmt: skip
 
     def add(
         self, image: NDArray[np.floating], light: Light, *, renew: bool = False
@@ -153,9 +161,8 @@ class ImageExposure:
                 self.hot, self.ledger, p.response, renew,
             )  # fmt: skip
             with threads_to_use(self._busy_threads(light.x.size)) as threads:
-                if threads == 1:
-                    return float(_shoot.shoot(*arguments, 1, *self._buffers))
-                return float(_shoot.shoot_on_threads(*arguments, threads, *self._buffers))
+                kernel = _shoot.shoot if threads == 1 else _shoot.shoot_on_threads
+                return float(kernel(*arguments, threads, *_buffers()))
 
     def _busy_threads(self, photons: int) -> int:
         """Return how many of the threads have a share of each block that is worth waking for."""
@@ -187,6 +194,19 @@ class ImageExposure:
         }
 
 
+def _buffers() -> tuple[NDArray[Any], ...]:
+    """Return this thread's buffers for photons under way, which are made once."""
+    found: tuple[NDArray[Any], ...] | None = getattr(_SCRATCH, "buffers", None)
+    if found is None:
+        batch = _shoot.BATCH
+        found = (
+            *(np.empty((2, batch), kind) for kind in (float, float, np.float32, np.uint32)),
+            *(np.empty(batch, np.int32) for _ in range(4)),
+        )
+        _SCRATCH.buffers = found
+    return found
+
+
 @contextmanager
 def _in_rows(image: NDArray[np.floating]) -> Iterator[Pixels]:
     """Yield the image as a C-contiguous array: its own, or a copy that is written back.
@@ -204,19 +224,20 @@ def _in_rows(image: NDArray[np.floating]) -> Iterator[Pixels]:
 def as_pixels(image: NDArray[np.floating]) -> Pixels:
     """Hand a C-contiguous image of float32 or float64 to the kernels, as one type for both."""
     if image.dtype == np.float32:
-        return Pixels(image, np.zeros((0, 0)))
+        return Pixels(image, _NO_DOUBLE)
     return Pixels(_EMPTY_2, image)
 
 
 def _no_hot_edges(edges: Edges, tiles: int) -> Hot:
     """Allocate the arrays of edges that are evaluated once a block."""
     pages = min(tiles, _HOT_PAGES)
+    most = min(2 * TILE * TILE * pages, _HOT_EDGES)
     return Hot(
         page_of=np.full(tiles, -1, np.int32),
         pages=np.empty((pages, 2, TILE * TILE), np.int32),
-        lines=np.empty((_HOT_EDGES, 32 * ((edges.points.size + 15) // 16)), np.float32),
-        fences=np.empty((_HOT_EDGES, FENCES, 4), np.float32),
-        edge=np.empty((_HOT_EDGES, 3), np.int32),
+        lines=np.empty((most, 32 * ((edges.points.size + 15) // 16)), np.float32),
+        fences=np.empty((most, FENCES, 4), np.float32),
+        edge=np.empty((most, 3), np.int32),
         used=np.zeros(2 + pages, np.int64),
     )
 
@@ -263,9 +284,11 @@ def _allocate(image: NDArray[np.floating], physics: Physics) -> tuple[Charges, L
     modes = physics.response.first.size > 0
     tiles = ((nx + TILE - 1) // TILE) * ((ny + TILE - 1) // TILE)
 
-    def by_tile(kind: type = np.float32) -> NDArray:
-        return np.zeros(tiles, kind)
-
+    # Small arrays are made together: for a stamp, making them one by one takes as long as its light.
+    low_first, low_second, margins, high_first, high_second = np.zeros(
+        (5, tiles), np.float32
+    )
+    spill_from, spill_to = np.full((2, 2, max(nx, ny)), -1, np.int64)
     charges = Charges(
         first=np.zeros(size, np.float32),
         second=np.zeros(size, np.float32) if modes else _EMPTY,
@@ -273,13 +296,13 @@ def _allocate(image: NDArray[np.floating], physics: Physics) -> tuple[Charges, L
         pad=pad,
         nx=nx,
         ny=ny,
-        low_first=by_tile(),
-        low_second=by_tile(),
-        margins=by_tile(),
-        ranges=by_tile(np.int64),
+        low_first=low_first,
+        low_second=low_second,
+        margins=margins,
+        ranges=np.zeros(tiles, np.int64),
     )
     # Pixels that one block may list; if it touches more, all pixels of the image are updated.
-    longest = nx * ny // 8 + 65536
+    longest = min(nx * ny // 8 + 65536, nx * ny)
     ledger = Ledger(
         carry=np.zeros((ny, nx), np.float32) if image.dtype == np.float32 else _EMPTY_2,
         marks=np.zeros((nx * ny + 7) // 8, np.uint8),
@@ -288,14 +311,17 @@ def _allocate(image: NDArray[np.floating], physics: Physics) -> tuple[Charges, L
         # Memory is taken only where it is written: by blocks that touch more pixels than are listed.
         before=np.empty(nx * ny if physics.predict else 0, np.float32),
         rows=np.zeros((3, nx + 2), np.float32),
+        starts=np.zeros(ny + 1, np.int32),
+        queue=np.zeros(_charge.QUEUE, np.int32),
+        ahead=np.zeros((2, _charge.QUEUE), np.float32),
         listed_before=np.empty(longest if physics.predict else 0, np.int32),
-        high_first=by_tile(),
-        high_second=by_tile(),
-        changes=by_tile(np.int32),
-        flags=by_tile(bool),
-        flagged=by_tile(np.int64),
-        spill_from=np.full((2, max(nx, ny)), -1, np.int64),
-        spill_to=np.full((2, max(nx, ny)), -1, np.int64),
+        high_first=high_first,
+        high_second=high_second,
+        changes=np.zeros(tiles, np.int32),
+        flags=np.zeros(tiles, bool),
+        flagged=np.zeros(tiles, np.int64),
+        spill_from=spill_from,
+        spill_to=spill_to,
         # The system commits the memory of zeros only where they are written.
         strikes=np.zeros((ny, nx), np.int32) if physics.full_well < np.inf else _NO_STRIKES,
         struck=np.empty(_HOT_EDGES, np.int32),

@@ -46,7 +46,16 @@ def test_command_lines_are_accepted(words, files_are_there):
     if program == "bfsensor":
         assert accept(main, "bfsensor", words[1:])
     else:
-        known = ("python", "python3", "pip", "pytest", "sphinx-build", "run", "conda", "export")
+        known = (
+            "python",
+            "python3",
+            "pip",
+            "pytest",
+            "sphinx-build",
+            "run",
+            "conda",
+            "export",
+        )
         assert not words or program in known, f"nothing checks {words}"
 
 
