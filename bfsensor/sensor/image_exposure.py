@@ -236,7 +236,7 @@ def _outside(physics: Physics) -> tuple[float, float, float]:
     image = np.array([[level]])
     charges, ledger = _allocate(image, alone)
     _charge.take_image(
-        image, charges, ledger, physics.response, physics.edges, np.float32(0)
+        as_pixels(image), charges, ledger, physics.response, physics.edges, np.float32(0)
     )
     second = charges.second[0] if charges.second.size else 0.0
     return float(charges.first[0]), float(second), level
