@@ -14,6 +14,7 @@ import numpy as np
 
 from bfsensor._kernels.compile_options import INLINED, INNER
 from bfsensor._kernels.hot import cool, heat
+from bfsensor._kernels.prefetch import prefetch
 from bfsensor._kernels.surroundings import mirror_all, mirror_pixel, within
 
 TILE = 16
@@ -40,6 +41,22 @@ MANY = 2048
 
 Chosen: charge of so many pixels and of their neighbours no longer fits the first-level cache; with
 twice as many small lists are left as they are, with the same bits."""
+FAINT = np.float32(64.0)
+"""Effective charge up to which that of a tile counts as of this size when edges are bounded [e-].
+
+Chosen: edges move by 1e-4 pixel, so that hardly more light is looked at closely; ten times as large,
+ten times as much.  A tenth of it, and where light is spread over many pixels each tile is bounded
+again and again as electron follows electron."""
+AHEAD = 32
+"""Number of pixels whose memory is asked for before the first of them is used.
+
+Chosen: ten lines of memory for each, 20 kB, fit in the first-level cache; four times as many do not
+and gain no more."""
+SCATTERED = 1 << 18
+"""Number of pixels of an image from which on memory is asked for ahead.
+
+Chosen: all that belongs to a smaller one stays in the larger caches; twice as large, images of a
+megabyte are not served, which gain little."""
 
 # Indices of the counters, int64: numbers of listed pixels in this block and in the last, whether
 # the list is full in this block and was in the last, flagged tiles, photons, pixels beyond the
@@ -213,6 +230,18 @@ def _sum_at_border(image, ledger, j, i):
 
 
 @numba.njit(**INLINED)
+def _counted(charges, ledger, tile):
+    """Lowest and highest effective charge of both modes by which edges of a tile are bounded."""
+    low, high = charges.low_first[tile], ledger.high_first[tile]
+    low_second, high_second = charges.low_second[tile], ledger.high_second[tile]
+    if low >= -FAINT and high <= FAINT:
+        high = FAINT
+    if low_second >= -FAINT and high_second <= FAINT:
+        low_second, high_second = -FAINT, FAINT
+    return low, high, low_second, high_second
+
+
+@numba.njit(**INLINED)
 def _around(image, ledger, j, i):
     """Mean charge of the neighbours of a pixel."""
     ny, nx = _shape(image)
@@ -265,11 +294,13 @@ def _set_pixels(image, charges, ledger, response, count):
         wider = value < charges.low_first[tile] or value > ledger.high_first[tile]
         wider = wider or more < charges.low_second[tile] or more > ledger.high_second[tile]
         if wider or ledger.changes[tile] >= REFRESH:
+            counted = _counted(charges, ledger, tile)
             charges.low_first[tile] = min(charges.low_first[tile], value)
             ledger.high_first[tile] = max(ledger.high_first[tile], value)
             charges.low_second[tile] = min(charges.low_second[tile], more)
             ledger.high_second[tile] = max(ledger.high_second[tile], more)
-            _flag(ledger, np.int64(tile))
+            if ledger.changes[tile] >= REFRESH or counted != _counted(charges, ledger, tile):
+                _flag(ledger, np.int64(tile))
 
 
 @numba.njit(**INLINED)
@@ -325,17 +356,14 @@ def _find_margin(charges, ledger, edges, tile):
     tiles_y = (charges.ny + TILE - 1) // TILE
     row = tile // tiles_x
     column = tile - row * tiles_x
-    low = charges.low_first[tile]
-    high = ledger.high_first[tile]
-    low_second = charges.low_second[tile]
-    high_second = ledger.high_second[tile]
+    low, high, low_second, high_second = _counted(charges, ledger, tile)
     for j in range(max(row - 1, 0), min(row + 2, tiles_y)):
         for i in range(max(column - 1, 0), min(column + 2, tiles_x)):
-            other = j * tiles_x + i
-            low = min(low, charges.low_first[other])
-            high = max(high, ledger.high_first[other])
-            low_second = min(low_second, charges.low_second[other])
-            high_second = max(high_second, ledger.high_second[other])
+            here = _counted(charges, ledger, j * tiles_x + i)
+            low = min(low, here[0])
+            high = max(high, here[1])
+            low_second = min(low_second, here[2])
+            high_second = max(high_second, here[3])
     size = max(high - low, high_second - low_second)
     # Single precision: rounding of the shift, and of what cancels in its sum.
     margin = np.float32(edges.normal) * (
@@ -576,6 +604,15 @@ def _heat_pixel(edges, charges, hot, j, i, electrons, crowd):
 
 
 @numba.njit(**INNER)
+def _expect_charge(image, place):
+    """Ask for the memory of a pixel of the image."""
+    if image.single.size > 0:
+        prefetch(image.single, place)
+    else:
+        prefetch(image.double, place)
+
+
+@numba.njit(**INNER)
 def _sort_by_row(ledger, nx, count):
     """Write the listed pixels to ``listed_before`` and their gains to ``before``, row after row."""
     starts = ledger.starts
@@ -790,7 +827,13 @@ def deposit(
     crossed = 0.0
     off = 0.0
     lost = 0.0
+    scattered = nx * charges.ny >= SCATTERED
     for n in range(np.uint64(lo), np.uint64(hi)):
+        if scattered and (n - np.uint64(lo)) % np.uint64(AHEAD) == np.uint64(0):
+            for m in range(n, min(n + np.uint64(AHEAD), np.uint64(hi))):
+                place = np.int64(j[m]) * nx + np.int64(i[m])
+                _expect_charge(image, place)
+                prefetch(ledger.marks, place >> 3)
         w = flux[np.uint64(first) + n]
         ci = np.int64(i[n])
         cj = np.int64(j[n])

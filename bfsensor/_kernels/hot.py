@@ -101,8 +101,8 @@ def heat(edges, charges, hot, side, line, other):
 
 
 @numba.njit(**INNER)
-def evaluate(edges, charges, hot, first, last):
-    """Find the polylines of the hot edges at the places first to last."""
+def evaluate(edges, charges, hot, part, parts):
+    """Find the polylines of the hot edges of every ``parts``-th line from ``part`` on."""
     q = edges.reach
     stride = np.uint64(charges.stride)
     # Blocks of 16 points, each with the sums over all sources and then the sources by row, whose
@@ -112,13 +112,13 @@ def evaluate(edges, charges, hot, first, last):
     far = (2 * q + 2) * 2 * pairs
     size = 32 * (2 + far + (16 if edges.modes == 2 else 0))
     # One side after the other, so that their weights stay in the first-level cache.
-    count = last - first
+    count = hot.used[1]
     for n in range(2 * count):
-        place = first + n % count
+        place = n % count
         side = np.int64(hot.edge[place, 0])
-        if side != n // count:
-            continue
         line = np.int64(hot.edge[place, 1])
+        if side != n // count or line % parts != part:
+            continue
         other = np.int64(hot.edge[place, 2])
         column, row = (line - q - 1, other - q) if side == 0 else (other - q, line - q - 1)
         at = (row + charges.pad) * charges.stride + column + charges.pad
@@ -154,12 +154,13 @@ def _bin(edges, height):
 
 
 @numba.njit(**INNER)
-def fence(edges, charges, hot, first, last):
-    """Find the bounds of the shifts of the edges at the places first to last, in steps along them.
+def fence(edges, charges, hot, part, parts):
+    """Find the bounds of the shifts of the hot edges, in steps along them.
 
-    All hot edges must have been evaluated, because a step may reach into the next edge.  The
-    bounds hold for the points of the topmost layer, each moved along the edge by as much as
-    ``Edges.change`` allows at the lowest height that is decided by them.
+    The edges are those of every ``parts``-th line from ``part`` on; all of a line must have been
+    evaluated, because a step may reach into the next edge.  The bounds hold for the points of the
+    topmost layer, each moved along the edge by as much as ``Edges.change`` allows at the lowest height
+    that is decided by them.
     """
     columns = np.int32((charges.nx - 1) >> 4)
     rows = np.int32((charges.ny - 1) >> 4)
@@ -167,9 +168,11 @@ def fence(edges, charges, hot, first, last):
     zero, a_half = np.float32(0.0), np.float32(0.5)
     count = np.int64(edges.points.size)
     change = edges.change[_bin(edges, np.float32(edges.lowest)), 1]
-    for at in range(first, last):
+    for at in range(hot.used[1]):
         side = hot.edge[at, 0]
         line, other = hot.edge[at, 1], hot.edge[at, 2]
+        if line % parts != part:
+            continue
         fences = hot.fences[at]
         # What the polyline does not pass in full is open.
         fences[:] = np.float32(np.inf)

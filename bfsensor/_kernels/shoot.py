@@ -156,8 +156,8 @@ def _shoot(
             image, plan, edges, charges, hot, ledger, response, light.flux, none, z[0],
             words[0], i, j, none, none, 0.0,
         )  # fmt: skip
-        evaluate(edges, charges, hot, none, hot.used[1])
-        fence(edges, charges, hot, none, hot.used[1])
+        evaluate(edges, charges, hot, none, none + 1)
+        fence(edges, charges, hot, none, none + 1)
     total = light.x.size
     number = ledger.counters[PHOTONS]
     count = min(BATCH, total)
@@ -209,11 +209,8 @@ def _shoot(
                     )  # fmt: skip
             if ledger.sums[IN_BLOCK] == 0.0 and hot.used[1] > 0:
                 for part in numba.prange(threads):
-                    lo = part * hot.used[1] // threads
-                    evaluate(edges, charges, hot, lo, (part + 1) * hot.used[1] // threads)
-                for part in numba.prange(threads):
-                    lo = part * hot.used[1] // threads
-                    fence(edges, charges, hot, lo, (part + 1) * hot.used[1] // threads)
+                    evaluate(edges, charges, hot, np.int64(part), threads)
+                    fence(edges, charges, hot, np.int64(part), threads)
             done = end
     return ledger.sums[ADDED]
 

@@ -283,7 +283,7 @@ class EngineSensor(galsim.SiliconSensor):
         """Refuse an image with nan or inf."""
         # The sum of finite numbers may overflow; only then is each one looked at.
         with np.errstate(all="ignore"):
-            total = np.add.reduce(array, axis=None, dtype=float)
+            total = np.add.reduce(array, axis=None)
         if not np.isfinite(total) and not np.isfinite(array).all():
             raise SensorError("the image holds values that are not finite")
 

@@ -396,7 +396,8 @@ class BrighterFatterSensor(EffectSensor):
         return data[:, 1].copy(), float(data[0, 0]), float(data[1, 0] - data[0, 0])
 
     def _check_charge(self, image: NDArray[np.floating]) -> None:
-        self._refuse_beyond(float(image.max(initial=0.0)))
+        if self.beyond == "error":
+            self._refuse_beyond(float(image.max(initial=0.0)))
 
     def _refuse_beyond(self, highest: float) -> None:
         """Refuse, with beyond='error', more charge in a pixel [e-] than the table holds."""

@@ -86,7 +86,8 @@ def test_warm_draws_enough_for_two_threads():
     with mock.patch.object(image_exposure._shoot, "shoot_on_threads", wraps=kernel) as seen:
         result = CliRunner().invoke(main, ["warm", "--threads"])
     assert result.exit_code == 0, result.output
-    assert seen.call_count >= 1
+    # One set of kernels serves images of either precision.
+    assert seen.called
 
 
 def test_a_second_user_of_threads_gets_one():
