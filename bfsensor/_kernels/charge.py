@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from bfsensor._kernels.compile_options import INLINED, INNER
+from bfsensor._kernels.compile_options import ENTRY, EXPANDED, INLINED, INNER
 from bfsensor._kernels.hot import cool, heat
 from bfsensor._kernels.prefetch import prefetch
 from bfsensor._kernels.surroundings import mirror_all, mirror_pixel, within
@@ -299,7 +299,9 @@ def _set_pixels(image, charges, ledger, response, count):
             ledger.high_first[tile] = max(ledger.high_first[tile], value)
             charges.low_second[tile] = min(charges.low_second[tile], more)
             ledger.high_second[tile] = max(ledger.high_second[tile], more)
-            if ledger.changes[tile] >= REFRESH or counted != _counted(charges, ledger, tile):
+            if ledger.changes[tile] >= REFRESH or counted != _counted(
+                charges, ledger, tile
+            ):
                 _flag(ledger, np.int64(tile))
 
 
@@ -376,7 +378,7 @@ def _find_margin(charges, ledger, edges, tile):
     charges.ranges[tile] = min(level, edges.doubts.shape[1] - 1)
 
 
-@numba.njit(**INNER)
+@numba.njit(**EXPANDED)
 def _find_margins(charges, ledger, edges):
     """Renew ranges and margins of the flagged tiles and their neighbours."""
     tiles_x = (charges.nx + TILE - 1) // TILE
@@ -462,7 +464,7 @@ def _any_charge(image, j, first, last):
     return found
 
 
-@numba.njit(**INNER)
+@numba.njit(**EXPANDED)
 def _take_pixels(image, j, first, last, charges, ledger, ahead, apart):
     """Take the charge of a part of a row; where it is ``apart``, the gain waits for the response."""
     start = (j + charges.pad) * charges.stride + charges.pad
@@ -503,7 +505,7 @@ def _flag_charge(image, charges, ledger, ahead, apart, fresh):
                     ledger.flags[row * tiles_x + k] = True
 
 
-@numba.njit(**INNER)
+@numba.njit(**EXPANDED)
 def _flag_sides(charges, ledger):
     """Flag the tiles at the sides of the image, where charge beyond it acts."""
     tiles_x = (charges.nx + TILE - 1) // TILE
@@ -528,7 +530,7 @@ def _load_row(image, ledger, j, out):
     out[nx + 1] = _charge(image, ledger, j, nx)
 
 
-@numba.njit(**INNER)
+@numba.njit(**EXPANDED)
 def _respond_in_row(charges, ledger, response, j):
     """Find the effective charge of the flagged tiles in a row, whose ``first`` holds the gain ahead."""
     rows = ledger.rows
@@ -566,7 +568,7 @@ def _respond_flagged(image, charges, ledger, response):
             _respond_in_row(charges, ledger, response, j)
 
 
-@numba.njit(cache=True, nogil=True, _nrt=False)
+@numba.njit(**ENTRY)
 def take_image(image, charges, ledger, response, edges, ahead):
     """Update the frozen charge from the whole image; ``ahead`` times each pixel's gain is added."""
     # Without a second mode and without prediction the charge itself is the effective one.
@@ -597,10 +599,10 @@ def _heat_pixel(edges, charges, hot, j, i, electrons, crowd):
     """Mark the edges of a pixel as hot if ``crowd`` electrons come near one of them."""
     margin = charges.margins[(j // TILE) * ((charges.nx + TILE - 1) // TILE) + i // TILE]
     if electrons * min(np.float32(4.0) * margin, np.float32(1.0)) >= crowd:
-        heat(edges, charges, hot, np.int64(0), i, j)
-        heat(edges, charges, hot, np.int64(0), i + 1, j)
-        heat(edges, charges, hot, np.int64(1), j, i)
-        heat(edges, charges, hot, np.int64(1), j + 1, i)
+        # A loop, so that there is one copy of the code.
+        for n in range(4):
+            line, other = (i, j) if n < 2 else (j, i)
+            heat(edges, charges, hot, n >> 1, line + (n & 1), other)
 
 
 @numba.njit(**INNER)
@@ -631,7 +633,7 @@ def _sort_by_row(ledger, nx, count):
         ledger.before[to] = ledger.gained[n]
 
 
-@numba.njit(**INNER)
+@numba.njit(**EXPANDED)
 def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_photon):
     """Update the charge with what the block brought; ``ahead`` times each pixel's gain is added.
 
@@ -678,11 +680,23 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_
             for m in range(max(j - 1, 0), min(j + 2, charges.ny)):
                 for k in range(max(i - 1, 0), min(i + 2, nx)):
                     waiting = _queue(
-                        image, charges, ledger, response, waiting, m * nx + k, none
+                        image,
+                        charges,
+                        ledger,
+                        response,
+                        waiting,
+                        np.int64(m * nx + k),
+                        none,
                     )
     for n in range(ledger.counters[LISTED_BEFORE]):
         waiting = _queue(
-            image, charges, ledger, response, waiting, ledger.listed_before[n], none
+            image,
+            charges,
+            ledger,
+            response,
+            waiting,
+            np.int64(ledger.listed_before[n]),
+            none,
         )
     pixels, gained = ledger.listed, ledger.gained
     if ahead > 0:
@@ -696,7 +710,13 @@ def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_
     # What the block brought acts last: the same pixels may wait already, without it.
     for n in range(count):
         waiting = _queue(
-            image, charges, ledger, response, waiting, pixels[n], ahead * gained[n]
+            image,
+            charges,
+            ledger,
+            response,
+            waiting,
+            np.int64(pixels[n]),
+            ahead * gained[n],
         )
     _set_pixels(image, charges, ledger, response, waiting)
     ledger.counters[LISTED_BEFORE] = count if ahead > 0 else 0
@@ -798,7 +818,7 @@ def _spill(image, charges, ledger, j, i, flux, full_well, along_y, up):
     return kept
 
 
-@numba.njit(**INNER)
+@numba.njit(**EXPANDED)
 def _strike(ledger, j, i, nx):
     """Count an electron that meets a full pixel."""
     if ledger.strikes.size == 0:
@@ -813,7 +833,7 @@ def _strike(ledger, j, i, nx):
     ledger.strikes[j, i] = before + 1
 
 
-@numba.njit(**INNER)
+@numba.njit(**EXPANDED)
 def deposit(
     image, charges, ledger, flux, first, i, j, z, words, lo, hi, full_well, along_y, loss
 ):

@@ -7,8 +7,16 @@ from types import FunctionType
 
 import numba
 
+ENTRY = {
+    "cache": True, "nogil": True, "_nrt": False, "no_cfunc_wrapper": True,
+    "error_model": "numpy",
+}  # fmt: skip
+"""For kernels that Python calls.  Divisions by zero give inf, nan or 0, as numpy's do, without code
+that raises errors."""
+
 INNER = {
     "cache": True, "_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True,
+    "error_model": "numpy",
 }  # fmt: skip
 """For kernels without code to call them from Python: such a call would end the process."""
 
@@ -16,6 +24,12 @@ INLINED = {**INNER, "forceinline": True}
 """For small ones, which the compiler copies into their callers.
 
 Unlike ``inline="always"``, by which numba copies them before it finds types, each is typed once."""
+
+EXPANDED = {**INNER, "inline": "always"}
+"""For large ones that are called in one place.
+
+What they call is then optimised for the caller alone, not once more for themselves.  Not for calls
+within numba.prange, whose results were found to be wrong then."""
 
 
 def from_python(kernel):

@@ -16,7 +16,7 @@ Lines are numbered as in :mod:`bfsensor._kernels.shifts`.
 import numba
 import numpy as np
 
-from bfsensor._kernels.compile_options import INLINED, INNER
+from bfsensor._kernels.compile_options import EXPANDED, INLINED, INNER
 from bfsensor._kernels.hot import decide_hot
 from bfsensor._kernels.shifts import (
     NORMAL,
@@ -29,7 +29,7 @@ from bfsensor._kernels.shifts import (
 )
 
 
-@numba.njit(**INNER)
+@numba.njit(**EXPANDED)
 def _crossing(weights, sums, points, nearest, first, second, g, upright, layer, part, line,
               along, limit, scale, low_first, low_second):  # fmt: skip
     """Normal shift [pixel] of the polyline ``line`` where it passes ``along`` [pixel].
@@ -177,8 +177,14 @@ def collect(edges, charges, hot, x, y, z, lo, hi, near_x, near_y, out_i, out_j):
             near_y[np.uint64(count_y)] = np.int32(n)
             count_x += abs(x[n] - i - 0.5) > 0.5 - margin * share_x
             count_y += abs(y[n] - j - 0.5) > 0.5 - margin * share_y
-    _decide(edges, charges, hot, np.bool_(True), x, y, z, near_x, count_x, out_i)
-    _decide(edges, charges, hot, np.bool_(False), y, x, z, near_y, count_y, out_j)
+    # A loop, so that there is one copy of the code.
+    for side in range(2):
+        upright = side == 0
+        _decide(
+            edges, charges, hot, upright, x if upright else y, y if upright else x, z,
+            near_x if upright else near_y, count_x if upright else count_y,
+            out_i if upright else out_j,
+        )  # fmt: skip
     for n in range(np.uint64(lo), np.uint64(hi)):
         i = out_i[n]
         j = out_j[n]
@@ -201,7 +207,7 @@ def _nearest_line(across, along, upright, columns, rows):
     return line, beyond, other, np.uint64(row * (columns + 1) + column)
 
 
-@numba.njit(**INNER)
+@numba.njit(**EXPANDED)
 def _decide(edges, charges, hot, upright, across, along, z, near, count, out):
     """Find the side of the nearest line on which the electrons listed in ``near`` are."""
     nx, ny = charges.nx, charges.ny

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from bfsensor._kernels.compile_options import INLINED, INNER
+from bfsensor._kernels.compile_options import EXPANDED, INLINED, INNER
 from bfsensor._kernels.window import add_16_points
 
 FENCES = 16
@@ -71,7 +71,7 @@ def cool(hot):
     hot.used[1] = 0
 
 
-@numba.njit(**INNER)
+@numba.njit(**EXPANDED)
 def heat(edges, charges, hot, side, line, other):
     """Mark an edge as hot for the next block; :func:`evaluate` and :func:`fence` must follow."""
     i = line if side == 0 else other
@@ -162,15 +162,15 @@ def fence(edges, charges, hot, part, parts):
     topmost layer, each moved along the edge by as much as ``Edges.change`` allows at the lowest height
     that is decided by them.
     """
-    columns = np.int32((charges.nx - 1) >> 4)
-    rows = np.int32((charges.ny - 1) >> 4)
+    columns = (charges.nx - 1) >> 4
+    rows = (charges.ny - 1) >> 4
     steps = np.float32(FENCES)
     zero, a_half = np.float32(0.0), np.float32(0.5)
     count = np.int64(edges.points.size)
     change = edges.change[_bin(edges, np.float32(edges.lowest)), 1]
     for at in range(hot.used[1]):
-        side = hot.edge[at, 0]
-        line, other = hot.edge[at, 1], hot.edge[at, 2]
+        side = np.int64(hot.edge[at, 0])
+        line, other = np.int64(hot.edge[at, 1]), np.int64(hot.edge[at, 2])
         if line % parts != part:
             continue
         fences = hot.fences[at]
@@ -264,7 +264,7 @@ def fence(edges, charges, hot, part, parts):
             fences[n, 3] += jumps
 
 
-@numba.njit(**INNER)
+@numba.njit(**EXPANDED)
 def decide_hot(edges, charges, hot, upright, across, along, z, near, count, out):
     """Decide the electrons in ``near`` that are outside the bounds of hot edges.
 
@@ -272,9 +272,9 @@ def decide_hot(edges, charges, hot, upright, across, along, z, near, count, out)
     by no more than ``Edges.change`` says.  Returns how many electrons stay listed.
     """
     fences, change = hot.fences, edges.change
-    side = 0 if upright else 1
-    columns = np.int32((charges.nx - 1) >> 4)
-    rows = np.int32((charges.ny - 1) >> 4)
+    side = np.int64(0) if upright else np.int64(1)
+    columns = (charges.nx - 1) >> 4
+    rows = (charges.ny - 1) >> 4
     lowest = np.float32(edges.lowest)
     left = 0
     for m in range(np.uint64(count)):

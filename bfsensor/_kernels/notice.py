@@ -6,9 +6,9 @@ import multiprocessing
 from numba.core import event
 
 # CPU seconds on one core of 2.6 GHz, by a first image and a first table, cache empty:
-# a sensor's 13 s, a table's 5 + 4 s.
+# a sensor's 21 s, a table's 5 + 4 s.
 TEXT = (
-    "compiling kernels, which happens once: about 15 s for a first image, 10 s for a first "
+    "compiling kernels, which happens once: about 21 s for a first image, 10 s for a first "
     "table; `bfsensor warm` does it ahead of use"
 )
 """Text of the notice."""
@@ -31,7 +31,9 @@ class CompilationNotice(event.Listener):
 
     def on_start(self, event):
         """Log the notice unless it was logged, or this is a worker whose parent process logs it."""
-        kernel = event.data["dispatcher"].py_func.__module__
+        kernel = (
+            event.data["dispatcher"].py_func.__module__ or ""
+        )  # none where made by exec
         if self.given or not kernel.startswith("bfsensor._kernels"):
             return
         self.given = True

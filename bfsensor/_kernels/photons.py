@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from bfsensor._kernels.compile_options import INLINED, INNER
+from bfsensor._kernels.compile_options import EXPANDED, INLINED, INNER
 from bfsensor._kernels.counter_rng import draw_words, exponentials, normals
 from bfsensor._kernels.lookups import get, looked_up, put
 
@@ -202,7 +202,7 @@ def _factors(pattern, part):
     )
 
 
-@numba.njit(**INNER)
+@numba.njit(**EXPANDED)
 def fixed_shift(pattern, x, y, part):
     """Shift (dx, dy) [pixel] of a boundary at (x, y), for ``part`` of the thickness."""
     ring_factor, map_factor = _factors(pattern, part)
@@ -267,7 +267,7 @@ def ring_shift(rings, last, at):
     return low + (at - np.float64(n)) * change, change
 
 
-@numba.njit(**INNER, error_model="numpy")
+@numba.njit(**INNER)
 def _ring_origins(pattern, thickness, z, alike, x, y, to, count, factor, radius, scale):
     """Move electrons to the points whose rings' shifts lead to where they are, in place.
 
@@ -321,7 +321,7 @@ def _ring_origins(pattern, thickness, z, alike, x, y, to, count, factor, radius,
             x[to + m], y[to + m] = find_origin(pattern, x[to + m], y[to + m], part)
 
 
-@numba.njit(**INNER, error_model="numpy")
+@numba.njit(**INNER)
 def _origins(pattern, thickness, z, x, y, to, count):
     """Move electrons to the points whose shifts, by rings and maps, lead to where they are, in place.
 
@@ -380,7 +380,7 @@ def _absorb(wavelength, first, lengths, start, per_step, path, out, count):
 
 
 # Division by zero, which cannot happen, is not looked for: that would not be vector code.
-@numba.njit(**INNER, error_model="numpy")
+@numba.njit(**INNER)
 def _tilt(slope_x, slope_y, first, kept, out, count):
     """Depths [um] of paths along the slopes."""
     for m in range(np.uint64(count)):

@@ -151,13 +151,6 @@ def _shoot(
     none = np.int64(0)
     if ledger.counters[TAKEN] == 0:
         take_image(image, charges, ledger, response, edges, np.float32(0))
-    if renew:
-        _settle(
-            image, plan, edges, charges, hot, ledger, response, light.flux, none, z[0],
-            words[0], i, j, none, none, 0.0,
-        )  # fmt: skip
-        evaluate(edges, charges, hot, none, none + 1)
-        fence(edges, charges, hot, none, none + 1)
     total = light.x.size
     number = ledger.counters[PHOTONS]
     count = min(BATCH, total)
@@ -169,15 +162,20 @@ def _shoot(
             light, medium, pattern, lo, hi, number + lo, plan.key0, plan.key1, plan.x0,
             plan.y0, x[0, lo:hi], y[0, lo:hi], z[0, lo:hi], words[0, lo:hi],
         )  # fmt: skip
-    for start in range(0, total, BATCH):
+    open_block = renew
+    for start in range(0, max(total, 1), BATCH):
         now = start // BATCH % 2
         count = min(BATCH, total - start)
         after = min(BATCH, total - start - count)
         whole = _all_one(light.flux, start, start + count)
         done = none
-        while done < count:
+        while done < count or open_block:
             size = np.inf
-            if plan.block > 0:
+            if open_block:
+                # It ends as others do, so that one copy of the code will do, with no photon more.
+                size = 0.0
+                open_block = False
+            elif plan.block > 0:
                 size = _size(plan, ledger.sums[TOTAL] - ledger.sums[IN_BLOCK])
             end = _end_of_block(light.flux, ledger, start, done, count, size, whole)
             parts = threads * ((end - done + threads * PIECE - 1) // (threads * PIECE))

@@ -229,7 +229,7 @@ class EngineSensor(galsim.SiliconSensor):
             self._exposure = self._expose(image, array, orig_center)
             self._last_image = image
         assert self._exposure is not None
-        self._exposure.threads = count_threads(self.threads)
+        self._exposure.threads = count_threads(self.threads, len(photons))
         self._exposure.dropped += dropped
         return self._exposure.add(array, self._change_light(light), renew=resume and recalc)
 

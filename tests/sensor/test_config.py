@@ -231,7 +231,7 @@ def used_threads(kind, nproc, monkeypatch, tmp_path):
                   "sensor": {"type": kind}},
     }  # fmt: skip
     pixels = galsim.config.BuildImage(config).array.copy()
-    monkeypatch.undo()
+    monkeypatch.setattr(image_exposure, "threads_to_use", inner)
     found = [path.name.split("-") for path in folder.iterdir()]
     return pixels, {int(p) for p, _ in found}, {int(t) for _, t in found}
 
@@ -242,6 +242,8 @@ def test_processes_of_a_configuration_use_one_thread_each(kind, monkeypatch, tmp
     before = galsim.get_omp_threads()
     if galsim.set_omp_threads(2) != 2:
         pytest.skip("GalSim was built without OpenMP")
+    # So that these photons are many enough for the default to be more than one thread.
+    monkeypatch.setattr("bfsensor.sensor.threads.MANY", 1000)
     try:
         alone, processes, threads = used_threads(kind, 1, monkeypatch, tmp_path)
         assert (processes, threads) == ({os.getpid()}, {2})

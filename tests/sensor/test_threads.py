@@ -15,6 +15,7 @@ from click.testing import CliRunner
 from bfsensor import BrighterFatterSensor, SensorError
 from bfsensor.cli.main import main
 from bfsensor.sensor import image_exposure
+from bfsensor.sensor import threads as threads_module
 from bfsensor.sensor.threads import threads_to_use
 from tests.sensor.contract_cases import BOTH, blank, draw, make, part, photons
 
@@ -47,7 +48,8 @@ def test_by_default_threads_are_those_of_galsim(kind):
     try:
         if galsim.set_omp_threads(2) != 2:
             pytest.skip("GalSim was built without OpenMP")
-        with mock.patch.object(image_exposure, "threads_to_use", noted):
+        many = mock.patch.object(threads_module, "MANY", 1000)
+        with many, mock.patch.object(image_exposure, "threads_to_use", noted):
             images.append(draw(make(kind), everything))
             images.append(draw(make(kind, threads=1), everything))
             images.append(draw(make(kind, threads=3), everything))
@@ -60,10 +62,12 @@ def test_by_default_threads_are_those_of_galsim(kind):
                 sensor.accumulate(some, image, resume=n > 0)
             images.append(image.array)
             sensor.accumulate(photons(1000), blank())
+        with mock.patch.object(image_exposure, "threads_to_use", noted):
+            draw(make(kind), everything)
     finally:
         galsim.set_omp_threads(before)
-    # Blocks of 4000 e- and 1000 photons are not worth two threads.
-    assert wanted == [2, 1, 3, 1, 1, 2, 1, 2, 1]
+    # Blocks of 4000 e- and 1000 photons are not worth two threads, nor, by default, are 40,000.
+    assert wanted == [2, 1, 3, 1, 1, 2, 1, 2, 1, 1]
     for n in (1, 2, 4):
         np.testing.assert_array_equal(images[0], images[n])
 
