@@ -458,7 +458,7 @@ def _numbers() -> dict[str, Callable[[Rows], str]]:
         for case, full in (
             ("", "star 1e6"), (" colour", "star 1e6, wavelengths and angles"), (" 1e7", star),
             (" flat", "flat 512, 1e6 photons"), (" first", "first accumulate 4096"),
-            (" areas", "areas 2048"),
+            (" areas", "areas 2048"), (" rings", "star 1e6, rings"),
         ):  # fmt: skip
             numbers[f"faster {short}{case}"] = lambda r, c=full, s=sensor: faster(r, c, s)
     for setting in MEASURED_SLOPES:

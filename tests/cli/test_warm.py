@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 
@@ -46,7 +47,7 @@ uniforms(0, 5, *key, np.empty((3, 2)))
 def test_what_warm_compiled_is_not_compiled_again():
     first = CliRunner().invoke(main, ["warm", "--areas"])
     assert first.exit_code == 0, first.output
-    assert "about 20 s, once" in first.stderr
+    assert re.search(r"about \d\d s, once", first.stderr)
     again = CliRunner().invoke(main, ["warm", "--areas"])
     assert again.stdout.startswith("all was compiled before")
     star = galsim.Gaussian(sigma=0.2, flux=2e4)
