@@ -192,15 +192,13 @@ def build(sensor, **others):
 
 
 def test_our_silicon_sensor_has_a_type_of_its_own():
-    """Beside GalSim's, which stays what it is; ``as_silicon`` replaces that one for all."""
+    """Beside GalSim's, which stays what it is (the test above)."""
     options = {"name": "lsst_e2v_50_8", "strength": 1.5, "nrecalc": 2000, "threads": 2}
     sensor = build({"type": "BfsensorSilicon", **options})
     assert type(sensor) is bfsensor.SiliconSensor
     assert sensor == bfsensor.SiliconSensor(rng=galsim.BaseDeviate(77), **options)
     assert build({"type": "BfsensorSilicon"}).threads is None
     assert build({"type": "BfsensorSilicon", "threads": None}).threads is None
-    theirs = build({"type": "Silicon"})
-    assert type(theirs) is galsim.SiliconSensor
     with pytest.raises(
         galsim.GalSimConfigError, match="Could not parse all as a <class 'int'>"
     ):
