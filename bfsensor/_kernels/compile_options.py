@@ -7,6 +7,8 @@ from types import FunctionType
 
 import numba
 
+from bfsensor._kernels.inner_compiler import InnerCompiler
+
 ENTRY = {
     "cache": True, "nogil": True, "_nrt": False, "no_cfunc_wrapper": True,
     "error_model": "numpy",
@@ -15,8 +17,8 @@ ENTRY = {
 that raises errors."""
 
 INNER = {
-    "cache": True, "_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True,
-    "error_model": "numpy",
+    "_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True,
+    "error_model": "numpy", "pipeline_class": InnerCompiler,
 }  # fmt: skip
 """For kernels without code to call them from Python: such a call would end the process."""
 
