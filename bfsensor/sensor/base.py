@@ -212,7 +212,7 @@ class EngineSensor(galsim.SiliconSensor):
         SensorTypeError
             The image is not of float32 or float64, or an argument has another type.
         SensorError
-            Photons with flux, or an image, with values that are not
+            Photons with flux, or an image at a call without ``resume``, with values that are not
             finite; photons of negative wavelength.  The image is unchanged after any error.
         """
         resume, recalc = check_flag("resume", resume), check_flag("recalc", recalc)
