@@ -12,14 +12,15 @@ import galsim
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor._kernels.areas import convolved_areas, pixel_areas, times_ring_areas
-from bfsensor._kernels.photons import Light, Pattern
+from bfsensor._kernels.areas import convolved_areas
+from bfsensor._kernels.photons import Light
 from bfsensor._kernels.shifts import Charges
 from bfsensor.errors import SensorError, SensorTypeError
 from bfsensor.sensor.applied_effects import AppliedEffects
 from bfsensor.sensor.area_kernels import AreaKernels, area_kernels
 from bfsensor.sensor.image_exposure import ImageExposure, Physics
 from bfsensor.sensor.options import check_flag, check_instance, check_threads, shown
+from bfsensor.sensor.pattern_areas import times_pattern_areas
 from bfsensor.sensor.shift_maps import ShiftMap, make_pattern, sample_rings
 from bfsensor.sensor.threads import count_threads
 from bfsensor.typing import FloatArray
@@ -38,16 +39,6 @@ _SMALL_AREA = 2e-8
 
 Chosen: below the resolution of single precision, 6e-8; twice as large leaves out kernels that are
 still below it."""
-
-_RING_AREA = 1e-6
-"""Largest error of an area [nominal area] by two points a side; above it polygons are drawn.  Chosen: a
-hundredth of the photon noise of 1e8 electrons; rings of 0.26 pixel a period of 47 leave 4e-8."""
-
-_FROM_CENTRE = 30.0
-"""Distance of the rings' centre from an image [pixel] from which a pixel's area follows from the mean
-shifts of its sides.  Derived: with the shift g by radius the stretches across and along the rings vary
-together within a pixel by g' g'' / (12 distance), 5e-7 for rings of 0.26 pixel a period of 47; at twice
-the distance half of that."""
 
 
 class EngineSensor(galsim.SiliconSensor):
@@ -212,7 +203,7 @@ class EngineSensor(galsim.SiliconSensor):
         SensorTypeError
             The image is not of float32 or float64, or an argument has another type.
         SensorError
-            Photons with flux, or an image, with values that are not
+            Photons with flux, or an image at a call without ``resume``, with values that are not
             finite; photons of negative wavelength.  The image is unchanged after any error.
         """
         resume, recalc = check_flag("resume", resume), check_flag("recalc", recalc)
@@ -324,7 +315,6 @@ class EngineSensor(galsim.SiliconSensor):
         self._check_finite(array)
         pattern = self._place_pattern(image, orig_center)
         out = np.empty(array.shape)
-        fixed = any(p.size > 0 for p in (pattern.rings, pattern.map_x, pattern.edge_x))
         if use_flux:
             exposure = ImageExposure(array, self._physics, pattern, (0.0, 0.0), (0, 0))
             self._convolve(exposure.charges, out, float(exposure.ledger.outside[0]))
@@ -332,28 +322,11 @@ class EngineSensor(galsim.SiliconSensor):
             out[...] = 1.0
         # Electrons meet rings and maps on their way, the charge's shifts above the wells: what
         # lands in a pixel comes from its area as the charge has it, stretched by the pattern.
-        if fixed and self._rings_only(pattern, array.shape):
-            times_ring_areas(pattern, out)
-        elif fixed:
-            stretch = np.empty(array.shape)
-            pixel_areas(
-                self._physics.edges, _no_charges(array.shape, self._physics), pattern, False,
-                np.float32(0), np.float32(0), 0, array.shape[0], stretch,
-            )  # fmt: skip
-            out *= stretch
+        times_pattern_areas(pattern, self._physics.edges, out)
         return galsim.Image(
             out.astype(array.dtype, copy=False), xmin=image.bounds.xmin,
             ymin=image.bounds.ymin, wcs=galsim.PixelScale(1.0),
         )  # fmt: skip
-
-    def _rings_only(self, pattern: Pattern, shape: tuple[int, int]) -> bool:
-        """Whether nothing but smooth rings shifts boundaries, whose centre is not in the image."""
-        away = max(
-            abs(centre - size / 2) - size / 2
-            for centre, size in ((pattern.ring_x, shape[1]), (pattern.ring_y, shape[0]))
-        )
-        alone = pattern.map_x.size == 0 and pattern.edge_x.size == 0
-        return alone and away > _FROM_CENTRE and _quadrature_error(pattern) < _RING_AREA
 
     def _convolve(self, charges: Charges, out: FloatArray, outside: float) -> None:
         """Areas by convolution, with as many kernels as matter for these charges and that outside."""
@@ -394,13 +367,6 @@ class EngineSensor(galsim.SiliconSensor):
             )  # fmt: skip
 
 
-def _quadrature_error(pattern: Pattern) -> float:
-    """Error of a pixel's area by two points of Gauss a side: 1/4320 of the fourth derivative."""
-    a_pixel = max(round(1.0 / pattern.ring_step), 1)
-    changes = np.diff(pattern.rings[:-2:a_pixel], 4)
-    return 2.0 * float(np.abs(changes).max(initial=0.0)) / 4320.0
-
-
 def _inside(charges: Charges, array: NDArray[np.float32]) -> NDArray[np.float32]:
     """Cut the pixels of the image out of a padded array."""
     if not array.size:
@@ -414,14 +380,6 @@ def _lowest(charges: Charges) -> tuple[np.float32, np.float32]:
     """Lowest effective charge of both modes in the image."""
     first, second = (_inside(charges, a) for a in (charges.first, charges.second))
     return first.min(), second.min() if second.size else np.float32(0)
-
-
-def _no_charges(shape: tuple[int, int], physics: Physics) -> Charges:
-    """Geometry of an image with empty arrays for its charge."""
-    none = np.zeros(0, np.float32)
-    return Charges(
-        none, none, 1, 0, shape[1], shape[0], none, none, none, np.zeros(0, np.int64)
-    )
 
 
 def pixels_of(image: galsim.Image, *, write: bool = True) -> NDArray[np.floating]:
