@@ -1,7 +1,7 @@
 """``min`` and ``max`` of two numbers for kernels, in place of Python's, with the same results.
 
 Of Python's, numba compiles one function for each pair of types, 50 ms each and some 25 of them for a
-sensor; here each use is two instructions of the kernel that it stands in.
+sensor; here each use is a few instructions of the kernel that it stands in.
 """
 
 import builtins
@@ -11,8 +11,8 @@ from numba.core import types
 from numba.extending import intrinsic
 
 
-def _choose(smaller):
-    """Function for numba that gives the second of two numbers where it is smaller, or larger."""
+def _choose(sign):
+    """Function for numba that gives the second of two numbers where it is ``sign``, < or >, the first."""
 
     def choose(typing_context, first, second):
         """Smaller or larger of two numbers, of the type that holds both; the first if neither is."""
@@ -25,14 +25,13 @@ def _choose(smaller):
                 context.cast(builder, value, kind, number)
                 for value, kind in zip(args, signature.args, strict=True)
             )
-            sign = "<" if smaller else ">"
             if isinstance(number, types.Float):
-                other = builder.fcmp_ordered(sign, b, a)
+                better = builder.fcmp_ordered(sign, b, a)
             elif number.signed:
-                other = builder.icmp_signed(sign, b, a)
+                better = builder.icmp_signed(sign, b, a)
             else:
-                other = builder.icmp_unsigned(sign, b, a)
-            return builder.select(other, b, a)
+                better = builder.icmp_unsigned(sign, b, a)
+            return builder.select(better, b, a)
 
         return number(first, second), generate
 
@@ -42,4 +41,4 @@ def _choose(smaller):
 if numba.config.DISABLE_JIT:
     min, max = builtins.min, builtins.max
 else:
-    min, max = intrinsic(_choose(True)), intrinsic(_choose(False))
+    min, max = intrinsic(_choose("<")), intrinsic(_choose(">"))

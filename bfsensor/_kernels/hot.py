@@ -224,9 +224,8 @@ def fence(edges, charges, hot, part, parts):
                     slope = (upper - lower) / (there - here) if further > nearer else zero
                     if there >= here:
                         jumps += abs(upper - lower)
-                    last = min(
-                        border - 1, np.int64(np.floor(further)) + 1, np.int64(FENCES)
-                    )
+                    last = min(np.int64(np.floor(further)) + 1, np.int64(FENCES))
+                    last = min(border - 1, last)
                     for n in range(max(np.int64(nearer), np.int64(0)), last):
                         row = np.uint64(n)
                         for place in (
