@@ -844,16 +844,15 @@ def _strike(ledger, j, i, nx):
 def deposit(
     image, charges, ledger, flux, first, i, j, z, words, lo, hi, full_well, along_y, loss
 ):
-    """Add the electrons lo to hi to the image in their order; returns the flux that stays [e-].
+    """Add the electrons lo to hi to the image, in their order, and to the sums of the ledger.
 
     ``flux`` is indexed from ``first``, all else from 0.  An electron is lost with
     probability 1 - exp(-loss Q), Q [e-] the charge that it meets.
     """
     nx = charges.nx
-    added = 0.0
-    crossed = 0.0
-    off = 0.0
-    lost = 0.0
+    # One sum after the other, whatever the pieces in which electrons come.
+    added, crossed = ledger.sums[ADDED], ledger.sums[CROSSED]
+    off, lost = ledger.sums[OFF_IMAGE], ledger.sums[LOST]
     scattered = nx * charges.ny >= SCATTERED
     for n in range(np.uint64(lo), np.uint64(hi)):
         if scattered and (n - np.uint64(lo)) % np.uint64(AHEAD) == np.uint64(0):
@@ -888,7 +887,5 @@ def deposit(
                 ledger.spill_from[1, column] = -1
             _put(image, ledger, nx, cj, ci, w)
             added += w
-    ledger.sums[CROSSED] += crossed
-    ledger.sums[OFF_IMAGE] += off
-    ledger.sums[LOST] += lost
-    return added
+    ledger.sums[ADDED], ledger.sums[CROSSED] = added, crossed
+    ledger.sums[OFF_IMAGE], ledger.sums[LOST] = off, lost

@@ -12,7 +12,7 @@ from numba.extending import intrinsic
 
 
 def _choose(sign):
-    """Function for numba that gives the second of two numbers where it is ``sign``, < or >, the first."""
+    """Function for numba that gives the second of two numbers if it is ``sign`` (< or >) the first."""
 
     def choose(typing_context, first, second):
         """Smaller or larger of two numbers, of the type that holds both; the first if neither is."""

@@ -153,7 +153,7 @@ class BrighterFatterSensor(EffectSensor):
         are lost.  A sky or flat without a frame of small pixels needs 'mirrored', or its level.
     threads : int, optional
         Largest number of threads of one call, at least 1; the result does not depend on it.  By
-        default as many as ``galsim.get_omp_threads()`` says at each call of 262,144 photons or
+        default as many as ``galsim.get_omp_threads()`` says at each call of 65,536 photons or
         more, otherwise 1.  Blocks of few photons use fewer.
     table : DistortionTable, optional
         A table in memory, in place of ``name``.
