@@ -278,8 +278,8 @@ def _mean_shift(pattern, factor, last, per_step, x, y, along_x, along_y):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def times_ring_areas(pattern, first_row, out):
-    """Multiply areas from the row ``first_row`` on by those that rings give the pixels, at full height.
+def times_ring_areas(pattern, out):
+    """Multiply areas by those that rings give the pixels, at full height.
 
     The area of a pixel under shifts ``p`` that change little across it is ``(1 + dxx) (1 + dyy) -
     dxy dyx`` with the differences of the mean shifts of opposite sides.  The rings' centre must
@@ -294,10 +294,9 @@ def times_ring_areas(pattern, first_row, out):
     sides = np.empty((2, nx + 1))
     for i in range(nx):
         top[0, i], top[1, i] = _mean_shift(
-            pattern, factor, last, per_step, float(i), float(first_row), 1.0, 0.0
+            pattern, factor, last, per_step, float(i), 0.0, 1.0, 0.0
         )
-    for n in range(ny):
-        j = first_row + n
+    for j in range(ny):
         bottom[:] = top
         for i in range(nx):
             top[0, i], top[1, i] = _mean_shift(
@@ -312,4 +311,4 @@ def times_ring_areas(pattern, first_row, out):
             dyx = sides[1, i + 1] - sides[1, i]
             dxy = top[0, i] - bottom[0, i]
             dyy = top[1, i] - bottom[1, i]
-            out[n, i] *= (1.0 + dxx) * (1.0 + dyy) - dxy * dyx
+            out[j, i] *= (1.0 + dxx) * (1.0 + dyy) - dxy * dyx

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from bfsensor._kernels.compile_options import EXPANDED, INLINED, INNER
+from bfsensor._kernels.compile_options import INLINED, INNER
+from bfsensor._kernels.extremes import max, min
 from bfsensor._kernels.window import add_16_points
 
 FENCES = 16
@@ -71,7 +72,7 @@ def cool(hot):
     hot.used[1] = 0
 
 
-@numba.njit(**EXPANDED)
+@numba.njit(**INNER)
 def heat(edges, charges, hot, side, line, other):
     """Mark an edge as hot for the next block; :func:`evaluate` and :func:`fence` must follow."""
     i = line if side == 0 else other
@@ -223,9 +224,8 @@ def fence(edges, charges, hot, part, parts):
                     slope = (upper - lower) / (there - here) if further > nearer else zero
                     if there >= here:
                         jumps += abs(upper - lower)
-                    last = min(
-                        border - 1, np.int64(np.floor(further)) + 1, np.int64(FENCES)
-                    )
+                    last = min(np.int64(np.floor(further)) + 1, np.int64(FENCES))
+                    last = min(border - 1, last)
                     for n in range(max(np.int64(nearer), np.int64(0)), last):
                         row = np.uint64(n)
                         for place in (
@@ -262,7 +262,7 @@ def fence(edges, charges, hot, part, parts):
                             fences[row, 1] = rise
                             fences[row, 2] = a_half * (highest - lowest) + slack
                         if inside > 2 and 0 < n <= FENCES:
-                            most = max(steep, steep_1, steep_2)
+                            most = max(max(steep, steep_1), steep_2)
                             fences[np.uint64(n - 1), 3] = spread * most
                         steep_2 = steep_1
                         steep_1 = steep
@@ -283,7 +283,7 @@ def fence(edges, charges, hot, part, parts):
             fences[n, 3] += jumps
 
 
-@numba.njit(**EXPANDED)
+@numba.njit(**INNER)
 def decide_hot(edges, charges, hot, upright, across, along, z, near, count, out):
     """Decide the electrons in ``near`` that are outside the bounds of hot edges.
 

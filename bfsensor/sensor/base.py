@@ -12,14 +12,13 @@ import galsim
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor._kernels.areas import pixel_areas, times_ring_areas
-from bfsensor._kernels.photons import Light, Pattern
-from bfsensor._kernels.shifts import Charges
+from bfsensor._kernels.photons import Light
 from bfsensor.errors import SensorError, SensorTypeError
 from bfsensor.sensor.applied_effects import AppliedEffects
 from bfsensor.sensor.area_kernels import AreaKernels, Convolution, area_kernels
 from bfsensor.sensor.image_exposure import ImageExposure, Physics
 from bfsensor.sensor.options import check_flag, check_instance, check_threads, shown
+from bfsensor.sensor.pattern_areas import times_pattern_areas
 from bfsensor.sensor.shift_maps import ShiftMap, make_pattern, sample_rings
 from bfsensor.sensor.threads import count_threads
 from bfsensor.typing import FloatArray
@@ -27,20 +26,10 @@ from bfsensor.typing import FloatArray
 _EMPTY = np.zeros(0)
 """Array in place of slopes or wavelengths that photons do not carry (by definition empty)."""
 
-_BAND = 2**16
+_BAND = 512 * 512
 """Number of pixels whose areas are computed together, in double precision.
 
-Chosen: half a megabyte, which stays in the second-level cache; twice as many, no less time."""
-
-_RING_AREA = 1e-6
-"""Largest error of an area [nominal area] by two points a side; above it polygons are drawn.  Chosen: a
-hundredth of the photon noise of 1e8 electrons; rings of 0.26 pixel a period of 47 leave 4e-8."""
-
-_FROM_CENTRE = 30.0
-"""Distance of the rings' centre from an image [pixel] from which a pixel's area follows from the mean
-shifts of its sides.  Derived: with the shift g by radius the stretches across and along the rings vary
-together within a pixel by g' g'' / (12 distance), 5e-7 for rings of 0.26 pixel a period of 47; at twice
-the distance half of that."""
+Chosen: 2 MB, a sixteenth of what an image of 4 million pixels would take; twice as large takes twice that."""
 
 
 class EngineSensor(galsim.SiliconSensor):
@@ -205,7 +194,7 @@ class EngineSensor(galsim.SiliconSensor):
         SensorTypeError
             The image is not of float32 or float64, or an argument has another type.
         SensorError
-            Photons with flux, or an image, with values that are not
+            Photons with flux, or an image at a call without ``resume``, with values that are not
             finite; photons of negative wavelength.  The image is unchanged after any error.
         """
         resume, recalc = check_flag("resume", resume), check_flag("recalc", recalc)
@@ -316,7 +305,6 @@ class EngineSensor(galsim.SiliconSensor):
         array = pixels_of(image, write=False)
         self._check_finite(array)
         pattern = self._place_pattern(image, orig_center)
-        fixed = any(p.size > 0 for p in (pattern.rings, pattern.map_x, pattern.edge_x))
         convolution = None
         if use_flux:
             if self._kernels is None:
@@ -326,30 +314,25 @@ class EngineSensor(galsim.SiliconSensor):
             if self.surroundings == "mirrored":
                 outside = math.nan
             convolution = Convolution(self._kernels, exposure.charges, outside)
-        # Electrons meet rings and maps on their way, the charge's shifts above the wells: what
-        # lands in a pixel comes from its area as the charge has it, stretched by the pattern.
-        rings_only = fixed and self._rings_only(pattern, array.shape)
-        if fixed and not rings_only:
-            stretch = np.empty(array.shape)
-            pixel_areas(
-                self._physics.edges, _no_charges(array.shape, self._physics), pattern, False,
-                np.float32(0), np.float32(0), 0, array.shape[0], stretch,
-            )  # fmt: skip
         areas = np.empty(array.shape, array.dtype)
-        # In double precision there are a few rows at a time: memory that is touched first costs as much
-        # as what is computed in it.
-        rows = max(_BAND // array.shape[1], 1)
-        band = np.empty((min(rows, array.shape[0]), array.shape[1]))
-        for first in range(0, array.shape[0], rows):
-            out = band[: min(rows, array.shape[0] - first)]
+        # A few rows at a time are in double precision: memory that is touched for the first time takes
+        # as long as what is computed in it.
+        ny, nx = array.shape
+        rows = max(_BAND // nx, 1)
+        band = np.empty((min(rows, ny), nx))
+        for first in range(0, ny, rows):
+            out = band[: min(rows, ny - first)]
             if convolution is None:
                 out[...] = 1.0
             else:
                 convolution.write(first, out)
-            if rings_only:
-                times_ring_areas(pattern, first, out)
-            elif fixed:
-                out *= stretch[first : first + len(out)]
+            # Electrons meet rings and maps on their way, the charge's shifts above the wells: what
+            # lands in a pixel comes from its area as the charge has it, stretched by the pattern.
+            moved = pattern._replace(
+                ring_y=pattern.ring_y - first, map_0y=pattern.map_0y - first,
+                edge_0y=pattern.edge_0y - first,
+            )  # fmt: skip
+            times_pattern_areas(moved, self._physics.edges, out)
             areas[first : first + len(out)] = out
         return galsim.Image(
             areas,
@@ -357,30 +340,6 @@ class EngineSensor(galsim.SiliconSensor):
             ymin=image.bounds.ymin,
             wcs=galsim.PixelScale(1.0),
         )
-
-    def _rings_only(self, pattern: Pattern, shape: tuple[int, int]) -> bool:
-        """Whether nothing but smooth rings shifts boundaries, whose centre is not in the image."""
-        away = max(
-            abs(centre - size / 2) - size / 2
-            for centre, size in ((pattern.ring_x, shape[1]), (pattern.ring_y, shape[0]))
-        )
-        alone = pattern.map_x.size == 0 and pattern.edge_x.size == 0
-        return alone and away > _FROM_CENTRE and _quadrature_error(pattern) < _RING_AREA
-
-
-def _quadrature_error(pattern: Pattern) -> float:
-    """Error of a pixel's area by two points of Gauss a side: 1/4320 of the fourth derivative."""
-    a_pixel = max(round(1.0 / pattern.ring_step), 1)
-    changes = np.diff(pattern.rings[:-2:a_pixel], 4)
-    return 2.0 * float(np.abs(changes).max(initial=0.0)) / 4320.0
-
-
-def _no_charges(shape: tuple[int, int], physics: Physics) -> Charges:
-    """Geometry of an image with empty arrays for its charge."""
-    none = np.zeros(0, np.float32)
-    return Charges(
-        none, none, 1, 0, shape[1], shape[0], none, none, none, np.zeros(0, np.int64)
-    )
 
 
 def pixels_of(image: galsim.Image, *, write: bool = True) -> NDArray[np.floating]:

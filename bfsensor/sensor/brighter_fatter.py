@@ -38,6 +38,7 @@ from bfsensor.sensor.options import (
     outside_charge,
     read_device,
     shown,
+    truth_as_number,
 )
 from bfsensor.sensor.shift_maps import ShiftMap
 from bfsensor.simulate.mean_field import STEPS
@@ -256,13 +257,15 @@ class BrighterFatterSensor(EffectSensor):
         layout: Layout | Mapping[str, Any] | None = None,
     ) -> None:
         self._take_table(name, table)
-        self.strength = check_number("strength", strength, low=-LARGEST, high=LARGEST)
+        self.strength = check_number(
+            "strength", truth_as_number(strength), low=-LARGEST, high=LARGEST
+        )
         self.rng = make_rng(rng)
         self.diffusion_factor = check_number(
-            "diffusion_factor", diffusion_factor, low=0.0, high=LARGEST
+            "diffusion_factor", truth_as_number(diffusion_factor), low=0.0, high=LARGEST
         )
         self.qdist = check_reach(qdist, self.table, self.name)
-        self.nrecalc = check_number("nrecalc", nrecalc, low=0.0)
+        self.nrecalc = check_number("nrecalc", truth_as_number(nrecalc), low=0.0)
         check_rings(treering_func, treering_center)
         self.treering_func, self.treering_center = treering_func, treering_center
         self.transpose = check_flag("transpose", transpose)

@@ -203,7 +203,7 @@ def test_areas_under_rings_and_charge_are_those_that_light_meets(make):
     image = make_image("random", (9, 10))
     found, lows = find_areas(sensor, image)
     without = found.copy()
-    times_ring_areas(pattern, 0, found)
+    times_ring_areas(pattern, found)
     vertical, horizontal = sides_of(sensor, image, lows)
     added = []
     for sides, nominal in zip(
@@ -231,7 +231,7 @@ def test_areas_of_rings_alone_are_those_of_polygons():
     sensor, pattern = silicon_sensor(), make_far_rings()
     expected, _ = find_areas(sensor, np.zeros((11, 14)), pattern=pattern, flux=False)
     found = np.ones((11, 14))
-    times_ring_areas(pattern, 0, found)
+    times_ring_areas(pattern, found)
     # A polygon's sides of an eighth of a pixel are chords: each side is off by (1/8)^2 / 12 of the
     # second derivative 0.5 (2 pi / 25)^2, which is 4e-5.
     assert np.abs(found - expected).max() < 5e-5
