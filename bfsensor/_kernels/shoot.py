@@ -22,8 +22,9 @@ from bfsensor._kernels.charge import (
     deposit,
     take_image,
 )
-from bfsensor._kernels.compile_options import INLINED, INNER
+from bfsensor._kernels.compile_options import ENTRY, INLINED, INNER
 from bfsensor._kernels.edges import collect
+from bfsensor._kernels.extremes import max, min
 from bfsensor._kernels.hot import evaluate, fence
 from bfsensor._kernels.photons import land
 
@@ -213,7 +214,7 @@ def _shoot(
     return ledger.sums[ADDED]
 
 
-shoot = numba.njit(cache=True, nogil=True, no_cfunc_wrapper=True)(_shoot)
+shoot = numba.njit(**{**ENTRY, "_nrt": True})(_shoot)
 # Under a name of its own: numba's cache knows functions by name and line, and would give
 # back the code for one thread.
 _shoot_on_threads = FunctionType(_shoot.__code__, globals(), "_shoot_on_threads")

@@ -142,9 +142,9 @@ class ImageExposure:
             loss=float(physics.loss),
         )
         if taken:
-            _charge.take_image(
+            _charge.hold_image(
                 as_pixels(np.ascontiguousarray(image)), self.charges, self.ledger,
-                physics.response, physics.edges, np.float32(0),
+                physics.response, physics.edges,
             )  # fmt: skip
 
     def add(
@@ -256,9 +256,7 @@ def _outside(physics: Physics) -> tuple[float, float, float]:
     alone = replace(physics, surroundings=np.nan)
     image = np.array([[level]])
     charges, ledger = _allocate(image, alone)
-    _charge.take_image(
-        as_pixels(image), charges, ledger, physics.response, physics.edges, np.float32(0)
-    )
+    _charge.hold_image(as_pixels(image), charges, ledger, physics.response, physics.edges)
     second = charges.second[0] if charges.second.size else 0.0
     return float(charges.first[0]), float(second), level
 
