@@ -297,6 +297,7 @@ class BrighterFatterSensor(EffectSensor):
         """Keep the table, read by name unless it is given."""
         what = "a built-in device or the path of a table"
         self.name = check_path("name", name, what) if table is None else "table"
+        self._table_name = f"table of {self.name}" if table is None else "given table"
         # A table that was read is pickled as its path, not as its 18 MB.
         self._source = find_table(self.name) if table is None else None
         self.table = load_table(*self._source) if self._source else check_table(table)
@@ -407,7 +408,7 @@ class BrighterFatterSensor(EffectSensor):
         last = float(self.table.charges[-1])
         if self.beyond == "error" and highest > max(last, self._table_well()):
             raise SensorError(
-                f"a pixel holds {highest:.0f} e-; the table of {self.name} ends at "
+                f"a pixel holds {highest:.0f} e-; the {self._table_name} ends at "
                 f"{max(last, self._table_well()):.0f} e-"
             )
 
@@ -506,7 +507,7 @@ class BrighterFatterSensor(EffectSensor):
             self._outside(
                 "deep light",
                 f"{100 * deep:.2g} % of light of {high:g} nm converts below {floor:g} um; the lowest "
-                f"depth of the table of {self.name} is {first:g} um",
+                f"depth of the {self._table_name} is {first:g} um",
                 "its shifts are used below it",
                 ": make one with lower depths",
             )
@@ -522,7 +523,7 @@ class BrighterFatterSensor(EffectSensor):
             if first > storage_height(self._device) + 1.0:
                 self._outside(
                     "deep light",
-                    f"light converts {height:g} um above the gates; the table of {self.name} begins "
+                    f"light converts {height:g} um above the gates; the {self._table_name} begins "
                     f"at {first:g} um",
                     "its shifts are used below it",
                     ": make one with lower depths",
@@ -531,8 +532,8 @@ class BrighterFatterSensor(EffectSensor):
         if last >= _COVERED * self.table.thickness:
             return
         text = (
-            f"light converts up to {self.table.thickness:g} um above the gates; the table of "
-            f"{self.name} ends at {last:g} um"
+            f"light converts up to {self.table.thickness:g} um above the gates; the "
+            f"{self._table_name} ends at {last:g} um"
         )
         self._outside(
             "high light", text, "its shifts are used above it",
@@ -548,7 +549,7 @@ class BrighterFatterSensor(EffectSensor):
             return
         self._said.add("charge")
         warnings.warn(
-            f"pixels hold more charge than the table of {self.name}, which ends at "
+            f"pixels hold more charge than the {self._table_name}, which ends at "
             f"{max(self.table.charges[-1], self._table_well()):.0f} e-: the response of the last "
             "level is used (diagnostics counts such pixels; beyond='error' refuses)",
             galsim.GalSimWarning,
