@@ -29,7 +29,7 @@ _EMPTY = np.zeros(0)
 _BAND = 512 * 512
 """Number of pixels whose areas are computed together, in double precision.
 
-Chosen: 2 MB, a sixteenth of what an image of 4 million pixels would take; twice as large takes twice that."""
+Chosen: 2 MB, a sixteenth of what 4 million pixels would take; twice as large takes twice that."""
 
 
 class EngineSensor(galsim.SiliconSensor):
