@@ -244,10 +244,15 @@ class EngineSensor(galsim.SiliconSensor):
         # Drawn once an exposure; photons are numbered within it, so that resumed calls
         # continue the same random numbers.
         key = (int(self.rng.raw()) & 0xFFFFFFFF, int(self.rng.raw()) & 0xFFFFFFFF)
-        exposure = ImageExposure(
-            array, self._physics, self._place_pattern(image, orig_center), origin, key,
-            taken=False,
-        )  # fmt: skip
+        pattern = self._place_pattern(image, orig_center)
+        # The last exposure is over, and a stamp of the same size takes its arrays over.
+        exposure = self._exposure
+        if exposure is None or not exposure.begin_again(
+            array, self._physics, pattern, origin, key
+        ):
+            exposure = ImageExposure(
+                array, self._physics, pattern, origin, key, taken=False
+            )
         exposure.pixels, exposure.bounds = array, image.bounds
         return exposure
 
@@ -266,7 +271,7 @@ class EngineSensor(galsim.SiliconSensor):
         # The sum of finite numbers may overflow; only then is each one looked at.
         with np.errstate(all="ignore"):
             total = np.add.reduce(array, axis=None)
-        if not np.isfinite(total) and not np.isfinite(array).all():
+        if not math.isfinite(total) and not np.isfinite(array).all():
             raise SensorError("the image holds values that are not finite")
 
     # -- areas -------------------------------------------------------------------------

@@ -543,7 +543,7 @@ class BrighterFatterSensor(EffectSensor):
     def _warn_beyond(self) -> None:
         """Warn once of pixels with more charge than the table holds."""
         assert self._exposure is not None
-        if "charge" in self._said or not self._exposure.diagnostics["beyond_table"]:
+        if "charge" in self._said or not self._exposure.beyond_table:
             return
         if math.isfinite(self._well) and self._well <= self._table_well():
             return

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -41,6 +40,12 @@ _NO_DOUBLE = np.zeros((0, 0))
 _NO_STRIKES = np.zeros((0, 0), np.int32)
 """The same of whole numbers (by definition empty)."""
 
+
+SMALL = 2**16
+"""Number of pixels up to which the next image of the same size uses the same arrays again.
+
+Chosen: to clear those of a stamp takes a tenth of the time to make them; for twice as many pixels the
+system hands out zeros in less time than they are written."""
 
 _SCRATCH = threading.local()
 """Buffers of each Python thread for the photons under way, which hold nothing between two calls."""
@@ -119,6 +124,25 @@ class ImageExposure:
         taken: bool = True,
     ) -> None:
         self.physics = physics
+        self.charges, self.ledger = _allocate(image, physics)
+        self.hot = _no_hot_edges(physics.edges, self.ledger.flags.size)
+        self._begin(image, pattern, origin, key, threads)
+        if taken:
+            _charge.hold_image(
+                as_pixels(np.ascontiguousarray(image)), self.charges, self.ledger,
+                physics.response, physics.edges,
+            )  # fmt: skip
+
+    def _begin(
+        self,
+        image: NDArray[np.floating],
+        pattern: Pattern,
+        origin: tuple[float, float],
+        key: tuple[int, int],
+        threads: int,
+    ) -> None:
+        """Set what belongs to one image."""
+        physics = self.physics
         self.pattern = pattern
         # Factor on the light by pixel of the sensor, and the offset of positions to its frame.
         self.light_factor: FloatArray | None = None
@@ -129,8 +153,6 @@ class ImageExposure:
         self.threads = threads
         # Photons without flux whose numbers are not finite, which fall nowhere.
         self.dropped = 0
-        self.charges, self.ledger = _allocate(image, physics)
-        self.hot = _no_hot_edges(physics.edges, self.ledger.flags.size)
         self.plan = _shoot.Plan(
             block=float(physics.block),
             predict=bool(physics.predict),
@@ -142,11 +164,30 @@ class ImageExposure:
             key1=np.uint32(key[1]),
             loss=float(physics.loss),
         )
-        if taken:
-            _charge.hold_image(
-                as_pixels(np.ascontiguousarray(image)), self.charges, self.ledger,
-                physics.response, physics.edges,
-            )  # fmt: skip
+
+    def begin_again(
+        self,
+        image: NDArray[np.floating],
+        physics: Physics,
+        pattern: Pattern,
+        origin: tuple[float, float],
+        key: tuple[int, int],
+    ) -> bool:
+        """Become the exposure of another small image of the same kind; returns whether it can.
+
+        Parameters are those of the class; charge in the image acts from the first :meth:`add` on.
+        """
+        last = self.pixels
+        if (
+            physics is not self.physics
+            or image.shape != last.shape
+            or image.dtype != last.dtype
+            or image.size > SMALL
+        ):
+            return False
+        _clear(self.charges, self.ledger, self.hot)
+        self._begin(image, pattern, origin, key, 1)
+        return True
 
     def add(
         self, image: NDArray[np.floating], light: Light, *, renew: bool = False
@@ -156,24 +197,18 @@ class ImageExposure:
         With ``renew`` the boundaries are renewed first, from the image's charge now.
         """
         p = self.physics
-        with _in_rows(image) as pixels:
-            baton = np.zeros(_shoot.N_BATON, np.int64)
-            call = partial(
-                _shoot.shoot, pixels, light, p.medium, self.pattern, self.plan, p.edges,
-                self.charges, self.hot, self.ledger, p.response, renew,
-                int(self.ledger.counters[_charge.PHOTONS]), *_buffers(), baton,
-            )  # fmt: skip
-            threads = self._busy_threads(light.x.size)
-            if threads == 1:
-                return float(call(1, False))
-            with ThreadPoolExecutor(threads - 1) as executor:
-                for _ in range(threads - 1):
-                    executor.submit(call, threads, True)
-                try:
-                    return float(call(threads, False))
-                finally:
-                    # Those that serve go, also where an error kept the kernel from telling them.
-                    baton[_shoot.TICKET] = -1
+        # Kernels are compiled once for each memory layout, which takes longer than any copy.
+        pixels = np.ascontiguousarray(image)
+        baton = np.zeros(_shoot.N_BATON, np.int64)
+        call = partial(
+            _shoot.shoot, as_pixels(pixels), light, p.medium, self.pattern, self.plan, p.edges,
+            self.charges, self.hot, self.ledger, p.response, renew,
+            int(self.ledger.counters[_charge.PHOTONS]), *_buffers(), baton,
+        )  # fmt: skip
+        added = _call_on_threads(call, self._busy_threads(light.x.size), baton)
+        if pixels is not image:
+            image[...] = pixels
+        return added
 
     def _busy_threads(self, photons: int) -> int:
         """Return how many of the threads have a share of the photons that is worth their start."""
@@ -188,6 +223,11 @@ class ImageExposure:
         return other
 
     @property
+    def beyond_table(self) -> int:
+        """Number of renewals of a pixel with more charge than response and full well know."""
+        return int(self.ledger.counters[_charge.BEYOND])
+
+    @property
     def diagnostics(self) -> dict[str, float]:
         """Counts of the exposure, as in :attr:`bfsensor.sensor.base.EngineSensor.diagnostics`."""
         sums, counters = self.ledger.sums, self.ledger.counters
@@ -198,7 +238,7 @@ class ImageExposure:
             "off_image": float(sums[_charge.OFF_IMAGE]),
             "crossed": float(sums[_charge.CROSSED]),
             "lost": float(sums[_charge.LOST]),
-            "beyond_table": int(counters[_charge.BEYOND]),
+            "beyond_table": self.beyond_table,
             "dropped": self.dropped,
         }
 
@@ -216,18 +256,20 @@ def _buffers() -> tuple[NDArray[Any], ...]:
     return found
 
 
-@contextmanager
-def _in_rows(image: NDArray[np.floating]) -> Iterator[Pixels]:
-    """Yield the image as a C-contiguous array: its own, or a copy that is written back.
-
-    Kernels are compiled once for each memory layout, which takes longer than any copy.
-    """
-    if image.flags.c_contiguous:
-        yield as_pixels(image)
-        return
-    pixels = np.ascontiguousarray(image)
-    yield as_pixels(pixels)
-    image[...] = pixels
+def _call_on_threads(
+    call: Callable[[int, bool], float], threads: int, baton: NDArray[np.int64]
+) -> float:
+    """Call the kernel, with other threads that serve it where there are more than one."""
+    if threads == 1:
+        return float(call(1, False))
+    with ThreadPoolExecutor(threads - 1) as executor:
+        for _ in range(threads - 1):
+            executor.submit(call, threads, True)
+        try:
+            return float(call(threads, False))
+        finally:
+            # Those that serve go, also where an error kept the kernel from telling them.
+            baton[_shoot.TICKET] = -1
 
 
 def as_pixels(image: NDArray[np.floating]) -> Pixels:
@@ -249,6 +291,29 @@ def _no_hot_edges(edges: Edges, tiles: int) -> Hot:
         edge=np.empty((most, 3), np.int32),
         used=np.zeros(2 + pages, np.int64),
     )
+
+
+def _clear(charges: Charges, ledger: Ledger, hot: Hot) -> None:
+    """Set the arrays of an exposure to what they were when they were made.
+
+    Others are written before they are read, or stay what they are: the charge beyond the image, which
+    only images with mirrored sides change.
+    """
+    for zeros in (
+        charges.low_first, charges.low_second, charges.margins, charges.ranges, ledger.carry,
+        ledger.marks, ledger.high_first, ledger.high_second, ledger.changes, ledger.flags,
+        ledger.strikes, ledger.counters, ledger.sums, hot.used,
+    ):  # fmt: skip
+        zeros.fill(0)
+    for none in (ledger.spill_from, ledger.spill_to, hot.page_of):
+        none.fill(-1)
+    ny, nx, pad = charges.ny, charges.nx, charges.pad
+    for effective in (charges.first, charges.second):
+        if ledger.mirrored:
+            effective.fill(0)
+        elif effective.size:
+            rows = effective[: (ny + 2 * pad) * charges.stride].reshape(-1, charges.stride)
+            rows[pad : pad + ny, pad : pad + nx] = 0
 
 
 def _copied(part: Any) -> Any:

@@ -230,6 +230,8 @@ def check_shape(name: str, value: tuple[int, int]) -> tuple[int, int]:
 
 def check_flag(name: str, value: bool) -> bool:
     """Return True or False; refuse anything but these, 1 and 0."""
+    if value is True or value is False:
+        return value
     number = math.nan if isinstance(value, str) else to_float(truth_as_number(value))
     if number not in (0.0, 1.0):
         raise wrong_value(value, f"{name} = {shown(value)} must be True or False")

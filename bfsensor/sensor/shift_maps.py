@@ -35,6 +35,9 @@ _NOTHING = np.zeros(0)
 _NO_MAP = np.zeros((0, 0))
 """Array in place of a map that is not there (by definition empty)."""
 
+_EVEN = np.ones(2)
+"""Factor by height of a map that is the same at all heights (by definition one)."""
+
 Stills = tuple[NDArray[np.float32], NDArray[np.float32]]
 """Displacements of edges between columns and between rows [pixel], or dx and dy of points."""
 
@@ -328,7 +331,7 @@ def make_pattern(
         map_y=_NO_MAP if shift_map is None else shift_map.dy,
         map_0x=0.0 if shift_map is None else shift_map.x0 - corner[0],
         map_0y=0.0 if shift_map is None else shift_map.y0 - corner[1],
-        map_factor=np.ones(2) if uniform else ring_factor,
+        map_factor=_EVEN if uniform else ring_factor,
     )
 
 
