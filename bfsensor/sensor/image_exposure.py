@@ -172,7 +172,7 @@ class ImageExposure:
                 try:
                     return float(call(threads, False))
                 finally:
-                    # Those that serve go, also where an error kept the kernel from telling them.
+                    # Those that serve end, also where an error ended this call before its kernel ran.
                     baton[_shoot.TICKET] = -1
 
     def _busy_threads(self, photons: int) -> int:
