@@ -41,7 +41,6 @@ DARK_CURRENT = 0.01
 """Gain [e-/ADU], noise [e-], the rest relative, [e-] and [e-/s]: as in the practice campaigns."""
 
 
-
 @dataclass
 class Taken:
     """One exposure as it is recorded: frames in readout order, codes of 16 bits."""
@@ -96,7 +95,9 @@ class Bench:
         self.gains = [NOMINAL_GAIN * (1 + 0.03 * z) for z in rng.standard_normal(count)]
         self.noises = [NOMINAL_NOISE * (1 + 0.04 * z) for z in rng.standard_normal(count)]
         self.offsets = [float(o) for o in rng.uniform(900, 1600, count)]
-        self.response = (1 + PIXEL_RESPONSE * rng.standard_normal((n, n))).astype(np.float32)
+        self.response = (1 + PIXEL_RESPONSE * rng.standard_normal((n, n))).astype(
+            np.float32
+        )
         y, x = np.mgrid[0:n, 0:n] / n - 0.5
         slope = 0.01 * rng.standard_normal(2)
         self.flat_shape = (1 + slope[0] * x + slope[1] * y).astype(np.float32)
@@ -275,16 +276,16 @@ class Bench:
             level = e.lamp * (1 + self.walk[e.sequence])
             for law in self._at["lamp"]:
                 level = law.lamp(level, e)
-            monitor = 100.0 * level * (1 + MONITOR_ERROR * self.stream(e, 7).standard_normal())
+            monitor = (
+                100.0 * level * (1 + MONITOR_ERROR * self.stream(e, 7).standard_normal())
+            )
         seconds = e.seconds
         for law in self._at["recorded"]:
             seconds = law.recorded(seconds, e)
         return Taken(e, codes, monitor, seconds)
 
 
-def _profile(
-    centre: NDArray, sigma: NDArray, n: int
-) -> tuple[NDArray, NDArray, NDArray]:
+def _profile(centre: NDArray, sigma: NDArray, n: int) -> tuple[NDArray, NDArray, NDArray]:
     """Gaussians along one axis: integral over each pixel, value and slope at its upper edge."""
     edge = np.arange(-1, n) + 0.5
     u = (edge - centre[:, None]) / sigma[:, None]

@@ -108,7 +108,7 @@ class Light:
         )
 
     def plus(self, rate: Image) -> Light:
-        """This light and a smooth one added to it [e-/s]."""
+        """Add a smooth light [e-/s] to it."""
         more = Light.smooth(np.asarray(rate, np.float32), 1.0)
         return Light(
             self.rate + more.rate,

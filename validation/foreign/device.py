@@ -76,7 +76,15 @@ DEVICES = {
         pixel=15.0, thickness=200.0, h=1.5, wx=5.0, wy=8.0, zx=3.4, zy=2.6, doping=4e11
     ),
     "thin_9um": Device(
-        pixel=9.0, thickness=60.0, h=0.8, wx=3.0, wy=5.0, zx=2.4, zy=1.8, vfront=6.0, doping=2e12
+        pixel=9.0,
+        thickness=60.0,
+        h=0.8,
+        wx=3.0,
+        wy=5.0,
+        zx=2.4,
+        zy=1.8,
+        vfront=6.0,
+        doping=2e12,
     ),
 }
 """Nominal devices; the first is that of the practice campaigns."""
@@ -143,7 +151,9 @@ def edge_shifts(
     return kx, np.ascontiguousarray(ky)
 
 
-def _one_axis(d: Device, length: float, seal: float, along: float, across: float, nodes: int):
+def _one_axis(
+    d: Device, length: float, seal: float, along: float, across: float, nodes: int
+):
     """Shifts of right edges, [row, column]; the packet is ``along`` wide in x, ``across`` in y."""
     t, p = d.thickness, d.pixel
     u, w = _gauss(nodes, 0.0, 1.0)
@@ -199,12 +209,19 @@ def area_changes(kx: NDArray, ky: NDArray) -> NDArray:
 
 def scattered(nominal: Device, rng: np.random.Generator) -> Device:
     """A real device: the nominal one scattered by the card's spread."""
-    values = {k: getattr(nominal, k) * (1 + s * rng.standard_normal()) for k, s in SPREAD.items()}
+    values = {
+        k: getattr(nominal, k) * (1 + s * rng.standard_normal()) for k, s in SPREAD.items()
+    }
     return replace(nominal, **values)
 
 
 def device_card(
-    name: str, nominal: Device, rows: int, columns: int, overscans: Mapping[str, int], grid: int
+    name: str,
+    nominal: Device,
+    rows: int,
+    columns: int,
+    overscans: Mapping[str, int],
+    grid: int,
 ) -> dict[str, Any]:
     """Contents of device_card.json."""
     values = {k: getattr(nominal, k) for k in nominal.__dataclass_fields__}
@@ -242,7 +259,9 @@ def nominal_shifts(nominal: Device, wavelength: float, back_bias: float):
     return edge_shifts(replace(nominal, vbb=back_bias), wavelength)
 
 
-def baseline_edges(nominal: Device, conditions: list[tuple[float, float]]) -> dict[str, Any]:
+def baseline_edges(
+    nominal: Device, conditions: list[tuple[float, float]]
+) -> dict[str, Any]:
     """Contents of baseline_edges.json for conditions (wavelength [nm], back bias [V])."""
     shifts = {}
     for wavelength, bias in conditions:

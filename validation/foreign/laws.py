@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from validation.foreign import (  # noqa: F401
     laws_amplifier,
+    laws_collection,
     laws_geometry,
     laws_light,
+    laws_noise,
     laws_silicon,
     laws_transfer,
     laws_unnamed,

@@ -1,4 +1,4 @@
-"""Laws of amplifier and converter: memory, gain, crosstalk, noise, bias, codes."""
+"""Laws of amplifier and converter: memory, gain, crosstalk, codes."""
 
 from __future__ import annotations
 
@@ -25,8 +25,13 @@ class _Memory(Law):
 _MEMORY = {"needs": ("serial_overscan",), "limits": (1e-7, 0.05), "amplitude": "alpha"}
 
 
-@law("electronic_memory", "previous_pixel", start=3e-6,
-     source="catalogue item 26; incomplete settling of a sample, first order: alpha S(n-1)", **_MEMORY)  # fmt: skip
+@law(
+    "electronic_memory",
+    "previous_pixel",
+    start=3e-05,
+    source="catalogue item 26; incomplete settling of a sample, first order: alpha S(n-1)",
+    **_MEMORY,
+)
 class PreviousPixel(_Memory):
     """alpha of the previous pixel is added."""
 
@@ -38,8 +43,14 @@ class PreviousPixel(_Memory):
         return out
 
 
-@law("electronic_memory", "settling", start=3e-6,
-     source="Horowitz & Hill, RC settling of the chain: sum over earlier pixels of alpha exp(-(n-1)/tau)", **_MEMORY)  # fmt: skip
+@law(
+    "electronic_memory",
+    "settling",
+    start=3e-06,
+    source="Horowitz & Hill, RC settling of the chain: sum over earlier pixels of "
+    "alpha exp(-(n-1)/tau)",
+    **_MEMORY,
+)
 class Settling(_Memory):
     """All earlier pixels are added, alpha exp(-(n - 1) / tau) of the one n before."""
 
@@ -52,9 +63,14 @@ class Settling(_Memory):
         return lfilter([0.0, self.values["alpha"]], [1.0, -decay], frame, axis=1)
 
 
-@law("electronic_memory", "threshold_and_decay", start=4e-6,
-     source="Snyder et al. 2021 (JATIS 7, 048002): offset_n = max(scale max(S_n - threshold, 0), "
-     "offset_(n-1) exp(-1/decay)), added to pixel n", **_MEMORY)  # fmt: skip
+@law(
+    "electronic_memory",
+    "threshold_and_decay",
+    start=3e-05,
+    source="Snyder et al. 2021 (JATIS 7, 048002): offset_n = max(scale max(S_n - "
+    "threshold, 0), offset_(n-1) exp(-1/decay)), added to pixel n",
+    **_MEMORY,
+)
 class ThresholdDecay(_Memory):
     """The offset jumps to alpha (S - threshold) and decays over the pixels after."""
 
@@ -70,7 +86,9 @@ class ThresholdDecay(_Memory):
         decay, old = np.float32(np.exp(-1 / v["tau"])), np.zeros(len(frame), np.float32)
         out = np.zeros_like(frame)
         for c in range(frame.shape[1]):
-            new = np.float32(v["alpha"]) * np.maximum(frame[:, c] - np.float32(v["threshold"]), 0)
+            new = np.float32(v["alpha"]) * np.maximum(
+                frame[:, c] - np.float32(v["threshold"]), 0
+            )
             old = np.maximum(new, old * decay)
             out[:, c] = old
         return out
@@ -88,8 +106,14 @@ class _Curve(Law):
         return [f * (1 + self.change(f).astype(np.float32)) for f in frames]
 
 
-@law("gain_nonlinearity", "polynomial", amplitude="c2", start=0.01, limits=(2e-5, 0.3),
-     source="Bernstein et al. 2017 (PASP 129, 114502); S (1 + c2 S/1e5 + c3 (S/1e5)^2)")  # fmt: skip
+@law(
+    "gain_nonlinearity",
+    "polynomial",
+    amplitude="c2",
+    start=0.0035,
+    limits=(2e-05, 0.3),
+    source="Bernstein et al. 2017 (PASP 129, 114502); S (1 + c2 S/1e5 + c3 (S/1e5)^2)",
+)
 class Polynomial(_Curve):
     """c2, and c3 in a ratio to it."""
 
@@ -105,9 +129,15 @@ class Polynomial(_Curve):
         return np.float32(self.values["c2"]) * x + np.float32(self.values["c3"]) * x * x
 
 
-@law("gain_nonlinearity", "kink", amplitude="c", start=0.01, limits=(2e-5, 0.4),
-     source="SDSS imager CCDs (DR7 non-linearity pages: response linear to a level, then falling); a change of "
-     "slope at one level")  # fmt: skip
+@law(
+    "gain_nonlinearity",
+    "kink",
+    amplitude="c",
+    start=0.01,
+    limits=(2e-05, 0.4),
+    source="SDSS imager CCDs (DR7 non-linearity pages: response linear to a level,"
+    " then falling); a change of slope at one level",
+)
 class Kink(_Curve):
     """The slope changes by c above a level."""
 
@@ -120,9 +150,15 @@ class Kink(_Curve):
         return np.float32(self.values["c"]) * above / np.maximum(q, 1)
 
 
-@law("gain_nonlinearity", "spline_table", amplitude="rms", start=0.004, limits=(1e-5, 0.1),
-     source="Plazas Malagon et al. 2024 (arXiv 2404.14516): spline linearizer of the video chain; random knots "
-     "of rms relative deviation")  # fmt: skip
+@law(
+    "gain_nonlinearity",
+    "spline_table",
+    amplitude="rms",
+    start=0.004,
+    limits=(1e-05, 0.1),
+    source="Plazas Malagon et al. 2024 (arXiv 2404.14516): spline linearizer of "
+    "the video chain; random knots of rms relative deviation",
+)
 class SplineTable(_Curve):
     """A cubic spline through ten random knots, without its constant and its slope."""
 
@@ -143,9 +179,15 @@ class SplineTable(_Curve):
         return self.values["rms"] * np.interp(q, *self.state["table"])
 
 
-@law("gain_nonlinearity", "low_signal", amplitude="c", start=20.0, limits=(0.05, 800.0),
-     source="Bernstein et al. 2017, section on DECam's response at low light: some CCDs lose charge at low signal; "
-     "deficit c (1 - exp(-S/length)) [e-]")  # fmt: skip
+@law(
+    "gain_nonlinearity",
+    "low_signal",
+    amplitude="c",
+    start=30,
+    limits=(0.05, 800.0),
+    source="Bernstein et al. 2017, section on DECam's response at low light: some "
+    "CCDs lose charge at low signal; deficit c (1 - exp(-S/length)) [e-]",
+)
 class LowSignal(_Curve):
     """A step of c electrons that is complete above ``length`` electrons."""
 
@@ -169,10 +211,15 @@ class _Drift(Law):
         return [f * np.float32(1 + self.change(exposure.hours)) for f in frames]
 
 
-_DRIFT = {"amplitude": "slope", "start": 0.002, "limits": (1e-5, 0.3)}
+_DRIFT = {"amplitude": "slope", "start": 0.01, "limits": (1e-5, 0.3)}
 
 
-@law("gain_drift", "linear", source="catalogue item 32: gain against time, slope for each hour", **_DRIFT)  # fmt: skip
+@law(
+    "gain_drift",
+    "linear",
+    source="catalogue item 32: gain against time, slope for each hour",
+    **_DRIFT,
+)
 class DriftLinear(_Drift):
     """Gain rises in proportion to time."""
 
@@ -182,8 +229,13 @@ class DriftLinear(_Drift):
         return self.values["slope"] * hours
 
 
-@law("gain_drift", "warming_up", source="O'Connor et al. 2016 (SPIE 9915, readout electronics): 5e-4/K; a "
-     "crate warms as 1 - exp(-t / tau)", **_DRIFT)  # fmt: skip
+@law(
+    "gain_drift",
+    "warming_up",
+    source="O'Connor et al. 2016 (SPIE 9915, readout electronics): 5e-4/K; a crate"
+    " warms as 1 - exp(-t / tau)",
+    **_DRIFT,
+)
 class DriftWarming(_Drift):
     """Gain settles: slope is that at the beginning."""
 
@@ -196,8 +248,13 @@ class DriftWarming(_Drift):
         return -self.values["slope"] * tau * np.expm1(-hours / tau)
 
 
-@law("gain_drift", "thermal_cycle", source="as before, with a cooler that cycles: slope is the largest one of a "
-     "sine of the time", **_DRIFT)  # fmt: skip
+@law(
+    "gain_drift",
+    "thermal_cycle",
+    source="as before, with a cooler that cycles: slope is the largest one of a "
+    "sine of the time",
+    **_DRIFT,
+)
 class DriftCycle(_Drift):
     """Gain follows a sine of the time."""
 
@@ -234,11 +291,21 @@ class _Crosstalk(Law):
         return out
 
 
-_TALK = {"needs": ("two_amplifiers", "spots"), "limits": (1e-7, 0.01), "amplitude": "c", "start": 2e-4}
+_TALK = {
+    "needs": ("two_amplifiers", "spots"),
+    "limits": (1e-7, 0.01),
+    "amplitude": "c",
+    "start": 4e-5,
+}
 
 
-@law("amp_crosstalk", "linear", source="O'Connor 2015 (JINST 10, C05010), coefficients between "
-     "outputs of one sensor; the same fraction in all others", **_TALK)  # fmt: skip
+@law(
+    "amp_crosstalk",
+    "linear",
+    source="O'Connor 2015 (arXiv 1501.04137, JINST 10, C05010), coefficients between outputs of one "
+    "sensor; the same fraction in all others",
+    **_TALK,
+)
 class TalkLinear(_Crosstalk):
     """A fraction c of every other amplifier, pixel by pixel in time."""
 
@@ -248,8 +315,13 @@ class TalkLinear(_Crosstalk):
         return frame
 
 
-@law("amp_crosstalk", "nonlinear", source="Paech (DECam's crosstalk notes): linear up to an onset, a polynomial "
-     "above; neighbours only", **_TALK)  # fmt: skip
+@law(
+    "amp_crosstalk",
+    "nonlinear",
+    source="Paech (DECam's crosstalk notes): linear up to an onset, a polynomial "
+    "above; neighbours only",
+    **_TALK,
+)
 class TalkNonlinear(_Crosstalk):
     """Adjacent amplifiers hear S + curve (S - onset)^2 / onset above an onset."""
 
@@ -266,11 +338,19 @@ class TalkNonlinear(_Crosstalk):
 
     def heard(self, frame):
         onset = np.float32(self.values["onset"])
-        return frame + np.float32(self.values["curve"]) * np.maximum(frame - onset, 0) ** 2 / onset
+        return (
+            frame
+            + np.float32(self.values["curve"]) * np.maximum(frame - onset, 0) ** 2 / onset
+        )
 
 
-@law("amp_crosstalk", "delayed", source="Freyhammer et al. 2001 (Exp. Astron. 12, 147): victims of opposite sign and "
-     "displaced by pixels; derivative of a delayed signal", **_TALK)  # fmt: skip
+@law(
+    "amp_crosstalk",
+    "delayed",
+    source="Freyhammer et al. 2001 (Exp. Astron. 12, 147): victims of opposite "
+    "sign and displaced by pixels; derivative of a delayed signal",
+    **_TALK,
+)
 class TalkDelayed(_Crosstalk):
     """Hears the aggressor ``delay`` pixels late, and a share of its change."""
 
@@ -291,151 +371,6 @@ class TalkDelayed(_Crosstalk):
         return late + np.float32(self.values["derivative"]) * change
 
 
-# -------------------------------------------------------------------- noise
-class _Noise(Law):
-    """Noise in readout order; one series for each amplifier unless it is common to all."""
-
-    def series(self, count, rng):
-        """Noise of unit rms, in the order of time."""
-        raise NotImplementedError
-
-    common = False
-
-    def noise(self, frames, exposure):
-        rms = np.float32(self.values[self.amplitude])
-        if not rms:
-            return frames
-        rng = self.rng(exposure)
-        first = self.series(frames[0].size, rng).astype(np.float32)
-        out = []
-        for k, frame in enumerate(frames):
-            x = first if self.common or not k else self.series(frame.size, rng).astype(np.float32)
-            out.append(frame + rms * x.reshape(frame.shape))
-        return out
-
-
-_NOISE = {"amplitude": "rms", "start": 1.5, "limits": (0.03, 60.0), "power": 2.0}
-_BESIDE = {"beside": ("popcorn_noise", "heavy_tailed_noise")}
-
-
-@law("correlated_noise", "autoregressive", source="catalogue item 30: AR(1) in pixel time", **_NOISE, **_BESIDE)  # fmt: skip
-class NoiseAR(_Noise):
-    """Each pixel's noise keeps a share corr of the one before."""
-
-    @classmethod
-    def draw(cls, rng, setting):
-        return {"corr": float(round(rng.uniform(0.2, 0.95), 3))}
-
-    def series(self, count, rng):
-        a = self.values["corr"]
-        return lfilter([np.sqrt(1 - a * a)], [1.0, -a], rng.standard_normal(count))
-
-
-@law("correlated_noise", "pickup_line", source="Antilogus et al. 2017 and catalogue item 30: pickup of a "
-     "power supply's line, coherent over amplifiers, phase at random in each frame", **_NOISE, **_BESIDE)  # fmt: skip
-class NoisePickup(_Noise):
-    """A sine of the pixel's time; its frequency wanders a little."""
-
-    common = True
-
-    @classmethod
-    def draw(cls, rng, setting):
-        return {"period": float(round(np.exp(rng.uniform(np.log(2.3), np.log(90))), 3))}
-
-    def series(self, count, rng):
-        period = self.values["period"] * (1 + 1e-4 * rng.standard_normal())
-        phase = 2 * np.pi * (np.arange(count) / period + rng.random())
-        return np.sqrt(2) * np.sin(phase)
-
-
-@law("correlated_noise", "pink", source="Janesick 2001, section 6.2 (flicker noise of the output amplifier): power "
-     "1/f^exponent above a knee", **_NOISE, **_BESIDE)  # fmt: skip
-class NoisePink(_Noise):
-    """Power 1 / f^exponent in pixel time."""
-
-    @classmethod
-    def draw(cls, rng, setting):
-        return {"exponent": float(round(rng.uniform(0.7, 1.6), 3))}
-
-    def series(self, count, rng):
-        f = np.fft.rfftfreq(count)
-        f[0] = np.inf
-        low = 1 / 20000.0
-        a = np.maximum(f, low) ** (-self.values["exponent"] / 2)
-        x = np.fft.irfft(np.fft.rfft(rng.standard_normal(count)) * a, count)
-        return x / x.std()
-
-
-@law("correlated_noise", "common_mode", source="Antilogus et al. 2017 (correlated noise between channels); white in "
-     "time, shared by all amplifiers", **{**_NOISE, "needs": ("two_amplifiers",)}, **_BESIDE)  # fmt: skip
-class NoiseCommon(_Noise):
-    """The same white noise in all amplifiers."""
-
-    common = True
-
-    def series(self, count, rng):
-        return rng.standard_normal(count)
-
-
-class _Bias(Law):
-    def offset(self, shape, exposure, number):
-        """Offset of unit rms [e-]."""
-        raise NotImplementedError
-
-    def noise(self, frames, exposure):
-        rms = np.float32(self.values[self.amplitude])
-        if not rms:
-            return frames
-        return [
-            f + rms * np.asarray(self.offset(f.shape, exposure, k), np.float32)
-            for k, f in enumerate(frames)
-        ]
-
-
-_BIAS = {
-    "amplitude": "rms", "start": 1.0, "limits": (0.02, 200.0), "power": 2.0,
-    "beside": ("bias_structure", "bias_drift", "popcorn_noise"),
-}  # fmt: skip
-
-
-@law("bias_instability", "frames", source="catalogue item 31: the level jumps between frames", **_BIAS)  # fmt: skip
-class BiasFrames(_Bias):
-    """Each frame of each amplifier has a level of its own, overscan included."""
-
-    def offset(self, shape, exposure, number):
-        return self.rng(exposure, number).standard_normal()
-
-
-@law("bias_instability", "rows", source="Plazas Malagon et al. 2024: bias by row follows the overscan; offsets of "
-     "rows with memory", **_BIAS)  # fmt: skip
-class BiasRows(_Bias):
-    """Rows have levels that keep a share of the row before."""
-
-    @classmethod
-    def draw(cls, rng, setting):
-        return {"memory": float(round(rng.uniform(0.0, 0.97), 3))}
-
-    def offset(self, shape, exposure, number):
-        a = self.values["memory"]
-        x = self.rng(exposure, number).standard_normal(shape[0])
-        return lfilter([np.sqrt(1 - a * a)], [1.0, -a], x)[:, None]
-
-
-@law("bias_instability", "along_rows", source="Utsumi et al. 2024 (LSSTCam, two-dimensional bias that varies between "
-     "frames): a ramp and a settling whose size differs from frame to frame", **_BIAS)  # fmt: skip
-class BiasAlongRows(_Bias):
-    """A settling exp(-x / length) at the begin of rows, of random size in each frame."""
-
-    @classmethod
-    def draw(cls, rng, setting):
-        w = setting.layout.frame_shape[1]
-        return {"length": float(round(rng.uniform(0.05, 0.5) * w, 2))}
-
-    def offset(self, shape, exposure, number):
-        x = np.exp(-np.arange(shape[1]) / self.values["length"])
-        return self.rng(exposure, number).standard_normal() * x[None, :] / np.sqrt(np.mean(x * x))
-
-
 # -------------------------------------------------------------------- converter
 class _Codes(Law):
     """Works on whole codes; a part of a code is a chance, as the noise before the converter makes it."""
@@ -454,8 +389,15 @@ class _Codes(Law):
         return out
 
 
-@law("adc_bits", "bit_weight", amplitude="delta", start=0.1, limits=(0.003, 64.0),
-     source="Janesick 2007, Photon Transfer, section 11 (ADC nonlinearity): one bit weighs delta codes more")  # fmt: skip
+@law(
+    "adc_bits",
+    "bit_weight",
+    amplitude="delta",
+    start=0.6,
+    limits=(0.003, 64.0),
+    source="Janesick 2007, Photon Transfer, section 11 (ADC nonlinearity): one bit"
+    " weighs delta codes more",
+)
 class BitWeight(_Codes):
     """Codes with a bit set (counted from 0) are higher by delta codes."""
 
@@ -464,11 +406,20 @@ class BitWeight(_Codes):
         return {**either_sign(rng), "bit": int(rng.integers(3, 12))}
 
     def shifted(self, code, uniform):
-        return np.floor(self.values["delta"] * ((code >> int(self.values["bit"])) & 1) + uniform)
+        return np.floor(
+            self.values["delta"] * ((code >> int(self.values["bit"])) & 1) + uniform
+        )
 
 
-@law("adc_bits", "wide_codes", amplitude="delta", start=0.05, limits=(0.001, 1.0),
-     source="IEEE 1241 (differential nonlinearity): every 2^bit-th code is wider, at the cost of the next")  # fmt: skip
+@law(
+    "adc_bits",
+    "wide_codes",
+    amplitude="delta",
+    start=0.15,
+    limits=(0.001, 1.0),
+    source="IEEE 1241 (differential nonlinearity): every 2^bit-th code is wider, "
+    "at the cost of the next",
+)
 class WideCodes(_Codes):
     """Codes at multiples of 2^bit are wider by delta codes, the codes above narrower."""
 

@@ -62,24 +62,41 @@ class _Rings(_Fixed):
         return self.radial(r) * (rx if axis == "x" else ry) / np.maximum(r, 1.0)
 
 
-@law("tree_rings", "one_period", amplitude="amp", start=0.006, limits=(2e-5, 0.3),
-     source="Plazas, Bernstein & Sheldon 2014 (PASP 126, 750): radial shift; area change is its "
-     "divergence; here one period")  # fmt: skip
+@law(
+    "tree_rings",
+    "one_period",
+    amplitude="amp",
+    start=0.006,
+    limits=(2e-05, 0.3),
+    source="Plazas, Bernstein & Sheldon 2014 (PASP 126, 750): radial shift; area "
+    "change is its divergence; here one period",
+)
 class RingsOnePeriod(_Rings):
     """Edges shift along the radius by amp cos(2 pi r / period + phase)."""
 
     @classmethod
     def draw(cls, rng, setting):
         period = float(round(np.exp(rng.uniform(np.log(8), np.log(60))), 2))
-        return {**cls.centre(rng, setting), "period": period, "phase": float(rng.uniform(0, 6.28))}
+        return {
+            **cls.centre(rng, setting),
+            "period": period,
+            "phase": float(rng.uniform(0, 6.28)),
+        }
 
     def radial(self, r):
         return np.cos(2 * np.pi * r / self.values["period"] + self.values["phase"])
 
 
-@law("tree_rings", "growing_sum", amplitude="amp", start=0.006, limits=(2e-5, 0.3),
-     source="Park et al. 2020 (JATIS 6, 011005) and Esteves et al. 2023 (PASP 135, 115003): several "
-     "periods, amplitude growing with radius; weaker for red light and higher bias")  # fmt: skip
+@law(
+    "tree_rings",
+    "growing_sum",
+    amplitude="amp",
+    start=0.006,
+    limits=(2e-05, 0.3),
+    source="Park et al. 2020 (JATIS 6, 011005) and Esteves et al. 2023 (PASP 135, "
+    "115003): several periods, amplitude growing with radius; weaker for "
+    "red light and higher bias",
+)
 class RingsGrowingSum(_Rings):
     """Four periods whose amplitudes grow with (r / r0)^growth; amp is the rms times sqrt 2.
 
@@ -128,9 +145,15 @@ class _Rim(_Fixed):
         return np.where(high < 0.25, 0.0, shift)
 
 
-@law("edge_rolloff", "exponential", amplitude="amp", start=0.03, limits=(1e-4, 2.0),
-     source="Plazas et al. 2014 (glowing edges of DECam); Bradshaw et al. 2015 (JINST 10, C04034): "
-     "amp exp(-d / length)")  # fmt: skip
+@law(
+    "edge_rolloff",
+    "exponential",
+    amplitude="amp",
+    start=0.03,
+    limits=(0.0001, 2.0),
+    source="Plazas et al. 2014 (glowing edges of DECam); Bradshaw et al. 2015 "
+    "(JINST 10, C04034): amp exp(-d / length)",
+)
 class RimExponential(_Rim):
     """Edges within a few lengths of the rim shift by amp exp(-d / length), inwards or outwards."""
 
@@ -146,24 +169,40 @@ class RimExponential(_Rim):
         return np.exp(-np.maximum(distance, 0) / self.values["length"])
 
 
-@law("edge_rolloff", "power", amplitude="amp", start=0.03, limits=(1e-4, 2.0),
-     source="O'Connor 2015/2019 (guard-ring field of thick sensors): field of a line charge outside "
-     "the rim, a power of the distance; amp (1 + d/length)^-p")  # fmt: skip
+@law(
+    "edge_rolloff",
+    "power",
+    amplitude="amp",
+    start=0.03,
+    limits=(0.0001, 2.0),
+    source="O'Connor 2015/2019 (guard-ring field of thick sensors): field of a "
+    "line charge outside the rim, a power of the distance; amp (1 + "
+    "d/length)^-p",
+)
 class RimPower(RimExponential):
     """Edges shift by amp (1 + d / length)^-exponent."""
 
     @classmethod
     def draw(cls, rng, setting):
-        return {**super().draw(rng, setting), "exponent": float(round(rng.uniform(1.5, 4), 2))}
+        return {
+            **super().draw(rng, setting),
+            "exponent": float(round(rng.uniform(1.5, 4), 2)),
+        }
 
     def fall(self, distance):
         base = 1 + np.maximum(distance, 0) / self.values["length"]
         return base ** -self.values["exponent"]
 
 
-@law("mask_stitch", "step", amplitude="amp", start=0.004, limits=(2e-5, 0.2),
-     source="Baumer & Roodman 2015 (arXiv 1412.5136): pixel sizes; Smith & Rahmer 2008 (SPIE 7021): "
-     "one boundary in each mask step displaced")  # fmt: skip
+@law(
+    "mask_stitch",
+    "step",
+    amplitude="amp",
+    start=0.004,
+    limits=(2e-05, 0.2),
+    source="Baumer & Roodman 2015 (arXiv 1412.5136): pixel sizes; Smith & Rahmer "
+    "2008 (SPIE 7021): one boundary in each mask step displaced",
+)
 class StitchStep(_Fixed):
     """One boundary of columns in each period is displaced by amp; its neighbours are not."""
 
@@ -177,16 +216,25 @@ class StitchStep(_Fixed):
         }
 
     def wave(self, at):
-        return (np.floor(at - 0.5 + self.values["phase"]) % self.values["period"] == 0) * 1.0
+        return (
+            np.floor(at - 0.5 + self.values["phase"]) % self.values["period"] == 0
+        ) * 1.0
 
     def pattern(self, x, y, axis, exposure):
         at = x if axis == "x" else y
         return self.wave(at) if axis == self.values["axis"] else np.zeros_like(at)
 
 
-@law("mask_stitch", "wave", amplitude="amp", start=0.004, limits=(2e-5, 0.2),
-     source="Kotov et al. 2010 (NIM A 652, 524, pixel sizes of LSST prototypes): the mask's step and "
-     "repeat error runs on within a field; a sine of the column")  # fmt: skip
+@law(
+    "mask_stitch",
+    "wave",
+    amplitude="amp",
+    start=0.004,
+    limits=(2e-05, 0.2),
+    source="Kotov et al. 2010 (NIM A 652, 524, pixel sizes of LSST prototypes): "
+    "the mask's step and repeat error runs on within a field; a sine of the"
+    " column",
+)
 class StitchWave(StitchStep):
     """Boundaries are displaced by amp sin(2 pi x / period)."""
 
@@ -198,9 +246,15 @@ class StitchWave(StitchStep):
         return np.sin(2 * np.pi * (at + self.values["phase"]) / self.values["period"])
 
 
-@law("tearing", "divisadero", amplitude="amp", start=0.01, limits=(1e-4, 0.6),
-     source="Juramy et al. 2020 (arXiv 2001.03223): holes missing along one column boundary; edges "
-     "lean to it as amp exp(-d/length)")  # fmt: skip
+@law(
+    "tearing",
+    "divisadero",
+    amplitude="amp",
+    start=0.01,
+    limits=(0.0001, 0.6),
+    source="Juramy et al. 2020 (arXiv 2002.09439): holes missing along one column "
+    "boundary; edges lean to it as amp exp(-d/length)",
+)
 class TearColumn(_Fixed):
     """Edges near one column boundary lean towards it, the same in all rows."""
 
@@ -222,9 +276,15 @@ class TearColumn(_Fixed):
         return -np.sign(d) * np.exp(-np.abs(d) / self.values["length"])
 
 
-@law("tearing", "ragged", amplitude="amp", start=0.012, limits=(1e-4, 0.6),
-     source="Doherty et al. 2014 (SPIE 9154) and Juramy et al. 2020: a tear wanders along the rows and "
-     "ends where holes were restored; gone after a purge")  # fmt: skip
+@law(
+    "tearing",
+    "ragged",
+    amplitude="amp",
+    start=0.012,
+    limits=(0.0001, 0.6),
+    source="Doherty et al. 2014 (SPIE 9154) and Juramy et al. 2020: a tear wanders"
+    " along the rows and ends where holes were restored; gone after a purge",
+)
 class TearRagged(TearColumn):
     """The tear's column wanders over the rows, and it is there until a purge at an exposure."""
 

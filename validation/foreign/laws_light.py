@@ -22,9 +22,17 @@ def random_field(rng, shape, spectrum):
 
 
 # -------------------------------------------------------------------- illumination
-@law("illumination_turbulence", "kolmogorov", amplitude="rms", start=4e-4, limits=(5e-6, 0.03), power=1.8,
-     source="Banovetz et al. 2024 (arXiv 2411.13386, JATIS): 'weather' in differenced flats; "
-     "Kolmogorov 1941: power k^(-11/3) above the outer scale")  # fmt: skip
+@law(
+    "illumination_turbulence",
+    "kolmogorov",
+    amplitude="rms",
+    start=0.0004,
+    limits=(5e-06, 0.03),
+    power=1.8,
+    source="Banovetz et al. 2024 (arXiv 2411.13386, JATIS): 'weather' in "
+    "differenced flats; Kolmogorov 1941: power k^(-11/3) above the outer "
+    "scale",
+)
 class Kolmogorov(Law):
     """Each flat is multiplied by 1 + rms x, x a field with power (k^2 + 1/length^2)^(-11/6)."""
 
@@ -44,9 +52,16 @@ class Kolmogorov(Law):
         return light.scaled(1 + np.float32(self.values["rms"]) * self.field(exposure))
 
 
-@law("illumination_turbulence", "drifting_cells", amplitude="rms", start=4e-4, limits=(5e-6, 0.03), power=1.8,
-     source="Banovetz et al. 2024: warm air of the projector; cells of one size that move on and "
-     "live for several exposures")  # fmt: skip
+@law(
+    "illumination_turbulence",
+    "drifting_cells",
+    amplitude="rms",
+    start=0.0004,
+    limits=(5e-06, 0.03),
+    power=1.8,
+    source="Banovetz et al. 2024: warm air of the projector; cells of one size "
+    "that move on and live for several exposures",
+)
 class DriftingCells(Kolmogorov):
     """Gaussian cells of one length; a share ``memory`` of the field lives on to the next exposure."""
 
@@ -95,8 +110,16 @@ class _Fringes(Law):
         return light.scaled((1 + amp * np.cos(phase)).astype(np.float32))
 
 
-@law("fringing", "wedge", amplitude="amp", start=0.003, limits=(2e-5, 0.2), needs=("red",),
-     source="Malumuth et al. 2003 (SPIE 4854, 567): amp cos(4 pi n d / lambda), d a bowl and a wedge")  # fmt: skip
+@law(
+    "fringing",
+    "wedge",
+    amplitude="amp",
+    start=0.003,
+    limits=(2e-05, 0.2),
+    needs=("red",),
+    source="Malumuth et al. 2003 (SPIE 4854, 567): amp cos(4 pi n d / lambda), d a"
+    " bowl and a wedge",
+)
 class FringesWedge(_Fringes):
     """Thickness is a wedge and a bowl of some wavelengths; amp at 950 nm, weaker to the blue."""
 
@@ -112,9 +135,16 @@ class FringesWedge(_Fringes):
         return a * x + b * y + self.values["bowl"] * (x * x + y * y)
 
 
-@law("fringing", "rough_layers", amplitude="amp", start=0.003, limits=(2e-5, 0.2), needs=("red",),
-     source="Guo et al. 2023 (PASP 135, 034503, fringing of LSST sensors): random thickness with a red spectrum, "
-     "and a second epoxy layer's fringes")  # fmt: skip
+@law(
+    "fringing",
+    "rough_layers",
+    amplitude="amp",
+    start=0.003,
+    limits=(2e-05, 0.2),
+    needs=("red",),
+    source="Guo et al. 2023 (PASP 135, 034503, fringing of LSST sensors): random "
+    "thickness with a red spectrum, and a second epoxy layer's fringes",
+)
 class FringesRough(_Fringes):
     """Thickness is a random field of ``rough`` um rms with power k^-4."""
 
@@ -146,8 +176,15 @@ class _Wings(Law):
         return core.plus(frac * wings)
 
 
-@law("psf_wings", "king", amplitude="frac", start=0.003, limits=(1e-5, 0.2), needs=("spots",),
-     source="King 1971 (PASP 83, 199): aureole as r^-2; Racine 1996 (PASP 108, 699)")  # fmt: skip
+@law(
+    "psf_wings",
+    "king",
+    amplitude="frac",
+    start=0.003,
+    limits=(1e-05, 0.2),
+    needs=("spots",),
+    source="King 1971 (PASP 83, 199): aureole as r^-2; Racine 1996 (PASP 108, 699)",
+)
 class WingsKing(_Wings):
     """A fraction of a spot's light lies in a halo 1 / (length^2 + r^2)."""
 
@@ -159,9 +196,16 @@ class WingsKing(_Wings):
         return 1 / (self.values["length"] ** 2 + r**2)
 
 
-@law("psf_wings", "exponential", amplitude="frac", start=0.003, limits=(1e-5, 0.2),
-     needs=("spots",), source="Sirianni et al. 2005 (PASP 117, 1049, long-wavelength halo of thinned "
-     "CCDs): exponential halo that grows to the red")  # fmt: skip
+@law(
+    "psf_wings",
+    "exponential",
+    amplitude="frac",
+    start=0.003,
+    limits=(1e-05, 0.2),
+    needs=("spots",),
+    source="Sirianni et al. 2005 (PASP 117, 1049, long-wavelength halo of thinned "
+    "CCDs): exponential halo that grows to the red",
+)
 class WingsExponential(_Wings):
     """A fraction of the light lies in a halo exp(-r / length)."""
 
@@ -189,11 +233,20 @@ class _Shutter(Law):
         map_ = self.state["shade"]
         if np.isscalar(map_):
             return np.maximum(seconds + self.values["dt"] * map_, 0.0)
-        return np.maximum(seconds + np.float32(self.values["dt"]) * map_, 0).astype(np.float32)
+        return np.maximum(seconds + np.float32(self.values["dt"]) * map_, 0).astype(
+            np.float32
+        )
 
 
-@law("shutter_timing", "offset", amplitude="dt", start=0.01, limits=(2e-5, 0.5),
-     beside=("exposure_time",), source="Stetson 1989 (dome-flat shutter tests): t + dt everywhere")  # fmt: skip
+@law(
+    "shutter_timing",
+    "offset",
+    amplitude="dt",
+    start=0.006,
+    limits=(2e-05, 0.5),
+    beside=("exposure_time",),
+    source="Stetson 1989 (dome-flat shutter tests): t + dt everywhere",
+)
 class ShutterOffset(_Shutter):
     """All exposures are longer by dt."""
 
@@ -203,9 +256,16 @@ class ShutterOffset(_Shutter):
         return 1.0
 
 
-@law("shutter_timing", "iris", amplitude="dt", start=0.01, limits=(5e-5, 0.5),
-     beside=("exposure_time",), source="Zissell 2000 (JAAVSO 28, 149, shutter mapping): an iris opens "
-     "from the middle, dt (1 - r^2 / R^2)")  # fmt: skip
+@law(
+    "shutter_timing",
+    "iris",
+    amplitude="dt",
+    start=0.004,
+    limits=(5e-05, 0.5),
+    beside=("exposure_time",),
+    source="Zissell 2000 (JAAVSO 28, 149, shutter mapping): an iris opens from the"
+    " middle, dt (1 - r^2 / R^2)",
+)
 class ShutterIris(_Shutter):
     """The middle is exposed longest: dt (1 - shading r^2 / R^2), normed to 1 on average."""
 
@@ -218,9 +278,16 @@ class ShutterIris(_Shutter):
         return (s / s.mean()).astype(np.float32)
 
 
-@law("shutter_timing", "blade", amplitude="dt", start=0.01, limits=(5e-5, 0.5),
-     beside=("exposure_time",), source="Reif et al. 2005 (Bonn shutter, Scientific Detectors for "
-     "Astronomy): blades of unequal speed, dt linear along the travel")  # fmt: skip
+@law(
+    "shutter_timing",
+    "blade",
+    amplitude="dt",
+    start=0.0035,
+    limits=(5e-05, 0.5),
+    beside=("exposure_time",),
+    source="Reif et al. 2005 (Bonn shutter, Scientific Detectors for Astronomy): "
+    "blades of unequal speed, dt linear along the travel",
+)
 class ShutterBlade(ShutterIris):
     """dt (1 + shading y) along the blades' way."""
 
@@ -248,13 +315,25 @@ class _Dark(Law):
             return charge
         if "rate" not in self.state:
             self.state["rate"] = self.rate()
-        mean = self.values["rate"] * self.state["rate"] * exposure.seconds * self.warmth(exposure)
+        mean = (
+            self.values["rate"]
+            * self.state["rate"]
+            * exposure.seconds
+            * self.warmth(exposure)
+        )
         more = self.rng(exposure).poisson(mean).astype(np.float32)
         return charge + more
 
 
-@law("dark_hot", "uniform", amplitude="rate", start=0.3, limits=(1e-3, 60.0),
-     beside=("hot_pixel",), source="Janesick 2001, section 7.1: dark current, twice as large every 7 K")  # fmt: skip
+@law(
+    "dark_hot",
+    "uniform",
+    amplitude="rate",
+    start=0.03,
+    limits=(0.001, 60.0),
+    beside=("hot_pixel",),
+    source="Janesick 2001, section 7.1: dark current, twice as large every 7 K",
+)
 class DarkUniform(_Dark):
     """Dark current of ``rate`` e-/s in all pixels."""
 
@@ -262,9 +341,16 @@ class DarkUniform(_Dark):
         return np.ones(self.setting.shape)
 
 
-@law("dark_hot", "hot_columns", amplitude="rate", start=3.0, limits=(0.02, 2000.0),
-     beside=("hot_pixel", "bad_column"), source="Widenhorn et al. 2002 (SPIE 4669): generation at single sites; "
-     "columns fed from a site's row up")  # fmt: skip
+@law(
+    "dark_hot",
+    "hot_columns",
+    amplitude="rate",
+    start=0.2,
+    limits=(0.02, 2000.0),
+    beside=("hot_pixel", "bad_column"),
+    source="Widenhorn et al. 2002 (SPIE 4669): generation at single sites; columns"
+    " fed from a site's row up",
+)
 class DarkColumns(_Dark):
     """Some columns are hot from a row on, the first with ``rate`` e-/s, others less."""
 
@@ -274,7 +360,10 @@ class DarkColumns(_Dark):
         return {
             "columns": [int(c) for c in rng.choice(n, count, replace=False)],
             "rows": [int(r) for r in rng.integers(0, n // 2, count)],
-            "weights": [1.0, *[float(round(w, 3)) for w in rng.uniform(0.1, 0.9, count - 1)]],
+            "weights": [
+                1.0,
+                *[float(round(w, 3)) for w in rng.uniform(0.1, 0.9, count - 1)],
+            ],
         }
 
     def rate(self):
@@ -284,9 +373,16 @@ class DarkColumns(_Dark):
         return out
 
 
-@law("dark_hot", "glow", amplitude="rate", start=2.0, limits=(0.01, 400.0),
-     beside=("hot_pixel",), source="Janesick 2001, section 7.2: glow of an output amplifier falls with distance from "
-     "its corner; here exp(-r / length)")  # fmt: skip
+@law(
+    "dark_hot",
+    "glow",
+    amplitude="rate",
+    start=0.12,
+    limits=(0.01, 400.0),
+    beside=("hot_pixel",),
+    source="Janesick 2001, section 7.2: glow of an output amplifier falls with "
+    "distance from its corner; here exp(-r / length)",
+)
 class DarkGlow(_Dark):
     """Glow from one corner, ``rate`` e-/s there; as strong at all temperatures."""
 
@@ -348,9 +444,16 @@ def straight_track(rng, n, thickness_px, pixel_um, steps=4):
     return x, y, (ELECTRONS_PER_UM * um / count * landau).astype(np.float32)
 
 
-@law("cosmic_rays", "muons", amplitude="rate", start=3.0, limits=(0.3, 400.0),
-     beside=("tracks",), source="Groom 2002 (Exp. Astron. 14, 45): muons, straight tracks, 80 e-/um, "
-     "zenith angles as cos^2")  # fmt: skip
+@law(
+    "cosmic_rays",
+    "muons",
+    amplitude="rate",
+    start=8,
+    limits=(0.3, 400.0),
+    beside=("tracks",),
+    source="Groom 2002 (Exp. Astron. 14, 45): muons, straight tracks, 80 e-/um, "
+    "zenith angles as cos^2",
+)
 class Muons(_Tracks):
     """Straight tracks, ``rate`` for each minute and 256 x 256 pixels."""
 
@@ -359,22 +462,37 @@ class Muons(_Tracks):
         return straight_track(rng, n, d.thickness / d.pixel, d.pixel)
 
 
-@law("cosmic_rays", "worms", amplitude="rate", start=3.0, limits=(0.3, 400.0),
-     beside=("tracks",), source="Groom 2002: low-energy electrons of Compton scattering, multiple-"
-     "scattered 'worms', and dots of X rays")  # fmt: skip
+@law(
+    "cosmic_rays",
+    "worms",
+    amplitude="rate",
+    start=12,
+    limits=(0.3, 400.0),
+    beside=("tracks",),
+    source="Groom 2002: low-energy electrons of Compton scattering, multiple-"
+    "scattered 'worms', and dots of X rays",
+)
 class Worms(_Tracks):
     """Wandering tracks that thicken to their end, and dots of a few thousand electrons."""
 
     def one(self, rng, n):
         x0, y0 = rng.uniform(0, n, 2)
         if rng.random() < 0.3:
-            return np.array([x0]), np.array([y0]), np.array([rng.uniform(300, 6000)], np.float32)
+            return (
+                np.array([x0]),
+                np.array([y0]),
+                np.array([rng.uniform(300, 6000)], np.float32),
+            )
         count = int(rng.integers(6, 60))
         turn = np.cumsum(rng.normal(0, 0.55, count)) + rng.uniform(0, 2 * np.pi)
         x, y = x0 + np.cumsum(0.5 * np.cos(turn)), y0 + np.cumsum(0.5 * np.sin(turn))
         um = 0.5 * self.setting.nominal.pixel
         rise = 1 + 2 * np.exp(-np.arange(count)[::-1] / 4)
-        return x, y, (ELECTRONS_PER_UM * um * rise * rng.gamma(6, 1 / 6, count)).astype(np.float32)
+        return (
+            x,
+            y,
+            (ELECTRONS_PER_UM * um * rise * rng.gamma(6, 1 / 6, count)).astype(np.float32),
+        )
 
 
 # -------------------------------------------------------------------- persistence
@@ -409,8 +527,14 @@ class _Persistence(Law):
         return out
 
 
-@law("persistence", "one_exponential", amplitude="frac", start=2e-4, limits=(1e-7, 0.02),
-     source="Janesick 2001, section 2.4 (residual images): one trap, exp(-n / tau)")  # fmt: skip
+@law(
+    "persistence",
+    "one_exponential",
+    amplitude="frac",
+    start=1e-05,
+    limits=(1e-07, 0.02),
+    source="Janesick 2001, section 2.4 (residual images): one trap, exp(-n / tau)",
+)
 class PersistenceOne(_Persistence):
     """frac of the charge comes in the next exposure, less by exp(-1/tau) in each one after."""
 
@@ -422,8 +546,15 @@ class PersistenceOne(_Persistence):
         return np.exp(-(age - 1) / self.values["tau"])
 
 
-@law("persistence", "two_exponentials", amplitude="frac", start=2e-4, limits=(1e-7, 0.02),
-     source="Polin et al. 2025 (JINST 20, P07031): two causes in e2v sensors, and only above a level")  # fmt: skip
+@law(
+    "persistence",
+    "two_exponentials",
+    amplitude="frac",
+    start=1.5e-05,
+    limits=(1e-07, 0.02),
+    source="Polin et al. 2025 (JINST 20, P07031): two causes in e2v sensors, and "
+    "only above a level",
+)
 class PersistenceTwo(PersistenceOne):
     """Two times, the second with a share; only charge above a threshold is kept."""
 
@@ -437,7 +568,9 @@ class PersistenceTwo(PersistenceOne):
         }
 
     def captured(self, charge):
-        return np.float32(self.values["frac"]) * np.maximum(charge - self.values["threshold"], 0)
+        return np.float32(self.values["frac"]) * np.maximum(
+            charge - self.values["threshold"], 0
+        )
 
     def shares(self, age):
         v = self.values
@@ -445,9 +578,15 @@ class PersistenceTwo(PersistenceOne):
         return (1 - v["share2"]) * np.exp(-(age - 1) / v["tau"]) + slow
 
 
-@law("persistence", "power_law", amplitude="frac", start=2e-4, limits=(1e-7, 0.02),
-     source="Smith et al. 2008 (SPIE 7021, 70210J, theory of image persistence): a range of time constants "
-     "makes a power law of time, age^-exponent")  # fmt: skip
+@law(
+    "persistence",
+    "power_law",
+    amplitude="frac",
+    start=1.5e-05,
+    limits=(1e-07, 0.02),
+    source="Smith et al. 2008 (SPIE 7021, 70210J, theory of image persistence): a "
+    "range of time constants makes a power law of time, age^-exponent",
+)
 class PersistencePower(_Persistence):
     """frac / age^exponent in the age-th exposure after."""
 

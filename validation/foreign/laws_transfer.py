@@ -69,7 +69,9 @@ def trap(
             free = held[s] * (1 - stay[s])
             held[s] = held[s] - free
             q = q + free
-            wanted = np.minimum(np.maximum(capacity[s](i, q) - held[s], 0), np.maximum(q, 0))
+            wanted = np.minimum(
+                np.maximum(capacity[s](i, q) - held[s], 0), np.maximum(q, 0)
+            )
             held[s] = held[s] + wanted
             q = q - wanted
         out[i] = q
@@ -148,24 +150,43 @@ class _TwoTimes(_VolumeFilling):
 _SERIAL = {"needs": ("serial_overscan",), "limits": (1e-9, 1e-3)}
 
 
-@law("cti_serial", "proportional", amplitude="cti", start=2e-7,
-     source="Janesick 2001, section 5.3 (deferred charge); Snyder & Roodman 2019 (JATIS 5, "
-     "041509): proportional loss", **_SERIAL)  # fmt: skip
+@law(
+    "cti_serial",
+    "proportional",
+    amplitude="cti",
+    start=2e-07,
+    source="Janesick 2001, section 5.3 (deferred charge); Snyder & Roodman 2019 "
+    "(JATIS 5, 041509): proportional loss",
+    **_SERIAL,
+)
 class SerialProportional(_Proportional, _SerialAxis):
     """A fraction cti is left behind at each serial transfer."""
 
 
-@law("cti_serial", "volume_filling", amplitude="cti", start=6e-7,
-     source="Massey et al. 2014 (MNRAS 439, 887), trapped charge ~ (S/w)^beta; Short et al. 2013 "
-     "(MNRAS 430, 3078, CDM): volume ~ S^beta", **_SERIAL)  # fmt: skip
+@law(
+    "cti_serial",
+    "volume_filling",
+    amplitude="cti",
+    start=6e-07,
+    source="Massey et al. 2014 (MNRAS 439, 887), trapped charge ~ (S/w)^beta; "
+    "Short et al. 2013 (MNRAS 430, 3078, CDM): volume ~ S^beta",
+    **_SERIAL,
+)
 class SerialVolumeFilling(_VolumeFilling, _SerialAxis):
     """Traps in every register pixel fill as S^beta and release exp(-1/tau) for each pixel."""
 
     draw = classmethod(lambda cls, rng, setting: cls.one_species(rng))
 
 
-@law("cti_serial", "two_time_constants", amplitude="cti", start=6e-7,
-     source="Massey et al. 2014 and ArCTIc: several species of traps with release times of their own", **_SERIAL)  # fmt: skip
+@law(
+    "cti_serial",
+    "two_time_constants",
+    amplitude="cti",
+    start=6e-07,
+    source="Massey et al. 2014 and ArCTIc: several species of traps with release "
+    "times of their own",
+    **_SERIAL,
+)
 class SerialTwoTimes(_TwoTimes, _SerialAxis):
     """Two species in every register pixel, the second slow."""
 
@@ -175,22 +196,40 @@ class SerialTwoTimes(_TwoTimes, _SerialAxis):
 _PARALLEL = {"needs": ("parallel_overscan",), "limits": (1e-9, 1e-3)}
 
 
-@law("cti_parallel", "proportional", amplitude="cti", start=2e-7,
-     source="Janesick 2001, section 5.3: extended pixel edge response along columns", **_PARALLEL)  # fmt: skip
+@law(
+    "cti_parallel",
+    "proportional",
+    amplitude="cti",
+    start=2e-07,
+    source="Janesick 2001, section 5.3: extended pixel edge response along columns",
+    **_PARALLEL,
+)
 class ParallelProportional(_Proportional, _ParallelAxis):
     """A fraction cti is left behind at each parallel transfer."""
 
 
-@law("cti_parallel", "volume_filling", amplitude="cti", start=6e-7,
-     source="Massey et al. 2014; Short et al. 2013 (CDM), parallel direction", **_PARALLEL)  # fmt: skip
+@law(
+    "cti_parallel",
+    "volume_filling",
+    amplitude="cti",
+    start=6e-07,
+    source="Massey et al. 2014; Short et al. 2013 (CDM), parallel direction",
+    **_PARALLEL,
+)
 class ParallelVolumeFilling(_VolumeFilling, _ParallelAxis):
     """Traps in every pixel of a column fill as S^beta."""
 
     draw = classmethod(lambda cls, rng, setting: cls.one_species(rng))
 
 
-@law("cti_parallel", "two_time_constants", amplitude="cti", start=6e-7,
-     source="Massey et al. 2014: three species in HST's columns, here two", **_PARALLEL)  # fmt: skip
+@law(
+    "cti_parallel",
+    "two_time_constants",
+    amplitude="cti",
+    start=6e-07,
+    source="Massey et al. 2014: three species in HST's columns, here two",
+    **_PARALLEL,
+)
 class ParallelTwoTimes(_TwoTimes, _ParallelAxis):
     """Two species in every pixel, the second slow."""
 
@@ -227,16 +266,24 @@ class _OneTrap(_SerialAxis):
             return lambda i, q: size * np.float32(share) * self.fill(q)
 
         species = self.species()
-        out[at:] = trap(packets[at:], [make(s) for s, _ in species], [t for _, t in species])
+        out[at:] = trap(
+            packets[at:], [make(s) for s, _ in species], [t for _, t in species]
+        )
         return out
 
 
 _TRAP = {"needs": ("serial_overscan",), "limits": (0.3, 4000.0)}
 
 
-@law("trap_serial", "linear_capture", amplitude="size", start=8.0,
-     source="Snyder et al. 2021 (JATIS 7, 048002), section 3: local trap, captures scaling x S up to its size; "
-     "release exp(-1/tau)", **_TRAP)  # fmt: skip
+@law(
+    "trap_serial",
+    "linear_capture",
+    amplitude="size",
+    start=8.0,
+    source="Snyder et al. 2021 (JATIS 7, 048002), section 3: local trap, captures "
+    "scaling x S up to its size; release exp(-1/tau)",
+    **_TRAP,
+)
 class TrapLinear(_OneTrap):
     """Captures in proportion to the charge until it is full at ``full`` electrons."""
 
@@ -248,8 +295,14 @@ class TrapLinear(_OneTrap):
         return np.clip(q / np.float32(self.values["full"]), 0, 1)
 
 
-@law("trap_serial", "logistic_capture", amplitude="size", start=8.0,
-     source="Snyder et al. 2021, section 3: logistic trap, size / (1 + exp(-k (S - f0)))", **_TRAP)  # fmt: skip
+@law(
+    "trap_serial",
+    "logistic_capture",
+    amplitude="size",
+    start=8.0,
+    source="Snyder et al. 2021, section 3: logistic trap, size / (1 + exp(-k (S - f0)))",
+    **_TRAP,
+)
 class TrapLogistic(_OneTrap):
     """Captures from packets above ``f0`` electrons, over a width 1/k."""
 
@@ -268,9 +321,15 @@ class TrapLogistic(_OneTrap):
         return np.maximum((1 / (1 + np.exp(-x)) - low) / (1 - low), 0).astype(np.float32)
 
 
-@law("trap_serial", "volume_two_times", amplitude="size", start=10.0,
-     source="Massey et al. 2014 (volume filling) with two release times as in Snyder et al. 2021's fits of several "
-     "traps", **_TRAP)  # fmt: skip
+@law(
+    "trap_serial",
+    "volume_two_times",
+    amplitude="size",
+    start=10.0,
+    source="Massey et al. 2014 (volume filling) with two release times as in "
+    "Snyder et al. 2021's fits of several traps",
+    **_TRAP,
+)
 class TrapVolume(_OneTrap):
     """Fills as (S / 1e5)^beta; releases with two time constants."""
 
@@ -308,8 +367,15 @@ class _Coupling(Law):
         return out
 
 
-@law("interpixel_coupling", "four_neighbours", amplitude="ax", start=0.004, limits=(1e-5, 0.08),
-     source="Moore, Ninkov & Forrest 2006 (Opt. Eng. 45, 076402): capacitive coupling to four neighbours")  # fmt: skip
+@law(
+    "interpixel_coupling",
+    "four_neighbours",
+    amplitude="ax",
+    start=0.004,
+    limits=(1e-05, 0.08),
+    source="Moore, Ninkov & Forrest 2006 (Opt. Eng. 45, 076402): capacitive "
+    "coupling to four neighbours",
+)
 class CouplingFour(_Coupling):
     """ax to each neighbour in x, ay in y."""
 
@@ -325,9 +391,15 @@ class CouplingFour(_Coupling):
         return {(1, 0): ax, (-1, 0): ax, (0, 1): ay, (0, -1): ay}
 
 
-@law("interpixel_coupling", "extended", amplitude="ax", start=0.004, limits=(1e-5, 0.05),
-     source="Donlon et al. 2016 and Giannini et al. 2013: coupling reaches diagonal and second "
-     "neighbours; here ax decay^(r - 1)")  # fmt: skip
+@law(
+    "interpixel_coupling",
+    "extended",
+    amplitude="ax",
+    start=0.004,
+    limits=(1e-05, 0.05),
+    source="Donlon et al. 2016 and Giannini et al. 2013: coupling reaches diagonal"
+    " and second neighbours; here ax decay^(r - 1)",
+)
 class CouplingExtended(_Coupling):
     """Coupling falls by a factor for each pixel of distance, over 5 x 5 pixels."""
 
@@ -360,8 +432,13 @@ class _FullWell(Law):
 _WELL = {"amplitude": "depth", "start": 0.1, "limits": (0.01, 0.5), "scaled": False}
 
 
-@law("saturation", "hard_clip", source="Janesick 2001, section 2.3: surface full well with anti-blooming drain; "
-     "what is above is lost", **_WELL)  # fmt: skip
+@law(
+    "saturation",
+    "hard_clip",
+    source="Janesick 2001, section 2.3: surface full well with anti-blooming "
+    "drain; what is above is lost",
+    **_WELL,
+)
 class HardClip(_FullWell):
     """Charge above full_well is lost."""
 
@@ -371,8 +448,13 @@ class HardClip(_FullWell):
         return np.minimum(charge, np.float32(self.values["full_well"]))
 
 
-@law("saturation", "blooming", source="Janesick 2001, section 2.3: blooming full well; excess runs along the column, "
-     "charge is conserved", **_WELL)  # fmt: skip
+@law(
+    "saturation",
+    "blooming",
+    source="Janesick 2001, section 2.3: blooming full well; excess runs along the "
+    "column, charge is conserved",
+    **_WELL,
+)
 class Blooming(_FullWell):
     """Excess runs to both neighbours along the column until none holds more than full_well."""
 
@@ -392,8 +474,13 @@ class Blooming(_FullWell):
         return q
 
 
-@law("saturation", "spill_back", source="Lage et al. 2017 and catalogue item 15: the barrier falls "
-     "gradually, a share of what lies above moves to neighbours before clipping", **_WELL)  # fmt: skip
+@law(
+    "saturation",
+    "spill_back",
+    source="Lage et al. 2017 and catalogue item 15: the barrier falls gradually, a"
+    " share of what lies above moves to neighbours before clipping",
+    **_WELL,
+)
 class SpillBack(_FullWell):
     """A share of charge above full_well goes to the column's neighbours; the rest is kept softly."""
 

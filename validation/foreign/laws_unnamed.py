@@ -15,22 +15,36 @@ from validation.foreign.laws_silicon import either_sign
 OUT = "outside_library"
 
 
-@law(OUT, "exchanged_axes", amplitude="share", start=0.3, limits=(2e-3, 1.0),
-     source="a fault of real pipelines: kernels read with exchanged axes; here the sensor's x law answers "
-     "in y by a share")  # fmt: skip
+@law(
+    OUT,
+    "exchanged_axes",
+    amplitude="share",
+    start=0.6,
+    limits=(0.002, 1.0),
+    source="a fault of real pipelines: kernels read with exchanged axes; here the "
+    "sensor's x law answers in y by a share",
+)
 class ExchangedAxes(Law):
     """Shifts are (1 - share) of the device's and share of those with exchanged axes."""
 
     def terms(self, terms, exposure):
         s = self.values["share"]
         return [
-            Term((1 - s) * t.kx + s * t.ky.T, (1 - s) * t.ky + s * t.kx.T, t.source) for t in terms
+            Term((1 - s) * t.kx + s * t.ky.T, (1 - s) * t.ky + s * t.kx.T, t.source)
+            for t in terms
         ]
 
 
-@law(OUT, "binary_offset", amplitude="step", start=0.5, limits=(0.01, 30.0), needs=("serial_overscan",),
-     source="Boone, Aldering, Copin et al. 2018 (PASP 130, 064504): an offset by the number of set bits of the "
-     "pixel read one to three before")  # fmt: skip
+@law(
+    OUT,
+    "binary_offset",
+    amplitude="step",
+    start=0.05,
+    limits=(0.01, 30.0),
+    needs=("serial_overscan",),
+    source="Boone, Aldering, Copin et al. 2018 (PASP 130, 064504): an offset by "
+    "the number of set bits of the pixel read one to three before",
+)
 class BinaryOffset(Law):
     """Codes rise by step times (set bits of the code ``lag`` pixels before, less 8) [ADU]."""
 
@@ -44,7 +58,9 @@ class BinaryOffset(Law):
             return frames
         for k, frame in enumerate(frames):
             code = np.clip(frame, 0, 65535).astype(np.uint16)
-            bits = np.unpackbits(code.view(np.uint8).reshape(*code.shape, 2), axis=-1).sum(-1)
+            bits = np.unpackbits(code.view(np.uint8).reshape(*code.shape, 2), axis=-1).sum(
+                -1
+            )
             late = np.full(code.shape, 8.0)
             late[:, lag:] = bits[:, :-lag]
             # steps below one code are dithered, as the converter's own noise would
@@ -53,9 +69,15 @@ class BinaryOffset(Law):
         return out
 
 
-@law(OUT, "row_droop", amplitude="share", start=2e-6, limits=(1e-9, 3e-3),
-     source="invention: the clamp's supply sags with the charge read in a row; all later pixels of the row and "
-     "the next row's begin sit lower")  # fmt: skip
+@law(
+    OUT,
+    "row_droop",
+    amplitude="share",
+    start=1e-07,
+    limits=(1e-09, 0.003),
+    source="invention: the clamp's supply sags with the charge read in a row; all "
+    "later pixels of the row and the next row's begin sit lower",
+)
 class RowDroop(Law):
     """Each pixel loses share times the running sum of the row, which relaxes over ``length`` pixels."""
 
@@ -77,9 +99,15 @@ class RowDroop(Law):
         return out
 
 
-@law(OUT, "odd_rows", amplitude="delta", start=0.15, limits=(1e-3, 1.0),
-     source="invention after Smith & Rahmer 2008: alternate rows have barriers of another height, so that shifts of "
-     "odd and even rows differ")  # fmt: skip
+@law(
+    OUT,
+    "odd_rows",
+    amplitude="delta",
+    start=0.15,
+    limits=(0.001, 1.0),
+    source="invention after Smith & Rahmer 2008: alternate rows have barriers of "
+    "another height, so that shifts of odd and even rows differ",
+)
 class OddRows(Law):
     """Shifts of edges in odd rows are larger by delta, in even rows smaller."""
 
@@ -94,9 +122,15 @@ class OddRows(Law):
         return lambda dx, dy, charge: (dx * sign, dy * sign)
 
 
-@law(OUT, "curl", amplitude="share", start=0.2, limits=(2e-3, 1.5),
-     source="Broughton et al. 2024: a curl of the shifts is not seen in flats; here shifts turned by 90 degrees, "
-     "as a drift across a magnetic field")  # fmt: skip
+@law(
+    OUT,
+    "curl",
+    amplitude="share",
+    start=0.5,
+    limits=(0.002, 1.5),
+    source="Broughton et al. 2024: a curl of the shifts is not seen in flats; here"
+    " shifts turned by 90 degrees, as a drift across a magnetic field",
+)
 class Curl(Law):
     """Shifts across the direction to the charge: (kx, ky) + share (-ky', kx'), on the other edges."""
 
@@ -108,7 +142,9 @@ class Curl(Law):
         for t in terms:
             # a field on upper edges, averaged to the right edges around, and the other way round
             up = 0.25 * (t.ky + np.roll(t.ky, 1, 0) + np.roll(t.ky, -1, 1) + _both(t.ky))
-            right = 0.25 * (t.kx + np.roll(t.kx, 1, 1) + np.roll(t.kx, -1, 0) + _both2(t.kx))
+            right = 0.25 * (
+                t.kx + np.roll(t.kx, 1, 1) + np.roll(t.kx, -1, 0) + _both2(t.kx)
+            )
             out.append(Term(t.kx - s * up, t.ky + s * right, t.source))
         return out
 
@@ -121,9 +157,16 @@ def _both2(k):
     return np.roll(np.roll(k, 1, 1), -1, 0)
 
 
-@law(OUT, "mirror_ghost", amplitude="frac", start=1e-3, limits=(1e-6, 0.05), needs=("spots",),
-     source="Eikenberry & O'Brien (optical ghosts of filters and windows): a faint image turned by 180 degrees, "
-     "defocused")  # fmt: skip
+@law(
+    OUT,
+    "mirror_ghost",
+    amplitude="frac",
+    start=0.0002,
+    limits=(1e-06, 0.05),
+    needs=("spots",),
+    source="Eikenberry & O'Brien (optical ghosts of filters and windows): a faint "
+    "image turned by 180 degrees, defocused",
+)
 class MirrorGhost(Law):
     """A fraction of the light makes a turned image, blurred over ``length`` pixels."""
 
@@ -136,13 +179,21 @@ class MirrorGhost(Law):
             return light
         from scipy.ndimage import uniform_filter
 
-        ghost = uniform_filter(light.rate[::-1, ::-1], int(self.values["length"]), mode="wrap")
+        ghost = uniform_filter(
+            light.rate[::-1, ::-1], int(self.values["length"]), mode="wrap"
+        )
         return light.plus(np.float32(self.values["frac"]) * ghost)
 
 
-@law(OUT, "phase_gain", amplitude="amp", start=1e-3, limits=(5e-6, 0.05),
-     source="invention after interleaved converters (IEEE 1241, interleaving spurs): four converters take turns "
-     "along a row and differ in gain")  # fmt: skip
+@law(
+    OUT,
+    "phase_gain",
+    amplitude="amp",
+    start=0.001,
+    limits=(5e-06, 0.05),
+    source="invention after interleaved converters (IEEE 1241, interleaving "
+    "spurs): four converters take turns along a row and differ in gain",
+)
 class PhaseGain(Law):
     """Gain by column modulo four: amp times (1, -1, 0.5, -0.5) in some order, for signal only."""
 
@@ -157,9 +208,15 @@ class PhaseGain(Law):
         return [f * gain.astype(np.float32) for f in frames]
 
 
-@law(OUT, "vampires", amplitude="depth", start=0.05, limits=(5e-4, 0.9),
-     source="Utsumi et al. 2024 and LSSTCam's SITCOMTN-148 ('vampire pixels'): a pixel draws charge from its "
-     "surroundings, more at higher signal")  # fmt: skip
+@law(
+    OUT,
+    "vampires",
+    amplitude="depth",
+    start=0.05,
+    limits=(0.0005, 0.9),
+    source="Utsumi et al. 2024 and LSSTCam's SITCOMTN-148 ('vampire pixels'): a "
+    "pixel draws charge from its surroundings, more at higher signal",
+)
 class Vampires(Law):
     """Some pixels draw from rings around them, depth (1 + growth Q / 1e5) of the pixel's light."""
 
@@ -190,9 +247,15 @@ class Vampires(Law):
         return out
 
 
-@law(OUT, "previous_mean", amplitude="share", start=3e-5, limits=(1e-7, 0.01),
-     source="invention: a slow integrator of the chain follows the mean of the frame before, so that offsets depend on "
-     "the exposure before")  # fmt: skip
+@law(
+    OUT,
+    "previous_mean",
+    amplitude="share",
+    start=1e-05,
+    limits=(1e-07, 0.01),
+    source="invention: a slow integrator of the chain follows the mean of the "
+    "frame before, so that offsets depend on the exposure before",
+)
 class PreviousMean(Law):
     """All pixels of a frame sit higher by share times the mean of the frame before, fading along x."""
 

@@ -244,7 +244,9 @@ def draw_layout(
         pixels=pixels,
         amplifiers=amplifiers,
         rows=rows,
-        flips=str(rng.choice(FLIPS)) if amplifiers > 1 else str(rng.choice(["plain", "alternate"])),
+        flips=str(rng.choice(FLIPS))
+        if amplifiers > 1
+        else str(rng.choice(["plain", "alternate"])),
         prescan=int(rng.choice([0, 3, 8, 10, 24])),
         serial_overscan=serial,
         parallel_overscan=parallel,

@@ -38,18 +38,28 @@ def _rounded(values, digits=4) -> list[float]:
     return [float(round(v, digits)) for v in values]
 
 
-@nuisance("bad_column", "Janesick 2001, section 4: columns of low response; a few in a cosmetic grade 1")
+@nuisance(
+    "bad_column",
+    "Janesick 2001, section 4: columns of low response; a few in a cosmetic grade 1",
+)
 class BadColumns(Law):
     """Columns, and single pixels, of 2 to 30 % low response."""
 
     @classmethod
     def draw(cls, rng, setting):
-        n, count, single = setting.layout.pixels, int(rng.integers(1, 9)), int(rng.integers(0, 40))
+        n, count, single = (
+            setting.layout.pixels,
+            int(rng.integers(1, 9)),
+            int(rng.integers(0, 40)),
+        )
         return {
             "columns": _ints(rng.choice(n, count, replace=False)),
             "rows": _ints(rng.choice([0, 0, 1, 2], count) * n // 4),
             "size": _rounded(-np.exp(rng.uniform(np.log(0.02), np.log(0.3), count))),
-            "pixels": [_ints(rng.integers(0, n, single)), _ints(rng.integers(0, n, single))],
+            "pixels": [
+                _ints(rng.integers(0, n, single)),
+                _ints(rng.integers(0, n, single)),
+            ],
             "pixel_size": _rounded(-np.exp(rng.uniform(np.log(0.03), np.log(0.6), single))),
         }
 
@@ -86,7 +96,9 @@ class HotPixels(Law):
         return out
 
 
-@nuisance("dust", "shadows of grains on a window near the focal plane: rings of a fast beam")
+@nuisance(
+    "dust", "shadows of grains on a window near the focal plane: rings of a fast beam"
+)
 class Dust(Law):
     """Grains on the window: ring-shaped shadows of 0.3 to 3 %."""
 
@@ -110,7 +122,9 @@ class Dust(Law):
                 v["x"], v["y"], v["radius"], v["hole"], v["size"], strict=True
             ):
                 d = np.hypot(x - cx, y - cy)
-                rim = 1 / (1 + np.exp((d - r) / 0.7)) - 1 / (1 + np.exp((d - hole * r) / 0.7))
+                rim = 1 / (1 + np.exp((d - r) / 0.7)) - 1 / (
+                    1 + np.exp((d - hole * r) / 0.7)
+                )
                 m *= 1 + s * rim
             self.state["map"] = m.astype(np.float32)
         return light.scaled(self.state["map"])
@@ -135,11 +149,16 @@ class Vignetting(Law):
             n, v = self.setting.layout.pixels, self.values
             y, x = np.mgrid[0:n, 0:n] / n
             r2 = 2 * ((x - v["centre"][0]) ** 2 + (y - v["centre"][1]) ** 2)
-            self.state["map"] = (1 - v["size"] * (r2 + v["higher"] * r2**2)).astype(np.float32)
+            self.state["map"] = (1 - v["size"] * (r2 + v["higher"] * r2**2)).astype(
+                np.float32
+            )
         return light.scaled(self.state["map"])
 
 
-@nuisance("bias_structure", "Plazas Malagon et al. 2024: fixed two-dimensional bias of columns, rows, settling")
+@nuisance(
+    "bias_structure",
+    "Plazas Malagon et al. 2024: fixed two-dimensional bias of columns, rows, settling",
+)
 class BiasStructure(Law):
     """The same in all frames: columns and rows of 0.05 to 0.3 e- rms, settling at the begin of rows."""
 
@@ -163,7 +182,9 @@ class BiasStructure(Law):
         return out
 
 
-@nuisance("bias_drift", "catalogue item 31: slow drift of the level with the rack's temperature")
+@nuisance(
+    "bias_drift", "catalogue item 31: slow drift of the level with the rack's temperature"
+)
 class BiasDrift(Law):
     """The level wanders slowly over the campaign, and by a common 0.2 to 1 e- between frames."""
 
@@ -182,7 +203,9 @@ class BiasDrift(Law):
         return [f + np.float32(level * (1 + 0.1 * k)) for k, f in enumerate(frames)]
 
 
-@nuisance("lamp_flicker", "benches without feedback: 0.1 to 0.5 % from exposure to exposure")
+@nuisance(
+    "lamp_flicker", "benches without feedback: 0.1 to 0.5 % from exposure to exposure"
+)
 class LampFlicker(Law):
     """The lamp's current differs between exposures; with or without a monitor that sees it."""
 
@@ -197,7 +220,10 @@ class LampFlicker(Law):
         return level * (1 + self.values["rms"] * self.rng(exposure).standard_normal())
 
 
-@nuisance("exposure_time", "shutters are timed to about a millisecond; headers hold the measured time")
+@nuisance(
+    "exposure_time",
+    "shutters are timed to about a millisecond; headers hold the measured time",
+)
 class ExposureTime(Law):
     """Times differ by a millisecond and by 3e-4 within pairs, and headers say so."""
 
@@ -219,7 +245,10 @@ class ExposureTime(Law):
         return round(float(self._time(seconds, exposure)), 6) if exposure.lit else seconds
 
 
-@nuisance("popcorn_noise", "Janesick 2001, section 6: random telegraph signals of the output transistor")
+@nuisance(
+    "popcorn_noise",
+    "Janesick 2001, section 6: random telegraph signals of the output transistor",
+)
 class Popcorn(Law):
     """0.3 to 3 % of the pixels, in bursts, sit 5 to 30 e- off."""
 
@@ -246,7 +275,10 @@ class Popcorn(Law):
         return out
 
 
-@nuisance("heavy_tailed_noise", "Student's t of read noise, 4 to 8 degrees of freedom; skewed in some chains")
+@nuisance(
+    "heavy_tailed_noise",
+    "Student's t of read noise, 4 to 8 degrees of freedom; skewed in some chains",
+)
 class HeavyTails(Law):
     """A part of the read noise has heavy tails, and a skewness."""
 
@@ -270,7 +302,10 @@ class HeavyTails(Law):
         return out
 
 
-@nuisance("tracks", "Particle Data Group: one muon for each cm^2 and minute at sea level; Groom 2002")
+@nuisance(
+    "tracks",
+    "Particle Data Group: one muon for each cm^2 and minute at sea level; Groom 2002",
+)
 class SeaLevelTracks(Law):
     """Cosmic rays as at sea level, 0.7 to 3 times."""
 
@@ -282,7 +317,9 @@ class SeaLevelTracks(Law):
         rng, d = self.rng(exposure), self.setting.nominal
         n = self.setting.layout.pixels
         area = (n * d.pixel * 1e-4) ** 2
-        count = rng.poisson(SEA_LEVEL * self.values["factor"] * area * (exposure.seconds + 2) / 60)
+        count = rng.poisson(
+            SEA_LEVEL * self.values["factor"] * area * (exposure.seconds + 2) / 60
+        )
         if not count:
             return charge
         charge = charge.copy()

@@ -166,7 +166,9 @@ class Plan:
 def _numbered(wanted: Iterator[tuple[str, float, dict[str, Any]]]) -> Iterator[Exposure]:
     elapsed = 0.0
     for n, (kind, seconds, condition) in enumerate(wanted):
-        yield replace(Exposure(kind, n, FIRST_MJD + elapsed / 86400.0, seconds), **condition)
+        yield replace(
+            Exposure(kind, n, FIRST_MJD + elapsed / 86400.0, seconds), **condition
+        )
         elapsed += seconds + SECONDS_BETWEEN
 
 
@@ -185,7 +187,9 @@ def draw_plan(
     ]
     if needs & {"red", "wavelengths"} and not (waves and max(waves) > 900):
         waves = (480.0, 950.0)
-    biases: tuple[float, ...] = ((-40.0,), (), (-40.0, -50.0))[rng.choice(3, p=[0.6, 0.25, 0.15])]
+    biases: tuple[float, ...] = ((-40.0,), (), (-40.0, -50.0))[
+        rng.choice(3, p=[0.6, 0.25, 0.15])
+    ]
     if "voltages" in needs and not biases:
         biases = (-40.0,)
     temperatures: tuple[float, ...] = ((-80.0,), ())[rng.choice(2, p=[0.6, 0.4])]

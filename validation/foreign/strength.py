@@ -29,13 +29,11 @@ and more where a law acts on noise (a factor of 1.5 at worst, by halving and oth
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
 from validation.foreign.bench import (
     MONITOR_ERROR,
@@ -53,93 +51,25 @@ from validation.foreign.device import (
     edge_shifts,
 )
 from validation.foreign.law import Law
-from validation.foreign.plan import SPOT_FLUX, Exposure, Plan
+from validation.foreign.plan import SPOT_FLUX
+from validation.foreign.raw_statistics import (
+    Products,
+    choose,
+    comb,
+    expose,
+    fitted_product,
+    gain,
+    smooth,
+    variance_gain,
+    welch,
+    white,
+)
 
 LAGS = 5
+"""Lags of covariances in each axis, from 0."""
+
 STAMP = 8
-
-
-@dataclass
-class Chosen:
-    """An exposure to be simulated, its group, and how many of the campaign it stands for."""
-
-    exposure: Exposure
-    group: tuple
-    stands_for: float
-
-
-def choose(plan: Plan) -> list[Chosen]:
-    """Choose a part of a campaign's exposures that stands for all of it."""
-    groups: dict[tuple, list[Exposure]] = defaultdict(list)
-    for e in plan.exposures():
-        groups[(e.kind, e.seconds, *e.condition, e.lamp)].append(e)
-    main = [g for g in groups if g[0] == "FLAT" and g[2:5] == (620.0, -60.0, -100.0) and g[5] == 1]
-    main.sort(key=lambda g: g[1])
-    at = sorted({0, len(main) // 3, (2 * len(main)) // 3, len(main) - 1})
-    few = [main[i] for i in at]
-    out = []
-    for group, es in groups.items():
-        kind = group[0]
-        if kind == "BIAS":
-            picked, stands = [*es[:3], es[-1]], len(es)
-        elif kind == "DARK":
-            picked, stands = es[:2], len(es)
-        elif kind == "FLAT" and group in main:
-            if group not in few:
-                continue
-            picked = [*es[:2], *es[-2:]] if group == main[-1] else es[:2]
-            stands = len(es) * len(main) / len(few)
-        elif kind == "FLAT":
-            brighter = [g for g in groups if g[0] == "FLAT" and g[2:] == group[2:]]
-            if group[1] < max(g[1] for g in brighter):
-                continue
-            picked, stands = es[:2], sum(len(groups[g]) for g in brighter)
-        else:
-            alike = sorted(g[1] for g in groups if g[0] == "SPOT" and g[2:] == group[2:])
-            wanted = {alike[-1]} if len(alike) < 4 else {alike[1], alike[4], alike[-1]}
-            if group[1] not in wanted:
-                continue
-            picked, stands = es[:1], len(es) * len(alike) / len(wanted)
-        out += [Chosen(e, group, stands) for e in dict.fromkeys(picked)]
-    return sorted(out, key=lambda c: c.exposure.sequence)
-
-
-@dataclass
-class Products:
-    """Statistics of one bench's exposures."""
-
-    frames: list[list[NDArray]] = field(default_factory=list)
-    codes: list[list[NDArray]] = field(default_factory=list)
-
-
-def expose(bench: Bench, chosen: Sequence[Chosen]) -> Products:
-    """Take the exposures; frames in electrons above the amplifiers' offsets."""
-    out = Products()
-    for c in chosen:
-        taken = bench.take(c.exposure)
-        out.codes.append([f.astype(np.int32) for f in taken.frames])
-        out.frames.append(
-            [
-                (f.astype(np.float32) - np.float32(o)) * np.float32(g)
-                for f, o, g in zip(taken.frames, bench.offsets, bench.gains, strict=True)
-            ]
-        )
-    return out
-
-
-def _form(a: NDArray, b: NDArray, sigma: NDArray, templates: NDArray | None, prior=None) -> float:
-    """a^T W b after the templates (columns) are fitted out of both, with priors on their sizes."""
-    w = 1 / sigma
-    a, b = a * w, b * w
-    if templates is None or not templates.size:
-        return float(a @ b)
-    t = templates * w[:, None]
-    scale = np.sqrt((t * t).sum(0))
-    keep = scale > 0
-    t = t[:, keep]
-    normal = t.T @ t + np.diag((prior if prior is not None else np.zeros(len(scale)))[keep])
-    normal += np.diag(1e-12 * (t * t).sum(0))
-    return float(a @ b - (a @ t) @ np.linalg.solve(normal, t.T @ b))
+"""Half of the side of a spot's cut-out [pixel]."""
 
 
 class Estimator:
@@ -156,6 +86,10 @@ class Estimator:
         self.chosen = choose(bench.plan)
         self.base = expose(bench, self.chosen)
         self.lay = bench.layout
+        self.monitor_error = MONITOR_ERROR
+        for n in bench.laws:
+            if not n.values.get("monitor", True):
+                self.monitor_error = float(n.values["rms"])
         self.templates = self._device_templates()
         self.spot_templates = self._device_spots()
 
@@ -166,7 +100,11 @@ class Estimator:
         out = []
         for name, part in SPREAD.items():
             d = table[name]
-            a = area_changes(np.array(d["dkx"]), np.array(d["dky"])) * part * getattr(nominal, name)
+            a = (
+                area_changes(np.array(d["dkx"]), np.array(d["dky"]))
+                * part
+                * getattr(nominal, name)
+            )
             out.append(a[REACH : REACH + LAGS, REACH : REACH + LAGS].ravel())
         return np.array(out).T
 
@@ -225,16 +163,19 @@ class Estimator:
             for k in flats:
                 f0 = self._light(self.base.frames[k])[amp]
                 f1 = self._light(other.frames[k])[amp]
-                a.append((f1[:half] - f0[:half]).mean(dtype=float))
-                b.append((f1[half:] - f0[half:]).mean(dtype=float))
+                # the median of columns is no place for tracks and rims
+                a.append(np.median((f1[:half] - f0[:half]).mean(0, dtype=float)))
+                b.append(np.median((f1[half:] - f0[half:]).mean(0, dtype=float)))
                 m = f0.mean(dtype=float)
                 of_group = sum(c.group == self.chosen[k].group for c in self.chosen)
                 n = self.chosen[k].stands_for / of_group
                 shot = (abs(m) + NOMINAL_NOISE**2) / f0.size
                 mu.append(m)
-                sigma.append(np.sqrt((shot + count * (MONITOR_ERROR * m) ** 2) / n))
+                sigma.append(np.sqrt((shot + count * (self.monitor_error * m) ** 2) / n))
             if a:
-                total += _form(np.array(a), np.array(b), np.array(sigma), np.array(mu)[:, None])
+                total += fitted_product(
+                    np.array(a), np.array(b), np.array(sigma), np.array(mu)[:, None]
+                )
             total += self._dark_levels(other, amp)
         return total
 
@@ -249,12 +190,14 @@ class Estimator:
             d = other.frames[k][amp] - self.base.frames[k][amp]
             light = d[self.lay.data]
             a, b = (
-                part.mean(dtype=float) - over.mean(dtype=float) for part, over in (
+                np.median(part.mean(0, dtype=float)) - over.mean(dtype=float) for part, over in (
                     (light[:half], d[:half, -self.lay.serial_overscan :]),
                     (light[half:], d[half : self.lay.height, -self.lay.serial_overscan :]),
                 )
             )  # fmt: skip
-            error = NOMINAL_NOISE**2 / (self.lay.height * self.lay.serial_overscan) + 0.02**2
+            error = (
+                NOMINAL_NOISE**2 / (self.lay.height * self.lay.serial_overscan) + 0.02**2
+            )
             total += a * b / error * n
         return max(total, 0.0)
 
@@ -277,9 +220,13 @@ class Estimator:
             device.append(self.templates * mu * mu)
         if not a:
             return 0.0
-        t = np.column_stack([np.concatenate(gain), np.concatenate(white), np.vstack(device)])
+        t = np.column_stack(
+            [np.concatenate(gain), np.concatenate(white), np.vstack(device)]
+        )
         prior = np.r_[0.0, 0.0, np.ones(self.templates.shape[1])]
-        return _form(np.concatenate(a), np.concatenate(b), np.concatenate(sigma), t, prior)
+        return fitted_product(
+            np.concatenate(a), np.concatenate(b), np.concatenate(sigma), t, prior
+        )
 
     def _lags(self, p: Products, i: int, j: int) -> NDArray:
         """Covariances of a differenced pair in the halves of all amplifiers, [half, lag]."""
@@ -305,10 +252,14 @@ class Estimator:
                 m = self.lay.pixels // side
                 blocks = d.reshape(m, side, m, side).mean((1, 3))
                 blocks = blocks - blocks.mean()
-                rho.append(np.array([np.mean(blocks[: m // 2] ** 2), np.mean(blocks[m // 2 :] ** 2)]))
+                rho.append(
+                    np.array(
+                        [np.mean(blocks[: m // 2] ** 2), np.mean(blocks[m // 2 :] ** 2)]
+                    )
+                )
             ratio = rho[1] / rho[0]
             # a tenth of the change is fitted as gain, noise or scale of the covariances
-            total += _variance_gain(ratio, blocks.size * n)
+            total += variance_gain(ratio, blocks.size * n)
         return total
 
     def _maps(self, other: Products) -> float:
@@ -317,7 +268,7 @@ class Estimator:
             by[self.chosen[k].group].append(k)
         best, rest = 0.0, 0.0
         for group, ks in by.items():
-            if len(ks) < 2:
+            if len(ks) < 3:
                 continue
             change = []
             for k in ks:
@@ -335,12 +286,11 @@ class Estimator:
                 var += (PIXEL_RESPONSE * smooth) ** 2
             products = [
                 float(np.vdot(change[a], change[b])) / var
-                for a, b in zip(range(0, len(ks) - 1, 2), range(1, len(ks), 2), strict=False)
+                for a in range(len(ks))
+                for b in range(a)
             ]
-            if len(ks) >= 4:
-                products.append(float(np.vdot(change[0], change[3])) / var)
             # a pattern that changes between exposures is no map
-            value = min(products) if min(products) > 0.3 * max(products) else 0.0
+            value = float(np.mean(products)) if min(products) > 0.3 * max(products) else 0.0
             if flat:
                 best = max(best, value)
             else:
@@ -386,15 +336,22 @@ class Estimator:
         for k in exposures:
             n = self.chosen[k].stands_for
             s0 = self._stamps(k, self._image(self.base, k))
-            d, mean = self._stamps(k, self._image(other, k)) - s0, np.maximum(np.median(s0, 0), 0)
+            d, mean = (
+                self._stamps(k, self._image(other, k)) - s0,
+                np.maximum(np.median(s0, 0), 0),
+            )
             a.append(np.median(d[::2], 0).ravel())
             b.append(np.median(d[1::2], 0).ravel())
             var = (mean + NOMINAL_NOISE**2) / n + (PIXEL_RESPONSE * mean) ** 2
             sigma.append(np.sqrt(var / len(s0)).ravel())
             gy, gx = np.gradient(mean)
-            own.append(np.column_stack([g.ravel() for g in (mean, gx, gy, np.ones_like(mean))]))
+            own.append(
+                np.column_stack([g.ravel() for g in (mean, gx, gy, np.ones_like(mean))])
+            )
             wide.append(
-                np.column_stack([np.gradient(gx, axis=1).ravel(), np.gradient(gy, axis=0).ravel()])
+                np.column_stack(
+                    [np.gradient(gx, axis=1).ravel(), np.gradient(gy, axis=0).ravel()]
+                )
             )
         rows, count = side * side, 4 * len(own)
         devices = self.spot_templates.shape[2]
@@ -404,7 +361,9 @@ class Estimator:
             t[q * rows : (q + 1) * rows, count : count + 2] = wide[q]
             t[q * rows : (q + 1) * rows, count + 2 :] = self.spot_templates[q]
         prior = np.r_[np.zeros(count + 2), np.ones(devices)]
-        form = _form(np.concatenate(a), np.concatenate(b), np.concatenate(sigma), t, prior)
+        form = fitted_product(
+            np.concatenate(a), np.concatenate(b), np.concatenate(sigma), t, prior
+        )
         return max(form, 0.0) + sum(max(self._echoes(other, k), 0.0) for k in exposures)
 
     def _echoes(self, other: Products, k: int) -> float:
@@ -412,16 +371,18 @@ class Estimator:
         n, total = self.chosen[k].stands_for, 0.0
         f0, f1 = self.base.frames[k], other.frames[k]
 
-        def regressed(change: NDArray, signal: NDArray) -> float:
-            # even and odd rows are the halves; brightest parts stand out of noise and structure
+        def regressed(change: NDArray, dark: NDArray, signal: NDArray) -> float:
+            # even and odd rows are the halves; what is the same everywhere is no echo
             weight = np.where(signal > 50, signal, 0)
-            change = np.where(weight > 0, np.clip(change, -1e4, 1e4), 0)
+            weight = np.where(dark, weight - weight[dark].mean(), 0)
             parts = [float(np.vdot(change[s::2], weight[s::2])) for s in (0, 1)]
             norm = float(np.vdot(weight, weight))
             return 4 * parts[0] * parts[1] / max(norm, 1.0) / NOMINAL_NOISE**2 * n
 
-        change = [b - a - np.median(b - a) for a, b in zip(f0, f1, strict=True)]
-        dark = [np.where(a < 50, c, 0) for a, c in zip(f0, change, strict=True)]
+        lit = np.zeros(self.lay.frame_shape, bool)
+        lit[self.lay.data] = True
+        change = [np.clip(b - a, -2e3, 2e3) for a, b in zip(f0, f1, strict=True)]
+        dark = [lit & (a < 50) for a in f0]
         for v in range(len(f0)):
             for u in range(len(f0)):
                 if u == v:
@@ -429,10 +390,10 @@ class Estimator:
                 for late in (0, 1, 2):
                     signal = np.zeros_like(f0[u])
                     signal[:, late:] = f0[u][:, : f0[u].shape[1] - late]
-                    total += max(regressed(dark[v], signal), 0.0)
+                    total += max(regressed(change[v], dark[v], signal), 0.0)
         image = self._image(self.base, k)
-        moved = np.where(image < 50, self._image(other, k) - image, 0)
-        return total + max(regressed(moved, image[::-1, ::-1]), 0.0)
+        moved = np.clip(self._image(other, k) - image, -2e3, 2e3)
+        return total + max(regressed(moved, image < 50, image[::-1, ::-1]), 0.0)
 
     def _device_spots(self) -> NDArray:
         """Changes of the mean spot for one sigma of each parameter of the card, [exposure, pixel, p]."""
@@ -474,19 +435,27 @@ class Estimator:
         ):
             return 0.0
         for amp in range(self.lay.amplifiers):
-            power = [[_welch(p.frames[k][amp]) for k in biases] for p in (self.base, other)]
+            power = [[welch(p.frames[k][amp]) for k in biases] for p in (self.base, other)]
             r = np.array(power[1]) / np.array(power[0])
             halves = np.array([r[::2].mean(0), r[1::2].mean(0)])
             segments = self.base.frames[0][amp].size / 512 * n
-            total += sum(_variance_gain(h, 2 * segments) for h in halves.T)
-            level = [[p.frames[k][amp].mean(dtype=float) for k in biases] for p in (self.base, other)]
+            total += sum(variance_gain(h, 2 * segments) for h in halves.T)
+            level = [
+                [p.frames[k][amp].mean(dtype=float) for k in biases]
+                for p in (self.base, other)
+            ]
             error = (NOMINAL_NOISE**2 / self.base.frames[0][amp].size) + 0.02**2
-            total += (n - 1) * _gain(1 + (np.var(level[1]) - np.var(level[0])) / error)
+            total += (n - 1) * gain(1 + (np.var(level[1]) - np.var(level[0])) / error)
         for one in range(self.lay.amplifiers):
             for two in range(one):
                 c = []
                 for p in (self.base, other):
-                    c.append([np.mean(_white(p.frames[k][one]) * _white(p.frames[k][two])) for k in biases])
+                    c.append(
+                        [
+                            np.mean(white(p.frames[k][one]) * white(p.frames[k][two]))
+                            for k in biases
+                        ]
+                    )
                 d = np.array(c[1]) - np.array(c[0])
                 size = self.base.frames[0][one].size * n
                 total += float(d[::2].mean() * d[1::2].mean()) * size / NOMINAL_NOISE**4
@@ -534,11 +503,14 @@ class Estimator:
                 size = int(max(f0.max(), f1.max())) - low + 1
                 half = len(f0) // 2
                 h = [
-                    [np.bincount((part - low).ravel(), minlength=size) for part in (f[:half], f[half:])]
+                    [
+                        np.bincount((part - low).ravel(), minlength=size)
+                        for part in (f[:half], f[half:])
+                    ]
                     for f in (f0, f1)
                 ]
-                d = [_comb(h[1][s] - h[0][s]) for s in (0, 1)]
-                expected = _smooth(h[0][0] + h[0][1])
+                d = [comb(h[1][s] - h[0][s]) for s in (0, 1)]
+                expected = smooth(h[0][0] + h[0][1])
                 good = expected > 5
                 values.append(4 * float(np.sum(d[0][good] * d[1][good] / expected[good])))
                 count += n
@@ -549,38 +521,13 @@ class Estimator:
         return float(count * mean) if mean > 3 * error else 0.0
 
 
-def _smooth(h: NDArray) -> NDArray:
-    return uniform_filter1d(h.astype(float), 33, mode="constant")
-
-
-def _comb(h: NDArray) -> NDArray:
-    return h - _smooth(h)
-
-
-def _white(frame: NDArray) -> NDArray:
-    return frame - np.median(frame)
-
-
-def _welch(frame: NDArray) -> NDArray:
-    x = (frame - frame.mean()).ravel()
-    x = x[: x.size // 512 * 512].reshape(-1, 512)
-    return (np.abs(np.fft.rfft(x, axis=1)) ** 2).mean(0)
-
-
-def _gain(ratio: float) -> float:
-    """2 ln L of one sample's variance that is ``ratio`` of what was expected."""
-    return float(max(ratio - 1 - np.log(ratio), 0.0)) if ratio > 1e-6 else 0.0
-
-
-def _variance_gain(halves: NDArray, count: float) -> float:
-    """As before, of ``count`` samples in two halves; nothing where the halves disagree in sign."""
-    if (halves[0] - 1) * (halves[1] - 1) <= 0:
-        return 0.0
-    return count * float(np.sqrt(_gain(float(halves[0])) * _gain(float(halves[1]))))
-
-
 def find_amplitude(
-    estimator: Estimator, law: Law, wanted: float, *, start: float | None = None, rounds: int = 4
+    estimator: Estimator,
+    law: Law,
+    wanted: float,
+    *,
+    start: float | None = None,
+    rounds: int = 4,
 ) -> dict[str, Any]:
     """Scale a law's amplitude to a wanted projected SNR, within its limits.
 
