@@ -332,6 +332,21 @@ def test_conventions_of_the_contract_hold():
     assert frame[0, 2] == pytest.approx(1000 * one.values["alpha"], rel=1e-4)
 
 
+def test_laws_of_the_edges_work_one_after_the_other():
+    kx, ky = edge_shifts(NOMINAL, 620)
+    terms = [Term(kx, ky)]
+    height = make(("bf_nonlinear", "packet_height"), 4e-6)
+    screened = make(("silicon_physics", "hole_screening"), 0.4)
+    q = np.full((1, 1), 5e4, np.float32)
+    terms = screened.terms(height.terms(terms, EXPOSURES[0]), EXPOSURES[0])
+    bent = float(q[0, 0]) * (1 + height.values["b"] / 2 * 5e4)
+    want = bent * (1 - 0.4 * np.exp(-bent / screened.values["q0"]))
+    x = next(t for t in terms if np.any(t.kx))
+    y = next(t for t in terms if np.any(t.ky))
+    assert x.source(q)[0, 0] == pytest.approx(want, rel=1e-5)
+    assert y.source(q)[0, 0] == pytest.approx(bent, rel=1e-5)
+
+
 def test_persistence_decays_with_tau_in_exposures():
     one = make(("persistence", "one_exponential"), 1e-3)
     flat = next(e for e in EXPOSURES if e.kind == "FLAT")
@@ -454,13 +469,14 @@ def test_layouts_read_back_by_the_command(layout, tmp_path):
     counts = {
         k: sum(e.kind == k for e in plan.exposures()) for k in ("BIAS", "FLAT", "SPOT")
     }
-    first = said.output.splitlines()[0]
+    # progress of slow machines goes to stderr
+    first = said.stdout.splitlines()[0]
     assert f"{counts['BIAS']} bias" in first and f"{counts['FLAT']} flat" in first
     assert f"{counts['SPOT']} spot" in first
     for text in ("480 nm", "back bias -40 V", "173.2 K", f"{layout.amplifiers} amplifiers"):
-        assert text in said.output
+        assert text in said.stdout
     assert (
-        f"{layout.width} x {layout.height} pixels, prescan {layout.prescan}" in said.output
+        f"{layout.width} x {layout.height} pixels, prescan {layout.prescan}" in said.stdout
     )
     if layout.storage == "mef":
         e = next(x for x in plan.exposures() if x.kind == "SPOT" and x.seconds == 30)
@@ -523,3 +539,14 @@ def test_device_of_another_thickness_answers_otherwise():
         edge_shifts(replace(Device(), thickness=t), 620)[1] for t in (90.0, 110.0)
     )
     assert abs(thick[10, 10]) > abs(thin[10, 10])
+
+
+def test_the_readme_lists_every_law_and_nuisance_with_its_source():
+    text = (Path(devices.__file__).parent / "README.md").read_text()
+    for (word, name), cls in LAWS.items():
+        row = next(
+            line for line in text.splitlines() if line.startswith(f"| {word} | `{name}` |")
+        )
+        assert cls.source in row
+    for word, cls in NUISANCES.items():
+        assert f"| `{word}` |" in text and cls.source in text

@@ -92,7 +92,11 @@ class Bench:
         lay, n = self.layout, self.layout.pixels
         count = lay.amplifiers
         self.device = scattered(self.nominal, rng)
-        self.gains = [NOMINAL_GAIN * (1 + 0.03 * z) for z in rng.standard_normal(count)]
+        # within 2.5 sigma, so that the brightest flats stay below 65535 codes
+        self.gains = [
+            NOMINAL_GAIN * (1 + 0.03 * float(np.clip(z, -2.5, 2.5)))
+            for z in rng.standard_normal(count)
+        ]
         self.noises = [NOMINAL_NOISE * (1 + 0.04 * z) for z in rng.standard_normal(count)]
         self.offsets = [float(o) for o in rng.uniform(900, 1600, count)]
         self.response = (1 + PIXEL_RESPONSE * rng.standard_normal((n, n))).astype(
@@ -101,7 +105,9 @@ class Bench:
         y, x = np.mgrid[0:n, 0:n] / n - 0.5
         slope = 0.01 * rng.standard_normal(2)
         self.flat_shape = (1 + slope[0] * x + slope[1] * y).astype(np.float32)
-        self.flat_level = LAMP * (1 + 0.02 * rng.standard_normal())
+        self.flat_level = LAMP * (
+            1 + 0.01 * float(np.clip(rng.standard_normal(), -2.5, 2.5))
+        )
         exposures = self.plan.exposures()
         self.walk = np.cumsum(LAMP_WALK * rng.standard_normal(len(exposures)))
         width = rng.uniform(1.15, 1.45)

@@ -198,6 +198,12 @@ def draw_campaign(wish: Wish, number: int, salt: str, name: str) -> Made:
             start = float(np.exp(rng.uniform(*ends)))
         assert estimator is not None
         found = find_amplitude(estimator, law, wanted, start=start)
+        if found["limited"] and SNR[0] < found["snr"] < wanted and wish.snr is None:
+            # what is wanted lies beyond what a real sensor has: drawn anew below that
+            wanted = float(np.exp(rng.uniform(low, np.log(found["snr"]))))
+            found = find_amplitude(
+                estimator, law, wanted, start=law.size * wanted / found["snr"]
+            )
         laws.append(law)
         effects.append(effect_truth(law, found))
     final = Bench(layout, plan, DEVICES[key], seed, laws=[*nuisances, *laws])

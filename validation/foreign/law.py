@@ -202,6 +202,14 @@ def _plain(value: Any) -> Any:
     return value
 
 
+def after(term: Term, change: Callable[[Image], Image]) -> Callable[[Image], Image]:
+    """Source of a term, with a change of the charge that it answers to put after what it has."""
+    if term.source is None:
+        return change
+    source = term.source
+    return lambda q: change(source(q))
+
+
 HOOKS = (
     "seconds", "recorded", "lamp", "spot_shape", "light", "fixed_edges", "terms", "modulation",
     "device", "absorption", "efficiency", "extra_charge", "stored", "remember", "parallel",

@@ -8,7 +8,7 @@ import numpy as np
 
 from validation.foreign.collection import Image, Term, divergence
 from validation.foreign.device import REFERENCE, SPREAD, Device, absorption_length
-from validation.foreign.law import Law, law
+from validation.foreign.law import Law, after, law
 from validation.foreign.laws_silicon import either_sign
 
 BACK_BIAS_ERROR = 1.0
@@ -102,7 +102,9 @@ class HoleScreening(Law):
         out = []
         for t in terms:
             out.append(Term(0 * t.kx, t.ky, t.source))
-            out.append(Term(t.kx, 0 * t.ky, lambda q: q * (1 - f * np.exp(-q / q0))))
+            out.append(
+                Term(t.kx, 0 * t.ky, after(t, lambda q: q * (1 - f * np.exp(-q / q0))))
+            )
         return out
 
     def truth(self):
@@ -167,7 +169,7 @@ class Einstein(Law):
     limits=(0.0002, 1.5),
     needs=("spots",),
     source="Jacoboni et al. 1977 (Solid-State Electron. 20, 77): D/mu above kT/q "
-    "in a high field, nearly without temperature; sigma^2 as |V|^-1/2",
+    "in a high field, nearly without temperature; sigma^2 as V^(-1/2)",
 )
 class HotElectrons(Einstein):
     """Extra variance var (V0 / V)^(1/2), the same at all temperatures."""

@@ -1,10 +1,12 @@
 """Laws of fixed shifts of pixel edges: rings, rims, stitches, tears.
 
 Light that lands between the nominal and the moved edge changes pixels, so that flats see areas and
-spots see places; the sum over the sensor stays as it was.
+spots see places; the sum over the sensor stays as it was, but for what crosses its rim.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -28,17 +30,35 @@ class _Fixed(Law):
         """What the pattern depends on beside the condition."""
         return 0
 
-    def fixed_edges(self, dx, dy, exposure):
+    def _patterns(self, exposure):
+        """Patterns of right and upper edges, and of the sensor's left and lower rim."""
         key = ("pattern", self.key(exposure))
         if key not in self.state:
             n = self.setting.layout.pixels
             y, x = np.mgrid[0:n, 0:n].astype(np.float64)
-            px = self.pattern(x + 0.5, y, "x", exposure)
-            py = self.pattern(x, y + 0.5, "y", exposure)
-            self.state[key] = tuple(np.asarray(p, np.float32) for p in (px, py))
-        px, py = self.state[key]
+            along, rim = np.arange(n, dtype=float), np.full(n, -0.5)
+            parts = (
+                self.pattern(x + 0.5, y, "x", exposure),
+                self.pattern(x, y + 0.5, "y", exposure),
+                self.pattern(rim, along, "x", exposure),
+                self.pattern(along, rim, "y", exposure),
+            )
+            self.state[key] = tuple(np.asarray(p, np.float32) for p in parts)
+        return self.state[key]
+
+    def fixed_edges(self, dx, dy, exposure):
+        px, py, _, _ = self._patterns(exposure)
         f = np.float32(self.values[self.amplitude] * self.factor(exposure))
         return dx + f * px, dy + f * py
+
+    def light(self, light, exposure):
+        """Light that crosses the rim comes from outside, not from the other end of the sensor."""
+        px, py, left, low = self._patterns(exposure)
+        f = np.float32(self.values[self.amplitude] * self.factor(exposure))
+        rate = light.rate.copy()
+        rate[:, 0] += f * (light.across_x[:, -1] * px[:, -1] - rate[:, 0] * left)
+        rate[0] += f * (light.across_y[-1] * py[-1] - rate[0] * low)
+        return replace(light, rate=rate)
 
 
 class _Rings(_Fixed):
@@ -141,8 +161,8 @@ class _Rim(_Fixed):
             return np.zeros_like(at)
         low, high = at + 0.5, n - 0.5 - at
         shift = self.fall(low) - self.fall(high)
-        # the last edge ends the sensor: nothing crosses it
-        return np.where(high < 0.25, 0.0, shift)
+        # the outermost edges end the sensor: nothing crosses them
+        return np.where((high < 0.25) | (low < 0.25), 0.0, shift)
 
 
 @law(

@@ -13,7 +13,7 @@ from validation.foreign.device import (
     absorption_length,
     edge_shifts,
 )
-from validation.foreign.law import Law, law
+from validation.foreign.law import Law, after, law
 
 
 def either_sign(rng: np.random.Generator) -> dict[str, Any]:
@@ -54,7 +54,7 @@ class PacketHeight(Law):
         b = np.float32(self.values["b"] / 2)
         if not b:
             return terms
-        return [Term(t.kx, t.ky, lambda q: q * (1 + b * q)) for t in terms]
+        return [Term(t.kx, t.ky, after(t, lambda q: q * (1 + b * q))) for t in terms]
 
 
 @law(
@@ -79,8 +79,8 @@ class TwoAxes(Law):
             return terms
         out = []
         for t in terms:
-            out.append(Term(t.kx, 0 * t.ky, lambda q: q * (1 + bx * q)))
-            out.append(Term(0 * t.kx, t.ky, lambda q: q * (1 + by * q)))
+            out.append(Term(t.kx, 0 * t.ky, after(t, lambda q: q * (1 + bx * q))))
+            out.append(Term(0 * t.kx, t.ky, after(t, lambda q: q * (1 + by * q))))
         return out
 
 
@@ -108,7 +108,7 @@ class OwnEdges(Law):
             kx, ky = np.zeros_like(t.kx), np.zeros_like(t.ky)
             kx[m, m - 1 : m + 1] = t.kx[m, m - 1 : m + 1]
             ky[m - 1 : m + 1, m] = t.ky[m - 1 : m + 1, m]
-            out += [Term(t.kx, t.ky, t.source), Term(kx, ky, lambda q: b * q * q)]
+            out += [Term(t.kx, t.ky, t.source), Term(kx, ky, after(t, lambda q: b * q * q))]
         return out
 
 
@@ -122,7 +122,7 @@ class OwnEdges(Law):
     "packet widens and its field saturates; here k Q / (1 - b Q/2), b < 0",
 )
 class Saturating(Law):
-    """Shifts saturate as k Q / (1 + |b| Q / 2)."""
+    """Shifts saturate as k Q / (1 - b Q / 2), b < 0."""
 
     draw = classmethod(lambda cls, rng, setting: {"sign": -1.0})
 
@@ -130,7 +130,10 @@ class Saturating(Law):
         b = np.float32(self.values["b"] / 2)
         if not b:
             return terms
-        return [Term(t.kx, t.ky, lambda q: q / (1 - b * np.maximum(q, 0))) for t in terms]
+        return [
+            Term(t.kx, t.ky, after(t, lambda q: q / (1 - b * np.maximum(q, 0))))
+            for t in terms
+        ]
 
 
 # -------------------------------------------------------------------- wavelength, axes, distance
@@ -339,11 +342,11 @@ class VoltageLinear(Law):
     start=0.2,
     limits=(0.0002, 0.6),
     needs=("voltages",),
-    source="Holland et al. 2014: drift time as a power of the voltage; here |V|^p "
+    source="Holland et al. 2014: drift time as a power of the voltage; here V^p "
     "with the change delta at +20 V",
 )
 class VoltagePower(Law):
-    """Shifts carry a further factor |V / V0|^p; delta is its value at V0 + 20 V, less one."""
+    """Shifts carry a further factor (V / V0)^p; delta is its value at V0 + 20 V, less one."""
 
     draw = classmethod(lambda cls, rng, setting: either_sign(rng))
 

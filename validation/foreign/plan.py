@@ -3,7 +3,7 @@
 Sizes (side, flat pairs at each level of the first condition, pairs at each of two levels of other
 conditions): T 128, 2, 1 (tests only); S 256, 4, 2; M 512, 8, 4; X 1024, 60, 12.
 
-Ladders differ between campaigns: six to nine levels up to 0.9e5 to 1.25e5 e-, walked up and down
+Ladders differ between campaigns: six to nine levels up to 0.9e5 to 1.2e5 e-, walked up and down
 or shuffled, so that time is not flux; some campaigns repeat two levels at a third of the lamp's
 current; other wavelengths, back biases and temperatures are there or not.
 """
@@ -23,7 +23,7 @@ FIRST_MJD = 60000.0
 LAMP = 2000.0
 """Electrons per second and pixel of flats at full lamp current."""
 
-SPOT_FLUX = 36000.0
+SPOT_FLUX = 33000.0
 """Mean electrons per second in one spot; its brightest pixel holds about a tenth of them."""
 
 
@@ -180,7 +180,7 @@ def draw_plan(
     ``needs`` may hold 'red', 'wavelengths', 'voltages', 'temperatures'.
     """
     count = int(rng.integers(6, 10)) if size != "T" else 4
-    top = rng.uniform(45.0, 62.5)
+    top = rng.uniform(45.0, 60.0)
     levels = np.round(np.concatenate([[1.0], np.linspace(5.0, top, count - 1)]), 2)
     waves: tuple[float, ...] = ((480.0, 950.0), (480.0, 870.0), (), (700.0, 1000.0))[
         rng.choice(4, p=[0.5, 0.15, 0.2, 0.15])

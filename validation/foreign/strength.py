@@ -553,5 +553,8 @@ def find_amplitude(
             break
         size = new
     return {
-        "snr": value, "parts": parts, "wanted": wanted, "limited": not 0.5 < value / wanted < 2,
-    }  # fmt: skip
+        "snr": value,
+        "parts": parts,
+        "wanted": wanted,
+        "limited": not 0.5 < value / wanted < 2,
+    }
