@@ -11,12 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from astropy.io import fits
 from click.testing import CliRunner
 
 from validation.foreign import device as devices
 from validation.foreign.__main__ import main
-from validation.foreign.bench import Bench
+from validation.foreign.bench import Bench, Taken
 from validation.foreign.campaign import (
     KINDS,
     Made,
@@ -27,6 +28,7 @@ from validation.foreign.campaign import (
 )
 from validation.foreign.collection import Edges, Light, Term, collect, divergence, poisson
 from validation.foreign.device import DEVICES, Device, area_changes, edge_shifts
+from validation.foreign.headers import file_name
 from validation.foreign.laws import CLASSES, LAWS, OUTSIDE
 from validation.foreign.laws_transfer import leave_behind, trap
 from validation.foreign.layout import Layout
@@ -409,19 +411,30 @@ def section(text):
     return [int(v) for v in re.findall(r"\d+", text)]
 
 
-def detector_image(path):
-    """Put a file together from its own sections, by the FITS conventions alone."""
+def detector_image(path, entries):
+    """Put a file together from its own sections, by the FITS conventions alone.
+
+    Sections are those of the headers, or the ``amplifiers`` of campaign.yaml.
+    """
+    image = np.zeros((128, 128))
     with fits.open(path) as f:
-        image = np.zeros((128, 128))
-        for hdu in f[1:]:
-            if "DATASEC" not in hdu.header:
-                continue
-            x0, x1, y0, y1 = section(hdu.header["DATASEC"])
-            part = hdu.data[y0 - 1 : y1, x0 - 1 : x1].astype(float)
-            if "BIASSEC" in hdu.header:
-                b = section(hdu.header["BIASSEC"])
-                part -= np.median(hdu.data[b[2] - 1 : b[3], b[0] - 1 : b[1]])
-            u0, u1, v0, v1 = section(hdu.header["DETSEC"])
+        if entries:
+            parts = [
+                (f[a["hdu"]].data, a["data"], a.get("bias"), a["detector"]) for a in entries
+            ]
+        else:
+            parts = [
+                (h.data, h.header["DATASEC"], h.header.get("BIASSEC"), h.header["DETSEC"])
+                for h in f
+                if "DATASEC" in h.header
+            ]
+        for data, light, bias, detector in parts:
+            x0, x1, y0, y1 = section(light)
+            part = data[y0 - 1 : y1, x0 - 1 : x1].astype(float)
+            if bias:
+                b = section(bias)
+                part -= np.median(data[b[2] - 1 : b[3], b[0] - 1 : b[1]])
+            u0, u1, v0, v1 = section(detector)
             part = part[:, ::-1] if u0 > u1 else part
             part = part[::-1] if v0 > v1 else part
             image[min(v0, v1) - 1 : max(v0, v1), min(u0, u1) - 1 : max(u0, u1)] = part
@@ -478,18 +491,22 @@ def test_layouts_read_back_by_the_command(layout, tmp_path):
     assert (
         f"{layout.width} x {layout.height} pixels, prescan {layout.prescan}" in said.stdout
     )
-    if layout.storage == "mef":
-        e = next(x for x in plan.exposures() if x.kind == "SPOT" and x.seconds == 30)
-        files = {f: fits.getheader(f) for f in sorted((tmp_path / "c").glob("*.fits*"))}
-        times = [f for f, h in files.items() if h["EXPTIME"] == 30 and "SPOT" in repr(h)]
-        image = detector_image(times[0])
-        x, y = made.bench.spot_places(e)
-        # each spot is where the sensor has it, whatever direction its amplifier reads in
-        for u, v in zip(np.rint(x).astype(int), np.rint(y).astype(int), strict=True):
-            if 4 < u < 124 and 4 < v < 124:
-                box = image[v - 4 : v + 5, u - 4 : u + 5]
-                j, i = np.unravel_index(box.argmax(), box.shape)
-                assert abs(j - 4) <= 1 and abs(i - 4) <= 1
+    e = next(x for x in plan.exposures() if x.kind == "SPOT" and x.seconds == 30)
+    taken = Taken(e, [], 0.0, 0.0)
+    entries = yaml.safe_load((tmp_path / "c" / "campaign.yaml").read_text()).get(
+        "amplifiers"
+    )
+    image = detector_image(tmp_path / "c" / file_name(taken, layout), entries)
+    # each spot is where the sensor has it, whatever direction its amplifier reads in
+    x, y = made.bench.spot_places(e)
+    seen = 0
+    for u, v in zip(np.rint(x).astype(int), np.rint(y).astype(int), strict=True):
+        if 4 < u < 124 and 4 < v < 124:
+            box = image[v - 4 : v + 5, u - 4 : u + 5]
+            j, i = np.unravel_index(box.argmax(), box.shape)
+            assert abs(j - 4) <= 1 and abs(i - 4) <= 1
+            seen += 1
+    assert seen >= 9
 
 
 def test_a_set_is_resumed_committed_to_and_refuses_another_wish(tmp_path):
@@ -532,6 +549,25 @@ def test_nothing_of_the_package_or_of_the_other_generator_is_imported():
                     path,
                     name,
                 )
+
+
+def test_bright_spots_are_wider_most_along_columns():
+    bench = Bench(Layout(pixels=128), PLAN, NOMINAL, 99, with_noise=False)
+    e = next(x for x in PLAN.exposures() if x.kind == "SPOT")
+    u, v = (int(np.rint(c[c.size // 2])) for c in bench.spot_places(e))
+    widths = []
+    for seconds in (1.0, 30.0):
+        q = bench.charge(replace(e, seconds=seconds))[v - 7 : v + 8, u - 7 : u + 8].astype(
+            float
+        )
+        j, i = np.mgrid[-7:8, -7:8]
+        y, x = (q * j).sum() / q.sum(), (q * i).sum() / q.sum()
+        widths.append(
+            [(q * (i - x) ** 2).sum() / q.sum(), (q * (j - y) ** 2).sum() / q.sum()]
+        )
+    growth = np.subtract(*widths[::-1]) / np.array(widths[0])
+    # about a percent for a peak of 1e5 e-, more along y where the shifts are larger
+    assert 0.01 < growth[0] < growth[1] < 0.2
 
 
 def test_device_of_another_thickness_answers_otherwise():
