@@ -5,11 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
+from astropy.table import Table
 from tqdm import tqdm
 
+from validation.common.run_header import run_header
+from validation.foreign.accuracy import accuracy_rows, faults_of
 from validation.foreign.campaign import Wish, make_set
 from validation.foreign.laws import CLASSES, LAWS
 from validation.foreign.nuisances import NUISANCES
+
+RESULTS = Path(__file__).parents[1] / "results" / "foreign_accuracy.ecsv"
 
 
 @click.group()
@@ -90,6 +95,27 @@ def laws() -> None:
         click.echo(f"{word:24s} {name:20s} {law.source}")
     for word, nuisance in NUISANCES.items():
         click.echo(f"{'nuisance':24s} {word:20s} {nuisance.source}")
+
+
+@main.command()
+@click.option("-o", "--output", type=click.Path(path_type=Path), default=RESULTS, show_default=True,
+              help="ECSV that the rows are written to.")  # fmt: skip
+def accuracy(output: Path) -> None:
+    """Hold the covariances of the collection's scheme against the closed form.
+
+    \b
+    Example:
+      python -m validation.foreign accuracy
+    """
+    rows = accuracy_rows()
+    table = Table(rows=rows)
+    table.meta.update(run_header("python -m validation.foreign accuracy"))
+    beside = output.with_name(output.name + ".part")
+    table.write(beside, format="ascii.ecsv", overwrite=True)
+    beside.replace(output)
+    click.echo(f"{output}: {len(rows)} rows")
+    if faults := faults_of(rows):
+        raise click.ClickException("; ".join(faults))
 
 
 if __name__ == "__main__":
