@@ -22,8 +22,7 @@ signal, a constant variance), the card's device parameters with their priors in 
 spot exposure's flux and place, and one change of the spots' widths.
 
 A sum of squares of differences would be biased by what common random numbers do not cancel; so each
-square is the product of two halves of the data.  Accuracy: about 15 % where one channel dominates
-and more where a law acts on noise (a factor of 1.5 at worst, by halving and other seeds).
+square is the product of two halves of the data.  Accuracy: 15 % against a case worked out by hand; README.md has the scatter between seeds.
 """
 
 from __future__ import annotations
@@ -63,6 +62,7 @@ from validation.foreign.raw_statistics import (
     variance_gain,
     welch,
     white,
+    without_tracks,
 )
 
 LAGS = 5
@@ -232,8 +232,7 @@ class Estimator:
         """Covariances of a differenced pair in the halves of all amplifiers, [half, lag]."""
         out = np.zeros((2, LAGS * LAGS))
         for f, g in zip(self._light(p.frames[i]), self._light(p.frames[j]), strict=True):
-            d = (f - g).astype(np.float32)
-            d -= d.mean()
+            d = without_tracks((f - g).astype(np.float32))
             h = len(d) // 2
             for half, part in enumerate((d[:h], d[h:])):
                 for y in range(LAGS):
@@ -248,7 +247,7 @@ class Estimator:
         for i, j, n in self._pairs():
             rho = []
             for p in (self.base, other):
-                d = self._image(p, i) - self._image(p, j)
+                d = without_tracks(self._image(p, i) - self._image(p, j))
                 m = self.lay.pixels // side
                 blocks = d.reshape(m, side, m, side).mean((1, 3))
                 blocks = blocks - blocks.mean()
