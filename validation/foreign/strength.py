@@ -22,7 +22,8 @@ signal, a constant variance), the card's device parameters with their priors in 
 spot exposure's flux and place, and one change of the spots' widths.
 
 A sum of squares of differences would be biased by what common random numbers do not cancel; so each
-square is the product of two halves of the data.  Accuracy: 15 % against a case worked out by hand; README.md has the scatter between seeds.
+square is the product of two halves of the data.  Accuracy: 15 % against a case worked out by hand;
+README.md has the scatter between seeds.
 """
 
 from __future__ import annotations
