@@ -33,7 +33,7 @@ def leave_behind(packets: Image, cti: float, most: int = 6) -> Image:
     --------
     >>> q = np.zeros((6, 1)); q[3] = 1000.0
     >>> leave_behind(q, 1e-2)[:, 0].round(2).tolist()
-    [0.0, 0.0, 0.0, 960.6, 38.42, 0.98]
+    [0.0, 0.0, 0.0, 960.6, 38.42, 0.96]
     """
     n = np.arange(1, len(packets) + 1, dtype=float)[:, None]
     out = np.zeros_like(packets)
