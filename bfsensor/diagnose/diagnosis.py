@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
 
 from bfsensor.diagnose.data.channels import PER_ELECTRON
 from bfsensor.diagnose.data.measure_channels import (
@@ -19,8 +22,10 @@ from bfsensor.diagnose.fit.baseline_fit import (
     held_out,
 )
 from bfsensor.diagnose.model.baseline import Baseline
+from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.diagnose.plan.advice import RecordingPlan, plan
 from bfsensor.diagnose.report.diagnosis_result import Diagnosis
+from bfsensor.errors import ConvergenceError
 
 
 def diagnose(
@@ -62,8 +67,6 @@ def diagnose(
     ------
     MeasurementError
         No exposure can be used, or no channel can be measured in them.
-    ConvergenceError
-        The baseline's predictions overflow or cannot be fitted.
 
     Examples
     --------
@@ -112,11 +115,6 @@ def diagnose_measured(
     Diagnosis
         Fit, mismatch, effects found and advice.
 
-    Raises
-    ------
-    ConvergenceError
-        The baseline's predictions overflow or cannot be fitted.
-
     Examples
     --------
     Diagnose area changes a_ij [1/e-] that conserve area:
@@ -133,6 +131,7 @@ def diagnose_measured(
     >>> diagnose_measured(measured, baseline).mismatch.detected
     False
     """
+    measured = _predictable(measured, baseline)
     predictor, fit = fit_bounded(measured, baseline)
     more = _of_free(measured, baseline, fit)
     if explain:
@@ -141,10 +140,14 @@ def diagnose_measured(
         mismatch = locate_mismatch(fit, seed=seed)
     attribution, advised = None, RecordingPlan()
     if mismatch.detected and explain:
-        attribution = attribute(predictor, fit, mismatch, seed=seed)
-        more += attribution.notes
-        advised = plan(attribution)
-        more += advised.notes
+        try:
+            attribution = attribute(predictor, fit, mismatch, seed=seed)
+        except ConvergenceError as error:
+            more.append(f"the mismatch is located, its explanation was given up: {error}")
+        else:
+            more += attribution.notes
+            advised = plan(attribution)
+            more += advised.notes
     return Diagnosis(
         campaign=campaign,
         baseline=baseline.name,
@@ -158,6 +161,24 @@ def diagnose_measured(
         plan=advised,
         predictor=predictor,
     )
+
+
+def _predictable(measured: MeasuredChannels, baseline: Baseline) -> MeasuredChannels:
+    """Set channels aside that the nominal baseline cannot predict at all, and name them in a note."""
+    predictor, kept, notes = Predictor(measured, baseline), [], []
+    for channel in measured.channels:
+        try:
+            finite = np.isfinite(predictor.predict(channel, predictor.start)).all()
+            why = "" if finite else "its prediction is not finite"
+        except ConvergenceError as error:
+            why = str(error)
+        if why:
+            notes.append(f"{channel.word} ({channel.fold}) set aside: {why}")
+        else:
+            kept.append(channel)
+    if not notes:
+        return measured
+    return replace(measured, channels=tuple(kept), notes=(*measured.notes, *notes))
 
 
 def _of_free(measured: MeasuredChannels, baseline: Baseline, fit: BaselineFit) -> list[str]:
