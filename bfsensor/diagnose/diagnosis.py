@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bfsensor.diagnose.data.channels import PER_ELECTRON
+from bfsensor.diagnose.data.channels import PER_ELECTRON, step_of
 from bfsensor.diagnose.data.measure_channels import (
     MeasuredChannels,
     Source,
@@ -193,7 +193,7 @@ def _of_free(measured: MeasuredChannels, baseline: Baseline, fit: BaselineFit) -
     )  # fmt: skip
     out = [f"fitted area changes a_ij [1/e-]: {text}"]
     flats = [c for c in measured.channels if c.word == "flat_cov"]
-    levels = {float(v) for c in flats for v in c.axes["time"]}
+    levels = {float(v) for c in flats for v in step_of(c.axes)}
     if len(levels) < 2 and not any(c.unit == PER_ELECTRON for c in flats):
         out.append(
             "flats at fewer than two levels: these do not separate other positive covariances of near "

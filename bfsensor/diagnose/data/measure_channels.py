@@ -33,6 +33,7 @@ from bfsensor.diagnose.data.flat_pairing import (
     UnlikePair,
     by_level,
     describe_unlike,
+    find_steps,
     group_flats,
     scan_unlike,
 )
@@ -240,8 +241,14 @@ def measure_channels(
         each.forget_mean()
     noise = biases.read_noise
     start = min((e.mjd for e in exposures if e.mjd is not None), default=np.nan)
+    steps = find_steps(kinds.get("flat", []))
     flats = FlatChannels(
-        bias_images, noise, lamp_error=source.lamp_error, lags=lags, start=start
+        bias_images,
+        noise,
+        lamp_error=source.lamp_error,
+        lags=lags,
+        start=start,
+        steps=steps,
     )
     longest: dict[Condition, float] = {}
     for flat in kinds.get("flat", []):
@@ -261,10 +268,17 @@ def measure_channels(
         "select": (maps, codes),
         "held-out": (late_maps, late_codes),
     }
-    levels = _take_pairs(finder, groups, flats, by_fold, biases, source.shape, notes)
+    by_step = by_level(groups, steps)
+    levels = _take_pairs(finder, by_step, flats, by_fold, biases, source.shape, notes)
+    single = sorted(
+        [*finder.single, *(g[0] for g in groups if len(g) == 1)], key=lambda f: f.number
+    )
+    for n, exposure in enumerate(single):
+        fold = "held-out" if is_held_out(n, len(single)) else "fit"
+        flats.add_single(exposure, frames := read(exposure), fold=fold)
+        levels[exposure.number] = _mean_level(flats, frames)
     unlike = scan_unlike(
-        sorted([*finder.single, *(g[0] for g in groups if len(g) == 1)], key=lambda f: f.number),
-        lambda flat: [_good(flats, f) for f in read(flat)], lags=lags,
+        single, lambda flat: [_good(flats, f) for f in read(flat)], lags=lags,
     )  # fmt: skip
     notes += [*finder.notes, *describe_unlike(unlike), *codes.notes, *late_codes.notes]
     # Sums of maps take most memory: they are released before images of spots are read.
@@ -327,7 +341,7 @@ def measure_channels(
     if not channels:
         raise MeasurementError(
             f"nothing can be measured: {len(kinds.get('flat', []))} flats make no pair of equal "
-            f"exposure and level, biases {len(kinds.get('bias', []))} (2 are needed), no dark, no "
+            f"light and level, biases {len(kinds.get('bias', []))} (2 are needed), no dark, no "
             f"spots that could be fitted{'; ' + '; '.join(notes) if notes else ''}"
         )
     if "bias" not in kinds and any(f.serial_overscan.size == 0 for f in layout):
@@ -365,7 +379,7 @@ def measure_channels(
 
 def _take_pairs(
     finder: PairFinder,
-    groups: Sequence[Sequence[ExposureInfo]],
+    by_step: Sequence[Sequence[Sequence[ExposureInfo]]],
     flats: FlatChannels,
     by_fold: Mapping[str, tuple[MapChannels, CodeChannels]],
     biases: BiasChannels,
@@ -374,7 +388,7 @@ def _take_pairs(
 ) -> dict[int, float]:
     """Read all pairs of flats, level by level; returns the mean level of each flat [ADU]."""
     levels: dict[int, float] = {}
-    for members in sorted(by_level(groups), key=lambda m: m[0][0].exposure_time or 0.0):
+    for members in sorted(by_step, key=lambda m: m[0][0].exposure_time or 0.0):
         folds = iter(
             assign_folds(range(sum(len(g) // 2 for g in members)), shift=len(levels))
         )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channel_rows import Rows, rows_by_condition
-from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
+from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel, step_of
 from bfsensor.diagnose.data.exposure_info import label_of
 from bfsensor.diagnose.data.map_channels import MapShare
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
@@ -494,7 +494,7 @@ def _noise_told(measured: MeasuredChannels) -> NDArray[np.bool_]:
             own = channel.axes["amp"] == n
             told[n] |= channel.word == "bias_cov"
             if channel.word == "flat_cov":
-                levels[n] |= set(channel.axes["time"][own].tolist())
+                levels[n] |= set(step_of(channel.axes)[own].tolist())
     flats = any(levels)
     return told | np.array([len(v) > 1 or not flats for v in levels], bool)
 
