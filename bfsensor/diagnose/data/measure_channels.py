@@ -18,6 +18,12 @@ from bfsensor.diagnose.data.bias_channels import (
 )
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.code_channels import CodeChannels, CrosstalkChannels
+from bfsensor.diagnose.data.cosmetics import (
+    Cosmetic,
+    RepairedFrame,
+    find_cosmetics,
+    repaired_of,
+)
 from bfsensor.diagnose.data.exposure_info import (
     ExposureInfo,
     Frame,
@@ -141,6 +147,8 @@ class MeasuredChannels:
     """Waves and rings detected in maps, as starting points of fits: see
     :func:`bfsensor.diagnose.data.map_waves.find_patterns`."""
     placed: tuple[PlacedSpots, ...] = ()
+    cosmetics: tuple[Cosmetic, ...] = ()
+    """Defects of the sensor that were repaired before anything was measured."""
 
 
 def measure_channels(
@@ -210,6 +218,9 @@ def measure_channels(
         haunted = dict(ghosts)
     if haunted:
         notes.append(describe_ghosts(haunted, exposures))
+    source, cosmetics = find_cosmetics(
+        source, [e for e in exposures if e.number not in haunted]
+    )
     biases, late_biases = BiasChannels(), BiasChannels("held-out")
     in_mean: list[int] = []
     for exposure in kinds.get("bias", []):
@@ -325,11 +336,15 @@ def measure_channels(
         (late_crosstalk if held else crosstalk).add(
             images, [noise.get(f.name, 1.0) for f in spot_frames]
         )
-        image = np.full(source.shape, np.nan)
+        image, filled = np.full(source.shape, np.nan), np.zeros(source.shape, bool)
         for frame, cleaned, gain in zip(spot_frames, images, rough, strict=True):
             place(image, frame, cleaned * gain)
+            if isinstance(frame, RepairedFrame):
+                place(filled, frame, frame.filled)
         levels[exposure.number] = float(np.mean([np.nanmean(i) for i in images]))
-        reason = spots.add(exposure, image, fold="held-out" if held else "fit")
+        reason = spots.add(
+            exposure, image, fold="held-out" if held else "fit", filled=filled
+        )
         if reason:
             notes.append(f"spots {exposure.number}: {reason}")
     channels = [
@@ -374,6 +389,7 @@ def measure_channels(
         ),
         biases=tuple(in_mean),
         sightings=sightings,
+        cosmetics=cosmetics,
     )
 
 
@@ -465,7 +481,7 @@ def _shots(
     return tuple(out)
 
 
-def place(image: NDArray[np.floating], frame: Frame, values: FloatArray) -> None:
+def place(image: NDArray, frame: Frame, values: NDArray) -> None:
     """Copy an amplifier's values, in readout order, to their place in an image of the sensor.
 
     Parameters
@@ -495,8 +511,8 @@ def _mean_level(flats: FlatChannels, frames: Sequence[Frame]) -> float:
 
 
 def _good(flats: FlatChannels, frame: Frame) -> FloatArray:
-    """Clean image, nan where a pixel is masked."""
-    return np.where(frame.mask, np.nan, flats.clean(frame))
+    """Clean image, nan where a pixel is masked and not repaired."""
+    return np.where(frame.mask & ~repaired_of(frame), np.nan, flats.clean(frame))
 
 
 def _rough_gains(channel: Channel, gains: list[list[float]]) -> None:
