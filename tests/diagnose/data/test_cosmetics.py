@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.data.cosmetics import bad_columns, find_cosmetics
+from bfsensor.diagnose.data.cosmetics import bad_columns, find_cosmetics, shadows
 from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.diagnosis import diagnose_measured
 from tests.virtual import SMALL, VirtualSource, make_effect, virtual_baseline
@@ -84,14 +84,59 @@ def test_a_sensor_without_defects_is_read_as_it_is():
     assert same is source and found == ()
 
 
-@pytest.mark.parametrize("name", ["tree_rings", "mask_stitch", "edge_rolloff", "tearing"])
-def test_displaced_edges_are_no_defects(name):
+@pytest.mark.parametrize(
+    "name", ["tree_rings", "mask_stitch", "edge_rolloff", "tearing", "hot column"]
+)
+def test_displaced_edges_and_dark_current_are_no_defects(name):
     rng = np.random.default_rng(11)
     x = np.arange(129.0)
     edges = {
         "tree_rings": 0.03 * np.sin(2 * np.pi * x / 18),
         "mask_stitch": np.where(x % 16 == 5, 0.01, 0.0),
         "edge_rolloff": 0.4 * np.exp(-(128 - x) / 4) - 0.4 * np.exp(-x / 4),
+        "hot column": np.where(x > 40, 0.03, 0.0),
         "tearing": 0.1 * np.sign(x - 64.5) * np.exp(-np.abs(x - 64.5) / 3),
     }[name]
     assert bad_columns(np.diff(edges) + 3e-4 * rng.standard_normal(128)) == []
+
+
+SHADOWS = ((25, 30, 4.0, 0.04), (90, 95, 5.0, 0.015))
+"""Row, column, width [pixel] and depth of shadows of dust."""
+
+
+class Dust(Effect):
+    """Round shadows, the same in all exposures."""
+
+    word = "dust"
+    variants: ClassVar = {"": {"part": Range(0.0, 1.0, amplitude=True)}}
+
+    def light(self, scene, context):
+        y, x = np.indices(scene.light.shape)
+        for row, column, width, depth in SHADOWS:
+            shadow = np.exp(-0.5 * ((x - column) ** 2 + (y - row) ** 2) / width**2)
+            scene.scale(1 - self.parameters["part"] * depth * shadow)
+
+
+def test_dust_is_listed_and_no_alarm():
+    source = VirtualSource(seed=7107, size=SMALL, effects=[Dust({"part": 1.0})])
+    measured = measure_channels(source)
+    dust = sorted(measured.cosmetics, key=lambda c: c.y)
+    assert [c.kind for c in dust] == ["dust"] * 2
+    for one, (row, column, _, depth) in zip(dust, SHADOWS, strict=True):
+        assert one.y[0] <= row < one.y[1] and one.x[0] <= column < one.x[1]
+        # The average over 1.5 pixels takes 1 - 1 / (1 + 1.5^2 / 4^2) = 12 % off a narrow shadow.
+        assert one.size == pytest.approx(-depth, rel=0.2)
+    assert not diagnose_measured(measured, virtual_baseline()).mismatch.detected
+
+
+@pytest.mark.parametrize("name", ["tree_rings", "stripe", "rim", "light"])
+def test_other_patterns_are_no_dust(name):
+    rng = np.random.default_rng(12)
+    y, x = np.indices((128, 64))
+    image = {
+        "tree_rings": 0.02 * np.sin(2 * np.pi * np.hypot(x + 60, y - 300) / 18),
+        "stripe": np.where((x > 20) & (x < 27) & (y < 90), -0.05, 0.0),
+        "rim": -0.2 * np.exp(-x / 4.0),
+        "light": 0.03 * (x / 64) ** 2 - 0.02 * y / 128,
+    }[name]
+    assert shadows(image + 3e-3 * rng.standard_normal(image.shape)) == []
