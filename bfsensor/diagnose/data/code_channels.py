@@ -218,12 +218,13 @@ class CrosstalkChannels:
                     continue
                 # A spot's halo is alike on both sides: the point across the victim's own spot
                 # has the same halo and, mostly, no light in the other amplifier.
-                distance, which = cKDTree(centres[b]).query(
-                    np.column_stack([rows, columns])
-                )
+                tree = cKDTree(centres[b])
+                distance, which = tree.query(np.column_stack([rows, columns]))
                 y, x = (2 * centres[b][which] - np.column_stack([rows, columns])).T
+                # Far from its spot that point may lie on another one of the victim.
+                across, _ = tree.query(np.column_stack([y, x]))
                 use = (
-                    (distance > CLEAR)
+                    (np.minimum(distance, across) > CLEAR)
                     & _is_inside(rows, columns, victim.shape)
                     & _is_inside(y, x, victim.shape)
                 )
