@@ -8,11 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from bfsensor.diagnose.data.channels import PER_ELECTRON, step_of
-from bfsensor.diagnose.data.measure_channels import (
-    MeasuredChannels,
-    Source,
-    measure_channels,
-)
+from bfsensor.diagnose.data.exposure_info import Source
+from bfsensor.diagnose.data.measure_channels import MeasuredChannels, measure_channels
 from bfsensor.diagnose.detect.locate import locate_mismatch
 from bfsensor.diagnose.detect.matched_filters import locate_effects
 from bfsensor.diagnose.explain.stepwise import attribute

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +23,8 @@ from scipy.ndimage import (
     median_filter,
 )
 
-from bfsensor.diagnose.data.exposure_info import ExposureInfo, Frame, condition_of
+from bfsensor.diagnose.data.exposure_info import ExposureInfo, Frame, Source, condition_of
 from bfsensor.typing import FloatArray
-
-if TYPE_CHECKING:
-    from bfsensor.diagnose.data.measure_channels import Source
 
 MOST_READ = 8
 """Largest number of flats, and of darks, that are read to find defects.  Chosen: a column of 256

@@ -1,11 +1,10 @@
-# ruff: noqa: D102  (protocol: the class says what its attributes are)
 """Measure all channels of a campaign from its exposures, one exposure or pair in memory at a time."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +26,7 @@ from bfsensor.diagnose.data.cosmetics import (
 from bfsensor.diagnose.data.exposure_info import (
     ExposureInfo,
     Frame,
+    Source,
     assign_folds,
     condition_of,
     is_held_out,
@@ -50,30 +50,6 @@ from bfsensor.diagnose.data.spot_places import PlacedSpots
 from bfsensor.effects.effect import Segment, Shot
 from bfsensor.errors import MeasurementError
 from bfsensor.typing import FloatArray
-
-
-class Source(Protocol):
-    """A campaign that gives exposures in order of time, and reads their frames.
-
-    Attributes
-    ----------
-    exposures : sequence of ExposureInfo
-        Headers of all exposures, in order of time.
-    lamp_error : float
-        Relative error of the lamp monitor, above 0.
-    shape : (int, int)
-        Rows and columns of the sensor.
-    read : callable
-        Returns the frames of an exposure, one for each amplifier, always in the same order.
-    """
-
-    @property
-    def exposures(self) -> Sequence[ExposureInfo]: ...
-    @property
-    def lamp_error(self) -> float: ...
-    @property
-    def shape(self) -> tuple[int, int]: ...
-    def read(self, exposure: Any) -> Sequence[Any]: ...
 
 
 @dataclass(frozen=True, eq=False)
