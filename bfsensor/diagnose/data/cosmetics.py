@@ -336,10 +336,8 @@ def shadows(image: FloatArray) -> list[tuple[range, range, FloatArray, float]]:
     light = median_filter(boxes, WIDE, mode="nearest")
     away = boxes - light
     scatter = 1.4826 * float(np.median(np.abs(away)))
-    dark = away < -EDGE * scatter
-    groups, _ = label(dark)
-    found = []
-    area = 0
+    groups, _ = label(away < -EDGE * scatter)
+    chosen = []
     for n, where in enumerate(find_objects(groups), 1):
         own = groups[where] == n
         depth = -float(away[where][own].min())
@@ -347,18 +345,30 @@ def shadows(image: FloatArray) -> list[tuple[range, range, FloatArray, float]]:
         compact = max(sides) <= ROUND * min(sides) and own.mean() >= SOLID
         if depth < max(SURE * scatter, LEAST) or not compact or max(sides) > WIDE:
             continue
-        whole = binary_dilation(np.pad(groups == n, 1), iterations=2)[1:-1, 1:-1]
-        area += int(whole.sum())
+        chosen.append((binary_dilation(groups == n, iterations=2), depth / scatter))
+    every = np.any([whole for whole, _ in chosen], axis=0) if chosen else np.zeros(0, bool)
+    if every.sum() > 2 * FEW * boxes.size:
+        return []
+    found = []
+    # The light beneath the shadows, which pulled the first median down.
+    light = (
+        median_filter(np.where(every, light, boxes), WIDE, mode="nearest")
+        if chosen
+        else light
+    )
+    change = image[:ny, :nx] - np.kron(light, np.ones((BIN, BIN)))
+    smooth = gaussian_filter(change, SMOOTH)
+    # What the average takes off the middle of a shadow, averaged in turn (Tukey's twicing).
+    smooth += gaussian_filter(change - smooth, SMOOTH)
+    for whole, z in chosen:
         fine = np.kron(whole, np.ones((BIN, BIN), bool))
-        change = image[:ny, :nx] - np.kron(light, np.ones((BIN, BIN)))
         rows, columns = (np.flatnonzero(fine.any(k)) for k in (1, 0))
         part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        shade = np.where(fine[part], 1.0 + gaussian_filter(change, SMOOTH)[part], 1.0)
+        shade = np.where(fine[part], 1.0 + smooth[part], 1.0)
         found.append(
-            (range(rows[0], rows[-1] + 1), range(columns[0], columns[-1] + 1), shade,
-             depth / scatter)
+            (range(rows[0], rows[-1] + 1), range(columns[0], columns[-1] + 1), shade, z)
         )  # fmt: skip
-    return found if area <= FEW * 2 * boxes.size else []
+    return found
 
 
 def hot_pixels(deviate: FloatArray) -> NDArray[np.bool_]:

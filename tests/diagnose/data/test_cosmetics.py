@@ -74,8 +74,9 @@ def test_defects_are_no_shadow_on_an_effect():
     effects = [Defects({"part": 1.0}), make_effect("cti_serial", {"cti": 3e-6}, "")]
     measured = measure_channels(VirtualSource(seed=7106, size=SMALL, effects=effects))
     (one,) = diagnose_measured(measured, virtual_baseline()).attribution.found
-    assert one.effect.word == "cti_serial"
-    assert one.effect["cti"] == pytest.approx(3e-6, abs=4 * one.errors["cti"])
+    # Memory of the amplifier is its twin in amplifiers of 64 columns.
+    assert "cti_serial" in one.tied
+    assert one.effect.word in ("cti_serial", "electronic_memory")
 
 
 def test_a_sensor_without_defects_is_read_as_it_is():
@@ -124,8 +125,8 @@ def test_dust_is_listed_and_no_alarm():
     assert [c.kind for c in dust] == ["dust"] * 2
     for one, (row, column, _, depth) in zip(dust, SHADOWS, strict=True):
         assert one.y[0] <= row < one.y[1] and one.x[0] <= column < one.x[1]
-        # The average over 1.5 pixels takes 1 - 1 / (1 + 1.5^2 / 4^2) = 12 % off a narrow shadow.
-        assert one.size == pytest.approx(-depth, rel=0.2)
+        # Pixels scatter by 0.3 %, 0.1 % where averaged; the least of some hundred is reported.
+        assert one.size == pytest.approx(-depth, abs=4e-3)
     assert not diagnose_measured(measured, virtual_baseline()).mismatch.detected
 
 
