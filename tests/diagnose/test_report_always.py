@@ -75,7 +75,7 @@ def test_a_mismatch_without_explanation_is_reported(fitted_loss, monkeypatch):
 
 
 STRONG = {
-    "tearing": [("tearing", {"amp": 0.15, "length": 3.0}, "")],
+    "tearing": [("tearing", {"amp": 0.15, "length": 3.0, "column": 0.5}, "")],
     "rings and fringes": [
         (
             "tree_rings",
