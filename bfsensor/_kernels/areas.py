@@ -8,8 +8,9 @@ inner loop runs along the row.
 import numba
 import numpy as np
 
-from bfsensor._kernels.compile_options import INLINED, INNER
+from bfsensor._kernels.compile_options import ENTRY, INLINED, INNER
 from bfsensor._kernels.photons import _at, fixed_shift, ring_shift
+from bfsensor._kernels.window import add_8_kernels
 
 GAUSS = 0.5 - 0.5 / np.sqrt(3.0)
 """Place of the first of Gauss's two points of a unit interval; exact for cubic polynomials."""
@@ -138,7 +139,7 @@ def _join(x0, y0, x1, y1):
     return 0.5 * (y0 + y1) * (x1 - x0)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(**{**ENTRY, "_nrt": True})
 def pixel_areas(edges, charges, pattern, flux, low, low_second, first_row, last_row, out):
     """Write the areas [nominal area] of the rows ``first_row`` to ``last_row`` to ``out`` [ny, nx].
 
@@ -189,66 +190,75 @@ def pixel_areas(edges, charges, pattern, flux, low, low_second, first_row, last_
             out[j, i] = -around
 
 
-@numba.njit(cache=True, nogil=True, _nrt=False)
+@numba.njit(**ENTRY)
 def convolved_areas(
     charges,
     first,
     second,
     values,
-    count,
     low,
     low_second,
     bottom,
     top,
     left,
     right,
-    row,
+    sums,
+    first_row,
     out,
 ):
-    """Write areas [nominal area] by convolution with the first ``count`` kernels to ``out``.
+    """Write areas [nominal area] by convolution to ``out``, which begins with the row ``first_row``.
 
     Only the rows ``bottom`` to ``top`` and the columns ``left`` to ``right`` are written.
 
-    ``first`` [1 + kernels, width, width] and ``second`` (5 x 5; width 0: none) begin with the
-    linear kernel; the squares of the other sums are added with the factors ``values``.
-    ``row`` is scratch for one row.
+    ``first`` [groups, width, width, 8] and ``second`` (5 x 5; width 0: none) are kernels, eight side by
+    side, of which the very first is the linear one; the squares of the other sums are added with
+    the factors ``values`` [groups, 8].  ``sums`` [9, 16] is scratch, of the type of the kernels.
     """
     width = first.shape[1]
     near = second.shape[1]
     flat = first.reshape(-1)
     flat_near = second.reshape(-1)
-    nx = right - left
-    corner = charges.pad * charges.stride + charges.pad + left
-    for j in range(bottom, top):
-        for i in range(left, right):
-            out[j, i] = 1.0
-        for k in range(count + 1):
-            total = flat[0] * 0
-            for n in range(k * width * width, (k + 1) * width * width):
-                total -= flat[n] * low
-            for n in range(k * near * near, (k + 1) * near * near):
-                total -= flat_near[n] * low_second
-            for i in range(nx):
-                row[i] = total
-            half = width // 2
-            _add_rows(
-                flat, k * width * width, width, width, width, charges.first,
-                corner + (j - half) * charges.stride - half,
-                charges.stride, row, nx,
-            )  # fmt: skip
-            if near > 0:
-                _add_rows(
-                    flat_near, k * near * near, near, near, near, charges.second,
-                    corner + (j - 2) * charges.stride - 2,
-                    charges.stride, row, nx,
+    corner = charges.pad * charges.stride + charges.pad
+    stride = np.uint64(charges.stride)
+    constant = sums[8]
+    half = width // 2
+    for group in range(first.shape[0]):
+        begin = group * width * width * 8
+        begin_near = group * near * near * 8
+        for k in range(8):
+            constant[k] = 0
+        for n in range(width * width):
+            for k in range(8):
+                constant[k] -= flat[begin + 8 * n + k] * low
+        for n in range(near * near):
+            for k in range(8):
+                constant[k] -= flat_near[begin_near + 8 * n + k] * low_second
+        for j in range(bottom, top):
+            for i in range(left, right, 16):
+                for k in range(8):
+                    sums[k] = constant[k]
+                add_8_kernels(
+                    flat, np.uint64(begin), charges.first,
+                    np.uint64(corner + (j - half) * charges.stride + i - half), stride,
+                    np.uint64(width), np.uint64(width), sums,
                 )  # fmt: skip
-            if k == 0:
-                for i in range(nx):
-                    out[j, left + i] += row[i]
-            else:
-                value = values[k - 1]
-                for i in range(nx):
-                    out[j, left + i] += value * np.float64(row[i]) * np.float64(row[i])
+                if near > 0:
+                    add_8_kernels(
+                        flat_near, np.uint64(begin_near), charges.second,
+                        np.uint64(corner + (j - 2) * charges.stride + i - 2), stride,
+                        np.uint64(near), np.uint64(near), sums,
+                    )  # fmt: skip
+                # Eight squares whatever the number of kernels: the others' factors are 0.
+                for m in range(np.uint64(min(right - i, 16))):
+                    area = out[j - first_row, np.uint64(i) + m]
+                    squared = np.int64(0)
+                    if group == 0:
+                        area = 1.0 + np.float64(sums[0, m])
+                        squared = np.int64(1)
+                    for k in range(squared, 8):
+                        total = np.float64(sums[k, m])
+                        area += values[group, k] * total * total
+                    out[j - first_row, np.uint64(i) + m] = area
 
 
 @numba.njit(**INLINED)
@@ -267,7 +277,7 @@ def _mean_shift(pattern, factor, last, per_step, x, y, along_x, along_y):
     return dx, dy
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(**{**ENTRY, "_nrt": True})
 def times_ring_areas(pattern, out):
     """Multiply areas by those that rings give the pixels, at full height.
 

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from bfsensor._kernels.compile_options import ENTRY, EXPANDED, INLINED, INNER
+from bfsensor._kernels.compile_options import ENTRY, INLINED, INNER
+from bfsensor._kernels.extremes import max, min
 from bfsensor._kernels.hot import cool, heat
 from bfsensor._kernels.prefetch import prefetch
 from bfsensor._kernels.surroundings import mirror_all, mirror_pixel, within
@@ -374,11 +375,11 @@ def _find_margin(charges, ledger, edges, tile):
     charges.margins[tile] = margin if margin < 0.5 else np.float32(1.0)
     level = 0
     if size > 250.0:
-        level = int(np.ceil(8.0 * np.log2(size / 250.0)))
+        level = np.int64(np.ceil(8.0 * np.log2(size / 250.0)))
     charges.ranges[tile] = min(level, edges.doubts.shape[1] - 1)
 
 
-@numba.njit(**EXPANDED)
+@numba.njit(**INNER)
 def _find_margins(charges, ledger, edges):
     """Renew ranges and margins of the flagged tiles and their neighbours."""
     tiles_x = (charges.nx + TILE - 1) // TILE
@@ -464,7 +465,7 @@ def _any_charge(image, j, first, last):
     return found
 
 
-@numba.njit(**EXPANDED)
+@numba.njit(**INNER)
 def _take_pixels(image, j, first, last, charges, ledger, ahead, apart):
     """Take the charge of a part of a row; where it is ``apart``, the gain waits for the response."""
     start = (j + charges.pad) * charges.stride + charges.pad
@@ -505,7 +506,7 @@ def _flag_charge(image, charges, ledger, ahead, apart, fresh):
                     ledger.flags[row * tiles_x + k] = True
 
 
-@numba.njit(**EXPANDED)
+@numba.njit(**INNER)
 def _flag_sides(charges, ledger):
     """Flag the tiles at the sides of the image, where charge beyond it acts."""
     tiles_x = (charges.nx + TILE - 1) // TILE
@@ -530,7 +531,7 @@ def _load_row(image, ledger, j, out):
     out[nx + 1] = _charge(image, ledger, j, nx)
 
 
-@numba.njit(**EXPANDED)
+@numba.njit(**INNER)
 def _respond_in_row(charges, ledger, response, j):
     """Find the effective charge of the flagged tiles in a row, whose ``first`` holds the gain ahead."""
     rows = ledger.rows
@@ -568,7 +569,7 @@ def _respond_flagged(image, charges, ledger, response):
             _respond_in_row(charges, ledger, response, j)
 
 
-@numba.njit(**ENTRY)
+@numba.njit(**INNER)
 def take_image(image, charges, ledger, response, edges, ahead):
     """Update the frozen charge from the whole image; ``ahead`` times each pixel's gain is added."""
     # Without a second mode and without prediction the charge itself is the effective one.
@@ -592,6 +593,12 @@ def take_image(image, charges, ledger, response, edges, ahead):
         ledger.flags[tile] = False
     for tile in range(ledger.flags.size):
         _find_margin(charges, ledger, edges, tile)
+
+
+@numba.njit(**ENTRY)
+def hold_image(image, charges, ledger, response, edges):
+    """Let the charge of an image act, without light."""
+    take_image(image, charges, ledger, response, edges, np.float32(0))
 
 
 @numba.njit(**INNER)
@@ -633,7 +640,7 @@ def _sort_by_row(ledger, nx, count):
         ledger.before[to] = ledger.gained[n]
 
 
-@numba.njit(**EXPANDED)
+@numba.njit(**INNER)
 def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_photon):
     """Update the charge with what the block brought; ``ahead`` times each pixel's gain is added.
 
@@ -818,7 +825,7 @@ def _spill(image, charges, ledger, j, i, flux, full_well, along_y, up):
     return kept
 
 
-@numba.njit(**EXPANDED)
+@numba.njit(**INNER)
 def _strike(ledger, j, i, nx):
     """Count an electron that meets a full pixel."""
     if ledger.strikes.size == 0:
@@ -833,20 +840,19 @@ def _strike(ledger, j, i, nx):
     ledger.strikes[j, i] = before + 1
 
 
-@numba.njit(**EXPANDED)
+@numba.njit(**INNER)
 def deposit(
     image, charges, ledger, flux, first, i, j, z, words, lo, hi, full_well, along_y, loss
 ):
-    """Add the electrons lo to hi to the image in their order; returns the flux that stays [e-].
+    """Add the electrons lo to hi to the image, in their order, and to the sums of the ledger.
 
     ``flux`` is indexed from ``first``, all else from 0.  An electron is lost with
     probability 1 - exp(-loss Q), Q [e-] the charge that it meets.
     """
     nx = charges.nx
-    added = 0.0
-    crossed = 0.0
-    off = 0.0
-    lost = 0.0
+    # One sum after the other, whatever the pieces in which electrons come.
+    added, crossed = ledger.sums[ADDED], ledger.sums[CROSSED]
+    off, lost = ledger.sums[OFF_IMAGE], ledger.sums[LOST]
     scattered = nx * charges.ny >= SCATTERED
     for n in range(np.uint64(lo), np.uint64(hi)):
         if scattered and (n - np.uint64(lo)) % np.uint64(AHEAD) == np.uint64(0):
@@ -881,7 +887,5 @@ def deposit(
                 ledger.spill_from[1, column] = -1
             _put(image, ledger, nx, cj, ci, w)
             added += w
-    ledger.sums[CROSSED] += crossed
-    ledger.sums[OFF_IMAGE] += off
-    ledger.sums[LOST] += lost
-    return added
+    ledger.sums[ADDED], ledger.sums[CROSSED] = added, crossed
+    ledger.sums[OFF_IMAGE], ledger.sums[LOST] = off, lost

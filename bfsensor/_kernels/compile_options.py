@@ -7,11 +7,11 @@ from types import FunctionType
 
 import numba
 
-from bfsensor._kernels.inner_compiler import InnerCompiler
+from bfsensor._kernels.inner_compiler import EntryCompiler, InnerCompiler
 
 ENTRY = {
     "cache": True, "nogil": True, "_nrt": False, "no_cfunc_wrapper": True,
-    "error_model": "numpy",
+    "error_model": "numpy", "pipeline_class": EntryCompiler,
 }  # fmt: skip
 """For kernels that Python calls.  Divisions by zero give inf, nan or 0, as numpy's do, without code
 that raises errors."""
@@ -20,18 +20,12 @@ INNER = {
     "_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True,
     "error_model": "numpy", "pipeline_class": InnerCompiler,
 }  # fmt: skip
-"""For kernels without code to call them from Python: such a call would end the process."""
+"""For kernels without code to call them from Python: such a call raises an error.
+
+Their code is made by the kernels that Python calls, and kept with these alone."""
 
 INLINED = {**INNER, "forceinline": True}
-"""For small ones, which the compiler copies into their callers.
-
-Unlike ``inline="always"``, by which numba copies them before it finds types, each is typed once."""
-
-EXPANDED = {**INNER, "inline": "always"}
-"""For large ones that are called in one place.
-
-What they call is then optimised for the caller alone, not once more for themselves.  Not for calls
-within numba.prange, whose results were found to be wrong then."""
+"""For small ones, which the compiler copies into their callers; each is typed once."""
 
 
 def from_python(kernel):

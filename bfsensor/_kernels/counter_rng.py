@@ -11,6 +11,7 @@ import numba
 import numpy as np
 
 from bfsensor._kernels.compile_options import INLINED, INNER
+from bfsensor._kernels.extremes import min
 
 
 @numba.njit(**INLINED)

@@ -16,7 +16,8 @@ Lines are numbered as in :mod:`bfsensor._kernels.shifts`.
 import numba
 import numpy as np
 
-from bfsensor._kernels.compile_options import EXPANDED, INLINED, INNER
+from bfsensor._kernels.compile_options import INLINED, INNER
+from bfsensor._kernels.extremes import max, min
 from bfsensor._kernels.hot import decide_hot
 from bfsensor._kernels.shifts import (
     NORMAL,
@@ -29,7 +30,7 @@ from bfsensor._kernels.shifts import (
 )
 
 
-@numba.njit(**EXPANDED)
+@numba.njit(**INNER)
 def _crossing(weights, sums, points, nearest, first, second, g, upright, layer, part, line,
               along, limit, scale, low_first, low_second):  # fmt: skip
     """Normal shift [pixel] of the polyline ``line`` where it passes ``along`` [pixel].
@@ -40,15 +41,15 @@ def _crossing(weights, sums, points, nearest, first, second, g, upright, layer, 
     """
     last = points.size - 1
     bins = nearest.size
-    other = min(max(int(np.floor(along)), -1), limit)
-    point = nearest[np.uint64(min(max(int((along - other) * bins), 0), bins - 1))]
+    other = min(max(np.int64(np.floor(along)), -1), limit)
+    point = nearest[np.uint64(min(max(np.int64((along - other) * bins), 0), bins - 1))]
     moved = along - scale * shift_of(
         weights, sums, first, second, g, upright,
         layer + np.int64(part > np.float32(0.5)), point, TANGENTIAL, line, other, low_first,
         low_second,
     )  # fmt: skip
-    other = min(max(int(np.floor(moved)), -1), limit)
-    low = nearest[np.uint64(min(max(int((moved - other) * bins), 0), bins - 1))]
+    other = min(max(np.int64(np.floor(moved)), -1), limit)
+    low = nearest[np.uint64(min(max(np.int64((moved - other) * bins), 0), bins - 1))]
     low -= np.int64(low > 0 and points[low] > moved - other)
     low = min(low, last - 1)
     lower, shift = point_shift(
@@ -207,7 +208,7 @@ def _nearest_line(across, along, upright, columns, rows):
     return line, beyond, other, np.uint64(row * (columns + 1) + column)
 
 
-@numba.njit(**EXPANDED)
+@numba.njit(**INNER)
 def _decide(edges, charges, hot, upright, across, along, z, near, count, out):
     """Find the side of the nearest line on which the electrons listed in ``near`` are."""
     nx, ny = charges.nx, charges.ny
@@ -232,7 +233,7 @@ def _decide(edges, charges, hot, upright, across, along, z, near, count, out):
         )
         layer, part = find_layer(log_z0, per_log, g.layers, z[n])
         place = along[n] - other
-        bin_ = np.uint64(min(int(place * bins), bins - 1))
+        bin_ = np.uint64(min(np.int64(place * bins), bins - 1))
         level = np.uint64(min(charges.ranges[tile], doubts.shape[1] - 1))
         inside = 0 <= line <= lines
         shift = shift_of(

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from bfsensor._kernels.compile_options import EXPANDED, INLINED, INNER
+from bfsensor._kernels.compile_options import INLINED, INNER
+from bfsensor._kernels.extremes import max, min
 from bfsensor._kernels.window import add_16_points
 
 FENCES = 16
@@ -71,7 +72,7 @@ def cool(hot):
     hot.used[1] = 0
 
 
-@numba.njit(**EXPANDED)
+@numba.njit(**INNER)
 def heat(edges, charges, hot, side, line, other):
     """Mark an edge as hot for the next block; :func:`evaluate` and :func:`fence` must follow."""
     i = line if side == 0 else other
@@ -111,13 +112,14 @@ def evaluate(edges, charges, hot, part, parts):
     pairs = q + 1
     far = (2 * q + 2) * 2 * pairs
     size = 32 * (2 + far + (16 if edges.modes == 2 else 0))
-    # One side after the other, so that their weights stay in the first-level cache.
+    # One block of points after the other, so that their weights stay in the first-level cache.
     count = hot.used[1]
-    for n in range(2 * count):
+    for n in range(2 * blocks * count):
         place = n % count
+        block = n // count
         side = np.int64(hot.edge[place, 0])
         line = np.int64(hot.edge[place, 1])
-        if side != n // count or line % parts != part:
+        if side != block // blocks or line % parts != part:
             continue
         other = np.int64(hot.edge[place, 2])
         column, row = (line - q - 1, other - q) if side == 0 else (other - q, line - q - 1)
@@ -127,23 +129,22 @@ def evaluate(edges, charges, hot, part, parts):
         low = charges.low_first[tile]
         low_second = charges.low_second[tile]
         shifts = hot.lines[place]
-        for block in range(blocks):
-            begin = np.uint64((side * blocks + block) * size)
-            to = np.uint64(32 * block)
-            for k in range(np.uint64(32)):
-                shifts[to + k] = (
-                    -edges.by_point[begin + k] * low
-                    - edges.by_point[begin + np.uint64(32) + k] * low_second
-                )
+        begin = np.uint64(block * size)
+        to = np.uint64(32 * (block % blocks))
+        for k in range(np.uint64(32)):
+            shifts[to + k] = (
+                -edges.by_point[begin + k] * low
+                - edges.by_point[begin + np.uint64(32) + k] * low_second
+            )
+        add_16_points(
+            edges.by_point, begin + np.uint64(64), charges.first, np.uint64(at), stride,
+            np.uint64(2 * q + 1 + side), np.uint64(pairs), shifts, to,
+        )  # fmt: skip
+        if edges.modes == 2:
             add_16_points(
-                edges.by_point, begin + np.uint64(64), charges.first, np.uint64(at), stride,
-                np.uint64(2 * q + 1 + side), np.uint64(pairs), shifts, to,
+                edges.by_point, begin + np.uint64(64 + 32 * far), charges.second,
+                np.uint64(at_near), stride, np.uint64(3 + side), np.uint64(2), shifts, to,
             )  # fmt: skip
-            if edges.modes == 2:
-                add_16_points(
-                    edges.by_point, begin + np.uint64(64 + 32 * far), charges.second,
-                    np.uint64(at_near), stride, np.uint64(3 + side), np.uint64(2), shifts, to,
-                )  # fmt: skip
 
 
 @numba.njit(**INLINED)
@@ -216,15 +217,33 @@ def fence(edges, charges, hot, part, parts):
                 )
                 upper = points[at_point]
                 p += 1
+                nearer, further = min(here, there), max(here, there)
+                if inside > 0 and nearer < np.float32(border - 1):
+                    # Back in steps that it has passed: their bounds are widened to hold it as well,
+                    # and those of the step that it is in where it goes back from there or returns.
+                    slope = (upper - lower) / (there - here) if further > nearer else zero
+                    if there >= here:
+                        jumps += abs(upper - lower)
+                    last = min(np.int64(np.floor(further)) + 1, np.int64(FENCES))
+                    last = min(border - 1, last)
+                    for n in range(max(np.int64(nearer), np.int64(0)), last):
+                        row = np.uint64(n)
+                        for place in (
+                            max(nearer, np.float32(n)), min(further, np.float32(n + 1)),
+                        ):  # fmt: skip
+                            away = lower + slope * (place - here) - fences[row, 0]
+                            away = abs(away - fences[row, 1] * (place - np.float32(n)))
+                            # Steps that are open, whose bounds are infinite, stay so.
+                            if away + slack > fences[row, 2]:
+                                fences[row, 2] = away + slack
+                    if further >= np.float32(border - 1):
+                        beside = lower + slope * (np.float32(border - 1) - here) - begin
+                        lowest = min(lowest, beside)
+                        highest = max(highest, beside)
                 if not started:
                     started = True
                     border = max(border, np.int64(np.ceil(there)))
                 elif there < here:
-                    if inside > 0 and there < np.float32(border - 1):
-                        # It was in that step before; it is left open with all others.
-                        fences[:] = np.float32(np.inf)
-                        border = np.int64(FENCES + 2)
-                        break
                     jumps += abs(upper - lower)
                 elif inside > 0 or there >= np.float32(border):
                     slope = (upper - lower) / (there - here) if there > here else zero
@@ -243,7 +262,7 @@ def fence(edges, charges, hot, part, parts):
                             fences[row, 1] = rise
                             fences[row, 2] = a_half * (highest - lowest) + slack
                         if inside > 2 and 0 < n <= FENCES:
-                            most = max(steep, steep_1, steep_2)
+                            most = max(max(steep, steep_1), steep_2)
                             fences[np.uint64(n - 1), 3] = spread * most
                         steep_2 = steep_1
                         steep_1 = steep
@@ -253,7 +272,7 @@ def fence(edges, charges, hot, part, parts):
                         lowest = highest = zero
                         inside += 1
                         border += 1
-                if inside > 0:
+                if inside > 0 and there >= np.float32(border - 1):
                     beside = upper - begin - rise * (there - np.float32(border - 1))
                     lowest = min(lowest, beside)
                     highest = max(highest, beside)
@@ -264,7 +283,7 @@ def fence(edges, charges, hot, part, parts):
             fences[n, 3] += jumps
 
 
-@numba.njit(**EXPANDED)
+@numba.njit(**INNER)
 def decide_hot(edges, charges, hot, upright, across, along, z, near, count, out):
     """Decide the electrons in ``near`` that are outside the bounds of hot edges.
 

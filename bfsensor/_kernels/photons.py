@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from bfsensor._kernels.compile_options import EXPANDED, INLINED, INNER
+from bfsensor._kernels.compile_options import INLINED, INNER
 from bfsensor._kernels.counter_rng import draw_words, exponentials, normals
+from bfsensor._kernels.extremes import max, min
 from bfsensor._kernels.lookups import get, looked_up, put
 
 BUFFER = 1024
@@ -123,8 +124,8 @@ def _between(map_x, map_y, u, v, factor):
     ny, nx = map_x.shape
     if not (0.0 <= u <= nx - 1 and 0.0 <= v <= ny - 1):
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    i = np.uint64(min(int(u), nx - 2))
-    j = np.uint64(min(int(v), ny - 2))
+    i = np.uint64(min(np.int64(u), nx - 2))
+    j = np.uint64(min(np.int64(v), ny - 2))
     one = np.uint64(1)
     u -= i
     v -= j
@@ -164,7 +165,7 @@ def _shift_and_slopes(pattern, x, y, ring_factor, map_factor):
         r = np.sqrt(rx * rx + ry * ry)
         at = r / pattern.ring_step
         if 0.0 < at < pattern.rings.size - 2:
-            n = np.uint64(min(int(at), pattern.rings.size - 2))
+            n = np.uint64(min(np.int64(at), pattern.rings.size - 2))
             low = pattern.rings[n]
             change = pattern.rings[n + np.uint64(1)] - low
             size = ring_factor * (low + (at - n) * change) / r
@@ -202,7 +203,7 @@ def _factors(pattern, part):
     )
 
 
-@numba.njit(**EXPANDED)
+@numba.njit(**INNER)
 def fixed_shift(pattern, x, y, part):
     """Shift (dx, dy) [pixel] of a boundary at (x, y), for ``part`` of the thickness."""
     ring_factor, map_factor = _factors(pattern, part)

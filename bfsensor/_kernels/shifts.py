@@ -13,6 +13,7 @@ import numpy as np
 
 from bfsensor._kernels.compile_options import INLINED, INNER
 from bfsensor._kernels.counter_rng import log_single
+from bfsensor._kernels.extremes import max, min
 from bfsensor._kernels.window import sum_8, sum_16, two_sums_8, two_sums_16
 
 NORMAL = np.int64(0)  # of a literal 0 numba makes a type and compiles for it as well
@@ -213,7 +214,7 @@ def find_layer(log_z0, per_log, layers, z):
         return 0, np.float32(0.0)
     at = (log_single(max(z, np.float32(1e-3))) - log_z0) * per_log
     at = min(max(at, np.float32(0.0)), np.float32(layers - 1))
-    layer = min(int(at), layers - 2)
+    layer = min(np.int64(at), layers - 2)
     return layer, at - np.float32(layer)
 
 

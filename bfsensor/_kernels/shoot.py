@@ -4,12 +4,12 @@ A block ends with the photon at which the flux since its start reaches its size.
 depend on the photons' order and flux alone.
 """
 
-from types import FunctionType
 from typing import NamedTuple
 
 import numba
 import numpy as np
 
+from bfsensor._kernels.atomics import add, exchange, give_way, observe, publish
 from bfsensor._kernels.charge import (
     ADDED,
     BEFORE,
@@ -22,8 +22,9 @@ from bfsensor._kernels.charge import (
     deposit,
     take_image,
 )
-from bfsensor._kernels.compile_options import INLINED, INNER
+from bfsensor._kernels.compile_options import ENTRY, INLINED, INNER
 from bfsensor._kernels.edges import collect
+from bfsensor._kernels.extremes import max, min
 from bfsensor._kernels.hot import evaluate, fence
 from bfsensor._kernels.photons import land
 
@@ -31,11 +32,33 @@ BATCH = 32768
 """Number of photons that land together while those of the batch before are deposited.
 
 Chosen: buffers of 2 MB; twice as large takes twice that and gives the same bits."""
-PIECE = 2048
+PIECE = 1024
 """Smallest share of a batch that is worth a thread [photon].
 
-Chosen: at some 40 ns a photon a share takes 0.1 ms, far more than to wake a thread; twice as large,
-small batches are spread over fewer shares, with the same bits."""
+Chosen: at some 20 ns a photon a share takes 0.04 ms, far more than to hand it out; twice as large,
+small blocks are spread over fewer shares, with the same bits."""
+PATIENCE = 1000
+"""Number of looks for a task after which a thread lets others run on its core between two of them.
+
+Chosen: they take a few microseconds; ten times as large, threads that wait keep others from a core that
+they share."""
+MOST_PIECES = 16
+"""Largest number of pieces of a batch, so that a bit for each says whether it is done.
+
+Chosen: it serves four threads; twice as large serves eight, while what one thread does alone bounds
+the gain at two or less."""
+NEVER = np.int64(1) << np.int64(62)
+"""Bit of a piece that no task has, by definition above those of MOST_PIECES twice: threads that serve
+wait for it until all is done."""
+# Places in the baton, int64, on three lines of memory.  The ticket of the next piece holds the number of
+# the task in its upper half, then with 16 bits each the number of pieces and the piece; -1 when all
+# is done.  DONE has a bit for each piece that is.  Then the task: how many pieces are to be collected,
+# after which come those that land; whether it is to evaluate hot edges instead; the buffer; the photons
+# to collect, and those of the batch that begins with AT to land.
+TICKET, DONE = 0, 8
+COLLECTED, HOT, NOW, LO, HI, LAND_LO, LAND_HI, AT = range(16, 24)
+N_BATON = 24
+"""Length of the baton, by definition three lines of memory."""
 
 
 class Plan(NamedTuple):
@@ -67,21 +90,8 @@ def _size(plan, total):
 
 
 @numba.njit(**INNER)
-def _settle(
-    image, plan, edges, charges, hot, ledger, response, flux, start, z, words, i, j, lo,
-    hi, size,
-):  # fmt: skip
-    """Deposit the electrons lo to hi of a batch.
-
-    A block of ``size`` electrons ends: the frozen charge is updated and hot edges are marked.
-    """
-    ledger.sums[ADDED] += deposit(
-        image, charges, ledger, flux, start, i, j, z, words, lo, hi, plan.full_well,
-        plan.spill_along_y, plan.loss,
-    )  # fmt: skip
-    ledger.counters[PHOTONS] += hi - lo
-    if ledger.sums[IN_BLOCK] < size:
-        return
+def _end_block(image, plan, edges, charges, hot, ledger, response):
+    """Update the frozen charge and mark hot edges, as all electrons of a block are deposited."""
     ahead = np.float32(0.0)
     if plan.predict and ledger.sums[IN_BLOCK] > 0:
         ahead = np.float32(0.5)
@@ -135,33 +145,119 @@ def _end_of_block(flux, ledger, start, done, count, size, whole):
     return end
 
 
-def _shoot(
+@numba.njit(**{**INNER, "_nrt": True})
+def _do_piece(
+    light, medium, pattern, plan, edges, charges, hot, number, x, y, z, words, i, j, near_x,
+    near_y, baton, piece, pieces,
+):  # fmt: skip
+    """Do one of the pieces of the task on the baton."""
+    collected, now = baton[COLLECTED], baton[NOW]
+    if baton[HOT]:
+        evaluate(edges, charges, hot, piece, pieces)
+        fence(edges, charges, hot, piece, pieces)
+    elif piece < collected:
+        lo, hi = _part(baton[LO], baton[HI], piece, collected)
+        collect(
+            edges, charges, hot, x[now], y[now], z[now], lo, hi, near_x[lo:hi],
+            near_y[lo:hi], i, j,
+        )  # fmt: skip
+    else:
+        lo, hi = _part(
+            baton[LAND_LO], baton[LAND_HI], piece - collected, pieces - collected
+        )
+        at, to = baton[AT], 1 - now
+        land(
+            light, medium, pattern, at + lo, at + hi, number + at + lo, plan.key0, plan.key1,
+            plan.x0, plan.y0, x[to, lo:hi], y[to, lo:hi], z[to, lo:hi], words[to, lo:hi],
+        )  # fmt: skip
+
+
+@numba.njit(**INLINED)
+def _part(lo, hi, piece, pieces):
+    """Begin and end of one of the pieces of lo to hi."""
+    return lo + piece * (hi - lo) // pieces, lo + (piece + 1) * (hi - lo) // pieces
+
+
+@numba.njit(**INNER)
+def _pieces(photons, threads):
+    """Number of pieces for so many photons: more than threads, as these are not free at once."""
+    if threads == 1:
+        return np.int64(photons > 0)
+    return min(min((photons + PIECE - 1) // PIECE, 4 * threads), MOST_PIECES)
+
+
+@numba.njit(**INNER)
+def _offer(baton, pieces):
+    """Offer the task on the baton to the threads that serve."""
+    baton[DONE] = 0
+    publish(baton, TICKET, (((baton[TICKET] >> 32) + 1) << 32) + (pieces << 16))
+
+
+@numba.njit(**{**INNER, "_nrt": True})
+def _work_until(
+    light, medium, pattern, plan, edges, charges, hot, number, x, y, z, words, i, j, near_x,
+    near_y, baton, wanted,
+):  # fmt: skip
+    """Do pieces of tasks until those in ``wanted``, a bit for each, are done by whomever."""
+    looks = 0
+    while observe(baton, DONE) & wanted != wanted:
+        ticket = observe(baton, TICKET)
+        piece, pieces = ticket & 0xFFFF, (ticket >> 16) & 0xFFFF
+        if ticket < 0:
+            return
+        # While a piece is left the task stays what it is; it is left where the ticket has not changed.
+        if piece < pieces:
+            if exchange(baton, TICKET, ticket, ticket + 1):
+                _do_piece(
+                    light, medium, pattern, plan, edges, charges, hot, number, x, y, z, words,
+                    i, j, near_x, near_y, baton, piece, pieces,
+                )  # fmt: skip
+                add(baton, DONE, np.int64(1) << piece)
+                looks = 0
+            continue
+        looks += 1
+        if looks > PATIENCE:
+            give_way()
+
+
+@numba.njit(**{**ENTRY, "_nrt": True})
+def shoot(
     image, light, medium, pattern, plan, edges, charges, hot, ledger, response, renew,
-    threads, x, y, z, words, i, j, near_x, near_y,
+    number, x, y, z, words, i, j, near_x, near_y, baton, threads, serve,
 ):  # fmt: skip
     """Accumulate all photons; returns the flux that stays in the image.
 
     With ``renew`` the open block ends before them; charge that is in the image at the first call acts.
-    ``x`` to ``words`` are pairs of buffers for BATCH photons, ``i`` to ``near_y`` buffers:
-    one batch lands while the one before is deposited, which only one thread can do.
-    ``image``, ``charges`` and ``ledger`` are changed.
+    ``number`` is the count of the first photon in the exposure.  ``x`` to ``words`` are pairs of buffers
+    for BATCH photons, ``i`` to ``near_y`` buffers.  ``image``, ``charges``, ``hot`` and ``ledger`` are
+    changed.
+
+    Where ``threads`` is above 1, others call with the same arguments and ``serve``: they take pieces of
+    tasks from the ``baton``, zeros at the beginning, until all is done.  Photons of a block are
+    collected, and those of the next batch land, while electrons are deposited in the photons' order by
+    this thread alone.  Who comes late, or never, is not waited for; the numbers are the same.
     """
-    ledger.sums[ADDED] = 0.0
     # Not 0, of which numba would make a type and compile all below for it as well.
-    none = np.int64(0)
+    none, one = np.int64(0), np.int64(1)
+    if serve:
+        _work_until(
+            light, medium, pattern, plan, edges, charges, hot, number, x, y, z, words, i, j,
+            near_x, near_y, baton, NEVER,
+        )  # fmt: skip
+        return 0.0
+    ledger.sums[ADDED] = 0.0
     if ledger.counters[TAKEN] == 0:
         take_image(image, charges, ledger, response, edges, np.float32(0))
     total = light.x.size
-    number = ledger.counters[PHOTONS]
-    count = min(BATCH, total)
-    pieces = threads * ((count + threads * PIECE - 1) // (threads * PIECE))
-    for piece in numba.prange(pieces):
-        lo = piece * count // pieces
-        hi = (piece + 1) * count // pieces
-        land(
-            light, medium, pattern, lo, hi, number + lo, plan.key0, plan.key1, plan.x0,
-            plan.y0, x[0, lo:hi], y[0, lo:hi], z[0, lo:hi], words[0, lo:hi],
-        )  # fmt: skip
+    # The first batch lands alone.
+    baton[COLLECTED], baton[HOT], baton[NOW], baton[AT] = 0, 0, 1, 0
+    baton[LAND_LO], baton[LAND_HI] = 0, min(BATCH, total)
+    pieces = _pieces(min(BATCH, total), threads)
+    _offer(baton, pieces)
+    _work_until(
+        light, medium, pattern, plan, edges, charges, hot, number, x, y, z, words, i, j,
+        near_x, near_y, baton, (one << pieces) - one,
+    )  # fmt: skip
     open_block = renew
     for start in range(0, max(total, 1), BATCH):
         now = start // BATCH % 2
@@ -178,46 +274,43 @@ def _shoot(
             elif plan.block > 0:
                 size = _size(plan, ledger.sums[TOTAL] - ledger.sums[IN_BLOCK])
             end = _end_of_block(light.flux, ledger, start, done, count, size, whole)
-            parts = threads * ((end - done + threads * PIECE - 1) // (threads * PIECE))
-            for part in numba.prange(parts):
-                lo = done + part * (end - done) // parts
-                hi = done + (part + 1) * (end - done) // parts
-                collect(
-                    edges, charges, hot, x[now], y[now], z[now], lo, hi, near_x[lo:hi],
-                    near_y[lo:hi], i, j,
+            # The same share of the next batch lands meanwhile.
+            lo, hi = min(done, after), min(end, after)
+            collected = _pieces(end - done, threads)
+            pieces = collected + _pieces(hi - lo, threads)
+            baton[COLLECTED], baton[HOT], baton[NOW], baton[AT] = (
+                collected,
+                0,
+                now,
+                start + count,
+            )
+            baton[LO], baton[HI], baton[LAND_LO], baton[LAND_HI] = done, end, lo, hi
+            _offer(baton, pieces)
+            for piece in range(collected):
+                _work_until(
+                    light, medium, pattern, plan, edges, charges, hot, number, x, y, z, words,
+                    i, j, near_x, near_y, baton, one << piece,
                 )  # fmt: skip
-            # The same share of the next batch.
-            first = min(done, after)
-            room = min(end, after) - first
-            others = 2 * threads if threads > 1 else 1
-            for task in numba.prange(others + 1):
-                if task == 0:
-                    _settle(
-                        image, plan, edges, charges, hot, ledger, response, light.flux,
-                        start, z[now], words[now], i, j, done, end, size,
-                    )  # fmt: skip
-                else:
-                    lo = first + (task - 1) * room // others
-                    hi = first + task * room // others
-                    at = start + count
-                    land(
-                        light, medium, pattern, at + lo, at + hi, number + at + lo,
-                        plan.key0, plan.key1, plan.x0, plan.y0, x[1 - now, lo:hi],
-                        y[1 - now, lo:hi], z[1 - now, lo:hi], words[1 - now, lo:hi],
-                    )  # fmt: skip
-            if ledger.sums[IN_BLOCK] == 0.0 and hot.used[1] > 0:
-                for part in numba.prange(threads):
-                    evaluate(edges, charges, hot, np.int64(part), threads)
-                    fence(edges, charges, hot, np.int64(part), threads)
+                lo, hi = _part(done, end, piece, collected)
+                deposit(
+                    image, charges, ledger, light.flux, start, i, j, z[now], words[now], lo, hi,
+                    plan.full_well, plan.spill_along_y, plan.loss,
+                )  # fmt: skip
+                ledger.counters[PHOTONS] += hi - lo
+            ended = ledger.sums[IN_BLOCK] >= size
+            if ended:
+                _end_block(image, plan, edges, charges, hot, ledger, response)
+            _work_until(
+                light, medium, pattern, plan, edges, charges, hot, number, x, y, z, words, i,
+                j, near_x, near_y, baton, (one << pieces) - one,
+            )  # fmt: skip
+            if ended and hot.used[1] > 0:
+                baton[HOT] = 1
+                _offer(baton, np.int64(threads))
+                _work_until(
+                    light, medium, pattern, plan, edges, charges, hot, number, x, y, z, words,
+                    i, j, near_x, near_y, baton, (one << threads) - one,
+                )  # fmt: skip
             done = end
+    publish(baton, TICKET, -one)
     return ledger.sums[ADDED]
-
-
-shoot = numba.njit(cache=True, nogil=True, no_cfunc_wrapper=True)(_shoot)
-# Under a name of its own: numba's cache knows functions by name and line, and would give
-# back the code for one thread.
-_shoot_on_threads = FunctionType(_shoot.__code__, globals(), "_shoot_on_threads")
-_shoot_on_threads.__qualname__ = "_shoot_on_threads"
-shoot_on_threads = numba.njit(cache=True, nogil=True, no_cfunc_wrapper=True, parallel=True)(
-    _shoot_on_threads
-)

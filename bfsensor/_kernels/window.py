@@ -195,3 +195,92 @@ add_16_points = _make_by_point()
 ``weights`` [rows, 2 pairs, 2, 16] from index ``first`` on, ``charges`` as for :func:`sum_8`;
 ``out`` [2, 16] from index ``at`` on is changed.  All flat float32 arrays, indices uint64.
 """
+
+
+def _make_by_kernel():
+    """Make the sums over the windows around 16 pixels of a row for eight sets of weights at once."""
+    if numba.config.DISABLE_JIT:
+
+        def plain(weights, first, charges, start, stride, rows, columns, out):
+            w = int(first)
+            for r in range(int(rows)):
+                for c in range(int(columns)):
+                    at = int(start) + r * int(stride) + c
+                    out += weights[w : w + 8, None] * charges[at : at + 16]
+                    w += 8
+
+        return plain
+
+    @intrinsic
+    def compiled(typingctx, weights, first, charges, start, stride, rows, columns, out):
+        whole = types.uint64
+        signature = types.void(weights, whole, charges, whole, whole, whole, whole, out)
+
+        def codegen(context, builder, sig, args):
+            wide = ir.IntType(64)
+            number = context.get_value_type(sig.args[0].dtype)
+            pixels = ir.VectorType(number, 16)
+            single = ir.VectorType(ir.FloatType(), 16)
+            w, c, o = (
+                context.make_array(sig.args[n])(context, builder, args[n]).data
+                for n in (0, 2, 7)
+            )
+            places = [
+                builder.bitcast(
+                    builder.gep(o, [ir.Constant(wide, 16 * k)]), pixels.as_pointer()
+                )
+                for k in range(8)
+            ]
+
+            def load(pointer, align):
+                value = builder.load(pointer)
+                value.align = align
+                return value
+
+            align = context.get_abi_sizeof(number)
+            sums = [
+                cgutils.alloca_once_value(builder, load(place, align)) for place in places
+            ]
+            undefined = ir.Constant(pixels, ir.Undefined)
+            all_first = ir.Constant(ir.VectorType(ir.IntType(32), 16), [0] * 16)
+            size_w = builder.mul(args[6], ir.Constant(wide, 8))
+            with cgutils.for_range(builder, args[5], intp=wide) as row:
+                row_w = builder.add(args[1], builder.mul(row.index, size_w))
+                row_c = builder.add(args[3], builder.mul(row.index, args[4]))
+                with cgutils.for_range(builder, args[6], intp=wide) as column:
+                    at = builder.gep(c, [builder.add(row_c, column.index)])
+                    charge = load(builder.bitcast(at, single.as_pointer()), 4)
+                    if number != ir.FloatType():
+                        charge = builder.fpext(charge, pixels)
+                    at_w = builder.add(
+                        row_w, builder.mul(column.index, ir.Constant(wide, 8))
+                    )
+                    for k, total in enumerate(sums):
+                        weight = builder.load(
+                            builder.gep(w, [builder.add(at_w, ir.Constant(wide, k))])
+                        )
+                        weight = builder.insert_element(
+                            undefined, weight, ir.Constant(ir.IntType(32), 0)
+                        )
+                        weight = builder.shuffle_vector(weight, undefined, all_first)
+                        product = builder.fmul(weight, charge, flags=("contract",))
+                        added = builder.fadd(
+                            product, builder.load(total), flags=("contract",)
+                        )
+                        builder.store(added, total)
+            for total, place in zip(sums, places, strict=True):
+                builder.store(builder.load(total), place).align = align
+            return context.get_dummy_value()
+
+        return signature, codegen
+
+    return compiled
+
+
+add_8_kernels = _make_by_kernel()
+"""Add to 16 pixels' sums by 8 kernels: (weights, first, charges, start, stride, rows, columns, out).
+
+``weights`` [rows, columns, 8] flat from index ``first`` on, of single or double precision as ``out``
+[8, 16], which is changed; ``charges`` float32, flat, from ``start`` on with ``stride`` from row to row.
+15 charges beyond the window of the last pixel that counts are read as well.  Indices are uint64.
+"""

@@ -8,21 +8,18 @@ from typing import Any
 import click
 
 # Measured CPU seconds with an empty cache, on the machine of the notice in bfsensor._kernels.notice:
-# images 21, areas 7, threads 21, tables 5 of their own and a table of 4.
-_IMAGES, _AREAS, _THREADS, _TABLES = 21, 7, 21, 9
+# images 15, areas 9, tables 5 of their own and a table of 4.
+_IMAGES, _AREAS, _TABLES = 15, 9, 9
 
 
 @click.command("warm", short_help="Compile the kernels of the sensors.")
 @click.option("--areas", is_flag=True,
               help="Also compile the kernels of calculate_pixel_areas, about "
               f"{_AREAS} CPU s.")  # fmt: skip
-@click.option("--threads", is_flag=True,
-              help=f"Also compile the kernels of sensors with threads=2 or more, about "
-              f"{_THREADS} CPU s.")  # fmt: skip
 @click.option("--tables", is_flag=True,
               help=f"Also compile the kernels of 'bfsensor table', about {_TABLES} CPU s.")  # fmt: skip
 @click.option("--all", "everything", is_flag=True, help="All of these.")
-def warm(areas: bool, threads: bool, tables: bool, everything: bool) -> None:
+def warm(areas: bool, tables: bool, everything: bool) -> None:
     """Compile the kernels of the sensors now, so that the first image does not wait.
 
     Without this command kernels are compiled on first use.  Compiled kernels are kept on disk, for
@@ -40,13 +37,13 @@ def warm(areas: bool, threads: bool, tables: bool, everything: bool) -> None:
     from bfsensor._kernels import shoot
     from bfsensor._kernels.notice import notice
 
-    areas, threads, tables = (part or everything for part in (areas, threads, tables))
-    seconds = _IMAGES + _AREAS * areas + _THREADS * threads + _TABLES * tables
+    areas, tables = (part or everything for part in (areas, tables))
+    seconds = _IMAGES + _AREAS * areas + _TABLES * tables
     click.echo(f"compiling the kernels that are missing: about {seconds} s, once", err=True)
     notice.given = True  # said just now
     began = time.perf_counter()
     with event.install_recorder("numba:compile") as recorder:
-        _use_sensors(areas=areas, threads=threads)
+        _use_sensors(areas=areas)
         if tables:
             _use_tables()
     kernels = {
@@ -59,25 +56,22 @@ def warm(areas: bool, threads: bool, tables: bool, everything: bool) -> None:
     click.echo(f"{done}, {took:.0f} s; kept in {shoot.shoot.stats.cache_path}")
 
 
-def _use_sensors(*, areas: bool, threads: bool) -> None:
+def _use_sensors(*, areas: bool) -> None:
     """Draw a few photons, and what else is asked for."""
     import galsim
     import numpy as np
 
-    from bfsensor._kernels.shoot import PIECE
     from bfsensor.sensor.brighter_fatter import BrighterFatterSensor
 
     rings = galsim.LookupTable([0.0, 100.0], [0.0, 0.01], interpolant="linear")
     options: list[dict[str, Any]] = [{}]
     options += [{"treering_func": rings}] if areas else []
-    options += [{"threads": 2}] if threads else []
     for given in options:
         sensor = BrighterFatterSensor(rng=galsim.BaseDeviate(7321), **given)
         # Areas of large images are summed in single precision, by code of its own.
         for side in (9, 512) if areas else (9,):
             image = galsim.Image(side, side, dtype=np.float32)
-            # Fewer would not be worth a second thread.
-            middle = np.full(2 * PIECE if "threads" in given else 10, 5.0)
+            middle = np.full(10, 5.0)
             photons = galsim.PhotonArray(len(middle), x=middle, y=middle, flux=1)
             sensor.accumulate(photons, image)
             if areas:

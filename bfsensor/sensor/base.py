@@ -12,14 +12,13 @@ import galsim
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor._kernels.areas import convolved_areas, pixel_areas, times_ring_areas
-from bfsensor._kernels.photons import Light, Pattern
-from bfsensor._kernels.shifts import Charges
+from bfsensor._kernels.photons import Light
 from bfsensor.errors import SensorError, SensorTypeError
 from bfsensor.sensor.applied_effects import AppliedEffects
-from bfsensor.sensor.area_kernels import AreaKernels, area_kernels
+from bfsensor.sensor.area_kernels import AreaKernels, Convolution, area_kernels
 from bfsensor.sensor.image_exposure import ImageExposure, Physics
 from bfsensor.sensor.options import check_flag, check_instance, check_threads, shown
+from bfsensor.sensor.pattern_areas import times_pattern_areas
 from bfsensor.sensor.shift_maps import ShiftMap, make_pattern, sample_rings
 from bfsensor.sensor.threads import count_threads
 from bfsensor.typing import FloatArray
@@ -27,27 +26,10 @@ from bfsensor.typing import FloatArray
 _EMPTY = np.zeros(0)
 """Array in place of slopes or wavelengths that photons do not carry (by definition empty)."""
 
-_LARGE = 512 * 512
-"""Number of pixels from which areas are summed in single precision.
+_BAND = 512 * 512
+"""Number of pixels whose areas are computed together, in double precision.
 
-Chosen: double precision takes twice as long and gains 1e-7 of an area; twice as large keeps it for
-images up to 724 pixels wide."""
-
-_SMALL_AREA = 2e-8
-"""Largest contribution to an area [nominal area] for which a kernel is left out.
-
-Chosen: below the resolution of single precision, 6e-8; twice as large leaves out kernels that are
-still below it."""
-
-_RING_AREA = 1e-6
-"""Largest error of an area [nominal area] by two points a side; above it polygons are drawn.  Chosen: a
-hundredth of the photon noise of 1e8 electrons; rings of 0.26 pixel a period of 47 leave 4e-8."""
-
-_FROM_CENTRE = 30.0
-"""Distance of the rings' centre from an image [pixel] from which a pixel's area follows from the mean
-shifts of its sides.  Derived: with the shift g by radius the stretches across and along the rings vary
-together within a pixel by g' g'' / (12 distance), 5e-7 for rings of 0.26 pixel a period of 47; at twice
-the distance half of that."""
+Chosen: 2 MB, a sixteenth of what 4 million pixels would take; twice as large takes twice that."""
 
 
 class EngineSensor(galsim.SiliconSensor):
@@ -212,7 +194,7 @@ class EngineSensor(galsim.SiliconSensor):
         SensorTypeError
             The image is not of float32 or float64, or an argument has another type.
         SensorError
-            Photons with flux, or an image, with values that are not
+            Photons with flux, or an image at a call without ``resume``, with values that are not
             finite; photons of negative wavelength.  The image is unchanged after any error.
         """
         resume, recalc = check_flag("resume", resume), check_flag("recalc", recalc)
@@ -323,105 +305,41 @@ class EngineSensor(galsim.SiliconSensor):
         array = pixels_of(image, write=False)
         self._check_finite(array)
         pattern = self._place_pattern(image, orig_center)
-        out = np.empty(array.shape)
-        fixed = any(p.size > 0 for p in (pattern.rings, pattern.map_x, pattern.edge_x))
+        convolution = None
         if use_flux:
+            if self._kernels is None:
+                self._kernels = area_kernels(self._physics.edges)
             exposure = ImageExposure(array, self._physics, pattern, (0.0, 0.0), (0, 0))
-            self._convolve(exposure.charges, out, float(exposure.ledger.outside[0]))
-        else:
-            out[...] = 1.0
-        # Electrons meet rings and maps on their way, the charge's shifts above the wells: what
-        # lands in a pixel comes from its area as the charge has it, stretched by the pattern.
-        if fixed and self._rings_only(pattern, array.shape):
-            times_ring_areas(pattern, out)
-        elif fixed:
-            stretch = np.empty(array.shape)
-            pixel_areas(
-                self._physics.edges, _no_charges(array.shape, self._physics), pattern, False,
-                np.float32(0), np.float32(0), 0, array.shape[0], stretch,
+            outside = float(exposure.ledger.outside[0])
+            if self.surroundings == "mirrored":
+                outside = math.nan
+            convolution = Convolution(self._kernels, exposure.charges, outside)
+        areas = np.empty(array.shape, array.dtype)
+        # A few rows at a time are in double precision: memory that is touched for the first time takes
+        # as long as what is computed in it.
+        ny, nx = array.shape
+        rows = max(_BAND // nx, 1)
+        band = np.empty((min(rows, ny), nx))
+        for first in range(0, ny, rows):
+            out = band[: min(rows, ny - first)]
+            if convolution is None:
+                out[...] = 1.0
+            else:
+                convolution.write(first, out)
+            # Electrons meet rings and maps on their way, the charge's shifts above the wells: what
+            # lands in a pixel comes from its area as the charge has it, stretched by the pattern.
+            moved = pattern._replace(
+                ring_y=pattern.ring_y - first, map_0y=pattern.map_0y - first,
+                edge_0y=pattern.edge_0y - first,
             )  # fmt: skip
-            out *= stretch
+            times_pattern_areas(moved, self._physics.edges, out)
+            areas[first : first + len(out)] = out
         return galsim.Image(
-            out.astype(array.dtype, copy=False), xmin=image.bounds.xmin,
-            ymin=image.bounds.ymin, wcs=galsim.PixelScale(1.0),
-        )  # fmt: skip
-
-    def _rings_only(self, pattern: Pattern, shape: tuple[int, int]) -> bool:
-        """Whether nothing but smooth rings shifts boundaries, whose centre is not in the image."""
-        away = max(
-            abs(centre - size / 2) - size / 2
-            for centre, size in ((pattern.ring_x, shape[1]), (pattern.ring_y, shape[0]))
+            areas,
+            xmin=image.bounds.xmin,
+            ymin=image.bounds.ymin,
+            wcs=galsim.PixelScale(1.0),
         )
-        alone = pattern.map_x.size == 0 and pattern.edge_x.size == 0
-        return alone and away > _FROM_CENTRE and _quadrature_error(pattern) < _RING_AREA
-
-    def _convolve(self, charges: Charges, out: FloatArray, outside: float) -> None:
-        """Areas by convolution, with as many kernels as matter for these charges and that outside."""
-        if self._kernels is None:
-            self._kernels = area_kernels(self._physics.edges)
-        kernels = self._kernels
-        low, low_second = _lowest(charges)
-        inner = max(
-            float(_inside(charges, charges.first).max() - low),
-            float(_inside(charges, charges.second).max(initial=low_second) - low_second),
-        )
-        ny, nx = out.shape
-        # Single precision is good to 1e-7 and twice as fast; small images, where the time hardly
-        # matters, are summed in double precision as GalSim's are.
-        kind = np.float64 if out.size < _LARGE else np.float32
-        row = np.empty(nx, kind)
-        # Beyond the image there may be no charge, so that pixels near its border see a larger spread
-        # of charge and may need more kernels.
-        reach = kernels.linear[0].shape[0] // 2
-        y0, x0 = min(reach, ny), min(reach, nx)
-        y1, x1 = max(ny - reach, y0), max(nx - reach, x0)
-        outer = inner
-        if self.surroundings != "mirrored":
-            above = float(low) - outside
-            outer = max(inner, abs(above), above + inner)
-        for spread, area in (
-            (inner, (y0, y1, x0, x1)), (outer, (0, y0, 0, nx)), (outer, (y1, ny, 0, nx)),
-            (outer, (y0, y1, 0, x0)), (outer, (y0, y1, x1, nx)),
-        ):  # fmt: skip
-            count = int(np.sum(np.abs(kernels.values) * (0.5 * spread) ** 2 > _SMALL_AREA))
-            first, second = (
-                np.concatenate([linear[None], squares[:count]]).astype(kind)
-                for linear, squares in zip(kernels.linear, kernels.squares, strict=True)
-            )
-            convolved_areas(
-                charges, first, second, kernels.values, count, low, low_second, *area, row,
-                out,
-            )  # fmt: skip
-
-
-def _quadrature_error(pattern: Pattern) -> float:
-    """Error of a pixel's area by two points of Gauss a side: 1/4320 of the fourth derivative."""
-    a_pixel = max(round(1.0 / pattern.ring_step), 1)
-    changes = np.diff(pattern.rings[:-2:a_pixel], 4)
-    return 2.0 * float(np.abs(changes).max(initial=0.0)) / 4320.0
-
-
-def _inside(charges: Charges, array: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Cut the pixels of the image out of a padded array."""
-    if not array.size:
-        return array
-    pad, rows = charges.pad, charges.ny + 2 * charges.pad
-    grid = array[: rows * charges.stride].reshape(rows, charges.stride)
-    return grid[pad : pad + charges.ny, pad : pad + charges.nx]
-
-
-def _lowest(charges: Charges) -> tuple[np.float32, np.float32]:
-    """Lowest effective charge of both modes in the image."""
-    first, second = (_inside(charges, a) for a in (charges.first, charges.second))
-    return first.min(), second.min() if second.size else np.float32(0)
-
-
-def _no_charges(shape: tuple[int, int], physics: Physics) -> Charges:
-    """Geometry of an image with empty arrays for its charge."""
-    none = np.zeros(0, np.float32)
-    return Charges(
-        none, none, 1, 0, shape[1], shape[0], none, none, none, np.zeros(0, np.int64)
-    )
 
 
 def pixels_of(image: galsim.Image, *, write: bool = True) -> NDArray[np.floating]:

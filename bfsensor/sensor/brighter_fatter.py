@@ -38,6 +38,7 @@ from bfsensor.sensor.options import (
     outside_charge,
     read_device,
     shown,
+    truth_as_number,
 )
 from bfsensor.sensor.shift_maps import ShiftMap
 from bfsensor.simulate.mean_field import STEPS
@@ -152,7 +153,7 @@ class BrighterFatterSensor(EffectSensor):
         are lost.  A sky or flat without a frame of small pixels needs 'mirrored', or its level.
     threads : int, optional
         Largest number of threads of one call, at least 1; the result does not depend on it.  By
-        default as many as ``galsim.get_omp_threads()`` says at each call of 262,144 photons or
+        default as many as ``galsim.get_omp_threads()`` says at each call of 65,536 photons or
         more, otherwise 1.  Blocks of few photons use fewer.
     table : DistortionTable, optional
         A table in memory, in place of ``name``.
@@ -256,13 +257,15 @@ class BrighterFatterSensor(EffectSensor):
         layout: Layout | Mapping[str, Any] | None = None,
     ) -> None:
         self._take_table(name, table)
-        self.strength = check_number("strength", strength, low=-LARGEST, high=LARGEST)
+        self.strength = check_number(
+            "strength", truth_as_number(strength), low=-LARGEST, high=LARGEST
+        )
         self.rng = make_rng(rng)
         self.diffusion_factor = check_number(
-            "diffusion_factor", diffusion_factor, low=0.0, high=LARGEST
+            "diffusion_factor", truth_as_number(diffusion_factor), low=0.0, high=LARGEST
         )
         self.qdist = check_reach(qdist, self.table, self.name)
-        self.nrecalc = check_number("nrecalc", nrecalc, low=0.0)
+        self.nrecalc = check_number("nrecalc", truth_as_number(nrecalc), low=0.0)
         check_rings(treering_func, treering_center)
         self.treering_func, self.treering_center = treering_func, treering_center
         self.transpose = check_flag("transpose", transpose)
@@ -294,6 +297,7 @@ class BrighterFatterSensor(EffectSensor):
         """Keep the table, read by name unless it is given."""
         what = "a built-in device or the path of a table"
         self.name = check_path("name", name, what) if table is None else "table"
+        self._table_name = f"table of {self.name}" if table is None else "given table"
         # A table that was read is pickled as its path, not as its 18 MB.
         self._source = find_table(self.name) if table is None else None
         self.table = load_table(*self._source) if self._source else check_table(table)
@@ -404,7 +408,7 @@ class BrighterFatterSensor(EffectSensor):
         last = float(self.table.charges[-1])
         if self.beyond == "error" and highest > max(last, self._table_well()):
             raise SensorError(
-                f"a pixel holds {highest:.0f} e-; the table of {self.name} ends at "
+                f"a pixel holds {highest:.0f} e-; the {self._table_name} ends at "
                 f"{max(last, self._table_well()):.0f} e-"
             )
 
@@ -503,7 +507,7 @@ class BrighterFatterSensor(EffectSensor):
             self._outside(
                 "deep light",
                 f"{100 * deep:.2g} % of light of {high:g} nm converts below {floor:g} um; the lowest "
-                f"depth of the table of {self.name} is {first:g} um",
+                f"depth of the {self._table_name} is {first:g} um",
                 "its shifts are used below it",
                 ": make one with lower depths",
             )
@@ -519,7 +523,7 @@ class BrighterFatterSensor(EffectSensor):
             if first > storage_height(self._device) + 1.0:
                 self._outside(
                     "deep light",
-                    f"light converts {height:g} um above the gates; the table of {self.name} begins "
+                    f"light converts {height:g} um above the gates; the {self._table_name} begins "
                     f"at {first:g} um",
                     "its shifts are used below it",
                     ": make one with lower depths",
@@ -528,8 +532,8 @@ class BrighterFatterSensor(EffectSensor):
         if last >= _COVERED * self.table.thickness:
             return
         text = (
-            f"light converts up to {self.table.thickness:g} um above the gates; the table of "
-            f"{self.name} ends at {last:g} um"
+            f"light converts up to {self.table.thickness:g} um above the gates; the "
+            f"{self._table_name} ends at {last:g} um"
         )
         self._outside(
             "high light", text, "its shifts are used above it",
@@ -545,7 +549,7 @@ class BrighterFatterSensor(EffectSensor):
             return
         self._said.add("charge")
         warnings.warn(
-            f"pixels hold more charge than the table of {self.name}, which ends at "
+            f"pixels hold more charge than the {self._table_name}, which ends at "
             f"{max(self.table.charges[-1], self._table_well()):.0f} e-: the response of the last "
             "level is used (diagnostics counts such pixels; beyond='error' refuses)",
             galsim.GalSimWarning,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -183,7 +184,7 @@ def _find(name: str) -> Path:
     if name in CAMERAS:
         return Path(__file__).parent / "focal_planes" / f"{CAMERAS[name]}.ecsv"
     path = Path(name)
-    if path.suffix not in (".ecsv", ".csv") or not path.is_file():
+    if path.suffix not in (".ecsv", ".csv") or not os.path.isfile(path):
         raise SensorError(
             f"focal_plane = {name!r} is neither a camera ({', '.join(CAMERAS)}) nor an .ecsv or "
             f".csv file{did_you_mean(name, CAMERAS)}"

@@ -5,8 +5,10 @@ from __future__ import annotations
 import copy
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,6 @@ from bfsensor._kernels.charge import TILE, Ledger, Pixels, Response
 from bfsensor._kernels.hot import FENCES, Hot
 from bfsensor._kernels.photons import Light, Medium, Pattern
 from bfsensor._kernels.shifts import Charges, Edges
-from bfsensor.sensor.threads import threads_to_use
 from bfsensor.typing import FloatArray
 
 _HOT_PAGES, _HOT_EDGES = 256, 4096
@@ -26,7 +27,7 @@ _HOT_PAGES, _HOT_EDGES = 256, 4096
 # stars; further edges are evaluated electron by electron, which is slower with the same result.
 
 _SHARE = _shoot.PIECE
-"""Number of photons of a block that is worth a thread, by definition the kernel's smallest share."""
+"""Number of photons that is worth a thread, by definition the kernel's smallest share."""
 
 _EMPTY = np.zeros(0, np.float32)
 """Array in place of one that a sensor does not need (by definition empty)."""
@@ -142,9 +143,9 @@ class ImageExposure:
             loss=float(physics.loss),
         )
         if taken:
-            _charge.take_image(
+            _charge.hold_image(
                 as_pixels(np.ascontiguousarray(image)), self.charges, self.ledger,
-                physics.response, physics.edges, np.float32(0),
+                physics.response, physics.edges,
             )  # fmt: skip
 
     def add(
@@ -156,19 +157,27 @@ class ImageExposure:
         """
         p = self.physics
         with _in_rows(image) as pixels:
-            arguments: Any = (
-                pixels, light, p.medium, self.pattern, self.plan, p.edges, self.charges,
-                self.hot, self.ledger, p.response, renew,
+            baton = np.zeros(_shoot.N_BATON, np.int64)
+            call = partial(
+                _shoot.shoot, pixels, light, p.medium, self.pattern, self.plan, p.edges,
+                self.charges, self.hot, self.ledger, p.response, renew,
+                int(self.ledger.counters[_charge.PHOTONS]), *_buffers(), baton,
             )  # fmt: skip
-            with threads_to_use(self._busy_threads(light.x.size)) as threads:
-                kernel = _shoot.shoot if threads == 1 else _shoot.shoot_on_threads
-                return float(kernel(*arguments, threads, *_buffers()))
+            threads = self._busy_threads(light.x.size)
+            if threads == 1:
+                return float(call(1, False))
+            with ThreadPoolExecutor(threads - 1) as executor:
+                for _ in range(threads - 1):
+                    executor.submit(call, threads, True)
+                try:
+                    return float(call(threads, False))
+                finally:
+                    # Those that serve end, also where an error ended this call before its kernel ran.
+                    baton[_shoot.TICKET] = -1
 
     def _busy_threads(self, photons: int) -> int:
-        """Return how many of the threads have a share of each block that is worth waking for."""
-        block = self.physics.block
-        largest = min(photons, block) if block > 0 else photons
-        return max(1, min(self.threads, int(largest // _SHARE)))
+        """Return how many of the threads have a share of the photons that is worth their start."""
+        return max(1, min(self.threads, photons // _SHARE))
 
     def copy(self) -> ImageExposure:
         """Return an independent copy."""
@@ -256,9 +265,7 @@ def _outside(physics: Physics) -> tuple[float, float, float]:
     alone = replace(physics, surroundings=np.nan)
     image = np.array([[level]])
     charges, ledger = _allocate(image, alone)
-    _charge.take_image(
-        as_pixels(image), charges, ledger, physics.response, physics.edges, np.float32(0)
-    )
+    _charge.hold_image(as_pixels(image), charges, ledger, physics.response, physics.edges)
     second = charges.second[0] if charges.second.size else 0.0
     return float(charges.first[0]), float(second), level
 

@@ -54,16 +54,21 @@ def find_table(name: str) -> tuple[str, int]:
     folder = tables_dir()
     path = Path(name)
     others = path.suffix in (".toml", ".cfg", ".dat")
-    if not str(name).endswith((".fits", ".fits.gz")) and (others or not path.is_file()):
+    # os.path.isfile is False for names that no file can have, where Path.is_file may raise.
+    if not str(name).endswith((".fits", ".fits.gz")) and (
+        others or not os.path.isfile(path)
+    ):
         path = folder / str(name) / "table.fits"
-        if not path.is_file():
+        if not os.path.isfile(path):
             _refuse_other_files(str(name))
             known = sorted(p.parent.name for p in folder.glob("*/table.fits"))
             raise SensorError(
-                f"name = {str(name)!r} is neither a built-in table ({', '.join(known)}) nor "
+                f"name = {shown(str(name))} is neither a built-in table ({', '.join(known)}) nor "
                 f"a .fits file{did_you_mean(str(name), known)}"
             )
-    return str(path.resolve()), path.stat().st_mtime_ns if path.exists() else 0
+    if not os.path.exists(path):
+        return str(path), 0
+    return str(path.resolve()), path.stat().st_mtime_ns
 
 
 def _refuse_other_files(name: str) -> None:
@@ -74,7 +79,7 @@ def _refuse_other_files(name: str) -> None:
             f"{name}` and give the .fits file that it writes"
         )
     stem = name.removesuffix(".cfg").removesuffix(".dat")
-    if Path(f"{stem}.cfg").is_file() or (galsim_folder() / f"{stem}.cfg").is_file():
+    if any(os.path.isfile(f"{start}.cfg") for start in (stem, galsim_folder() / stem)):
         raise SensorError(
             f"{name} is a table in GalSim's format: give it to bfsensor.SiliconSensor; "
             "BrighterFatterSensor takes tables made by `bfsensor table`"
@@ -142,7 +147,7 @@ def check_reach(qdist: int | None, table: DistortionTable, name: str) -> int:
     """Return the distance at which charge acts [pixel], by default the table's reach."""
     if qdist is None:
         return table.reach
-    number = to_float(qdist)
+    number = to_float(truth_as_number(qdist))
     if not (number.is_integer() and 0 <= number <= table.reach):
         raise wrong_value(
             qdist,
@@ -225,9 +230,7 @@ def check_shape(name: str, value: tuple[int, int]) -> tuple[int, int]:
 
 def check_flag(name: str, value: bool) -> bool:
     """Return True or False; refuse anything but these, 1 and 0."""
-    if isinstance(value, bool):
-        return value
-    number = math.nan if isinstance(value, str) else to_float(value)
+    number = math.nan if isinstance(value, str) else to_float(truth_as_number(value))
     if number not in (0.0, 1.0):
         raise wrong_value(value, f"{name} = {shown(value)} must be True or False")
     return bool(number)
@@ -307,10 +310,15 @@ def wrong_value(value: Any, text: str) -> SensorError:
     return SensorTypeError(text)
 
 
+def truth_as_number(value: Any) -> Any:
+    """Return 1 and 0 for True and False, which GalSim takes for numbers; anything else as it is."""
+    return int(value) if isinstance(value, bool | np.bool_) else value
+
+
 def to_float(value: Any) -> float:
-    """Convert a number or its text, as GalSim does; nan stands for anything else."""
+    """Convert a number or its text, as GalSim does; nan stands for anything else, also for True."""
     try:
-        if np.ndim(value) or np.iscomplexobj(value):
+        if isinstance(value, bool | np.bool_) or np.ndim(value) or np.iscomplexobj(value):
             return math.nan
         return float(value)
     except (TypeError, ValueError, OverflowError):

@@ -27,6 +27,8 @@ from bfsensor.sensor.options import (
     check_whole,
     galsim_folder,
     outside_charge,
+    shown,
+    truth_as_number,
 )
 from bfsensor.simulate.mean_field import STEPS
 from bfsensor.table.galsim_format import read_sides
@@ -96,7 +98,7 @@ class SiliconSensor(EngineSensor):
         are lost.  A sky or flat without a frame of small pixels needs 'mirrored', or its level.
     threads : int, optional
         Largest number of threads of one call, at least 1; the result does not depend on it.  By
-        default as many as ``galsim.get_omp_threads()`` says at each call of 262,144 photons or
+        default as many as ``galsim.get_omp_threads()`` says at each call of 65,536 photons or
         more, otherwise 1.  Blocks of few photons use fewer.
 
     Raises
@@ -141,13 +143,17 @@ class SiliconSensor(EngineSensor):
     ) -> None:
         self.name = check_path("name", name, "the stem of a .cfg and a .dat file")
         self.surroundings = check_surroundings(surroundings)
-        self.strength = check_number("strength", strength, low=-LARGEST, high=LARGEST)
+        self.strength = check_number(
+            "strength", truth_as_number(strength), low=-LARGEST, high=LARGEST
+        )
         self.rng = make_rng(rng)
         self.diffusion_factor = check_number(
-            "diffusion_factor", diffusion_factor, low=0.0, high=LARGEST
+            "diffusion_factor", truth_as_number(diffusion_factor), low=0.0, high=LARGEST
         )
-        self.qdist = check_whole("qdist", qdist)
-        self.nrecalc = check_number("nrecalc", nrecalc, low=0.0, infinite=True)
+        self.qdist = check_whole("qdist", truth_as_number(qdist))
+        self.nrecalc = check_number(
+            "nrecalc", truth_as_number(nrecalc), low=0.0, infinite=True
+        )
         check_rings(treering_func, treering_center)
         self.treering_func = treering_func
         self.treering_center = treering_center
@@ -295,9 +301,8 @@ def _find(name: str) -> tuple[str, str]:
             if not os.path.isfile(stem + ".dat"):
                 raise OSError(f"cannot find the vertex file {stem}.dat")
             return stem + ".cfg", stem + ".dat"
-    if (
-        name.endswith((".fits", ".fits.gz"))
-        or (tables_dir() / name / "table.fits").is_file()
+    if name.endswith((".fits", ".fits.gz")) or os.path.isfile(
+        tables_dir() / name / "table.fits"
     ):
         raise OSError(
             f"{name} is a table of bfsensor: give it to BrighterFatterSensor; SiliconSensor takes "
@@ -305,7 +310,8 @@ def _find(name: str) -> tuple[str, str]:
         )
     known = sorted(path.stem for path in galsim_folder().glob("*.cfg"))
     raise OSError(
-        f"cannot find {name}.cfg, here or as {shipped}.cfg{did_you_mean(name, known)}"
+        f"name = {shown(name)}: neither here nor in {galsim_folder()} is there a file of this name "
+        f"and .cfg{did_you_mean(name, known)}"
     )
 
 

@@ -133,7 +133,7 @@ def read_fields(path: str | os.PathLike[str]) -> dict[str, Any]:
         The file is missing, of another kind or schema, or damaged; the message names it.
     """
     path = Path(path)
-    if not path.exists():
+    if not os.path.exists(path):
         raise TableError(f"{path}: no such file")
     try:
         with warnings.catch_warnings():

@@ -27,7 +27,8 @@ def put(
 ):  # fmt: skip
     """Deposit electrons in pixels (i, j); returns what stays."""
     count = len(i)
-    return deposit(
+    before = exposure.ledger.sums[kernel.ADDED]
+    deposit(
         as_pixels(image), exposure.charges, exposure.ledger,
         np.ascontiguousarray(np.broadcast_to(np.asarray(flux, float), count)), 0,
         np.asarray(i, np.int32), np.asarray(j, np.int32),
@@ -35,6 +36,7 @@ def put(
         np.zeros(count, np.uint32) if words is None else np.asarray(words, np.uint32),
         0, count, float(full_well), along_y, loss,
     )  # fmt: skip
+    return exposure.ledger.sums[kernel.ADDED] - before
 
 
 def close(sensor, exposure, image, ahead=0.0, crowd=np.inf):

@@ -6,6 +6,7 @@ import pytest
 from bfsensor._kernels import hot as hot_kernel
 from bfsensor._kernels.charge import TILE
 from bfsensor._kernels.compile_options import from_python
+from bfsensor._kernels.hot import FENCES
 from tests.kernels.plain_edges import (
     IMAGES,
     Truth,
@@ -276,6 +277,55 @@ def test_hot_edges_change_nothing_at_any_height(sensor, name, pedestal):
         np.zeros(5000, np.int32),
     )  # fmt: skip
     assert left < 2500 or charges.margins.max() >= 0.5
+    cool(hot)
+    again = find_pixels(sensor, exposure, x, y, z)
+    assert np.array_equal(given[0], again[0])
+    assert np.array_equal(given[1], again[1])
+
+
+def test_hot_edges_that_overlap_where_they_meet_are_bounded_as_well():
+    # Far beyond any full well the ends of two edges pass each other, by what their windows leave out.
+    sensor = silicon_sensor()
+    ny, nx = 20, 21
+    y, x = np.mgrid[:ny, :nx]
+    image = 7e5 * np.exp(-0.5 * ((x - 10) ** 2 + (y - 9.5) ** 2) / 1.1**2)
+    exposure = expose(sensor, image)
+    edges, charges, hot = sensor.physics.edges, exposure.charges, exposure.hot
+    for j in range(ny):
+        for i in range(nx):
+            heat(edges, charges, hot, 0, i, j)
+            heat(edges, charges, hot, 1, j, i)
+    evaluate(edges, charges, hot, 0, 1)
+    fence(edges, charges, hot, 0, 1)
+    line = 10
+    chosen = {
+        int(other): n
+        for n, (side, where, other) in enumerate(hot.edge[: hot.used[1]])
+        if side == 0 and where == line
+    }
+    points = edges.points.size
+    # Where each edge ends and the next begins: place along them, and shift.
+    ends, begins = (
+        np.array([
+            (other + k + edges.points[p] + hot.lines[chosen[other + k], 16 + p],
+             hot.lines[chosen[other + k], p]) for other in range(5, 14)
+        ]) for k, p in ((0, points - 1), (1, 0))
+    )  # fmt: skip
+    back = np.floor(FENCES * ends[:, 0]) > np.floor(FENCES * begins[:, 0])
+    # Some go back across the end of a step along an edge, and no step is left open for that.
+    assert back.any()
+    for other in range(6, 14):
+        assert np.isfinite(hot.fences[chosen[other]]).all()
+    # Electrons about these points, where it matters which of the two edges decides.
+    rng = np.random.default_rng(71843)
+    part, more = rng.uniform(-0.2, 1.2, (2, 20000, back.sum()))
+    y, x = (
+        (begins[back, n] + t * (ends - begins)[back, n]).ravel()
+        for n, t in ((0, part), (1, more))
+    )
+    x += line
+    z = np.full(x.size, 99.0)
+    given = find_pixels(sensor, exposure, x, y, z)
     cool(hot)
     again = find_pixels(sensor, exposure, x, y, z)
     assert np.array_equal(given[0], again[0])

@@ -143,3 +143,31 @@ def test_sums_for_16_points_are_those_of_plain_loops(rows, pairs, seed):
     # One rounding a product and one an addition, at most.
     limit = (2 * rows * pairs + 3) * 2.0**-24 * size * 1.001
     assert (np.abs(out[at:] - before[at:] - terms.sum((0, 1))) <= limit).all()
+
+
+@numba.njit
+def add_8_kernels(w, first, c, start, stride, rows, columns, out):
+    window.add_8_kernels(w, first, c, start, stride, rows, columns, out)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+@settings(deadline=None, max_examples=30)
+@given(rows=st.integers(0, 10), columns=st.integers(1, 11), seed=st.integers(0, 2**32 - 1))
+def test_sums_by_8_kernels_are_those_of_plain_loops(kind, rows, columns, seed):
+    rng = np.random.default_rng(seed)
+    first, start = (int(n) for n in rng.integers(0, 40, 2))
+    stride = columns + 15 + int(rng.integers(0, 9))
+    weights = rng.normal(0, 1e-6, first + rows * columns * 8).astype(kind)
+    charges = rng.uniform(-1e3, 1.5e5, start + rows * stride + 1).astype(np.float32)
+    before = rng.normal(0, 0.1, (8, 16)).astype(kind)
+    out = before.copy()
+    whole = (np.uint64(n) for n in (first, start, stride, rows, columns))
+    first_, start_, stride_, rows_, columns_ = whole
+    add_8_kernels(weights, first_, charges, start_, stride_, rows_, columns_, out)
+    w = weights[first:].astype(float).reshape(rows, columns, 8)
+    places = (start + stride * np.arange(rows)[:, None] + np.arange(columns))[..., None]
+    terms = w[..., None] * charges[places + np.arange(16)][:, :, None].astype(float)
+    size = np.abs(terms).sum((0, 1)) + np.abs(before)
+    # One rounding a product and one an addition, at most; in double precision those of this sum too.
+    limit = 2 * (rows * columns + 2) * np.finfo(kind).eps * size
+    assert (np.abs(out - before - terms.sum((0, 1))) <= limit).all()

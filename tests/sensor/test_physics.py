@@ -372,9 +372,7 @@ def test_a_table_that_ends_below_the_light_says_so_once(depths):
         ITL, depths=ITL.depths[kept],
         **{n: getattr(ITL, n)[:, :, kept] for n in ("corners", "horizontal", "vertical")},
     )  # fmt: skip
-    said = (
-        rf"up to 100 um above the gates; the table of table ends at {low.depths[-1]:g} um"
-    )
+    said = rf"up to 100 um above the gates; the given table ends at {low.depths[-1]:g} um"
     with pytest.warns(galsim.GalSimWarning, match=said) as caught:
         instrument = BrighterFatterSensor(table=low)
     assert [issubclass(w.category, UserWarning) for w in caught] == [True]
@@ -458,7 +456,7 @@ def test_light_within_the_table_says_nothing():
 
 
 def test_light_without_wavelengths_below_the_table_is_said_or_refused():
-    said = "light converts 5 um above the gates; the table of table begins at 20 um"
+    said = "light converts 5 um above the gates; the given table begins at 20 um"
     with pytest.warns(galsim.GalSimWarning, match=said):
         BrighterFatterSensor(table=table_from(20.0), conversion_depth=95.0)
     with pytest.raises(SensorError, match=said):

@@ -2,21 +2,19 @@
 
 import copy
 import multiprocessing
+import os
+import threading
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from unittest import mock
 
 import galsim
-import numba
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from bfsensor import BrighterFatterSensor, SensorError
-from bfsensor.cli.main import main
 from bfsensor.sensor import image_exposure
 from bfsensor.sensor import threads as threads_module
-from bfsensor.sensor.threads import threads_to_use
 from tests.sensor.contract_cases import BOTH, blank, draw, make, part, photons
 
 
@@ -38,9 +36,11 @@ def test_by_default_threads_are_those_of_galsim(kind):
     """A number wins; what is asked for is used as far as there is work, with the same bits."""
     wanted = []
 
-    def noted(threads):
-        wanted.append(threads)
-        return threads_to_use(threads)
+    busy = image_exposure.ImageExposure._busy_threads
+
+    def noted(exposure, count):
+        wanted.append(busy(exposure, count))
+        return wanted[-1]
 
     before = galsim.get_omp_threads()
     everything = photons(40_000, full=True)
@@ -49,7 +49,8 @@ def test_by_default_threads_are_those_of_galsim(kind):
         if galsim.set_omp_threads(2) != 2:
             pytest.skip("GalSim was built without OpenMP")
         many = mock.patch.object(threads_module, "MANY", 1000)
-        with many, mock.patch.object(image_exposure, "threads_to_use", noted):
+        use = mock.patch.object(image_exposure.ImageExposure, "_busy_threads", noted)
+        with many, use:
             images.append(draw(make(kind), everything))
             images.append(draw(make(kind, threads=1), everything))
             images.append(draw(make(kind, threads=3), everything))
@@ -62,19 +63,18 @@ def test_by_default_threads_are_those_of_galsim(kind):
                 sensor.accumulate(some, image, resume=n > 0)
             images.append(image.array)
             sensor.accumulate(photons(1000), blank())
-        with mock.patch.object(image_exposure, "threads_to_use", noted):
+        with use:
             draw(make(kind), everything)
     finally:
         galsim.set_omp_threads(before)
-    # Blocks of 4000 e- and 1000 photons are not worth two threads, nor, by default, are 40,000.
-    assert wanted == [2, 1, 3, 1, 1, 2, 1, 2, 1, 1]
+    # 1000 photons are not worth two threads, nor, by default, are 40,000; blocks may be small.
+    assert wanted == [2, 1, 3, 2, 1, 2, 1, 2, 1, 1]
     for n in (1, 2, 4):
         np.testing.assert_array_equal(images[0], images[n])
 
 
 @BOTH
 def test_python_threads_may_draw_at_once(kind):
-    """Numba's own work queue would end the process; who comes second draws on one thread."""
     alone = draw(make(kind, threads=1))
     with ThreadPoolExecutor(4) as executor:
         futures = [executor.submit(draw, make(kind, threads=2)) for _ in range(16)]
@@ -82,25 +82,51 @@ def test_python_threads_may_draw_at_once(kind):
             np.testing.assert_array_equal(future.result(), alone)
 
 
-def test_warm_draws_enough_for_two_threads():
-    """Ten photons would be drawn on one, and leave the kernel to be compiled later."""
-    if numba.config.NUMBA_NUM_THREADS < 2:
-        pytest.skip("this machine has one core")
-    kernel = image_exposure._shoot.shoot_on_threads
-    with mock.patch.object(image_exposure._shoot, "shoot_on_threads", wraps=kernel) as seen:
-        result = CliRunner().invoke(main, ["warm", "--threads"])
-    assert result.exit_code == 0, result.output
-    # One set of kernels serves images of either precision.
-    assert seen.called
+@BOTH
+def test_nobody_is_waited_for(kind):
+    """Threads that never come leave the work, and the numbers, to the one that draws."""
+
+    class Nobody(ThreadPoolExecutor):
+        def submit(self, *args, **kwargs):
+            return None
+
+    everything = photons(100_000, full=True)
+    alone = draw(make(kind, threads=1), everything)
+    with mock.patch.object(image_exposure, "ThreadPoolExecutor", Nobody):
+        np.testing.assert_array_equal(draw(make(kind, threads=3), everything), alone)
 
 
-def test_a_second_user_of_threads_gets_one():
-    if numba.config.NUMBA_NUM_THREADS < 2:
-        pytest.skip("this machine has one core")
-    with threads_to_use(2) as first, threads_to_use(2) as second:
-        assert (first, second) == (2, 1)
-    with threads_to_use(2) as third:
-        assert third == 2
+@BOTH
+def test_threads_go_when_the_kernel_fails(kind):
+    """An error of the kernel leaves no thread behind that waits for work."""
+    kernel = image_exposure._shoot.shoot
+
+    def fail(*arguments):
+        if arguments[-1]:
+            return kernel(*arguments)
+        raise MemoryError
+
+    sensor = make(kind, threads=2)
+    draw(sensor)
+    before = threading.active_count()
+    with (
+        mock.patch.object(image_exposure._shoot, "shoot", fail),
+        pytest.raises(MemoryError),
+    ):
+        draw(sensor, photons(100_000))
+    assert threading.active_count() == before
+
+
+@BOTH
+def test_fluxes_are_summed_alike(kind):
+    """Fluxes of which sums depend on their order give the same sum on several threads."""
+    light = photons(100_000)
+    light.flux = np.random.default_rng(5701).uniform(0.1, 2.0, 100_000)
+    sums = []
+    for threads in (1, 2, 3):
+        sensor = make(kind, threads=threads)
+        sums.append((sensor.accumulate(light, blank()), *sensor.diagnostics.values()))
+    assert sums[0] == sums[1] == sums[2]
 
 
 @BOTH
@@ -120,7 +146,6 @@ def test_the_number_of_threads_may_be_changed(kind):
 @BOTH
 def test_threads_survive_a_fork(kind):
     """A process that is forked after threads were used may use threads as well."""
-    # GNU OpenMP, which numba prefers, ends such a process; GalSim's configuration forks.
     sensor = make(kind)
     sensor.threads = 2
     here = draw(copy.deepcopy(sensor))
@@ -132,7 +157,7 @@ def test_threads_survive_a_fork(kind):
 @BOTH
 def test_threads_share_the_work(kind):
     """The loops run on two threads: both have used processor time."""
-    if numba.config.NUMBA_NUM_THREADS < 2:
+    if os.cpu_count() < 2:
         pytest.skip("this machine has one core")
     sensor = make(kind, nrecalc=0)
     sensor.threads = 2

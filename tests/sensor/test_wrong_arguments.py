@@ -25,7 +25,7 @@ WRONG = {
 LIGHT = photons(50)
 CORNERS = np.zeros((3, 3))
 
-# What is taken of them.  Numbers: True is 1, as for GalSim.
+# What is taken of them.  Numbers that GalSim knows too: True is 1, as there; of others it is refused.
 SEED = "none text negative bool"  # as galsim.BaseDeviate takes them
 FLAG = "bool"
 NUMBER = "bool"
@@ -33,10 +33,9 @@ SIGNED = "bool negative"
 TAKEN = {
     # A strength below 0 attracts, for comparisons; GalSim takes it, and nan, as well.
     "strength": SIGNED, "rng": SEED, "diffusion_factor": NUMBER, "nrecalc": "bool large",
-    "transpose": FLAG, "threads": "none bool large", "charge_response": FLAG,
-    "background": FLAG, "depth": FLAG, "predict": FLAG, "conversion_depth": NUMBER,
-    "diffusion": NUMBER, "surroundings": NUMBER,
-    "full_well": "none bool inf large", "treering_func": "none",
+    "transpose": FLAG, "threads": "none large", "charge_response": FLAG,
+    "background": FLAG, "depth": FLAG, "predict": FLAG, "full_well": "none inf large",
+    "treering_func": "none",
     **dict.fromkeys(["shift_map", "temperature", "table", "effects", "conditions", "layout"],
                     "none"),
 }  # fmt: skip
@@ -103,8 +102,8 @@ def of_functions(folder: str) -> dict[tuple[str, str], Target]:
     """Every argument of the functions for flats and of shift maps."""
     flat = {"sensor": make(SiliconSensor), "shape": (4, 4), "level": 10.0, "step": 5.0,
             "rng": 1, "illumination": None, "border": 2, "dtype": np.float32}  # fmt: skip
-    taken = {"level": NUMBER, "step": "bool large", "rng": SEED, "illumination": "none",
-             "border": "bool none"}  # fmt: skip
+    taken = {"step": "large", "rng": SEED, "illumination": "none",
+             "border": "none"}  # fmt: skip
     out: dict[tuple[str, str], Target] = {}
     for name in inspect.signature(draw_flat).parameters:
         out["draw_flat", name] = (
@@ -117,7 +116,7 @@ def of_functions(folder: str) -> dict[tuple[str, str], Target]:
     for name in inspect.signature(ShiftMap).parameters:
         out["ShiftMap", name] = (
             lambda v, name=name: ShiftMap(**{**corners, name: v}),
-            "bool negative large" if name in ("x0", "y0") else "",
+            "negative large" if name in ("x0", "y0") else "",
         )  # fmt: skip
     for name in inspect.signature(ShiftMap.from_edges).parameters:
         out["ShiftMap.from_edges", name] = (
@@ -194,6 +193,8 @@ def test_wrong_values_are_refused_by_name(group, tmp_path):
         ({"threads": 0}, "threads = 0 must be at least 1, a whole number, or None"),
         ({"rng": np.random.default_rng(1)},
          r"rng = Generator\(PCG64\).* must be a galsim.BaseDeviate, a whole number as its seed"),
+        ({"threads": "two"}, "threads = 'two' must be at least 1, a whole number, or None"),
+        ({"threads": True}, "threads = True must be at least 1, a whole number, or None"),
         ({"name": 3.5}, r"name = 3.5 must be (the stem|a built-in device)"),
         ({"treering_func": RINGS, "treering_center": galsim.PositionD(0, np.nan)},
          "treering_center = .* must be a finite galsim.Position"),
@@ -204,6 +205,16 @@ def test_wrong_values_are_refused_by_name(group, tmp_path):
 def test_messages_say_what_is_allowed(kind, options, message):
     with pytest.raises(SensorError, match=message.replace("+", r"\+")):
         kind(**options)
+
+
+@BOTH
+@pytest.mark.parametrize(
+    "name", ["x" * 5000, "x" * 5000 + ".fits", "a\0b", "a\0b.fits", ""]
+)
+def test_names_that_no_file_can_have_are_refused(kind, name):
+    error = SensorError if kind is BrighterFatterSensor else OSError
+    with pytest.raises(error, match=r"^name = |no such file$|is a table of bfsensor"):
+        kind(name)
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ def draw(flux: float, strength: float, seed: int) -> galsim.Image:
 
 @click.command(help=__doc__)
 @click.argument("recordings", type=click.Path(path_type=Path, exists=True, file_okay=False))
-@click.option("--stars", default=8, show_default=True)
+@click.option("--stars", type=click.IntRange(min=2), default=8, show_default=True)
 @click.option("-o", "--output", type=click.Path(path_type=Path), default=RESULTS)
 def main(recordings: Path, stars: int, output: Path) -> None:
     """Draw, measure, correct, print, write."""

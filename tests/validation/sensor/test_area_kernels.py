@@ -7,7 +7,7 @@ import pytest
 from bfsensor import BrighterFatterSensor, DistortionTable, SiliconSensor
 from bfsensor._kernels.areas import pixel_areas
 from bfsensor.device.shipped import tables_dir
-from bfsensor.sensor.base import _lowest
+from bfsensor.sensor.area_kernels import _lowest
 from bfsensor.sensor.flats import draw_flat
 from bfsensor.sensor.image_exposure import ImageExposure
 from tests.kernels.plain_edges import NO_PATTERN
