@@ -8,7 +8,7 @@ inner loop runs along the row.
 import numba
 import numpy as np
 
-from bfsensor._kernels.compile_options import INLINED, INNER
+from bfsensor._kernels.compile_options import ENTRY, INLINED, INNER
 from bfsensor._kernels.photons import _at, fixed_shift, ring_shift
 from bfsensor._kernels.window import add_8_kernels
 
@@ -139,7 +139,7 @@ def _join(x0, y0, x1, y1):
     return 0.5 * (y0 + y1) * (x1 - x0)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(**{**ENTRY, "_nrt": True})
 def pixel_areas(edges, charges, pattern, flux, low, low_second, first_row, last_row, out):
     """Write the areas [nominal area] of the rows ``first_row`` to ``last_row`` to ``out`` [ny, nx].
 
@@ -190,7 +190,7 @@ def pixel_areas(edges, charges, pattern, flux, low, low_second, first_row, last_
             out[j, i] = -around
 
 
-@numba.njit(cache=True, nogil=True, _nrt=False)
+@numba.njit(**ENTRY)
 def convolved_areas(
     charges,
     first,
@@ -277,7 +277,7 @@ def _mean_shift(pattern, factor, last, per_step, x, y, along_x, along_y):
     return dx, dy
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(**{**ENTRY, "_nrt": True})
 def times_ring_areas(pattern, out):
     """Multiply areas by those that rings give the pixels, at full height.
 

@@ -13,6 +13,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 _WORD = types.Array(types.int64, 1, "C")
+"""Type of the arrays, by definition: contiguous, of int64."""
 
 
 def _place(context, builder, signature, args):

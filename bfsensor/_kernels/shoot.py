@@ -48,7 +48,8 @@ MOST_PIECES = 16
 Chosen: it serves four threads; twice as large serves eight, while what one thread does alone bounds
 the gain at two or less."""
 NEVER = np.int64(1) << np.int64(62)
-"""Bit of a piece that no task has, for which threads wait that serve until all is done."""
+"""Bit of a piece that no task has, by definition above those of MOST_PIECES twice: threads that serve
+wait for it until all is done."""
 # Places in the baton, int64, on three lines of memory.  The ticket of the next piece holds the number of
 # the task in its upper half, then with 16 bits each the number of pieces and the piece; -1 when all
 # is done.  DONE has a bit for each piece that is.  Then the task: how many pieces are to be collected,

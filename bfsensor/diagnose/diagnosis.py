@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
-from bfsensor.diagnose.data.channels import PER_ELECTRON
-from bfsensor.diagnose.data.measure_channels import (
-    MeasuredChannels,
-    Source,
-    measure_channels,
-)
+import numpy as np
+
+from bfsensor.diagnose.data.channels import PER_ELECTRON, step_of
+from bfsensor.diagnose.data.exposure_info import Source
+from bfsensor.diagnose.data.measure_channels import MeasuredChannels, measure_channels
 from bfsensor.diagnose.detect.locate import locate_mismatch
 from bfsensor.diagnose.detect.matched_filters import locate_effects
 from bfsensor.diagnose.explain.stepwise import attribute
@@ -19,8 +19,10 @@ from bfsensor.diagnose.fit.baseline_fit import (
     held_out,
 )
 from bfsensor.diagnose.model.baseline import Baseline
+from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.diagnose.plan.advice import RecordingPlan, plan
 from bfsensor.diagnose.report.diagnosis_result import Diagnosis
+from bfsensor.errors import ConvergenceError
 
 
 def diagnose(
@@ -62,8 +64,6 @@ def diagnose(
     ------
     MeasurementError
         No exposure can be used, or no channel can be measured in them.
-    ConvergenceError
-        The baseline's predictions overflow or cannot be fitted.
 
     Examples
     --------
@@ -112,11 +112,6 @@ def diagnose_measured(
     Diagnosis
         Fit, mismatch, effects found and advice.
 
-    Raises
-    ------
-    ConvergenceError
-        The baseline's predictions overflow or cannot be fitted.
-
     Examples
     --------
     Diagnose area changes a_ij [1/e-] that conserve area:
@@ -133,6 +128,7 @@ def diagnose_measured(
     >>> diagnose_measured(measured, baseline).mismatch.detected
     False
     """
+    measured = _predictable(measured, baseline)
     predictor, fit = fit_bounded(measured, baseline)
     more = _of_free(measured, baseline, fit)
     if explain:
@@ -141,10 +137,14 @@ def diagnose_measured(
         mismatch = locate_mismatch(fit, seed=seed)
     attribution, advised = None, RecordingPlan()
     if mismatch.detected and explain:
-        attribution = attribute(predictor, fit, mismatch, seed=seed)
-        more += attribution.notes
-        advised = plan(attribution)
-        more += advised.notes
+        try:
+            attribution = attribute(predictor, fit, mismatch, seed=seed)
+        except ConvergenceError as error:
+            more.append(f"the mismatch is located, its explanation was given up: {error}")
+        else:
+            more += attribution.notes
+            advised = plan(attribution)
+            more += advised.notes
     return Diagnosis(
         campaign=campaign,
         baseline=baseline.name,
@@ -160,6 +160,24 @@ def diagnose_measured(
     )
 
 
+def _predictable(measured: MeasuredChannels, baseline: Baseline) -> MeasuredChannels:
+    """Set channels aside that the nominal baseline cannot predict at all, and name them in a note."""
+    predictor, kept, notes = Predictor(measured, baseline), [], []
+    for channel in measured.channels:
+        try:
+            finite = np.isfinite(predictor.predict(channel, predictor.start)).all()
+            why = "" if finite else "its prediction is not finite"
+        except ConvergenceError as error:
+            why = str(error)
+        if why:
+            notes.append(f"{channel.word} ({channel.fold}) set aside: {why}")
+        else:
+            kept.append(channel)
+    if not notes:
+        return measured
+    return replace(measured, channels=tuple(kept), notes=(*measured.notes, *notes))
+
+
 def _of_free(measured: MeasuredChannels, baseline: Baseline, fit: BaselineFit) -> list[str]:
     """Notes on the free a_ij of a baseline without a device, and on flats of too few levels."""
     if not baseline.not_below:
@@ -172,7 +190,7 @@ def _of_free(measured: MeasuredChannels, baseline: Baseline, fit: BaselineFit) -
     )  # fmt: skip
     out = [f"fitted area changes a_ij [1/e-]: {text}"]
     flats = [c for c in measured.channels if c.word == "flat_cov"]
-    levels = {float(v) for c in flats for v in c.axes["time"]}
+    levels = {float(v) for c in flats for v in step_of(c.axes)}
     if len(levels) < 2 and not any(c.unit == PER_ELECTRON for c in flats):
         out.append(
             "flats at fewer than two levels: these do not separate other positive covariances of near "

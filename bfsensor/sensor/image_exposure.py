@@ -268,7 +268,7 @@ def _call_on_threads(
         try:
             return float(call(threads, False))
         finally:
-            # Those that serve go, also where an error kept the kernel from telling them.
+            # Those that serve end, also where an error ended this call before its kernel ran.
             baton[_shoot.TICKET] = -1
 
 

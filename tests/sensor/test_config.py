@@ -209,17 +209,18 @@ def test_our_silicon_sensor_has_a_type_of_its_own():
 
 def used_threads(kind, nproc, monkeypatch, tmp_path):
     """Threads that kernels use while a configuration draws, by process."""
-    from bfsensor.sensor import image_exposure
+    from bfsensor.sensor.image_exposure import ImageExposure
 
-    inner = image_exposure.threads_to_use
+    inner = ImageExposure._busy_threads
     folder = tmp_path / f"{kind}{nproc}"
     folder.mkdir()
 
-    def noted(threads):
+    def noted(exposure, photons):
+        threads = inner(exposure, photons)
         (folder / f"{os.getpid()}-{threads}").touch()
-        return inner(threads)
+        return threads
 
-    monkeypatch.setattr(image_exposure, "threads_to_use", noted)
+    monkeypatch.setattr(ImageExposure, "_busy_threads", noted)
     config = {
         "modules": ["bfsensor"],
         "gal": {"type": "Gaussian", "sigma": 0.3, "flux": 4e4},
@@ -229,7 +230,7 @@ def used_threads(kind, nproc, monkeypatch, tmp_path):
                   "sensor": {"type": kind}},
     }  # fmt: skip
     pixels = galsim.config.BuildImage(config).array.copy()
-    monkeypatch.setattr(image_exposure, "threads_to_use", inner)
+    monkeypatch.setattr(ImageExposure, "_busy_threads", inner)
     found = [path.name.split("-") for path in folder.iterdir()]
     return pixels, {int(p) for p, _ in found}, {int(t) for _, t in found}
 

@@ -239,6 +239,11 @@ class Channel:
         return out if self.common is None else out + self.common.told(out)
 
 
+def step_of(axes: Mapping[str, NDArray]) -> NDArray:
+    """Level of a ladder that each value of flats belongs to: its usual exposure time [s]."""
+    return axes.get("step", axes["time"])
+
+
 def join_channels(channels: Sequence[Channel]) -> Channel:
     """Join channels of one name and unit; axes that not all of them have are left out."""
     first = channels[0]

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.cosmetics import repaired_of
 from bfsensor.diagnose.data.exposure_info import Axes, Frame
 from bfsensor.typing import FloatArray
 
@@ -113,7 +114,7 @@ class CodeChannels:
     def add(self, frames: Sequence[Frame]) -> None:
         """Add a flat's raw codes."""
         for amp, frame in enumerate(frames):
-            codes = frame.image[np.isfinite(frame.image)]
+            codes = frame.image[np.isfinite(frame.image) & ~repaired_of(frame)]
             middle = np.median(codes)
             width = 1.4826 * np.median(np.abs(codes - middle))
             if width < 1.25 * PERIOD:
@@ -217,12 +218,13 @@ class CrosstalkChannels:
                     continue
                 # A spot's halo is alike on both sides: the point across the victim's own spot
                 # has the same halo and, mostly, no light in the other amplifier.
-                distance, which = cKDTree(centres[b]).query(
-                    np.column_stack([rows, columns])
-                )
+                tree = cKDTree(centres[b])
+                distance, which = tree.query(np.column_stack([rows, columns]))
                 y, x = (2 * centres[b][which] - np.column_stack([rows, columns])).T
+                # Far from its spot that point may lie on another one of the victim.
+                across, _ = tree.query(np.column_stack([y, x]))
                 use = (
-                    (distance > CLEAR)
+                    (np.minimum(distance, across) > CLEAR)
                     & _is_inside(rows, columns, victim.shape)
                     & _is_inside(y, x, victim.shape)
                 )

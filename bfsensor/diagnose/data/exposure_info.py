@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Protocol
+from collections.abc import Iterable, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,6 +142,30 @@ class Frame(Protocol):
     def flip_y(self) -> bool: ...
     @property
     def origin(self) -> tuple[int, int] | None: ...
+
+
+class Source(Protocol):
+    """A campaign that gives exposures in order of time, and reads their frames.
+
+    Attributes
+    ----------
+    exposures : sequence of ExposureInfo
+        Headers of all exposures, in order of time.
+    lamp_error : float
+        Relative error of the lamp monitor, above 0.
+    shape : (int, int)
+        Rows and columns of the sensor.
+    read : callable
+        Returns the frames of an exposure, one for each amplifier, always in the same order.
+    """
+
+    @property
+    def exposures(self) -> Sequence[ExposureInfo]: ...
+    @property
+    def lamp_error(self) -> float: ...
+    @property
+    def shape(self) -> tuple[int, int]: ...
+    def read(self, exposure: Any) -> Sequence[Any]: ...
 
 
 HELD = 5

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.exposure_info import Axes, ExposureInfo, Frame, condition_of
@@ -34,13 +35,21 @@ shutters and lamps: deviations from linearity below 2 % are then no findings; wi
 below 4 %."""
 
 
+STRUCK = 10.0
+"""Departure of a pixel of a single flat from the median of its 5 x 5 neighbours, over the median of
+all pixels' departures, above which it is left out of the mean: 6.7 standard deviations.  Chosen:
+noise reaches it in 2e-11 of pixels; with 20, a particle's pixels may shift the mean of 1e4 pixels by
+1e-4 of their noise."""
+
+
 @dataclass
 class _FlatGroup:
-    """Measurements of the pairs of one condition, exposure time, amplifier and fold."""
+    """Measurements of the pairs of one condition, level, amplifier and fold."""
 
     covariances: list[FloatArray] = field(default_factory=list)
     counts: list[NDArray[np.int64]] = field(default_factory=list)
     levels: list[float] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)
     hours: list[float] = field(default_factory=list)
     serial: list[FloatArray] = field(default_factory=list)
     parallel: list[FloatArray] = field(default_factory=list)
@@ -62,6 +71,9 @@ class FlatChannels:
         Largest lag of the covariances [pixel].
     start : float
         Time of the first exposure of the campaign [MJD]; nan where not known.
+    steps : mapping of int to float, optional
+        Level of each flat by its number, from
+        :func:`bfsensor.diagnose.data.flat_pairing.find_steps`; by default its exposure time.
     """
 
     def __init__(
@@ -72,8 +84,10 @@ class FlatChannels:
         lamp_error: float,
         lags: int = LAGS,
         start: float = np.nan,
+        steps: Mapping[int, float] | None = None,
     ) -> None:
         self._bias, self._noise, self._start = bias, read_noise, start
+        self._steps = steps or {}
         self._lamp_error, self._lags = lamp_error, lags
         self._groups: dict[tuple, _FlatGroup] = {}
         self._means: dict[str, list[tuple]] = {}
@@ -101,7 +115,7 @@ class FlatChannels:
             Covariances cannot be measured.
         """
         condition = condition_of(first[0])
-        time = first[0].exposure_time or 0.0
+        step = self._step(first[0])
         means: list[list[tuple[float, float, int]]] = [[], []]
         for n, frames in enumerate(zip(first[1], second[1], strict=True)):
             name = frames[0].name
@@ -110,11 +124,12 @@ class FlatChannels:
             found = flat_covariances(
                 *images, mask=mask, lags=self._lags, unit="adu", region=name
             )
-            group = self._groups.setdefault((condition, time, n, fold), _FlatGroup())
+            group = self._groups.setdefault((condition, step, n, fold), _FlatGroup())
             group.covariances.append(found.covariances)
             group.counts.append(found.pairs)
             group.levels.append(found.level)
             group.hours += [self._hours(e) for e, _ in (first, second)]
+            group.times += [e.exposure_time or 0.0 for e, _ in (first, second)]
             group.clipped += found.clipped
             for frame in frames:
                 group.serial.append(profile(frame.serial_overscan, 1))
@@ -131,6 +146,40 @@ class FlatChannels:
                 )
         for (exposure, _), values in zip((first, second), means, strict=True):
             self._means.setdefault(fold, []).append((exposure, condition, values))
+
+    def add_single(
+        self, exposure: ExposureInfo, frames: Sequence[Frame], *, fold: str
+    ) -> None:
+        """Measure the mean of a flat without a partner.
+
+        Parameters
+        ----------
+        exposure : ExposureInfo
+            The flat.
+        frames : sequence of Frame
+            Frames of all amplifiers.
+        fold : str
+            'fit', 'select' or 'held-out'.
+        """
+        values = []
+        for frame in frames:
+            image = self.clean(frame)
+            good = ~frame.mask & np.isfinite(image)
+            # A pair's difference shows struck pixels; here the surroundings of each pixel do.
+            away = image - median_filter(np.where(good, image, np.nanmedian(image)), 5)
+            usual = float(np.median(np.abs(away[good]))) if good.any() else 0.0
+            good &= np.abs(away) <= STRUCK * max(usual, 1e-300)
+            read = self._noise.get(frame.name, 0.0) ** 2
+            count = max(int(good.sum()), 1)
+            zero = read / max(frame.serial_overscan.size // 2, 1) + read / count
+            values.append((float(image[good].mean()) if good.any() else 0.0, zero, count))
+        if all(m > 0 for m, *_ in values):
+            self._means.setdefault(fold, []).append(
+                (exposure, condition_of(exposure), values)
+            )
+
+    def _step(self, exposure: ExposureInfo) -> float:
+        return self._steps.get(exposure.number, exposure.exposure_time or 0.0)
 
     def clean(self, frame: Frame) -> FloatArray:
         """Image less the frame's overscan level and the mean bias [ADU]."""
@@ -153,7 +202,7 @@ class FlatChannels:
         j, i = (index.ravel() for index in np.indices((self._lags + 1,) * 2))
         for fold in dict.fromkeys(key[3] for key in self._groups):
             values, blocks, axes = [], [], Axes()
-            for (condition, time, amp, which), group in self._groups.items():
+            for (condition, step, amp, which), group in self._groups.items():
                 if which != fold:
                     continue
                 pairs = np.sum(group.counts, axis=0)
@@ -162,7 +211,7 @@ class FlatChannels:
                 blocks.append(bartlett_matrix(mean, pairs))
                 level = float(np.mean(group.levels))
                 axes.add(
-                    len(j), condition, amp=amp, time=time, level=level,
+                    len(j), condition, amp=amp, time=_mean_time(group), step=step, level=level,
                     pairs=len(group.levels), hours=float(np.mean(group.hours)), i=i, j=j,
                 )  # fmt: skip
             out.append(
@@ -172,7 +221,10 @@ class FlatChannels:
         return out
 
     def _mean_levels(self) -> list[Channel]:
-        out = []
+        out: list[Channel] = []
+        if not self._ratios:
+            # Without a pair no gain is known.
+            return out
         for fold, rows in self._means.items():
             values, blocks, axes = [], [], Axes()
             for exposure, condition, amplifiers in rows:
@@ -186,6 +238,7 @@ class FlatChannels:
                 blocks.append(np.diag(variance) + error**2 * np.outer(m, m))
                 axes.add(
                     len(m), condition, amp=np.arange(len(m)), time=exposure.exposure_time,
+                    step=self._step(exposure),
                     lamp=exposure.lamp if known else 1.0, exposure=exposure.number, level=m,
                     mjd=np.nan if exposure.mjd is None else exposure.mjd,
                     hours=self._hours(exposure),
@@ -211,7 +264,7 @@ class FlatChannels:
             uneven = self._unevenness(name)
             for fold in dict.fromkeys(key[3] for key in self._groups):
                 values, blocks, axes = [], [], Axes()
-                for (condition, time, amp, which), group in self._groups.items():
+                for (condition, step, amp, which), group in self._groups.items():
                     profiles = [p for p in getattr(group, name) if len(p)]
                     if which != fold or not profiles:
                         continue
@@ -219,7 +272,7 @@ class FlatChannels:
                     values.append(mean)
                     blocks.append(uneven[amp] * matrix)
                     axes.add(
-                        len(mean), condition, amp=amp, time=time,
+                        len(mean), condition, amp=amp, time=_mean_time(group), step=step,
                         level=float(np.mean(group.levels)), k=np.arange(1, len(mean) + 1),
                     )  # fmt: skip
                 if values:
@@ -246,6 +299,11 @@ class FlatChannels:
             if total / freedom - 1 > max(UNEVEN - 1, 5 * np.sqrt(2 / freedom)):
                 out[amp] = float(total / freedom)
         return out
+
+
+def _mean_time(group: _FlatGroup) -> float:
+    """Mean exposure time [s]; that of each flat to the last bit where all are equal."""
+    return group.times[0] + float(np.mean(np.array(group.times) - group.times[0]))
 
 
 def _scatter(profiles: FloatArray) -> tuple[float, int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,16 +11,11 @@ from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.exposure_info import ExposureInfo, Frame, condition_of
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.flat_pairs import flat_covariances
+from bfsensor.recording.campaign.exposures import PAIR_TOLERANCE
 from bfsensor.typing import FloatArray
 
 Flat = tuple[ExposureInfo, Sequence[Frame]]
 """A flat with the frames of all amplifiers."""
-
-UNEQUAL = 0.05
-"""Relative difference of two levels above which flats make no pair.  The part of the fixed
-pattern that is not in proportion to the light stays in their difference, in proportion to that
-of the levels.  Chosen: ``bfsensor check`` warns above 0.02; with 0.1, up to twice as much
-pattern stays."""
 
 FAR = 2.5
 """Distance of lags [pixel] beyond which the brighter-fatter effect is negligible for this
@@ -75,42 +70,98 @@ class UnlikePair:
 def group_flats(flats: Sequence[ExposureInfo]) -> list[list[ExposureInfo]]:
     """Group flats that may make pairs, in order of time.
 
-    By the numbers of pairs in their headers if any flat has one (flats without are then left
-    out); otherwise successive flats of one condition and exposure time.
+    By the numbers of pairs in their headers if any flat has one (each flat without is a group of
+    its own); otherwise successive flats of one condition and of equal light.
     """
     groups: list[list[ExposureInfo]] = []
     if any(flat.pair is not None for flat in flats):
         by_number: dict[int, list[ExposureInfo]] = {}
         for flat in flats:
-            if flat.pair is not None:
-                by_number.setdefault(flat.pair, []).append(flat)
+            # Negative, so that they are no pair's number.
+            key = -1 - flat.number if flat.pair is None else flat.pair
+            by_number.setdefault(key, []).append(flat)
         return list(by_number.values())
+    light = light_of(flats)
     for flat in flats:
-        if groups and level_of(groups[-1][-1]) == level_of(flat):
+        first = groups[-1][0] if groups else flat
+        alike = _is_alike(light[first.number], light[flat.number])
+        if groups and alike and condition_of(first) == condition_of(flat):
             groups[-1].append(flat)
         else:
             groups.append([flat])
     return groups
 
 
-def level_of(flat: ExposureInfo) -> tuple:
-    """Condition and exposure time of a flat, as a key of its level."""
-    return condition_of(flat), flat.exposure_time
+def light_of(flats: Sequence[ExposureInfo]) -> dict[int, float]:
+    """Light of flats by number, in units of one second: exposure time times lamp, if all have one."""
+    lamps = [flat.lamp for flat in flats]
+    known = bool(lamps) and all(lamps)
+    usual = float(np.median(np.array(lamps, float))) if known else 1.0
+    return {
+        flat.number: (flat.exposure_time or 0.0)
+        * ((flat.lamp or 0.0) / usual if known else 1.0)
+        for flat in flats
+    }
+
+
+def _is_alike(one: float, other: float) -> bool:
+    return abs(one - other) <= PAIR_TOLERANCE * max(one, other)
+
+
+def find_steps(flats: Sequence[ExposureInfo]) -> dict[int, float]:
+    """Find the level of a ladder that each flat belongs to.
+
+    Flats of one condition whose light differs by less than :data:`PAIR_TOLERANCE` are of one
+    level, although their exposure times may differ.
+
+    Parameters
+    ----------
+    flats : sequence of ExposureInfo
+        All flats.
+
+    Returns
+    -------
+    steps : dict of int to float
+        Median exposure time of its level [s] by the number of the flat; where two levels of one
+        condition would share it, as after a change of the lamp, the median light [s at the median
+        lamp].
+    """
+    light = light_of(flats)
+    conditions: dict[Condition, list[ExposureInfo]] = {}
+    for flat in flats:
+        conditions.setdefault(condition_of(flat), []).append(flat)
+    steps: dict[int, float] = {}
+    for members in conditions.values():
+        levels: list[list[ExposureInfo]] = []
+        for flat in sorted(members, key=lambda f: light[f.number]):
+            if levels and _is_alike(light[levels[-1][0].number], light[flat.number]):
+                levels[-1].append(flat)
+            else:
+                levels.append([flat])
+        taken: set[float] = set()
+        for level in levels:
+            step = float(np.median([f.exposure_time or 0.0 for f in level]))
+            if step in taken:
+                step = float(np.median([light[f.number] for f in level]))
+            taken.add(step)
+            steps |= dict.fromkeys((f.number for f in level), step)
+    return steps
 
 
 def by_level(
-    groups: Sequence[Sequence[ExposureInfo]],
+    groups: Sequence[Sequence[ExposureInfo]], steps: Mapping[int, float]
 ) -> list[list[Sequence[ExposureInfo]]]:
-    """Collect the groups of each condition and exposure time; groups of one flat are left out."""
+    """Collect the groups of each condition and level; groups of one flat are left out."""
     levels: dict[tuple, list[Sequence[ExposureInfo]]] = {}
     for group in groups:
         if len(group) > 1:
-            levels.setdefault(level_of(group[0]), []).append(group)
+            key = condition_of(group[0]), steps[group[0].number]
+            levels.setdefault(key, []).append(group)
     return list(levels.values())
 
 
 class PairFinder:
-    """Reads flats of equal exposure, two in memory at a time, and yields pairs of equal level.
+    """Reads flats of equal light, two in memory at a time, and yields pairs of equal level.
 
     Parameters
     ----------
@@ -139,7 +190,7 @@ class PairFinder:
     def pairs(
         self, groups: Iterable[Sequence[ExposureInfo]]
     ) -> Iterator[tuple[Flat, Flat]]:
-        """Yield pairs of successive flats whose levels agree to :data:`UNEQUAL`, each flat once."""
+        """Yield pairs of successive flats whose levels agree, each flat once."""
         for group in groups:
             held: tuple[Flat, float] | None = None
             for exposure in group:
@@ -149,14 +200,14 @@ class PairFinder:
                     held = flat, level
                     continue
                 first, other = held
-                if abs(level - other) <= UNEQUAL * 0.5 * abs(level + other):
+                if abs(level - other) <= PAIR_TOLERANCE * 0.5 * abs(level + other):
                     held = None
                     yield first, flat
                     continue
                 self.single.append(first[0])
                 self.notes.append(
                     f"flats {first[0].number}, {exposure.number}: levels of {other:.0f} and "
-                    f"{level:.0f} ADU make no pair, as they differ by more than {UNEQUAL:.0%}: "
+                    f"{level:.0f} ADU make no pair, as they differ by more than {PAIR_TOLERANCE:.0%}: "
                     "fixed pattern would not cancel in their difference"
                 )
                 held = flat, level
@@ -265,7 +316,7 @@ def describe_unlike(pairs: Sequence[UnlikePair]) -> list[str]:
             f"all lags rise together{above} (far lags up to {worst.far:.2g} of the variance, at "
             f"{worst.level:.0f} ADU): fixed pattern that does not scale with the light, saturation "
             "included; not the brighter-fatter effect, which changes far lags by less than 0.2 %. "
-            "No flats of unlike exposure are used"
+            "Of flats of unlike exposure no covariances are used"
         )
     quiet = [p for p in ordered if not p.rises]
     for lag, values in (

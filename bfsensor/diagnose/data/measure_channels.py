@@ -1,11 +1,10 @@
-# ruff: noqa: D102  (protocol: the class says what its attributes are)
 """Measure all channels of a campaign from its exposures, one exposure or pair in memory at a time."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +17,16 @@ from bfsensor.diagnose.data.bias_channels import (
 )
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.code_channels import CodeChannels, CrosstalkChannels
+from bfsensor.diagnose.data.cosmetics import (
+    Cosmetic,
+    RepairedFrame,
+    find_cosmetics,
+    repaired_of,
+)
 from bfsensor.diagnose.data.exposure_info import (
     ExposureInfo,
     Frame,
+    Source,
     assign_folds,
     condition_of,
     is_held_out,
@@ -33,6 +39,7 @@ from bfsensor.diagnose.data.flat_pairing import (
     UnlikePair,
     by_level,
     describe_unlike,
+    find_steps,
     group_flats,
     scan_unlike,
 )
@@ -43,30 +50,6 @@ from bfsensor.diagnose.data.spot_places import PlacedSpots
 from bfsensor.effects.effect import Segment, Shot
 from bfsensor.errors import MeasurementError
 from bfsensor.typing import FloatArray
-
-
-class Source(Protocol):
-    """A campaign that gives exposures in order of time, and reads their frames.
-
-    Attributes
-    ----------
-    exposures : sequence of ExposureInfo
-        Headers of all exposures, in order of time.
-    lamp_error : float
-        Relative error of the lamp monitor, above 0.
-    shape : (int, int)
-        Rows and columns of the sensor.
-    read : callable
-        Returns the frames of an exposure, one for each amplifier, always in the same order.
-    """
-
-    @property
-    def exposures(self) -> Sequence[ExposureInfo]: ...
-    @property
-    def lamp_error(self) -> float: ...
-    @property
-    def shape(self) -> tuple[int, int]: ...
-    def read(self, exposure: Any) -> Sequence[Any]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +123,8 @@ class MeasuredChannels:
     """Waves and rings detected in maps, as starting points of fits: see
     :func:`bfsensor.diagnose.data.map_waves.find_patterns`."""
     placed: tuple[PlacedSpots, ...] = ()
+    cosmetics: tuple[Cosmetic, ...] = ()
+    """Defects of the sensor that were repaired before anything was measured."""
 
 
 def measure_channels(
@@ -209,6 +194,9 @@ def measure_channels(
         haunted = dict(ghosts)
     if haunted:
         notes.append(describe_ghosts(haunted, exposures))
+    source, cosmetics = find_cosmetics(
+        source, [e for e in exposures if e.number not in haunted]
+    )
     biases, late_biases = BiasChannels(), BiasChannels("held-out")
     in_mean: list[int] = []
     for exposure in kinds.get("bias", []):
@@ -240,8 +228,14 @@ def measure_channels(
         each.forget_mean()
     noise = biases.read_noise
     start = min((e.mjd for e in exposures if e.mjd is not None), default=np.nan)
+    steps = find_steps(kinds.get("flat", []))
     flats = FlatChannels(
-        bias_images, noise, lamp_error=source.lamp_error, lags=lags, start=start
+        bias_images,
+        noise,
+        lamp_error=source.lamp_error,
+        lags=lags,
+        start=start,
+        steps=steps,
     )
     longest: dict[Condition, float] = {}
     for flat in kinds.get("flat", []):
@@ -261,10 +255,17 @@ def measure_channels(
         "select": (maps, codes),
         "held-out": (late_maps, late_codes),
     }
-    levels = _take_pairs(finder, groups, flats, by_fold, biases, source.shape, notes)
+    by_step = by_level(groups, steps)
+    levels = _take_pairs(finder, by_step, flats, by_fold, biases, source.shape, notes)
+    single = sorted(
+        [*finder.single, *(g[0] for g in groups if len(g) == 1)], key=lambda f: f.number
+    )
+    for n, exposure in enumerate(single):
+        fold = "held-out" if is_held_out(n, len(single)) else "fit"
+        flats.add_single(exposure, frames := read(exposure), fold=fold)
+        levels[exposure.number] = _mean_level(flats, frames)
     unlike = scan_unlike(
-        sorted([*finder.single, *(g[0] for g in groups if len(g) == 1)], key=lambda f: f.number),
-        lambda flat: [_good(flats, f) for f in read(flat)], lags=lags,
+        single, lambda flat: [_good(flats, f) for f in read(flat)], lags=lags,
     )  # fmt: skip
     notes += [*finder.notes, *describe_unlike(unlike), *codes.notes, *late_codes.notes]
     # Sums of maps take most memory: they are released before images of spots are read.
@@ -311,11 +312,15 @@ def measure_channels(
         (late_crosstalk if held else crosstalk).add(
             images, [noise.get(f.name, 1.0) for f in spot_frames]
         )
-        image = np.full(source.shape, np.nan)
+        image, filled = np.full(source.shape, np.nan), np.zeros(source.shape, bool)
         for frame, cleaned, gain in zip(spot_frames, images, rough, strict=True):
             place(image, frame, cleaned * gain)
+            if isinstance(frame, RepairedFrame):
+                place(filled, frame, frame.filled)
         levels[exposure.number] = float(np.mean([np.nanmean(i) for i in images]))
-        reason = spots.add(exposure, image, fold="held-out" if held else "fit")
+        reason = spots.add(
+            exposure, image, fold="held-out" if held else "fit", filled=filled
+        )
         if reason:
             notes.append(f"spots {exposure.number}: {reason}")
     channels = [
@@ -327,7 +332,7 @@ def measure_channels(
     if not channels:
         raise MeasurementError(
             f"nothing can be measured: {len(kinds.get('flat', []))} flats make no pair of equal "
-            f"exposure and level, biases {len(kinds.get('bias', []))} (2 are needed), no dark, no "
+            f"light and level, biases {len(kinds.get('bias', []))} (2 are needed), no dark, no "
             f"spots that could be fitted{'; ' + '; '.join(notes) if notes else ''}"
         )
     if "bias" not in kinds and any(f.serial_overscan.size == 0 for f in layout):
@@ -360,12 +365,13 @@ def measure_channels(
         ),
         biases=tuple(in_mean),
         sightings=sightings,
+        cosmetics=cosmetics,
     )
 
 
 def _take_pairs(
     finder: PairFinder,
-    groups: Sequence[Sequence[ExposureInfo]],
+    by_step: Sequence[Sequence[Sequence[ExposureInfo]]],
     flats: FlatChannels,
     by_fold: Mapping[str, tuple[MapChannels, CodeChannels]],
     biases: BiasChannels,
@@ -374,7 +380,7 @@ def _take_pairs(
 ) -> dict[int, float]:
     """Read all pairs of flats, level by level; returns the mean level of each flat [ADU]."""
     levels: dict[int, float] = {}
-    for members in sorted(by_level(groups), key=lambda m: m[0][0].exposure_time or 0.0):
+    for members in sorted(by_step, key=lambda m: m[0][0].exposure_time or 0.0):
         folds = iter(
             assign_folds(range(sum(len(g) // 2 for g in members)), shift=len(levels))
         )
@@ -451,7 +457,7 @@ def _shots(
     return tuple(out)
 
 
-def place(image: NDArray[np.floating], frame: Frame, values: FloatArray) -> None:
+def place(image: NDArray, frame: Frame, values: NDArray) -> None:
     """Copy an amplifier's values, in readout order, to their place in an image of the sensor.
 
     Parameters
@@ -481,8 +487,8 @@ def _mean_level(flats: FlatChannels, frames: Sequence[Frame]) -> float:
 
 
 def _good(flats: FlatChannels, frame: Frame) -> FloatArray:
-    """Clean image, nan where a pixel is masked."""
-    return np.where(frame.mask, np.nan, flats.clean(frame))
+    """Clean image, nan where a pixel is masked and not repaired."""
+    return np.where(frame.mask & ~repaired_of(frame), np.nan, flats.clean(frame))
 
 
 def _rough_gains(channel: Channel, gains: list[list[float]]) -> None:

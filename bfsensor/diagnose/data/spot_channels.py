@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
 from bfsensor.diagnose.data.channels import FOLDS, Channel
@@ -73,7 +74,12 @@ class SpotChannels:
         self.placed: list[PlacedSpots] = []
 
     def add(
-        self, exposure: ExposureInfo, image: FloatArray, *, fold: str = "fit"
+        self,
+        exposure: ExposureInfo,
+        image: FloatArray,
+        *,
+        fold: str = "fit",
+        filled: NDArray[np.bool_] | None = None,
     ) -> str | None:
         """Measure an exposure.
 
@@ -85,6 +91,9 @@ class SpotChannels:
             Image on the sensor [e-]; nan where nothing is read.
         fold : str
             Fold of its values.
+        filled : ndarray of bool, shape (ny, nx), optional
+            Pixels whose values are their neighbours'; spots on them are left out, where at least
+            half of all are not.
 
         Returns
         -------
@@ -95,15 +104,17 @@ class SpotChannels:
         peak = float(np.nanpercentile(image, 99.9)) - background
         if peak < 10 * max(self._noise, 1.0):
             return "no spots are ten times brighter than the noise"
-        filled = np.where(np.isfinite(image), image, background)
+        whole = np.where(np.isfinite(image), image, background)
         try:
             spots = find_spots(
-                filled, threshold=background + 0.3 * peak, separation=WING // 2, stamp=STAMP
+                whole, threshold=background + 0.3 * peak, separation=WING // 2, stamp=STAMP
             )
-            inside = _inside(spots, filled.shape, WING // 2 + 1)
+            inside = _inside(spots, whole.shape, WING // 2 + 1)
+            if filled is not None and filled.any():
+                inside = _off(inside, filled)
             if len(inside) < 4:
                 return f"{len(inside)} spots lie inside, 4 are needed"
-            stamps = cut_stamps(filled, inside, size=STAMP)
+            stamps = cut_stamps(whole, inside, size=STAMP)
             fit = fit_spots(
                 stamps, read_noise=self._noise, weights="equal", largest_offset=1.5
             )
@@ -112,7 +123,7 @@ class SpotChannels:
         used = fit.used
         if used.sum() < 4:
             return f"{int(used.sum())} spots could be fitted, 4 are needed"
-        wide = cut_stamps(filled, inside, size=WING).electrons[used]
+        wide = cut_stamps(whole, inside, size=WING).electrons[used]
         values = stamp_moments(
             stamps.electrons[used], wide, fit.centre_x[used], fit.centre_y[used]
         )
@@ -225,6 +236,16 @@ def _inside(spots: SpotList, shape: tuple[int, int], border: int) -> SpotList:
         & (spots.y >= border) & (spots.y < shape[0] - border)
     )  # fmt: skip
     return SpotList(spots.x[keep], spots.y[keep], dict(spots.rejected))
+
+
+def _off(spots: SpotList, filled: NDArray[np.bool_]) -> SpotList:
+    """Spots whose stamps hold no filled pixel; all where fewer than half are left."""
+    near = maximum_filter(filled, STAMP)[
+        np.rint(spots.y).astype(int), np.rint(spots.x).astype(int)
+    ]
+    if 2 * int((~near).sum()) < max(len(near), 8):
+        return spots
+    return SpotList(spots.x[~near], spots.y[~near], dict(spots.rejected))
 
 
 def _clipped_mean(values: FloatArray) -> FloatArray:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
+from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel, step_of
 from bfsensor.diagnose.detect.scan_shapes import boundaries, boxes, frames, own_shapes
 from bfsensor.diagnose.detect.scan_templates import Group, Pattern, Template
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
@@ -123,8 +123,8 @@ def _covariances(g: Group) -> Iterator[Pattern]:
                 "lag x amplifier", np.where(here & (x["amp"] == amp), unit**2, 0.0),
                 {**base, "amp": int(amp)},
             )  # fmt: skip
-        for time in np.unique(x["time"]):
-            own = here & (x["time"] == time)
+        for time in np.unique(step_of(x)):
+            own = here & (step_of(x) == time)
             span = (float(level[own].min()), float(level[own].max()))
             yield "lag x level", np.where(own, 1.0, 0.0), {"lags": [(a, b)], "level": span}
     for name, here in _lags_together(i, j).items():
@@ -150,8 +150,8 @@ def _means(g: Group) -> Iterator[Pattern]:
                 np.where(here, unit**p, 0.0),
                 {"amp": name, "level": span, "power": p},
             )
-        for time in np.unique(x["time"]):
-            own = here & (x["time"] == time)
+        for time in np.unique(step_of(x)):
+            own = here & (step_of(x) == time)
             if own.any():
                 yield "mean x level", np.where(own, unit, 0.0), {
                     "amp": name, "level": (float(level[own].min()), float(level[own].max())),
@@ -273,8 +273,8 @@ def _overscan(g: Group) -> Iterator[Pattern]:
                 yield "overscan tail x power", np.where(here, tail * unit**p, 0.0), {
                     "amp": name, "k": (1, int(k.max())), "length": length, "level": span, "power": p,
                 }  # fmt: skip
-            for time in np.unique(x["time"]):
-                own = here & (x["time"] == time)
+            for time in np.unique(step_of(x)):
+                own = here & (step_of(x) == time)
                 yield "overscan tail x level", np.where(own, tail, 0.0), {
                     "amp": name, "k": (1, int(k.max())), "length": length,
                     "level": (float(level[own].min()), float(level[own].max())),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.channels import Channel, step_of
 from bfsensor.diagnose.explain.pursuit import Choice, Dictionary
 from bfsensor.diagnose.explain.terms import SCALE, Family, Scene, Term
 from bfsensor.typing import FloatArray
@@ -80,7 +80,7 @@ def _relative(
 
 def _by_level(scene: Scene, flats: list[Channel]) -> Iterator[Term]:
     """Terms by power of the level and by single level, for all amplifiers and for each."""
-    times = np.unique(np.concatenate([c.axes["time"] for c in flats]))
+    times = np.unique(np.concatenate([step_of(c.axes) for c in flats]))
 
     def own(channel: Channel, amp: int | None) -> FloatArray:
         return np.where(amp is None or channel.axes["amp"] == amp, 1.0, 0.0)
@@ -93,7 +93,7 @@ def _by_level(scene: Scene, flats: list[Channel]) -> Iterator[Term]:
         return change
 
     def single(time: float, amp: int | None) -> Callable[[Channel], FloatArray]:
-        return lambda c: own(c, amp) * (c.axes["time"] == time)
+        return lambda c: own(c, amp) * (step_of(c.axes) == time)
 
     for amp, label in _amplifiers(scene):
         for p in LEVEL_POWERS:
@@ -101,7 +101,9 @@ def _by_level(scene: Scene, flats: list[Channel]) -> Iterator[Term]:
                 f"mean x S^{p}{label}", {"power": p, "amp": amp}, power(p, amp), spots=False
             )
         for time in times if len(times) > 3 else ():
-            level = np.concatenate([c.axes["level"][c.axes["time"] == time] for c in flats])
+            level = np.concatenate(
+                [c.axes["level"][step_of(c.axes) == time] for c in flats]
+            )
             told = {"level": float(level.mean() * scene.gains.mean()), "amp": amp}
             yield _relative(
                 f"mean at {time:g} s{label}", told, single(float(time), amp), spots=False

@@ -10,18 +10,17 @@ from numpy.typing import NDArray
 
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
-from bfsensor.diagnose.data.ptc_turnoff import TurnOff, below, find_turn_off
+from bfsensor.diagnose.data.ptc_turnoff import below, find_turn_off
 from bfsensor.diagnose.fit.gauss_newton import Steps
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.diagnose.model.predictor import Predictor, used_channels
-from bfsensor.errors import ConvergenceError
 from bfsensor.typing import FloatArray
 
 UNSETTLED = (
-    "the recordings are so unlike the baseline that its parameters did not settle: the residuals "
-    "are those of the best point that was found"
+    "the fit did not converge, so unlike the model are the recordings: its residuals are those of "
+    "the best point that was found, and errors of its parameters are those of that point"
 )
-"""Note of a fit without effects whose full steps did not converge."""
+"""Note of a fit that ended before it reached a minimum."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +58,8 @@ class BaselineFit:
         variance parameters.
     notes : tuple of str
         Assumptions of the prediction, and conditions of the fit, in words.
+    converged : bool
+        Whether the fit ended at a minimum.
     """
 
     channels: tuple[Channel, ...]
@@ -75,6 +76,7 @@ class BaselineFit:
     chance: float = 0.0
     scores: int = 0
     notes: tuple[str, ...] = ()
+    converged: bool = True
 
     def of(self, word: str) -> NDArray[np.bool_]:
         """Mask of the residuals that belong to channels of one name, shape (n,)."""
@@ -124,12 +126,12 @@ class BaselineFit:
 def fit_baseline(
     predictor: Predictor, channels: Sequence[Channel], *, like: BaselineFit | None = None
 ) -> BaselineFit:
-    """Fit the baseline to channels by Gauss-Newton, with Gaussian priors on device parameters.
+    """Fit the baseline to channels, with Gaussian priors on device parameters.
 
-    For recordings that are very unlike the baseline full steps may diverge.  Without effects the
-    fit is then repeated with steps that never raise the chi-square, and ends where they end; its
-    residuals are large and ``notes`` say why.  If flats reach full well, where their variance
-    collapses, only fainter flats are fitted, and all are compared with that fit.
+    A fit always ends.  If it ends before it reaches a minimum, ``converged`` is False and ``notes``
+    say so; its residuals are those of the best point that was found.  If flats reach full well,
+    where their variance collapses, only fainter flats are fitted, and all are compared with that
+    fit.
 
     Parameters
     ----------
@@ -148,40 +150,21 @@ def fit_baseline(
     Raises
     ------
     ConvergenceError
-        The parameters still move after :data:`bfsensor.diagnose.fit.gauss_newton.ROUNDS` rounds.
+        Nothing can be predicted at the starting point.
     """
     slopes = None if like is None else like.slopes
     steps = Steps(predictor, channels, slopes)
-    if predictor.effects:
-        steps.go_carefully()
-        return _as_fit(steps)
-    off = find_turn_off(channels)
-    if off is not None:
-        point = (
-            predictor.start if like is not None else _fit_faint(predictor, channels, off)
-        )
-        if point is not None:
-            steps.stay(point)
-            return _as_fit(steps, off.said)
-    try:
+    off = None if predictor.effects else find_turn_off(channels)
+    if off is None:
         steps.go()
-    except ConvergenceError:
-        steps = Steps(predictor, channels, slopes)
-        steps.go_carefully()
-        return _as_fit(steps, UNSETTLED)
-    return _as_fit(steps)
-
-
-def _fit_faint(
-    predictor: Predictor, channels: Sequence[Channel], off: TurnOff
-) -> FloatArray | None:
-    """Non-linear parameters fitted below the turn-off; None if that does not converge either."""
-    faint = Steps(predictor, below(channels, off))
-    try:
+        return _as_fit(steps)
+    point = predictor.start
+    if like is None:
+        faint = Steps(predictor, below(channels, off))
         faint.go()
-    except ConvergenceError:
-        return None
-    return faint.point
+        point = faint.point
+    steps.stay(point)
+    return _as_fit(steps, off.said)
 
 
 def _as_fit(steps: Steps, *notes: str) -> BaselineFit:
@@ -208,7 +191,8 @@ def _as_fit(steps: Steps, *notes: str) -> BaselineFit:
         slopes=steps.slopes,
         scores=len(steps.score.target),
         chance=float(np.linalg.slogdet(np.eye(chance) + steps.modes.T @ steps.modes)[1]),
-        notes=(*predictor.notes, *notes),
+        notes=(*predictor.notes, *notes, *(() if steps.converged else (UNSETTLED,))),
+        converged=steps.converged,
     )
 
 
@@ -241,7 +225,7 @@ def fit_bounded(
     Raises
     ------
     ConvergenceError
-        A fit does not converge.
+        Nothing can be predicted with the nominal baseline.
     """
     while True:
         predictor = Predictor(measured, baseline)

@@ -1,4 +1,4 @@
-r"""Gauss-Newton solver of the joint fit of device, gains, linear terms, effects, random effects.
+r"""Joint fit of device, gains, linear terms, effects and random effects within a trust region.
 
 The whitened values :math:`y` of all channels are modelled as
 
@@ -7,100 +7,80 @@ The whitened values :math:`y` of all channels are modelled as
     \epsilon \sim N(0, 1), \quad u \sim N(0, 1),
 
 with non-linear parameters :math:`\theta` (device, gains, effects), linear ones :math:`\beta` and
-random effects :math:`u`, whose strength is in the modes :math:`M`.  A step minimises the penalised
+random effects :math:`u`, whose strength is in the modes :math:`M`.  The fit minimises the penalised
 sum of squares
 
 .. math::
     |y - f(\theta) - L \beta - M u|^2 + |u|^2 + |\theta_\mathrm{prior}|^2
     + |t - R (\theta - \theta_0)|^2
 
-to first order in :math:`\theta` (Henderson's mixed-model equations).  For given :math:`M` that is
-least squares with the covariance :math:`1 + M M^T` (Woodbury's identity).  The last term is the
-score of the restricted likelihood for parameters that enter through :math:`M`
+(Henderson's mixed-model equations), by :func:`scipy.optimize.least_squares` in :math:`\theta` with
+:math:`\beta` and :math:`u` projected out.  For given :math:`M` that is least squares with the
+covariance :math:`1 + M M^T` (Woodbury's identity).  The last term is the score of the restricted
+likelihood for parameters that enter through :math:`M`
 (:mod:`bfsensor.diagnose.fit.random_effects`).
 
 References
 ----------
 Henderson 1975, Biometrics 31, 423 (mixed-model equations); Golub & Pereyra 1973, SIAM J. Numer.
-Anal. 10, 413 (linear parameters projected out).
+Anal. 10, 413 (linear parameters projected out); Branch, Coleman & Li 1999, SIAM J. Sci. Comput. 21,
+1 (trust region with bounds).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
+from scipy.optimize import OptimizeResult, least_squares
 
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.fit.random_effects import no_score, score_of, scored
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.effect import Effect
 from bfsensor.errors import ConvergenceError
-from bfsensor.inference.bounded_lsq import SINGULAR, BoundedSolution, solve_within
+from bfsensor.inference.bounded_lsq import SINGULAR, BoundedSolution, solve_within, span
 from bfsensor.typing import FloatArray
 
-ROUNDS = 20
-"""Largest number of Gauss-Newton rounds.  If parameters still move after them, :meth:`Steps.go`,
-and :meth:`Steps.go_carefully` with effects, raise :class:`ConvergenceError`; without effects the
-latter ends where it is.  Chosen: twice as many doubles the time that a fit which does not converge
-takes, and changes no fit that converges within 20."""
+ROUNDS = 40
+"""Largest number of points that one minimisation evaluates; a fit that needs more ends at its best
+point, marked as not converged.  Chosen: twice as many doubles the time that a fit which does not
+converge takes, and changes none that does; fits of ``python -m tests.golden`` need 3 to 15."""
 
-HALVINGS = 5
-"""Lengths at which a step is tried, each half of the one before: 1 to 1/16.  If none keeps the
-chi-square within :data:`NO_HARM`, the step is refused.  Chosen: twice as many would try lengths
-from 1/32 to 1/512, for which a linear model promises 6 to 0.4 % of the full step's gain."""
+NEAR = 0.01
+"""Decrease of the chi-square, for residuals of unit variance, below which a fit has converged.
+Chosen: the square of 0.1, the distance in standard errors of the minimum along one direction; twice
+as large, of 0.14."""
 
-MISLED = 2
-"""Lengths of a step (1 and 1/2) that are tried with derivatives borrowed from another fit; if
-both fail, the fit finds its own derivatives.  Chosen, to be derived: with 4, two more
-predictions are spent before that; the point where the fit ends hardly depends on it."""
+FIRST, STILL = 1e4, 1e-6
+"""First radius of the trust region [standard errors], and the part of it below which the minimiser
+ends.  Chosen: baselines start within 1e4 errors of the minimum, and the first step is a full
+Gauss-Newton step; at twice as many the region shrinks once more where that misleads.  The part is
+0.01 errors."""
 
-STALLED = 4
-"""Last rounds among which the chi-square must have changed by at least twice :data:`NO_HARM`;
-otherwise no further step is taken, however many errors long it would be.  Chosen, to be derived:
-twice as large lets fits along flat directions run 4 rounds longer."""
-
-REFRESHED = 2, 4
-"""Rounds, counted from 0, at whose start the modes of the random effects are computed again with
-the parameters of that round; in between they are constant, so that the chi-square of successive
-rounds can be compared.  Chosen, to be derived: with 4 and 8 a fit that converges within four
-rounds would keep the modes of its starting values."""
+SHRUNK = 3
+"""Status of :func:`scipy.optimize.least_squares` where only :data:`STILL` ended it."""
 
 ANEW, AWAY = 8, 0.1
 """Largest number of times that the modes and the score of the variance parameters are linearised
-again after the steps have converged, and the distance [standard errors] of such a parameter from
-the last point of linearisation above which that is done.  Chosen, to be derived: after twice as
-many times, or within 0.2 errors, an estimate may differ by the curvature of the restricted
-likelihood, of second order in that distance."""
-
-SMALL = 0.05
-"""Largest step of any parameter [standard errors] at which the fit has converged; that step is
-taken, too.  Chosen: for a single parameter it lowers the chi-square by 0.0025, with 0.1 by 0.01."""
-
-NO_HARM = 0.01
-"""Rise of the chi-square up to which a step is accepted.  Chosen: it moves a parameter by 0.1 of
-its error (the square root); twice as large, by 0.14."""
+again, and the distance [standard errors] of such a parameter from the last point of linearisation
+above which that is done.  Chosen, to be derived: after twice as many times, or within 0.2 errors, an
+estimate may differ by the curvature of the restricted likelihood, of second order in that distance."""
 
 IDLE = 1.0
-"""Decrease of the chi-square promised by the derivatives below which parameters count as fitted
-although the last step was refused: the residuals returned are then orthogonal to their columns.
-Also the promised decrease above which :data:`POOR` is tested.  Chosen, to be derived: a decrease
+"""Decrease of the chi-square promised by the derivatives below which parameters count as fitted:
+the residuals returned are then orthogonal to their columns.  Chosen, to be derived: a decrease
 of 1 is what noise makes of one free parameter; with 2, residuals would be projected on a linear
 model that missed the minimum by up to 1.4 errors."""
-
-POOR = 0.5
-"""Part of the promised decrease of the chi-square that a round must reach; otherwise derivatives
-by all parameters, not only by those of effects, are found again in the next round.  Chosen, to
-be derived: with 1 they are found in most rounds, which costs time and no accuracy."""
 
 Seen = tuple[list[FloatArray], FloatArray]
 """Predictions of each channel, and the whitened residuals of all."""
 
 
 class Steps:
-    """Gauss-Newton iteration around a point, which :meth:`go` and :meth:`go_carefully` move.
+    """Minimisation of the penalised sum of squares from a point, which :meth:`go` moves.
 
     Parameters
     ----------
@@ -124,8 +104,8 @@ class Steps:
         Whitened modes :math:`M` of the random effects.
     score : Score
         Score of the variance parameters.
-    history : list of float
-        Largest step of each round [standard errors].
+    converged : bool
+        Whether the last :meth:`go` ended at a minimum.
     """
 
     def __init__(
@@ -140,7 +120,6 @@ class Steps:
         self._find_columns()
         self.count, self._priors = len(predictor.names), len(predictor.prior_rows)
         self.effect = np.char.startswith(np.array(predictor.names, str), "effect ")
-        self._shape = predictor.shapes()
         # An effect in electrons on means of flats [ADU] makes them depend on the gains, whose
         # derivatives are then found again in each round, too.
         flats = any("flat_mean" in e.touches for e in predictor.effects)
@@ -156,7 +135,9 @@ class Steps:
         if slopes is not None and not full:
             plain = int((~self.effect).sum())
             self.slopes[:, :plain] = slopes[:, :plain]
-        self.history: list[float] = []
+        self.converged = False
+        self._there: FloatArray | None = None
+        self._fresh = 0
         self.solved: BoundedSolution
         self._last: tuple[FloatArray, Seen] | None = None
         self._scored = np.array(sorted(scored(predictor)), int)
@@ -191,10 +172,8 @@ class Steps:
         both = np.zeros((self.total + chance, self._linear.shape[1] + chance))
         both[: self.total] = np.concatenate([self._linear, self.modes], axis=1)
         both[self.total :, self._linear.shape[1] :] = np.eye(chance)
-        self._whole, triangle = np.linalg.qr(both)
+        self._whole = span(both)
         self._span = self._whole[: self.total]
-        size = np.abs(np.diag(triangle))
-        self._apart = chance > 0 and bool((size > SINGULAR * size.max(initial=0.0)).all())
         self._update_score()
 
     def _update_score(self) -> None:
@@ -206,26 +185,26 @@ class Steps:
                 self.residuals(self.point)[1],
             )  # fmt: skip
 
-    def _reach(self, point: FloatArray) -> FloatArray:
-        """Smallest and largest steps, shape (2, p).
+    def _limits(self) -> FloatArray:
+        """Smallest and largest values of the parameters, shape (2, p).
 
         Variance parameters stay between half and twice the value at which their score was
         linearised: their information goes with the inverse square of the value, so that the
         linear score says nothing farther away.
         """
-        ends = np.array(self.predictor.reach(point), float)
+        ends = np.array(self.predictor.limits(), float)
         own = self._scored[(self.score.rows[:, self._scored] != 0).any(0)]
-        there = self.predictor.reach(self.score.origin)[:, own]
-        size = np.abs(self.score.origin[own])
-        there = np.clip(there, -0.5 * size, size) + self.score.origin[own] - point[own]
-        ends[:, own] = np.clip(
-            ends[:, own], np.minimum(there[0], 0), np.maximum(there[1], 0)
-        )
+        there = np.sort(self.score.origin[own] * np.array([[0.5], [2.0]]), axis=0)
+        ends[:, own] = np.clip(there, *ends[:, own])
+        # A value outside its range, such as a start, may only move towards it.
+        ends[0] = np.minimum(ends[0], self.point)
+        ends[1] = np.maximum(ends[1], self.point)
         return ends
 
     def _behind(self) -> bool:
         """Whether a variance parameter has moved by more than AWAY since its score was found."""
-        errors = self.solved.errors[self._scored]
+        rows = self._projected_slopes()[:, self._scored]
+        errors = 1 / np.maximum(np.sqrt((rows**2).sum(0)), 1e-300)
         away = np.abs(self.point - self.score.origin)[self._scored]
         return bool((away > AWAY * errors).any())
 
@@ -246,23 +225,13 @@ class Steps:
         self._last = point.copy(), (predicted, np.concatenate(left))
         return self._last[1]
 
-    def square(self, residuals: FloatArray, point: FloatArray) -> float:
-        """Chi-square with linear parameters and random effects at their best, priors included."""
-        given = self._span.T @ residuals
-        held = point[self.predictor.prior_rows]
-        told = self.score.left(point)
-        square = float(residuals @ residuals) - float(given @ given)
-        return square + float(held @ held) + float(told @ told)
-
     def differentiate(
         self,
         which: NDArray[np.bool_],
         point: FloatArray,
         predicted: Sequence[FloatArray],
-        *,
-        forgiving: bool = False,
     ) -> None:
-        """Find derivatives by some parameters; ``forgiving`` keeps old ones where that fails."""
+        """Find derivatives by some parameters; where that fails old ones are kept."""
         for n in map(int, np.flatnonzero(which)):
             for channel, start, here in zip(
                 self.channels, self.starts, predicted, strict=False
@@ -272,16 +241,11 @@ class Steps:
                 try:
                     with np.errstate(over="ignore", invalid="ignore"):
                         change = self.predictor.slope(channel, point, n, here)
-                    if not np.isfinite(change).all():
-                        raise ConvergenceError(
-                            f"the derivative by {self.predictor.names[n]}"
-                        )
                 except ConvergenceError:
                     # At the edge of the range in which widths of spots can be computed.
-                    if not forgiving:
-                        raise
                     continue
-                self.slopes[start : start + len(channel), n] = channel.whiten(change)
+                if np.isfinite(change).all():
+                    self.slopes[start : start + len(channel), n] = channel.whiten(change)
 
     def problem(
         self, residuals: FloatArray, point: FloatArray
@@ -305,6 +269,30 @@ class Steps:
         told = self.score.left(point)
         return design, np.concatenate([residuals, -point[rows], np.zeros(chance), told])
 
+    def _projected(self, residuals: FloatArray, point: FloatArray) -> FloatArray:
+        """Residuals with linear parameters and random effects at their best, priors included."""
+        first = len(self._whole)
+        out = np.zeros(first + self._priors + len(self.score.target))
+        out[: self.total] = residuals
+        out[:first] -= self._whole @ (self._span.T @ residuals)
+        out[first : first + self._priors] = -point[self.predictor.prior_rows]
+        out[first + self._priors :] = self.score.left(point)
+        return out
+
+    def _projected_slopes(self) -> FloatArray:
+        """Derivatives of the prediction, projected as :meth:`_projected` does, priors included."""
+        first = len(self._whole)
+        out = np.zeros((first + self._priors + len(self.score.target), self.count))
+        out[: self.total] = self.slopes
+        out[:first] -= self._whole @ (self._span.T @ self.slopes)
+        out[first + np.arange(self._priors), self.predictor.prior_rows] = 1.0
+        out[first + self._priors :] = self.score.rows
+        # A column of which the projection leaves rounding errors alone would get a random step.
+        norms = np.sqrt((self.slopes**2).sum(0) + (self.score.rows**2).sum(0))
+        norms[self.predictor.prior_rows] = np.hypot(norms[self.predictor.prior_rows], 1.0)
+        out[:, np.sqrt((out**2).sum(0)) < SINGULAR * norms] = 0.0
+        return out
+
     def solve(
         self,
         residuals: FloatArray,
@@ -314,139 +302,96 @@ class Steps:
         """Best step of all parameters within their reach, some non-linear ones held."""
         design, target = self.problem(residuals, point)
         ends = np.repeat([[-np.inf], [np.inf]], design.shape[1], axis=1)
-        ends[:, : self.count] = self._reach(point)
+        ends[:, : self.count] = self._limits() - point
         if held is not None:
             ends[:, : self.count][:, held] = 0.0
         return solve_within(design, target, *ends)
 
-    def _solve(
-        self,
-        residuals: FloatArray,
-        point: FloatArray,
-        held: NDArray[np.bool_] | None = None,
-    ) -> BoundedSolution:
-        """Solve for the non-linear parameters alone, all others projected out.
-
-        With hundreds of random effects that is a small problem in place of a large one (variable
-        projection).  The solution returned holds the non-linear parameters only, and its basis
-        is that of the projected problem.
-        """
-        if not self._apart:
-            return self.solve(residuals, point, held)
-        rows = self.predictor.prior_rows
-        # Unlike in problem(), rows of random effects come before those of the device's priors.
-        first = len(self._whole)
-        last = first + self._priors
-        design = np.zeros((last + len(self.score.target), self.count + 1))
-        design[: self.total, :-1], design[: self.total, -1] = self.slopes, residuals
-        design[first + np.arange(self._priors), rows] = 1.0
-        design[first:last, -1] = -point[rows]
-        design[last:, :-1], design[last:, -1] = self.score.rows, self.score.left(point)
-        design[:first] -= self._whole @ (self._span.T @ design[: self.total])
-        ends = self._reach(point)
-        if held is not None:
-            ends[:, held] = 0.0
-        # A column of which the projection leaves rounding errors alone would get a random step.
-        norms = np.sqrt((self.slopes**2).sum(0) + (self.score.rows**2).sum(0))
-        norms[rows] = np.hypot(norms[rows], 1.0)
-        gone = np.sqrt((design[:, :-1] ** 2).sum(0)) < SINGULAR * norms
-        design[:, :-1][:, gone] = 0.0
-        return solve_within(design[:, :-1], design[:, -1], *ends)
-
-    def _step(self, solved: BoundedSolution) -> float:
-        """Move the point by a full step; returns the largest step [standard errors]."""
-        self._note(solved)
-        self.point = self.point + solved.solution[: self.count]
-        return self.history[-1]
-
-    def _note(self, solved: BoundedSolution) -> None:
-        """Store a solution and its largest step [standard errors]."""
-        self.solved = solved
-        step, errors = solved.solution[: self.count], solved.errors[: self.count]
-        moved = np.abs(step) / np.maximum(errors, 1e-300)
-        self.history.append(float(np.max(moved, where=errors > 0, initial=0.0)))
-
     def go(self) -> None:
-        """Take full steps, with derivatives found in the first two rounds.
+        """Minimise by a trust region, and linearise the random effects anew until they stay.
 
-        Derivatives by parameters of effects are found in every round; all others hardly change
-        (a chord method), and the residuals, which decide where the iteration ends, are exact.
-
-        Raises
-        ------
-        ConvergenceError
-            The parameters still move after :data:`ROUNDS` rounds.
+        Linear parameters and random effects are projected out, so that the minimiser sees the
+        non-linear parameters alone.  The fit always ends: ``converged`` says whether at a minimum.
         """
-        for turn in range(ROUNDS):
-            predicted, residuals = self.residuals(self.point)
-            if turn in REFRESHED and self._chance:
-                self.update_chance()
-            fresh = turn < 2 and not self._borrowed
-            self.differentiate(self.effect | fresh, self.point, predicted)
-            if self._step(self.solve(residuals, self.point)) < SMALL:
-                return
-        raise self._unsettled()
-
-    def go_carefully(self) -> None:
-        """Take steps that do not raise the chi-square, with effects' derivatives of each round.
-
-        A step that raises it is first corrected: the effects' amplitudes are refitted at the new
-        shapes, because minima along curved directions have correlated amplitudes and shapes.
-        Then it is halved, up to :data:`HALVINGS` lengths.  A fit without effects that does not
-        converge ends where it is.
-
-        Raises
-        ------
-        ConvergenceError
-            The effects' parameters still move after :data:`ROUNDS` rounds.
-        """
-        own = not self.effect.any()
-        squares: list[float] = []
-        promised, anew = 0.0, 0
-        for turn in range(ROUNDS):
-            predicted, residuals = self.residuals(self.point)
-            if turn in REFRESHED and self._chance:
-                self.update_chance()
-                squares.clear()
-            here = self.square(residuals, self.point)
-            squares.append(here)
-            poor = promised > IDLE and -np.diff(squares[-2:]).sum() < POOR * promised
-            fresh = own or (turn < 2 and not self._borrowed) or poor
-            self.differentiate(self._anew | fresh, self.point, predicted, forgiving=True)
-            stalled = len(squares) > STALLED and np.ptp(squares[-STALLED:]) < 2 * NO_HARM
-            start = self.point
-            solved = self._solve(residuals, start)
-            promised = here - float(solved.left @ solved.left)
-            if stalled or not self._gainful(solved, here):
-                if self._borrowed:
-                    # Derivatives borrowed from a fit without these effects gave no gain: find own.
-                    self._borrowed = False
-                    self.differentiate(~self.effect, self.point, predicted, forgiving=True)
-                    solved = self._solve(residuals, self.point)
-                    if self._gainful(solved, here):
-                        continue
-                # With the effects' parameters held the others may still lower the chi-square.
-                if own or not self._gainful(
-                    self._solve(residuals, self.point, self.effect), here
-                ):
-                    break
-                here = self.square(self.residuals(self.point)[1], self.point)
-                if squares[-1] - here < 2 * NO_HARM:
-                    break
-                continue
-            if self.history[-1] < SMALL:
-                if anew < ANEW and self._behind():
-                    anew += 1
-                    self.update_chance()
-                    squares.clear()
-                    continue
-                if self._apart:
-                    self.solved = self.solve(residuals, start)
-                return
-        else:
-            if not own:
-                raise self._unsettled()
+        self.converged = self._descend()
+        for turn in range(ANEW if self._chance else 0):
+            if turn and not self._behind():
+                break
+            self.update_chance()
+            self.converged = self._descend()
         self._end()
+
+    def _descend(self) -> bool:
+        """Move to the minimum for given modes; False if :data:`ROUNDS` points do not reach it.
+
+        Derivatives by parameters other than effects' hardly change: those of the first two points,
+        or of another fit, serve until the trust region shrinks to nothing, which shows that they
+        mislead; the minimiser then goes on with derivatives of that point.
+        """
+        low, high = self._limits()
+        while True:
+            own = not self._borrowed
+            self._fresh = 2 * own
+            here = self._jacobian(self.point)
+            # Without influence is, for example, the shape of an effect of no strength.
+            idle = ~here.any(0)
+            free = np.flatnonzero((low < high) & ~idle)
+            if not len(free):
+                return True
+            found = self._minimise(
+                free, low, high, 1 / np.sqrt((here[:, free] ** 2).sum(0))
+            )
+            woken = (idle & self.effect).any() and self._jacobian(self.point)[:, idle].any()
+            if not woken and (own or found.status != SHRUNK):
+                return bool(found.status > 0)
+            self._borrowed = False
+
+    def _minimise(
+        self, free: NDArray[np.int64], low: FloatArray, high: FloatArray, unit: FloatArray
+    ) -> OptimizeResult:
+        """Move some parameters to the minimum between their limits.
+
+        The minimiser counts them from the start in units of their errors, and takes the distance
+        from its origin as the first radius: all have the same offset, of the length FIRST.
+        """
+        start, offset = self.point.copy(), FIRST / np.sqrt(len(free))
+
+        def at(x: FloatArray) -> FloatArray:
+            point = start.copy()
+            point[free] += (x - offset) * unit
+            return np.clip(point, low, high)
+
+        def left(x: FloatArray) -> FloatArray:
+            try:
+                return self._projected(self.residuals(at(x))[1], at(x))
+            except ConvergenceError:
+                # The trust region shrinks where residuals are not finite.
+                return np.full(
+                    len(self._whole) + self._priors + len(self.score.target), np.nan
+                )
+
+        found = least_squares(
+            left, np.full(len(free), offset), lambda x: -self._jacobian(at(x))[:, free] * unit,
+            bounds=[(end - start)[free] / unit + offset for end in (low, high)], x_scale="jac",
+            ftol=NEAR / self.total, xtol=STILL, gtol=None, max_nfev=ROUNDS,
+        )  # fmt: skip
+        self.point = at(found.x)
+        for side, ends in ((-1, low), (1, high)):
+            stopped = free[found.active_mask == side]
+            self.point[stopped] = ends[stopped]
+        return found
+
+    def _jacobian(self, point: FloatArray) -> FloatArray:
+        """Derivatives of the projected prediction; those that change are found at the point."""
+        if (
+            self._there is None
+            or not np.array_equal(self._there, point)
+            or self._fresh == 2
+        ):
+            every = self._fresh > 0
+            self.differentiate(self._anew | every, point, self.residuals(point)[0])
+            self._there, self._fresh = point.copy(), max(self._fresh - 1, 0)
+        return self._projected_slopes()
 
     def _end(self) -> None:
         """Store the solution at a point where no step lowers the chi-square any more.
@@ -478,49 +423,4 @@ class Steps:
         everything = np.ones(self.count, bool)
         self.differentiate(everything, self.point, predicted)
         self.solved = self.solve(residuals, self.point, everything)
-
-    def _gainful(self, solved: BoundedSolution, least: float) -> bool:
-        """Move by the largest tried length of a step that does no harm; False if none does not."""
-        start, step = self.point, solved.solution[: self.count]
-        self._note(solved)
-        if self.history[-1] < SMALL:
-            self.point = start + step
-            return True
-        for halved in range(HALVINGS):
-            there = start + 0.5**halved * step
-            try:
-                for tried in self._tries(there):
-                    if self.square(self.residuals(tried)[1], tried) <= least + NO_HARM:
-                        self.point = tried
-                        return True
-            except ConvergenceError:
-                # Nothing can be predicted there: the same as a rise of the chi-square.
-                continue
-            if self._borrowed and halved + 1 == MISLED:
-                return False
-        return False
-
-    def _tries(self, there: FloatArray) -> Iterator[FloatArray]:
-        """Yield a point, then the same point with the effects' amplitudes refitted.
-
-        First all but amplitudes are held: a full well has to follow the gain to one part in 1e5.
-        Then only the shapes of effects are held.
-        """
-        yield there
-        amplitudes = self.effect & ~self._shape
-        for held in (~amplitudes, self._shape):
-            if not held.any() or not amplitudes.any():
-                continue
-            predicted, residuals = self.residuals(there)
-            kept = self.slopes.copy()
-            self.differentiate(amplitudes, there, predicted)
-            solved = self._solve(residuals, there, held)
-            self.slopes = kept
-            yield there + solved.solution[: self.count]
-
-    def _unsettled(self) -> ConvergenceError:
-        steps = ", ".join(f"{h:.2g}" for h in self.history)
-        return ConvergenceError(
-            f"the fit did not converge: after {ROUNDS} rounds its parameters still move by up to "
-            f"{self.history[-1]:.2g} standard errors, {SMALL} allowed (rounds: {steps})"
-        )
+        self.converged = True

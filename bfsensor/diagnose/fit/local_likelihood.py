@@ -250,8 +250,8 @@ def valley_of(model: Model, n: int) -> Valley:
     used = (design**2).sum(0) > 0
     used[rows] = False
     # A parameter of another effect at the end of its range cannot follow.
-    low, high = predictor.reach(point)
-    used[: len(point)] &= (low < 0) & (high > 0)
+    low, high = predictor.limits()
+    used[: len(point)] &= (low < point) & (point < high)
     others = span(design[:, used])
 
     def free(columns: FloatArray) -> FloatArray:

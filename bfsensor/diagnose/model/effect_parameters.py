@@ -27,8 +27,8 @@ class FittedEffects:
         Names of the parameters in a fit.
     start, steps : ndarray, shape (n,)
         Start values, and steps of numerical derivatives, in the parameters' units.
-    shapes : ndarray of bool, shape (n,)
-        Whether a parameter describes the shape of an effect, not its amplitude.
+    limits : ndarray, shape (2, n)
+        Smallest and largest values that a fit may give them.
     """
 
     def __init__(self, effects: Sequence[Effect] = ()) -> None:
@@ -37,7 +37,7 @@ class FittedEffects:
         self.names = tuple(f"effect {n} {e.name} {p.name}" for n, e, p in self._each)
         self.start = np.array([e[p.name] for _, e, p in self._each], float)
         self.steps = np.array([_step(e, p) for _, e, p in self._each], float)
-        self.shapes = np.array([not p.amplitude for _, _, p in self._each], bool)
+        self.limits = np.array([widened(p) for *_, p in self._each], float).reshape(-1, 2).T
 
     def __len__(self) -> int:
         return len(self._each)
@@ -53,13 +53,6 @@ class FittedEffects:
     def touch(self, word: str) -> NDArray[np.bool_]:
         """Mask of the parameters that a channel can depend on."""
         return np.array([word in e.touches for _, e, _ in self._each], bool)
-
-    def reach(self, values: FloatArray) -> FloatArray:
-        """Smallest and largest steps that a fit may take from given values, shape (2, n)."""
-        ends = [
-            reach_of(p, float(v)) for (_, _, p), v in zip(self._each, values, strict=True)
-        ]
-        return np.array(ends, float).reshape(-1, 2).T
 
 
 def fitted(effect: Effect) -> list[Parameter]:

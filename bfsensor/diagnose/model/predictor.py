@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channel_rows import Rows, rows_by_condition
-from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
+from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel, step_of
 from bfsensor.diagnose.data.exposure_info import label_of
 from bfsensor.diagnose.data.map_channels import MapShare
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
@@ -330,16 +330,11 @@ class Predictor:
         """Indices of a channel's values by condition; cached, as channels do not change."""
         return self._of_channels.get(("rows", channel), lambda: rows_by_condition(channel))
 
-    def shapes(self) -> NDArray[np.bool_]:
-        """Mask of the parameters that describe an effect's shape, not its amplitude."""
-        plain = len(self.names) - len(self._free)
-        return np.append(np.zeros(plain, bool), self._free.shapes)
-
-    def reach(self, point: FloatArray) -> FloatArray:
-        """Smallest and largest steps that a fit may take from a point, shape (2, parameters)."""
+    def limits(self) -> FloatArray:
+        """Smallest and largest values that a fit may give the parameters, shape (2, parameters)."""
         plain = len(self.names) - len(self._free)
         free = np.repeat([[-np.inf], [np.inf]], plain, axis=1)
-        return np.concatenate([free, self._free.reach(point[plain:])], axis=1)
+        return np.concatenate([free, self._free.limits], axis=1)
 
     def _with_light(self, channel: Channel, gains: FloatArray) -> dict[str, NDArray]:
         """Axes of a channel; for flats also 'light': electrons of a linear response to the lamp."""
@@ -499,7 +494,7 @@ def _noise_told(measured: MeasuredChannels) -> NDArray[np.bool_]:
             own = channel.axes["amp"] == n
             told[n] |= channel.word == "bias_cov"
             if channel.word == "flat_cov":
-                levels[n] |= set(channel.axes["time"][own].tolist())
+                levels[n] |= set(step_of(channel.axes)[own].tolist())
     flats = any(levels)
     return told | np.array([len(v) > 1 or not flats for v in levels], bool)
 

@@ -277,6 +277,8 @@ class Diagnosis:
             "alarm": ALARM,
             **reported(self.attribution),
             "location": self.location(),
+            "converged": bool(self.fit.converged and self.accepted[1].converged),
+            "cosmetics": [c.to_report() for c in self.measured.cosmetics],
             "recommended_recordings": self.plan.said(),
             "plan": self.plan.to_report(),
             "not_tested": [u.to_report() for u in find_untested(self.measured)],

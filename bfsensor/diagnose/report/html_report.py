@@ -92,6 +92,7 @@ def to_html(diagnosis: Diagnosis, figures: Sequence[Drawn]) -> str:
         _channels(diagnosis, report, drawn),
         _residuals(figures),
         _findings(report),
+        _cosmetics(report),
         _not_tested(report),
         _notes(report),
     ]
@@ -307,6 +308,25 @@ def _findings(report: Mapping[str, Any]) -> str:
     return (
         "<h2>Largest deviations from the baseline</h2><details open><summary>At most 15, the largest "
         f"first</summary>{_table(titles, rows, (2, 3))}</details>"
+    )
+
+
+def _cosmetics(report: Mapping[str, Any]) -> str:
+    """Tabulate defects of the sensor that were repaired before anything was measured."""
+    if not report["cosmetics"]:
+        return ""
+    rows = [
+        [
+            c["kind"].replace("_", " "), ", ".join(map(str, c["amps"])),
+            "{} to {}".format(c["x"][0], c["x"][1] - 1), "{} to {}".format(c["y"][0], c["y"][1] - 1),
+            f"{c['size']:.3g} {c['unit']}", f"{c['z']:.0f}",
+        ]
+        for c in report["cosmetics"]
+    ]  # fmt: skip
+    titles = ["defect", "amplifier", "columns", "rows", "size", "standard deviations"]
+    return (
+        "<h2>Defects of the sensor</h2><p>Repaired in all exposures before anything was measured; "
+        f"they are no part of the mismatch.</p>{_table(titles, rows, (4, 5))}"
     )
 
 

@@ -338,9 +338,9 @@ def check_pairs(exposures: Sequence[Exposure]) -> list[Caution]:
         found.append(
             Caution(
                 "pairs", f"{len(alone)} of {len(flats)} flats have no partner ({named(alone)})",
-                "they give levels and no covariances; flats are paired that follow one another "
-                "directly with equal exposure time and settings, or by a column pair in "
-                "manifest.ecsv",
+                "they give mean levels and no covariances; flats are paired that follow one another "
+                "directly with equal settings and light, to the part 'pairs: {tolerance: 0.05}' of "
+                "campaign.yaml, or by a column pair in manifest.ecsv",
                 tuple(one.number for one in alone),
             )
         )  # fmt: skip

@@ -20,6 +20,11 @@ they were twice as large, two temperatures 3 K apart would be one condition, and
 such a step could be a pair.
 """
 
+PAIR_TOLERANCE = 0.05
+"""Largest difference of the light of a pair's flats over the larger one, if campaign.yaml gives no
+other.  Chosen: each flat is divided by its mean before they are subtracted, so that pattern in
+proportion to the light drops out; with 0.1, up to twice as much of other pattern stays."""
+
 LIT = ("flat", "sflat", "spot", "qe", "light")
 """Kinds of exposures to light of a lamp."""
 
@@ -180,9 +185,11 @@ def cluster(values: Sequence[float | None], gap: float) -> list[float | None]:
 
 
 def find_pairs(
-    exposures: Sequence[Exposure], *, tolerance: float = 1e-3
+    exposures: Sequence[Exposure], *, tolerance: float = PAIR_TOLERANCE
 ) -> list[tuple[Exposure, Exposure]]:
-    """Pair flats that follow one another, of equal exposure time and settings.
+    """Pair flats that follow one another, of equal light and settings.
+
+    The light is the exposure time, times the reading of the lamp monitor where both flats have one.
 
     Two flats with another exposure between them, also one that was set aside, are no pair: the
     lamp may have drifted, and of four equal flats with the second lost, the first and the third
@@ -193,7 +200,7 @@ def find_pairs(
     exposures : sequence of Exposure
         Flats.
     tolerance : float
-        Largest difference of the exposure times over the longer one.
+        Largest difference of the light of the two over the larger one.
 
     Returns
     -------
@@ -211,7 +218,7 @@ def find_pairs(
             waiting is not None
             and one.position == waiting.position + 1
             and same[one.number] == same[waiting.number]
-            and _equal(one.exposure_time, waiting.exposure_time, tolerance)
+            and _alike(one, waiting, tolerance)
         ):
             pairs.append((waiting, one))
             waiting = None
@@ -220,10 +227,14 @@ def find_pairs(
     return pairs
 
 
-def _equal(one: float | None, other: float | None, tolerance: float) -> bool:
-    if one is None or other is None:
+def _alike(one: Exposure, other: Exposure, tolerance: float) -> bool:
+    """Whether two flats have equal light, as far as their headers say."""
+    if one.exposure_time is None or other.exposure_time is None:
         return False
-    return abs(one - other) <= tolerance * max(one, other)
+    light, more = one.exposure_time, other.exposure_time
+    if one.lamp and other.lamp:
+        light, more = light * one.lamp, more * other.lamp
+    return abs(light - more) <= tolerance * max(light, more)
 
 
 def named(exposures: Iterable[Exposure], most: int = 3) -> str:

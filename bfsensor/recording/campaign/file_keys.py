@@ -115,8 +115,8 @@ CAMPAIGN_KEYS = (
             "Files that are left out; reports quote the reason.",
             "excluded: {'flat_0012*': shutter stuck}"),
     FileKey("pairs.tolerance", "", "above 0",
-            "Relative difference of exposure times up to which two flats make a pair; 0.001 "
-            "without it.", "pairs: {tolerance: 0.002}"),
+            "Relative difference of the light (exposure time, times the lamp monitor where there "
+            "is one) up to which two flats make a pair; 0.05 without it.", "pairs: {tolerance: 0.02}"),
     FileKey("nuisances", "", "a mapping",
             "Remarks of who made the campaign; it is kept and not interpreted.",
             "nuisances: {shutter: electronic}"),

@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from bfsensor.errors import RecordingError
+from bfsensor.recording.campaign.exposures import PAIR_TOLERANCE
 from bfsensor.recording.raw.headers import SECTION_ENTRIES
 from bfsensor.recording.raw.keywords import AMPLIFIER_UNITS, Override, parse_overrides
 
@@ -69,7 +70,7 @@ class CampaignSettings:
     excluded : mapping of str to str
         Reasons for leaving files out, by pattern of their names.
     pair_tolerance : float
-        Largest difference of a pair's exposure times over the longer one.
+        Largest difference of the light of a pair's flats over the larger one.
     nuisances : mapping
         The entry ``nuisances``, which is not used.
     remarks : tuple of str
@@ -87,7 +88,7 @@ class CampaignSettings:
     amplifiers: tuple[Mapping[str, Any], ...] = ()
     masks: tuple[str, ...] = ()
     excluded: Mapping[str, str] = field(default_factory=dict)
-    pair_tolerance: float = 1e-3
+    pair_tolerance: float = PAIR_TOLERANCE
     nuisances: Mapping[str, Any] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
 
@@ -160,7 +161,7 @@ def read_settings(folder: Path) -> CampaignSettings:
         masks=_texts(path, given, "masks"),
         excluded=_excluded(path, given),
         pair_tolerance=_number(path, _mapping(path, given, "pairs"), "pairs", "tolerance")
-        or 1e-3,
+        or PAIR_TOLERANCE,
         nuisances=_mapping(path, given, "nuisances"),
         remarks=tuple(remarks),
     )

@@ -9,7 +9,12 @@ import pytest
 from bfsensor.diagnose.data.channels import Channel, join_channels
 from bfsensor.diagnose.data.exposure_info import assign_folds, condition_of, label_of
 from bfsensor.diagnose.data.flat_channels import TAIL, mean_profile, profile
-from bfsensor.diagnose.data.flat_pairing import PairFinder, by_level, group_flats
+from bfsensor.diagnose.data.flat_pairing import (
+    PairFinder,
+    by_level,
+    find_steps,
+    group_flats,
+)
 from bfsensor.errors import DiagnosisError
 
 
@@ -81,6 +86,7 @@ class Shot:
     wavelength: float = 620.0
     back_bias: float = -60.0
     temperature: float | None = None
+    lamp: float | None = None
     pair: int | None = None
     level: float = 1000.0
 
@@ -90,7 +96,7 @@ def pairs_of(shots):
     finder = PairFinder(lambda shot: shot.level, lambda level: level)
     found = [
         (a[0].number, b[0].number)
-        for groups in by_level(group_flats(shots))
+        for groups in by_level(group_flats(shots), find_steps(shots))
         for a, b in finder.pairs(groups)
     ]
     return found, [s.number for s in finder.single], finder.notes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.special import ndtr
 
 from bfsensor.diagnose.data.code_channels import CrosstalkChannels
@@ -39,3 +40,34 @@ def test_crosstalk_is_found() -> None:
     (channel,) = spots_over_a_border(1e-4).channels()
     assert np.all(np.abs(channel.values - 1e-4) < 4 * channel.errors)
     assert np.all(channel.values > 6 * channel.errors)
+
+
+def spots_beside_spots(crosstalk: float, apart: int) -> CrosstalkChannels:
+    """Spots of one amplifier are some pixels from those of the other, but for a first column.
+
+    Across the nearest spot of the other amplifier, the first column's spots lie at that distance
+    from its next ones.
+    """
+    out = CrosstalkChannels()
+    edge = np.arange(SIZE + 1) - 0.5
+    rows, own = np.arange(15.0, SIZE - 8, PITCH), np.arange(15.0, SIZE - 16, PITCH)
+
+    def light(places: np.ndarray) -> np.ndarray:
+        return np.diff(ndtr((edge - places[:, None]) / 1.1), axis=1).sum(0)
+
+    for seed in range(8651, 8655):
+        rng = np.random.default_rng(seed)
+        left = 6e5 * np.outer(light(rows), light(own + rng.uniform(-0.4, 0.4)))
+        right = 6e5 * np.outer(light(rows), light(own[1:] + apart + rng.uniform(-0.4, 0.4)))
+        frames = [left + crosstalk * right, right + crosstalk * left]
+        out.add([f + NOISE * rng.standard_normal(f.shape) for f in frames], [NOISE, NOISE])
+    return out
+
+
+@pytest.mark.parametrize("crosstalk", [0.0, 1e-3])
+@pytest.mark.parametrize("apart", [5, 9])
+def test_other_spots_of_the_amplifier_are_no_crosstalk(crosstalk, apart) -> None:
+    (channel,) = spots_beside_spots(crosstalk, apart).channels()
+    assert np.all(np.abs(channel.values - crosstalk) < 4 * channel.errors)
+    if apart > 7 and crosstalk:
+        assert np.all(channel.values > 6 * channel.errors)

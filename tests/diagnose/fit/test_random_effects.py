@@ -41,11 +41,8 @@ class Shaken:
         del channel
         return np.diag(point[0] * STRENGTHS)
 
-    def shapes(self):
-        return np.array([False])
-
-    def reach(self, point):
-        return np.array([0.0 - point, 0.1 - point])
+    def limits(self):
+        return np.array([[0.0], [0.1]])
 
 
 def channel(amplitude: float, seed: int) -> Channel:
@@ -69,7 +66,7 @@ def restricted(amplitude: float, values: np.ndarray) -> float:
 def test_the_likeliest_amplitude_is_found(start, seed):
     one = channel(1e-3, seed)
     steps = Steps(Shaken(start), [one])
-    steps.go_carefully()
+    steps.go()
     grid = np.geomspace(1e-4, 1e-2, 2000)
     best = grid[np.argmin([restricted(a, one.values) for a in grid])]
     assert steps.point[0] == pytest.approx(best, rel=0.02)
@@ -79,7 +76,7 @@ def test_errors_are_those_of_the_scatter():
     pulls = []
     for seed in range(100):
         steps = Steps(Shaken(5e-4), [channel(1e-3, 100 + seed)])
-        steps.go_carefully()
+        steps.go()
         pulls.append((steps.point[0] - 1e-3) / steps.solved.errors[0])
     assert np.mean(pulls) == pytest.approx(0.0, abs=0.4)
     assert np.std(pulls) == pytest.approx(1.0, abs=0.25)
@@ -88,7 +85,7 @@ def test_errors_are_those_of_the_scatter():
 def test_an_amplitude_that_no_channel_constrains_stays(monkeypatch):
     monkeypatch.setattr(IlluminationTurbulence, "told_by_scatter", ())
     steps = Steps(Shaken(3e-4), [channel(1e-3, 0)])
-    steps.go_carefully()
+    steps.go()
     assert steps.point[0] == 3e-4 and len(steps.score.target) == 0
 
 
