@@ -1,10 +1,7 @@
-"""Deposit of electrons in pixels, spilling, and the frozen charge that moves the boundaries.
+"""Frozen charge that moves the boundaries: state of an exposure, and its update from the image.
 
-The image holds the charge.  While a block of photons lasts, the effective charge that moves
-boundaries is frozen; electrons go into the image at once, in the order of the photons, and the
-first in a pixel marks it and enters it in a list, with the charge it had.  When the block ends
-the effective charge of the listed pixels is updated to what it will be, on average, in the next
-block: by the charge now and half of what the pixel gained in the last block.
+While a block of photons lasts, the effective charge is frozen.  When it ends, that of the pixels that
+gained charge is found again, or that of all pixels of the image.
 """
 
 from typing import NamedTuple
@@ -14,8 +11,6 @@ import numpy as np
 
 from bfsensor._kernels.compile_options import ENTRY, INLINED, INNER
 from bfsensor._kernels.extremes import max, min
-from bfsensor._kernels.hot import cool, heat
-from bfsensor._kernels.prefetch import prefetch
 from bfsensor._kernels.surroundings import mirror_all, mirror_pixel, within
 
 TILE = 16
@@ -28,37 +23,16 @@ REFRESH = 256
 """Number of changes of a tile's pixels after which its range of charges is found again.
 
 Derived: :data:`TILE` squared, so that a search over a tile costs one pixel per change."""
-STALE = np.float32(512.0)
-"""Charge that a pixel may gain before the background of its neighbours is found again [e-].
-
-Chosen: the background of a pixel, the mean of eight neighbours, is then out of date by less than
-this; twice as large, by twice as much, and the search is made half as often."""
 QUEUE = 256
 """Number of pixels whose effective charge is updated together.
 
 Chosen: they take 3 kB, which stay in the first-level cache; twice as many, no less time."""
-MANY = 2048
-"""Number of listed pixels from which they are sorted by row, so that they are near in memory.
-
-Chosen: charge of so many pixels and of their neighbours no longer fits the first-level cache; with
-twice as many small lists are left as they are, with the same bits."""
 FAINT = np.float32(64.0)
 """Effective charge up to which that of a tile counts as of this size when edges are bounded [e-].
 
 Chosen: edges move by 1e-4 pixel, so that hardly more light is looked at closely; ten times as large,
 ten times as much.  A tenth of it, and where light is spread over many pixels each tile is bounded
 again and again as electron follows electron."""
-AHEAD = 32
-"""Number of pixels whose memory is asked for before the first of them is used.
-
-Chosen: ten lines of memory for each, 20 kB, fit in the first-level cache; four times as many do not
-and gain no more."""
-SCATTERED = 1 << 20
-"""Number of pixels of an image from which on memory is asked for ahead.
-
-Chosen: all that belongs to a smaller one stays in the larger caches, and to ask costs more than it
-gains (4 % of a flat at a quarter of it); twice as large, images of 4 MB are not served."""
-
 # Indices of the counters, int64: numbers of listed pixels in this block and in the last, whether
 # the list is full in this block and was in the last, flagged tiles, photons, pixels beyond the
 # response, photons when the block began, full pixels that were met, whether an image was taken,
@@ -144,7 +118,7 @@ class Ledger(NamedTuple):
 
 
 @numba.njit(**INLINED)
-def _charge_of(image, j, i):
+def charge_of(image, j, i):
     """Charge of a pixel, in double precision."""
     return np.float64(image.single[j, i]) if image.single.size > 0 else image.double[j, i]
 
@@ -203,7 +177,7 @@ def _charge(image, ledger, j, i):
         if not ledger.mirrored:
             return ledger.outside[2]
         j, i = within(j, ny), within(i, nx)
-    return np.float32(_charge_of(image, np.uint64(j), np.uint64(i)))
+    return np.float32(charge_of(image, np.uint64(j), np.uint64(i)))
 
 
 @numba.njit(**INLINED)
@@ -256,7 +230,7 @@ def _around(image, ledger, j, i):
 
 
 @numba.njit(**INNER)
-def _set_pixels(image, charges, ledger, response, count):
+def set_pixels(image, charges, ledger, response, count):
     """Update the effective charge of the first ``count`` pixels of the queue.
 
     One step after the other for all of them, so that many loads are under way at once.
@@ -268,7 +242,7 @@ def _set_pixels(image, charges, ledger, response, count):
         pixel = np.uint64(pixels[n])
         j = pixel // width
         i = pixel - j * width
-        first[n] += np.float32(_charge_of(image, j, i))
+        first[n] += np.float32(charge_of(image, j, i))
         if modes:
             second[n] = _around(image, ledger, np.int64(j), np.int64(i))
     if modes:
@@ -304,18 +278,6 @@ def _set_pixels(image, charges, ledger, response, count):
                 charges, ledger, tile
             ):
                 _flag(ledger, np.int64(tile))
-
-
-@numba.njit(**INLINED)
-def _queue(image, charges, ledger, response, waiting, pixel, ahead):
-    """Put a pixel in the queue, with ``ahead`` electrons to add; returns how many wait there."""
-    ledger.queue[np.uint64(waiting)] = pixel
-    ledger.ahead[0, np.uint64(waiting)] = ahead
-    waiting += 1
-    if waiting == QUEUE:
-        _set_pixels(image, charges, ledger, response, waiting)
-        waiting = 0
-    return waiting
 
 
 @numba.njit(**INNER)
@@ -380,7 +342,7 @@ def _find_margin(charges, ledger, edges, tile):
 
 
 @numba.njit(**INNER)
-def _find_margins(charges, ledger, edges):
+def find_margins(charges, ledger, edges):
     """Renew ranges and margins of the flagged tiles and their neighbours."""
     tiles_x = (charges.nx + TILE - 1) // TILE
     tiles_y = (charges.ny + TILE - 1) // TILE
@@ -450,7 +412,7 @@ def _respond(response, above, here, below, begin, first, second, start, count):
 
 
 @numba.njit(**INLINED)
-def _marked(marks, pixel):
+def marked(marks, pixel):
     """Whether a pixel has gained charge in this block."""
     bit = np.uint8(1) << np.uint8(pixel & np.uint64(7))
     return (marks[pixel >> np.uint64(3)] & bit) != 0
@@ -461,7 +423,7 @@ def _any_charge(image, j, first, last):
     """Whether a part of a row holds charge; without a branch, so that it is read in vectors."""
     found = False
     for i in range(np.uint64(first), np.uint64(last)):
-        found |= _charge_of(image, np.uint64(j), i) != 0.0
+        found |= charge_of(image, np.uint64(j), i) != 0.0
     return found
 
 
@@ -471,11 +433,11 @@ def _take_pixels(image, j, first, last, charges, ledger, ahead, apart):
     start = (j + charges.pad) * charges.stride + charges.pad
     for i in range(first, last):
         at = np.uint64(start + i)
-        now = np.float32(_charge_of(image, j, i))
+        now = np.float32(charge_of(image, j, i))
         if apart:
             gain = np.float32(0.0)
             pixel = np.uint64(j * charges.nx + i)
-            if ledger.before.size > 0 and _marked(ledger.marks, pixel):
+            if ledger.before.size > 0 and marked(ledger.marks, pixel):
                 gain = now - ledger.before[pixel]
             charges.first[at] = ahead * gain
         else:
@@ -526,7 +488,7 @@ def _load_row(image, ledger, j, out):
         return
     row = np.uint64(within(j, ny))
     for i in range(np.uint64(nx)):
-        out[i + np.uint64(1)] = np.float32(_charge_of(image, row, i))
+        out[i + np.uint64(1)] = np.float32(charge_of(image, row, i))
     out[0] = _charge(image, ledger, j, -1)
     out[nx + 1] = _charge(image, ledger, j, nx)
 
@@ -599,293 +561,3 @@ def take_image(image, charges, ledger, response, edges, ahead):
 def hold_image(image, charges, ledger, response, edges):
     """Let the charge of an image act, without light."""
     take_image(image, charges, ledger, response, edges, np.float32(0))
-
-
-@numba.njit(**INNER)
-def _heat_pixel(edges, charges, hot, j, i, electrons, crowd):
-    """Mark the edges of a pixel as hot if ``crowd`` electrons come near one of them."""
-    margin = charges.margins[(j // TILE) * ((charges.nx + TILE - 1) // TILE) + i // TILE]
-    if electrons * min(np.float32(4.0) * margin, np.float32(1.0)) >= crowd:
-        # A loop, so that there is one copy of the code.
-        for n in range(4):
-            line, other = (i, j) if n < 2 else (j, i)
-            heat(edges, charges, hot, n >> 1, line + (n & 1), other)
-
-
-@numba.njit(**INNER)
-def _expect_charge(image, place):
-    """Ask for the memory of a pixel of the image."""
-    if image.single.size > 0:
-        prefetch(image.single, place)
-    else:
-        prefetch(image.double, place)
-
-
-@numba.njit(**INNER)
-def _sort_by_row(ledger, nx, count):
-    """Write the listed pixels to ``listed_before`` and their gains to ``before``, row after row."""
-    starts = ledger.starts
-    starts[:] = 0
-    width = np.uint64(nx)
-    for n in range(np.uint64(count)):
-        starts[np.uint64(ledger.listed[n]) // width + np.uint64(1)] += 1
-    for j in range(1, starts.size):
-        starts[j] += starts[j - 1]
-    for n in range(np.uint64(count)):
-        pixel = np.uint64(ledger.listed[n])
-        row = pixel // width
-        to = np.uint64(starts[row])
-        starts[row] += 1
-        ledger.listed_before[to] = pixel
-        ledger.before[to] = ledger.gained[n]
-
-
-@numba.njit(**INNER)
-def close_block(image, charges, ledger, response, edges, hot, ahead, crowd, per_photon):
-    """Update the charge with what the block brought; ``ahead`` times each pixel's gain is added.
-
-    The edges of pixels where ``crowd`` electrons or more came near one are marked as
-    hot; ``per_photon`` is the number of electrons per photon.
-    """
-    cool(hot)
-    if ledger.counters[DENSE] or ledger.counters[DENSE_BEFORE]:
-        if ledger.before.size > 0:
-            for n in range(ledger.counters[LISTED]):
-                ledger.before[ledger.listed[n]] = ledger.gained[n]
-        take_image(image, charges, ledger, response, edges, ahead)
-        ledger.marks[:] = 0
-        ledger.counters[DENSE_BEFORE] = ledger.counters[DENSE] and ahead > 0
-        ledger.counters[DENSE] = 0
-        ledger.counters[LISTED_BEFORE] = 0
-        ledger.counters[LISTED] = 0
-        for n in range(ledger.counters[STRUCK]):
-            ledger.strikes[
-                ledger.struck[n] // charges.nx, ledger.struck[n] % charges.nx
-            ] = 0
-        ledger.counters[STRUCK] = 0
-        return
-    nx = charges.nx
-    count = np.int64(0)
-    waiting = np.int64(0)
-    none = np.float32(0.0)
-    modes = response.first.size > 0
-    for n in range(ledger.counters[LISTED]):
-        pixel = ledger.listed[n]
-        j = np.int64(np.uint64(pixel) // np.uint64(nx))
-        i = pixel - j * nx
-        # The other pixels of this byte are in the list as well.
-        ledger.marks[np.uint64(pixel) >> np.uint64(3)] = 0
-        now = np.float32(_charge_of(image, j, i))
-        gain = now - ledger.gained[n]
-        if gain == none:
-            # Negative flux had brought it back, or nothing came of it.
-            continue
-        ledger.listed[count] = pixel
-        ledger.gained[count] = gain
-        count += 1
-        if modes and np.floor(now / STALE) != np.floor((now - gain) / STALE):
-            for m in range(max(j - 1, 0), min(j + 2, charges.ny)):
-                for k in range(max(i - 1, 0), min(i + 2, nx)):
-                    waiting = _queue(
-                        image,
-                        charges,
-                        ledger,
-                        response,
-                        waiting,
-                        np.int64(m * nx + k),
-                        none,
-                    )
-    for n in range(ledger.counters[LISTED_BEFORE]):
-        waiting = _queue(
-            image,
-            charges,
-            ledger,
-            response,
-            waiting,
-            np.int64(ledger.listed_before[n]),
-            none,
-        )
-    pixels, gained = ledger.listed, ledger.gained
-    if ahead > 0:
-        pixels = ledger.listed_before
-        if count > MANY:
-            gained = ledger.before
-            _sort_by_row(ledger, nx, count)
-        else:
-            for n in range(count):
-                pixels[n] = ledger.listed[n]
-    # What the block brought acts last: the same pixels may wait already, without it.
-    for n in range(count):
-        waiting = _queue(
-            image,
-            charges,
-            ledger,
-            response,
-            waiting,
-            np.int64(pixels[n]),
-            ahead * gained[n],
-        )
-    _set_pixels(image, charges, ledger, response, waiting)
-    ledger.counters[LISTED_BEFORE] = count if ahead > 0 else 0
-    ledger.counters[LISTED] = 0
-    _find_margins(charges, ledger, edges)
-    for n in range(count):
-        if ledger.gained[n] >= crowd:
-            j = ledger.listed[n] // nx
-            i = ledger.listed[n] - j * nx
-            _heat_pixel(edges, charges, hot, j, i, ledger.gained[n], crowd)
-    # Full pixels gain nothing, yet electrons come.
-    for n in range(ledger.counters[STRUCK]):
-        j = ledger.struck[n] // nx
-        i = ledger.struck[n] - j * nx
-        electrons = np.float32(ledger.strikes[j, i]) * per_photon
-        _heat_pixel(edges, charges, hot, j, i, electrons, crowd)
-        ledger.strikes[j, i] = 0
-    ledger.counters[STRUCK] = 0
-
-
-@numba.njit(**INLINED)
-def _put(image, ledger, nx, j, i, flux):
-    """Add electrons to a pixel; what single precision loses is kept in ``carry``."""
-    j, i = np.uint64(j), np.uint64(i)
-    before = _charge_of(image, j, i)
-    pixel = j * np.uint64(nx) + i
-    if not _marked(ledger.marks, pixel):
-        ledger.marks[pixel >> np.uint64(3)] |= np.uint8(1) << np.uint8(pixel & np.uint64(7))
-        count = ledger.counters[LISTED]
-        if count < ledger.listed.size:
-            ledger.listed[np.uint64(count)] = pixel
-            ledger.gained[np.uint64(count)] = before
-            ledger.counters[LISTED] = count + 1
-        else:
-            ledger.counters[DENSE] = 1
-            if ledger.before.size > 0:
-                ledger.before[pixel] = before
-    carry = ledger.carry
-    if carry.size == 0:
-        image.double[j, i] = before + flux
-    elif ledger.counters[CARRIED] == 0:
-        # Whole electrons are not lost, and nothing carried is looked up before anything is lost.
-        total = before + flux
-        now = np.float32(total)
-        image.single[j, i] = now
-        if np.float64(now) != total:
-            ledger.counters[CARRIED] = 1
-            carry[j, i] = np.float32(total - np.float64(now))
-    else:
-        carried = carry[j, i]
-        total = before + np.float64(carried) + flux
-        now = np.float32(total)
-        image.single[j, i] = now
-        rest = np.float32(total - np.float64(now))
-        # Not written where nothing is carried: untouched pages cost no memory.
-        if rest != carried:
-            carry[j, i] = rest
-
-
-@numba.njit(**INNER)
-def _spill(image, charges, ledger, j, i, flux, full_well, along_y, up):
-    """Fill a pixel, then those beyond it along its column; returns the flux that stays inside [e-]."""
-    room = full_well - _charge_of(image, j, i)
-    kept = 0.0
-    if room > 0:
-        part = min(room, flux)
-        _put(image, ledger, charges.nx, j, i, part)
-        flux -= part
-        kept += part
-    ledger.sums[SPILLED] += flux
-    step = 1 if up else -1
-    column = i if along_y else j
-    place = j if along_y else i
-    last = charges.ny if along_y else charges.nx
-    side = 1 if up else 0
-    # A column remembers from where to where it was full when it last spilled.
-    start = ledger.spill_from[side, column]
-    end = ledger.spill_to[side, column]
-    to = place + step
-    if start >= 0 and (start - place) * step <= 0 and (end - place) * step > 0:
-        to = end
-    else:
-        ledger.spill_from[side, column] = place
-    while flux > 0 and 0 <= to < last:
-        tj = to if along_y else j
-        ti = i if along_y else to
-        room = full_well - _charge_of(image, tj, ti)
-        if room > 0:
-            part = min(room, flux)
-            _put(image, ledger, charges.nx, tj, ti, part)
-            flux -= part
-            kept += part
-            if flux <= 0:
-                break
-        to += step
-    ledger.spill_to[side, column] = to
-    if flux > 0:
-        ledger.sums[SPILLED_OFF] += flux
-    return kept
-
-
-@numba.njit(**INNER)
-def _strike(ledger, j, i, nx):
-    """Count an electron that meets a full pixel."""
-    if ledger.strikes.size == 0:
-        return
-    before = ledger.strikes[j, i]
-    if before == 0:
-        count = ledger.counters[STRUCK]
-        if count >= ledger.struck.size:
-            return
-        ledger.struck[count] = j * nx + i
-        ledger.counters[STRUCK] = count + 1
-    ledger.strikes[j, i] = before + 1
-
-
-@numba.njit(**INNER)
-def deposit(
-    image, charges, ledger, flux, first, i, j, z, words, lo, hi, full_well, along_y, loss
-):
-    """Add the electrons lo to hi to the image, in their order, and to the sums of the ledger.
-
-    ``flux`` is indexed from ``first``, all else from 0.  An electron is lost with
-    probability 1 - exp(-loss Q), Q [e-] the charge that it meets.
-    """
-    nx = charges.nx
-    # One sum after the other, whatever the pieces in which electrons come.
-    added, crossed = ledger.sums[ADDED], ledger.sums[CROSSED]
-    off, lost = ledger.sums[OFF_IMAGE], ledger.sums[LOST]
-    scattered = nx * charges.ny >= SCATTERED
-    for n in range(np.uint64(lo), np.uint64(hi)):
-        if scattered and (n - np.uint64(lo)) % np.uint64(AHEAD) == np.uint64(0):
-            for m in range(n, min(n + np.uint64(AHEAD), np.uint64(hi))):
-                place = np.int64(j[m]) * nx + np.int64(i[m])
-                _expect_charge(image, place)
-                prefetch(ledger.marks, place >> 3)
-        w = flux[np.uint64(first) + n]
-        ci = np.int64(i[n])
-        cj = np.int64(j[n])
-        if ci < 0:
-            if z[n] < 0:
-                crossed += w
-            else:
-                off += w
-            continue
-        if loss > 0.0:
-            # The lowest bit says where electrons spill to.
-            word = (np.float64(words[n] >> np.uint32(1)) + 0.5) * 2.0**-31
-            if word >= np.exp(-loss * _charge_of(image, cj, ci)):
-                lost += w
-                continue
-        if w > 0 and _charge_of(image, np.uint64(cj), np.uint64(ci)) + w > full_well:
-            up = (words[n] & np.uint32(1)) == np.uint32(1)
-            _strike(ledger, cj, ci, nx)
-            added += _spill(image, charges, ledger, cj, ci, w, full_well, along_y, up)
-        else:
-            if w < 0.0:
-                # A full column may have a hole now.
-                column = ci if along_y else cj
-                ledger.spill_from[0, column] = -1
-                ledger.spill_from[1, column] = -1
-            _put(image, ledger, nx, cj, ci, w)
-            added += w
-    ledger.sums[ADDED], ledger.sums[CROSSED] = added, crossed
-    ledger.sums[OFF_IMAGE], ledger.sums[LOST] = off, lost

@@ -18,11 +18,10 @@ from bfsensor._kernels.charge import (
     PHOTONS,
     TAKEN,
     TOTAL,
-    close_block,
-    deposit,
     take_image,
 )
 from bfsensor._kernels.compile_options import ENTRY, INLINED, INNER
+from bfsensor._kernels.deposit import close_block, deposit
 from bfsensor._kernels.edges import collect
 from bfsensor._kernels.extremes import max, min
 from bfsensor._kernels.hot import evaluate, fence

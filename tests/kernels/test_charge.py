@@ -9,6 +9,7 @@ import pytest
 from bfsensor._kernels import charge as kernel
 from bfsensor._kernels.charge import TILE
 from bfsensor._kernels.compile_options import from_python
+from bfsensor._kernels.deposit import close_block, deposit
 from bfsensor.sensor.image_exposure import as_pixels
 from tests.kernels.plain_edges import (
     effective_charges,
@@ -18,7 +19,7 @@ from tests.kernels.plain_edges import (
     table_sensor,
 )
 
-close_block, deposit = from_python(kernel.close_block), from_python(kernel.deposit)
+close_block, deposit = from_python(close_block), from_python(deposit)
 
 
 def put(
