@@ -15,15 +15,16 @@ from bfsensor.diagnose.model.predictor import Predictor
 from tests.caching import keep
 from validation.common.virtual_source import VirtualSource, virtual_baseline
 from validation.concealed.campaign import write_campaign
-from validation.concealed.effect import Effect
+from validation.concealed.effect import Effect, Range
 from validation.concealed.electrostatics import EdgeShifts
 from validation.concealed.library import EFFECTS, KNOWN, make_effect
 from validation.concealed.outside import OutsideLibrary
 from validation.concealed.plan import Geometry, Size
 
 __all__ = [
-    "EFFECTS", "KNOWN", "SMALL", "EdgeShifts", "Geometry", "OutsideLibrary", "Size", "VirtualSource",
-    "fit_virtual", "make_effect", "measure_virtual", "virtual_baseline", "write_campaign",
+    "EFFECTS", "KNOWN", "SMALL", "EdgeShifts", "Effect", "Geometry", "OutsideLibrary", "Range",
+    "Size", "VirtualSource", "fit_virtual", "make_effect", "measure_virtual", "virtual_baseline",
+    "write_campaign",
 ]  # fmt: skip
 
 SMALL = Size(128, 4, 1, dithers=1)

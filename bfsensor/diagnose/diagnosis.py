@@ -140,7 +140,7 @@ def diagnose_measured(
         try:
             attribution = attribute(predictor, fit, mismatch, seed=seed)
         except ConvergenceError as error:
-            more.append(f"the mismatch is located, its explanation was given up: {error}")
+            more.append(f"the mismatch is located, but not explained: {error}")
         else:
             more += attribution.notes
             advised = plan(attribution)

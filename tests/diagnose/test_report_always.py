@@ -15,12 +15,11 @@ from bfsensor.diagnose.fit import gauss_newton
 from bfsensor.diagnose.fit.baseline_fit import UNSETTLED, fit_baseline
 from bfsensor.errors import ConvergenceError
 from tests.diagnose.fit.test_gauss_newton import Halo, channel
-from tests.virtual import make_effect, measure_virtual, virtual_baseline
-from validation.concealed.effect import Effect, Range
+from tests.virtual import Effect, Range, make_effect, measure_virtual, virtual_baseline
 
 
 class Dust(Effect):
-    """Ten round shadows of up to a few per cent, the same in all exposures."""
+    """Ten round dust spots of up to a few per cent, the same in all exposures."""
 
     word = "dust"
     variants: ClassVar = {"": {"depth": Range(1e-3, 0.1, amplitude=True)}}

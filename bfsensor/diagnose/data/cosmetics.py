@@ -1,8 +1,8 @@
 """Defects of a sensor and dust: found in flats and darks, and repaired in every frame.
 
-A column of low response, a hot pixel or a shadow of dust is no missing physics, yet it stands out of
+A column of low response, a hot pixel or a dust spot is no missing physics, yet it stands out of
 maps and darks by hundreds of standard deviations.  They are found robustly before anything is
-measured, named in the report, and repaired: columns and shadows are divided by their response; a dead
+measured, named in the report, and repaired: columns and dust spots are divided by their response; a dead
 column and a hot pixel take the mean of the nearest good pixels of their row.  Covariances of flats
 leave repaired columns and pixels out.
 """
@@ -64,24 +64,24 @@ Chosen: its noise would be more than doubled; with -0.25, columns that lack 25 t
 
 
 BIN = 4
-"""Side of the boxes in which shadows are looked for [pixel].  Chosen: 0.3 % scatter of pixels averages
-to 0.08 %; with 8, shadows of 3 pixels radius fill a tenth of a box."""
+"""Side of the boxes in which dust spots are looked for [pixel].  Chosen: 0.3 % scatter of pixels
+averages to 0.08 %; with 8, dust spots of 3 pixels radius fill a tenth of a box."""
 
 WIDE = 15
-"""Boxes of the median that light without shadows is taken from: 60 pixels.  Chosen: twice the largest
-shadow of 30 pixels; with 31, light must be even over 120 pixels."""
+"""Boxes of the median that light without dust spots is taken from: 60 pixels.  Chosen: twice the largest
+dust spot of 30 pixels; with 31, light must be even over 120 pixels."""
 
 EDGE = 2.0
-"""Deviation [standard deviations of boxes] down to which a shadow goes on from its middle.  Chosen: of
-a depth of 20 standard deviations 10 % are left outside; with 4, 20 %."""
+"""Deviation [standard deviations of boxes] down to which a dust spot goes on from its middle.  Chosen:
+of a depth of 20 standard deviations 10 % are left outside; with 4, 20 %."""
 
 ROUND, SOLID = 2.5, 0.4
-"""Largest ratio of the sides of a shadow's box, and least part of it that is dark.  Chosen: a disc
+"""Largest ratio of the sides of a dust spot's box, and least part of it that is dark.  Chosen: a disc
 fills 0.79 of a square; stripes, arcs of rings and rims do not pass.  With 5, short stripes do."""
 
 SMOOTH = 1.5
-"""Width of the Gaussian over which a shadow's response is averaged [pixel].  Chosen: the scatter of
-pixels averages to 0.06 % of them; with 3, edges of sharp shadows stay."""
+"""Width of the Gaussian over which a dust spot's response is averaged [pixel].  Chosen: the scatter of
+pixels averages to 0.06 % of them; with 3, edges of sharp dust spots stay."""
 
 
 class Cosmetic(NamedTuple):
@@ -241,7 +241,7 @@ def find_cosmetics(
                     repairs[amp].filled[:, column] = True
                 else:
                     repairs[amp].response[column] = 1.0 + departure
-        for rows_of, columns_of, shade, z in shadows(repairs[amp].of_image(image, -1.0)):
+        for rows_of, columns_of, shade, z in dust_spots(repairs[amp].of_image(image, -1.0)):
             place = _place(layout[amp], columns_of, rows_of)
             found.append(
                 Cosmetic("dust", amp, *place, float(shade.min()) - 1.0, "of the signal", z)
@@ -307,7 +307,7 @@ def bad_columns(profile: FloatArray) -> list[tuple[range, FloatArray, float]]:
     return found if sum(len(c) for c, *_ in found) <= FEW * len(profile) else []
 
 
-def shadows(image: FloatArray) -> list[tuple[range, range, FloatArray, float]]:
+def dust_spots(image: FloatArray) -> list[tuple[range, range, FloatArray, float]]:
     """Find round dark patches in the response of an amplifier's pixels.
 
     Parameters
@@ -317,7 +317,7 @@ def shadows(image: FloatArray) -> list[tuple[range, range, FloatArray, float]]:
 
     Returns
     -------
-    shadows : list of (range, range, ndarray, float)
+    spots : list of (range, range, ndarray, float)
         Rows, columns, response of the pixels there, and the deviate of the darkest box.
 
     Examples
@@ -325,7 +325,7 @@ def shadows(image: FloatArray) -> list[tuple[range, range, FloatArray, float]]:
     >>> y, x = np.indices((96, 64))
     >>> image = 3e-3 * np.random.default_rng(4).standard_normal(y.shape)
     >>> image -= 0.03 * np.exp(-0.5 * ((x - 30) ** 2 + (y - 50) ** 2) / 4**2)
-    >>> ((rows, columns, shade, z),) = shadows(image)
+    >>> ((rows, columns, shade, z),) = dust_spots(image)
     >>> 50 in rows, 30 in columns, float(shade.min().round(2))
     (True, True, 0.97)
     """
@@ -350,7 +350,7 @@ def shadows(image: FloatArray) -> list[tuple[range, range, FloatArray, float]]:
     if every.sum() > 2 * FEW * boxes.size:
         return []
     found = []
-    # The light beneath the shadows, which pulled the first median down.
+    # The light beneath the dust spots, which pulled the first median down.
     light = (
         median_filter(np.where(every, light, boxes), WIDE, mode="nearest")
         if chosen
@@ -358,7 +358,7 @@ def shadows(image: FloatArray) -> list[tuple[range, range, FloatArray, float]]:
     )
     change = image[:ny, :nx] - np.kron(light, np.ones((BIN, BIN)))
     smooth = gaussian_filter(change, SMOOTH)
-    # What the average takes off the middle of a shadow, averaged in turn (Tukey's twicing).
+    # What the average takes off the middle of a dust spot, averaged in turn (Tukey's twicing).
     smooth += gaussian_filter(change - smooth, SMOOTH)
     for whole, z in chosen:
         fine = np.kron(whole, np.ones((BIN, BIN), bool))

@@ -61,7 +61,8 @@ Gauss-Newton step; at twice as many the region shrinks once more where that misl
 0.01 errors."""
 
 SHRUNK = 3
-"""Status of :func:`scipy.optimize.least_squares` where only :data:`STILL` ended it."""
+"""Status of :func:`scipy.optimize.least_squares` where only :data:`STILL` ended it, by
+scipy's definition."""
 
 ANEW, AWAY = 8, 0.1
 """Largest number of times that the modes and the score of the variance parameters are linearised
@@ -308,7 +309,7 @@ class Steps:
         return solve_within(design, target, *ends)
 
     def go(self) -> None:
-        """Minimise by a trust region, and linearise the random effects anew until they stay.
+        """Minimise by a trust region, and linearise the random effects again until they stay.
 
         Linear parameters and random effects are projected out, so that the minimiser sees the
         non-linear parameters alone.  The fit always ends: ``converged`` says whether at a minimum.

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.data.cosmetics import bad_columns, find_cosmetics, shadows
+from bfsensor.diagnose.data.cosmetics import bad_columns, dust_spots, find_cosmetics
 from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.diagnosis import diagnose_measured
 from tests.virtual import SMALL, VirtualSource, make_effect, virtual_baseline
@@ -102,11 +102,11 @@ def test_displaced_edges_and_dark_current_are_no_defects(name):
 
 
 SHADOWS = ((25, 30, 4.0, 0.04), (90, 95, 5.0, 0.015))
-"""Row, column, width [pixel] and depth of shadows of dust."""
+"""Row, column, width [pixel] and depth of dust spots."""
 
 
 class Dust(Effect):
-    """Round shadows, the same in all exposures."""
+    """Round dust spots, the same in all exposures."""
 
     word = "dust"
     variants: ClassVar = {"": {"part": Range(0.0, 1.0, amplitude=True)}}
@@ -140,4 +140,4 @@ def test_other_patterns_are_no_dust(name):
         "rim": -0.2 * np.exp(-x / 4.0),
         "light": 0.03 * (x / 64) ** 2 - 0.02 * y / 128,
     }[name]
-    assert shadows(image + 3e-3 * rng.standard_normal(image.shape)) == []
+    assert dust_spots(image + 3e-3 * rng.standard_normal(image.shape)) == []
