@@ -69,7 +69,7 @@ def test_a_mismatch_without_explanation_is_reported(fitted_loss, monkeypatch):
     monkeypatch.setattr(diagnosis, "attribute", fail)
     found = diagnose_measured(fitted_loss[0], virtual_baseline())
     assert found.mismatch.detected and found.attribution is None
-    assert any("given up: nothing can be predicted" in n for n in found.notes)
+    assert any("not explained: nothing can be predicted" in n for n in found.notes)
     assert found.to_report()["detected"]
 
 

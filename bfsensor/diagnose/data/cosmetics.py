@@ -182,7 +182,7 @@ class RepairedFrame:
     repaired: NDArray[np.bool_]
     """Pixels of the mask whose values are usable in means, although not in covariances."""
     filled: NDArray[np.bool_]
-    """Those of them whose values are their neighbours'."""
+    """Pixels of the mask whose values are replaced by their neighbours'."""
 
 
 def repaired_of(frame: Frame) -> NDArray[np.bool_]:
@@ -394,7 +394,7 @@ def _bright(exposures: Sequence[ExposureInfo]) -> list[ExposureInfo]:
 
 
 def _long(exposures: Sequence[ExposureInfo]) -> list[ExposureInfo]:
-    """The longest darks; none unless at least QUIET, so that particles are told from defects."""
+    """The longest darks; none unless at least QUIET, so that particles differ from defects."""
     darks = [e for e in exposures if e.kind == "dark" and e.exposure_time]
     longest = max((e.exposure_time or 0.0 for e in darks), default=0.0)
     own = [e for e in darks if e.exposure_time == longest]

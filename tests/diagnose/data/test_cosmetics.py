@@ -10,8 +10,7 @@ import pytest
 from bfsensor.diagnose.data.cosmetics import bad_columns, dust_spots, find_cosmetics
 from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.diagnosis import diagnose_measured
-from tests.virtual import SMALL, VirtualSource, make_effect, virtual_baseline
-from validation.concealed.effect import Effect, Range
+from tests.virtual import SMALL, Effect, Range, VirtualSource, make_effect, virtual_baseline
 
 COLUMNS = {20: -0.07, 21: -0.03, 47: -0.9, 90: -0.015, 108: -0.29}
 """Columns of the sensor, 64 to an amplifier, and their response less one."""

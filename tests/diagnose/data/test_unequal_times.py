@@ -13,8 +13,7 @@ from bfsensor.diagnose.data.flat_pairing import by_level, find_steps, group_flat
 from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.diagnosis import diagnose_measured
 from bfsensor.recording.campaign.exposures import Exposure, find_pairs
-from tests.virtual import SMALL, VirtualSource, virtual_baseline
-from validation.concealed.effect import Effect, Range
+from tests.virtual import SMALL, Effect, Range, VirtualSource, virtual_baseline
 
 PER_CENT = 0.01
 
