@@ -6,9 +6,9 @@ import multiprocessing
 from numba.core import event
 
 # CPU seconds on one core of 2.6 GHz, by a first image and a first table, cache empty:
-# a sensor's 14 s, a table's 5 + 4 s.
+# a sensor's 16 s, a table's 5 + 4 s.
 TEXT = (
-    "compiling kernels, which happens once: about 15 s for a first image, 10 s for a first "
+    "compiling kernels, which happens once: about 17 s for a first image, 10 s for a first "
     "table; `bfsensor warm` does it ahead of use"
 )
 """Text of the notice."""

@@ -34,7 +34,7 @@ Chosen: buffers of 2 MB; twice as large takes twice that and gives the same bits
 PIECE = 1024
 """Smallest share of a batch that is worth a thread [photon].
 
-Chosen: at some 20 ns a photon a share takes 0.04 ms, far more than to hand it out; twice as large,
+Chosen: at some 20 ns a photon a share takes 0.02 ms, far more than to hand it out; twice as large,
 small blocks are spread over fewer shares, with the same bits."""
 PATIENCE = 1000
 """Number of looks for a task after which a thread lets others run on its core between two of them.

@@ -43,7 +43,7 @@ from validation.foreign.nuisances import NUISANCES, draw_nuisances
 from validation.foreign.plan import Plan
 from validation.foreign.strength import Estimator
 
-SHARED = Path("/work/shared/practice")
+SHARED = Path(__file__).resolve().parents[3] / "shared" / "practice"
 NOMINAL = DEVICES["thick_10um"]
 PLAN = Plan("T", (1.0, 20.0, 60.0), wavelengths=(480.0, 950.0))
 LAYOUT = Layout(pixels=64, amplifiers=4, rows=2, flips="mirrored", spots=16)
