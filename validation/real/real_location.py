@@ -57,7 +57,7 @@ def diagnose_sbig(folders: Sequence[Path], baseline: Baseline, *, rim: bool) -> 
         folder = Path(name)
         for one in folders:
             for path in one.glob("*.FIT"):
-                (folder / f"{one.name}-{path.name}").symlink_to(path)
+                (folder / f"{one.name}-{path.name}").symlink_to(path.resolve())
         masks = "".join(f"  - '{section}'\n" for section in RIM)
         (folder / "campaign.yaml").write_text(
             "schema: bfsensor-campaign-1\n" + (f"masks:\n{masks}" if rim else "")
