@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
+from scipy.stats import chi2, norm
 
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposure_info import Axes, ExposureInfo, Frame, condition_of
+from bfsensor.diagnose.data.exposure_info import (
+    Axes,
+    ExposureInfo,
+    Frame,
+    condition_of,
+    overscan_level,
+)
 from bfsensor.effects.read_noise import READOUT_LAGS, near_lags
 from bfsensor.typing import FloatArray
 
@@ -37,19 +44,29 @@ HOT = 10.0
 is hot [sigma of a column's mean].  Chosen: spots raise a column's median by half a sigma of a
 pixel; with 20, hot columns of 64 pixels must be 1.6 times as bright to be removed."""
 
+SCATTERED = 3.0
+"""Significance [sigma] above which the scatter of autocovariances between strips of frames replaces
+Bartlett's errors.  Chosen: Gaussian noise exceeds 3 at one in 700 lags, whose errors are then 1.2
+times as large; with 6, errors of pulses' lags may be 1.6 times too small."""
+
 STANDS_OUT = 5.0
 """Significance [sigma] above which a covariance of the noise, or an excess of rows or columns,
 enters the errors.  Chosen: noise exceeds 5 at one in 2e6 lags; with 10 weaker correlations are
 left out of the errors, which are then too small."""
 
 FRAME_ERROR = 0.1
-"""Scatter of the bias level from frame to frame that is no finding [ADU].  Chosen, to be derived
-from quiet systems: with 0.2, scatter of the level below 0.2 ADU could hardly be found."""
+"""Scatter of an amplifier's bias level, against the others', that is no finding [ADU].  Chosen, to be
+derived from quiet systems: with 0.2, scatter of the level below 0.2 ADU could hardly be found."""
 
-LEVEL_ERROR = 0.05
-"""Systematic difference between the overscan's level and the image's that is no finding [ADU].
-Chosen, to be derived from quiet systems: with 0.1, differences below 0.1 ADU could hardly be
-found."""
+JUMP = 1.0
+"""The same of a single amplifier, whose drift with the bench has no other to be compared with [ADU].
+Published: bias jumps of LSST sensors are typically above 1 ADU (SITCOMTN-148, Rubin Observatory
+2024)."""
+
+PARTS = 16
+"""Number of strips of rows of a bias whose autocovariances scatter.  Chosen: with four pairs of
+biases the scatter gives an error to 9 %; with 64, strips of 256 rows are shorter than waves that
+keep their phase over several rows."""
 
 
 class BiasChannels:
@@ -77,7 +94,9 @@ class BiasChannels:
         self._rows: list[list[tuple[float, float, float]]] = []
         self._levels: list[tuple[ExposureInfo, list[tuple[float, float]]]] = []
         self._long: list[list[FloatArray]] = []
-        self._zeros: list[list[tuple[float, float]]] = []
+        self._zeros: list[tuple[int, list[tuple[float, float]]]] = []
+        self._third: list[FloatArray] = []
+        self._strips: list[list[FloatArray]] = []
         self._size = 0
         self._condition = Condition()
 
@@ -98,7 +117,7 @@ class BiasChannels:
         # Each frame is used in one difference only, so that the differences are independent.
         self._size = here[0][0].size
         flat = np.empty((len(here), self._size))
-        spectra, long, rows = [], [], []
+        spectra, long, rows, strips = [], [], [], []
         for own, (a, zero_a), (b, zero_b) in zip(flat, self._last, here, strict=True):
             first, second = a.astype(np.float64) - zero_a, b.astype(np.float64) - zero_b
             noise = _without_outliers((first - second) / np.sqrt(2.0))
@@ -106,7 +125,9 @@ class BiasChannels:
             long.append(_autocovariance(noise))
             spectra.append(long[-1][: READOUT_LAGS + 1])
             rows.append(_row_excess(noise))
+            strips.append(_scatter_of_strips(noise))
         self._last = []
+        self._strips.append(strips)
         self._spectra.append(spectra)
         self._long.append(long)
         self._rows.append(rows)
@@ -128,18 +149,21 @@ class BiasChannels:
         for n, frame in enumerate(frames):
             over = frame.serial_overscan.astype(np.float64)
             # Without an overscan the mean bias is the zero of flats: its level stays in it.
-            zeros.append(float(over.mean()) if over.size else 0.0)
+            zeros.append(overscan_level(frame))
             image = frame.image.astype(np.float64)
             if over.size:
                 # Tracks of particles would raise the level by their number.
                 struck = _struck(image, TRACK)
-                image = image[~(struck & ~lit[n]) if lit else ~struck]
-                share = image.var() / image.size + over.var() / over.size
-                levels.append((float(image.mean()) - zeros[-1], share + LEVEL_ERROR**2))
+                out = struck & ~lit[n] if lit else struck
+                rows = np.where(out, np.nan, image)
+                # The scatter of rows has all noise that is correlated along them.
+                above = np.nanmean(rows, axis=1) - over.mean(axis=1)
+                share = float(above.var(ddof=1)) / len(above)
+                levels.append((float(np.nanmean(rows)) - float(over.mean()), share))
         if len(levels) == len(frames):
             self._levels.append((exposure, levels))
             overs = [f.serial_overscan.astype(np.float64) for f in frames]
-            self._zeros.append([(o.mean(), o.var() / o.size) for o in overs])
+            self._zeros.append((exposure.number, [_mean_and_variance(o) for o in overs]))
         return zeros
 
     def mean(self, name: str) -> FloatArray | None:
@@ -166,11 +190,13 @@ class BiasChannels:
         pairs = len(self._spectra)
         values, blocks, axes = [], [], Axes()
         found = [self._seen(amp) for amp in range(len(self._names))]
+        pulses = self.pulses()
         for amp, seen in enumerate(found):
             mean = np.mean([s[amp] for s in self._spectra], axis=0)
             values.append(mean)
-            blocks.append(_errors_in_order(seen) / (self._size * pairs))
-            axes.add(len(mean), self._condition, amp=amp, lag=np.arange(len(mean)))
+            blocks.append(self._errors(seen, amp) / (self._size * pairs))
+            axes.add(len(mean), self._condition, amp=amp, lag=np.arange(len(mean)),
+                     pulse=pulses)  # fmt: skip
         out = [
             Channel("bias_cov", np.concatenate(values), tuple(blocks), axes.columns(), "adu2",
                     self._fold)
@@ -179,6 +205,61 @@ class BiasChannels:
         if len(self._names) > 1:
             out.append(self._shared(found, pairs))
         return out
+
+    def add_third(self, frames: Sequence[Frame], bias: Mapping[str, FloatArray]) -> None:
+        """Add third cumulants of a bias frame's noise about the mean bias, by lag and amplifier."""
+        out = []
+        for frame in frames:
+            mean = bias.get(frame.name)
+            if mean is None:
+                continue
+            d = _without_outliers(frame.image - overscan_level(frame) - mean).ravel()
+            d /= d.std()
+            square, n = d**2 - 1.0, len(d)
+            out.append(np.array([
+                0.5 * (square[: n - h] @ d[h:] + square[h:] @ d[: n - h]) / (n - h)
+                for h in range(1, READOUT_LAGS + 1)
+            ]) * np.sqrt(2.0 * n / (d**4).mean()))  # fmt: skip
+        if len(out) == len(frames):
+            self._third.append(np.array(out))
+
+    def pulses(self) -> FloatArray:
+        """Covariance by lag of pulses in the amplifiers' noise, that of lag 1 being 1; 0 without.
+
+        A random telegraph signal of the output transistor has covariances that fall exponentially
+        with the lag (Machlup 1954, J. Appl. Phys. 25, 341).  Unlike Gaussian noise, and unlike
+        independent noise of any distribution, it has third cumulants between pixels that fall
+        alike.  Where these are significant, one exponential is fitted to them and the covariances.
+        """
+        out = np.zeros(READOUT_LAGS + 1)
+        if not self._third or not self._spectra:
+            return out
+        third = np.sum(self._third, axis=0) / np.sqrt(len(self._third))
+        shapes = np.exp(
+            -np.arange(READOUT_LAGS) / np.geomspace(0.2, 4.0 * READOUT_LAGS, 200)[:, None]
+        )
+        shapes /= np.sqrt(np.square(shapes).sum(1))[:, None]
+        gain = np.square(third @ shapes.T).sum(0)
+        if chi2.sf(gain.max(), len(third)) > norm.sf(STANDS_OUT):
+            return out
+        c = np.mean(self._spectra, axis=0)
+        away = c[:, 1:] / c[:, :1] * np.sqrt(self._size * len(self._spectra))
+        best = shapes[int(np.argmax(gain + np.square(away @ shapes.T).sum(0)))]
+        out[1:] = best / best[0]
+        return out
+
+    def _errors(self, seen: FloatArray, amp: int) -> FloatArray:
+        """Covariance of an amplifier's autocovariances, times the length of the series [ADU^4].
+
+        Bartlett's formula is that of Gaussian noise.  Heavy tails and pulses scatter more: where
+        strips of the frames do so significantly, their scatter scales the errors.
+        """
+        out = _errors_in_order(seen)
+        strips = np.mean([s[amp] for s in self._strips], axis=0) * self._size
+        freedom = (PARTS - 1) * len(self._strips)
+        more = strips / np.diag(out)
+        more = np.sqrt(np.where(more > 1 + SCATTERED * np.sqrt(2 / freedom), more, 1.0))
+        return np.asarray(out * np.outer(more, more))
 
     def _seen(self, amp: int) -> FloatArray:
         """Covariances of the noise at all lags, those below STANDS_OUT set to zero [ADU^2]."""
@@ -212,13 +293,19 @@ class BiasChannels:
             axes.add(len(level), self._condition, amp=np.arange(len(level)),
                      exposure=exposure.number, what="level", white=variance)  # fmt: skip
         if len(self._zeros) > 2:
-            zeros = np.array(self._zeros)
-            freedom = len(zeros) - 1
-            white = zeros[..., 1].mean(0) + FRAME_ERROR**2
-            scatter = zeros[..., 0].var(0, ddof=1) + FRAME_ERROR**2
-            values.append(np.log(scatter / white))
-            blocks.append(2.0 / freedom * np.eye(len(white)))
-            axes.add(len(white), self._condition, amp=np.arange(len(white)), exposure=-1,
+            zeros = np.array([z for _, z in sorted(self._zeros)])
+            own, amps = _contrasts(zeros[..., 0].shape[1])
+            white = zeros[..., 1].mean(0) @ own.T**2
+            white += (FRAME_ERROR if len(own.T) > 1 else JUMP) ** 2
+            # A slow drift hardly changes from one bias to the next; what jumps does.  Half of the
+            # mean square of successive differences is the variance of independent values (von
+            # Neumann 1941, Ann. Math. Stat. 12, 367), with the variance (3 n - 4) / (n - 1)^2.
+            steps = np.diff(zeros[..., 0], axis=0) @ own.T
+            floor = white - zeros[..., 1].mean(0) @ own.T**2
+            values.append(np.log((0.5 * np.square(steps).mean(0) + floor) / white))
+            n = len(zeros)
+            blocks.append((3.0 * n - 4.0) / (n - 1.0) ** 2 * np.eye(len(white)))
+            axes.add(len(white), self._condition, amp=amps, exposure=-1,
                      what="frames", white=white)  # fmt: skip
         return Channel("bias_level", np.concatenate(values), tuple(blocks), axes.columns(), "adu",
                        self._fold)  # fmt: skip
@@ -251,6 +338,9 @@ class DarkChannels:
         Fold of the channel.
     biases : int
         Number of frames in the mean bias; 0 without one.
+    tails : sequence of sequence of int
+        Pixels of each bias and amplifier in the tails of the noise, from :func:`count_tails`; as
+        many are expected in a dark, without any particle.
     """
 
     def __init__(
@@ -260,9 +350,11 @@ class DarkChannels:
         fold: str = "fit",
         *,
         biases: int = 0,
+        tails: Sequence[Sequence[int]] = (),
     ) -> None:
         self._bias, self._noise, self._fold = bias, read_noise, fold
         self._biases = biases
+        self._tails = np.array(tails, float)
         self._rows: list[
             tuple[ExposureInfo, float, list[tuple[float, float, int, int]]]
         ] = []
@@ -280,8 +372,7 @@ class DarkChannels:
         self._names = [f.name for f in frames]
         for frame in frames:
             over = frame.serial_overscan
-            zero = float(over[:, over.shape[1] // 2 :].mean()) if over.size else 0.0
-            image = frame.image.astype(np.float64) - zero
+            image = frame.image.astype(np.float64) - overscan_level(frame)
             bias = self._bias.get(frame.name)
             if bias is not None:
                 image = image - bias
@@ -308,6 +399,7 @@ class DarkChannels:
         if not self._rows:
             return []
         values, blocks, axes = [], [], Axes()
+        usual, scatter = self._usual_tails()
         for exposure, after, found in self._rows:
             level, variance, struck, _ = (
                 np.array(c, float) for c in zip(*found, strict=True)
@@ -319,8 +411,8 @@ class DarkChannels:
             blocks.append(np.diag(variance))
             axes.add(len(level), self._condition, what="level", x=-1, **common)
             # Poisson; one is added to the variance, as zero may be counted where a few are expected.
-            values.append(struck)
-            blocks.append(np.diag(struck + 1.0))
+            values.append(struck - usual)
+            blocks.append(np.diag(np.maximum(struck - usual, 0.0) + 1.0 + scatter))
             axes.add(len(level), self._condition, what="struck", x=-1, **common)
         longest = max(c.seconds for c in self._columns)
         chosen = [c for c in self._columns if c.seconds == longest]
@@ -338,6 +430,18 @@ class DarkChannels:
                      time=longest, exposure=-1, after=0.0)  # fmt: skip
         return [Channel("dark_map", np.concatenate(values), tuple(blocks), axes.columns(), "adu",
                         self._fold)]  # fmt: skip
+
+    def _usual_tails(self) -> tuple[FloatArray, FloatArray]:
+        """Pixels in the tails of the noise of a frame by amplifier, and the variance of that number.
+
+        Pulses of several pixels make it scatter by more than a Poisson number.
+        """
+        if not len(self._tails):
+            return (np.zeros(len(self._names)),) * 2
+        n = len(self._tails)
+        mean = self._tails.mean(0)
+        scatter = self._tails.var(0, ddof=1) if n > 1 else mean
+        return mean, np.maximum(mean, scatter) * (1 + 1 / n)
 
     def _column_error(self, mean: FloatArray, amp: int, noise: float, darks: int) -> float:
         """Error of a column's mean [ADU]: from the pixels' noise, or from the columns' own scatter.
@@ -367,6 +471,40 @@ class DarkChannels:
     def _rows_of(self, amp: int, mean: FloatArray) -> float:
         """Number of pixels of a column."""
         return self._rows[0][2][amp][3] / len(mean)
+
+
+def count_tails(
+    frames: Sequence[Frame],
+    bias: dict[str, FloatArray],
+    read_noise: dict[str, float],
+    biases: int,
+) -> list[int]:
+    """Count the pixels of a bias that lie in the tails of the noise, by amplifier.
+
+    They are as far out as struck pixels of darks, but not as far as most of a particle's.
+
+    Parameters
+    ----------
+    frames : sequence of Frame
+        One of the biases that the mean bias is made of.
+    bias, read_noise, biases
+        As for :class:`DarkChannels`; two biases at least.
+
+    Returns
+    -------
+    counts : list of int
+    """
+    out = []
+    for frame in frames:
+        sigma, mean = read_noise.get(frame.name, 0.0), bias.get(frame.name)
+        if mean is None or not sigma > 0 or biases < 2:
+            out.append(0)
+            continue
+        away = np.abs(frame.image - overscan_level(frame) - mean)
+        # A frame is part of its mean bias; a dark is not.
+        scale = sigma * np.sqrt((1 - 1 / biases) / (1 + 1 / biases))
+        out.append(int(((away > OUTLIER * scale) & (away < TRACK * scale)).sum()))
+    return out
 
 
 class _Columns(NamedTuple):
@@ -419,6 +557,37 @@ def _struck(noise: FloatArray, limit: float = OUTLIER) -> NDArray[np.bool_]:
     return np.asarray(away > limit * max(1.4826 * float(np.median(away)), 0.3))
 
 
+def _contrasts(amplifiers: int) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Helmert contrasts of amplifiers' levels, and the amplifier that each tells of.
+
+    What moves all amplifiers alike, such as the temperature of their common supply, is a drift of
+    the bench; an amplifier that jumps by itself is unstable.  A single amplifier is its own.
+    """
+    if amplifiers == 1:
+        return np.ones((1, 1)), np.zeros(1, int)
+    last = np.arange(1, amplifiers)
+    before = np.tri(amplifiers - 1, amplifiers) / last[:, None]
+    own = np.eye(amplifiers)[1:]
+    return np.asarray((own - before) * np.sqrt(last / (last + 1.0))[:, None]), last
+
+
+def _mean_and_variance(strip: FloatArray) -> tuple[float, float]:
+    """Mean of an overscan, and its variance from the scatter of the means of rows."""
+    rows = strip.mean(axis=1)
+    return float(rows.mean()), float(rows.var(ddof=1)) / len(rows)
+
+
+def _scatter_of_strips(noise: FloatArray) -> FloatArray:
+    """Variance of the autocovariances of a frame by their scatter between strips of its rows."""
+    strips = [s.ravel() - s.mean() for s in np.array_split(noise, PARTS)]
+    found = [
+        [s[: len(s) - h] @ s[h:] / (len(s) - h) for h in range(READOUT_LAGS + 1)]
+        for s in strips
+        if len(s) > READOUT_LAGS
+    ]
+    return np.asarray(np.var(found, axis=0, ddof=1) / len(found))
+
+
 def _autocovariance(noise: FloatArray) -> FloatArray:
     """Autocovariance of pixels in readout order, at lags up to a quarter of the frame [ADU^2]."""
     series = noise.ravel() - noise.mean()
@@ -453,12 +622,15 @@ def _row_excess(noise: FloatArray) -> tuple[float, float, float]:
     'bias_cov', and would otherwise be counted twice.
     """
     rows, columns = noise.shape
-    share = noise.var() / columns
-    excess = float(noise.mean(1).var(ddof=1) / share - 1.0)
     noise = noise - noise.mean()
     lags = near_lags(columns)
-    near = sum((noise[:, k:] * noise[:, :-k]).sum() / rows / columns for k in lags.tolist())
-    excess -= 2 * float(near) / float(noise.var())
+    near = sum((noise[:, k:] * noise[:, :-k]).sum(1) for k in lags.tolist()) / columns
+    share = noise.var() / columns
+    # The excess is a mean over rows: pulses of the noise, which few rows hold, scatter it.
+    each = (np.square(noise.mean(1)) * rows / (rows - 1.0) / share) - 2 * near / noise.var()
+    excess = float(each.mean()) - 1.0
     # All products of two pixels of a row have the same variance, and no covariance.
     far = 2.0 / (rows - 1) - 4.0 / rows / columns * float((1 - lags / columns).sum())
-    return excess, float(np.sqrt(far)), float(share)
+    own = float(each.var(ddof=1)) / rows
+    more = own if own > far * (1 + SCATTERED * np.sqrt(2 / rows)) else far
+    return excess, float(np.sqrt(more)), float(share)

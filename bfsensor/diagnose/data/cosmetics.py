@@ -15,15 +15,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import (
-    binary_dilation,
-    find_objects,
-    gaussian_filter,
-    label,
-    median_filter,
-)
+from scipy.ndimage import uniform_filter1d
 
-from bfsensor.diagnose.data.exposure_info import ExposureInfo, Frame, Source, condition_of
+from bfsensor.diagnose.data.exposure_info import (
+    ExposureInfo,
+    Frame,
+    Source,
+    condition_of,
+    overscan_level,
+)
+from bfsensor.diagnose.data.flat_defects import (
+    QUIET,
+    WIDEST,
+    bad_columns,
+    dust_spots,
+    hot_pixels,
+    low_pixels,
+    smooth_light,
+)
 from bfsensor.typing import FloatArray
 
 MOST_READ = 8
@@ -35,53 +44,20 @@ BRIGHT = 0.6
 well, and bright enough that Poisson noise is below the pixels' own scatter; at 0.3, noise is 1.4
 times as large."""
 
-SURE = 8.0
-"""Deviation above which a column or a pixel counts as a defect [robust standard deviations of its
-like].  Chosen: noise reaches it in 1e-15 of the columns; with 16, defects of twice the size stay."""
-
-LEAST = 0.004
-"""Smallest departure of the response of a bad column from its neighbours'.  Chosen: 20 times the
-scatter of columns of 256 pixels whose responses scatter by 0.3 %; with twice as much, columns of up
-to 0.8 % stay in the maps as findings."""
-
-WIDEST, QUIET = 8, 3
-"""Most columns of one defect, and number of columns on either side of it that must be like the
-others.  Chosen: patterns of light and of pixel edges (roll-off at the rim, tearing at a border of
-amplifiers, rings) are wider or have no quiet side; with 16 and 3, narrow rings are taken for defects."""
-
-LOST = 0.5
-"""Part of the summed magnitudes of the departures that is lacking in all.  Chosen: where edges between
-columns are displaced the sum is 0, where response is lacking it is the whole; at 0.25, tearing of
-unequal sides passes."""
-
-FEW = 0.1
-"""Part of an amplifier's columns, or of a column's pixels, above which none is a defect: they are a
-pattern, or a hot column.  Chosen: with 0.2, a ripple of every fifth column would be repaired away."""
-
 DEAD = -0.5
-"""Response less one below which a column is not divided by it but filled from its neighbours.
-Chosen: its noise would be more than doubled; with -0.25, columns that lack 25 to 50 % are filled."""
+"""Response less one below which pixels are not divided by it but filled from their neighbours.
+Chosen: their noise would be more than doubled; with -0.25, columns that lack 25 to 50 % are filled."""
 
 
-BIN = 4
-"""Side of the boxes in which dust spots are looked for [pixel].  Chosen: 0.3 % scatter of pixels
-averages to 0.08 %; with 8, dust spots of 3 pixels radius fill a tenth of a box."""
+BRIDGED = 1 / 3
+"""Part of that number of columns on either side that maps do not use.  Chosen: at the rest a power of
+the distance is fitted; with 2/3, defects of a few columns take a fifth of an amplifier of 64."""
 
-WIDE = 15
-"""Boxes of the median that light without dust spots is taken from: 60 pixels.  Chosen: twice the largest
-dust spot of 30 pixels; with 31, light must be even over 120 pixels."""
-
-EDGE = 2.0
-"""Deviation [standard deviations of boxes] down to which a dust spot goes on from its middle.  Chosen:
-of a depth of 20 standard deviations 10 % are left outside; with 4, 20 %."""
-
-ROUND, SOLID = 2.5, 0.4
-"""Largest ratio of the sides of a dust spot's box, and least part of it that is dark.  Chosen: a disc
-fills 0.79 of a square; stripes, arcs of rings and rims do not pass.  With 5, short stripes do."""
-
-SMOOTH = 1.5
-"""Width of the Gaussian over which a dust spot's response is averaged [pixel].  Chosen: the scatter of
-pixels averages to 0.06 % of them; with 3, edges of sharp dust spots stay."""
+SHIFTED = 200.0
+"""Square of the number of columns that the edges of a column without any charge shift visibly.
+Derived: such a column changes the areas of the next one's pixels by 2e-7 per electron in LSST's
+sensors (sum over a column of a_ij, Lage et al. 2017), 2 % at 1e5 e-, and of one r columns away by
+about r^-2 times that, which falls below 1e-4, an error of a column of 256 pixels, at r^2 = 200."""
 
 
 class Cosmetic(NamedTuple):
@@ -124,44 +100,45 @@ class Repair(NamedTuple):
 
     Attributes
     ----------
-    response : ndarray, shape (columns,)
-        Response of each column that its pixels are divided by, 1 where it is like the others.
+    response : ndarray, shape (rows, columns)
+        Response of bad columns that their pixels are divided by, 1 where it is like the others'.
     shade : ndarray, shape (rows, columns)
         Response of each pixel by dust, 1 where there is none.
     filled : ndarray of bool, shape (rows, columns)
         Pixels that take the mean of the nearest good ones of their row.
+    near : list of (int, int)
+        First column, and the one after the last, of bad columns with those whose edges they shift.
     """
 
     response: FloatArray
     shade: FloatArray
     filled: NDArray[np.bool_]
+    near: list[tuple[int, int]]
 
     @classmethod
     def none(cls, shape: tuple[int, ...]) -> Repair:
         """Nothing to repair in an image."""
-        return cls(np.ones(shape[1]), np.ones(shape), np.zeros(shape, bool))
+        return cls(np.ones(shape), np.ones(shape), np.zeros(shape, bool), [])
 
     def of_image(self, image: FloatArray, zero: float) -> FloatArray:
         """Repair an image whose pixels without light have the value ``zero``."""
-        out = zero + (image - zero) / (self.response * self.shade)
-        columns = np.arange(image.shape[1])
-        for row in np.flatnonzero(self.filled.any(1)):
-            bad = self.filled[row]
-            out[row, bad] = np.interp(columns[bad], columns[~bad], out[row, ~bad])
-        return np.asarray(out)
+        return interpolated(
+            zero + (image - zero) / (self.response * self.shade), self.filled
+        )
 
     def made(self, frame: Frame) -> RepairedFrame:
         """Repair a frame; values are rounded to codes again, as those of all other pixels are."""
-        over = frame.serial_overscan
-        zero = float(over[:, over.shape[1] // 2 :].mean()) if over.size else 0.0
-        image = self.of_image(frame.image.astype(np.float64), zero)
+        image = self.of_image(frame.image.astype(np.float64), overscan_level(frame))
         repaired = self.filled | (self.response != 1.0)
         changed = repaired | (self.shade != 1.0)
+        for start, stop in self.near:
+            repaired[:, start:stop] = True
         return RepairedFrame(
             frame.name, frame.pixels, frame.mask | repaired,
             np.where(changed, np.rint(image), frame.image).astype(np.float32),
             frame.prescan, frame.serial_overscan, frame.parallel_overscan,
             frame.flip_x, frame.flip_y, frame.origin, repaired & ~frame.mask, self.filled,
+            tuple(self.near),
         )  # fmt: skip
 
 
@@ -183,6 +160,63 @@ class RepairedFrame:
     """Pixels of the mask whose values are usable in means, although not in covariances."""
     filled: NDArray[np.bool_]
     """Pixels of the mask whose values are replaced by their neighbours'."""
+    near: tuple[tuple[int, int], ...]
+    """Columns whose edges are shifted by bad columns between them."""
+
+
+def reach_of(size: float) -> float:
+    """Number of columns on either side whose edges a column of relative response 1 + size shifts."""
+    return float(np.sqrt(abs(size) * SHIFTED))
+
+
+def interpolated(image: FloatArray, bad: NDArray[np.bool_]) -> FloatArray:
+    """Image whose bad pixels take the value between the nearest good ones of their row.
+
+    Examples
+    --------
+    >>> interpolated(np.array([[1.0, 9.0, 3.0]]), np.array([[False, True, False]]))
+    array([[1., 2., 3.]])
+    """
+    out = np.array(image)
+    columns = np.arange(image.shape[1])
+    for row in np.flatnonzero(bad.any(1) & ~bad.all(1)):
+        own = bad[row]
+        out[row, own] = np.interp(columns[own], columns[~own], image[row, ~own])
+    return out
+
+
+def bridged(image: FloatArray, frame: Frame) -> FloatArray:
+    """Image whose bad columns, and those beside them, go on straight from the columns around.
+
+    A bad column collects less charge, and by the brighter-fatter effect its neighbours more, by an
+    amount that differs between levels: neither belongs in maps of the response.
+    """
+    ranges = frame.near if isinstance(frame, RepairedFrame) else ()
+    if not ranges:
+        return image
+    out = np.array(image)
+    columns = np.arange(image.shape[1])
+    clear = ~np.any([(columns >= a) & (columns < b) for a, b in ranges], axis=0)
+    for start, stop in ranges:
+        ends = [
+            w for w in (columns[clear & (columns < start)][-WIDEST:],
+                        columns[clear & (columns >= stop)][:WIDEST]) if len(w)
+        ]  # fmt: skip
+        if not ends:
+            continue
+        # Over some rows, so that their noise is hardly seen in the bridge.
+        means = [
+            uniform_filter1d(image[:, w].mean(1), QUIET, mode="nearest")[:, None]
+            for w in ends
+        ]
+        at = columns[start:stop]
+        part = (
+            (at - ends[0].mean()) / (ends[-1].mean() - ends[0].mean())
+            if len(ends) > 1
+            else np.zeros(len(at))
+        )
+        out[:, start:stop] = means[0] + part * (means[-1] - means[0])
+    return out
 
 
 def repaired_of(frame: Frame) -> NDArray[np.bool_]:
@@ -230,24 +264,9 @@ def find_cosmetics(
     layout = source.read((flats or darks)[0])
     found: list[Cosmetic] = []
     repairs = [Repair.none(f.image.shape) for f in layout]
-    for amp, image in enumerate(_mean_flats(source, flats)):
-        rows = image.shape[0]
-        for columns, departures, z in bad_columns(np.median(image, axis=0)):
-            worst = float(departures[np.argmax(np.abs(departures))])
-            place = _place(layout[amp], columns, range(rows))
-            found.append(Cosmetic("bad_column", amp, *place, worst, "of the signal", z))
-            for column, departure in zip(columns, departures, strict=True):
-                if departure < DEAD:
-                    repairs[amp].filled[:, column] = True
-                else:
-                    repairs[amp].response[column] = 1.0 + departure
-        for rows_of, columns_of, shade, z in dust_spots(repairs[amp].of_image(image, -1.0)):
-            place = _place(layout[amp], columns_of, rows_of)
-            found.append(
-                Cosmetic("dust", amp, *place, float(shade.min()) - 1.0, "of the signal", z)
-            )
-            where = np.ix_(rows_of, columns_of)
-            repairs[amp].shade[where] *= shade
+    images = _mean_flats(source, flats)
+    if images:
+        found += _repair_response(repairs, layout, images, source.shape)
     for amp, (rate, deviate) in enumerate(_faintest_darks(source, darks)):
         for y, x in np.argwhere(hot_pixels(deviate)).tolist():
             place = _place(layout[amp], range(x, x + 1), range(y, y + 1))
@@ -265,120 +284,78 @@ def find_cosmetics(
     return (RepairedSource(source, repairs) if found else source), tuple(found)
 
 
-def bad_columns(profile: FloatArray) -> list[tuple[range, FloatArray, float]]:
-    """Find columns of low response in an amplifier.
-
-    Parameters
-    ----------
-    profile : ndarray, shape (n,)
-        Response of each column less one.
-
-    Returns
-    -------
-    defects : list of (range, ndarray, float)
-        Columns, their departures from their neighbours', and the largest deviate.
-
-    Examples
-    --------
-    >>> profile = 1e-4 * np.random.default_rng(4).standard_normal(100)
-    >>> profile[[40, 41]] -= 0.02, 0.05
-    >>> profile[[60, 61]] += 0.02, -0.02
-    >>> [(list(c), d.round(2).tolist()) for c, d, _ in bad_columns(profile)]
-    [([40, 41], [-0.02, -0.05])]
-    """
-    away = profile - median_filter(profile, 2 * WIDEST + 2 * QUIET + 1, mode="nearest")
-    scatter = 1.4826 * float(np.median(np.abs(away)))
-    if scatter <= 0:
-        return []
-    # Neighbours of a clear defect belong to it from half of that deviate on.
-    off = np.abs(away) > 0.5 * max(SURE * scatter, LEAST)
-    groups, count = label(off)
-    found = []
-    for n in range(1, count + 1):
-        own = np.flatnonzero(groups == n)
-        first, last, size = int(own[0]), int(own[-1]) + 1, np.abs(away[own])
-        sides = off[max(first - QUIET, 0) : first], off[last : last + QUIET]
-        alone = all(len(s) == QUIET and not s.any() for s in sides)
-        # An excess is dark current of a hot column, which the diagnosis explains.
-        lost = -float(away[own].sum()) > LOST * float(size.sum())
-        clear = float(size.max()) > max(SURE * scatter, LEAST)
-        if alone and lost and clear and len(own) <= WIDEST:
-            found.append((range(first, last), away[own], float(size.max()) / scatter))
-    return found if sum(len(c) for c, *_ in found) <= FEW * len(profile) else []
-
-
-def dust_spots(image: FloatArray) -> list[tuple[range, range, FloatArray, float]]:
-    """Find round dark patches in the response of an amplifier's pixels.
-
-    Parameters
-    ----------
-    image : ndarray, shape (rows, columns)
-        Response of each pixel less one.
-
-    Returns
-    -------
-    spots : list of (range, range, ndarray, float)
-        Rows, columns, response of the pixels there, and the deviate of the darkest box.
-
-    Examples
-    --------
-    >>> y, x = np.indices((96, 64))
-    >>> image = 3e-3 * np.random.default_rng(4).standard_normal(y.shape)
-    >>> image -= 0.03 * np.exp(-0.5 * ((x - 30) ** 2 + (y - 50) ** 2) / 4**2)
-    >>> ((rows, columns, shade, z),) = dust_spots(image)
-    >>> 50 in rows, 30 in columns, float(shade.min().round(2))
-    (True, True, 0.97)
-    """
-    ny, nx = (n // BIN * BIN for n in image.shape)
-    if min(ny, nx) < WIDE:
-        return []
-    boxes = image[:ny, :nx].reshape(ny // BIN, BIN, nx // BIN, BIN).mean((1, 3))
-    light = median_filter(boxes, WIDE, mode="nearest")
-    away = boxes - light
-    scatter = 1.4826 * float(np.median(np.abs(away)))
-    groups, _ = label(away < -EDGE * scatter)
-    chosen = []
-    for n, where in enumerate(find_objects(groups), 1):
-        own = groups[where] == n
-        depth = -float(away[where][own].min())
-        sides = own.shape
-        compact = max(sides) <= ROUND * min(sides) and own.mean() >= SOLID
-        if depth < max(SURE * scatter, LEAST) or not compact or max(sides) > WIDE:
-            continue
-        chosen.append((binary_dilation(groups == n, iterations=2), depth / scatter))
-    every = np.any([whole for whole, _ in chosen], axis=0) if chosen else np.zeros(0, bool)
-    if every.sum() > 2 * FEW * boxes.size:
-        return []
-    found = []
-    # The light beneath the dust spots, which pulled the first median down.
-    light = (
-        median_filter(np.where(every, light, boxes), WIDE, mode="nearest")
-        if chosen
-        else light
-    )
-    change = image[:ny, :nx] - np.kron(light, np.ones((BIN, BIN)))
-    smooth = gaussian_filter(change, SMOOTH)
-    # What the average takes off the middle of a dust spot, averaged in turn (Tukey's twicing).
-    smooth += gaussian_filter(change - smooth, SMOOTH)
-    for whole, z in chosen:
-        fine = np.kron(whole, np.ones((BIN, BIN), bool))
-        rows, columns = (np.flatnonzero(fine.any(k)) for k in (1, 0))
-        part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-        shade = np.where(fine[part], 1.0 + smooth[part], 1.0)
-        found.append(
-            (range(rows[0], rows[-1] + 1), range(columns[0], columns[-1] + 1), shade, z)
-        )  # fmt: skip
+def _repair_response(
+    repairs: Sequence[Repair],
+    layout: Sequence[Frame],
+    images: Sequence[FloatArray],
+    shape: tuple[int, int],
+) -> list[Cosmetic]:
+    """Find what lacks response in mean flats, enter it in the repairs, and list it."""
+    found: list[Cosmetic] = []
+    whole, owner = np.zeros(shape), np.full(shape, -1)
+    good = []
+    for amp, (repair, frame, image) in enumerate(zip(repairs, layout, images, strict=True)):
+        low = low_pixels(image)
+        repair.filled[low] = True
+        found += [_low_pixel(frame, amp, image, *at) for at in np.argwhere(low).tolist()]
+        good.append(repair.of_image(image, -1.0))
+        _on_sensor(whole, frame)[...] = good[-1]
+        _on_sensor(owner, frame)[...] = amp
+    whole -= smooth_light(whole, owner)
+    whole[owner < 0] = 0.0
+    shade, change = np.ones(shape), np.zeros(shape)
+    # Dust beside a column hides that the column stands alone, and a column disturbs dust's shape:
+    # each is sought again in the image without the other.
+    for _ in range(2):
+        columns = []
+        change[:] = 0.0
+        for amp, (frame, image) in enumerate(zip(layout, good, strict=True)):
+            here = (1 + image) / _on_sensor(shade, frame) - 1
+            for one in bad_columns(here):
+                columns.append((amp, one))
+                own = _on_sensor(change, frame)
+                own[:, one.columns.start : one.columns.stop] = one.change
+        dust = dust_spots((1 + whole) / (1 + change) - 1)
+        shade[:] = 1.0
+        for rows_of, columns_of, part, _ in dust:
+            shade[np.ix_(rows_of, columns_of)] *= part
+    for amp, one in columns:
+        worst = float(one.change.flat[np.abs(one.change).argmax()])
+        place = _place(layout[amp], one.columns, one.rows)
+        found.append(Cosmetic("bad_column", amp, *place, worst, "of the signal", one.z))
+        reach = int(np.ceil(BRIDGED * reach_of(worst)))
+        first, last = one.columns.start - reach, one.columns.stop + reach
+        repairs[amp].near.append((max(first, 0), last))
+    for repair, frame in zip(repairs, layout, strict=True):
+        own = _on_sensor(change, frame)
+        repair.filled[own < DEAD] = True
+        repair.response[:] = np.where(own < DEAD, 1.0, 1.0 + own)
+        repair.shade[:] = _on_sensor(shade, frame)
+    for rows_of, columns_of, part, z in dust:
+        middle = owner[rows_of[len(rows_of) // 2], columns_of[len(columns_of) // 2]]
+        place = (columns_of.start, columns_of.stop), (rows_of.start, rows_of.stop)
+        size = float(part.min()) - 1.0
+        found.append(Cosmetic("dust", int(middle), *place, size, "of the signal", z))
     return found
 
 
-def hot_pixels(deviate: FloatArray) -> NDArray[np.bool_]:
-    """Mask of single hot pixels, by the deviates of pixels in the faintest of several darks.
+def _on_sensor(image: NDArray[Any], frame: Frame) -> NDArray[Any]:
+    """View of an amplifier's part of an image of the sensor, in readout order."""
+    (x, y), (rows, columns) = frame.origin or (0, 0), frame.image.shape
+    view = image[y : y + rows, x : x + columns]
+    return view[:: -1 if frame.flip_y else 1, :: -1 if frame.flip_x else 1]
 
-    Hot columns, in which many pixels are hot, and clusters of light are left to the diagnosis.
-    """
-    hot = deviate > SURE
-    hot[:, hot.mean(0) > FEW] = False
-    return hot if hot.mean() < FEW**2 else np.zeros_like(hot)
+
+def _low_pixel(frame: Frame, amp: int, image: FloatArray, y: int, x: int) -> Cosmetic:
+    """List a pixel of low response, as a column of one row."""
+    near = image[max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3]
+    middle = float(np.median(near))
+    scatter = 1.4826 * float(np.median(np.abs(near - middle)))
+    size = float(image[y, x]) - middle
+    place = _place(frame, range(x, x + 1), range(y, y + 1))
+    return Cosmetic(
+        "bad_column", amp, *place, size, "of the signal", abs(size) / max(scatter, 1e-12)
+    )
 
 
 def _bright(exposures: Sequence[ExposureInfo]) -> list[ExposureInfo]:
@@ -434,9 +411,7 @@ def _faintest_darks(
 
 def _signal(frame: Frame) -> FloatArray:
     """Image less the overscan's level [ADU]."""
-    over = frame.serial_overscan
-    zero = float(over[:, over.shape[1] // 2 :].mean()) if over.size else 0.0
-    return frame.image.astype(np.float64) - zero
+    return frame.image.astype(np.float64) - overscan_level(frame)
 
 
 def _place(

@@ -144,6 +144,19 @@ class Frame(Protocol):
     def origin(self) -> tuple[int, int] | None: ...
 
 
+def overscan_level(frame: Frame) -> float:
+    """Level of a frame's serial overscan [ADU]; 0 without one.
+
+    The mean of its second half, which charge deferred from the image does not reach.
+    """
+    over = frame.serial_overscan
+    return (
+        float(np.mean(over[:, over.shape[1] // 2 :], dtype=np.float64))
+        if over.size
+        else 0.0
+    )
+
+
 class Source(Protocol):
     """A campaign that gives exposures in order of time, and reads their frames.
 
@@ -224,3 +237,32 @@ def assign_folds(pairs: Iterable[int], shift: int = 0) -> list[str]:
     if len(given) == 2:
         return ["fit", ("held-out", "select")[shift % 2]]
     return [pattern[(n + (shift if len(given) >= 5 else 0)) % 5] for n in range(len(given))]
+
+
+def zero_folds(place: int, count: int) -> tuple[str, ...]:
+    """Folds whose overscans have their zero from a bias.
+
+    The folds are independent only if each has biases of its own; with fewer than
+    four all biases serve all folds.
+
+    Parameters
+    ----------
+    place : int
+        Index of the bias in order of time, from 0.
+    count : int
+        Number of biases.
+
+    Returns
+    -------
+    folds : tuple of str
+
+    Examples
+    --------
+    >>> [zero_folds(n, 4) for n in range(4)], zero_folds(0, 3)
+    ([('fit',), ('held-out',), ('fit',), ('select',)], ('fit', 'select', 'held-out'))
+    """
+    return (
+        (assign_folds(range(count))[place],)
+        if count >= 4
+        else ("fit", "select", "held-out")
+    )

@@ -7,10 +7,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.ndimage import median_filter
 
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.exposure_info import Axes, ExposureInfo, Frame, condition_of
+from bfsensor.diagnose.data.exposure_info import (
+    Axes,
+    ExposureInfo,
+    Frame,
+    condition_of,
+    overscan_level,
+)
 from bfsensor.measure.bartlett import bartlett_matrix
 from bfsensor.measure.flat_pairs import flat_covariances
 from bfsensor.typing import FloatArray
@@ -56,6 +63,19 @@ class _FlatGroup:
     clipped: int = 0
 
 
+@dataclass
+class OverscanZero:
+    """Profiles of the overscans of an amplifier's biases, one for each frame."""
+
+    serial: list[FloatArray] = field(default_factory=list)
+    parallel: list[FloatArray] = field(default_factory=list)
+
+    def add(self, frame: Frame) -> None:
+        """Add a bias."""
+        self.serial.append(profile(frame.serial_overscan, 1))
+        self.parallel.append(profile(frame.parallel_overscan, 0))
+
+
 class FlatChannels:
     """Accumulates pairs of flats one by one and gives their channels.
 
@@ -74,6 +94,12 @@ class FlatChannels:
     steps : mapping of int to float, optional
         Level of each flat by its number, from
         :func:`bfsensor.diagnose.data.flat_pairing.find_steps`; by default its exposure time.
+    zeros : mapping of str to sequence of OverscanZero, optional
+        By fold, the overscans of biases in each amplifier: their mean profile, which no light
+        causes, is subtracted from that of flats.
+    pulses : ndarray, optional
+        Covariance by lag of pulses of the amplifiers' noise, from
+        :meth:`bfsensor.diagnose.data.bias_channels.BiasChannels.pulses`.
     """
 
     def __init__(
@@ -85,8 +111,12 @@ class FlatChannels:
         lags: int = LAGS,
         start: float = np.nan,
         steps: Mapping[int, float] | None = None,
+        zeros: Mapping[str, Sequence[OverscanZero]] | None = None,
+        pulses: FloatArray | None = None,
     ) -> None:
+        self._pulses = np.zeros(1) if pulses is None else pulses
         self._bias, self._noise, self._start = bias, read_noise, start
+        self._zeros = zeros or {}
         self._steps = steps or {}
         self._lamp_error, self._lags = lamp_error, lags
         self._groups: dict[tuple, _FlatGroup] = {}
@@ -183,9 +213,7 @@ class FlatChannels:
 
     def clean(self, frame: Frame) -> FloatArray:
         """Image less the frame's overscan level and the mean bias [ADU]."""
-        over = frame.serial_overscan
-        level = float(np.mean(over[:, over.shape[1] // 2 :])) if over.size else 0.0
-        image = frame.image.astype(np.float64) - level
+        image = frame.image.astype(np.float64) - overscan_level(frame)
         bias = self._bias.get(frame.name)
         return image if bias is None else image - bias
 
@@ -213,12 +241,19 @@ class FlatChannels:
                 axes.add(
                     len(j), condition, amp=amp, time=_mean_time(group), step=step, level=level,
                     pairs=len(group.levels), hours=float(np.mean(group.hours)), i=i, j=j,
+                    pulse=self._pulse(i, j),
                 )  # fmt: skip
             out.append(
                 Channel("flat_cov", np.concatenate(values), tuple(blocks), axes.columns(),
                         "adu2", fold)
             )  # fmt: skip
         return out
+
+    def _pulse(self, i: NDArray[np.int64], j: NDArray[np.int64]) -> FloatArray:
+        """Covariance of pulses of the noise at lags, in units of that at lag (1, 0); 0 without."""
+        shape = self._pulses
+        inside = (j == 0) & (i > 0) & (i < len(shape))
+        return np.where(inside, shape[np.minimum(i, len(shape) - 1)], 0.0)
 
     def _mean_levels(self) -> list[Channel]:
         out: list[Channel] = []
@@ -264,23 +299,48 @@ class FlatChannels:
             uneven = self._unevenness(name)
             for fold in dict.fromkeys(key[3] for key in self._groups):
                 values, blocks, axes = [], [], Axes()
-                for (condition, step, amp, which), group in self._groups.items():
-                    profiles = [p for p in getattr(group, name) if len(p)]
-                    if which != fold or not profiles:
-                        continue
-                    mean, matrix = mean_profile(np.array(profiles))
-                    values.append(mean)
-                    blocks.append(uneven[amp] * matrix)
-                    axes.add(
-                        len(mean), condition, amp=amp, time=_mean_time(group), step=step,
-                        level=float(np.mean(group.levels)), k=np.arange(1, len(mean) + 1),
-                    )  # fmt: skip
+                for amp in range(len(uneven)):
+                    own = []
+                    for (condition, step, n, which), group in self._groups.items():
+                        profiles = [p for p in getattr(group, name) if len(p)]
+                        if which != fold or n != amp or not profiles:
+                            continue
+                        mean, matrix = mean_profile(np.array(profiles))
+                        own.append(uneven[amp] * matrix)
+                        zero = self._zero(fold, amp, name, len(mean))
+                        values.append(mean if zero is None else mean - zero[0])
+                        axes.add(
+                            len(mean), condition, amp=amp, time=_mean_time(group), step=step,
+                            level=float(np.mean(group.levels)), k=np.arange(1, len(mean) + 1),
+                        )  # fmt: skip
+                    if own:
+                        # The biases' mean has the same error in the profiles of all levels.
+                        zero = self._zero(fold, amp, name, len(own[0]))
+                        blocks += (
+                            own
+                            if zero is None
+                            else [
+                                block_diag(*own)
+                                + np.tile(uneven[amp] * zero[1], (len(own),) * 2)
+                            ]
+                        )
                 if values:
                     out.append(
                         Channel(word, np.concatenate(values), tuple(blocks), axes.columns(),
                                 "adu", fold)
                     )  # fmt: skip
         return out
+
+    def _zero(
+        self, fold: str, amp: int, name: str, size: int
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Mean profile of the biases' overscans and its covariance; None without biases."""
+        every = self._zeros.get(fold, ())
+        profiles = [p for p in getattr(every[amp], name) if len(p)] if every else []
+        if not profiles:
+            return None
+        mean, matrix = mean_profile(np.array(profiles))
+        return (mean, matrix) if len(mean) == size else None
 
     def _unevenness(self, name: str) -> dict[int, float]:
         """Variance of profiles between exposures over that of white noise, by amplifier.

@@ -13,6 +13,7 @@ from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.bias_channels import (
     BiasChannels,
     DarkChannels,
+    count_tails,
     without_hot_columns,
 )
 from bfsensor.diagnose.data.channels import Channel
@@ -20,7 +21,9 @@ from bfsensor.diagnose.data.code_channels import CodeChannels, CrosstalkChannels
 from bfsensor.diagnose.data.cosmetics import (
     Cosmetic,
     RepairedFrame,
+    bridged,
     find_cosmetics,
+    interpolated,
     repaired_of,
 )
 from bfsensor.diagnose.data.exposure_info import (
@@ -31,8 +34,9 @@ from bfsensor.diagnose.data.exposure_info import (
     condition_of,
     is_held_out,
     numbers_of,
+    zero_folds,
 )
-from bfsensor.diagnose.data.flat_channels import FlatChannels
+from bfsensor.diagnose.data.flat_channels import FlatChannels, OverscanZero
 from bfsensor.diagnose.data.flat_pairing import (
     Flat,
     PairFinder,
@@ -199,6 +203,7 @@ def measure_channels(
     )
     biases, late_biases = BiasChannels(), BiasChannels("held-out")
     in_mean: list[int] = []
+    zeros: dict[str, list[OverscanZero]] = {}
     for exposure in kinds.get("bias", []):
         if exposure.number in haunted:
             biases.add_level(exposure, read(exposure), haunted[exposure.number])
@@ -206,7 +211,12 @@ def measure_channels(
     for n, exposure in enumerate(quiet):
         # Noise is measured in differences of two frames, which share a fold.
         held = is_held_out(n // 2, len(quiet) // 2)
-        (late_biases if held else biases).add(exposure, read(exposure))
+        bias_frames = read(exposure)
+        (late_biases if held else biases).add(exposure, bias_frames)
+        for fold in zero_folds(n, len(quiet)):
+            own = zeros.setdefault(fold, [OverscanZero() for _ in bias_frames])
+            for zero, frame in zip(own, bias_frames, strict=True):
+                zero.add(frame)
         if not held:
             in_mean.append(exposure.number)
     bias_images: dict[str, FloatArray] = {}
@@ -227,6 +237,12 @@ def measure_channels(
     for each in (biases, late_biases):
         each.forget_mean()
     noise = biases.read_noise
+    tails = []
+    for exposure in quiet:
+        if exposure.number in in_mean:
+            bias_frames = source.read(exposure)
+            tails.append(count_tails(bias_frames, bias_images, noise, biases.frames))
+            biases.add_third(bias_frames, bias_images)
     start = min((e.mjd for e in exposures if e.mjd is not None), default=np.nan)
     steps = find_steps(kinds.get("flat", []))
     flats = FlatChannels(
@@ -236,6 +252,8 @@ def measure_channels(
         lags=lags,
         start=start,
         steps=steps,
+        zeros=zeros,
+        pulses=biases.pulses(),
     )
     longest: dict[Condition, float] = {}
     for flat in kinds.get("flat", []):
@@ -279,7 +297,7 @@ def measure_channels(
             _rough_gains(channel, gains)
     rough = tuple(float(np.median(g)) if g else 1.0 for g in gains)
     darks, late_darks = (
-        DarkChannels(bias_images, noise, fold, biases=biases.frames)
+        DarkChannels(bias_images, noise, fold, biases=biases.frames, tails=tails)
         for fold in ("fit", "held-out")
     )
     before: dict[int, float] = {}
@@ -487,8 +505,10 @@ def _mean_level(flats: FlatChannels, frames: Sequence[Frame]) -> float:
 
 
 def _good(flats: FlatChannels, frame: Frame) -> FloatArray:
-    """Clean image, nan where a pixel is masked and not repaired."""
-    return np.where(frame.mask & ~repaired_of(frame), np.nan, flats.clean(frame))
+    """Clean image, nan where a pixel is masked; defects have their neighbours' values."""
+    repaired = repaired_of(frame)
+    image = bridged(interpolated(flats.clean(frame), repaired | frame.mask), frame)
+    return np.where(frame.mask & ~repaired, np.nan, image)
 
 
 def _rough_gains(channel: Channel, gains: list[list[float]]) -> None:

@@ -6,14 +6,16 @@ import numpy as np
 
 from bfsensor.diagnose.data.channel_rows import Rows
 from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.cosmetics import Cosmetic, reach_of
 from bfsensor.diagnose.data.exposure_info import label_of
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.model.map_shapes import Places
 from bfsensor.typing import FloatArray
 
-MAP_ORDER = 4
-"""Largest total order of the polynomial in x and y that describes the light on the sensor. Chosen, to
-be derived: twice as large takes up more of smooth effects such as rings of long period."""
+MAP_ORDER, LIGHT_ORDER = 4, 8
+"""Largest total order of the polynomial in x and y that describes the ratio of two maps; and the largest
+number of half waves on the sensor that describes the light beyond it.  Chosen: with 8 half waves the
+light may vary over a quarter of the sensor; twice as many take up rings of an eighth of it."""
 
 
 def linear_columns(
@@ -21,8 +23,9 @@ def linear_columns(
 ) -> dict[str, FloatArray]:
     """Make the columns of a channel's linear parameters: its change for a unit of each, by name.
 
-    Parameters are the light by amplifier and condition, the dark current, the shape of the light
-    and the flux of the spots; the same name is the same parameter in all channels.
+    Parameters are the light by amplifier and condition, the dark current, the shape of the light,
+    the flux of the spots, the bias structure and pulses of the noise; the same name is the same
+    parameter in all channels.
 
     Parameters
     ----------
@@ -46,6 +49,10 @@ def linear_columns(
         return _dark_columns(channel)
     if channel.word == "spot":
         return _spot_columns(channel, rows)
+    if channel.word in ("bias_cov", "flat_cov"):
+        return _pulse_columns(channel)
+    if channel.word == "bias_level":
+        return _level_columns(channel)
     return {}
 
 
@@ -62,6 +69,25 @@ def _mean_columns(channel: Channel, rows_of: Rows) -> dict[str, FloatArray]:
     for amp in np.unique(x["amp"]):
         out[f"dark {int(amp)}"] = np.where(x["amp"] == amp, x["time"], 0.0)
     return out
+
+
+def _pulse_columns(channel: Channel) -> dict[str, FloatArray]:
+    """Covariance of the pulses of each amplifier's noise, where biases show any."""
+    x, shape = channel.axes, channel.axes.get("pulse")
+    if shape is None:
+        return {}
+    own = {int(a): np.where(x["amp"] == a, shape, 0.0) for a in np.unique(x["amp"])}
+    return {f"pulses {amp}": column for amp, column in own.items() if column.any()}
+
+
+def _level_columns(channel: Channel) -> dict[str, FloatArray]:
+    """Level of each amplifier's fixed bias structure above its overscan."""
+    x = channel.axes
+    level = x["what"] == "level"
+    return {
+        f"bias level {int(amp)}": np.where(level & (x["amp"] == amp), 1.0, 0.0)
+        for amp in np.unique(x["amp"][level])
+    }
 
 
 def _dark_columns(channel: Channel) -> dict[str, FloatArray]:
@@ -82,10 +108,25 @@ def _map_columns(channel: Channel, measured: MeasuredChannels) -> dict[str, Floa
     out: dict[str, FloatArray] = {}
     places = Places.of(x, measured.shape)
     u, v = (2 * (np.arange(n) + 0.5) / n - 1 for n in (nx, ny))
+    orders = [(p, q) for p in range(LIGHT_ORDER + 1) for q in range(LIGHT_ORDER + 1 - p)]
+    high = {f"light {p}{q}" for p, q in orders if p + q > MAP_ORDER}
+    # Cosines, as polynomials of high order resolve the rims, where the field rolls off.
+    waves = [
+        np.cos(0.5 * np.pi * np.outer(np.arange(LIGHT_ORDER + 1), w + 1)) for w in (u, v)
+    ]
     smooth = {
-        f"light {p}{q}": places.product(u**p, v**q, size)
-        for p in range(MAP_ORDER + 1) for q in range(MAP_ORDER + 1 - p)
-    }  # fmt: skip
+        f"light {p}{q}": places.product(waves[0][p], waves[1][q], size)
+        if p + q > MAP_ORDER
+        else places.product(u**p, v**q, size)
+        for p, q in orders
+    }
+    # Where opposite rims get unequal light, pixels at a rim lean out or in by the brighter-fatter
+    # effect.  The area change by a row of charge falls as the square of its distance.  Both rims
+    # have opposite signs, unlike the roll-off of the field there.
+    rims = [(1.0 + np.arange(n)) ** -2.0 for n in (nx, ny)]
+    rims = [r - r[::-1] for r in rims]
+    smooth["rim x"] = places.product(rims[0], np.ones(ny), size)
+    smooth["rim y"] = places.product(np.ones(nx), rims[1], size)
     # Each amplifier was divided by its mean, so that steps between amplifiers are free.
     for amp, s in enumerate(measured.segments[1:], 1):
         inside = np.zeros(nx), np.zeros(ny)
@@ -95,6 +136,8 @@ def _map_columns(channel: Channel, measured: MeasuredChannels) -> dict[str, Floa
     for name in dict.fromkeys(x["map"]):
         here = x["map"] == name
         for what, column in smooth.items():
+            if what in high and name != "all":
+                continue
             out[f"map {name} {what}"] = np.where(here, column, 0.0)
         ring = here & (x["what"] == "ring")
         if ring.any():
@@ -102,8 +145,48 @@ def _map_columns(channel: Channel, measured: MeasuredChannels) -> dict[str, Floa
             # pixels' response by amounts that differ between levels and conditions.
             for power in (2, 4):
                 out[f"map {name} rings k{power}"] = np.where(ring, x["k"] ** power, 0.0)
+        for n, one in enumerate(_lines(measured)):
+            # Charge that a bad column lacks leaves its neighbours more area, at each level and
+            # condition another.
+            beside = _beside(nx, *one.x), _inside(ny, *one.y)
+            out[f"map {name} beside {n}"] = np.where(
+                here, places.product(*beside, size), 0.0
+            )
+        if name == "all":
+            for n, spot in enumerate(c for c in measured.cosmetics if c.kind == "dust"):
+                # The light beneath a dust spot is known less well than that beside it.
+                bump = _bump(nx, *spot.x), _bump(ny, *spot.y)
+                out[f"map dust {n}"] = np.where(here, places.product(*bump, size), 0.0)
         if name == "all" and ring.any():
             out["map rings white"] = np.where(ring, 1.0, 0.0)
+    return out
+
+
+def _lines(measured: MeasuredChannels) -> list[Cosmetic]:
+    """Bad columns of many rows that lack enough charge to shift the edges beside them."""
+    return [
+        c for c in measured.cosmetics
+        if c.kind == "bad_column" and c.y[1] - c.y[0] > 1 and reach_of(c.size) > 1
+    ]  # fmt: skip
+
+
+def _beside(size: int, start: int, stop: int) -> FloatArray:
+    """Inverse square of the distance from columns ``start`` to ``stop``, 0 in them; shape (size,)."""
+    place = np.arange(size)
+    away = np.maximum(np.maximum(start - place, place - stop + 1), 0)
+    return np.asarray(np.where(away > 0, np.maximum(away, 1.0) ** -2.0, 0.0))
+
+
+def _inside(size: int, start: int, stop: int) -> FloatArray:
+    """1 from ``start`` to ``stop``, 0 elsewhere; shape (size,)."""
+    place = np.arange(size)
+    return np.asarray(((place >= start) & (place < stop)).astype(float))
+
+
+def _bump(size: int, start: int, stop: int) -> FloatArray:
+    """One arch of a squared sine from ``start`` to ``stop``, 0 elsewhere; shape (size,)."""
+    out, place = np.zeros(size), np.arange(max(start, 0), min(stop, size))
+    out[place] = np.sin(np.pi * (place - start + 0.5) / (stop - start)) ** 2
     return out
 
 

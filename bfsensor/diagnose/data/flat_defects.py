@@ -1,0 +1,376 @@
+"""Defects of a sensor's response and dust in a mean flat, and hot pixels in darks, found robustly."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import (
+    binary_dilation,
+    binary_fill_holes,
+    find_objects,
+    gaussian_filter,
+    label,
+    maximum_filter,
+    median_filter,
+)
+
+from bfsensor.typing import FloatArray
+
+SURE = 8.0
+"""Deviation above which a column or a pixel counts as a defect [robust standard deviations of its
+like].  Chosen: noise reaches it in 1e-15 of the columns; with 16, defects of twice the size stay."""
+
+LEAST = 0.004
+"""Smallest departure of the response of a bad column from its neighbours'.  Chosen: 20 times the
+scatter of columns of 256 pixels whose responses scatter by 0.3 %; with twice as much, columns of up
+to 0.8 % stay in the maps as findings."""
+
+WIDEST, QUIET = 8, 3
+"""Most columns of one defect, and number of columns on either side of it that must be like the
+others.  Chosen: patterns of light and of pixel edges (roll-off at the rim, tearing at a border of
+amplifiers, rings) are wider or have no quiet side; with 16 and 3, narrow rings are taken for defects."""
+
+LOST = 0.5
+"""Part of the summed magnitudes of the departures that is lacking in all.  Chosen: where edges between
+columns are displaced the sum is 0, where response is lacking it is the whole; at 0.25, tearing of
+unequal sides passes."""
+
+FEW = 0.1
+"""Part of an amplifier's columns, or of a column's pixels, above which none is a defect: they are a
+pattern, or a hot column.  Chosen: with 0.2, a ripple of every fifth column would be repaired away."""
+
+BIN = 4
+"""Side of the boxes in which dust spots are looked for [pixel].  Chosen: 0.3 % scatter of pixels
+averages to 0.08 %; with 8, dust spots of 3 pixels radius fill a tenth of a box."""
+
+WIDE = 15
+"""Boxes of the median that light without dust spots is taken from: 60 pixels.  Chosen: twice the largest
+dust spot of 30 pixels; with 31, light must be even over 120 pixels."""
+
+LIGHT = 8
+"""Order of the polynomial of the light that dust spots stand out of.  Chosen: cos^4 of the field and a
+stop's shadow are smooth over half of the sensor; with 16, waves of an eighth of the sensor, 32 of 256
+pixels, are light and wide dust spots with them."""
+
+EDGE = 2.0
+"""Deviation [standard deviations of averaged boxes] down to which a dust spot goes on from its middle.
+Chosen: of a depth of 20 standard deviations 10 % are left outside; with 4, 20 %."""
+
+OUTSIDE = 5.0
+"""Departure of a box from the polynomial above which it has no part in it [robust standard deviations].
+Chosen: dust spots are farther out; with 3, corners that a stop darkens lie outside, too."""
+
+DARK = 5.0
+"""Depth of a dust spot above which it is sure [robust standard deviations of averaged boxes].  Chosen:
+noise reaches it in 3e-7 of the boxes, once in 800 sensors of 256 x 256 pixels; with 10, spots of twice
+the depth stay in the maps, where blocks of 16 pixels show them."""
+
+SHALLOW = 1e-3
+"""Smallest depth of a dust spot, where boxes are averaged.  Chosen: three times the error of a block of
+a map in a campaign of 256 x 256 pixels; with 2e-3, dust spots of twice the depth stay in the maps."""
+
+ROUND, SOLID = 2.5, 0.4
+"""Largest ratio of the sides of a dust spot's box, and least part of it that is dark.  Chosen: a disc
+fills 0.79 of a square; stripes, arcs of rings and rims do not pass.  With 5, short stripes do."""
+
+SMOOTH = 1.5
+"""Width of the Gaussian over which a dust spot's response is averaged [pixel].  Chosen: the scatter of
+pixels averages to 0.06 % of them; with 3, edges of sharp dust spots stay."""
+
+
+class BadColumns(NamedTuple):
+    """Adjacent columns of low response in an amplifier.
+
+    Attributes
+    ----------
+    columns, rows : range
+        Columns, and rows from the first to the last that any of them lacks response in.
+    change : ndarray, shape (rows, columns) of the amplifier's rows and these columns
+        Response less one; 0 where it is like the neighbours'.
+    z : float
+        Largest deviate [robust standard deviations].
+    """
+
+    columns: range
+    rows: range
+    change: FloatArray
+    z: float
+
+
+def low_pixels(image: FloatArray) -> NDArray[np.bool_]:
+    """Mask of single pixels, or two adjacent ones, of low response.
+
+    Parameters
+    ----------
+    image : ndarray, shape (rows, columns)
+        Response of each pixel less one.
+
+    Returns
+    -------
+    low : ndarray of bool, shape (rows, columns)
+
+    Examples
+    --------
+    >>> image = 3e-3 * np.random.default_rng(4).standard_normal((64, 64))
+    >>> image[20, 30] -= 0.06
+    >>> np.argwhere(low_pixels(image)).tolist()
+    [[20, 30]]
+    """
+    away = image - median_filter(image, 5, mode="nearest")
+    scatter = 1.4826 * float(np.median(np.abs(away)))
+    # Pixels of a bad column are low beside other columns, not along their own.
+    along = image - median_filter(image, (9, 1), mode="nearest")
+    low = np.maximum(away, along) < -max(SURE * scatter, LEAST)
+    groups, _ = label(low, np.ones((3, 3)))
+    for n, where in enumerate(find_objects(groups), 1):
+        if max(s.stop - s.start for s in where) > 2:
+            low[groups == n] = False
+    # Pixels of a column are a column's defect, patterns of light are in many.
+    low[:, low.mean(0) > FEW] = False
+    return low if low.mean() < FEW**2 else np.zeros_like(low)
+
+
+def bad_columns(image: FloatArray) -> list[BadColumns]:
+    """Find columns of low response in an amplifier, whole or from a row on.
+
+    Parameters
+    ----------
+    image : ndarray, shape (rows, columns)
+        Response of each pixel less one, without single low pixels.
+
+    Returns
+    -------
+    defects : list of BadColumns
+
+    Examples
+    --------
+    >>> image = 3e-3 * np.random.default_rng(4).standard_normal((200, 100))
+    >>> image[:, [40, 41]] -= 0.02, 0.05
+    >>> image[80:, 70] -= 0.04
+    >>> image[:, [60, 61]] += 0.02, -0.02
+    >>> [(list(d.columns), d.rows, d.change[150].round(2).tolist()) for d in bad_columns(image)]
+    [([40, 41], range(0, 200), [-0.02, -0.05]), ([70], range(80, 200), [-0.04])]
+    """
+    ny, nx = image.shape
+    across = 2 * WIDEST + 2 * QUIET + 1
+    profile = np.median(image, axis=0)
+    whole = profile - median_filter(profile, across, mode="nearest")
+    scatter = 1.4826 * float(np.median(np.abs(whole)))
+    if scatter <= 0:
+        return []
+    # Parts of columns are compared with their nearest neighbours: light and dust change slowly.
+    strips = np.array_split(image, max(ny // (2 * BIN), 1))
+    away = np.concatenate(
+        [
+            s - median_filter(np.median(s, axis=0), 2 * QUIET + 3, mode="nearest")
+            for s in strips
+        ]
+    )
+    first, last = _lacking_rows(away)
+    rows = np.arange(ny)[:, None]
+    part = (rows >= first) & (rows < last)
+    count = part.sum(0)
+    part_mean = np.where(part, away, 0.0).sum(0) / count
+    # A column's own median is robust against what a part of it has.
+    mean = np.where(count == ny, whole, part_mean)
+    z = mean * np.sqrt(count / ny) / scatter
+    # Neighbours of a clear defect belong to it from half of that deviate on.
+    off = np.minimum(np.abs(z) / SURE, np.abs(mean) / LEAST) > 0.5
+    at = np.flatnonzero(off)
+    found = []
+    # Columns with fewer than QUIET others between them are one defect.
+    for own in np.split(at, np.flatnonzero(np.diff(at) > QUIET) + 1) if len(at) else []:
+        start, stop, size = int(own[0]), int(own[-1]) + 1, np.abs(mean[own])
+        # At an amplifier's border there may be fewer neighbours, but not none.
+        sides = off[max(start - QUIET, 0) : start], off[stop : stop + QUIET]
+        alone = not any(s.any() for s in sides) and sum(map(len, sides)) >= QUIET
+        # An excess is dark current of a hot column, which the diagnosis explains.
+        lost = -float(mean[own].sum()) > LOST * float(size.sum())
+        clear = float(np.min([np.abs(z[own]) / SURE, size / LEAST], axis=0).max()) > 1.0
+        if alone and lost and clear and stop - start <= WIDEST:
+            span = range(int(first[own].min()), int(last[own].max()))
+            change = np.zeros((ny, stop - start))
+            change[:, own - start] = np.where(part[:, own], mean[own], 0.0)
+            found.append(
+                BadColumns(range(start, stop), span, change, float(np.abs(z[own]).max()))
+            )
+    return found if sum(len(d.columns) for d in found) <= FEW * nx else []
+
+
+def _lacking_rows(
+    away: FloatArray,
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First row, and the one after the last, of the part of each column that departs most clearly.
+
+    It begins or ends at the image's edge: charge that a site holds back is lacking in all rows that
+    are read through it.
+    """
+    ny = len(away)
+    sums = np.concatenate([np.zeros((1, away.shape[1])), np.cumsum(away, axis=0)])
+    length = np.maximum(np.arange(ny + 1), 1)[:, None]
+    low, high = sums**2 / length, (sums[-1] - sums) ** 2 / length[::-1]
+    # Short parts are few pixels: they are no column.
+    least = max(ny // 16, 4)
+    low[:least], high[ny - least + 1 :] = 0.0, 0.0
+    end, start = low.argmax(0), high.argmax(0)
+    from_start = low.max(0) >= high.max(0)
+    return np.where(from_start, 0, start), np.where(from_start, end, ny)
+
+
+def smooth_light(
+    image: FloatArray, amplifiers: NDArray[np.int64] | None = None
+) -> FloatArray:
+    """Fit a polynomial of the place to boxes of a mean flat, with a step for each amplifier.
+
+    Parameters
+    ----------
+    image : ndarray, shape (rows, columns)
+        Response of each pixel of the sensor less one.
+    amplifiers : ndarray of int, shape (rows, columns), optional
+        Index of each pixel's amplifier, below 0 where none reads; by default one reads all.
+
+    Returns
+    -------
+    light : ndarray, shape (rows, columns)
+        What dust spots and patterns stand out of.
+    """
+    owner = np.zeros(image.shape, int) if amplifiers is None else amplifiers
+    y, x = (np.linspace(-1.0, 1.0, n) for n in image.shape)
+    step = max(1, int(np.ceil(max(image.shape) / 64)))
+    y_at, x_at = (np.arange(step // 2, n - step + step // 2 + 1, step) for n in image.shape)
+    ny, nx = len(y_at), len(x_at)
+    boxes = image[: ny * step, : nx * step].reshape(ny, step, nx, step)
+    # The median of a box is that of its good pixels.
+    values = np.median(boxes, axis=(1, 3)).ravel()
+    own = owner[np.ix_(y_at, x_at)].ravel()
+    powers = [(p, q) for p in range(LIGHT + 1) for q in range(LIGHT + 1 - p) if p + q]
+    legendre = [np.polynomial.legendre.legvander(u, LIGHT) for u in (x, y)]
+    at = legendre[0][x_at], legendre[1][y_at]
+    columns = [np.outer(at[1][:, q], at[0][:, p]).ravel() for p, q in powers]
+    steps = [(own == n).astype(float) for n in range(int(owner.max()) + 1)]
+    design = np.column_stack([*columns, *steps])
+    used = own >= 0
+    for _ in range(3):
+        found = np.linalg.lstsq(design[used], values[used], rcond=None)[0]
+        away = values - design @ found
+        middle = np.median(away[used])
+        spread = 1.4826 * float(np.median(np.abs(away[used] - middle)))
+        used = (own >= 0) & (np.abs(away - middle) <= OUTSIDE * spread)
+    light = sum(
+        c * np.outer(legendre[1][:, q], legendre[0][:, p])
+        for c, (p, q) in zip(found, powers, strict=False)
+    )
+    offsets = np.append(found[len(powers) :], 0.0)
+    return np.asarray(light + offsets[owner])
+
+
+def dust_spots(image: FloatArray) -> list[tuple[range, range, FloatArray, float]]:
+    """Find round dark patches in the response of a sensor's pixels.
+
+    Parameters
+    ----------
+    image : ndarray, shape (rows, columns)
+        Response of each pixel less one, without the smooth light.
+
+    Returns
+    -------
+    spots : list of (range, range, ndarray, float)
+        Rows, columns, response of the pixels there, and the deviate of the darkest place.
+
+    Examples
+    --------
+    >>> y, x = np.indices((96, 64))
+    >>> image = 3e-3 * np.random.default_rng(4).standard_normal(y.shape)
+    >>> image -= 0.03 * np.exp(-0.5 * ((x - 30) ** 2 + (y - 50) ** 2) / 4**2)
+    >>> ((rows, columns, shade, z),) = dust_spots(image)
+    >>> 50 in rows, 30 in columns, float(shade.min().round(2))
+    (True, True, 0.97)
+    """
+    ny, nx = (n // BIN * BIN for n in image.shape)
+    if min(ny, nx) < WIDE:
+        return []
+    boxes = image[:ny, :nx].reshape(ny // BIN, BIN, nx // BIN, BIN).mean((1, 3))
+    light = median_filter(boxes, WIDE, mode="nearest")
+    # A second time with the light beneath the first dust spots, which pulled the median down.
+    for _ in range(2):
+        chosen, bright = _dark_patches(boxes - light)
+        every = (
+            np.any([w for w, _ in chosen], axis=0) if chosen else np.zeros_like(boxes, bool)
+        )
+        if not chosen or every.sum() > 2 * FEW * boxes.size:
+            return []
+        light = _beneath(boxes, every)
+    # Dust only takes light away; rings, cells of air and fringes are as often as bright as dark.
+    usual = float(np.median([z for _, z in chosen]))
+    if sum(z > usual for z in bright) > len(chosen) // 4:
+        return []
+    found = []
+    change = image[:ny, :nx] - np.kron(light, np.ones((BIN, BIN)))
+    smooth = gaussian_filter(change, SMOOTH)
+    # What the average takes off the middle of a dust spot, averaged in turn (Tukey's twicing).
+    smooth += gaussian_filter(change - smooth, SMOOTH)
+    for whole, z in chosen:
+        fine = np.kron(whole, np.ones((BIN, BIN), bool))
+        rows, columns = (np.flatnonzero(fine.any(k)) for k in (1, 0))
+        part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        shade = np.where(fine[part], 1.0 + smooth[part], 1.0)
+        found.append(
+            (range(rows[0], rows[-1] + 1), range(columns[0], columns[-1] + 1), shade, z)
+        )  # fmt: skip
+    return found
+
+
+def _beneath(boxes: FloatArray, dusty: NDArray[np.bool_]) -> FloatArray:
+    """Median of the boxes around each that hold no dust."""
+    high = 1.0 + float(np.abs(boxes).max())
+    out = median_filter(np.where(dusty, high, boxes), WIDE, mode="nearest")
+    low = median_filter(np.where(dusty, -high, boxes), WIDE, mode="nearest")
+    # With as many boxes above as below, the mean of both medians is that of the clear ones.
+    known = (np.abs(out) < high) & (np.abs(low) < high)
+    return np.asarray(np.where(known, 0.5 * (out + low), np.median(boxes[~dusty])))
+
+
+def _dark_patches(
+    away: FloatArray,
+) -> tuple[list[tuple[NDArray[np.bool_], float]], list[float]]:
+    """Masks of round dark patches of boxes with their deviates; those of bright maxima.
+
+    Boxes alone show small patches, their averages over the neighbours wide and shallow ones.
+    """
+    out: list[tuple[NDArray[np.bool_], float]] = []
+    taken = np.zeros(away.shape, bool)
+    bright: list[float] = []
+    for width in (0.0, 0.5, 1.0):
+        mean = gaussian_filter(away, width) if width else away
+        scatter = 1.4826 * float(np.median(np.abs(mean)))
+        least = max(DARK * scatter, SHALLOW if width else LEAST)
+        top = mean[(mean == maximum_filter(mean, 5)) & (mean > least)]
+        bright += (top / scatter).tolist()
+        # Dust spots that touch are apart at a greater depth.
+        for edge in (EDGE, 2 * EDGE, 4 * EDGE):
+            groups, _ = label((mean < -edge * scatter) & ~taken)
+            for n, where in enumerate(find_objects(groups), 1):
+                own = binary_fill_holes(groups[where] == n)
+                depth = -float(mean[where][groups[where] == n].min())
+                sides = own.shape
+                compact = max(sides) <= ROUND * min(sides) and own.mean() >= SOLID
+                if depth < least or not compact or max(sides) > WIDE:
+                    continue
+                whole = np.zeros(away.shape, bool)
+                whole[where] = own
+                whole = binary_dilation(whole, iterations=2)
+                taken |= whole
+                out.append((whole, depth / scatter))
+    return out, bright
+
+
+def hot_pixels(deviate: FloatArray) -> NDArray[np.bool_]:
+    """Mask of single hot pixels, by the deviates of pixels in the faintest of several darks.
+
+    Hot columns, in which many pixels are hot, and clusters of light are left to the diagnosis.
+    """
+    hot = deviate > SURE
+    hot[:, hot.mean(0) > FEW] = False
+    return hot if hot.mean() < FEW**2 else np.zeros_like(hot)
