@@ -25,6 +25,7 @@ from bfsensor.diagnose.data.exposure_info import (
     overscan_level,
 )
 from bfsensor.diagnose.data.flat_defects import (
+    LEAST,
     QUIET,
     WIDEST,
     bad_columns,
@@ -66,9 +67,10 @@ class Cosmetic(NamedTuple):
     Attributes
     ----------
     kind : str
-        'bad_column', 'hot_pixel' or 'dust'.
+        'bad_column', 'hot_pixel', 'dust', 'vignetting', or a nuisance of the bench: see
+        :mod:`bfsensor.diagnose.data.bench_nuisances`.
     amp : int
-        Index of the amplifier, from 0.
+        Index of the amplifier, from 0; -1 where all are meant.
     x, y : (int, int)
         First column and row on the sensor, and the ones after the last.
     size : float
@@ -90,7 +92,8 @@ class Cosmetic(NamedTuple):
     def to_report(self) -> dict[str, Any]:
         """Make the entry of report.json; amplifiers are counted from 1."""
         return {
-            "kind": self.kind, "x": list(self.x), "y": list(self.y), "amps": [self.amp + 1],
+            "kind": self.kind, "x": list(self.x), "y": list(self.y),
+            "amps": [self.amp + 1] if self.amp >= 0 else [],
             "size": float(f"{self.size:.4g}"), "unit": self.unit, "z": round(self.z, 1),
         }  # fmt: skip
 
@@ -198,24 +201,23 @@ def bridged(image: FloatArray, frame: Frame) -> FloatArray:
     columns = np.arange(image.shape[1])
     clear = ~np.any([(columns >= a) & (columns < b) for a, b in ranges], axis=0)
     for start, stop in ranges:
-        ends = [
-            w for w in (columns[clear & (columns < start)][-WIDEST:],
-                        columns[clear & (columns >= stop)][:WIDEST]) if len(w)
-        ]  # fmt: skip
-        if not ends:
-            continue
-        # Over some rows, so that their noise is hardly seen in the bridge.
-        means = [
-            uniform_filter1d(image[:, w].mean(1), QUIET, mode="nearest")[:, None]
-            for w in ends
-        ]
-        at = columns[start:stop]
-        part = (
-            (at - ends[0].mean()) / (ends[-1].mean() - ends[0].mean())
-            if len(ends) > 1
-            else np.zeros(len(at))
+        low, high = columns[clear & (columns < start)], columns[clear & (columns >= stop)]
+        # At an amplifier's border the light's slope goes on from one side.
+        near = (
+            np.concatenate([low[-WIDEST:], high[:WIDEST]])
+            if len(low) and len(high)
+            else np.concatenate([low[-2 * WIDEST :], high[: 2 * WIDEST]])
         )
-        out[:, start:stop] = means[0] + part * (means[-1] - means[0])
+        if len(near) < 2:
+            continue
+        middle = near.mean()
+        away = near - middle
+        # Over some rows, so that their noise is hardly seen in the bridge.
+        lines = uniform_filter1d(image[:, near], QUIET, axis=0, mode="nearest")
+        slope = lines @ away / (away @ away)
+        out[:, start:stop] = lines.mean(1)[:, None] + np.outer(
+            slope, columns[start:stop] - middle
+        )
     return out
 
 
@@ -301,7 +303,8 @@ def _repair_response(
         good.append(repair.of_image(image, -1.0))
         _on_sensor(whole, frame)[...] = good[-1]
         _on_sensor(owner, frame)[...] = amp
-    whole -= smooth_light(whole, owner)
+    light = smooth_light(whole, owner)
+    whole -= light
     whole[owner < 0] = 0.0
     shade, change = np.ones(shape), np.zeros(shape)
     # Dust beside a column hides that the column stands alone, and a column disturbs dust's shape:
@@ -319,13 +322,25 @@ def _repair_response(
         shade[:] = 1.0
         for rows_of, columns_of, part, _ in dust:
             shade[np.ix_(rows_of, columns_of)] *= part
+    # Steps between amplifiers are their gains'.
+    falls = [float(np.ptp(_on_sensor(light, f))) for f in layout]
+    if max(falls) > LEAST:
+        noise = float(np.std(whole[owner >= 0])) / np.sqrt(whole.size)
+        place = (0, shape[1]), (0, shape[0])
+        size = -max(falls)
+        found.append(
+            Cosmetic("vignetting", -1, *place, size, "of the signal", -size / noise)
+        )
     for amp, one in columns:
         worst = float(one.change.flat[np.abs(one.change).argmax()])
         place = _place(layout[amp], one.columns, one.rows)
         found.append(Cosmetic("bad_column", amp, *place, worst, "of the signal", one.z))
         reach = int(np.ceil(BRIDGED * reach_of(worst)))
-        first, last = one.columns.start - reach, one.columns.stop + reach
-        repairs[amp].near.append((max(first, 0), last))
+        # Beyond a border of amplifiers the neighbour's columns are shifted, too.
+        beyond = place[0][0] - reach, place[0][1] + reach
+        for repair, frame in zip(repairs, layout, strict=True):
+            if frame is layout[amp] or _faces(frame, layout[amp]):
+                repair.near.extend(_columns_of(frame, *beyond))
     for repair, frame in zip(repairs, layout, strict=True):
         own = _on_sensor(change, frame)
         repair.filled[own < DEAD] = True
@@ -337,6 +352,22 @@ def _repair_response(
         size = float(part.min()) - 1.0
         found.append(Cosmetic("dust", int(middle), *place, size, "of the signal", z))
     return found
+
+
+def _faces(frame: Frame, other: Frame) -> bool:
+    """Whether two amplifiers are different ones that read the same rows."""
+    y, z = (frame.origin or (0, 0))[1], (other.origin or (0, 0))[1]
+    apart = y >= z + other.image.shape[0] or z >= y + frame.image.shape[0]
+    return frame is not other and not apart
+
+
+def _columns_of(frame: Frame, start: int, stop: int) -> list[tuple[int, int]]:
+    """Columns of an amplifier in readout order from columns of the sensor; none if it has none."""
+    x, size = (frame.origin or (0, 0))[0], frame.image.shape[1]
+    low, high = max(start - x, 0), min(stop - x, size)
+    if low >= high:
+        return []
+    return [(size - high, size - low) if frame.flip_x else (low, high)]
 
 
 def _on_sensor(image: NDArray[Any], frame: Frame) -> NDArray[Any]:

@@ -122,6 +122,7 @@ class FlatChannels:
         self._groups: dict[tuple, _FlatGroup] = {}
         self._means: dict[str, list[tuple]] = {}
         self._ratios: dict[int, list[tuple[float, float]]] = {}
+        self._lines: dict[tuple[str, int], _Lines] = {}
 
     def add_pair(
         self,
@@ -164,6 +165,10 @@ class FlatChannels:
             for frame in frames:
                 group.serial.append(profile(frame.serial_overscan, 1))
                 group.parallel.append(profile(frame.parallel_overscan, 0))
+                for where, lines in (
+                    ("serial", frame.serial_overscan), ("parallel", frame.parallel_overscan.T)
+                ):  # fmt: skip
+                    self._lines.setdefault((where, n), _Lines()).add(lines)
             for k in (0, 1):
                 m = found.means[k]
                 read = self._noise.get(name, 0.0) ** 2
@@ -298,14 +303,18 @@ class FlatChannels:
         ):
             uneven = self._unevenness(name)
             for fold in dict.fromkeys(key[3] for key in self._groups):
-                values, blocks, axes = [], [], Axes()
+                values: list[FloatArray] = []
+                blocks: list[FloatArray] = []
+                axes = Axes()
                 for amp in range(len(uneven)):
                     own = []
                     for (condition, step, n, which), group in self._groups.items():
                         profiles = [p for p in getattr(group, name) if len(p)]
                         if which != fold or n != amp or not profiles:
                             continue
-                        mean, matrix = mean_profile(np.array(profiles))
+                        mean, matrix = mean_profile(
+                            np.array(profiles), self._lines[name, amp].correlation
+                        )
                         own.append(uneven[amp] * matrix)
                         zero = self._zero(fold, amp, name, len(mean))
                         values.append(mean if zero is None else mean - zero[0])
@@ -339,7 +348,10 @@ class FlatChannels:
         profiles = [p for p in getattr(every[amp], name) if len(p)] if every else []
         if not profiles:
             return None
-        mean, matrix = mean_profile(np.array(profiles))
+        tied = self._lines[name, amp].correlation
+        if profiles[0].shape[0] != len(tied):
+            return None
+        mean, matrix = mean_profile(np.array(profiles), tied)
         return (mean, matrix) if len(mean) == size else None
 
     def _unevenness(self, name: str) -> dict[int, float]:
@@ -352,7 +364,8 @@ class FlatChannels:
         for (_, _, amp, _), group in self._groups.items():
             profiles = [p for p in getattr(group, name) if len(p)]
             if len(profiles) > 1:
-                seen.setdefault(amp, []).append(_scatter(np.array(profiles)))
+                tied = self._lines[name, amp].correlation
+                seen.setdefault(amp, []).append(_scatter(np.array(profiles), tied))
         out = {amp: 1.0 for _, _, amp, _ in self._groups}
         for amp, both in seen.items():
             total, freedom = np.sum(both, axis=0)
@@ -366,13 +379,47 @@ def _mean_time(group: _FlatGroup) -> float:
     return group.times[0] + float(np.mean(np.array(group.times) - group.times[0]))
 
 
-def _scatter(profiles: FloatArray) -> tuple[float, int]:
+class _Lines:
+    """Accumulates the covariance of the pixels along the depth of an overscan."""
+
+    def __init__(self) -> None:
+        self._sum: FloatArray | float = 0.0
+
+    def add(self, strip: NDArray[np.float32]) -> None:
+        """Add an overscan, shape (lines, depth)."""
+        if strip.size:
+            away = strip - strip.mean(0)
+            # Tracks of particles are no noise.
+            usual = 1.4826 * float(np.median(np.abs(away)))
+            away = np.where(np.abs(away) > STRUCK * max(usual, 0.3), 0.0, away)
+            self._sum = self._sum + away.T @ away
+
+    @property
+    def correlation(self) -> FloatArray:
+        """Correlation of the noise of two pixels along the depth; shape (depth, depth)."""
+        if isinstance(self._sum, float):
+            return np.zeros((0, 0))
+        size = np.sqrt(np.maximum(np.diag(self._sum), 1e-30))
+        out = self._sum / np.outer(size, size)
+        np.fill_diagonal(out, 1.0)
+        return np.asarray(out)
+
+
+def _above_tail(depth: int) -> FloatArray:
+    """Matrix that takes a profile to its values above the mean of its tail."""
+    head = depth - TAIL
+    return np.hstack([np.eye(head), np.full((head, TAIL), -1.0 / TAIL)])
+
+
+def _scatter(profiles: FloatArray, correlation: FloatArray) -> tuple[float, int]:
     """Chi-square of profiles above their tails about their mean, and its degrees of freedom."""
     values, variance = profiles[..., 0], profiles[..., 1]
     head = values.shape[1] - TAIL
-    above = values[:, :head] - values[:, head:].mean(1, keepdims=True)
-    error = variance[:, :head] + variance[:, head:].mean(1, keepdims=True) / TAIL
-    square = (above - above.mean(0)) ** 2 / error.mean(0)
+    step = _above_tail(values.shape[1])
+    above = values @ step.T
+    size = np.sqrt(variance.mean(0))
+    error = np.diag(step @ (correlation * np.outer(size, size)) @ step.T)
+    square = (above - above.mean(0)) ** 2 / error
     return float(square.sum()), (len(profiles) - 1) * head
 
 
@@ -402,7 +449,7 @@ def profile(strip: NDArray[np.float32], axis: int) -> FloatArray:
 
 
 def mean_profile(
-    profiles: FloatArray,
+    profiles: FloatArray, correlation: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """Mean profile above its own tail, and the covariance of its errors.
 
@@ -410,6 +457,8 @@ def mean_profile(
     ----------
     profiles : ndarray, shape (exposures, n, 2)
         Profiles from :func:`profile`, n above :data:`TAIL`.
+    correlation : ndarray, shape (n, n), optional
+        Correlation of the noise of two pixels along the depth; by default it is independent.
 
     Returns
     -------
@@ -423,5 +472,6 @@ def mean_profile(
     variance = profiles[..., 1].mean(0) / count
     head = len(mean) - TAIL
     values = mean[:head] - mean[head:].mean()
-    matrix = np.diag(variance[:head]) + variance[head:].mean() / TAIL
-    return values, matrix
+    tied = np.eye(len(mean)) if correlation is None else correlation
+    step, size = _above_tail(len(mean)), np.sqrt(variance)
+    return values, step @ (tied * np.outer(size, size)) @ step.T

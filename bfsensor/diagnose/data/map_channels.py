@@ -373,6 +373,8 @@ class MapChannels:
         free = without_shape(filled)
         power = ring_power(free)
         keep = self._modes > 50
+        # The lowest frequencies are those of the light's own shape.
+        keep[0] = False
         frequency = (np.arange(RINGS) + 0.5) / (2 * RINGS)
         # The power of a mode of noise is exponential, so that a mean of n has the relative error
         # n^(-1/2); in units of 1e-6.

@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.device.condition import Condition
+from bfsensor.diagnose.data.bench_nuisances import bench_nuisances
 from bfsensor.diagnose.data.bias_channels import (
     BiasChannels,
-    DarkChannels,
-    count_tails,
-    without_hot_columns,
 )
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.code_channels import CodeChannels, CrosstalkChannels
@@ -25,6 +23,11 @@ from bfsensor.diagnose.data.cosmetics import (
     find_cosmetics,
     interpolated,
     repaired_of,
+)
+from bfsensor.diagnose.data.dark_channels import (
+    DarkChannels,
+    count_tails,
+    without_hot_columns,
 )
 from bfsensor.diagnose.data.exposure_info import (
     ExposureInfo,
@@ -243,8 +246,11 @@ def measure_channels(
             bias_frames = source.read(exposure)
             tails.append(count_tails(bias_frames, bias_images, noise, biases.frames))
             biases.add_third(bias_frames, bias_images)
-    start = min((e.mjd for e in exposures if e.mjd is not None), default=np.nan)
     steps = find_steps(kinds.get("flat", []))
+    cosmetics += tuple(bench_nuisances(
+        biases, bias_images, tails, kinds.get("flat", []), steps, source.shape
+    ))  # fmt: skip
+    start = min((e.mjd for e in exposures if e.mjd is not None), default=np.nan)
     flats = FlatChannels(
         bias_images,
         noise,

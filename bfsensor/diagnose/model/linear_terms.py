@@ -6,7 +6,7 @@ import numpy as np
 
 from bfsensor.diagnose.data.channel_rows import Rows
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.cosmetics import Cosmetic, reach_of
+from bfsensor.diagnose.data.cosmetics import BRIDGED, Cosmetic, reach_of
 from bfsensor.diagnose.data.exposure_info import label_of
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.model.map_shapes import Places
@@ -123,8 +123,8 @@ def _map_columns(channel: Channel, measured: MeasuredChannels) -> dict[str, Floa
     # Where opposite rims get unequal light, pixels at a rim lean out or in by the brighter-fatter
     # effect.  The area change by a row of charge falls as the square of its distance.  Both rims
     # have opposite signs, unlike the roll-off of the field there.
-    rims = [(1.0 + np.arange(n)) ** -2.0 for n in (nx, ny)]
-    rims = [r - r[::-1] for r in rims]
+    rims = [np.asarray((1.0 + np.arange(n)) ** -2.0, float) for n in (nx, ny)]
+    rims = [np.asarray(r - r[::-1], float) for r in rims]
     smooth["rim x"] = places.product(rims[0], np.ones(ny), size)
     smooth["rim y"] = places.product(np.ones(nx), rims[1], size)
     # Each amplifier was divided by its mean, so that steps between amplifiers are free.
@@ -148,7 +148,8 @@ def _map_columns(channel: Channel, measured: MeasuredChannels) -> dict[str, Floa
         for n, one in enumerate(_lines(measured)):
             # Charge that a bad column lacks leaves its neighbours more area, at each level and
             # condition another.
-            beside = _beside(nx, *one.x), _inside(ny, *one.y)
+            reach = int(np.ceil(BRIDGED * reach_of(one.size)))
+            beside = _beside(nx, *one.x, reach), _inside(ny, *one.y)
             out[f"map {name} beside {n}"] = np.where(
                 here, places.product(*beside, size), 0.0
             )
@@ -170,11 +171,11 @@ def _lines(measured: MeasuredChannels) -> list[Cosmetic]:
     ]  # fmt: skip
 
 
-def _beside(size: int, start: int, stop: int) -> FloatArray:
-    """Inverse square of the distance from columns ``start`` to ``stop``, 0 in them; shape (size,)."""
+def _beside(size: int, start: int, stop: int, reach: int) -> FloatArray:
+    """Inverse square of the distance from columns ``start`` to ``stop``, 0 up to ``reach`` columns."""
     place = np.arange(size)
     away = np.maximum(np.maximum(start - place, place - stop + 1), 0)
-    return np.asarray(np.where(away > 0, np.maximum(away, 1.0) ** -2.0, 0.0))
+    return np.asarray(np.where(away > reach, np.maximum(away, 1.0) ** -2.0, 0.0))
 
 
 def _inside(size: int, start: int, stop: int) -> FloatArray:

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.data.bias_channels import DarkChannels
+from bfsensor.diagnose.data.dark_channels import DarkChannels
 
 ROWS, COLUMNS, NOISE, BIASES, DARKS = 64, 128, 3.0, 10, 4
 

@@ -1,0 +1,118 @@
+"""What a bench adds to every campaign, as report.json lists it: bias structure and drift, pulses, lamp.
+
+All of it is subtracted or fitted by the channels; the list says that it is there and how large.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from bfsensor.diagnose.data.bias_channels import BiasChannels
+from bfsensor.diagnose.data.cosmetics import Cosmetic
+from bfsensor.diagnose.data.exposure_info import ExposureInfo, condition_of
+from bfsensor.typing import FloatArray
+
+CLEAR = 5.0
+"""Significance [standard deviations] from which a nuisance is listed.  Chosen: noise reaches it in 3e-7
+of campaigns; with 10, nuisances of twice the size are fitted without being listed."""
+
+
+def bench_nuisances(
+    biases: BiasChannels,
+    bias_images: Mapping[str, FloatArray],
+    tails: Sequence[Sequence[int]],
+    flats: Sequence[ExposureInfo],
+    steps: Mapping[int, float],
+    shape: tuple[int, int],
+) -> list[Cosmetic]:
+    """List what biases and the headers of flats show of the bench.
+
+    Parameters
+    ----------
+    biases : BiasChannels
+        All biases of the mean bias.
+    bias_images : mapping of str to ndarray
+        Mean bias of each amplifier's image above its overscan [ADU].
+    tails : sequence of sequence of int
+        Pixels of each bias and amplifier in the tails of the noise.
+    flats : sequence of ExposureInfo
+        All flats.
+    steps : mapping of int to float
+        Level of each flat by its number.
+    shape : (int, int)
+        Rows and columns of the sensor.
+
+    Returns
+    -------
+    found : list of Cosmetic
+        Entries of one amplifier, or of the whole sensor with the amplifier -1.
+    """
+    place = (0, shape[1]), (0, shape[0])
+    found = []
+    noise = list(biases.read_noise.values())
+    for amp, image in enumerate(bias_images.values() if noise else ()):
+        size, z = _structure(image, noise[amp] / np.sqrt(max(biases.frames, 1)))
+        if z > CLEAR:
+            found.append(Cosmetic("bias_structure", amp, *place, size, "adu", z))
+    size, z = biases.drift()
+    if z > CLEAR:
+        found.append(Cosmetic("bias_drift", -1, *place, size, "adu", z))
+    pulses = biases.pulses()
+    if pulses.any():
+        length = float(pulses.sum())
+        found.append(Cosmetic("popcorn_noise", -1, *place, length, "pixel", CLEAR))
+    elif len(tails):
+        number = np.array(tails, float).sum(1)
+        z = float(number.sum() / np.sqrt(number.sum() + 1.0))
+        if z > CLEAR:
+            unit = "pixels of a frame"
+            found.append(
+                Cosmetic("heavy_tailed_noise", -1, *place, float(number.mean()), unit, z)
+            )
+    lamps, times = _scatter(flats, steps)
+    for kind, (size, z) in (("lamp_flicker", lamps), ("exposure_time", times)):
+        if z > CLEAR:
+            found.append(Cosmetic(kind, -1, *place, size, "of the value", z))
+    return found
+
+
+def _structure(image: FloatArray, noise: float) -> tuple[float, float]:
+    """Standard deviation of rows' and columns' means of a mean bias [ADU], less noise; its deviate."""
+    excess, square, count = 0.0, 0.0, 0
+    for axis in (0, 1):
+        means = np.nanmedian(image, axis=axis)
+        # The median of n Gaussian pixels has pi / 2 times the variance of their mean.
+        usual = 0.5 * np.pi * noise**2 / image.shape[axis]
+        excess += float(means.var()) - usual
+        square += float(np.square(means - means.mean()).sum()) / max(usual, 1e-12)
+        count += len(means)
+    return float(np.sqrt(max(excess, 0.0))), (square - count) / float(np.sqrt(2 * count))
+
+
+def _scatter(
+    flats: Sequence[ExposureInfo], steps: Mapping[int, float]
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Relative scatter of lamp readings and of exposure times within levels, with deviates.
+
+    Headers have no noise: any scatter beyond the digits of a time is certain.
+    """
+    groups: dict[object, list[ExposureInfo]] = {}
+    for flat in flats:
+        groups.setdefault((condition_of(flat), steps.get(flat.number)), []).append(flat)
+    out = []
+    for name in ("lamp", "exposure_time"):
+        ratios: list[float] = []
+        for members in groups.values():
+            values = np.array([getattr(m, name) or np.nan for m in members], float)
+            if len(values) > 1 and np.isfinite(values).all():
+                ratios += (values / values.mean() - 1.0).tolist()
+        size = float(np.std(ratios)) if ratios else 0.0
+        out.append((size, size / LEAST))
+    return out[0], out[1]
+
+
+LEAST = 1e-5
+"""Relative scatter of headers' values that their digits may have.  Derived: times of a second are given
+to 1e-5 s or better; with 1e-4, flicker below 5e-4 is fitted without being listed."""

@@ -1,0 +1,249 @@
+"""Channel 'dark_map' of darks: level, struck pixels, columns; hot columns in images of spots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from bfsensor.device.condition import Condition
+from bfsensor.diagnose.data.bias_channels import OUTLIER, STANDS_OUT, TRACK
+from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.exposure_info import (
+    Axes,
+    ExposureInfo,
+    Frame,
+    condition_of,
+    overscan_level,
+)
+from bfsensor.typing import FloatArray
+
+UNEVEN = 1.25
+"""Robust scatter of a dark's columns over that expected from noise, above which their own
+scatter is taken for their error.  Chosen, to be derived: the scatter by median deviations of n
+columns is known to 1.17 / n^(1/2), so that 1.25 is 2.4 sigma for 128 columns (reached by noise
+in 0.8 % of amplifiers) and 4.8 for 512; with 1.5, columns uneven by as much as noise would be
+findings."""
+
+HOT = 10.0
+"""Excess of a column of an image of spots, beyond one sigma of the noise of a pixel, above which it
+is hot [sigma of a column's mean].  Chosen: spots raise a column's median by half a sigma of a
+pixel; with 20, hot columns of 64 pixels must be 1.6 times as bright to be removed."""
+
+
+class DarkChannels:
+    """Accumulates darks one by one: level by time and order, columns, struck pixels.
+
+    Parameters
+    ----------
+    bias : mapping of str to ndarray
+        Mean bias of each amplifier's image less its overscan [ADU]; may lack some.
+    read_noise : mapping of str to float
+        Read noise of each amplifier [ADU]; may lack some.
+    fold : str
+        Fold of the channel.
+    biases : int
+        Number of frames in the mean bias; 0 without one.
+    tails : sequence of sequence of int
+        Pixels of each bias and amplifier in the tails of the noise, from :func:`count_tails`; as
+        many are expected in a dark, without any particle.
+    """
+
+    def __init__(
+        self,
+        bias: dict[str, FloatArray],
+        read_noise: dict[str, float],
+        fold: str = "fit",
+        *,
+        biases: int = 0,
+        tails: Sequence[Sequence[int]] = (),
+    ) -> None:
+        self._bias, self._noise, self._fold = bias, read_noise, fold
+        self._biases = biases
+        self._tails = np.array(tails, float)
+        self._rows: list[
+            tuple[ExposureInfo, float, list[tuple[float, float, int, int]]]
+        ] = []
+        self._columns: list[_Columns] = []
+        self._names: list[str] = []
+        self._condition = Condition()
+
+    def add(
+        self, exposure: ExposureInfo, frames: Sequence[Frame], *, after: float = 0.0
+    ) -> None:
+        """Add a dark; ``after`` is the mean level [ADU] of the exposure before it."""
+        self._condition = condition_of(exposure)
+        found = []
+        lines = _Columns(exposure.exposure_time or 0.0, [], [], [])
+        self._names = [f.name for f in frames]
+        for frame in frames:
+            over = frame.serial_overscan
+            image = frame.image.astype(np.float64) - overscan_level(frame)
+            bias = self._bias.get(frame.name)
+            if bias is not None:
+                image = image - bias
+            sigma = self._noise.get(frame.name) or 1.4826 * float(
+                np.median(np.abs(image - np.median(image)))
+            )
+            struck = np.abs(image - np.median(image)) > OUTLIER * sigma
+            good = image[~struck]
+            error = good.var() / good.size
+            if over.size:
+                error += float(over.var()) / (over.size // 2)
+            found.append((float(good.mean()), float(error), int(struck.sum()), image.size))
+            # A column most of whose pixels deviate is hot, not struck: it keeps its values.
+            hot = struck.mean(0) > 0.5
+            kept = np.where(struck & ~hot, np.nan, image)
+            lines.means.append(np.nanmean(kept, 0))
+            lines.own.append(np.nanvar(kept, 0) / image.shape[0])
+            lines.noise.append(float(good.var()) / image.shape[0])
+        self._rows.append((exposure, after, found))
+        self._columns.append(lines)
+
+    def channels(self) -> list[Channel]:
+        """Channel 'dark_map': levels and struck pixels by dark, columns of the longest darks."""
+        if not self._rows:
+            return []
+        values, blocks, axes = [], [], Axes()
+        expected, scatter = self._usual_tails()
+        for exposure, after, found in self._rows:
+            level, variance, struck, _ = (
+                np.array(c, float) for c in zip(*found, strict=True)
+            )
+            amps = np.arange(len(level))
+            common = {"amp": amps, "time": exposure.exposure_time or 0.0,
+                      "exposure": exposure.number, "after": after}  # fmt: skip
+            values.append(level)
+            blocks.append(np.diag(variance))
+            axes.add(len(level), self._condition, what="level", x=-1, **common)
+            # Poisson; one is added to the variance, as zero may be counted where a few are expected.
+            values.append(struck - expected)
+            blocks.append(np.diag(np.maximum(struck - expected, 0.0) + 1.0 + scatter))
+            axes.add(len(level), self._condition, what="struck", x=-1, **common)
+        longest = max(c.seconds for c in self._columns)
+        chosen = [c for c in self._columns if c.seconds == longest]
+        for amp in range(len(self._names)):
+            mean = np.mean([c.means[amp] for c in chosen], axis=0)
+            noise = float(np.mean([c.noise[amp] for c in chosen]))
+            own = np.mean([c.own[amp] for c in chosen], axis=0)
+            usual = self._column_error(mean, amp, noise, len(chosen)) ** 2
+            # Dark current of a hot column has shot noise of its own.
+            sure = STANDS_OUT * np.sqrt(2.0 / self._rows_of(amp, mean) / len(chosen))
+            more = np.where(own > noise * (1 + sure), own - noise, 0.0) / len(chosen)
+            values.append(mean - np.median(mean))
+            blocks.extend((usual + more)[:, None, None])
+            axes.add(len(mean), self._condition, what="column", x=np.arange(len(mean)), amp=amp,
+                     time=longest, exposure=-1, after=0.0)  # fmt: skip
+        return [Channel("dark_map", np.concatenate(values), tuple(blocks), axes.columns(), "adu",
+                        self._fold)]  # fmt: skip
+
+    def _usual_tails(self) -> tuple[FloatArray, FloatArray]:
+        """Pixels in the tails of the noise of a frame by amplifier, and the variance of that number.
+
+        Pulses of several pixels make it scatter by more than a Poisson number.
+        """
+        if not len(self._tails):
+            return (np.zeros(len(self._names)),) * 2
+        n = len(self._tails)
+        mean = self._tails.mean(0)
+        scatter = self._tails.var(0, ddof=1) if n > 1 else mean
+        return mean, np.maximum(mean, scatter) * (1 + 1 / n)
+
+    def _column_error(self, mean: FloatArray, amp: int, noise: float, darks: int) -> float:
+        """Error of a column's mean [ADU]: from the pixels' noise, or from the columns' own scatter.
+
+        The scatter of a hundred columns is itself known to 10 % only, so that errors from it would
+        scatter more than those from noise; it is used only where it exceeds noise by UNEVEN.
+
+        Parameters
+        ----------
+        mean : ndarray, shape (columns,)
+            Means of the columns [ADU].
+        amp : int
+            Index of the amplifier.
+        noise : float
+            Variance of a column's mean in one dark, with the share of the mean bias [ADU^2].
+        darks : int
+            Number of darks in the mean.
+        """
+        scatter = max(1.4826 * float(np.median(np.abs(mean - np.median(mean)))), 1e-6)
+        read = self._noise.get(self._names[amp], 0.0)
+        pixels = self._rows_of(amp, mean)
+        # The mean bias is the same in all darks: its noise does not average out.
+        shared = read**2 / self._biases / pixels if self._biases else 0.0
+        expected = float(np.sqrt(max(noise - shared, 0.0) / darks + shared))
+        return expected if scatter < UNEVEN * expected else scatter
+
+    def _rows_of(self, amp: int, mean: FloatArray) -> float:
+        """Number of pixels of a column."""
+        return self._rows[0][2][amp][3] / len(mean)
+
+
+def count_tails(
+    frames: Sequence[Frame],
+    bias: dict[str, FloatArray],
+    read_noise: dict[str, float],
+    biases: int,
+) -> list[int]:
+    """Count the pixels of a bias that lie in the tails of the noise, by amplifier.
+
+    They are as far out as struck pixels of darks, but not as far as most of a particle's.
+
+    Parameters
+    ----------
+    frames : sequence of Frame
+        One of the biases that the mean bias is made of.
+    bias, read_noise, biases
+        As for :class:`DarkChannels`; two biases at least.
+
+    Returns
+    -------
+    counts : list of int
+    """
+    out = []
+    for frame in frames:
+        sigma, mean = read_noise.get(frame.name, 0.0), bias.get(frame.name)
+        if mean is None or not sigma > 0 or biases < 2:
+            out.append(0)
+            continue
+        away = np.abs(frame.image - overscan_level(frame) - mean)
+        # A frame is part of its mean bias; a dark is not.
+        scale = sigma * np.sqrt((1 - 1 / biases) / (1 + 1 / biases))
+        out.append(int(((away > OUTLIER * scale) & (away < TRACK * scale)).sum()))
+    return out
+
+
+class _Columns(NamedTuple):
+    """Columns of one dark, by amplifier."""
+
+    seconds: float
+    means: list[FloatArray]
+    own: list[FloatArray]
+    """Variance of each column's mean from its own pixels [ADU^2]."""
+    noise: list[float]
+    """Variance of a column's mean from all pixels [ADU^2]."""
+
+
+def without_hot_columns(image: FloatArray, noise: float) -> FloatArray:
+    """Image of spots [ADU] with hot columns set to the level of the others.
+
+    A column's median separates its level from spots on it: a row of spots raises the median by
+    half a standard deviation of the noise only.
+
+    Parameters
+    ----------
+    image : ndarray, shape (ny, nx)
+        Image of one amplifier, bias subtracted [ADU].
+    noise : float
+        Read noise of a pixel [ADU].
+
+    Returns
+    -------
+    image : ndarray, shape (ny, nx)
+        The same array where no column is hot.
+    """
+    columns = np.nanmedian(image, axis=0)
+    excess = columns - np.nanmedian(columns)
+    hot = excess > noise * (1.0 + HOT / np.sqrt(image.shape[0]))
+    return image - np.where(hot, excess, 0.0) if hot.any() else image
