@@ -65,12 +65,14 @@ def _device(fit: BaselineFit) -> Iterator[Template]:
 
     The fit moves these parameters against their priors.  A device far from nominal therefore
     leaves residuals along the derivative, in proportion to the pull, and noise a known amount.
+    A parameter that only has a bound has no nominal value to differ from.
     """
     for n, name in enumerate(fit.names[: fit.slopes.shape[1]]):
-        if name.startswith("device "):
+        quantity = name.removeprefix("device ")
+        if quantity != name and quantity not in fit.unknown:
             rows = np.nonzero(fit.slopes[:, n])[0]
             if len(rows):
-                where = {"device": name.removeprefix("device ")}
+                where = {"device": quantity}
                 yield Template(DEVICE_SCAN, DEVICE, rows, fit.slopes[rows, n], where)
 
 
