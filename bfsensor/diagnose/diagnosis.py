@@ -12,17 +12,22 @@ from bfsensor.diagnose.data.exposure_info import Source
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels, measure_channels
 from bfsensor.diagnose.detect.locate import locate_mismatch
 from bfsensor.diagnose.detect.matched_filters import locate_effects
+from bfsensor.diagnose.explain.single_value import explain_single_value
 from bfsensor.diagnose.explain.stepwise import attribute
 from bfsensor.diagnose.fit.baseline_fit import (
     BaselineFit,
     fit_bounded,
     held_out,
 )
+from bfsensor.diagnose.fit.error_scale import scale_errors
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.diagnose.model.predictor import Predictor
+from bfsensor.diagnose.model.unknown_level import NAME as LEVEL_NAME
+from bfsensor.diagnose.model.unknown_level import float_unknown_level
 from bfsensor.diagnose.plan.advice import RecordingPlan, plan
 from bfsensor.diagnose.report.diagnosis_result import Diagnosis
 from bfsensor.errors import ConvergenceError
+from bfsensor.response.edge_response import LEVEL
 
 
 def diagnose(
@@ -88,6 +93,7 @@ def diagnose_measured(
     seed: int = 1,
     notes: Sequence[str] = (),
     explain: bool = True,
+    scaled: bool = True,
 ) -> Diagnosis:
     """Compare measured channels with a baseline, and explain the mismatch.
 
@@ -106,6 +112,8 @@ def diagnose_measured(
         Warnings from reading the recordings, for the report.
     explain : bool
         Whether to find effects that explain a mismatch, as for :func:`diagnose`.
+    scaled : bool
+        Whether stated errors of a_ij that the scatter of far lags contradicts are scaled by it.
 
     Returns
     -------
@@ -128,9 +136,15 @@ def diagnose_measured(
     >>> diagnose_measured(measured, baseline).mismatch.detected
     False
     """
-    measured = _predictable(measured, baseline)
+    stated = _predictable(measured, baseline)
+    measured = scale_errors(stated, baseline) if scaled else stated
+    baseline = float_unknown_level(measured, baseline)
     predictor, fit = fit_bounded(measured, baseline)
-    more = _of_free(measured, baseline, fit)
+    more = [
+        *_of_free(measured, baseline, fit),
+        *_of_level(baseline, fit),
+        *_as_stated(stated, measured, baseline, seed),
+    ]
     if explain:
         mismatch = locate_effects(predictor, fit, seed=seed)
     else:
@@ -138,7 +152,9 @@ def diagnose_measured(
     attribution, advised = None, RecordingPlan()
     if mismatch.detected and explain:
         try:
-            attribution = attribute(predictor, fit, mismatch, seed=seed)
+            attribution = explain_single_value(
+                predictor, fit, mismatch, seed=seed
+            ) or attribute(predictor, fit, mismatch, seed=seed)
         except ConvergenceError as error:
             more.append(f"the mismatch is located, but not explained: {error}")
         else:
@@ -176,6 +192,31 @@ def _predictable(measured: MeasuredChannels, baseline: Baseline) -> MeasuredChan
     if not notes:
         return measured
     return replace(measured, channels=tuple(kept), notes=(*measured.notes, *notes))
+
+
+def _of_level(baseline: Baseline, fit: BaselineFit) -> list[str]:
+    """Note on a level of flats that no table states."""
+    if LEVEL_NAME not in fit.pulls:
+        return []
+    errors = dict(zip(fit.names, fit.errors, strict=True))
+    spread = baseline.spread[LEVEL_NAME]
+    level = LEVEL + fit.pulls[LEVEL_NAME] * spread
+    return [
+        f"no table states the level of its flats: {level:.0f} +- "
+        f"{errors[f'device {LEVEL_NAME}'] * spread:.0f} e- was fitted; state it with --at level=, for a "
+        "wrong a_00 can look like another level"
+    ]
+
+
+def _as_stated(
+    stated: MeasuredChannels, measured: MeasuredChannels, baseline: Baseline, seed: int
+) -> list[str]:
+    """Note on the p-value with the errors as stated, where they were scaled."""
+    pairs = zip(stated.channels, measured.channels, strict=True)
+    if all(np.array_equal(a.errors, b.errors) for a, b in pairs):
+        return []
+    found = locate_mismatch(fit_bounded(stated, baseline)[1], seed=seed)
+    return [f"with the errors as stated the family-wise p is {found.p_value:.2g}"]
 
 
 def _of_free(measured: MeasuredChannels, baseline: Baseline, fit: BaselineFit) -> list[str]:
