@@ -39,7 +39,8 @@ from bfsensor.cli.common import Bar, parse_conditions
 @click.option("--errors", default="scaled", show_default=True,
               type=click.Choice(["scaled", "stated"]),
               help="'scaled' multiplies the errors of tables of a_ij by a factor where far lags, at "
-              "which no sensor has a signal, contradict them; 'stated' takes them as they are.")  # fmt: skip
+              "which no sensor has a signal, contradict them; 'stated' takes them as they are."
+              )  # fmt: skip
 @click.option(
     "--towards", metavar="TABLE|DEVICE",
     help="The baseline's device at another operating point. The fit may then move the operating "

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from bfsensor.diagnose.detect.locate import locate_mismatch
-from bfsensor.diagnose.detect.scans import make_templates
+from bfsensor.diagnose.detect.scans import make_fitted_templates, make_templates
 from bfsensor.diagnose.explain.nonparametric import Coefficient, OpenWorld
 from bfsensor.diagnose.fit.baseline_fit import held_out
 from bfsensor.diagnose.plan.advice import plan
@@ -174,7 +174,7 @@ def test_places_of_all_templates_are_as_the_schema_says(schema, fitted_loss):
     validator = jsonschema.Draft202012Validator(place)
     _, _, fit = fitted_loss
     seen = set()
-    for template in make_templates(fit):
+    for template in (*make_templates(fit.channels), *make_fitted_templates(fit)):
         where = _plain(template.where)
         assert not list(validator.iter_errors(where)), (template.family, where)
         seen |= set(where)
