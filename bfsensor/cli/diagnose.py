@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sys
+import time
 from pathlib import Path
 
 import click
@@ -103,6 +105,7 @@ def diagnose(
       bfsensor diagnose e2v_covariances.csv --baseline e2v_ccd250 --towards e2v_ccd250_70
       bfsensor diagnose recordings/run_12 --predict level=40000,back_bias=-40 --predict flux=5e5
     """
+    from bfsensor.checkpoints import Checkpoints
     from bfsensor.diagnose import diagnosis
     from bfsensor.diagnose.data.reduced_channels import measure_reduced
     from bfsensor.diagnose.model.open_baseline import (
@@ -120,8 +123,10 @@ def diagnose(
         refuse_unheld,
     )
     from bfsensor.diagnose.report.html_report import write_report
+    from bfsensor.diagnose.report.provenance import files_of, provenance_of
     from bfsensor.recording.campaign.campaign import read_campaign
 
+    began = time.monotonic()
     wanted = read_conditions(asked)
     first = campaign[0]
     folder = output or first.with_name(first.resolve().stem + "_diagnosis")
@@ -150,6 +155,10 @@ def diagnose(
     else:
         predicted = find_baseline(named, card=None if found is None else found.card)
     refuse_unheld(wanted, predicted)
+    read = list(campaign) if found is None else found.files
+    files = files_of(first if found is not None else first.parent, read)
+    options = f"{seed} {explain} {errors} {conditions}"
+    keep = Checkpoints(folder / "unfinished", json.dumps(files), predicted.digest, options)
     if found is None:
         assert reduced is not None
         measured = measure_reduced(reduced, reach=predicted.reach)
@@ -160,23 +169,27 @@ def diagnose(
             seed=seed,
             explain=explain,
             scaled=errors == "scaled",
+            keep=keep,
         )
     else:
         result = diagnosis.diagnose(
             CampaignSource(found), predicted, campaign=found.name, seed=seed, explain=explain,
-            progress=Bar("pixels"),
+            progress=Bar("pixels"), keep=keep,
             notes=[f"{c.topic}: {c.message}" for c in found.warnings]
             + [f"set aside: {s.path.name}: {s.reason}" for s in found.set_aside],
         )  # fmt: skip
-    written = write_report(result, folder)
+    command = " ".join(["bfsensor", *sys.argv[1:]])
+    told = provenance_of(command, seed=seed, files=files, began=began)
+    written = write_report(result, folder, provenance=told)
     notes: tuple[str, ...] = ()
     predictor, fit = result.accepted
     if wanted and predictor is not None:
         prediction = predict_conditions(predictor, fit, wanted)
         notes = prediction.notes
         written.append(prediction.write(folder / "predicted.ecsv"))
+    keep.clear()
     if as_json:
-        click.echo(json.dumps(result.to_report(), indent=1))
+        click.echo((folder / "report.json").read_text(), nl=False)
         return
     click.echo(result.said())
     click.echo(f"{'channel':22s}{'chi2':>10s}{'dof':>8s}{'ratio':>8s}")

@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from bfsensor.checkpoints import Checkpoints
 from bfsensor.diagnose.data.channels import PER_ELECTRON, step_of
 from bfsensor.diagnose.data.exposure_info import Source
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels, measure_channels
-from bfsensor.diagnose.detect.locate import locate_mismatch
+from bfsensor.diagnose.detect.locate import Mismatch, locate_mismatch
 from bfsensor.diagnose.detect.matched_filters import locate_effects
 from bfsensor.diagnose.explain.single_value import explain_single_value
 from bfsensor.diagnose.explain.stepwise import attribute
@@ -39,6 +40,7 @@ def diagnose(
     notes: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
     explain: bool = True,
+    keep: Checkpoints | None = None,
 ) -> Diagnosis:
     """Compare a campaign's recordings with a baseline, and explain the mismatch.
 
@@ -59,6 +61,8 @@ def diagnose(
     explain : bool
         Whether to find effects that explain a mismatch, and recordings to take next; without it
         the mismatch is only located, which is much faster.
+    keep : Checkpoints, optional
+        Where finished stages are stored and, after an interruption, read.
 
     Returns
     -------
@@ -79,9 +83,16 @@ def diagnose(
         source = CampaignSource(read_campaign("recordings/"))
         print(diagnose(source, find_baseline("itl_sta3800c")).said())
     """
-    measured = measure_channels(source, progress=progress)
+    keep = keep or Checkpoints(None)
+    measured = keep.get("channels", lambda: measure_channels(source, progress=progress))
     return diagnose_measured(
-        measured, baseline, campaign=campaign, seed=seed, notes=notes, explain=explain
+        measured,
+        baseline,
+        campaign=campaign,
+        seed=seed,
+        notes=notes,
+        explain=explain,
+        keep=keep,
     )
 
 
@@ -94,6 +105,7 @@ def diagnose_measured(
     notes: Sequence[str] = (),
     explain: bool = True,
     scaled: bool = True,
+    keep: Checkpoints | None = None,
 ) -> Diagnosis:
     """Compare measured channels with a baseline, and explain the mismatch.
 
@@ -114,6 +126,8 @@ def diagnose_measured(
         Whether to find effects that explain a mismatch, as for :func:`diagnose`.
     scaled : bool
         Whether stated errors of a_ij that the scatter of far lags contradicts are scaled by it.
+    keep : Checkpoints, optional
+        As for :func:`diagnose`.
 
     Returns
     -------
@@ -136,25 +150,29 @@ def diagnose_measured(
     >>> diagnose_measured(measured, baseline).mismatch.detected
     False
     """
+    keep = keep or Checkpoints(None)
     stated = _predictable(measured, baseline)
     measured = scale_errors(stated, baseline) if scaled else stated
     baseline = float_unknown_level(measured, baseline)
-    predictor, fit = fit_bounded(measured, baseline)
+    # Channels are stored with their fit again, so that both are the same objects when read.
+    measured, predictor, fit, mismatch = keep.get(
+        "located", lambda: _located(measured, baseline, seed, explain)
+    )
     more = [
         *_of_free(measured, baseline, fit),
         *_of_level(baseline, fit),
         *_as_stated(stated, measured, baseline, seed),
     ]
-    if explain:
-        mismatch = locate_effects(predictor, fit, seed=seed)
-    else:
-        mismatch = locate_mismatch(fit, seed=seed)
     attribution, advised = None, RecordingPlan()
     if mismatch.detected and explain:
         try:
-            attribution = explain_single_value(
-                predictor, fit, mismatch, seed=seed
-            ) or attribute(predictor, fit, mismatch, seed=seed)
+            attribution = keep.get(
+                "explained",
+                lambda: (
+                    explain_single_value(predictor, fit, mismatch, seed=seed)
+                    or attribute(predictor, fit, mismatch, seed=seed)
+                ),
+            )
         except ConvergenceError as error:
             more.append(f"the mismatch is located, but not explained: {error}")
         else:
@@ -174,6 +192,16 @@ def diagnose_measured(
         plan=advised,
         predictor=predictor,
     )
+
+
+def _located(
+    measured: MeasuredChannels, baseline: Baseline, seed: int, explain: bool
+) -> tuple[MeasuredChannels, Predictor, BaselineFit, Mismatch]:
+    """Channels, the baseline's predictor and fit, and the residuals of the fit that stand out."""
+    predictor, fit = fit_bounded(measured, baseline)
+    if explain:
+        return measured, predictor, fit, locate_effects(predictor, fit, seed=seed)
+    return measured, predictor, fit, locate_mismatch(fit, seed=seed)
 
 
 def _predictable(measured: MeasuredChannels, baseline: Baseline) -> MeasuredChannels:

@@ -329,6 +329,9 @@ class Predictor:
         """Smallest and largest values that a fit may give the parameters, shape (2, parameters)."""
         plain = len(self.names) - len(self._free)
         free = np.repeat([[-np.inf], [np.inf]], plain, axis=1)
+        for name, ends in self.baseline.bounds.items():
+            row = self.names.index(f"device {name}")
+            free[:, row] = np.array(ends) / self.baseline.spread[name]
         return np.concatenate([free, self._free.limits], axis=1)
 
     def _with_light(self, channel: Channel, gains: FloatArray) -> dict[str, NDArray]:

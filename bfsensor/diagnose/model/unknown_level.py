@@ -33,7 +33,8 @@ def float_unknown_level(measured: MeasuredChannels, baseline: Baseline) -> Basel
     Returns
     -------
     Baseline
-        With the free parameter :data:`NAME` [e-], where it can be known at all.
+        With the free parameter :data:`NAME` [e-], from 0 to twice the usual level, where it can be
+        known at all.
     """
     flats = [c for c in measured.channels if c.unit == PER_ELECTRON]
     if not flats or not baseline.slopes or any(c.axes["stated"].any() for c in flats):
@@ -51,5 +52,6 @@ def float_unknown_level(measured: MeasuredChannels, baseline: Baseline) -> Basel
         baseline,
         derivatives={**baseline.derivatives, NAME: own},
         spread={**baseline.spread, NAME: SPREAD},
+        bounds={**baseline.bounds, NAME: (-LEVEL, LEVEL)},
         held=held,
     )

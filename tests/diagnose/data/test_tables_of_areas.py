@@ -118,6 +118,15 @@ def test_an_unknown_level_floats():
         assert result.mismatch.detected == seen and NAME not in result.fit.pulls
 
 
+def test_an_unknown_level_stays_between_none_and_twice_the_usual_one():
+    """A wrong voltage must not be taken for a level below 0."""
+    at50 = find_baseline("itl_sta3800c")
+    measured = measure_reduced(table_of(areas_at(2e4), 8, error=1e-10), reach=4)
+    found = diagnose_measured(measured, at50, explain=False, scaled=False)
+    assert found.mismatch.detected
+    assert abs(found.fit.pulls[NAME] * SPREAD) <= LEVEL * (1 + 1e-9)
+
+
 def test_a_baseline_without_levels_has_no_level_to_float():
     measured = measure_reduced(table_of(areas_at(), 9), reach=4)
     assert float_unknown_level(measured, fixed()) == fixed() or not float_unknown_level(
