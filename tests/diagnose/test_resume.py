@@ -86,9 +86,7 @@ def test_other_errors_are_another_diagnosis(tmp_path, monkeypatch):
 def test_ten_kills_at_random_moments(tmp_path):
     """``kill -9`` loses the stage in work and nothing else; the last run writes the same report."""
     run = tmp_path / "run"
-    write_campaign(
-        run, seed=7301, size=SMALL, effects=[make_effect("cti_serial", {"cti": 3e-6})]
-    )
+    write_campaign(run, seed=7301, effects=[make_effect("cti_serial", {"cti": 3e-6})])
 
     def command(name):
         return [

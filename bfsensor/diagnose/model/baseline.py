@@ -122,7 +122,8 @@ class Baseline:
         """SHA-256 of all that the baseline predicts with, 64 hexadecimal digits."""
         numbers = (
             self.name, self.reference, self.not_below, self.level, self.temperature,
-            self.spots_bend, sorted(self.bounds.items()), sorted(self.spread.items()), sorted(self.nominal.items()),
+            self.spots_bend, sorted(self.bounds.items()), sorted(self.spread.items()),
+            sorted(self.nominal.items()),
             sorted(self.card.items(), key=str), [str(p) for p in self.pieces],
         )  # fmt: skip
         tables: dict[str, Mapping[Any, Edges]] = {

@@ -101,7 +101,7 @@ def test_nulls_with_wrong_errors_raise_no_more_alarms_than_stated(stated):
 
 def test_an_unknown_level_floats():
     """a_ij of another level: no mismatch where the level is not stated, a clear one where it is."""
-    level = 80_000.0
+    level = 60_000.0
     drawn = table_of(areas_at(level), 7, error=1e-9)
     free = diagnose_measured(
         measure_reduced([StatedTable(drawn)], reach=4), DEVICE, explain=False
