@@ -112,7 +112,7 @@ class Checkpoints:
                 beside.write_bytes(hashlib.sha256(payload).digest() + payload)
         except (OSError, BFSensorError) as fault:
             LOG.warning(
-                "a stage cannot be stored, an interrupted run starts anew: %s", fault
+                "a stage cannot be stored, an interrupted run would begin again: %s", fault
             )
 
 

@@ -132,7 +132,7 @@ class Mismatch:
         return self.p_value < ALARM
 
 
-_FIXED = Cache(most=1)
+_fixed = Cache(most=1)
 """Templates of the last channels that were scanned: all fits of a diagnosis scan the same ones."""
 
 
@@ -158,7 +158,7 @@ class Scanner:
         self._blocks: list[csr_array] = []
         inside, norms = [], []
         size = len(fit.residuals)
-        fixed = _FIXED.get(
+        fixed = _fixed.get(
             tuple(fit.channels), lambda: list(_stacked(make_templates(fit.channels), size))
         )
         for block, some in chain(fixed, _stacked(make_fitted_templates(fit), size)):

@@ -363,7 +363,7 @@ def _not_tested(report: Mapping[str, Any]) -> str:
 
 
 def _provenance(told: Mapping[str, Any]) -> str:
-    """What made the report: command, time, versions, and hashes of the files that were read."""
+    """Table of the provenance: command, time, versions, and hashes of the files that were read."""
     if not told:
         return ""
     plain = {k: v for k, v in told.items() if not isinstance(v, Mapping)}
