@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from bfsensor.effects.bf_chromatic import BrighterFatterChromatic
     from bfsensor.effects.bf_long_range import BrighterFatterLongRange
     from bfsensor.effects.bf_nonlinear import BrighterFatterNonlinear
-    from bfsensor.effects.bias_instability import BiasByFrame, BiasByRow, BiasRamp
+    from bfsensor.effects.bias_instability import BiasByFrame, BiasByRow
     from bfsensor.effects.charge_loss import ChargeLoss
     from bfsensor.effects.correlated_noise import CommonNoise, NoiseInTime, Pickup
     from bfsensor.effects.cosmic_rays import CosmicRays
@@ -52,7 +52,7 @@ else:
             "bf_chromatic": ["BrighterFatterChromatic"],
             "bf_long_range": ["BrighterFatterLongRange"],
             "bf_nonlinear": ["BrighterFatterNonlinear"],
-            "bias_instability": ["BiasByFrame", "BiasByRow", "BiasRamp"],
+            "bias_instability": ["BiasByFrame", "BiasByRow"],
             "charge_loss": ["ChargeLoss"],
             "correlated_noise": ["CommonNoise", "NoiseInTime", "Pickup"],
             "cosmic_rays": ["CosmicRays"],
@@ -88,7 +88,6 @@ __all__ = [
     "AmpCrosstalk",
     "BiasByFrame",
     "BiasByRow",
-    "BiasRamp",
     "BrighterFatterAnisotropy",
     "BrighterFatterChromatic",
     "BrighterFatterLongRange",

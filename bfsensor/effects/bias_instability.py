@@ -1,4 +1,7 @@
-"""Bias instability: the bias level varies from frame to frame, row to row, or along rows."""
+"""Bias instability: the bias level varies from frame to frame or from row to row.
+
+A shape that all frames share is no instability: it is subtracted with the biases' mean.
+"""
 
 from __future__ import annotations
 
@@ -81,61 +84,3 @@ class BiasByRow(ReadNoise):
 
     def on_frame(self, i: NDArray, j: NDArray, width: float) -> FloatArray:
         return np.where(np.broadcast_arrays(i, j)[1] == 0, self["rms"] ** 2, 0.0)
-
-
-class BiasRamp(Effect):
-    """Each row begins ``amp`` too high and decays exponentially over ``length`` pixels, always alike.
-
-    Parameters
-    ----------
-    values : mapping of str to float
-        Plausible ranges: ``amp`` [e-]: 2 to 30 (0 changes nothing); ``length`` [pixel]: 5 to 60.
-
-    Examples
-    --------
-    >>> BiasRamp({"amp": 8.0, "length": 20.0}).name
-    'bias_instability:ramp'
-    """
-
-    word = "bias_instability"
-    variant = "ramp"
-    parameters = (
-        Parameter("amp", "e-", 2.0, 30.0, amplitude=True),
-        Parameter("length", "pixel", 5.0, 60.0),
-    )
-    touches = ("bias_level", "serial_overscan", "flat_mean")
-    source = SOURCE
-
-    def noise(
-        self, frames: list[Image], layout: Layout, rng: np.random.Generator
-    ) -> list[Image]:
-        if self["amp"] == 0:
-            return frames
-        return added(frames, [self._at(np.arange(f.shape[1]))[None] for f in frames])
-
-    def bias_level(self, axes: Axes, layout: Layout) -> FloatArray:
-        image = self._mean(axes, layout, "image") - self._mean(axes, layout, "overscan")
-        return np.where(axes["what"] == "level", image, 0.0)
-
-    def serial_overscan(self, axes: Axes, layout: Layout) -> FloatArray:
-        first = layout.of_amp("prescan", axes["amp"]) + layout.of_amp(
-            "columns", axes["amp"]
-        )
-        return self._at(first + axes["k"] - 1)
-
-    def flat_mean(self, axes: Axes, layout: Layout) -> FloatArray:
-        # The mean bias, which is subtracted, has the ramp too, above the mean of its whole overscan.
-        return self._mean(axes, layout, "overscan")
-
-    def _at(self, column: NDArray) -> FloatArray:
-        """Height of the ramp at columns in readout order, from 0 [e-]."""
-        return np.asarray(self["amp"] * np.exp(-column / self["length"]))
-
-    def _mean(self, axes: Axes, layout: Layout, part: str) -> FloatArray:
-        """Mean of the ramp over the 'image' or the 'overscan' of each value's amplifier [e-]."""
-        every = []
-        for s in layout.segments:
-            first = s.prescan + (s.columns if part == "overscan" else 0)
-            count = s.serial_overscan if part == "overscan" else s.columns
-            every.append(self._at(first + np.arange(count)).mean() if count else 0.0)
-        return np.array(every)[axes["amp"].astype(int)]

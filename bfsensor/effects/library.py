@@ -10,7 +10,7 @@ from bfsensor.effects.bf_anisotropy import BrighterFatterAnisotropy
 from bfsensor.effects.bf_chromatic import BrighterFatterChromatic
 from bfsensor.effects.bf_long_range import BrighterFatterLongRange
 from bfsensor.effects.bf_nonlinear import BrighterFatterNonlinear
-from bfsensor.effects.bias_instability import BiasByFrame, BiasByRow, BiasRamp
+from bfsensor.effects.bias_instability import BiasByFrame, BiasByRow
 from bfsensor.effects.charge_loss import ChargeLoss
 from bfsensor.effects.correlated_noise import CommonNoise, NoiseInTime, Pickup
 from bfsensor.effects.cosmic_rays import CosmicRays
@@ -42,7 +42,6 @@ LIBRARY: tuple[type[Effect], ...] = (
     AmpCrosstalk,
     BiasByFrame,
     BiasByRow,
-    BiasRamp,
     BrighterFatterAnisotropy,
     BrighterFatterChromatic,
     BrighterFatterLongRange,

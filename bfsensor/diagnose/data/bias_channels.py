@@ -188,7 +188,7 @@ class BiasChannels:
             values.append(mean)
             blocks.append(self._errors(seen, amp) / (self._size * pairs))
             axes.add(len(mean), self._condition, amp=amp, lag=np.arange(len(mean)),
-                     pulse=pulses)  # fmt: skip
+                     pulse=np.pad(pulses, (0, len(mean) - len(pulses))))  # fmt: skip
         out = [
             Channel("bias_cov", np.concatenate(values), tuple(blocks), axes.columns(), "adu2",
                     self._fold)
@@ -206,7 +206,8 @@ class BiasChannels:
             if mean is None:
                 continue
             d = _without_outliers(frame.image - overscan_level(frame) - mean).ravel()
-            d /= d.std()
+            # A mean or a variance left in would be covariances at all lags.
+            d = (d - d.mean()) / d.std()
             square, n = d**2 - 1.0, len(d)
             out.append(np.array([
                 0.5 * (square[: n - h] @ d[h:] + square[h:] @ d[: n - h]) / (n - h)
@@ -244,7 +245,9 @@ class BiasChannels:
         if chi2.sf(gain.max(), len(third)) > norm.sf(STANDS_OUT):
             return out
         c = np.mean(self._spectra, axis=0)
-        away = c[:, 1:] / c[:, :1] * np.sqrt(self._size * len(self._spectra))
+        away = (
+            c[:, 1 : READOUT_LAGS + 1] / c[:, :1] * np.sqrt(self._size * len(self._spectra))
+        )
         best = shapes[int(np.argmax(gain + np.square(away @ shapes.T).sum(0)))]
         out[1:] = best / best[0]
         return out
@@ -258,8 +261,9 @@ class BiasChannels:
         out = _errors_in_order(seen)
         strips = np.mean([s[amp] for s in self._strips], axis=0) * self._size
         freedom = (PARTS - 1) * len(self._strips)
-        more = strips / np.diag(out)
-        more = np.sqrt(np.where(more > 1 + SCATTERED * np.sqrt(2 / freedom), more, 1.0))
+        ratio, more = strips / np.diag(out)[: len(strips)], np.ones(len(out))
+        clear = ratio > 1 + SCATTERED * np.sqrt(2 / freedom)
+        more[: len(strips)] = np.sqrt(np.where(clear, ratio, 1.0))
         return np.asarray(out * np.outer(more, more))
 
     def _seen(self, amp: int) -> FloatArray:

@@ -283,7 +283,11 @@ def find_cosmetics(
                 )
             )
             repairs[amp].filled[y, x] = True
-    return (RepairedSource(source, repairs) if found else source), tuple(found)
+    changed = any(
+        r.filled.any() or (r.response != 1.0).any() or (r.shade != 1.0).any()
+        for r in repairs
+    )
+    return (RepairedSource(source, repairs) if changed else source), tuple(found)
 
 
 def _repair_response(
@@ -303,8 +307,8 @@ def _repair_response(
         good.append(repair.of_image(image, -1.0))
         _on_sensor(whole, frame)[...] = good[-1]
         _on_sensor(owner, frame)[...] = amp
-    light = smooth_light(whole, owner)
-    whole -= light
+    light, steps = smooth_light(whole, owner)
+    whole -= light + steps
     whole[owner < 0] = 0.0
     shade, change = np.ones(shape), np.zeros(shape)
     # Dust beside a column hides that the column stands alone, and a column disturbs dust's shape:
@@ -322,14 +326,18 @@ def _repair_response(
         shade[:] = 1.0
         for rows_of, columns_of, part, _ in dust:
             shade[np.ix_(rows_of, columns_of)] *= part
-    # Steps between amplifiers are their gains'.
-    falls = [float(np.ptp(_on_sensor(light, f))) for f in layout]
-    if max(falls) > LEAST:
-        noise = float(np.std(whole[owner >= 0])) / np.sqrt(whole.size)
+    corners = light[[0, 0, -1, -1], [0, -1, 0, -1]]
+    outside, middle = (
+        owner[[0, 0, -1, -1], [0, -1, 0, -1]],
+        light[shape[0] // 2, shape[1] // 2],
+    )
+    # Corners darker than the middle: a slope of the light has one brighter and one darker.
+    fall = float(corners.mean() - middle)
+    if (outside >= 0).all() and -fall > LEAST:
+        noise = float(np.std(whole[owner >= 0]) / np.sqrt(whole.size))
         place = (0, shape[1]), (0, shape[0])
-        size = -max(falls)
         found.append(
-            Cosmetic("vignetting", -1, *place, size, "of the signal", -size / noise)
+            Cosmetic("vignetting", -1, *place, fall, "of the signal", -fall / noise)
         )
     for amp, one in columns:
         worst = float(one.change.flat[np.abs(one.change).argmax()])

@@ -226,8 +226,8 @@ def _lacking_rows(
 
 def smooth_light(
     image: FloatArray, amplifiers: NDArray[np.int64] | None = None
-) -> FloatArray:
-    """Fit a polynomial of the place to boxes of a mean flat, with a step for each amplifier.
+) -> tuple[FloatArray, FloatArray]:
+    """Fit a smooth function of the place to boxes of a mean flat, with a step for each amplifier.
 
     Parameters
     ----------
@@ -238,8 +238,8 @@ def smooth_light(
 
     Returns
     -------
-    light : ndarray, shape (rows, columns)
-        What dust spots and patterns stand out of.
+    light, steps : ndarray, shape (rows, columns)
+        The light, and the amplifiers' steps: dust spots and patterns stand out of their sum.
     """
     owner = np.zeros(image.shape, int) if amplifiers is None else amplifiers
     y, x = (np.linspace(-1.0, 1.0, n) for n in image.shape)
@@ -274,7 +274,7 @@ def smooth_light(
         for c, f, (p, q) in zip(found, shapes, powers, strict=False)
     )
     offsets = np.append(found[len(powers) :], 0.0)
-    return np.asarray(light + offsets[owner])
+    return np.asarray(light), offsets[owner]
 
 
 def dust_spots(image: FloatArray) -> list[tuple[range, range, FloatArray, float]]:

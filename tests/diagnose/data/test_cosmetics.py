@@ -121,7 +121,10 @@ class Dust(Effect):
 def test_dust_is_listed_and_no_alarm():
     source = VirtualSource(seed=7107, size=SMALL, effects=[Dust({"part": 1.0})])
     measured = measure_channels(source)
-    dust = sorted(measured.cosmetics, key=lambda c: c.y)
+    # The virtual lamp flickers, which is listed, too.
+    dust = sorted(
+        (c for c in measured.cosmetics if c.kind != "lamp_flicker"), key=lambda c: c.y
+    )
     assert [c.kind for c in dust] == ["dust"] * 2
     for one, (row, column, _, depth) in zip(dust, SHADOWS, strict=True):
         assert one.y[0] <= row < one.y[1] and one.x[0] <= column < one.x[1]
