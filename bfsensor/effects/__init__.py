@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from bfsensor.effects.shutter_timing import ShutterTiming
     from bfsensor.effects.tearing import Tearing
     from bfsensor.effects.trap_serial import TrapSerial
-    from bfsensor.effects.tree_rings import TreeRings, UnevenTreeRings
+    from bfsensor.effects.tree_rings import RadialTreeRings, TreeRings, UnevenTreeRings
     from bfsensor.effects.voltage_dependence import VoltageDependence
 else:
     __getattr__, __dir__ = lazy_names(
@@ -77,7 +77,7 @@ else:
             "shutter_timing": ["ShutterTiming"],
             "tearing": ["Tearing"],
             "trap_serial": ["TrapSerial"],
-            "tree_rings": ["TreeRings", "UnevenTreeRings"],
+            "tree_rings": ["RadialTreeRings", "TreeRings", "UnevenTreeRings"],
             "voltage_dependence": ["VoltageDependence"],
         },
     )
@@ -118,6 +118,7 @@ __all__ = [
     "Persistence",
     "Pickup",
     "PsfWings",
+    "RadialTreeRings",
     "Saturation",
     "Segment",
     "Shot",

@@ -33,7 +33,7 @@ from bfsensor.effects.saturation import Saturation
 from bfsensor.effects.shutter_timing import ShutterTiming
 from bfsensor.effects.tearing import Tearing
 from bfsensor.effects.trap_serial import TrapSerial
-from bfsensor.effects.tree_rings import TreeRings, UnevenTreeRings
+from bfsensor.effects.tree_rings import RadialTreeRings, TreeRings, UnevenTreeRings
 from bfsensor.effects.voltage_dependence import VoltageDependence
 from bfsensor.errors import EffectError
 
@@ -67,6 +67,7 @@ LIBRARY: tuple[type[Effect], ...] = (
     Persistence,
     Pickup,
     PsfWings,
+    RadialTreeRings,
     Saturation,
     ShutterTiming,
     Tearing,
