@@ -33,12 +33,12 @@ if TYPE_CHECKING:
     from bfsensor.effects.interpixel_coupling import InterpixelCoupling
     from bfsensor.effects.lateral_diffusion import LateralDiffusion
     from bfsensor.effects.library import LIBRARY, make_effect
-    from bfsensor.effects.mask_stitch import MaskStitch
+    from bfsensor.effects.mask_stitch import MaskStitch, WavyMask
     from bfsensor.effects.persistence import Persistence
     from bfsensor.effects.psf_wings import PsfWings
     from bfsensor.effects.saturation import Saturation
-    from bfsensor.effects.shutter_timing import ShutterTiming
-    from bfsensor.effects.tearing import Tearing
+    from bfsensor.effects.shutter_timing import FlatShutter, ShutterTiming
+    from bfsensor.effects.tearing import DivisaderoTearing, Tearing
     from bfsensor.effects.trap_serial import TrapSerial
     from bfsensor.effects.tree_rings import RadialTreeRings, TreeRings, UnevenTreeRings
     from bfsensor.effects.voltage_dependence import VoltageDependence
@@ -70,12 +70,12 @@ else:
             "interpixel_coupling": ["InterpixelCoupling"],
             "lateral_diffusion": ["LateralDiffusion"],
             "library": ["LIBRARY", "make_effect"],
-            "mask_stitch": ["MaskStitch"],
+            "mask_stitch": ["MaskStitch", "WavyMask"],
             "persistence": ["Persistence"],
             "psf_wings": ["PsfWings"],
             "saturation": ["Saturation"],
-            "shutter_timing": ["ShutterTiming"],
-            "tearing": ["Tearing"],
+            "shutter_timing": ["FlatShutter", "ShutterTiming"],
+            "tearing": ["DivisaderoTearing", "Tearing"],
             "trap_serial": ["TrapSerial"],
             "tree_rings": ["RadialTreeRings", "TreeRings", "UnevenTreeRings"],
             "voltage_dependence": ["VoltageDependence"],
@@ -100,9 +100,11 @@ __all__ = [
     "CtiSerial",
     "DarkCurrent",
     "DeviceParameter",
+    "DivisaderoTearing",
     "EdgeRolloff",
     "Effect",
     "ElectronicMemory",
+    "FlatShutter",
     "Fringing",
     "GainDrift",
     "GainNonlinearity",
@@ -128,5 +130,6 @@ __all__ = [
     "TreeRings",
     "UnevenTreeRings",
     "VoltageDependence",
+    "WavyMask",
     "make_effect",
 ]

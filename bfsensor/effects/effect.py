@@ -369,6 +369,11 @@ class Effect:
         """Name of the class of effects, followed by ``:`` and the variant where there is one."""
         return f"{self.word}:{self.variant}" if self.variant else self.word
 
+    @property
+    def law_name(self) -> str:
+        """Name of the law within the class: the variant, or 'plain' for the simplest law."""
+        return self.variant or "plain"
+
     @classmethod
     def amplitudes(cls) -> tuple[str, ...]:
         """Names of the parameters that are strengths, each 0 effect at its neutral value."""

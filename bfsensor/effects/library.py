@@ -26,12 +26,12 @@ from bfsensor.effects.gain_nonlinearity import GainNonlinearity
 from bfsensor.effects.illumination_turbulence import IlluminationTurbulence
 from bfsensor.effects.interpixel_coupling import InterpixelCoupling
 from bfsensor.effects.lateral_diffusion import LateralDiffusion
-from bfsensor.effects.mask_stitch import MaskStitch
+from bfsensor.effects.mask_stitch import MaskStitch, WavyMask
 from bfsensor.effects.persistence import Persistence
 from bfsensor.effects.psf_wings import PsfWings
 from bfsensor.effects.saturation import Saturation
-from bfsensor.effects.shutter_timing import ShutterTiming
-from bfsensor.effects.tearing import Tearing
+from bfsensor.effects.shutter_timing import FlatShutter, ShutterTiming
+from bfsensor.effects.tearing import DivisaderoTearing, Tearing
 from bfsensor.effects.trap_serial import TrapSerial
 from bfsensor.effects.tree_rings import RadialTreeRings, TreeRings, UnevenTreeRings
 from bfsensor.effects.voltage_dependence import VoltageDependence
@@ -53,8 +53,10 @@ LIBRARY: tuple[type[Effect], ...] = (
     CtiParallel,
     CtiSerial,
     DarkCurrent,
+    DivisaderoTearing,
     EdgeRolloff,
     ElectronicMemory,
+    FlatShutter,
     Fringing,
     GainDrift,
     GainNonlinearity,
@@ -75,6 +77,7 @@ LIBRARY: tuple[type[Effect], ...] = (
     TreeRings,
     UnevenTreeRings,
     VoltageDependence,
+    WavyMask,
 )
 """Classes of all effects, one for each variant.  Those of a device's parameters depend on the
 baseline: :func:`bfsensor.effects.device_parameter.device_parameters` makes them."""

@@ -126,8 +126,14 @@ class Tearing(Effect):
 
     def _torn(self, nx: int) -> FloatArray:
         """Displacements of the edges between columns in rows with the tear [pixel]."""
-        away = np.abs(np.arange(nx + 1.0) - self["column"] * nx)
-        return np.asarray(self["amp"] * np.exp(-away / self["length"]))
+        from_tear = np.arange(nx + 1.0) - self["column"] * nx
+        fallen = np.exp(-np.abs(from_tear) / self["length"])
+        return np.asarray(self["amp"] * fallen * self._way(from_tear))
+
+    def _way(self, from_tear: FloatArray) -> FloatArray | float:
+        """Direction of the displacement at a distance from the tear [pixel]: the same on both sides."""
+        del from_tear
+        return 1.0
 
     def _open(self, ny: int) -> FloatArray:
         """Fraction of the exposures in which each row has the tear."""
@@ -140,6 +146,42 @@ class Tearing(Effect):
         part = self._open(ny)
         both = np.minimum(part[:, None], part)
         return np.asarray(both - part[:, None] * part)
+
+
+class DivisaderoTearing(Tearing):
+    """Edges on either side of a tear are displaced away from it, or towards it.
+
+    Missing holes in one channel stop attract or repel the electrons of both sides alike.  Between
+    the two sides, within half a pixel of the tear, the displacement is linear.  ``column`` may lie within
+    a column, whose two edges then move apart.  ``amp`` is positive away from the tear; all other
+    parameters are those of :class:`Tearing`.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``amp`` [pixel]: 0.003 to 0.2 in magnitude, either sign (0 changes
+        nothing); ``length`` [pixel]: 1 to 5; ``column``: 0 to 1; ``open``: 0 to 1.
+
+    Examples
+    --------
+    >>> shape = {"length": 2.0, "column": 0.5, "open": 0.5}
+    >>> DivisaderoTearing({"amp": 0.02} | shape).name
+    'tearing:divisadero'
+    """
+
+    variant = "divisadero"
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        """Begin within columns as well as at the boundaries that :class:`Tearing` begins with."""
+        half = 0.5 / layout.shape[1]
+        return [
+            s | {"column": s["column"] + more}
+            for s in super().starts(layout, seen) for more in (0.0, half)
+        ]  # fmt: skip
+
+    def _way(self, from_tear: FloatArray) -> FloatArray | float:
+        return np.clip(2 * from_tear, -1.0, 1.0)
 
 
 def _reduced(rows: FloatArray, columns: FloatArray, axes: Axes) -> FloatArray:

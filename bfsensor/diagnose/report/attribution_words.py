@@ -46,6 +46,7 @@ def reported(attribution: Attribution | None) -> dict[str, Any]:
 
 def _effect(found: Found) -> dict[str, Any]:
     told: dict[str, Any] = {"class": found.effect.word, "parameters": found.intervals()}
+    told["law"] = found.effect.law_name
     if found.effect.variant:
         told["variant"] = found.effect.variant
     told["gain_chi2"] = found.gain
