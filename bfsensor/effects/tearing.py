@@ -22,17 +22,19 @@ class Tearing(Effect):
 
     ``column`` is the place of the boundary as a fraction of the sensor's width.  The tear ends at a
     row that differs at random in every exposure: uniform between the fraction ``open`` of the rows
-    and the top.  Without a number of an exposure, :meth:`displacements` are the mean ones.
+    and the top; where ``top`` is 1, rows count from the top.  Without a number of an exposure, :meth:`displacements` are the mean ones.
 
     Parameters
     ----------
     values : mapping of str to float
         Plausible ranges: ``amp`` [pixel]: 0.003 to 0.2 in magnitude, either sign (0 changes
-        nothing); ``length`` [pixel]: 1 to 5; ``column``: 0 to 1; ``open``: 0 to 1.
+        nothing); ``length`` [pixel]: 1 to 5; ``column``: 0 to 1; ``open``: 0 to 1; ``top``: 0
+        to 1, whole.
 
     Examples
     --------
-    >>> Tearing({"amp": 0.02, "length": 2.0, "column": 0.5, "open": 0.5}).name
+    >>> shape = {"length": 2.0, "column": 0.5, "open": 0.5, "top": 0}
+    >>> Tearing({"amp": 0.02} | shape).name
     'tearing'
     """
 
@@ -43,6 +45,7 @@ class Tearing(Effect):
         Parameter("length", "pixel", 1.0, 5.0),
         Parameter("column", "", 0.0, 1.0, law="flat", step=2e-4),
         Parameter("open", "", 0.0, 1.0, law="flat"),
+        Parameter("top", "", 0, 1, law="whole"),
     )
     touches = ("flat_map", "flat_cov")
     of_pixels = True
@@ -66,11 +69,11 @@ class Tearing(Effect):
             if high - low < width / 8
         }  # fmt: skip
         return [
-            {"amp": 0.02, "length": length, "column": boundary / width, "open": 0.4}
+            {"amp": 0.02, "length": length, "column": boundary / width, "open": 0.4, "top": top}
             for boundary in sorted(near or range(2, width, max(width // 64, 2)))
-            for length in (1.5, 3.5)
+            for length in (1.5, 3.5) for top in (0.0, 1.0)
             if 0 < boundary < width
-        ]
+        ]  # fmt: skip
 
     def displacements(self, shot: Shot, layout: Layout) -> Edges | None:
         ny, nx = layout.shape
@@ -112,6 +115,7 @@ class Tearing(Effect):
         ny, nx = layout.shape
         area = np.diff(self._torn(nx))
         t = (np.arange(ny) + 0.5 - self["open"] * ny) / max((1 - self["open"]) * ny, 1.0)
+        t = t[::-1] if self["top"] else t
         out, fold = [], str(axes["fold"][0])
         for name in dict.fromkeys(axes["map"]):
             spread = np.sqrt(layout.map_noise.get((fold, str(name)), 0.0)) * (
@@ -139,7 +143,8 @@ class Tearing(Effect):
         """Fraction of the exposures in which each row has the tear."""
         row, never = np.arange(ny) + 0.5, self["open"] * ny
         above = np.clip((ny - row) / max(ny - never, 1.0), 0.0, 1.0)
-        return np.where(row <= never, 1.0, above)
+        part = np.where(row <= never, 1.0, above)
+        return part[::-1] if self["top"] else part
 
     def _chance(self, ny: int) -> FloatArray:
         """Covariance between rows of having the tear (0 or 1) in an exposure, shape (ny, ny)."""
@@ -160,11 +165,12 @@ class DivisaderoTearing(Tearing):
     ----------
     values : mapping of str to float
         Plausible ranges: ``amp`` [pixel]: 0.003 to 0.2 in magnitude, either sign (0 changes
-        nothing); ``length`` [pixel]: 1 to 5; ``column``: 0 to 1; ``open``: 0 to 1.
+        nothing); ``length`` [pixel]: 1 to 5; ``column``: 0 to 1; ``open``: 0 to 1; ``top``: 0
+        to 1, whole.
 
     Examples
     --------
-    >>> shape = {"length": 2.0, "column": 0.5, "open": 0.5}
+    >>> shape = {"length": 2.0, "column": 0.5, "open": 0.5, "top": 0}
     >>> DivisaderoTearing({"amp": 0.02} | shape).name
     'tearing:divisadero'
     """
