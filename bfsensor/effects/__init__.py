@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from bfsensor.effects.bf_anisotropy import BrighterFatterAnisotropy
     from bfsensor.effects.bf_chromatic import BrighterFatterChromatic
     from bfsensor.effects.bf_long_range import BrighterFatterLongRange
-    from bfsensor.effects.bf_nonlinear import BrighterFatterNonlinear
+    from bfsensor.effects.bf_nonlinear import BrighterFatterNonlinear, EdgesNonlinear
     from bfsensor.effects.bias_instability import BiasByFrame, BiasByRow, BiasRamp
     from bfsensor.effects.charge_loss import ChargeLoss
     from bfsensor.effects.correlated_noise import CommonNoise, NoiseInTime, Pickup
@@ -51,7 +51,7 @@ else:
             "bf_anisotropy": ["BrighterFatterAnisotropy"],
             "bf_chromatic": ["BrighterFatterChromatic"],
             "bf_long_range": ["BrighterFatterLongRange"],
-            "bf_nonlinear": ["BrighterFatterNonlinear"],
+            "bf_nonlinear": ["BrighterFatterNonlinear", "EdgesNonlinear"],
             "bias_instability": ["BiasByFrame", "BiasByRow", "BiasRamp"],
             "charge_loss": ["ChargeLoss"],
             "correlated_noise": ["CommonNoise", "NoiseInTime", "Pickup"],
@@ -102,6 +102,7 @@ __all__ = [
     "DeviceParameter",
     "DivisaderoTearing",
     "EdgeRolloff",
+    "EdgesNonlinear",
     "Effect",
     "ElectronicMemory",
     "FlatShutter",

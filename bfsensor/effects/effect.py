@@ -465,6 +465,18 @@ class Effect:
         del shot, layout
         return None
 
+    def bend_edges(self, kx: FloatArray, ky: FloatArray) -> Edges | None:
+        """Give the change of the baseline's shifts per electron with the charge that causes them.
+
+        Returns
+        -------
+        slopes : Edges or None
+            Derivative of the shifts (kx, ky) by the charge [pixel/e-^2]: a charge Q moves boundaries
+            by k Q and half of this times Q^2.  None: no change.
+        """
+        del kx, ky
+        return None
+
     def law(self) -> Law:
         """Give the departure of charge collection from shifts proportional to the charge."""
         return Law()

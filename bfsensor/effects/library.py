@@ -9,7 +9,7 @@ from bfsensor.effects.amp_crosstalk import AmpCrosstalk
 from bfsensor.effects.bf_anisotropy import BrighterFatterAnisotropy
 from bfsensor.effects.bf_chromatic import BrighterFatterChromatic
 from bfsensor.effects.bf_long_range import BrighterFatterLongRange
-from bfsensor.effects.bf_nonlinear import BrighterFatterNonlinear
+from bfsensor.effects.bf_nonlinear import BrighterFatterNonlinear, EdgesNonlinear
 from bfsensor.effects.bias_instability import BiasByFrame, BiasByRow, BiasRamp
 from bfsensor.effects.charge_loss import ChargeLoss
 from bfsensor.effects.correlated_noise import CommonNoise, NoiseInTime, Pickup
@@ -55,6 +55,7 @@ LIBRARY: tuple[type[Effect], ...] = (
     DarkCurrent,
     DivisaderoTearing,
     EdgeRolloff,
+    EdgesNonlinear,
     ElectronicMemory,
     FlatShutter,
     Fringing,

@@ -9,16 +9,16 @@ import numpy as np
 from bfsensor.effects.effect import Effect, Layout, Parameter, Seen, Shot
 from bfsensor.typing import Edges
 
-PERIODS = range(16, 65)
+PERIODS = range(8, 65)
 """Periods that are tried [pixel].
 
-Chosen: with twice the top, 113 instead of 49 periods are tried, and the penalty for the number of
-trials grows."""
+Chosen: below 8 several displaced boundaries lie in the reach of one another's diffusion; with twice the
+top, 121 instead of 57 periods are tried, and the penalty for the number of trials grows."""
 
 FOUND = 3
 """Largest number of detected columns from which phases are taken.
 
-Chosen: each adds 49 starts; twice as large, the search takes up to 1.75 times as long."""
+Chosen: each adds 57 starts; twice as large, the search takes up to 1.75 times as long."""
 
 
 class MaskStitch(Effect):
@@ -30,7 +30,7 @@ class MaskStitch(Effect):
     ----------
     values : mapping of str to float
         Plausible ranges: ``amp`` [pixel]: 0.0005 to 0.01 in magnitude, either sign (0 changes
-        nothing); ``period`` [pixel]: 16 to 64, whole; ``phase`` [pixel]: 0 to 63, whole.
+        nothing); ``period`` [pixel]: 8 to 64, whole; ``phase`` [pixel]: 0 to 63, whole.
 
     Examples
     --------
@@ -53,6 +53,7 @@ class MaskStitch(Effect):
         "C05024 (arXiv 1504.06088); that they repeat with the mask's field, and the range, are assumed"
     )
     standing = True
+    law_name = "step"
 
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
@@ -93,7 +94,7 @@ class WavyMask(Effect):
     Parameters
     ----------
     values : mapping of str to float
-        Plausible ranges: ``amp`` [pixel]: 0.0005 to 0.01 (0 changes nothing); ``period`` [pixel]: 16
+        Plausible ranges: ``amp`` [pixel]: 0.0005 to 0.01 (0 changes nothing); ``period`` [pixel]: 8
         to 64; ``phase`` [cycle]: -0.5 to 0.5; ``along``: 0 to 1, whole.
 
     Examples
