@@ -26,7 +26,7 @@ class BrighterFatterAnisotropy(Effect):
 
     Examples
     --------
-    >>> BrighterFatterAnisotropy({"eps": 0.08, "near": 0.0}).law_name
+    >>> BrighterFatterAnisotropy({"eps": 0.08}).law_name
     'uniform'
     """
 
@@ -34,13 +34,14 @@ class BrighterFatterAnisotropy(Effect):
     stage = "collect"
     parameters = (
         Parameter("eps", "", 0.02, 0.3, signed=True, amplitude=True),
-        Parameter("near", "1/pixel", 0.0, 2.0, law="flat"),
+        Parameter("near", "1/pixel", 0.0, 2.0, law="flat", plain=0.0),
     )
     touches = ("flat_cov", "spot")
     source = (
-        "Coefficients of the two axes are independent: Antilogus et al. 2014, JINST 9, C03048; boundaries "
-        "between rows and columns are made by other barriers (electrostatic fits of Astier & Regnault "
-        "2023, A&A 670, A118), which near edges feel most; exponential and range assumed"
+        "Coefficients of the two axes are independent: Antilogus et al. 2014, JINST 9, C03048; "
+        "boundaries between rows and columns are made by other barriers (electrostatic fits of "
+        "Astier & Regnault 2023, A&A 670, A118), which near edges feel most; exponential and "
+        "range assumed"
     )
 
     @property

@@ -35,7 +35,7 @@ class BrighterFatterLongRange(Effect):
 
     Examples
     --------
-    >>> BrighterFatterLongRange({"amp": 2e-08, "power": 2.0, "near": 0.0}).law_name
+    >>> BrighterFatterLongRange({"amp": 2e-08, "power": 2.0}).law_name
     'power'
     """
 
@@ -44,7 +44,7 @@ class BrighterFatterLongRange(Effect):
     parameters = (
         Parameter("amp", "1/e-", 5e-9, 1e-7, amplitude=True),
         Parameter("power", "", 0.0, 3.0, law="flat"),
-        Parameter("near", "1/pixel", 0.0, 1.0, law="flat"),
+        Parameter("near", "1/pixel", 0.0, 1.0, law="flat", plain=0.0),
     )
     touches = ("flat_cov", "spot")
     source = (
@@ -72,7 +72,9 @@ class BrighterFatterLongRange(Effect):
         # At most half of a small sensor: farther, a charge would act on itself around the rim.
         half = max(min(REACH, min(layout.shape) // 2 - 2), kx.shape[0] // 2)
         moved = []
-        for old, new in zip((kx, ky), shifts_of_tail(self["power"], half, self["near"]), strict=True):
+        for old, new in zip(
+            (kx, ky), shifts_of_tail(self["power"], half, self["near"]), strict=True
+        ):
             margin = half - old.shape[0] // 2
             moved.append(np.pad(old, margin) + self["amp"] * new)
         return moved[0], moved[1]

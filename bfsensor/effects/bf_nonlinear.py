@@ -50,9 +50,9 @@ class EdgesNonlinear(Effect):
 
     .. math:: c = b\, e^{-n (r - 1/2)}
 
-    r is the distance of an edge's middle from the charge [pixel], and b is ``b`` for edges between columns,
-    ``b_y`` for those between rows.  ``near`` n is 0 where all edges have the same, above 0 where those
-    beside the charge feel its height most.
+    r is the distance of an edge's middle from the charge [pixel], and b is ``b`` for edges between
+    columns, ``b_y`` for those between rows.  ``near`` n is 0 where all edges have the same, above 0
+    where those beside the charge feel its height most.
 
     Parameters
     ----------
@@ -78,8 +78,9 @@ class EdgesNonlinear(Effect):
     touches = ("flat_cov", "spot")
     of_levels = True
     source = (
-        "Coefficients b_ij differ between lags: Astier & Regnault 2023, A&A 670, A118; higher orders evolve "
-        "anisotropically with flux: Broughton et al. 2024, PASP 136, 045003; exponential and range assumed"
+        "Coefficients b_ij differ between lags: Astier & Regnault 2023, A&A 670, A118; higher "
+        "orders evolve anisotropically with flux: Broughton et al. 2024, PASP 136, 045003; exponential "
+        "and range assumed"
     )
 
     @property

@@ -20,21 +20,19 @@ class EdgeRolloff(Effect):
     .. math:: u(d) = A \left( 1 + t\, \frac{d}{L} \right)^{-1/t}
 
     ``length`` L is the decay length at the rim.  ``tail`` t is 0 for an exponential and 1 / p for a
-    power p of the distance, (1 + d / (p L))^-p.  ``amp`` A is that of edges between columns, near the
-    sides; ``amp_y`` that of edges between rows, near bottom and top; below 0 inwards.  The outermost
-    boundary itself is displaced where ``rim`` is 1, and held by the guard ring where it is 0.
+    power p of the distance, (1 + d / (p L))^-p.  ``amp`` A is below 0 for a displacement inwards; edges
+    between columns, near the sides, have (1 + ``sides``) A, those between rows (1 - ``sides``) A.  The
+    outermost boundary itself is displaced where ``rim`` is 1, and held by the guard ring where it is 0.
 
     Parameters
     ----------
     values : mapping of str to float
         Plausible ranges: ``amp`` [pixel]: 0.01 to 0.5 in magnitude, either sign (0 changes nothing);
-        ``amp_y`` [pixel]: 0.01 to 0.5 in magnitude, either sign (0 changes nothing); ``length``
-        [pixel]: 1.5 to 8; ``tail``: 0 to 1; ``rim``: 0 to 1, whole.
+        ``length`` [pixel]: 1.5 to 8; ``sides``: -1 to 1; ``tail``: 0 to 1; ``rim``: 0 to 1, whole.
 
     Examples
     --------
-    >>> both = {"amp": 0.07, "amp_y": 0.07}
-    >>> EdgeRolloff(both | {"length": 3.0, "tail": 0.0, "rim": 1}).law_name
+    >>> EdgeRolloff({"amp": 0.07, "length": 3.0}).law_name
     'exponential'
     """
 
@@ -42,10 +40,10 @@ class EdgeRolloff(Effect):
     stage = "collect"
     parameters = (
         Parameter("amp", "pixel", 0.01, 0.5, signed=True, amplitude=True),
-        Parameter("amp_y", "pixel", 0.01, 0.5, signed=True, amplitude=True),
         Parameter("length", "pixel", 1.5, 8.0),
-        Parameter("tail", "", 0.0, 1.0, law="flat"),
-        Parameter("rim", "", 0, 1, law="whole"),
+        Parameter("sides", "", -1.0, 1.0, law="flat", plain=0.0),
+        Parameter("tail", "", 0.0, 1.0, law="flat", plain=0.0),
+        Parameter("rim", "", 0, 1, law="whole", plain=1.0),
     )
     touches = ("flat_map",)
     of_pixels = True
@@ -66,14 +64,15 @@ class EdgeRolloff(Effect):
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
         return [
-            {"amp": 0.05, "amp_y": 0.05, "length": length, "tail": tail, "rim": rim}
+            {"amp": 0.05, "length": length, "sides": 0.0, "tail": tail, "rim": rim}
             for length in (1.7, 2.6, 4.0, 6.3) for tail in (0.1, 0.5) for rim in (1.0, 0.0)
         ]  # fmt: skip
 
     def displacements(self, shot: Shot, layout: Layout) -> Edges | None:
         ny, nx = layout.shape
         x, y = (
-            self[amp] * self._outwards(n) for amp, n in (("amp", nx), ("amp_y", ny))
+            (1 + sign * self["sides"]) * self._outwards(n)
+            for sign, n in ((1, nx), (-1, ny))
         )
         return (
             np.broadcast_to(x, (ny, nx + 1)),
@@ -81,12 +80,12 @@ class EdgeRolloff(Effect):
         )
 
     def _outwards(self, n: int) -> np.ndarray:
-        """Displacements of the n + 1 edges of n pixels over ``amp``, positive towards larger numbers."""
+        """Displacements of the n + 1 edges of n pixels [pixel], positive towards larger numbers."""
         edge = np.arange(n + 1.0)
         out = self._fallen(n - edge) - self._fallen(edge)
         if not self["rim"]:
             out[[0, -1]] = 0.0
-        return np.asarray(out)
+        return np.asarray(self["amp"] * out)
 
     def _fallen(self, away: FloatArray) -> FloatArray:
         """Profile at a distance from the rim [pixel], 1 at the rim."""

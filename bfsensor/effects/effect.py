@@ -49,6 +49,9 @@ class Parameter(NamedTuple):
     step : float
         Step of numerical derivatives, in the unit of the parameter; 0: 2 % of the value for the
         law "log", 1 % of the range for "flat".
+    plain : float, optional
+        Value at which a more general law is the plain one; an effect that is made without this
+        parameter has it.  None: the value must be given.
 
     Examples
     --------
@@ -65,6 +68,7 @@ class Parameter(NamedTuple):
     signed: bool = False
     amplitude: bool = False
     step: float = 0.0
+    plain: float | None = None
 
 
 class Segment(NamedTuple):
@@ -345,6 +349,8 @@ class Effect:
 
     def __post_init__(self) -> None:
         needed = {p.name for p in self.parameters}
+        plain = {p.name: p.plain for p in self.parameters if p.plain is not None}
+        object.__setattr__(self, "values", plain | dict(self.values))
         if set(self.values) != needed:
             raise EffectError(
                 f"{self.name}: parameters {', '.join(sorted(self.values)) or 'none'} given, "

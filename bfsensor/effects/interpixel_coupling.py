@@ -10,8 +10,9 @@ from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Seen
 from bfsensor.typing import FloatArray
 
 REACH = 3
-"""Largest distance of pixels that are coupled [pixel].  Derived: at the top of the decay's range, a half,
-a pixel four away is given an eighth of the fraction at one pixel, and its covariances are as faint."""
+"""Largest distance of pixels that are coupled [pixel].  Derived: at the top of the decay's range, a
+half, a pixel four away is given an eighth of the fraction at one pixel, and its covariances are as
+faint."""
 
 
 class InterpixelCoupling(Effect):
@@ -30,7 +31,7 @@ class InterpixelCoupling(Effect):
 
     Examples
     --------
-    >>> InterpixelCoupling({"ax": 0.0009, "ay": 0.0009, "decay": 0.0}).law_name
+    >>> InterpixelCoupling({"ax": 0.0009, "ay": 0.0009}).law_name
     'four_neighbours'
     """
 
@@ -39,18 +40,23 @@ class InterpixelCoupling(Effect):
     parameters = (
         Parameter("ax", "", 3e-4, 3e-3, amplitude=True),
         Parameter("ay", "", 3e-4, 3e-3, amplitude=True),
-        Parameter("decay", "", 0.0, 0.5, law="flat"),
+        Parameter("decay", "", 0.0, 0.5, law="flat", plain=0.0),
     )
     touches = ("flat_cov", "spot")
     source = (
-        "Four neighbours: Moore, Ninkov & Forrest 2004, Proc. SPIE 5167, 204; diagonal and farther ones: "
-        "Giannini et al. 2013, Exp. Astron. 36, 1; Donlon et al. 2016; range of CCD video chains assumed"
+        "Four neighbours: Moore, Ninkov & Forrest 2004, Proc. SPIE 5167, 204; diagonal and farther "
+        "ones: Giannini et al. 2013, Exp. Astron. 36, 1; Donlon et al. 2016; range of CCD video chains "
+        "assumed"
     )
 
     @property
     def law_name(self) -> str:
         """'extended' if a diagonal neighbour is given more than a tenth of what a near one is."""
-        return "extended" if self["decay"] > 0.1 ** (1 / (np.sqrt(2.0) - 1)) else "four_neighbours"
+        return (
+            "extended"
+            if self["decay"] > 0.1 ** (1 / (np.sqrt(2.0) - 1))
+            else "four_neighbours"
+        )
 
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
@@ -86,6 +92,8 @@ class InterpixelCoupling(Effect):
                 if not 0 < square <= reach * reach:
                     continue
                 near = (self["ax"] * i * i + self["ay"] * j * j) / square
-                part = near * (self["decay"] ** (np.sqrt(square) - 1) if square > 1 else 1.0)
+                part = near * (
+                    self["decay"] ** (np.sqrt(square) - 1) if square > 1 else 1.0
+                )
                 out = out + part * (np.roll(image, (j, i), (-2, -1)) - image)
         return out

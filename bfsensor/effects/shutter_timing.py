@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -32,7 +33,7 @@ class ShutterTiming(Effect):
 
     Examples
     --------
-    >>> ShutterTiming({"dt": 0.02, "shade": 0.0, "rise": 0.0, "iris": 0.0}).law_name
+    >>> ShutterTiming({"dt": 0.02, "shade": 0.0}).law_name
     'offset'
     """
 
@@ -41,15 +42,15 @@ class ShutterTiming(Effect):
     parameters = (
         Parameter("dt", "s", 5e-3, 5e-2, signed=True, amplitude=True),
         Parameter("shade", "", -1.0, 1.0, law="flat"),
-        Parameter("rise", "", -1.0, 1.0, law="flat"),
-        Parameter("iris", "", -1.0, 1.0, law="flat"),
+        Parameter("rise", "", -1.0, 1.0, law="flat", plain=0.0),
+        Parameter("iris", "", -1.0, 1.0, law="flat", plain=0.0),
     )
     # A shade makes a gradient in maps of short exposures, which the unknown illumination hides.
-    touches = ("flat_mean", "spot")
+    touches: ClassVar[tuple[str, ...]] = ("flat_mean", "spot")
     source = (
         "Opening and closing take time, more here than there: Stetson 1989, Highlights of Astronomy "
-        "8, 635; Galadi-Enriquez, Jordi & Trullols 1995, IAU Symp. 167; blades of unequal speed: Reif et "
-        "al. 2005; an iris: Zissell 2000, JAAVSO 28, 149; 0.07 s in one camera: Lee 2016, J. Korean "
+        "8, 635; Galadi-Enriquez, Jordi & Trullols 1995, IAU Symp. 167; blades of unequal speed: Reif "
+        "et al. 2005; an iris: Zissell 2000, JAAVSO 28, 149; 0.07 s in one camera: Lee 2016, J. Korean "
         "Astron. Soc. 49, 6; range assumed"
     )
     by_time = True
@@ -68,7 +69,9 @@ class ShutterTiming(Effect):
         return [
             {"dt": sign * 0.02} | even | {name: size}
             for sign in (1, -1)
-            for name, size in (("shade", -0.3), ("shade", 0.0), ("shade", 0.3), ("rise", -0.3), ("rise", 0.3))
+            for name, size in (
+                ("shade", -0.3), ("shade", 0.0), ("shade", 0.3), ("rise", -0.3), ("rise", 0.3),
+            )
         ]  # fmt: skip
 
     def light_map(self, shot: Shot, layout: Layout) -> FloatArray | None:
@@ -109,16 +112,17 @@ class FlatShutter(ShutterTiming):
     Parameters
     ----------
     values : mapping of str to float
-        Plausible ranges: those of :class:`ShutterTiming`.
+        Plausible ranges: ``dt`` [s]: 0.005 to 0.05 in magnitude, either sign (0 changes nothing);
+        ``shade``: -1 to 1; ``rise``: -1 to 1; ``iris``: -1 to 1.
 
     Examples
     --------
-    >>> FlatShutter({"dt": 0.02, "shade": 0.0, "rise": 0.0, "iris": 0.0}).name
+    >>> FlatShutter({"dt": 0.02, "shade": 0.0}).name
     'shutter_timing:flats'
     """
 
     variant = "flats"
-    touches = ("flat_mean",)
+    touches: ClassVar[tuple[str, ...]] = ("flat_mean",)
 
     def spot_flux(self, axes: Axes, layout: Layout) -> FloatArray:
         return np.zeros(len(axes["flux"]))

@@ -22,7 +22,8 @@ class Tearing(Effect):
 
     ``column`` is the place of the boundary as a fraction of the sensor's width.  The tear ends at a
     row that differs at random in every exposure: uniform between the fraction ``open`` of the rows
-    and the top; where ``top`` is 1, rows count from the top.  Without a number of an exposure, :meth:`displacements` are the mean ones.
+    and the top; where ``top`` is 1, rows count from the top.  Without a number of an exposure,
+    :meth:`displacements` are the mean ones.
 
     Parameters
     ----------
@@ -45,7 +46,7 @@ class Tearing(Effect):
         Parameter("length", "pixel", 1.0, 5.0),
         Parameter("column", "", 0.0, 1.0, law="flat", step=2e-4),
         Parameter("open", "", 0.0, 1.0, law="flat"),
-        Parameter("top", "", 0, 1, law="whole"),
+        Parameter("top", "", 0, 1, law="whole", plain=0.0),
     )
     touches = ("flat_map", "flat_cov")
     of_pixels = True
@@ -157,8 +158,8 @@ class DivisaderoTearing(Tearing):
     """Edges on either side of a tear are displaced away from it, or towards it.
 
     Missing holes in one channel stop attract or repel the electrons of both sides alike.  Between
-    the two sides, within half a pixel of the tear, the displacement is linear.  ``column`` may lie within
-    a column, whose two edges then move apart.  ``amp`` is positive away from the tear; all other
+    the two sides, within half a pixel of the tear, the displacement is linear.  ``column`` may lie
+    within a column, whose two edges then move apart.  ``amp`` is positive away from the tear; all other
     parameters are those of :class:`Tearing`.
 
     Parameters

@@ -240,12 +240,13 @@ class RadialTreeRings(_Rings):
 
     def profile(self, r: FloatArray, layout: Layout) -> FloatArray:
         waves = [s["waves"] for s in layout.sightings if s["shape"] == "radial"]
-        near = np.arange(np.ceil(r.max()) + 2)
+        # A spline is worst near its ends, so that it goes on for a few knots beyond the radii.
+        near = np.arange(-3.0, float(r.max()) + 3.0, 0.5)
         out = np.zeros_like(near)
         for f, sine, cosine in waves[0] if waves else ():
             turn = 2 * np.pi * f * near
             out += sine * np.sin(turn) + cosine * np.cos(turn)
-        # Waves are longer than five pixels: a cubic between whole pixels is exact to 1e-3 of them.
+        # Waves are longer than five pixels: a cubic through ten points of each is exact to 1e-3.
         return np.asarray(CubicSpline(near, out)(r))
 
     def strength(self, shot: Shot, layout: Layout) -> float:

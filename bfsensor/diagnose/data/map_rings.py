@@ -394,17 +394,22 @@ def find_radial(
     best = max(first, key=gain)
     found = minimize(
         lambda c: -gain(c), best, method="Nelder-Mead",
-        options={"initial_simplex": best + step * np.array([[0, 0], [2, 0], [0, 2]]), "xatol": 0.1 * step,
-                 "fatol": 0.1, "maxfev": 80},
+        options={
+            "initial_simplex": best + step * np.array([[0, 0], [2, 0], [0, 2]]),
+            "xatol": 0.1 * step, "fatol": 0.1, "maxfev": 80,
+        },
     )  # fmt: skip
     xc, yc = (float(v) for v in found.x)
     place, mean, count = _profile(values, x, y, found.x, step)
     # Centres are distinct if a wave of the shortest period is out of phase between them.
     tried = values.size * (step * HIGHEST * 2) ** 2
-    waves, fitted, gained = _waves_of(place, mean, count, least, 2 * np.log(max(tried, 1.0)))
+    waves, gained = _waves_of(place, mean, count, least, 2 * np.log(max(tried, 1.0)))
     if not waves:
         return None
-    u = sum(s * np.sin(2 * np.pi * f * place) + c * np.cos(2 * np.pi * f * place) for f, s, c in waves)
+    u = sum(
+        s * np.sin(2 * np.pi * f * place) + c * np.cos(2 * np.pi * f * place)
+        for f, s, c in waves
+    )
     amp = float(np.sqrt(2 * np.average(np.square(u), weights=count)))
     strongest = max(waves, key=lambda w: w[0] * np.hypot(w[1], w[2]))
     return {
@@ -414,7 +419,7 @@ def find_radial(
 
 
 def _symmetric(values: FloatArray) -> list[tuple[float, float]]:
-    """Places (column, row) of a map, to half a pixel, about which it is most symmetric under reflection."""
+    """Places (column, row) of a map, to half a pixel, about which it is most symmetric."""
     ny, nx = values.shape
     shape = 2 * ny, 2 * nx
     even = irfft2(rfft2(values, s=shape) ** 2, s=shape)
@@ -448,8 +453,8 @@ def _profile(
 
 def _waves_of(
     place: FloatArray, mean: FloatArray, count: FloatArray, least: float, more: float
-) -> tuple[list[tuple[float, float, float]], FloatArray, float]:
-    """Waves (frequency, sine, cosine) of the displacement in a profile, its fit, and their gain."""
+) -> tuple[list[tuple[float, float, float]], float]:
+    """Waves (frequency, sine, cosine) of the displacement in a profile, and their gain."""
     weight = np.sqrt(count)
     target = mean * weight
     # Four frequencies within the width of a peak, from one and a half waves on.
@@ -480,7 +485,7 @@ def _waves_of(
         chosen.append(float(grid[k]))
         design, left = trial, after
     if not chosen:
-        return [], np.zeros_like(target), 0.0
+        return [], 0.0
 
     def fitted(f: FloatArray) -> tuple[FloatArray, FloatArray]:
         design = np.concatenate([columns(v) for v in f])
@@ -500,4 +505,4 @@ def _waves_of(
         for f, (s, c) in zip(frequencies, parts.reshape(-1, 2), strict=True)
     ]
     left = target - model
-    return waves, model, float(target @ target - left @ left)
+    return waves, float(target @ target - left @ left)

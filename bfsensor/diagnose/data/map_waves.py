@@ -179,10 +179,11 @@ def find_patterns(
     if name == "all":
         first = 0.5 * (side - 1)
         y, x = (
-            side * g + first + c for g, c in zip(np.indices(values.shape), corner, strict=True)
+            side * g + first + c
+            for g, c in zip(np.indices(values.shape), corner, strict=True)
         )
-        near = [(float(r["xc"]), float(r["yc"])) for r in clearest]
-        radial = find_radial(values, x, y, near, least=GAIN)
+        places = [(float(r["xc"]), float(r["yc"])) for r in clearest]
+        radial = find_radial(values, x, y, places, least=GAIN)
         if radial is not None:
             radial["amp"] *= spread
             clearest = [*clearest, {"map": name, "shape": "radial", **radial}]

@@ -38,10 +38,10 @@ noise of 3 e-, so that noiseless predictions are clipped like recordings; with 4
 32 e- per pixel would count in the background."""
 
 BACKGROUND_ERROR = 0.2
-"""Systematic error of the background of a spot's stamp [e- per pixel], which makes an error of the part of
-its flux outside the small stamp.  Measured: backgrounds that the wings of four practice campaigns without
-halos ask for scatter by 0.06 to 0.11 e-, alike in exposures of equal flux, hence twice the largest; with
-0.4, halos must hold twice the charge to be found."""
+"""Systematic error of the background of a spot's stamp [e- per pixel], which makes an error of the part
+of its flux outside the small stamp.  Measured: backgrounds that the wings of four practice campaigns
+without halos ask for scatter by 0.06 to 0.11 e-, alike in exposures of equal flux, hence twice the
+largest; with 0.4, halos must hold twice the charge to be found."""
 
 
 class SpotChannels:
