@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from bfsensor.effects.effect import Effect, Layout, Parameter, Seen, Shot
-from bfsensor.effects.lateral_diffusion import diffusion_variance
+from bfsensor.effects.lateral_diffusion import drift_path
 from bfsensor.typing import Edges, FloatArray
 
 AMP = Parameter("amp", "pixel", 1e-3, 0.05, amplitude=True)
@@ -193,26 +193,26 @@ class UnevenTreeRings(_Rings):
 class RadialTreeRings(_Rings):
     r"""Tree rings of any profile in radius: several periods, with strengths that change with radius.
 
-    .. math::
-        u(r) = A\, g(r) \left[ \frac{d\, V_0}{d_0\, V} \right]^{e}
+    .. math:: u(r) = A\, g(r) \left( \frac{d}{d_0} \right)^{e} \left( \frac{V_0}{V} \right)^{f}
 
     r is the distance from (``xc``, ``yc``) [pixel].  The profile g is the sum of waves that
     :func:`bfsensor.diagnose.data.map_rings.find_radial` detected in the map of all wavelengths, with
     the mean square of a sine: it is held by the layout and not fitted.  ``amp`` A [pixel];
     ``period`` [pixel] is that of the strongest wave.  A radial field moves an electron in proportion
-    to the length d of its drift and to the drift field, hence inversely to the voltage V:
-    ``drift`` e is 1; 0 if displacements are the same for all light and all voltages.
+    to the length d of its drift and inversely to the drift field, and so to the voltage V: ``drift`` e
+    and ``field`` f are 1; 0 if displacements are the same for all light and all voltages.
 
     Parameters
     ----------
     values : mapping of str to float
         Plausible ranges: ``amp`` [pixel]: 0.001 to 0.05 (0 changes nothing); ``period`` [pixel]:
-        10 to 100; ``xc`` [pixel]: -3000 to 3000; ``yc`` [pixel]: -3000 to 3000; ``drift``: 0 to 1.
+        10 to 100; ``xc`` [pixel]: -3000 to 3000; ``yc`` [pixel]: -3000 to 3000; ``drift``: 0 to 1;
+        ``field``: 0 to 1.
 
     Examples
     --------
     >>> place = {"period": 30.0, "xc": 0.0, "yc": 0.0}
-    >>> RadialTreeRings({"amp": 0.007, "drift": 1.0} | place).name
+    >>> RadialTreeRings({"amp": 0.007, "drift": 1.0, "field": 1.0} | place).name
     'tree_rings:radial'
     """
 
@@ -224,6 +224,7 @@ class RadialTreeRings(_Rings):
         PLACE[0]._replace(law="whole"),
         *PLACE[1:],
         Parameter("drift", "", 0.0, 1.0, law="flat"),
+        Parameter("field", "", 0.0, 1.0, law="flat"),
     )
     source = (
         "Several periods, amplitude growing with radius: Park et al. 2020, JATIS 6, 011005; Esteves et "
@@ -234,8 +235,8 @@ class RadialTreeRings(_Rings):
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
         names = ("amp", "period", "xc", "yc")
         return [
-            {n: float(s[n]) for n in names} | {"drift": drift}
-            for s in layout.sightings if s["shape"] == "radial" for drift in (0.0, 1.0)
+            {n: float(s[n]) for n in names} | {"drift": e, "field": e}
+            for s in layout.sightings if s["shape"] == "radial" for e in (0.0, 1.0)
         ]  # fmt: skip
 
     def profile(self, r: FloatArray, layout: Layout) -> FloatArray:
@@ -250,10 +251,7 @@ class RadialTreeRings(_Rings):
         return np.asarray(CubicSpline(near, out)(r))
 
     def strength(self, shot: Shot, layout: Layout) -> float:
-        wavelength, back_bias, temperature = layout.reference
-        usual = shot._replace(
-            wavelength=wavelength, back_bias=back_bias, temperature=temperature
-        )
-        here = diffusion_variance(shot, layout) / shot.temperature
-        ratio = here / (diffusion_variance(usual, layout) / temperature)
-        return float(self["amp"] * ratio ** self["drift"])
+        wavelength, back_bias, _ = layout.reference
+        path = drift_path(shot.wavelength, layout) / drift_path(wavelength, layout)
+        volts = (layout.front - back_bias) / (layout.front - shot.back_bias)
+        return float(self["amp"] * path ** self["drift"] * volts ** self["field"])

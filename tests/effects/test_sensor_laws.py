@@ -96,7 +96,7 @@ def wavy_rows(amp: float) -> np.ndarray:
 
 MAPS: dict[str, tuple[Callable[[float], Effect], Callable[[float], np.ndarray]]] = {
     "radial": (
-        lambda a: RadialTreeRings({"amp": a, "period": 17.0, "xc": 21.0, "yc": -7.0, "drift": 1.0}),
+        lambda a: RadialTreeRings({"amp": a, "period": 17.0, "xc": 21.0, "yc": -7.0, "drift": 1.0, "field": 1.0}),
         radial,
     ),
     "edge power": (
@@ -135,14 +135,14 @@ def test_maps_change_as_the_law_says(law, strength):
 
 def test_rings_weaken_with_the_voltage_and_with_a_shorter_drift():
     place = {"amp": 0.01, "period": 17.0, "xc": 21.0, "yc": -7.0}
-    effect = RadialTreeRings(place | {"drift": 1.0})
+    effect = RadialTreeRings(place | {"drift": 1.0, "field": 1.0})
     usual = area_change(effect, SHOT, LAYOUT)
     more = area_change(effect, SHOT._replace(back_bias=-100.0), LAYOUT)
     # From 8 V at the front to -60 and -100 V at the back.
     assert more == pytest.approx(usual * 68 / 108)
     red = area_change(effect, SHOT._replace(wavelength=950.0), LAYOUT)
     assert np.abs(red).max() < 0.9 * np.abs(usual).max()
-    same = RadialTreeRings(place | {"drift": 0.0})
+    same = RadialTreeRings(place | {"drift": 0.0, "field": 1.0})
     assert np.array_equal(
         area_change(same, SHOT._replace(wavelength=950.0), LAYOUT),
         area_change(same, SHOT, LAYOUT),
