@@ -377,8 +377,8 @@ class Effect:
 
     @property
     def law_name(self) -> str:
-        """Name of the law within the class: the variant, or 'plain' for the simplest law."""
-        return self.variant or "plain"
+        """Name of the law within the class; by default the variant, '' where the class has one law."""
+        return self.variant
 
     @classmethod
     def amplitudes(cls) -> tuple[str, ...]:

@@ -56,6 +56,7 @@ class Tearing(Effect):
         "moved by clocks, worst beside segments' edges); exponential, rows and range are assumed"
     )
     standing = True
+    law_name = "same_way"
 
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
@@ -177,6 +178,7 @@ class DivisaderoTearing(Tearing):
     """
 
     variant = "divisadero"
+    law_name = "divisadero"
 
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:

@@ -115,6 +115,7 @@ class TreeRings(_Rings):
     'tree_rings'
     """
 
+    law_name = "one_period"
     parameters = (
         AMP,
         *PLACE,

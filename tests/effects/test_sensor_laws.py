@@ -96,7 +96,9 @@ def wavy_rows(amp: float) -> np.ndarray:
 
 MAPS: dict[str, tuple[Callable[[float], Effect], Callable[[float], np.ndarray]]] = {
     "radial": (
-        lambda a: RadialTreeRings({"amp": a, "period": 17.0, "xc": 21.0, "yc": -7.0, "drift": 1.0, "field": 1.0}),
+        lambda a: RadialTreeRings(
+            {"amp": a, "period": 17.0, "xc": 21.0, "yc": -7.0, "drift": 1.0, "field": 1.0}
+        ),
         radial,
     ),
     "edge power": (

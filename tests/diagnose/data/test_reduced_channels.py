@@ -13,7 +13,7 @@ from bfsensor.cli.main import main
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.flat_pairing import RISE, compare_unlike, describe_unlike
 from bfsensor.diagnose.data.reduced_channels import measure_reduced
-from bfsensor.diagnose.detect.scans import DEVICE_SCAN, make_templates
+from bfsensor.diagnose.detect.scans import DEVICE_SCAN, make_fitted_templates
 from bfsensor.diagnose.diagnosis import diagnose_measured
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.diagnose.model.free_baseline import SPREAD, free_baseline
@@ -126,10 +126,10 @@ def test_areas_that_only_have_a_bound_are_not_compared_with_a_nominal_value(tmp_
     measured = measure_reduced(table, reach=4)
     fit = diagnose_measured(measured, free, explain=False).fit
     assert fit.unknown == free.parameters
-    assert DEVICE_SCAN not in {t.family for t in make_templates(fit)}
+    assert DEVICE_SCAN not in {t.family for t in make_fitted_templates(fit)}
     # The same parameters with a nominal value each are compared with it.
     known = diagnose_measured(measured, replace(free, not_below=()), explain=False).fit
-    assert DEVICE_SCAN in {t.family for t in make_templates(known)}
+    assert DEVICE_SCAN in {t.family for t in make_fitted_templates(known)}
 
 
 def covariances(seed, *, gain=1.0, noise=30.0, extra=0.0, side=1000, matrix=True):
