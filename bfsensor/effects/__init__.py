@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from bfsensor.effects.bf_anisotropy import BrighterFatterAnisotropy
     from bfsensor.effects.bf_chromatic import BrighterFatterChromatic
     from bfsensor.effects.bf_long_range import BrighterFatterLongRange
-    from bfsensor.effects.bf_nonlinear import BrighterFatterNonlinear
+    from bfsensor.effects.bf_nonlinear import BrighterFatterNonlinear, EdgesNonlinear
     from bfsensor.effects.bias_instability import BiasByFrame, BiasByRow
     from bfsensor.effects.charge_loss import ChargeLoss
     from bfsensor.effects.correlated_noise import CommonNoise, NoiseInTime, Pickup
@@ -33,14 +33,14 @@ if TYPE_CHECKING:
     from bfsensor.effects.interpixel_coupling import InterpixelCoupling
     from bfsensor.effects.lateral_diffusion import LateralDiffusion
     from bfsensor.effects.library import LIBRARY, make_effect
-    from bfsensor.effects.mask_stitch import MaskStitch
+    from bfsensor.effects.mask_stitch import MaskStitch, WavyMask
     from bfsensor.effects.persistence import Persistence
     from bfsensor.effects.psf_wings import PsfWings
     from bfsensor.effects.saturation import Saturation
-    from bfsensor.effects.shutter_timing import ShutterTiming
-    from bfsensor.effects.tearing import Tearing
+    from bfsensor.effects.shutter_timing import FlatShutter, ShutterTiming
+    from bfsensor.effects.tearing import DivisaderoTearing, Tearing
     from bfsensor.effects.trap_serial import TrapSerial
-    from bfsensor.effects.tree_rings import TreeRings, UnevenTreeRings
+    from bfsensor.effects.tree_rings import RadialTreeRings, TreeRings, UnevenTreeRings
     from bfsensor.effects.voltage_dependence import VoltageDependence
 else:
     __getattr__, __dir__ = lazy_names(
@@ -51,7 +51,7 @@ else:
             "bf_anisotropy": ["BrighterFatterAnisotropy"],
             "bf_chromatic": ["BrighterFatterChromatic"],
             "bf_long_range": ["BrighterFatterLongRange"],
-            "bf_nonlinear": ["BrighterFatterNonlinear"],
+            "bf_nonlinear": ["BrighterFatterNonlinear", "EdgesNonlinear"],
             "bias_instability": ["BiasByFrame", "BiasByRow"],
             "charge_loss": ["ChargeLoss"],
             "correlated_noise": ["CommonNoise", "NoiseInTime", "Pickup"],
@@ -70,14 +70,14 @@ else:
             "interpixel_coupling": ["InterpixelCoupling"],
             "lateral_diffusion": ["LateralDiffusion"],
             "library": ["LIBRARY", "make_effect"],
-            "mask_stitch": ["MaskStitch"],
+            "mask_stitch": ["MaskStitch", "WavyMask"],
             "persistence": ["Persistence"],
             "psf_wings": ["PsfWings"],
             "saturation": ["Saturation"],
-            "shutter_timing": ["ShutterTiming"],
-            "tearing": ["Tearing"],
+            "shutter_timing": ["FlatShutter", "ShutterTiming"],
+            "tearing": ["DivisaderoTearing", "Tearing"],
             "trap_serial": ["TrapSerial"],
-            "tree_rings": ["TreeRings", "UnevenTreeRings"],
+            "tree_rings": ["RadialTreeRings", "TreeRings", "UnevenTreeRings"],
             "voltage_dependence": ["VoltageDependence"],
         },
     )
@@ -99,9 +99,12 @@ __all__ = [
     "CtiSerial",
     "DarkCurrent",
     "DeviceParameter",
+    "DivisaderoTearing",
     "EdgeRolloff",
+    "EdgesNonlinear",
     "Effect",
     "ElectronicMemory",
+    "FlatShutter",
     "Fringing",
     "GainDrift",
     "GainNonlinearity",
@@ -117,6 +120,7 @@ __all__ = [
     "Persistence",
     "Pickup",
     "PsfWings",
+    "RadialTreeRings",
     "Saturation",
     "Segment",
     "Shot",
@@ -126,5 +130,6 @@ __all__ = [
     "TreeRings",
     "UnevenTreeRings",
     "VoltageDependence",
+    "WavyMask",
     "make_effect",
 ]

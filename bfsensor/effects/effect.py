@@ -49,6 +49,9 @@ class Parameter(NamedTuple):
     step : float
         Step of numerical derivatives, in the unit of the parameter; 0: 2 % of the value for the
         law "log", 1 % of the range for "flat".
+    plain : float, optional
+        Value at which a more general law is the plain one; an effect that is made without this
+        parameter has it.  None: the value must be given.
 
     Examples
     --------
@@ -65,6 +68,7 @@ class Parameter(NamedTuple):
     signed: bool = False
     amplitude: bool = False
     step: float = 0.0
+    plain: float | None = None
 
 
 class Segment(NamedTuple):
@@ -345,6 +349,8 @@ class Effect:
 
     def __post_init__(self) -> None:
         needed = {p.name for p in self.parameters}
+        plain = {p.name: p.plain for p in self.parameters if p.plain is not None}
+        object.__setattr__(self, "values", plain | dict(self.values))
         if set(self.values) != needed:
             raise EffectError(
                 f"{self.name}: parameters {', '.join(sorted(self.values)) or 'none'} given, "
@@ -368,6 +374,11 @@ class Effect:
     def name(self) -> str:
         """Name of the class of effects, followed by ``:`` and the variant where there is one."""
         return f"{self.word}:{self.variant}" if self.variant else self.word
+
+    @property
+    def law_name(self) -> str:
+        """Name of the law within the class; by default the variant, '' where the class has one law."""
+        return self.variant
 
     @classmethod
     def amplitudes(cls) -> tuple[str, ...]:
@@ -458,6 +469,18 @@ class Effect:
             [pixel/e-^2]; half of their second derivative [pixel/e-^3].  None: as in the baseline.
         """
         del shot, layout
+        return None
+
+    def bend_edges(self, kx: FloatArray, ky: FloatArray) -> Edges | None:
+        """Give the change of the baseline's shifts per electron with the charge that causes them.
+
+        Returns
+        -------
+        slopes : Edges or None
+            Derivative of the shifts (kx, ky) by the charge [pixel/e-^2]: a charge Q moves boundaries
+            by k Q and half of this times Q^2.  None: no change.
+        """
+        del kx, ky
         return None
 
     def law(self) -> Law:

@@ -31,8 +31,8 @@ class Fringing(Effect):
     Parameters
     ----------
     values : mapping of str to float
-        Plausible ranges: ``amp``: 0.001 to 0.02 (0 changes nothing); ``period`` [pixel]: 15 to 60;
-        ``tilt``: -3 to 3; ``xx``: -2 to 2; ``xy``: -2 to 2; ``yy``: -2 to 2; ``phase`` [cycle]:
+        Plausible ranges: ``amp``: 0.001 to 0.02 (0 changes nothing); ``period`` [pixel]: 15 to 150;
+        ``tilt``: -6 to 6; ``xx``: -6 to 6; ``xy``: -6 to 6; ``yy``: -6 to 6; ``phase`` [cycle]:
         -0.5 to 0.5.
 
     Examples
@@ -46,11 +46,11 @@ class Fringing(Effect):
     stage = "light"
     parameters = (
         Parameter("amp", "", 1e-3, 2e-2, amplitude=True),
-        Parameter("period", "pixel", 15.0, 60.0, step=0.01),
-        Parameter("tilt", "", -3.0, 3.0, law="flat", step=1e-3),
-        Parameter("xx", "", -2.0, 2.0, law="flat", step=2e-3),
-        Parameter("xy", "", -2.0, 2.0, law="flat", step=2e-3),
-        Parameter("yy", "", -2.0, 2.0, law="flat", step=2e-3),
+        Parameter("period", "pixel", 15.0, 150.0, step=0.01),
+        Parameter("tilt", "", -6.0, 6.0, law="flat", step=1e-3),
+        Parameter("xx", "", -6.0, 6.0, law="flat", step=2e-3),
+        Parameter("xy", "", -6.0, 6.0, law="flat", step=2e-3),
+        Parameter("yy", "", -6.0, 6.0, law="flat", step=2e-3),
         Parameter("phase", "cycle", -0.5, 0.5, law="flat"),
     )
     touches = ("flat_map",)

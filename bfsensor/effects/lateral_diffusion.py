@@ -68,15 +68,19 @@ def diffusion_variance(shot: Shot, layout: Layout) -> float:
     ZeroDivisionError
         The back bias equals the potential of the front.
     """
-    thickness = layout.thickness
-    length = absorption_length(shot.wavelength, layout)
-    # Mean depth of an exponential that ends at the gates.
-    left = np.exp(-thickness / length)
-    depth = length - thickness * left / (1 - left)
     heat = BOLTZMANN * shot.temperature
     volts = layout.front - shot.back_bias
-    path = thickness - depth
-    return float(2 * heat * path * thickness / volts / layout.pixel**2)
+    path = drift_path(shot.wavelength, layout)
+    return float(2 * heat * path * layout.thickness / volts / layout.pixel**2)
+
+
+def drift_path(wavelength: float, layout: Layout) -> float:
+    """Mean length of the drift [um] of electrons from light of a wavelength [nm] to the gates."""
+    thickness = layout.thickness
+    length = absorption_length(wavelength, layout)
+    # Mean depth of an exponential that ends at the gates.
+    left = np.exp(-thickness / length)
+    return float(thickness - length + thickness * left / (1 - left))
 
 
 def absorption_length(wavelength: float, layout: Layout) -> float:

@@ -9,7 +9,7 @@ from bfsensor.effects.amp_crosstalk import AmpCrosstalk
 from bfsensor.effects.bf_anisotropy import BrighterFatterAnisotropy
 from bfsensor.effects.bf_chromatic import BrighterFatterChromatic
 from bfsensor.effects.bf_long_range import BrighterFatterLongRange
-from bfsensor.effects.bf_nonlinear import BrighterFatterNonlinear
+from bfsensor.effects.bf_nonlinear import BrighterFatterNonlinear, EdgesNonlinear
 from bfsensor.effects.bias_instability import BiasByFrame, BiasByRow
 from bfsensor.effects.charge_loss import ChargeLoss
 from bfsensor.effects.correlated_noise import CommonNoise, NoiseInTime, Pickup
@@ -26,14 +26,14 @@ from bfsensor.effects.gain_nonlinearity import GainNonlinearity
 from bfsensor.effects.illumination_turbulence import IlluminationTurbulence
 from bfsensor.effects.interpixel_coupling import InterpixelCoupling
 from bfsensor.effects.lateral_diffusion import LateralDiffusion
-from bfsensor.effects.mask_stitch import MaskStitch
+from bfsensor.effects.mask_stitch import MaskStitch, WavyMask
 from bfsensor.effects.persistence import Persistence
 from bfsensor.effects.psf_wings import PsfWings
 from bfsensor.effects.saturation import Saturation
-from bfsensor.effects.shutter_timing import ShutterTiming
-from bfsensor.effects.tearing import Tearing
+from bfsensor.effects.shutter_timing import FlatShutter, ShutterTiming
+from bfsensor.effects.tearing import DivisaderoTearing, Tearing
 from bfsensor.effects.trap_serial import TrapSerial
-from bfsensor.effects.tree_rings import TreeRings, UnevenTreeRings
+from bfsensor.effects.tree_rings import RadialTreeRings, TreeRings, UnevenTreeRings
 from bfsensor.effects.voltage_dependence import VoltageDependence
 from bfsensor.errors import EffectError
 
@@ -52,8 +52,11 @@ LIBRARY: tuple[type[Effect], ...] = (
     CtiParallel,
     CtiSerial,
     DarkCurrent,
+    DivisaderoTearing,
     EdgeRolloff,
+    EdgesNonlinear,
     ElectronicMemory,
+    FlatShutter,
     Fringing,
     GainDrift,
     GainNonlinearity,
@@ -66,6 +69,7 @@ LIBRARY: tuple[type[Effect], ...] = (
     Persistence,
     Pickup,
     PsfWings,
+    RadialTreeRings,
     Saturation,
     ShutterTiming,
     Tearing,
@@ -73,6 +77,7 @@ LIBRARY: tuple[type[Effect], ...] = (
     TreeRings,
     UnevenTreeRings,
     VoltageDependence,
+    WavyMask,
 )
 """Classes of all effects, one for each variant.  Those of a device's parameters depend on the
 baseline: :func:`bfsensor.effects.device_parameter.device_parameters` makes them."""

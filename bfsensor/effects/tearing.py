@@ -22,17 +22,20 @@ class Tearing(Effect):
 
     ``column`` is the place of the boundary as a fraction of the sensor's width.  The tear ends at a
     row that differs at random in every exposure: uniform between the fraction ``open`` of the rows
-    and the top.  Without a number of an exposure, :meth:`displacements` are the mean ones.
+    and the top; where ``top`` is 1, rows count from the top.  Without a number of an exposure,
+    :meth:`displacements` are the mean ones.
 
     Parameters
     ----------
     values : mapping of str to float
         Plausible ranges: ``amp`` [pixel]: 0.003 to 0.2 in magnitude, either sign (0 changes
-        nothing); ``length`` [pixel]: 1 to 5; ``column``: 0 to 1; ``open``: 0 to 1.
+        nothing); ``length`` [pixel]: 1 to 5; ``column``: 0 to 1; ``open``: 0 to 1; ``top``: 0
+        to 1, whole.
 
     Examples
     --------
-    >>> Tearing({"amp": 0.02, "length": 2.0, "column": 0.5, "open": 0.5}).name
+    >>> shape = {"length": 2.0, "column": 0.5, "open": 0.5, "top": 0}
+    >>> Tearing({"amp": 0.02} | shape).name
     'tearing'
     """
 
@@ -43,6 +46,7 @@ class Tearing(Effect):
         Parameter("length", "pixel", 1.0, 5.0),
         Parameter("column", "", 0.0, 1.0, law="flat", step=2e-4),
         Parameter("open", "", 0.0, 1.0, law="flat"),
+        Parameter("top", "", 0, 1, law="whole", plain=0.0),
     )
     touches = ("flat_map", "flat_cov")
     of_pixels = True
@@ -52,6 +56,7 @@ class Tearing(Effect):
         "moved by clocks, worst beside segments' edges); exponential, rows and range are assumed"
     )
     standing = True
+    law_name = "same_way"
 
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
@@ -66,11 +71,11 @@ class Tearing(Effect):
             if high - low < width / 8
         }  # fmt: skip
         return [
-            {"amp": 0.02, "length": length, "column": boundary / width, "open": 0.4}
+            {"amp": 0.02, "length": length, "column": boundary / width, "open": 0.4, "top": top}
             for boundary in sorted(near or range(2, width, max(width // 64, 2)))
-            for length in (1.5, 3.5)
+            for length in (1.5, 3.5) for top in (0.0, 1.0)
             if 0 < boundary < width
-        ]
+        ]  # fmt: skip
 
     def displacements(self, shot: Shot, layout: Layout) -> Edges | None:
         ny, nx = layout.shape
@@ -112,6 +117,7 @@ class Tearing(Effect):
         ny, nx = layout.shape
         area = np.diff(self._torn(nx))
         t = (np.arange(ny) + 0.5 - self["open"] * ny) / max((1 - self["open"]) * ny, 1.0)
+        t = t[::-1] if self["top"] else t
         out, fold = [], str(axes["fold"][0])
         for name in dict.fromkeys(axes["map"]):
             spread = np.sqrt(layout.map_noise.get((fold, str(name)), 0.0)) * (
@@ -126,20 +132,65 @@ class Tearing(Effect):
 
     def _torn(self, nx: int) -> FloatArray:
         """Displacements of the edges between columns in rows with the tear [pixel]."""
-        away = np.abs(np.arange(nx + 1.0) - self["column"] * nx)
-        return np.asarray(self["amp"] * np.exp(-away / self["length"]))
+        from_tear = np.arange(nx + 1.0) - self["column"] * nx
+        fallen = np.exp(-np.abs(from_tear) / self["length"])
+        return np.asarray(self["amp"] * fallen * self._way(from_tear))
+
+    def _way(self, from_tear: FloatArray) -> FloatArray | float:
+        """Direction of the displacement at a distance from the tear [pixel]: the same on both sides."""
+        del from_tear
+        return 1.0
 
     def _open(self, ny: int) -> FloatArray:
         """Fraction of the exposures in which each row has the tear."""
         row, never = np.arange(ny) + 0.5, self["open"] * ny
         above = np.clip((ny - row) / max(ny - never, 1.0), 0.0, 1.0)
-        return np.where(row <= never, 1.0, above)
+        part = np.where(row <= never, 1.0, above)
+        return part[::-1] if self["top"] else part
 
     def _chance(self, ny: int) -> FloatArray:
         """Covariance between rows of having the tear (0 or 1) in an exposure, shape (ny, ny)."""
         part = self._open(ny)
         both = np.minimum(part[:, None], part)
         return np.asarray(both - part[:, None] * part)
+
+
+class DivisaderoTearing(Tearing):
+    """Edges on either side of a tear are displaced away from it, or towards it.
+
+    Missing holes in one channel stop attract or repel the electrons of both sides alike.  Between
+    the two sides, within half a pixel of the tear, the displacement is linear.  ``column`` may lie
+    within a column, whose two edges then move apart.  ``amp`` is positive away from the tear; all other
+    parameters are those of :class:`Tearing`.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``amp`` [pixel]: 0.003 to 0.2 in magnitude, either sign (0 changes
+        nothing); ``length`` [pixel]: 1 to 5; ``column``: 0 to 1; ``open``: 0 to 1; ``top``: 0
+        to 1, whole.
+
+    Examples
+    --------
+    >>> shape = {"length": 2.0, "column": 0.5, "open": 0.5, "top": 0}
+    >>> DivisaderoTearing({"amp": 0.02} | shape).name
+    'tearing:divisadero'
+    """
+
+    variant = "divisadero"
+    law_name = "divisadero"
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        """Begin within columns as well as at the boundaries that :class:`Tearing` begins with."""
+        half = 0.5 / layout.shape[1]
+        return [
+            s | {"column": s["column"] + more}
+            for s in super().starts(layout, seen) for more in (0.0, half)
+        ]  # fmt: skip
+
+    def _way(self, from_tear: FloatArray) -> FloatArray | float:
+        return np.clip(2 * from_tear, -1.0, 1.0)
 
 
 def _reduced(rows: FloatArray, columns: FloatArray, axes: Axes) -> FloatArray:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from bfsensor.effects.effect import Effect, Layout, Parameter, Seen, Shot
+from bfsensor.effects.lateral_diffusion import drift_path
 from bfsensor.typing import Edges, FloatArray
 
 AMP = Parameter("amp", "pixel", 1e-3, 0.05, amplitude=True)
@@ -54,23 +56,38 @@ class _Rings(Effect):
         """Phase at radii [pixel], in cycles."""
         raise NotImplementedError
 
+    def profile(self, r: FloatArray, layout: Layout) -> FloatArray:
+        """Displacement outwards at radii [pixel] over ``amp``."""
+        del layout
+        return np.asarray(np.sin(2 * np.pi * self.turns(r)))
+
+    def strength(self, shot: Shot, layout: Layout) -> float:
+        """Amplitude of the displacements in an exposure [pixel]."""
+        del shot, layout
+        return self["amp"]
+
     def displacements(self, shot: Shot, layout: Layout) -> Edges | None:
         ny, nx = layout.shape
-        if not self["amp"]:
+        amp = self.strength(shot, layout)
+        if not amp:
             return None
         x, y = np.arange(float(nx)) - self["xc"], np.arange(float(ny))[:, None] - self["yc"]
         edge_x, edge_y = (
             np.arange(nx + 1.0) - 0.5 - self["xc"],
             np.arange(ny + 1.0)[:, None] - 0.5 - self["yc"],
         )
-        return self._along(edge_x, y, edge_x), self._along(x, edge_y, edge_y)
-
-    def _along(self, x: FloatArray, y: FloatArray, axis: FloatArray) -> FloatArray:
-        """Component along an axis of the displacement at places relative to the centre [pixel]."""
-        r = np.sqrt(x * x + y * y)
-        return np.asarray(
-            self["amp"] * np.sin(2 * np.pi * self.turns(r)) * (axis / np.maximum(r, 0.5))
+        across, up = (
+            amp * self._along(*place, layout)
+            for place in ((edge_x, y, edge_x), (x, edge_y, edge_y))
         )
+        return across, up
+
+    def _along(
+        self, x: FloatArray, y: FloatArray, axis: FloatArray, layout: Layout
+    ) -> FloatArray:
+        """Component along an axis of the profile at places relative to the centre."""
+        r = np.sqrt(x * x + y * y)
+        return np.asarray(self.profile(r, layout) * (axis / np.maximum(r, 0.5)))
 
 
 class TreeRings(_Rings):
@@ -98,6 +115,7 @@ class TreeRings(_Rings):
     'tree_rings'
     """
 
+    law_name = "one_period"
     parameters = (
         AMP,
         *PLACE,
@@ -171,3 +189,70 @@ class UnevenTreeRings(_Rings):
     def turns(self, r: FloatArray) -> FloatArray:
         bend = np.sin(2 * np.pi * (r / self["length"] + self["sway_phase"]))
         return np.asarray(r / self["period"] * (1 + self["sway"] * bend) + self["phase"])
+
+
+class RadialTreeRings(_Rings):
+    r"""Tree rings of any profile in radius: several periods, with strengths that change with radius.
+
+    .. math:: u(r) = A\, g(r) \left( \frac{d}{d_0} \right)^{e} \left( \frac{V_0}{V} \right)^{f}
+
+    r is the distance from (``xc``, ``yc``) [pixel].  The profile g is the sum of waves that
+    :func:`bfsensor.diagnose.data.map_rings.find_radial` detected in the map of all wavelengths, with
+    the mean square of a sine: it is held by the layout and not fitted.  ``amp`` A [pixel];
+    ``period`` [pixel] is that of the strongest wave.  A radial field moves an electron in proportion
+    to the length d of its drift and inversely to the drift field, and so to the voltage V: ``drift`` e
+    and ``field`` f are 1; 0 if displacements are the same for all light and all voltages.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``amp`` [pixel]: 0.001 to 0.05 (0 changes nothing); ``period`` [pixel]:
+        10 to 100; ``xc`` [pixel]: -3000 to 3000; ``yc`` [pixel]: -3000 to 3000; ``drift``: 0 to 1;
+        ``field``: 0 to 1.
+
+    Examples
+    --------
+    >>> place = {"period": 30.0, "xc": 0.0, "yc": 0.0}
+    >>> RadialTreeRings({"amp": 0.007, "drift": 1.0, "field": 1.0} | place).name
+    'tree_rings:radial'
+    """
+
+    variant = "radial"
+    standing = False
+    parameters = (
+        AMP,
+        # The search has chosen the periods: the prior of one is charged, and nothing is fitted.
+        PLACE[0]._replace(law="whole"),
+        *PLACE[1:],
+        Parameter("drift", "", 0.0, 1.0, law="flat"),
+        Parameter("field", "", 0.0, 1.0, law="flat"),
+    )
+    source = (
+        "Several periods, amplitude growing with radius: Park et al. 2020, JATIS 6, 011005; Esteves et "
+        "al. 2023, PASP 135, 115003; drift path over voltage: a constant lateral field along the path"
+    )
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        names = ("amp", "period", "xc", "yc")
+        return [
+            {n: float(s[n]) for n in names} | {"drift": e, "field": e}
+            for s in layout.sightings if s["shape"] == "radial" for e in (0.0, 1.0)
+        ]  # fmt: skip
+
+    def profile(self, r: FloatArray, layout: Layout) -> FloatArray:
+        waves = [s["waves"] for s in layout.sightings if s["shape"] == "radial"]
+        # A spline is worst near its ends, so that it goes on for a few knots beyond the radii.
+        near = np.arange(-3.0, float(r.max()) + 3.0, 0.5)
+        out = np.zeros_like(near)
+        for f, sine, cosine in waves[0] if waves else ():
+            turn = 2 * np.pi * f * near
+            out += sine * np.sin(turn) + cosine * np.cos(turn)
+        # Waves are longer than five pixels: a cubic through ten points of each is exact to 1e-3.
+        return np.asarray(CubicSpline(near, out)(r))
+
+    def strength(self, shot: Shot, layout: Layout) -> float:
+        wavelength, back_bias, _ = layout.reference
+        path = drift_path(shot.wavelength, layout) / drift_path(wavelength, layout)
+        volts = (layout.front - back_bias) / (layout.front - shot.back_bias)
+        return float(self["amp"] * path ** self["drift"] * volts ** self["field"])

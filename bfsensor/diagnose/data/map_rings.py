@@ -1,12 +1,14 @@
-"""Detection of tree rings, evenly spaced or not, in maps of flats: starting points of their fits."""
+"""Detection of tree rings of any profile in radius, in maps of flats: starting points of their fits."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.fft import irfft2, rfft2
+from scipy.optimize import least_squares, minimize
 
 from bfsensor.typing import FloatArray
 
@@ -328,3 +330,179 @@ def _follow(
             order += 1
             continue
         reach, order = min(1.25 * reach, far), min(order + 1, ORDERS)
+
+
+def find_radial(
+    values: FloatArray,
+    x: FloatArray,
+    y: FloatArray,
+    near: Sequence[tuple[float, float]],
+    *,
+    least: float,
+) -> dict[str, Any] | None:
+    r"""Find the centre about which a map varies with the radius alone, and its profile as waves.
+
+    The displacement is a sum of waves in radius,
+
+    .. math:: u(r) = A \sum_k s_k \sin 2 \pi f_k r + c_k \cos 2 \pi f_k r,
+
+    whose frequencies are found one after another (orthogonal matching pursuit).  Centres on the map
+    are found by its symmetry: a pattern of circles is even under reflection in its centre, so that
+    the map's convolution with itself has a peak at twice the centre.
+
+    Parameters
+    ----------
+    values : ndarray, shape (ny, nx)
+        Map, in units of its noise.
+    x, y : ndarray, shape (ny, nx)
+        Coordinates of its pixels [pixel].
+    near : sequence of (float, float)
+        Further centres x and y to begin with [pixel].
+    least : float
+        Decrease of the chi-square above which a wave is real, for a given centre; for the first one
+        it grows by twice the logarithm of the number of centres that were searched.
+
+    Returns
+    -------
+    dict or None
+        'xc', 'yc' [pixel]; 'period' of the strongest wave [pixel]; 'amp' A [pixel]; 'waves', tuple of
+        (f [1/pixel], s, c), of which the sum has the mean square of a sine; 'z', root of the decrease
+        of the chi-square.  None without a wave.
+
+    Examples
+    --------
+    >>> y, x = np.mgrid[:96., :96.]
+    >>> r = np.hypot(x - 30, y - 50)
+    >>> flat = np.cos(2 * np.pi * r / 14) + np.cos(2 * np.pi * r / 23)
+    >>> noise = np.random.default_rng(8231).standard_normal(r.shape)
+    >>> found = find_radial(flat + noise, x, y, [], least=35.0)
+    >>> round(found["xc"]), round(found["yc"]), len(found["waves"])
+    (30, 50, 2)
+    """
+    step = float(x[0, 1] - x[0, 0])
+    symmetric = _symmetric(values)
+    starts = [(x[0, 0] + step * i, y[0, 0] + step * j) for i, j in symmetric]
+
+    def gain(centre: FloatArray) -> float:
+        # Excess of the squares of a profile's means over those of noise.
+        _, mean, count = _profile(values, x, y, centre, step)
+        return float((count * mean**2).sum()) - len(mean)
+
+    first = [np.array(c, float) for c in (*starts, *near)]
+    if not first:
+        return None
+    best = max(first, key=gain)
+    found = minimize(
+        lambda c: -gain(c), best, method="Nelder-Mead",
+        options={
+            "initial_simplex": best + step * np.array([[0, 0], [2, 0], [0, 2]]),
+            "xatol": 0.1 * step, "fatol": 0.1, "maxfev": 80,
+        },
+    )  # fmt: skip
+    xc, yc = (float(v) for v in found.x)
+    place, mean, count = _profile(values, x, y, found.x, step)
+    # Centres are distinct if a wave of the shortest period is out of phase between them.
+    tried = values.size * (step * HIGHEST * 2) ** 2
+    waves, gained = _waves_of(place, mean, count, least, 2 * np.log(max(tried, 1.0)))
+    if not waves:
+        return None
+    u = sum(
+        s * np.sin(2 * np.pi * f * place) + c * np.cos(2 * np.pi * f * place)
+        for f, s, c in waves
+    )
+    amp = float(np.sqrt(2 * np.average(np.square(u), weights=count)))
+    strongest = max(waves, key=lambda w: w[0] * np.hypot(w[1], w[2]))
+    return {
+        "xc": xc, "yc": yc, "period": 1 / strongest[0], "amp": amp, "z": float(np.sqrt(gained)),
+        "waves": tuple((f, s / amp, c / amp) for f, s, c in waves),
+    }  # fmt: skip
+
+
+def _symmetric(values: FloatArray) -> list[tuple[float, float]]:
+    """Places (column, row) of a map, to half a pixel, about which it is most symmetric."""
+    ny, nx = values.shape
+    shape = 2 * ny, 2 * nx
+    even = irfft2(rfft2(values, s=shape) ** 2, s=shape)
+    # A sum of n products of noise has the variance n, or 2 n as each product is there twice.
+    inside = irfft2(rfft2(np.ones_like(values), s=shape) ** 2, s=shape)
+    z = even / np.sqrt(2 * np.maximum(inside, 1.0))
+    # Centres near the rim leave a few pixels, whose products are far from Gaussian.
+    z[inside < 0.1 * values.size] = 0.0
+    out: list[tuple[float, float]] = []
+    for flat in np.argsort(z, axis=None)[::-1][:200]:
+        j, i = np.unravel_index(flat, z.shape)
+        if all(max(abs(i / 2 - a), abs(j / 2 - b)) > 2 for a, b in out):
+            out.append((float(i) / 2, float(j) / 2))
+        if len(out) == 4:
+            break
+    return out
+
+
+def _profile(
+    values: FloatArray, x: FloatArray, y: FloatArray, centre: FloatArray, step: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean radius [pixel], mean value and number of the pixels of each annulus about a centre."""
+    r = np.hypot(x - centre[0], y - centre[1]).ravel()
+    bins = ((r - r.min()) / step).astype(int)
+    count = np.bincount(bins)
+    kept = count > 3
+    one = np.maximum(count, 1)
+    place, mean = (np.bincount(bins, v)[kept] / one[kept] for v in (r, values.ravel()))
+    return place, mean, count[kept].astype(float)
+
+
+def _waves_of(
+    place: FloatArray, mean: FloatArray, count: FloatArray, least: float, more: float
+) -> tuple[list[tuple[float, float, float]], float]:
+    """Waves (frequency, sine, cosine) of the displacement in a profile, and their gain."""
+    weight = np.sqrt(count)
+    target = mean * weight
+    # Four frequencies within the width of a peak, from one and a half waves on.
+    grid = np.arange(1.5, HIGHEST * np.ptp(place), 0.25) / np.ptp(place)
+
+    def columns(f: float) -> FloatArray:
+        turn = 2 * np.pi * f * place
+        over = 1 / np.maximum(place, 0.5)
+        rate = 2 * np.pi * f
+        return weight * np.stack([
+            rate * np.cos(turn) + over * np.sin(turn), -rate * np.sin(turn) + over * np.cos(turn)
+        ])  # fmt: skip
+
+    every = np.stack([columns(f) for f in grid])
+    chosen: list[float] = []
+    design = np.zeros((0, len(place)))
+    left = target
+    while len(grid):
+        along = every @ left
+        normal = every @ every.transpose(0, 2, 1)
+        gains = (along * np.linalg.solve(normal, along[..., None])[..., 0]).sum(1)
+        k = int(np.argmax(gains))
+        trial = np.concatenate([design, columns(grid[k])])
+        parts = np.linalg.lstsq(trial.T, target, rcond=None)[0]
+        after = target - parts @ trial
+        if left @ left - after @ after < least + (0.0 if chosen else more):
+            break
+        chosen.append(float(grid[k]))
+        design, left = trial, after
+    if not chosen:
+        return [], 0.0
+
+    def fitted(f: FloatArray) -> tuple[FloatArray, FloatArray]:
+        design = np.concatenate([columns(v) for v in f])
+        parts = np.linalg.lstsq(design.T, target, rcond=None)[0]
+        return parts, parts @ design
+
+    # Between frequencies of the grid: the strengths are linear, so that only frequencies are searched.
+    width = 0.25 / np.ptp(place)
+    better = least_squares(
+        lambda d: target - fitted(np.array(chosen) + width * d)[1], np.zeros(len(chosen)),
+        bounds=(-2.0, 2.0), max_nfev=20,
+    )  # fmt: skip
+    frequencies = np.array(chosen) + width * better.x
+    parts, model = fitted(frequencies)
+    waves = [
+        (float(f), float(s), float(c))
+        for f, (s, c) in zip(frequencies, parts.reshape(-1, 2), strict=True)
+    ]
+    left = target - model
+    return waves, float(target @ target - left @ left)

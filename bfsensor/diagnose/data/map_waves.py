@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.data.map_rings import find_rings
+from bfsensor.diagnose.data.map_rings import find_radial, find_rings
 from bfsensor.typing import FloatArray
 
 ORDER = 4
@@ -176,6 +176,17 @@ def find_patterns(
         })  # fmt: skip
     # Waves in different parts of the same rings give different circles: the best is kept.
     clearest = max(found, key=lambda f: f[0], default=(0.0, []))[1]
+    if name == "all":
+        first = 0.5 * (side - 1)
+        y, x = (
+            side * g + first + c
+            for g, c in zip(np.indices(values.shape), corner, strict=True)
+        )
+        places = [(float(r["xc"]), float(r["yc"])) for r in clearest]
+        radial = find_radial(values, x, y, places, least=GAIN)
+        if radial is not None:
+            radial["amp"] *= spread
+            clearest = [*clearest, {"map": name, "shape": "radial", **radial}]
     return [*clearest, *told[:2]]
 
 

@@ -97,7 +97,9 @@ class EffectChain:
     @property
     def leaves_spots(self) -> bool:
         """Whether effects leave growth and readout of spots unchanged, except for added light."""
-        own = ("edges", "law", "level_response", "spot_light", "spot_image", "signal")
+        own = (
+            "edges", "law", "level_response", "bend_edges", "spot_light", "spot_image", "signal",
+        )  # fmt: skip
         return all(
             getattr(type(e), name) is getattr(Effect, name)
             for e in self.effects
@@ -117,29 +119,40 @@ class EffectChain:
         return np.asarray(more - np.pad(a, margin))
 
     def level_change(
-        self, condition: Condition, levels: FloatArray, *, grown: bool = True
+        self, edges: Edges, condition: Condition, levels: FloatArray, *, grown: bool = True
     ) -> FloatArray | None:
         """Change of the areas by effects that depend on the level [1/e-]; None without such effects."""
         total = None
-        for level, slope, bend in self._level_responses(condition):
+        for level, slope, bend in self._level_responses(edges, condition):
             one = level_areas(slope, bend, level, levels, grown=grown)
             total = one if total is None else total + one
         return total
 
-    def _level_responses(self, condition: Condition) -> list[tuple[float, Edges, Edges]]:
-        found = [e.level_response(self.shot(condition), self.layout) for e in self.effects]
-        return [f for f in found if f is not None]
+    def _level_responses(
+        self, edges: Edges, condition: Condition
+    ) -> list[tuple[float, Edges, Edges | None]]:
+        shot = self.shot(condition)
+        out: list[tuple[float, Edges, Edges | None]] = []
+        for effect in self.effects:
+            found = effect.level_response(shot, self.layout)
+            if found is not None:
+                out.append(found)
+            bent = effect.bend_edges(*edges)
+            if bent is not None:
+                out.append((0.0, bent, None))
+        return out
 
     def spot_edges(
         self, edges: Edges, slopes: Edges | None, condition: Condition
     ) -> tuple[Edges, Edges | None]:
         """Shifts of spots without charge, and their slopes with charge, with all effects."""
         kx, ky = self.edges(edges, condition)
+        responses = self._level_responses(edges, condition)
         # Shifts may have a wider window than their slopes.
         reach = kx.shape[0] // 2
         if slopes is not None:
             slopes = pad_areas(slopes[0], reach), pad_areas(slopes[1], reach)
-        for level, slope, _ in self._level_responses(condition):
+        for level, slope, _ in responses:
             sx, sy = (pad_areas(s, reach) for s in slope)
             kx, ky = kx - level * sx, ky - level * sy
             slopes = (sx, sy) if slopes is None else (slopes[0] + sx, slopes[1] + sy)

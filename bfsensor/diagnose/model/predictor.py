@@ -454,11 +454,12 @@ class Predictor:
                 lit = self._with_light(channel, gains)
                 axes = {k: v[rows[first]] for k, v in lit.items()} | {"level": levels}
                 axes["level"] = levels = chain.collected(levels, axes)
-                more = chain.area_change(self.baseline.at(where, device)[0], where)
+                edges = self.baseline.at(where, device)[0]
+                more = chain.area_change(edges, where)
                 a = self.baseline.flat_areas(where, device, levels)
                 reach = max(more.shape[-1], a.shape[-1]) // 2
                 a = pad_areas(a, reach) + pad_areas(more, reach)
-                bent = chain.level_change(where, levels)
+                bent = chain.level_change(edges, where, levels)
                 if bent is not None:
                     a = a + pad_areas(bent, reach)
                 whole = periodic_covariances(a, levels, law=chain.law)
@@ -483,7 +484,7 @@ class Predictor:
         a = a * (1 + chain.law.bend * level)
         reach = max(more.shape[-1], a.shape[-1]) // 2
         a = pad_areas(a, reach) + pad_areas(more, reach)
-        bent = chain.level_change(where, np.array([level]), grown=False)
+        bent = chain.level_change(edges, where, np.array([level]), grown=False)
         return a if bent is None else np.asarray(a + pad_areas(bent[0], reach))
 
 

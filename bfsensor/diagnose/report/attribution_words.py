@@ -46,6 +46,8 @@ def reported(attribution: Attribution | None) -> dict[str, Any]:
 
 def _effect(found: Found) -> dict[str, Any]:
     told: dict[str, Any] = {"class": found.effect.word, "parameters": found.intervals()}
+    if found.effect.law_name:
+        told["law"] = found.effect.law_name
     if found.effect.variant:
         told["variant"] = found.effect.variant
     told["gain_chi2"] = found.gain
@@ -112,7 +114,10 @@ def _said_effect(found: Found, verb: str) -> str:
         values.append(
             f"{words.get(name, name)} = {said_value(word, name, told['value'])}{unit} ({interval})"
         )
-    text = f"{word} ({CLASS_WORDS.get(word, word)}) {verb}: {', '.join(values)}"
+    meaning = CLASS_WORDS.get(word, word)
+    if found.effect.law_name:
+        meaning += f"; law: {found.effect.law_name.replace('_', ' ')}"
+    text = f"{word} ({meaning}) {verb}: {', '.join(values)}"
     others = [w for w in found.tied if w != word]
     if others:
         text += f"; these recordings do not distinguish it from {' or '.join(others)}"

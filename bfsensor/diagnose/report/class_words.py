@@ -69,6 +69,7 @@ PARAMETER_WORDS: Mapping[str, Mapping[str, str]] = {
     "interpixel_coupling": {
         "ax": "fraction given to each neighbour in the row",
         "ay": "fraction given to each neighbour in the column",
+        "decay": "factor on that per pixel of further distance",
     },
     "amp_crosstalk": {"c": "fraction of the other amplifiers' signal"},
     "correlated_noise": {
@@ -85,11 +86,18 @@ PARAMETER_WORDS: Mapping[str, Mapping[str, str]] = {
     },
     "adc_bits": {"delta": "error of the bit's weight", "bit": "bit, the lowest is 0"},
     "gain_drift": {"slope": "relative growth of the signal"},
-    "bf_nonlinear": {"b": "b in the shift k Q (1 + b Q / 2) of a charge Q"},
+    "bf_nonlinear": {
+        "b": "b in the shift k Q (1 + b Q / 2) of a charge Q", "b_y": "the same of edges between rows",
+        "near": "inverse distance over which it falls",
+    },
     "bf_chromatic": {"kappa": "relative change of the shifts from 620 to 950 nm"},
-    "bf_anisotropy": {"eps": "excess of the shifts in y over those in x, relative"},
+    "bf_anisotropy": {
+        "eps": "excess of the shifts in y over those in x, relative",
+        "near": "inverse distance over which it falls",
+    },
     "bf_long_range": {
         "amp": "area change at 1 pixel's distance", "power": "power of the distance",
+        "near": "inverse length of its exponential",
     },
     "voltage_dependence": {"delta": "relative growth of the shifts per 20 V less back bias"},
     "lateral_diffusion": {"var": "added variance of a spot"},
@@ -98,22 +106,33 @@ PARAMETER_WORDS: Mapping[str, Mapping[str, str]] = {
         "phase": "phase", "chirp": "relative change of the rings' frequency",
         "sway": "relative modulation of the rings' frequency", "length": "length of the modulation",
         "sway_phase": "phase of the modulation",
+        "drift": "power of the drift path that it goes with",
+        "field": "power of one over the voltage that it goes with",
     },
-    "edge_rolloff": {"amp": "displacement at the edge", "length": "decay length"},
+    "edge_rolloff": {
+        "amp": "displacement at the edge", "length": "decay length",
+        "sides": "excess near the sides over bottom and top, relative",
+        "tail": "one over the power of the distance, 0 for an exponential",
+        "rim": "whether the outermost boundaries move (1) or not (0)",
+    },
     "mask_stitch": {
         "amp": "displacement of the boundaries", "period": "period",
-        "phase": "first displaced boundary",
+        "phase": "first displaced boundary, or phase",
+        "along": "0 along rows, 1 along columns",
     },
     "tearing": {
         "amp": "displacement at the boundary", "length": "decay length",
         "column": "place of the boundary, as a fraction of the sensor's width",
         "open": "fraction of rows in which the tear never closes",
+        "top": "side from which rows count, 0 the bottom and 1 the top",
     },
     "charge_loss": {"q": "relative loss of light per stored electron"},
     "persistence": {"frac": "fraction released", "tau": "decay constant"},
     "shutter_timing": {
         "dt": "exposure beyond the commanded time",
         "shade": "relative change of that from the centre to the last column",
+        "rise": "relative change of that from the centre to the last row",
+        "iris": "relative fall of that from the centre to the corners",
     },
     "dark_hot": {"rate": "dark current", "columns": "number of hot columns"}
     | {f"x{n}": f"hot column {n}" for n in range(1, 7)},
