@@ -35,9 +35,9 @@ number of those that are then compared in all channels.  Chosen, to be derived: 
 about twice as many predictions of all channels are made; a start that one channel ranks seventh
 is then kept."""
 
-TELLING = "code_hist", "bias_cov", "flat_map"
+TELLING = "code_hist", "bias_cov", "flat_map", "flat_mean"
 """Channels that are fast to predict and separate many starting points of one effect (bits, rows,
-positions in a map), in the order of preference."""
+positions in a map, times), in the order of preference."""
 
 ASTRAY = 0.1
 """Relative change of the amplitude by the linear fit above which the template of an effect that

@@ -186,9 +186,8 @@ class EffectChain:
         if channel.word == "flat_mean":
             level = axes["level"]
             out += self.signal(level, axes) - level
-            if self.law.loss:
-                # Light that brings the level m with a loss q: (exp(q m) - 1) / q.
-                out += level - np.expm1(self.law.loss * level) / self.law.loss
+            if self.law.loses:
+                out += level - self.law.light(level)
         out = out / _unit(channel, own, gains)
         if channel.word == "bias_level":
             # Values are variances relative to white noise; those of frames are their logarithms.

@@ -217,7 +217,7 @@ def grow_spots(
         # The mean gain of the first step holds half of the growth of later ones: double it once.
         coming = last + (last - before) * (2.0 if step == 1 else 1.0)
         middle = charge + 0.5 * coming - 0.125 * (coming - last)
-        kept_part = np.exp(-law.loss * middle) if law.loss else None
+        kept_part = np.exp(-law.lost(middle)) if law.loses else None
         squared = None if bent is None else rfft2(0.5 * middle**2, s=(side, side))
         if law.bend:
             middle = middle * (1 + 0.5 * law.bend * middle)
