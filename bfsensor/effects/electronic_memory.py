@@ -165,8 +165,8 @@ class OffsetDrift(Effect):
     Parameters
     ----------
     values : mapping of str to float
-        Plausible ranges: ``scale``: 1e-05 to 0.001 (0 changes nothing); ``threshold`` [e-]: 0 to
-        100000; ``tau`` [pixel times]: 0.5 to 100.
+        Plausible ranges: ``scale``: 1e-05 to 0.001 (0 changes nothing); ``threshold`` [e-]: 300
+        to 100000; ``tau`` [pixel times]: 0.5 to 100.
 
     Examples
     --------
@@ -178,7 +178,7 @@ class OffsetDrift(Effect):
     variant = "offset_drift"
     parameters = (
         Parameter("scale", "", 1e-5, 1e-3, amplitude=True),
-        Parameter("threshold", "e-", 0.0, 1e5, law="flat"),
+        Parameter("threshold", "e-", 300.0, 1e5),
         Parameter("tau", "pixel times", 0.5, 100.0),
     )
     touches = ("serial_overscan", "flat_mean", "flat_cov", "spot")

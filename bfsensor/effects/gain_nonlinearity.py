@@ -112,7 +112,7 @@ class LateStart(_Response):
     ----------
     values : mapping of str to float
         Plausible ranges: ``deficit`` [e-]: 1 to 300 in magnitude, either sign (0 changes nothing);
-        ``length`` [e-]: 100 to 20000.
+        ``length`` [e-]: 100 to 5000.
 
     Examples
     --------
@@ -123,7 +123,7 @@ class LateStart(_Response):
     variant = "low_signal"
     parameters = (
         Parameter("deficit", "e-", 1.0, 300.0, signed=True, amplitude=True),
-        Parameter("length", "e-", 100.0, 2e4),
+        Parameter("length", "e-", 100.0, 5e3),
     )
     source = (
         "Loss of the first electrons in some CCDs of the Dark Energy Camera: Bernstein et al. 2017, "
@@ -132,7 +132,7 @@ class LateStart(_Response):
 
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
-        return [{"deficit": 30.0, "length": v} for v in (300.0, 1500.0, 7000.0)]
+        return [{"deficit": 30.0, "length": v} for v in (300.0, 1000.0, 3000.0)]
 
     def _bent(self, signal: Image) -> Image:
         # Below zero, where only noise leads, the curve goes on with its slope there.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from bfsensor.effects.adc_bits import AdcBits
+from bfsensor.effects.adc_bits import AdcBits, ShiftedCodes, WideCodes
 from bfsensor.effects.amp_crosstalk import AmpCrosstalk
 from bfsensor.effects.bf_anisotropy import BrighterFatterAnisotropy
 from bfsensor.effects.bf_chromatic import BrighterFatterChromatic
@@ -50,6 +50,8 @@ from bfsensor.errors import EffectError
 
 LIBRARY: tuple[type[Effect], ...] = (
     AdcBits,
+    ShiftedCodes,
+    WideCodes,
     AmpCrosstalk,
     BiasByFrame,
     BiasByRow,

@@ -184,7 +184,7 @@ class TwoTimesPersistence(Persistence):
     ----------
     values : mapping of str to float
         Plausible ranges: ``frac``: 1e-05 to 0.001 (0 changes nothing); ``tau`` [exposure]: 0.3 to
-        5; ``slow``: 0.02 to 0.98; ``slow_tau`` [exposure]: 2 to 30; ``threshold`` [e-]: 0 to 100000.
+        5; ``slow``: 0.02 to 0.98; ``slow_tau`` [exposure]: 2 to 30; ``threshold`` [e-]: 300 to 100000.
 
     Examples
     --------
@@ -199,7 +199,7 @@ class TwoTimesPersistence(Persistence):
         Parameter("tau", "exposure", 0.3, 5.0),
         Parameter("slow", "", 0.02, 0.98, law="flat"),
         Parameter("slow_tau", "exposure", 2.0, 30.0),
-        Parameter("threshold", "e-", 0.0, 1e5, law="flat"),
+        Parameter("threshold", "e-", 300.0, 1e5),
     )
     source = (
         "Residual images of LSST's e2v sensors, of two causes and above a level: Polin, Snyder, Lage "
@@ -214,7 +214,7 @@ class TwoTimesPersistence(Persistence):
         ]
 
     def _trapped(self, charge: NDArray) -> FloatArray:
-        return np.maximum(charge - max(self["threshold"], 0.0), 0.0)
+        return np.maximum(charge - self["threshold"], 0.0)
 
     def _after(self, later: FloatArray) -> FloatArray:
         slow, k = float(np.clip(self["slow"], 0.0, 1.0)), np.maximum(later, 0.0)
