@@ -9,6 +9,7 @@ from bfsensor.diagnose.explain.attribution import Attribution, Found
 from bfsensor.diagnose.model.exchanged_axes import AxesExchanged, says_exchanged
 from bfsensor.diagnose.report.class_words import (
     CLASS_WORDS,
+    LAW_WORDS,
     NAMES,
     PARAMETER_WORDS,
     said_family_p,
@@ -48,6 +49,8 @@ def _effect(found: Found) -> dict[str, Any]:
     told: dict[str, Any] = {"class": found.effect.word, "parameters": found.intervals()}
     if found.effect.variant:
         told["variant"] = found.effect.variant
+    if found.effect.name in LAW_WORDS:
+        told["law"] = LAW_WORDS[found.effect.name][0]
     told["gain_chi2"] = found.gain
     told["tied"] = list(found.tied)
     told["source"] = found.effect.source
@@ -112,7 +115,10 @@ def _said_effect(found: Found, verb: str) -> str:
         values.append(
             f"{words.get(name, name)} = {said_value(word, name, told['value'])}{unit} ({interval})"
         )
-    text = f"{word} ({CLASS_WORDS.get(word, word)}) {verb}: {', '.join(values)}"
+    meaning = CLASS_WORDS.get(word, word)
+    if found.effect.name in LAW_WORDS:
+        meaning += f"; here {LAW_WORDS[found.effect.name][1]}"
+    text = f"{word} ({meaning}) {verb}: {', '.join(values)}"
     others = [w for w in found.tied if w != word]
     if others:
         text += f"; these recordings do not distinguish it from {' or '.join(others)}"
