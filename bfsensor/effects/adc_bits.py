@@ -45,7 +45,7 @@ class AdcBits(Effect):
     ----------
     values : mapping of str to float
         Plausible ranges: ``delta`` [ADU]: 0.2 to 2 in magnitude, either sign (0 changes nothing);
-        ``bit``: 2 to 9, whole.
+        ``bit``: 1 to 14, whole.
 
     Examples
     --------
@@ -57,7 +57,7 @@ class AdcBits(Effect):
     stage = "converter"
     parameters = (
         Parameter("delta", "ADU", 0.2, 2.0, signed=True, amplitude=True),
-        Parameter("bit", "", 2, 9, law="whole"),
+        Parameter("bit", "", 1, 14, law="whole"),
     )
     touches = ("code_hist", "flat_mean", "flat_cov", "bias_cov", "spot")
     source = (
@@ -218,7 +218,7 @@ class ShiftedCodes(AdcBits):
     ----------
     values : mapping of str to float
         Plausible ranges: ``delta`` [ADU]: 0.2 to 4 in magnitude, either sign (0 changes nothing);
-        ``bit``: 2 to 9, whole.
+        ``bit``: 1 to 14, whole.
 
     Examples
     --------
@@ -229,7 +229,7 @@ class ShiftedCodes(AdcBits):
     variant = "shifted"
     parameters = (
         Parameter("delta", "ADU", 0.2, 4.0, signed=True, amplitude=True),
-        Parameter("bit", "", 2, 9, law="whole"),
+        Parameter("bit", "", 1, 14, law="whole"),
     )
     source = (
         "Offsets that depend on the bits of a code: Boone et al. 2018, PASP 130, 064504; sub-ranges of "

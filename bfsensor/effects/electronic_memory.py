@@ -16,12 +16,13 @@ from bfsensor.typing import FloatArray
 class ElectronicMemory(Effect):
     """The fraction ``alpha`` of the signal of the pixel read before is added to each pixel.
 
-    It is the same in all columns, whereas charge left behind by transfers grows with the column.
+    It is the same in all columns, whereas charge left behind by transfers grows with the column; a
+    stage that overshoots has a negative fraction, which transfers cannot have.
 
     Parameters
     ----------
     values : mapping of str to float
-        Plausible ranges: ``alpha``: 1e-05 to 0.001 (0 changes nothing).
+        Plausible ranges: ``alpha``: 1e-05 to 0.001 in magnitude, either sign (0 changes nothing).
 
     Examples
     --------
@@ -30,7 +31,7 @@ class ElectronicMemory(Effect):
     """
 
     word = "electronic_memory"
-    parameters = (Parameter("alpha", "", 1e-5, 1e-3, amplitude=True),)
+    parameters = (Parameter("alpha", "", 1e-5, 1e-3, signed=True, amplitude=True),)
     touches = ("serial_overscan", "flat_mean", "flat_cov", "flat_map", "spot")
     source = (
         "Electronic offset drift of ITL sensors, here of one pixel: Snyder et al. 2021, JATIS 7, "
@@ -84,8 +85,8 @@ class Settling(Effect):
     Parameters
     ----------
     values : mapping of str to float
-        Plausible ranges: ``alpha``: 1e-05 to 0.001 (0 changes nothing); ``tau`` [pixel times]: 0.5
-        to 30.
+        Plausible ranges: ``alpha``: 1e-05 to 0.001 in magnitude, either sign (0 changes nothing);
+        ``tau`` [pixel times]: 0.5 to 30.
 
     Examples
     --------
@@ -96,7 +97,7 @@ class Settling(Effect):
     word = "electronic_memory"
     variant = "settling"
     parameters = (
-        Parameter("alpha", "", 1e-5, 1e-3, amplitude=True),
+        Parameter("alpha", "", 1e-5, 1e-3, signed=True, amplitude=True),
         Parameter("tau", "pixel times", 0.5, 30.0),
     )
     touches = ("serial_overscan", "flat_mean", "flat_cov", "flat_map", "spot")
