@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.signal import lfilter
 
 from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter
 from bfsensor.typing import FloatArray
@@ -158,19 +159,17 @@ class Traps(Effect):
     axis: ClassVar[int] = 1
     """Axis of the frame along which packets move: 1 for rows, 0 for columns."""
 
-    def _shares(self, late: NDArray[Any]) -> FloatArray:
-        """Fraction of the late charge that is released at least ``late`` packets late, from 1."""
+    def _species(self) -> list[tuple[float, float]]:
+        """Parts of the late charge, and what is left of each after a packet has passed."""
         parts = [(1.0, self["tau"])]
         if "slow" in self.values:
             slow = float(np.clip(self["slow"], 0.0, 1.0))
             parts = [(1 - slow, self["tau"]), (slow, self["slow_tau"])]
-        return np.asarray(
-            sum(part * np.exp(-(np.asarray(late) - 1.0) / tau) for part, tau in parts)
-        )
+        return [(part, float(np.exp(-1 / tau))) for part, tau in parts]
 
-    def _released(self, reach: int) -> FloatArray:
-        """Fractions released 1, 2, ... ``reach`` packets late."""
-        return -np.diff(self._shares(np.arange(1, reach + 2)))
+    def _released(self, late: NDArray[Any]) -> FloatArray:
+        """Fraction of the late charge that is released exactly ``late`` packets late, from 1."""
+        return np.asarray(sum(p * (1 - keep) * keep ** (late - 1.0) for p, keep in self._species()))
 
     def _lost(self, charge: NDArray[Any]) -> FloatArray:
         """Charge that one transfer of a packet leaves to later packets [e-]."""
@@ -181,13 +180,9 @@ class Traps(Effect):
         """Lines along the last axis, first packet first, after ``transfers`` of each packet."""
         lost = self._lost(images) * transfers
         out = np.asarray(images - lost, float)
-        reach = min(images.shape[-1] - 1, round(5 * max(self._times())) + 1)
-        for late, share in enumerate(self._released(reach), 1):
-            out[..., late:] += share * lost[..., :-late]
+        for part, keep in self._species():
+            out += lfilter([0.0, part * (1 - keep)], [1.0, -keep], lost)
         return out
-
-    def _times(self) -> list[float]:
-        return [self[n] for n in ("tau", "slow_tau") if n in self.values]
 
     def _lit(self, layout: Layout, amp: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
         """Packets with light, and packets read before them, by amplifier."""
@@ -211,7 +206,8 @@ class Traps(Effect):
     def _overscan(self, axes: Axes, layout: Layout) -> FloatArray:
         lit, before = self._lit(layout, axes["amp"])
         # All packets with light leave charge in the k-th one behind them: the last one most.
-        return self._lost(axes["level"]) * (before + lit) * self._shares(axes["k"])
+        left = sum(part * keep ** (axes["k"] - 1.0) for part, keep in self._species())
+        return np.asarray(self._lost(axes["level"]) * (before + lit) * left)
 
     def covariances(self, c: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
         lit, before = self._lit(layout, axes["amp"])
@@ -220,8 +216,8 @@ class Traps(Effect):
         part = (part * (before + (lit + 1) / 2)).reshape(-1, 1, 1)
         axis = self.axis - 2
         out = c - 2 * part * c
-        reach = min(c.shape[axis] // 2, round(5 * max(self._times())) + 1)
-        for late, share in enumerate(self._released(reach), 1):
+        lags = np.arange(1, c.shape[axis] // 2)
+        for late, share in zip(lags.tolist(), self._released(lags), strict=True):
             out += part * share * (np.roll(c, late, axis) + np.roll(c, -late, axis))
         return np.asarray(out)
 
