@@ -263,14 +263,17 @@ class Law(NamedTuple):
     """Charge of a pixel above which the rest spills along its column [e-]."""
     losses: tuple[tuple[float, float, float], ...] = ()
     """(q, p, K) of further losses: the efficiency is also exp(-q 1e5 (Q/1e5)^p / (1 + Q/K))."""
+    drain: float = 0.0
+    """Part of the charge above the full well that is lost where it spills, from 0 to 1."""
 
     def with_law(self, other: Law) -> Law:
-        """Combine two laws: coefficients add, the lower full well holds."""
+        """Combine two laws: coefficients add, the lower full well holds with its drain."""
         return Law(
             self.bend + other.bend,
             self.loss + other.loss,
             min(self.full_well, other.full_well),
             self.losses + other.losses,
+            self.drain if self.full_well <= other.full_well else other.drain,
         )
 
     @property

@@ -160,7 +160,9 @@ class GainCurve(_Drift):
 
     variant = "curve"
     parameters = tuple(
-        Parameter(f"g{n}", "", -0.03, 0.03, law="flat", signed=True, amplitude=True)
+        Parameter(
+            f"g{n}", "", -0.03, 0.03, law="flat", signed=True, amplitude=True, step=1e-4
+        )
         for n in range(1, KNOTS + 1)
     )
     source = (

@@ -159,7 +159,9 @@ class ResponseCurve(_Response):
 
     variant = "curve"
     parameters = tuple(
-        Parameter(f"f{n}", "", -0.03, 0.03, law="flat", signed=True, amplitude=True)
+        Parameter(
+            f"f{n}", "", -0.03, 0.03, law="flat", signed=True, amplitude=True, step=1e-4
+        )
         for n in range(1, len(KNOTS) + 1)
     )
     source = (

@@ -40,7 +40,7 @@ from bfsensor.effects.lateral_diffusion import LateralDiffusion
 from bfsensor.effects.mask_stitch import MaskStitch
 from bfsensor.effects.persistence import Persistence, PowerPersistence, TwoTimesPersistence
 from bfsensor.effects.psf_wings import PsfWings
-from bfsensor.effects.saturation import Saturation
+from bfsensor.effects.saturation import DrainedSaturation, Saturation
 from bfsensor.effects.shutter_timing import ShutterTiming
 from bfsensor.effects.tearing import Tearing
 from bfsensor.effects.trap_serial import GradualTrap, TrapSerial, TwoTimesTrap
@@ -101,6 +101,7 @@ LIBRARY: tuple[type[Effect], ...] = (
     Pickup,
     PsfWings,
     Saturation,
+    DrainedSaturation,
     ShutterTiming,
     Tearing,
     TrapSerial,

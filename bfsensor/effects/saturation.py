@@ -1,4 +1,4 @@
-"""Saturation: a full well below that of the nominal device, with spilling along the columns."""
+"""Saturation: a full well below that of the nominal device; charge above it spills or is drained."""
 
 from __future__ import annotations
 
@@ -97,6 +97,10 @@ class Saturation(Effect):
     def law(self) -> Law:
         return Law(full_well=np.inf if self.is_neutral() else self["full_well"])
 
+    def _near(self, distance: float, uneven: float) -> tuple[float, FloatArray]:
+        """Deficit of the mean and covariances near the full well: :func:`_near`."""
+        return _between(distance, uneven, 0.0)
+
     def flat_mean(self, axes: Axes, layout: Layout) -> FloatArray:
         light = axes.get("light", axes["level"])
         if self.is_neutral():
@@ -105,7 +109,7 @@ class Saturation(Effect):
         sigma = np.sqrt(np.maximum(light, 1.0))
         distance = (self["full_well"] - light) / sigma
         for n in np.nonzero(np.abs(distance) <= FAR)[0]:
-            short, _ = _between(float(distance[n]), _unevenness(light[n], sigma[n]))
+            short, _ = self._near(float(distance[n]), _unevenness(light[n], sigma[n]))
             out[n] -= short * sigma[n]
         return out
 
@@ -125,7 +129,7 @@ class Saturation(Effect):
         rows = np.flatnonzero(near)
         out = np.zeros((len(light), len(rows)))
         for mode, n in enumerate(rows):
-            short, left = _between(float(distance[n]), _unevenness(light[n], sigma[n]))
+            short, left = self._near(float(distance[n]), _unevenness(light[n], sigma[n]))
             left[0] = min(left[0], 1 - left[0])
             own = short * sigma[n] if word == "flat_mean" else left[lag[n]] * light[n]
             out[n, mode] = UNSURE * own
@@ -141,7 +145,7 @@ class Saturation(Effect):
         out = c.copy()
         out[distance < -FAR] = 0.0
         for n in np.nonzero((distance >= -FAR) & (distance < reach))[0]:
-            _, left = _between(float(distance[n]), _unevenness(light[n], sigma[n]))
+            _, left = self._near(float(distance[n]), _unevenness(light[n], sigma[n]))
             # All covariances shrink like the variance; spilled charge correlates the column.
             out[n] *= left[0]
             for lag in range(1, LAGS + 1):
@@ -149,25 +153,64 @@ class Saturation(Effect):
         return out
 
 
+class DrainedSaturation(Saturation):
+    """The part ``drain`` of the charge above ``full_well`` is lost, the rest spills along the column.
+
+    With ``drain`` = 1 pixels are clipped: the charge goes to the substrate or to a surface layer.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``full_well`` [e-]: 70000 to 115000 (200000 changes nothing); ``drain``: 0
+        to 1.
+
+    Examples
+    --------
+    >>> DrainedSaturation({"full_well": 90000.0, "drain": 1.0}).name
+    'saturation:drained'
+    """
+
+    variant = "drained"
+    parameters = (*Saturation.parameters, Parameter("drain", "", 0.0, 1.0, law="flat"))
+    source = (
+        "Surface full well and anti-blooming drains: Janesick 2001, Scientific Charge-Coupled "
+        "Devices, SPIE Press PM83, section 2.3; shares and range assumed"
+    )
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        return [s | {"drain": 0.9} for s in super().starts(layout, seen)]
+
+    def law(self) -> Law:
+        drain = float(np.clip(self["drain"], 0.0, 1.0))
+        return super().law()._replace(drain=0.0 if self.is_neutral() else drain)
+
+    def _near(self, distance: float, uneven: float) -> tuple[float, FloatArray]:
+        # Linear between both ends: the simulation of each is kept, and derivatives need no more.
+        part = float(np.clip(self["drain"], 0.0, 1.0))
+        (short, left), (lost, less) = (_between(distance, uneven, d) for d in (0.0, 1.0))
+        return (1 - part) * short + part * lost, (1 - part) * left + part * less
+
+
 def _unevenness(light: float, sigma: float) -> float:
     """Scatter of the charge from pixel to pixel in standard deviations of its noise."""
     return UNEVEN * float(light) / float(sigma)
 
 
-def _between(distance: float, uneven: float) -> tuple[float, FloatArray]:
+def _between(distance: float, uneven: float, drain: float) -> tuple[float, FloatArray]:
     """Interpolate :func:`_near` linearly between tenths of both: derivatives need no steps."""
     tenths = int(np.floor(10 * distance)), int(np.floor(10 * uneven))
     parts = 10 * distance - tenths[0], 10 * uneven - tenths[1]
     short, left = 0.0, np.zeros(LAGS + 1)
     for n, m in np.ndindex(2, 2):
-        found = _near((tenths[0] + n) / 10, (tenths[1] + m) / 10)
+        found = _near((tenths[0] + n) / 10, (tenths[1] + m) / 10, drain)
         weight = (parts[0] if n else 1 - parts[0]) * (parts[1] if m else 1 - parts[1])
         short, left = short + weight * found[0], left + weight * found[1]
     return short, left
 
 
 @lru_cache(maxsize=1024)
-def _near(distance: float, uneven: float) -> tuple[float, FloatArray]:
+def _near(distance: float, uneven: float, drain: float = 0.0) -> tuple[float, FloatArray]:
     """Deficit of the mean of a flat near the full well, and covariances along the column.
 
     Both come from a small simulation of pairs with fixed random numbers, with errors of 1 % of the
@@ -179,6 +222,8 @@ def _near(distance: float, uneven: float) -> tuple[float, FloatArray]:
         Full well minus mean [standard deviations of the noise].
     uneven : float
         Fixed scatter from pixel to pixel, equal in both flats of a pair [same unit].
+    drain : float
+        Part of the spilled charge that is lost.
 
     Returns
     -------
@@ -192,7 +237,7 @@ def _near(distance: float, uneven: float) -> tuple[float, FloatArray]:
     noise = rng.standard_normal((2, *shape))
     noise /= noise.std()
     pattern = uneven * rng.standard_normal(shape)
-    pairs = np.array([spilled(n + pattern, distance) for n in noise])
+    pairs = np.array([spilled(n + pattern, distance, drain=drain) for n in noise])
     before, after = np.diff(noise, axis=0)[0], np.diff(pairs, axis=0)[0]
     whole = before.var()
     left = [np.mean(after[lag:] * after[: len(after) - lag]) for lag in range(LAGS + 1)]
@@ -204,7 +249,7 @@ def _near(distance: float, uneven: float) -> tuple[float, FloatArray]:
     return short, found
 
 
-def spilled(charge: FloatArray, full_well: float) -> FloatArray:
+def spilled(charge: FloatArray, full_well: float, *, drain: float = 0.0) -> FloatArray:
     """Spill the charge above the full well along the columns, half to each neighbour, repeatedly.
 
     Charge that reaches the end of a column leaves.  The final state does not depend on the order of
@@ -216,6 +261,8 @@ def spilled(charge: FloatArray, full_well: float) -> FloatArray:
         Charge of the pixels, in any unit; not changed.
     full_well : float
         Largest charge of a pixel, in the same unit.
+    drain : float
+        Part of the excess that is lost in each step, from 0 to 1.
 
     Returns
     -------
@@ -233,6 +280,7 @@ def spilled(charge: FloatArray, full_well: float) -> FloatArray:
         if not excess.any():
             return charge
         charge -= excess
-        charge[1:] += 0.5 * excess[:-1]
-        charge[:-1] += 0.5 * excess[1:]
+        half = 0.5 * (1 - drain) * excess
+        charge[1:] += half[:-1]
+        charge[:-1] += half[1:]
     return np.minimum(charge, full_well)

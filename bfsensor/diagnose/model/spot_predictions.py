@@ -122,10 +122,13 @@ def _swept(series: FloatArray, s: FloatArray) -> FloatArray:
     return np.asarray(s * (series[0] + s * (series[1] + s * (series[2] + s * series[3]))))
 
 
-def spill(charge: FloatArray, full_well: float, rounds: int = 64) -> FloatArray:
+def spill(
+    charge: FloatArray, full_well: float, rounds: int = 64, *, drain: float = 0.0
+) -> FloatArray:
     """Move charge beyond the full well to both neighbours in the column, shape (n, ny, nx) [e-].
 
-    Charge that finds no room within ``rounds`` pixels, or leaves the image, is lost.
+    Charge that finds no room within ``rounds`` pixels, or leaves the image, is lost, and the part
+    ``drain`` of it wherever it spills.
     """
     charge = charge.copy()
     for _ in range(rounds):
@@ -133,8 +136,9 @@ def spill(charge: FloatArray, full_well: float, rounds: int = 64) -> FloatArray:
         if excess.max() < LITTLE * full_well:
             break
         charge -= excess
-        charge[:, 1:] += 0.5 * excess[:, :-1]
-        charge[:, :-1] += 0.5 * excess[:, 1:]
+        half = 0.5 * (1 - drain) * excess
+        charge[:, 1:] += half[:, :-1]
+        charge[:, :-1] += half[:, 1:]
     return np.minimum(charge, full_well)
 
 
@@ -238,7 +242,7 @@ def grow_spots(
         charge = charge + gained
         last, before = gained, last
         if charge.max() > law.full_well:
-            charge = spill(charge, law.full_well)
+            charge = spill(charge, law.full_well, drain=law.drain)
         out[step] = charge
     return out
 

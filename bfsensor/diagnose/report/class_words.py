@@ -99,6 +99,8 @@ LAW_WORDS = {
     "persistence": ("one_exponential", "released with one time constant"),
     "persistence:power": ("power", "released as a power of the age"),
     "persistence:two_times": ("two_exponentials", "above a level, with two time constants"),
+    "saturation": ("blooming", "charge above it spills along the columns"),
+    "saturation:drained": ("drained", "charge above it is lost, or spills in part"),
     "trap_serial": ("sharp", "full after any packet above its reach"),
     "trap_serial:gradual": ("gradual", "larger packets fill it further"),
     "trap_serial:two_times": ("two_times", "larger packets fill it further; two release times"),
@@ -198,7 +200,9 @@ PARAMETER_WORDS: Mapping[str, Mapping[str, str]] = {
     "dark_hot": {"rate": "dark current", "columns": "number of hot columns",
                  "length": "decay length", "corner": "corner"}
     | {f"x{n}": f"hot column {n}" for n in range(1, 7)},
-    "saturation": {"full_well": "full well"},
+    "saturation": {
+        "full_well": "full well", "drain": "part of the charge above it that is lost",
+    },
     "fringing": {
         "amp": "relative amplitude", "period": "period along a row at the centre",
         "tilt": "tilt of the contours", "phase": "phase",
