@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Segment
 from bfsensor.effects.read_noise import ReadNoise, added
 from bfsensor.typing import FloatArray
 
@@ -158,7 +158,9 @@ class SettlingByFrame(ReadNoise):
         Parameter("rms", "e-", 1.0, 30.0, amplitude=True),
         Parameter("length", "pixel", 3.0, 300.0),
     )
-    touches = ("bias_cov", "bias_level", "flat_cov")
+    touches = ("bias_cov", "bias_level", "dark_map", "flat_cov")
+    told_by_scatter = ("bias_level", "dark_map")
+    bends = True
     source = (
         "Two-dimensional bias that differs between frames of LSST's camera: Utsumi et al. 2024, Proc. "
         "SPIE 13103; an exponential along rows, as of a clamp that settles; range assumed"
@@ -184,6 +186,22 @@ class SettlingByFrame(ReadNoise):
             c = np.fft.irfft(spectrum, int(size)) / int(size)
             out[rows] = self["rms"] ** 2 * c[lag[rows].astype(int) % int(size)]
         return out
+
+    def modes(self, word: str, axes: Axes, layout: Layout) -> FloatArray | None:
+        """Scatter of levels that are those of the image above the overscan's, frame by frame."""
+        if word not in self.told_by_scatter:
+            return None
+        apart = np.array([
+            self._mean(s.prescan, s.columns, s) - self._mean(s.prescan + s.columns, s.serial_overscan, s)
+            for s in layout.segments
+        ])  # fmt: skip
+        size = apart[axes["amp"].astype(int)] * (axes["what"] == "level")
+        return np.asarray(self["rms"] * np.diag(size)[:, size != 0])
+
+    def _mean(self, first: int, count: int, s: Segment) -> float:
+        """Mean of the settling over some columns of a frame."""
+        width = s.prescan + s.columns + s.serial_overscan
+        return float(self._shape(width)[first : first + count].mean()) if count else 0.0
 
     def _shape(self, width: int) -> FloatArray:
         """Settling by column of the frame in readout order, 1 at the first."""

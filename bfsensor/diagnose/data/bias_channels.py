@@ -42,6 +42,11 @@ STANDS_OUT = 5.0
 enters the errors.  Chosen: noise exceeds 5 at one in 2e6 lags; with 10 weaker correlations are
 left out of the errors, which are then too small."""
 
+ROWS = 3
+"""Number of rows between which the covariance of the noise is measured, too.  Chosen: levels of rows
+that keep half of the row before are told from independent ones by the first; with 6, slower ones by
+a half more."""
+
 FRAME_ERROR = 0.1
 """Scatter of the bias level from frame to frame that is no finding [ADU].  Chosen, to be derived
 from quiet systems: with 0.2, scatter of the level below 0.2 ADU could hardly be found."""
@@ -79,6 +84,7 @@ class BiasChannels:
         self._long: list[list[FloatArray]] = []
         self._zeros: list[list[tuple[float, float]]] = []
         self._size = 0
+        self._lags = np.arange(READOUT_LAGS + 1)
         self._condition = Condition()
 
     def add(self, exposure: ExposureInfo, frames: Sequence[Frame]) -> None:
@@ -104,7 +110,8 @@ class BiasChannels:
             noise = _without_outliers((first - second) / np.sqrt(2.0))
             own[:] = noise.ravel()
             long.append(_autocovariance(noise))
-            spectra.append(long[-1][: READOUT_LAGS + 1])
+            self._lags = _lags(*noise.shape)
+            spectra.append(long[-1][self._lags])
             rows.append(_row_excess(noise))
         self._last = []
         self._spectra.append(spectra)
@@ -169,8 +176,8 @@ class BiasChannels:
         for amp, seen in enumerate(found):
             mean = np.mean([s[amp] for s in self._spectra], axis=0)
             values.append(mean)
-            blocks.append(_errors_in_order(seen) / (self._size * pairs))
-            axes.add(len(mean), self._condition, amp=amp, lag=np.arange(len(mean)))
+            blocks.append(_errors_in_order(seen, self._lags) / (self._size * pairs))
+            axes.add(len(mean), self._condition, amp=amp, lag=self._lags)
         out = [
             Channel("bias_cov", np.concatenate(values), tuple(blocks), axes.columns(), "adu2",
                     self._fold)
@@ -429,20 +436,30 @@ def _autocovariance(noise: FloatArray) -> FloatArray:
     return np.asarray(irfft(power, size)[:lags] / (n - np.arange(lags)))
 
 
-def _errors_in_order(c: FloatArray) -> FloatArray:
-    """Covariance matrix of sample autocovariances times the length of the series [ADU^4].
+def _lags(rows: int, columns: int) -> NDArray[np.int64]:
+    """Lags of the measured noise [pixel times]: those of near pixels, and of :data:`ROWS` rows.
+
+    Noise of a long memory and levels of rows are alike within a row; between rows they are not.
+    """
+    near = np.arange(min(READOUT_LAGS, max(rows * columns - 1, 0)) + 1)
+    far = columns * np.arange(1, ROWS + 1)
+    # The measured autocovariance ends at a quarter of the frame.
+    return np.concatenate([near, far[(far > near[-1]) & (far < rows * columns // 4)]])
+
+
+def _errors_in_order(c: FloatArray, h: NDArray[np.int64]) -> FloatArray:
+    """Covariance matrix of sample autocovariances at lags ``h``, times the series' length [ADU^4].
 
     Bartlett's formula, cov(c_h, c_k) = sum over m of (c_m c_(m+h-k) + c_m c_(m+h+k)) / n.  The
     sum over a quarter of the frame's lags holds nearly all of it even for a wave that keeps its
     phase through the frame.
     """
     n = len(c)
-    size = next_fast_len(2 * n + 2 * READOUT_LAGS, real=True)
+    size = next_fast_len(2 * n + 2 * int(h[-1]), real=True)
     even = np.zeros(size)
     even[:n] = c
     even[size - n + 1 :] = c[:0:-1]
     g = irfft(rfft(even).real ** 2, size)
-    h = np.arange(READOUT_LAGS + 1)
     return np.asarray(g[np.abs(h[:, None] - h)] + g[h[:, None] + h])
 
 
