@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +46,7 @@ class AdcBits(Effect):
     ----------
     values : mapping of str to float
         Plausible ranges: ``delta`` [ADU]: 0.2 to 2 in magnitude, either sign (0 changes nothing);
-        ``bit``: 1 to 14, whole.
+        ``bit``: 2 to 9, whole.
 
     Examples
     --------
@@ -55,11 +56,17 @@ class AdcBits(Effect):
 
     word = "adc_bits"
     stage = "converter"
-    parameters = (
+    parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("delta", "ADU", 0.2, 2.0, signed=True, amplitude=True),
-        Parameter("bit", "", 1, 14, law="whole"),
+        Parameter("bit", "", 2, 9, law="whole"),
     )
-    touches = ("code_hist", "flat_mean", "flat_cov", "bias_cov", "spot")
+    touches: ClassVar[tuple[str, ...]] = (
+        "code_hist",
+        "flat_mean",
+        "flat_cov",
+        "bias_cov",
+        "spot",
+    )
     source = (
         "Counts of 0 and 1 by bit in flats: Abbott 1995, In-situ CCD testing (CTIO), bit biases; "
         "effects of converters on CCD data: Boone et al. 2018, PASP 130, 064504; range assumed"
@@ -264,7 +271,10 @@ class ShiftedCodes(AdcBits):
         place = np.asarray(place) % (2 * half)
         # Codes from half to period - 1 appear delta higher, some of them in the next period.
         first = half + delta + np.array([0, -2 * half])
-        there = [np.clip(place + 1 - f, 0, 1) - np.clip(place + 1 - half - f, 0, 1) for f in first]
+        there = [
+            np.clip(place + 1 - f, 0, 1) - np.clip(place + 1 - half - f, 0, 1)
+            for f in first
+        ]
         return np.asarray(there[0] + there[1] - (place >= half), float)
 
 
@@ -275,7 +285,7 @@ class WideCodes(AdcBits):
     ----------
     values : mapping of str to float
         Plausible ranges: ``delta`` [ADU]: 0.05 to 1 in magnitude, either sign (0 changes nothing);
-        ``bit``: 1 to 9, whole; ``place``: -1 or 0, whole: the wide codes are those just below
+        ``bit``: 1 to 9, whole; ``place``: -1 to 0, whole: the wide codes are those just below
         multiples of 2^bit, or these themselves.
 
     Examples

@@ -143,7 +143,7 @@ class SettlingByFrame(ReadNoise):
     Parameters
     ----------
     values : mapping of str to float
-        Plausible ranges: ``rms`` [e-] at the first column: 1 to 30 (0 changes nothing); ``length``
+        Plausible ranges: ``rms`` [e-]: 1 to 30 at the first column (0 changes nothing); ``length``
         [pixel]: 3 to 300.
 
     Examples

@@ -84,8 +84,8 @@ class FillingLoss(Effect):
     Parameters
     ----------
     values : mapping of str to float
-        Plausible ranges: ``q`` [1/e-]: 1e-08 to 1e-06 (0 changes nothing); ``knee`` K [e-]: 3000
-        to 300000.
+        Plausible ranges: ``q`` [1/e-]: 1e-08 to 1e-06 (0 changes nothing); ``knee`` [e-]: 3000
+        to 300000, K.
 
     Examples
     --------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -63,15 +64,15 @@ class CtiParallel(Effect):
 
 
 class ParallelTraps(Traps):
-    """Traps in the columns: a loss as a power of the signal, released over several packets.
+    """Traps in the columns: a power of the signal, released over several packets.
 
     The equations are those of :class:`bfsensor.effects.transfer.Traps`.
 
     Parameters
     ----------
     values : mapping of str to float
-        Plausible ranges: ``cti`` at 5e4 e-: 1e-07 to 5e-06 (0 changes nothing); ``power`` of the
-        signal: 0.2 to 1.2; ``tau`` [packets]: 0.3 to 10.
+        Plausible ranges: ``cti``: 1e-07 to 5e-06 at 5e4 e- (0 changes nothing); ``power``: 0.2 to
+        1.2, of the signal; ``tau`` [packets]: 0.3 to 10.
 
     Examples
     --------
@@ -82,7 +83,7 @@ class ParallelTraps(Traps):
     word = "cti_parallel"
     variant = "traps"
     axis = 0
-    parameters = TRAPS
+    parameters: ClassVar[tuple[Parameter, ...]] = TRAPS
     touches = ("parallel_overscan", "flat_cov", "spot")
     source = (
         "Volume of a packet as a power of its charge, exponential release: Short et al. 2013, "
@@ -92,7 +93,9 @@ class ParallelTraps(Traps):
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
         return [
-            {"cti": 1e-6, "power": power, "tau": tau} for power in (0.5, 1.0) for tau in (0.5, 3.0)
+            {"cti": 1e-6, "power": power, "tau": tau}
+            for power in (0.5, 1.0)
+            for tau in (0.5, 3.0)
         ]
 
     def parallel_overscan(self, axes: Axes, layout: Layout) -> FloatArray:
@@ -105,7 +108,9 @@ class TwoParallelTraps(ParallelTraps):
     Parameters
     ----------
     values : mapping of str to float
-        As for :class:`ParallelTraps`; ``slow``: 0.02 to 0.98; ``slow_tau`` [packets]: 2 to 40.
+        Plausible ranges: ``cti``: 1e-07 to 5e-06 at 5e4 e- (0 changes nothing); ``power``: 0.2 to
+        1.2, of the signal; ``tau`` [packets]: 0.3 to 10; ``slow``: 0.02 to 0.98; ``slow_tau``
+        [packets]: 2 to 40.
 
     Examples
     --------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -64,15 +65,15 @@ class CtiSerial(Effect):
 
 
 class SerialTraps(Traps):
-    """Traps in the serial register: a loss as a power of the signal, released over several packets.
+    """Traps in the serial register: a power of the signal, released over several packets.
 
     The equations are those of :class:`bfsensor.effects.transfer.Traps`.
 
     Parameters
     ----------
     values : mapping of str to float
-        Plausible ranges: ``cti`` at 5e4 e-: 1e-07 to 5e-06 (0 changes nothing); ``power`` of the
-        signal: 0.2 to 1.2; ``tau`` [packets]: 0.3 to 10.
+        Plausible ranges: ``cti``: 1e-07 to 5e-06 at 5e4 e- (0 changes nothing); ``power``: 0.2 to
+        1.2, of the signal; ``tau`` [packets]: 0.3 to 10.
 
     Examples
     --------
@@ -83,7 +84,7 @@ class SerialTraps(Traps):
     word = "cti_serial"
     variant = "traps"
     axis = 1
-    parameters = TRAPS
+    parameters: ClassVar[tuple[Parameter, ...]] = TRAPS
     touches = ("serial_overscan", "flat_cov", "flat_mean", "spot")
     source = (
         "Volume of a packet as a power of its charge, exponential release: Short et al. 2013, "
@@ -93,7 +94,9 @@ class SerialTraps(Traps):
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
         return [
-            {"cti": 1e-6, "power": power, "tau": tau} for power in (0.5, 1.0) for tau in (0.5, 3.0)
+            {"cti": 1e-6, "power": power, "tau": tau}
+            for power in (0.5, 1.0)
+            for tau in (0.5, 3.0)
         ]
 
     def serial_overscan(self, axes: Axes, layout: Layout) -> FloatArray:
@@ -106,7 +109,9 @@ class TwoSerialTraps(SerialTraps):
     Parameters
     ----------
     values : mapping of str to float
-        As for :class:`SerialTraps`; ``slow``: 0.02 to 0.98; ``slow_tau`` [packets]: 2 to 40.
+        Plausible ranges: ``cti``: 1e-07 to 5e-06 at 5e4 e- (0 changes nothing); ``power``: 0.2 to
+        1.2, of the signal; ``tau`` [packets]: 0.3 to 10; ``slow``: 0.02 to 0.98; ``slow_tau``
+        [packets]: 2 to 40.
 
     Examples
     --------

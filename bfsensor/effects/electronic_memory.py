@@ -114,7 +114,9 @@ class Settling(Effect):
     def amplify(self, frames: list[Image], shot: Shot, layout: Layout) -> list[Image]:
         if self["alpha"] == 0:
             return frames
-        return [(f + self._before(f.ravel()).reshape(f.shape)).astype(f.dtype) for f in frames]
+        return [
+            (f + self._before(f.ravel()).reshape(f.shape)).astype(f.dtype) for f in frames
+        ]
 
     def pattern(self, shot: Shot, layout: Layout) -> FloatArray | None:
         out = np.zeros(layout.shape)

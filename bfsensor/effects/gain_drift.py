@@ -11,7 +11,6 @@ from scipy.interpolate import CubicSpline
 from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Seen, Shot
 from bfsensor.typing import FloatArray
 
-
 KNOTS = 6
 """Number of equal intervals of the campaign's time in which the free curve of the gain may turn.
 
@@ -150,7 +149,9 @@ class GainCurve(_Drift):
     Parameters
     ----------
     values : mapping of str to float
-        Plausible ranges: ``g1`` to ``g6``: -0.03 to 0.03 (0 changes nothing).
+        Plausible ranges (0 changes nothing): ``g1``: -0.03 to 0.03; ``g2``: -0.03 to
+        0.03; ``g3``: -0.03 to 0.03; ``g4``: -0.03 to 0.03; ``g5``: -0.03 to 0.03;
+        ``g6``: -0.03 to 0.03.
 
     Examples
     --------

@@ -148,7 +148,9 @@ class ResponseCurve(_Response):
     Parameters
     ----------
     values : mapping of str to float
-        Plausible ranges: ``f1`` to ``f7``: -0.03 to 0.03 (0 changes nothing).
+        Plausible ranges (0 changes nothing): ``f1``: -0.03 to 0.03; ``f2``: -0.03 to
+        0.03; ``f3``: -0.03 to 0.03; ``f4``: -0.03 to 0.03; ``f5``: -0.03 to 0.03;
+        ``f6``: -0.03 to 0.03; ``f7``: -0.03 to 0.03.
 
     Examples
     --------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,6 @@ from numpy.typing import NDArray
 from bfsensor.effects.dark_pixels import mean_bias, struck_pixels
 from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Seen, Shot
 from bfsensor.typing import FloatArray
-
 
 MEMORY = 40
 """Number of exposures for which pixels remember charge.
@@ -39,7 +39,7 @@ class Persistence(Effect):
 
     word = "persistence"
     stage = "store"
-    parameters = (
+    parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("frac", "", 1e-5, 1e-3, amplitude=True),
         Parameter("tau", "exposure", 0.7, 5.0),
     )
@@ -136,7 +136,9 @@ class Persistence(Effect):
         later = np.subtract.outer(
             np.asarray(number, float), np.array([s.number for s in lit], float)
         )
-        return np.asarray(self._after(later) @ self._trapped(np.array([s.level for s in lit])))
+        return np.asarray(
+            self._after(later) @ self._trapped(np.array([s.level for s in lit]))
+        )
 
 
 class PowerPersistence(Persistence):

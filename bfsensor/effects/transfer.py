@@ -169,7 +169,9 @@ class Traps(Effect):
 
     def _released(self, late: NDArray[Any]) -> FloatArray:
         """Fraction of the late charge that is released exactly ``late`` packets late, from 1."""
-        return np.asarray(sum(p * (1 - keep) * keep ** (late - 1.0) for p, keep in self._species()))
+        return np.asarray(
+            sum(p * (1 - keep) * keep ** (late - 1.0) for p, keep in self._species())
+        )
 
     def _lost(self, charge: NDArray[Any]) -> FloatArray:
         """Charge that one transfer of a packet leaves to later packets [e-]."""
@@ -232,8 +234,8 @@ class Traps(Effect):
         # The light beside the image leaves charge in it, too: only the change against it counts.
         flat = np.moveaxis(np.broadcast_to(level, images.shape), self.axis - 2, -1)
         one = self._moved(lines, mean) - self._moved(flat, mean)
-        two = (
-            self._moved(lines[..., ::-1], mean) - self._moved(flat[..., ::-1], mean)
-        )[..., ::-1]
+        two = (self._moved(lines[..., ::-1], mean) - self._moved(flat[..., ::-1], mean))[
+            ..., ::-1
+        ]
         share = layout.backwards("x" if self.axis else "y")
         return np.asarray(np.moveaxis((1 - share) * one + share * two, -1, self.axis - 2))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -44,7 +45,7 @@ class TrapSerial(Effect):
 
     word = "trap_serial"
     stage = "shift"
-    parameters = (
+    parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("size", "e-", 5.0, 100.0, amplitude=True),
         Parameter("tau", "pixel times", 0.7, 4.0),
         Parameter("amp", "", 0, 1, law="whole"),
@@ -189,7 +190,7 @@ class GradualTrap(TrapSerial):
     """
 
     variant = "gradual"
-    parameters = (
+    parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("size", "e-", 5.0, 2000.0, amplitude=True),
         Parameter("tau", "pixel times", 0.5, 20.0),
         Parameter("amp", "", 0, 1, law="whole"),
@@ -221,7 +222,8 @@ class GradualTrap(TrapSerial):
         x = np.log(np.maximum(level, 1e-6) / self["middle"])
         power, corner = self["power"], self["corner"]
         return np.asarray(
-            self["size"] * np.exp(power * x - np.logaddexp(0.0, power * corner * x) / corner)
+            self["size"]
+            * np.exp(power * x - np.logaddexp(0.0, power * corner * x) / corner)
         )
 
     def _caught(self, packet: FloatArray, held: FloatArray, part: float) -> FloatArray:
@@ -238,7 +240,9 @@ class TwoTimesTrap(GradualTrap):
     Parameters
     ----------
     values : mapping of str to float
-        As for :class:`GradualTrap`; ``slow``: 0.02 to 0.98; ``slow_tau`` [pixel times]: 2 to 50.
+        Plausible ranges: ``size`` [e-]: 5 to 2000 (0 changes nothing); ``tau`` [pixel times]: 0.5 to
+        20; ``amp``: 0 to 1, whole; ``middle`` [e-]: 300 to 100000; ``power``: 0.3 to 6; ``corner``:
+        0.7 to 8; ``slow``: 0.02 to 0.98; ``slow_tau`` [pixel times]: 2 to 50.
 
     Examples
     --------
@@ -254,7 +258,8 @@ class TwoTimesTrap(GradualTrap):
         Parameter("slow_tau", "pixel times", 2.0, 50.0),
     )
     source = (
-        "Several traps with release times of their own: Snyder et al. 2021, JATIS 7, 048002, section 3"
+        "Several traps with release times of their own: Snyder et al. 2021, JATIS 7, 048002, section "
+        "3; ranges assumed"
     )
 
     @classmethod

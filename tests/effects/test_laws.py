@@ -68,7 +68,9 @@ def test_traps_of_a_register(word, variant, strength):
         read = late(row, values)
         frame = np.tile(row, (3, 1)) if serial else np.tile(row[:, None], (1, 3))
         out = effect.shift(frame, 0, LAYOUT)
-        np.testing.assert_allclose(out[0] if serial else out[:, 0], read, atol=1e-3 * level * values["cti"] * 50)
+        np.testing.assert_allclose(
+            out[0] if serial else out[:, 0], read, atol=1e-3 * level * values["cti"] * 50
+        )
         behind = read[-OVERSCAN:] if serial else read[-12:]
         said = getattr(effect, "serial_overscan" if serial else "parallel_overscan")(
             overscan_axes(level, len(behind)), LAYOUT
@@ -114,7 +116,9 @@ def test_fluctuations_of_flats_are_delayed_by_the_slope_of_the_loss(strength):
     x = {"amp": np.zeros(1, int), "level": np.full(1, level)}
     said = effect.covariances(c, x, layout)[0, 0, :4] - c[0, 0, :4]
     # To first order in a loss of 2e-2 at most; 400 columns lose what their last packets hold.
-    np.testing.assert_allclose(np.subtract(seen, same), said, atol=0.03 * abs(said[0]) + 0.5)
+    np.testing.assert_allclose(
+        np.subtract(seen, same), said, atol=0.03 * abs(said[0]) + 0.5
+    )
     assert said[1] > 8 * strength
 
 
@@ -140,7 +144,9 @@ def test_a_trap_that_larger_packets_fill_further(variant, strength):
                 row[n] += free - taken
                 held[s] += taken - free
         frame = np.tile(row_of(level), (2, 1))
-        np.testing.assert_allclose(effect.shift(frame, 0, LAYOUT)[0], row, atol=1e-6 * level)
+        np.testing.assert_allclose(
+            effect.shift(frame, 0, LAYOUT)[0], row, atol=1e-6 * level
+        )
         said = effect.serial_overscan(overscan_axes(level), LAYOUT)
         np.testing.assert_allclose(said, row[-OVERSCAN:], rtol=1e-6, atol=1e-9)
         assert said[0] > 0.5 * strength
@@ -151,7 +157,7 @@ def test_a_trap_that_larger_packets_fill_further(variant, strength):
 # -- memory of the amplifier
 
 
-@pytest.mark.parametrize("strength", (*STRENGTHS, -1.0))
+@pytest.mark.parametrize("strength", [*STRENGTHS, -1.0])
 def test_settling_of_a_slow_stage(strength):
     values = {"alpha": strength * 1e-3, "tau": 3.0}
     effect = make_effect("electronic_memory", values, "settling")
@@ -175,7 +181,9 @@ def test_an_offset_that_bright_pixels_drive(strength):
     values = {"scale": strength * 1e-3, "threshold": 1e4, "tau": 6.0}
     effect = make_effect("electronic_memory", values, "offset_drift")
     rng = np.random.default_rng(3)
-    row = row_of(2e4) + np.where(row_of(1.0) > 0, rng.uniform(-1.5e4, 3e4, len(row_of(1.0))), 0)
+    row = row_of(2e4) + np.where(
+        row_of(1.0) > 0, rng.uniform(-1.5e4, 3e4, len(row_of(1.0))), 0
+    )
     for signal in (row_of(2e4), row):
         offset, read = 0.0, []
         for s in signal:
@@ -243,7 +251,7 @@ RESPONSES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("strength", (*STRENGTHS, -1.0))
+@pytest.mark.parametrize("strength", [*STRENGTHS, -1.0])
 @pytest.mark.parametrize("variant", RESPONSES)
 def test_responses(variant, strength):
     values, law = RESPONSES[variant]
@@ -266,7 +274,7 @@ DRIFTS = {
 }
 
 
-@pytest.mark.parametrize("strength", (*STRENGTHS, -1.0))
+@pytest.mark.parametrize("strength", [*STRENGTHS, -1.0])
 @pytest.mark.parametrize("variant", DRIFTS)
 def test_drifts(variant, strength):
     values, law = DRIFTS[variant]
@@ -326,7 +334,9 @@ def test_glow_of_a_corner(corner, strength):
     x0, y0 = COLUMNS * (corner % 2), 30 * (corner // 2)
     for y in range(30):
         for x in range(COLUMNS):
-            exact[y, x] = 60 * strength * np.exp(-np.hypot(x + 0.5 - x0, y + 0.5 - y0) / 15.0)
+            exact[y, x] = (
+                60 * strength * np.exp(-np.hypot(x + 0.5 - x0, y + 0.5 - y0) / 15.0)
+            )
     assert dark.mean() == pytest.approx(exact.mean(), rel=5 / exact.sum() ** 0.5)
     assert np.argmax(exact) == np.argmax(effect._light(LAYOUT))
     # What is measured: pixels beyond 6 sigma are counted, the others averaged.
@@ -359,7 +369,9 @@ def test_rows_that_remember_the_row_before(strength):
     said = effect.on_frame(np.zeros(4), np.arange(4), 21.0)
     # 40,000 rows, of which every other is independent: 1 %.
     np.testing.assert_allclose(seen, said, atol=0.03 * strength**2)
-    assert near == pytest.approx(float(effect.in_order(np.array(4), np.array(21))), abs=0.03 * strength**2)
+    assert near == pytest.approx(
+        float(effect.in_order(np.array(4), np.array(21))), abs=0.03 * strength**2
+    )
     assert said[1] > 0.5 * strength**2
 
 

@@ -63,12 +63,21 @@ CLASS_WORDS = {
 LAW_WORDS = {
     "adc_bits": ("bit_weight", "the bit has a wrong weight"),
     "adc_bits:shifted": ("shifted_codes", "codes with the bit set are moved by a constant"),
-    "adc_bits:wide": ("wide_codes", "every 2^bit-th code is wider, at the cost of the next"),
+    "adc_bits:wide": (
+        "wide_codes",
+        "every 2^bit-th code is wider, at the cost of the next",
+    ),
     "bias_instability:frame": ("frames", "the level differs from frame to frame"),
     "bias_instability:row": ("rows", "the level differs from row to row, without memory"),
-    "bias_instability:row_memory": ("rows_with_memory", "rows remember the level of the row before"),
+    "bias_instability:row_memory": (
+        "rows_with_memory",
+        "rows remember the level of the row before",
+    ),
     "bias_instability:ramp": ("ramp", "rows settle exponentially, always alike"),
-    "bias_instability:settling": ("settling", "rows settle, by a size that differs between frames"),
+    "bias_instability:settling": (
+        "settling",
+        "rows settle, by a size that differs between frames",
+    ),
     "charge_loss": ("exponential", "the loss is proportional to the charge"),
     "charge_loss:power": ("power", "the loss grows as a power of the charge"),
     "charge_loss:filling": ("filling", "the loss saturates, as of traps that fill up"),
@@ -78,7 +87,10 @@ LAW_WORDS = {
     "correlated_noise:flicker": ("flicker", "power that falls with the frequency"),
     "cti_parallel": ("proportional", "in proportion to the signal, one packet late"),
     "cti_parallel:traps": ("traps", "a power of the signal, released over several packets"),
-    "cti_parallel:two_traps": ("two_traps", "a power of the signal, with two release times"),
+    "cti_parallel:two_traps": (
+        "two_traps",
+        "a power of the signal, with two release times",
+    ),
     "cti_serial": ("proportional", "in proportion to the signal, one packet late"),
     "cti_serial:traps": ("traps", "a power of the signal, released over several packets"),
     "cti_serial:two_traps": ("two_traps", "a power of the signal, with two release times"),
@@ -86,15 +98,24 @@ LAW_WORDS = {
     "dark_hot:glow": ("glow", "around one corner of the sensor"),
     "dark_hot:hot": ("hot_columns", "in single columns"),
     "electronic_memory": ("previous_pixel", "of the pixel read before alone"),
-    "electronic_memory:settling": ("settling", "of all pixels before, falling exponentially"),
-    "electronic_memory:offset_drift": ("offset_drift", "an offset that bright pixels drive"),
+    "electronic_memory:settling": (
+        "settling",
+        "of all pixels before, falling exponentially",
+    ),
+    "electronic_memory:offset_drift": (
+        "offset_drift",
+        "an offset that bright pixels drive",
+    ),
     "gain_drift": ("linear", "in proportion to time"),
     "gain_drift:warming": ("warming", "towards a last value, exponentially"),
     "gain_drift:cycle": ("cycle", "as a sine of time"),
     "gain_drift:curve": ("curve", "as a free curve of time"),
     "gain_nonlinearity": ("polynomial", "by a polynomial of the signal"),
     "gain_nonlinearity:kink": ("kink", "by a change of slope at one level"),
-    "gain_nonlinearity:low_signal": ("low_signal", "the first electrons are lost, or too many"),
+    "gain_nonlinearity:low_signal": (
+        "low_signal",
+        "the first electrons are lost, or too many",
+    ),
     "gain_nonlinearity:curve": ("curve", "by a free curve of the signal"),
     "persistence": ("one_exponential", "released with one time constant"),
     "persistence:power": ("power", "released as a power of the age"),
@@ -103,7 +124,10 @@ LAW_WORDS = {
     "saturation:drained": ("drained", "charge above it is lost, or spills in part"),
     "trap_serial": ("sharp", "full after any packet above its reach"),
     "trap_serial:gradual": ("gradual", "larger packets fill it further"),
-    "trap_serial:two_times": ("two_times", "larger packets fill it further; two release times"),
+    "trap_serial:two_times": (
+        "two_times",
+        "larger packets fill it further; two release times",
+    ),
 }
 """Name and plain words of the law, by the name of an effect, for classes that have several."""
 
