@@ -200,6 +200,8 @@ class Layout:
     map_noise: Mapping[tuple[str, str], float] = field(default_factory=dict)
     sightings: tuple[Seen, ...] = ()
     """Waves and rings detected in the maps, as starts of fits: 'map', 'shape', its parameters."""
+    turn_off: float = np.inf
+    """Lowest level of flats whose variance has collapsed [e-], as pixels are full; inf without."""
     box: int = 64
     lags: int = 4
     clip: float = 5.0
