@@ -73,7 +73,7 @@ class Persistence(Effect):
         return charge + rng.poisson(left).astype(charge.dtype)
 
     def flat_mean(self, axes: Axes, layout: Layout) -> FloatArray:
-        return self._left_at(axes["exposure"], layout)
+        return self._left_at(axes["exposure"], layout) - self._in_bias(layout)
 
     def bias_level(self, axes: Axes, layout: Layout) -> FloatArray:
         return np.where(
@@ -82,7 +82,8 @@ class Persistence(Effect):
 
     def dark_map(self, axes: Axes, layout: Layout) -> FloatArray:
         noise, more = layout.noise, mean_bias(layout)
-        left = self._left_at(axes["exposure"], layout)
+        # Biases hold charge of earlier exposures too, and their mean is subtracted from darks.
+        left = self._left_at(axes["exposure"], layout) - self._in_bias(layout)
         out = np.zeros(len(left))
         for row in np.nonzero(axes["what"] != "column")[0]:
             amp = int(axes["amp"][row])
@@ -130,6 +131,12 @@ class Persistence(Effect):
         shown = self["frac"] * np.exp(-np.maximum(later, 0.0) / self["tau"])
         return np.where(later > 0, shown, 0.0)
 
+    def _in_bias(self, layout: Layout) -> float:
+        """Charge of earlier exposures in the mean bias [e-]."""
+        if not layout.biases:
+            return 0.0
+        return float(self._left_at(np.array(layout.biases, float), layout).mean())
+
     def _left_at(self, number: FloatArray, layout: Layout) -> FloatArray:
         """Charge that earlier exposures left in those with these numbers [e-]."""
         lit = [s for s in layout.shots if s.level > 0]
@@ -142,37 +149,42 @@ class Persistence(Effect):
 
 
 class PowerPersistence(Persistence):
-    """The fraction ``frac`` k^-exponent of a charge appears in the k-th exposure after it.
+    """The fraction ``frac`` k^-exponent exp(-k / tau) of a charge appears in the k-th exposure after it.
 
-    Traps of all release times with equal weight in their logarithm release as 1 / k.
+    Traps of all release times up to ``tau`` release as a power of the time, and faster after tau.
 
     Parameters
     ----------
     values : mapping of str to float
-        Plausible ranges: ``frac``: 1e-05 to 0.001 (0 changes nothing); ``exponent``: 0.3 to 3.
+        Plausible ranges: ``frac``: 1e-05 to 0.001 (0 changes nothing); ``exponent``: 0 to 3;
+        ``tau`` [exposure]: 3 to 300.
 
     Examples
     --------
-    >>> PowerPersistence({"frac": 0.0001, "exponent": 1.0}).name
+    >>> PowerPersistence({"frac": 0.0001, "exponent": 1.0, "tau": 50.0}).name
     'persistence:power'
     """
 
     variant = "power"
     parameters = (
         Parameter("frac", "", 1e-5, 1e-3, amplitude=True),
-        Parameter("exponent", "", 0.3, 3.0, law="flat"),
+        Parameter("exponent", "", 0.0, 3.0, law="flat"),
+        Parameter("tau", "exposure", 3.0, 300.0),
     )
     source = (
         "A range of release times gives a power of time: Smith et al. 2008, Proc. SPIE 7021, 70210J, "
-        "theory of image persistence; range assumed"
+        "theory of image persistence; ranges assumed"
     )
 
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
-        return [{"frac": 1e-4, "exponent": v} for v in (0.7, 1.5)]
+        return [
+            {"frac": 1e-4, "exponent": v, "tau": tau} for v in (0.5, 1.5) for tau in (10.0, 60.0)
+        ]
 
     def _after(self, later: FloatArray) -> FloatArray:
-        shown = self["frac"] * np.maximum(later, 1.0) ** -self["exponent"]
+        k = np.maximum(later, 1.0)
+        shown = self["frac"] * k ** -self["exponent"] * np.exp(-k / self["tau"])
         return np.where(later > 0, shown, 0.0)
 
 

@@ -291,7 +291,10 @@ def test_drifts(variant, strength):
 # -- persistence, glow, noise
 
 LATE = {
-    "power": ({"frac": 1e-3, "exponent": 1.4}, 0.0, lambda k: 1e-3 * k**-1.4),
+    "power": (
+        {"frac": 1e-3, "exponent": 1.4, "tau": 12.0}, 0.0,
+        lambda k: 1e-3 * k**-1.4 * np.exp(-k / 12),
+    ),
     "two_times": (
         {"frac": 1e-3, "tau": 0.8, "slow": 0.3, "slow_tau": 6.0, "threshold": 3e4}, 3e4,
         lambda k: 1e-3 * (0.7 * np.exp(-k / 0.8) + 0.3 * np.exp(-k / 6.0)),
