@@ -332,8 +332,10 @@ def predict_spots(
         grow_spots, kx, ky, sigma=sigma, flux=top, halo=halo, neighbours=neighbours, law=law,
         slopes=slopes,
     )  # fmt: skip
-    every = STEPS // KNOTS
-    images = grow(phases=centres)
+    # A loss that follows a root of the charge is no polynomial in the flux.
+    bending = bool(law.losses)
+    every = 1 if bending else STEPS // KNOTS
+    images = grow(phases=centres, steps=SPILLING if bending else STEPS)
     spilling = bool(images[-1].max() >= law.full_well)
     if spilling:
         # The flux at which pixels spill depends on the place: combine all x with all y.
@@ -349,7 +351,7 @@ def predict_spots(
         )
     plain = measure(images[every - 1 :: every])
     lines = _interpolate(plain[:, -1], np.column_stack([plain[:, :-1], plain[:, -1] - light]),
-                         turning=spilling)  # fmt: skip
+                         turning=spilling or bending)  # fmt: skip
     if change is None or np.array_equal(change(images[-1]), images[-1]):
         return dict(zip(MEASURED, lines(wanted).T, strict=True))
     # Changes after collection need not be smooth in the flux: interpolate them piecewise.
