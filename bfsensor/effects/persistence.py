@@ -179,7 +179,9 @@ class PowerPersistence(Persistence):
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
         return [
-            {"frac": 1e-4, "exponent": v, "tau": tau} for v in (0.5, 1.5) for tau in (10.0, 60.0)
+            {"frac": 1e-4, "exponent": v, "tau": tau}
+            for v in (0.5, 1.5)
+            for tau in (10.0, 60.0)
         ]
 
     def _after(self, later: FloatArray) -> FloatArray:
