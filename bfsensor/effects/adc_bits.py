@@ -281,11 +281,13 @@ class ShiftedCodes(AdcBits):
 class WideCodes(AdcBits):
     """Every 2^bit-th code is ``delta`` ADU wider, at the cost of the next one.
 
+    Every second code (``bit`` = 1) is no candidate: each fit has an excess of even codes.
+
     Parameters
     ----------
     values : mapping of str to float
         Plausible ranges: ``delta`` [ADU]: 0.05 to 1 in magnitude, either sign (0 changes nothing);
-        ``bit``: 1 to 9, whole; ``place``: -1 to 0, whole: the wide codes are those just below
+        ``bit``: 2 to 9, whole; ``place``: -1 to 0, whole: the wide codes are those just below
         multiples of 2^bit, or these themselves.
 
     Examples
@@ -297,7 +299,7 @@ class WideCodes(AdcBits):
     variant = "wide"
     parameters = (
         Parameter("delta", "ADU", 0.05, 1.0, signed=True, amplitude=True),
-        Parameter("bit", "", 1, 9, law="whole"),
+        Parameter("bit", "", 2, 9, law="whole"),
         Parameter("place", "", -1, 0, law="whole"),
     )
     touches = ("code_hist",)

@@ -258,7 +258,7 @@ def test_rows_have_the_covariance_that_is_said():
     [
         ("", 0.6, 2), ("", -0.6, 2), ("", 1.7, 5), ("", -1.7, 4), ("", 2.0, 7),
         ("shifted", 3.0, 5), ("shifted", -2.0, 4), ("shifted", 1.0, 2), ("shifted", -2.0, 7),
-        ("wide", 0.4, 3), ("wide", -0.4, 4), ("wide", 0.8, 1),
+        ("wide", 0.4, 3), ("wide", -0.4, 4), ("wide", 0.8, 2),
     ],
 )  # fmt: skip
 def test_codes_are_as_wide_as_is_said(variant, delta, bit):
