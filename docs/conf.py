@@ -99,7 +99,7 @@ def to_markdown(text: str) -> str:
 
 def write_effects() -> None:
     """Write the page of effect classes from the library itself, and draw their pictures."""
-    from bfsensor.diagnose.report.class_words import CLASS_WORDS
+    from bfsensor.diagnose.report.class_words import CLASS_WORDS, LAW_WORDS
     from bfsensor.effects.device_parameter import DeviceParameter
     from bfsensor.effects.library import LIBRARY
 
@@ -114,6 +114,18 @@ def write_effects() -> None:
         "",
     ]
     kinds = (*LIBRARY, DeviceParameter)
+    lines += [
+        "A class is named by what only it can do: where it acts, in which order of readout, and on",
+        "which overscan. Within a class a diagnosis tells the law apart (`law` in report.json):",
+        "",
+        "| class | law | meaning | source |",
+        "|---|---|---|---|",
+    ]
+    for kind in sorted(kinds, key=lambda k: (k.word, k.variant)):
+        name = f"{kind.word}:{kind.variant}".rstrip(":")
+        law, meaning = LAW_WORDS.get(name, (kind.variant, ""))
+        lines += [f"| {kind.word} | {law} | {meaning} | {kind.source} |"]
+    lines += [""]
     for word in sorted({kind.word for kind in kinds}):
         shown = effect_figures.PICTURES[word]
         lines += [f"## {word}", "", CLASS_WORDS[word].capitalize() + ".", ""]
@@ -126,8 +138,10 @@ def write_effects() -> None:
         ]
         lines += [""]
         for kind in (k for k in kinds if k.word == word):
-            if kind.variant:
-                lines += [f"**{kind.variant}**", ""]
+            name = f"{kind.word}:{kind.variant}".rstrip(":")
+            law = LAW_WORDS.get(name, (kind.variant, ""))[0]
+            if law:
+                lines += [f"**{law}**", ""]
             lines += [class_text(kind), ""]
             if kind.parameters:
                 lines += ["| parameter | unit | from | to |", "|---|---|---|---|"]

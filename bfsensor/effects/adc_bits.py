@@ -1,9 +1,10 @@
-"""Errors of a converter's bits: one bit has a wrong weight, so that codes are skipped or too wide."""
+"""Errors of a converter: a bit has a wrong weight, moves codes by a constant, or makes wide codes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,11 +56,17 @@ class AdcBits(Effect):
 
     word = "adc_bits"
     stage = "converter"
-    parameters = (
+    parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("delta", "ADU", 0.2, 2.0, signed=True, amplitude=True),
         Parameter("bit", "", 2, 9, law="whole"),
     )
-    touches = ("code_hist", "flat_mean", "flat_cov", "bias_cov", "spot")
+    touches: ClassVar[tuple[str, ...]] = (
+        "code_hist",
+        "flat_mean",
+        "flat_cov",
+        "bias_cov",
+        "spot",
+    )
     source = (
         "Counts of 0 and 1 by bit in flats: Abbott 1995, In-situ CCD testing (CTIO), bit biases; "
         "effects of converters on CCD data: Boone et al. 2018, PASP 130, 064504; range assumed"
@@ -89,31 +96,31 @@ class AdcBits(Effect):
         code, bit, own = axes["code"].astype(int), axes["bit"].astype(int), int(self["bit"])
         out = np.zeros(len(code))
         high, half = bit >= 0, 2**own
-        for odd in (True, False):
-            here = high & ((bit == own) if odd else (bit > own))
-            change = self._width(-code[here], odd=odd)
+        near = np.arange(-REMAINDERS // 2, REMAINDERS // 2)
+        for edge, here in ((half, high & (bit == own)), (2 * half, high & (bit > own))):
+            change = self._widths(edge + code[here])
             # The expected frequency is a mean over the codes beside, which the error changes too.
-            total = self["delta"] * (1 if odd else -1) if 2 * half > REMAINDERS else 0.0
+            total = float(self._widths(edge + near).sum()) if 2 * half > REMAINDERS else 0.0
             out[here] += (1 + change) / (1 + total / REMAINDERS) - 1
         if 2 * half <= REMAINDERS:
-            place = code % (2 * half)
-            out[~high] += self._width(half - place[~high], odd=True)
-            out[~high] += self._width(2 * half - place[~high], odd=False)
+            out[~high] += self._widths(code[~high])
             return out
         # Some multiples of 64 are odd multiples of the bit and some even: their shares depend on
         # the levels of the flats.
+        after = np.arange(REMAINDERS)
+        # Codes of the second half of a period lie below the next multiple.
+        after = np.where(after < REMAINDERS // 2, after, after - REMAINDERS)
         for amp in np.unique(axes["amp"]):
             mine = axes["amp"] == amp
             bits, first = np.unique(np.where(mine & high, bit, -1), return_index=True)
             share = dict(zip(bits.tolist(), axes["share"][first].tolist(), strict=True))
             even = sum(v for b, v in share.items() if b > own)
-            below = np.arange(1, REMAINDERS + 1)
-            change = share.get(own, 0.0) * self._width(below, odd=True)
-            change = change + even * self._width(below, odd=False)
+            change = share.get(own, 0.0) * self._widths(half + after)
+            change = change + even * self._widths(2 * half + after)
             # Frequencies are relative to their mean: where one code rises, the others fall.
             change = (1 + change) / (1 + change.mean()) - 1
             rows = mine & ~high
-            out[rows] += change[REMAINDERS - code[rows] - 1]
+            out[rows] += change[code[rows]]
         return out
 
     def bias_cov(self, axes: Axes, layout: Layout) -> FloatArray:
@@ -174,13 +181,8 @@ class AdcBits(Effect):
 
     def _error(self, level: FloatArray, sigma: FloatArray) -> FloatArray:
         """Mean error of the codes [ADU] of levels [ADU] with Gaussian noise ``sigma`` [ADU]."""
-        delta, half = self["delta"], 2.0 ** int(self["bit"])
-        period, s = 2 * half, abs(delta)
-        # One end of the set bit is a jump; at the other the wide code makes a ramp of length delta.
-        if delta > 0:
-            ends = (half - 1 + s / 2, s), (period - 0.5, 0.0)
-        else:
-            ends = (half - s - 0.5, 0.0), (period - 1 - s / 2, s)
+        delta, period = self["delta"], 2.0 * 2 ** int(self["bit"])
+        ends = self._ends()
         place = np.asarray(level % period)
         on = np.zeros(place.shape)
         for k in range(-STEPS, STEPS + 1):
@@ -190,14 +192,149 @@ class AdcBits(Effect):
         even = (ends[1][0] - ends[0][0]) / period
         return np.asarray(-delta * np.where(sigma > 0.75 * period, even, on))
 
-    def _width(self, below: NDArray[np.int64], *, odd: bool) -> FloatArray:
-        """Change of the width of the ``below``-th code below odd or even multiples of 2^bit [codes]."""
+    def _ends(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Places in a period at which the bit is set and cleared, and the lengths of their ramps."""
+        delta, half = self["delta"], 2.0 ** int(self["bit"])
+        # One end of the set bit is a jump; at the other the wide code makes a ramp of length delta.
+        if delta > 0:
+            return (half - 1 + delta / 2, delta), (2 * half - 0.5, 0.0)
+        return (half + delta - 0.5, 0.0), (2 * half - 1 + delta / 2, -delta)
+
+    def _widths(self, place: NDArray[np.int64]) -> FloatArray:
+        """Change of the frequency of codes by their place, counted from an even multiple of 2^bit."""
         delta, half = self["delta"], 2 ** int(self["bit"])
-        if (delta > 0) == odd:
-            out = np.where(below == 1, abs(delta), 0.0)
-        else:
-            out = -np.clip(abs(delta) - (below - 1.0), 0.0, 1.0)
-        return np.asarray(np.where((below >= 1) & (below <= half), out, 0.0))
+        place = np.asarray(place) % (2 * half)
+        out = np.zeros(place.shape)
+        for edge, odd in ((half, True), (2 * half, False)):
+            below = edge - place
+            if (delta > 0) == odd:
+                change = np.where(below == 1, abs(delta), 0.0)
+            else:
+                change = -np.clip(abs(delta) - (below - 1.0), 0.0, 1.0)
+            out += np.where((below >= 1) & (below <= half), change, 0.0)
+        return out
+
+
+class ShiftedCodes(AdcBits):
+    """Codes with bit ``bit`` set are ``delta`` ADU too high: an offset is added after conversion.
+
+    Then ``delta`` codes at odd multiples of 2^bit never occur, and as many at even ones occur twice as
+    often; the other way round, below the multiples, for a negative ``delta``.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``delta`` [ADU]: 0.2 to 4 in magnitude, either sign (0 changes nothing);
+        ``bit``: 1 to 14, whole.
+
+    Examples
+    --------
+    >>> ShiftedCodes({"delta": 3.0, "bit": 5}).convert(np.array([31.2, 32.2]))
+    array([31.2, 35.2])
+    """
+
+    variant = "shifted"
+    parameters = (
+        Parameter("delta", "ADU", 0.2, 4.0, signed=True, amplitude=True),
+        Parameter("bit", "", 1, 14, law="whole"),
+    )
+    source = (
+        "Offsets that depend on the bits of a code: Boone et al. 2018, PASP 130, 064504; sub-ranges of "
+        "a converter that do not meet: IEEE Std 1241-2010, section 9.4; range assumed"
+    )
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        low, high = (int(v) for v in cls.parameters[1][2:4])
+        return [
+            {"delta": delta, "bit": float(bit)}
+            for bit in range(low, high + 1)
+            for delta in (1.0, -1.0, 3.0, -3.0)
+        ]
+
+    def convert(self, levels: Image) -> Image:
+        if self["delta"] == 0:
+            return levels
+        code = np.floor(np.clip(levels + 0.5, 0, LARGEST - 1e-3))
+        half = 2.0 ** int(self["bit"])
+        return levels + self["delta"] * (code % (2 * half) >= half)
+
+    def _error(self, level: FloatArray, sigma: FloatArray) -> FloatArray:
+        return -super()._error(level, sigma)
+
+    def _ends(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        half = 2.0 ** int(self["bit"])
+        return (half - 0.5, 0.0), (2 * half - 0.5, 0.0)
+
+    def _widths(self, place: NDArray[np.int64]) -> FloatArray:
+        delta, half = self["delta"], 2 ** int(self["bit"])
+        place = np.asarray(place) % (2 * half)
+        # Codes from half to period - 1 appear delta higher, some of them in the next period.
+        first = half + delta + np.array([0, -2 * half])
+        there = [
+            np.clip(place + 1 - f, 0, 1) - np.clip(place + 1 - half - f, 0, 1)
+            for f in first
+        ]
+        return np.asarray(there[0] + there[1] - (place >= half), float)
+
+
+class WideCodes(AdcBits):
+    """Every 2^bit-th code is ``delta`` ADU wider, at the cost of the next one.
+
+    Every second code (``bit`` = 1) is no candidate: each fit has an excess of even codes.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``delta`` [ADU]: 0.05 to 1 in magnitude, either sign (0 changes nothing);
+        ``bit``: 2 to 9, whole; ``place``: -1 to 0, whole: the wide codes are those just below
+        multiples of 2^bit, or these themselves.
+
+    Examples
+    --------
+    >>> WideCodes({"delta": 0.3, "bit": 2, "place": 0}).convert(np.array([4.7, 4.9]))
+    array([4.4, 4.9])
+    """
+
+    variant = "wide"
+    parameters = (
+        Parameter("delta", "ADU", 0.05, 1.0, signed=True, amplitude=True),
+        Parameter("bit", "", 2, 9, law="whole"),
+        Parameter("place", "", -1, 0, law="whole"),
+    )
+    touches = ("code_hist",)
+    source = "Differential nonlinearity: IEEE Std 1241-2010, section 9.4; range assumed"
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        low, high = (int(v) for v in cls.parameters[1][2:4])
+        return [
+            {"delta": 0.3, "bit": float(bit), "place": float(place)}
+            for bit in range(low, high + 1) for place in (-1, 0)
+        ]  # fmt: skip
+
+    def convert(self, levels: Image) -> Image:
+        delta, half = self["delta"], 2 ** int(self["bit"])
+        # Place above the transition from the wide code to the next one.
+        above = (levels - 0.5 - self["place"]) % half
+        if delta >= 0:
+            return np.where(above < delta, levels - delta, levels)
+        return np.where(above >= half + delta, levels - delta, levels)
+
+    def bias_cov(self, axes: Axes, layout: Layout) -> FloatArray:
+        return np.zeros(len(axes["amp"]))
+
+    def signal(self, level: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
+        # The mean error, delta / 2^bit ADU in a pixel of 2^bit, is the same at all levels.
+        return level
+
+    def covariances(self, c: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
+        return c
+
+    def _widths(self, place: NDArray[np.int64]) -> FloatArray:
+        half = 2 ** int(self["bit"])
+        own = np.asarray(place - int(self["place"])) % half
+        return np.asarray(self["delta"] * (1.0 * (own == 0) - (own == 1 % half)))
 
 
 def _known(layout: Layout) -> bool:

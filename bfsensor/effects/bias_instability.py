@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
-from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Segment
 from bfsensor.effects.read_noise import ReadNoise, added
 from bfsensor.typing import FloatArray
 
@@ -84,3 +85,127 @@ class BiasByRow(ReadNoise):
 
     def on_frame(self, i: NDArray, j: NDArray, width: float) -> FloatArray:
         return np.where(np.broadcast_arrays(i, j)[1] == 0, self["rms"] ** 2, 0.0)
+
+
+class BiasByRowWithMemory(ReadNoise):
+    """The bias level of each row varies by ``rms`` and remembers the part ``corr`` of the row before.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``rms`` [e-]: 0.3 to 3 (0 changes nothing); ``corr``: 0.05 to 0.99.
+
+    Examples
+    --------
+    >>> BiasByRowWithMemory({"rms": 0.9, "corr": 0.7}).name
+    'bias_instability:row_memory'
+    """
+
+    word = "bias_instability"
+    variant = "row_memory"
+    parameters = (
+        Parameter("rms", "e-", 0.3, 3.0, amplitude=True),
+        Parameter("corr", "", 0.05, 0.99, law="flat"),
+    )
+    touches = ("bias_cov", "bias_level", "flat_cov")
+    source = (
+        "Bias levels by row that follow the overscan's: Plazas Malagon et al. 2024, arXiv 2404.14516; "
+        "range assumed"
+    )
+
+    def noise(
+        self, frames: list[Image], layout: Layout, rng: np.random.Generator
+    ) -> list[Image]:
+        if self["rms"] == 0:
+            return frames
+        keep, out = self["corr"], []
+        for frame in frames:
+            fresh = self["rms"] * rng.standard_normal(len(frame))
+            fresh[1:] *= np.sqrt(1 - keep**2)
+            out.append(lfilter([1.0], [1.0, -keep], fresh)[:, None])
+        return added(frames, out)
+
+    def in_order(self, lag: NDArray, width: NDArray) -> FloatArray:
+        rows, part = np.divmod(np.abs(lag) / np.asarray(width), 1.0)
+        return np.asarray(self._rows(rows) * (1 - part) + self._rows(rows + 1) * part)
+
+    def on_frame(self, i: NDArray, j: NDArray, width: float) -> FloatArray:
+        return self._rows(np.abs(np.broadcast_arrays(i, j)[1]))
+
+    def _rows(self, apart: NDArray) -> FloatArray:
+        """Covariance of two rows [e-^2]."""
+        keep = float(np.clip(self["corr"], 0.0, 0.999))
+        return np.asarray(self["rms"] ** 2 * keep**apart)
+
+
+class SettlingByFrame(ReadNoise):
+    """Each row settles exponentially over ``length`` pixels, by ``rms`` that differs between frames.
+
+    The settling of a frame is the same in all of its rows; that of the mean of all frames is 0.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``rms`` [e-]: 1 to 30 at the first column (0 changes nothing); ``length``
+        [pixel]: 3 to 300.
+
+    Examples
+    --------
+    >>> SettlingByFrame({"rms": 5.0, "length": 20.0}).name
+    'bias_instability:settling'
+    """
+
+    word = "bias_instability"
+    variant = "settling"
+    parameters = (
+        Parameter("rms", "e-", 1.0, 30.0, amplitude=True),
+        Parameter("length", "pixel", 3.0, 300.0),
+    )
+    touches = ("bias_cov", "bias_level", "dark_map", "flat_cov")
+    told_by_scatter = ("bias_level", "dark_map")
+    bends = True
+    source = (
+        "Two-dimensional bias that differs between frames of LSST's camera: Utsumi et al. 2024, Proc. "
+        "SPIE 13103; an exponential along rows, as of a clamp that settles; range assumed"
+    )
+
+    def noise(
+        self, frames: list[Image], layout: Layout, rng: np.random.Generator
+    ) -> list[Image]:
+        if self["rms"] == 0:
+            return frames
+        return added(frames, [
+            self["rms"] * rng.standard_normal() * self._shape(f.shape[1])[None] for f in frames
+        ])  # fmt: skip
+
+    def in_order(self, lag: NDArray, width: NDArray) -> FloatArray:
+        lag, width = np.broadcast_arrays(np.abs(np.asarray(lag)), np.asarray(width))
+        out = np.zeros(lag.shape)
+        for size in np.unique(width):
+            rows = width == size
+            shape = self._shape(int(size)) - self._shape(int(size)).mean()
+            spectrum = np.abs(np.fft.rfft(shape)) ** 2
+            # Rows follow one another without a gap and are alike: the covariance is periodic.
+            c = np.fft.irfft(spectrum, int(size)) / int(size)
+            out[rows] = self["rms"] ** 2 * c[lag[rows].astype(int) % int(size)]
+        return out
+
+    def modes(self, word: str, axes: Axes, layout: Layout) -> FloatArray | None:
+        """Scatter of levels that are those of the image above the overscan's, frame by frame."""
+        if word not in self.told_by_scatter:
+            return None
+        apart = np.array([
+            self._mean(s.prescan, s.columns, s) - self._mean(s.prescan + s.columns, s.serial_overscan, s)
+            for s in layout.segments
+        ])  # fmt: skip
+        size = apart[axes["amp"].astype(int)] * (axes["what"] == "level")
+        return np.asarray(self["rms"] * np.diag(size)[:, size != 0])
+
+    def _mean(self, first: int, count: int, s: Segment) -> float:
+        """Mean of the settling over some columns of a frame."""
+        width = s.prescan + s.columns + s.serial_overscan
+        return float(self._shape(width)[first : first + count].mean()) if count else 0.0
+
+    def _shape(self, width: int) -> FloatArray:
+        """Settling by column of the frame in readout order, 1 at the first."""
+        return np.asarray(np.exp(-np.arange(width) / self["length"]))

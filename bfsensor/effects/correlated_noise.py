@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +63,84 @@ class NoiseInTime(ReadNoise):
         # Fits may try values of 1 and more, at which the correlation would not decay.
         keep = float(np.clip(self["corr"], -0.999, 0.999))
         return np.asarray(self["rms"] ** 2 * keep ** np.abs(lag))
+
+
+SAMPLES = 2**16
+"""Length of the series whose spectrum gives the covariances of flicker noise [pixel times].
+
+Chosen: 256 rows of 256 pixels; twice as long, noise that is flatter than 1 / f changes by less than
+1 % at measured lags, as the parameter ``rms`` is that of noise with a ``memory``."""
+
+
+class FlickerNoise(ReadNoise):
+    r"""Noise of ``rms`` whose power falls as :math:`(f^2 + f_0^2)^{-\alpha/2}` with the frequency f.
+
+    f_0 = 1 / (2 pi memory): slower noise is white.  alpha is ``exponent``; 2 is the noise of one
+    relaxation, as in the plain law, 1 that of many.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``rms`` [e-]: 0.5 to 4 (0 changes nothing); ``exponent``: 0.4 to 2;
+        ``memory`` [pixel times]: 3 to 3000.
+
+    Examples
+    --------
+    >>> FlickerNoise({"rms": 1.0, "exponent": 1.0, "memory": 100.0}).name
+    'correlated_noise:flicker'
+    """
+
+    word = "correlated_noise"
+    variant = "flicker"
+    parameters = (
+        RMS,
+        Parameter("exponent", "", 0.4, 2.0, law="flat"),
+        Parameter("memory", "pixel times", 3.0, 3000.0),
+    )
+    touches = ("bias_cov", "bias_level", "flat_cov")
+    source = (
+        "Flicker noise of an output transistor: Janesick 2001, Scientific Charge-Coupled Devices, "
+        "SPIE Press, section 6.2; sum of relaxations: McWhorter 1957; ranges assumed"
+    )
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        return [
+            {"rms": 1.0, "exponent": v, "memory": memory}
+            for v in (0.8, 1.4) for memory in (20.0, 300.0)
+        ]  # fmt: skip
+
+    def noise(
+        self, frames: list[Image], layout: Layout, rng: np.random.Generator
+    ) -> list[Image]:
+        if self["rms"] == 0:
+            return frames
+        out = []
+        for frame in frames:
+            power = _power(frame.size, self["exponent"], self["memory"])
+            white = np.fft.rfft(rng.standard_normal(frame.size))
+            series = np.fft.irfft(white * np.sqrt(power), frame.size)
+            out.append(self["rms"] * series.reshape(frame.shape))
+        return added(frames, out)
+
+    def in_order(self, lag: NDArray, width: NDArray) -> FloatArray:
+        c = _flicker(float(np.clip(self["exponent"], 0.0, 3.0)), self["memory"])
+        near = np.minimum(np.abs(np.asarray(lag)).astype(int), len(c) - 1)
+        return np.asarray(self["rms"] ** 2 * c[near])
+
+
+def _power(size: int, exponent: float, memory: float) -> FloatArray:
+    """Power by frequency of flicker noise in a series, of variance 1."""
+    f = np.fft.rfftfreq(size)
+    power = (f**2 + (2 * np.pi * memory) ** -2.0) ** (-0.5 * exponent)
+    return np.asarray(power / np.fft.irfft(power, size)[0])
+
+
+@lru_cache(maxsize=64)
+def _flicker(exponent: float, memory: float) -> FloatArray:
+    """Correlation of flicker noise by lag, up to half of :data:`SAMPLES`."""
+    power = _power(SAMPLES, exponent, memory)
+    return np.asarray(np.fft.irfft(power, SAMPLES)[: SAMPLES // 2])
 
 
 class CommonNoise(ReadNoise):

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
-from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Seen
 from bfsensor.effects.transfer import (
+    SLOWER,
+    TRAPS,
+    Traps,
     behind_flat,
     leave_behind,
     trail_covariances,
@@ -58,3 +62,74 @@ class CtiSerial(Effect):
     ) -> FloatArray:
         mean = np.mean([s.prescan + (s.columns + 1) / 2 for s in layout.segments])
         return trail_image(images, self["cti"] * float(mean), layout.backwards("x"), -1)
+
+
+class SerialTraps(Traps):
+    """Traps in the serial register: a power of the signal, released over several packets.
+
+    The equations are those of :class:`bfsensor.effects.transfer.Traps`.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``cti``: 1e-07 to 5e-06 at 5e4 e- (0 changes nothing); ``power``: 0.2 to
+        1.2, of the signal; ``tau`` [packets]: 0.3 to 10.
+
+    Examples
+    --------
+    >>> SerialTraps({"cti": 7e-07, "power": 0.6, "tau": 2.0}).name
+    'cti_serial:traps'
+    """
+
+    word = "cti_serial"
+    variant = "traps"
+    axis = 1
+    parameters: ClassVar[tuple[Parameter, ...]] = TRAPS
+    touches = ("serial_overscan", "flat_cov", "flat_mean", "spot")
+    source = (
+        "Volume of a packet as a power of its charge, exponential release: Short et al. 2013, "
+        "MNRAS 430, 3078; Massey et al. 2014, MNRAS 439, 887"
+    )
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        return [
+            {"cti": 1e-6, "power": power, "tau": tau}
+            for power in (0.5, 1.0)
+            for tau in (0.5, 3.0)
+        ]
+
+    def serial_overscan(self, axes: Axes, layout: Layout) -> FloatArray:
+        return self._overscan(axes, layout)
+
+
+class TwoSerialTraps(SerialTraps):
+    """Two kinds of traps in the serial register, which release the part ``slow`` over ``slow_tau``.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``cti``: 1e-07 to 5e-06 at 5e4 e- (0 changes nothing); ``power``: 0.2 to
+        1.2, of the signal; ``tau`` [packets]: 0.3 to 10; ``slow``: 0.02 to 0.98; ``slow_tau``
+        [packets]: 2 to 40.
+
+    Examples
+    --------
+    >>> values = {"cti": 7e-07, "power": 0.6, "tau": 1.0, "slow": 0.4, "slow_tau": 8.0}
+    >>> TwoSerialTraps(values).name
+    'cti_serial:two_traps'
+    """
+
+    variant = "two_traps"
+    parameters = (*TRAPS, *SLOWER)
+    source = (
+        "Several species of traps with release times of their own: Massey et al. 2014, MNRAS 439, "
+        "887, section 2"
+    )
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        return [
+            {"cti": 1e-6, "power": power, "tau": 0.7, "slow": 0.3, "slow_tau": 7.0}
+            for power in (0.5, 1.0)
+        ]

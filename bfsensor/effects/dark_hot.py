@@ -1,4 +1,4 @@
-"""Additional dark current, in all pixels or in hot columns."""
+"""Additional dark current, in all pixels, in hot columns, or as the glow of a corner."""
 
 from __future__ import annotations
 
@@ -189,3 +189,100 @@ class HotColumns(_Dark):
             return None
         born = self._born(shot.seconds, shot.temperature) / shot.level
         return np.broadcast_to(born * self.hot(layout), layout.shape)
+
+
+class Glow(Effect):
+    """Glow of ``rate`` [e-/s] at a corner of the sensor, which falls as exp(-r / length).
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``rate`` [e-/s]: 0.02 to 20 (0 changes nothing); ``length`` [pixel]: 10 to
+        1000; ``corner``: 0 to 3, whole, of (first column, first row), (last, first), (first, last),
+        (last, last).
+
+    Examples
+    --------
+    >>> Glow({"rate": 0.5, "length": 60.0, "corner": 0}).name
+    'dark_hot:glow'
+    """
+
+    word = "dark_hot"
+    variant = "glow"
+    stage = "store"
+    parameters = (
+        Parameter("rate", "e-/s", 0.02, 20.0, amplitude=True),
+        Parameter("length", "pixel", 10.0, 1000.0),
+        Parameter("corner", "", 0, 3, law="whole"),
+    )
+    touches = ("dark_map", "flat_map")
+    by_time = True
+    of_pixels = True
+    source = (
+        "Glow of an output amplifier, which falls with the distance from it: Janesick 2001, Scientific "
+        "Charge-Coupled Devices, SPIE Press, section 7.2; ranges assumed"
+    )
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        return [
+            {"rate": 0.5, "length": length, "corner": float(corner)}
+            for corner in range(4) for length in (30.0, 120.0)
+        ]  # fmt: skip
+
+    def store(
+        self,
+        charge: Image,
+        shot: Shot,
+        layout: Layout,
+        rng: np.random.Generator,
+        memory: dict[str, NDArray],
+    ) -> Image:
+        if self["rate"] == 0:
+            return charge
+        mean = self._light(layout) * shot.seconds
+        return charge + rng.poisson(mean).astype(charge.dtype)
+
+    def pattern(self, shot: Shot, layout: Layout) -> FloatArray | None:
+        return self._light(layout) * shot.seconds / shot.level if shot.level > 0 else None
+
+    def dark_map(self, axes: Axes, layout: Layout) -> FloatArray:
+        noise, more = layout.noise, mean_bias(layout)
+        out = np.zeros(len(axes["time"]))
+        light = self._light(layout)
+        for amp, s in enumerate(layout.segments):
+            own = np.asarray(axes["amp"]).astype(int) == amp
+            glow = light[s.y : s.y + s.rows, s.sensor_column(np.arange(s.columns))]
+            for seconds in np.unique(axes["time"][own]):
+                rows = own & (axes["time"] == seconds)
+                part, kept = self._seen(glow * seconds, float(noise[amp]), more)
+                columns = (kept * (1 - part)).sum(0) / np.maximum((1 - part).sum(0), 1e-9)
+                what, x = axes["what"][rows], axes["x"][rows].astype(int)
+                column = (columns - np.median(columns))[np.clip(x, 0, len(columns) - 1)]
+                level = float((kept * (1 - part)).sum() / max((1 - part).sum(), 1e-9))
+                out[rows] = np.select(
+                    [what == "struck", what == "column"], [float(part.sum()), column], level
+                )
+        return out
+
+    def _seen(
+        self, mean: FloatArray, noise: float, more: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Fraction of pixels that count as struck, and the mean of the others, by mean charge."""
+        # A function of one smooth variable: interpolate it between forty means.
+        top = float(np.max(mean))
+        if not top > 0:
+            return np.zeros(mean.shape), mean
+        knots = np.append(0.0, np.geomspace(1e-3 * top, top, 40))
+        level = float(np.median(mean))
+        found = np.array([struck_pixels(float(m), level, noise, more) for m in knots])
+        return np.interp(mean, knots, found[:, 0]), np.interp(mean, knots, found[:, 1])
+
+    def _light(self, layout: Layout) -> FloatArray:
+        """Glow by pixel of the sensor [e-/s]."""
+        ny, nx = layout.shape
+        right, top = int(self["corner"]) % 2, int(self["corner"]) // 2
+        x = np.arange(nx) + 0.5
+        y = np.arange(ny) + 0.5
+        away = np.hypot((nx - x if right else x)[None], (ny - y if top else y)[:, None])
+        return np.asarray(self["rate"] * np.exp(-away / self["length"]))

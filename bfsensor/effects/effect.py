@@ -204,6 +204,8 @@ class Layout:
     map_noise: Mapping[tuple[str, str], float] = field(default_factory=dict)
     sightings: tuple[Seen, ...] = ()
     """Waves and rings detected in the maps, as starts of fits: 'map', 'shape', its parameters."""
+    turn_off: float = np.inf
+    """Lowest level of flats whose variance has collapsed [e-], as pixels are full; inf without."""
     box: int = 64
     lags: int = 4
     clip: float = 5.0
@@ -255,6 +257,8 @@ class Law(NamedTuple):
     --------
     >>> Law(loss=1e-7).with_law(Law(loss=2e-7, full_well=1e5)).full_well
     100000.0
+    >>> float(Law(losses=((1e-7, 0.5, np.inf),)).lost(1e5))
+    0.01
     """
 
     bend: float = 0.0
@@ -263,14 +267,44 @@ class Law(NamedTuple):
     """q [1/e-]: light is collected with the efficiency exp(-q Q)."""
     full_well: float = np.inf
     """Charge of a pixel above which the rest spills along its column [e-]."""
+    losses: tuple[tuple[float, float, float], ...] = ()
+    """(q, p, K) of further losses: the efficiency is also exp(-q 1e5 (Q/1e5)^p / (1 + Q/K))."""
+    drain: float = 0.0
+    """Part of the charge above the full well that is lost where it spills, from 0 to 1."""
 
     def with_law(self, other: Law) -> Law:
-        """Combine two laws: coefficients add, the lower full well holds."""
+        """Combine two laws: coefficients add, the lower full well holds with its drain."""
         return Law(
             self.bend + other.bend,
             self.loss + other.loss,
             min(self.full_well, other.full_well),
+            self.losses + other.losses,
+            self.drain if self.full_well <= other.full_well else other.drain,
         )
+
+    @property
+    def loses(self) -> bool:
+        """Whether the efficiency depends on the charge."""
+        return bool(self.loss or self.losses)
+
+    def lost(self, charge: FloatArray | float) -> FloatArray:
+        """Negative logarithm of the efficiency with which light is collected beside a charge [e-]."""
+        full = np.maximum(np.asarray(charge, float), 0.0)
+        out = self.loss * np.asarray(charge, float)
+        for q, power, knee in self.losses:
+            out = out + q * 1e5 * (full / 1e5) ** power / (1 + full / knee)
+        return np.asarray(out)
+
+    def light(self, charge: FloatArray) -> FloatArray:
+        """Light [e-] that fills an empty pixel up to a charge [e-], shape (n,)."""
+        if not self.losses:
+            m = np.asarray(charge, float)
+            return np.expm1(self.loss * m) / self.loss if self.loss else m
+        # Nodes dense near 0, where a root of the charge rises steeply: Q = m t^2.
+        nodes, weights = np.polynomial.legendre.leggauss(12)
+        t = 0.5 * (nodes + 1)
+        at = np.multiply.outer(np.asarray(charge, float), t * t)
+        return np.asarray(np.exp(self.lost(at)) @ (weights * t) * charge)
 
 
 @dataclass(frozen=True)

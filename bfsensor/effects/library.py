@@ -4,79 +4,114 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from bfsensor.effects.adc_bits import AdcBits
+from bfsensor.effects.adc_bits import AdcBits, ShiftedCodes, WideCodes
 from bfsensor.effects.amp_crosstalk import AmpCrosstalk
 from bfsensor.effects.bf_anisotropy import BrighterFatterAnisotropy
 from bfsensor.effects.bf_chromatic import BrighterFatterChromatic
 from bfsensor.effects.bf_long_range import BrighterFatterLongRange
 from bfsensor.effects.bf_nonlinear import BrighterFatterNonlinear, EdgesNonlinear
-from bfsensor.effects.bias_instability import BiasByFrame, BiasByRow
-from bfsensor.effects.charge_loss import ChargeLoss
-from bfsensor.effects.correlated_noise import CommonNoise, NoiseInTime, Pickup
+from bfsensor.effects.bias_instability import (
+    BiasByFrame,
+    BiasByRow,
+    BiasByRowWithMemory,
+    SettlingByFrame,
+)
+from bfsensor.effects.charge_loss import ChargeLoss, FillingLoss, PowerLoss
+from bfsensor.effects.correlated_noise import CommonNoise, FlickerNoise, NoiseInTime, Pickup
 from bfsensor.effects.cosmic_rays import CosmicRays
-from bfsensor.effects.cti_parallel import CtiParallel
-from bfsensor.effects.cti_serial import CtiSerial
-from bfsensor.effects.dark_hot import DarkCurrent, HotColumns
+from bfsensor.effects.cti_parallel import CtiParallel, ParallelTraps, TwoParallelTraps
+from bfsensor.effects.cti_serial import CtiSerial, SerialTraps, TwoSerialTraps
+from bfsensor.effects.dark_hot import DarkCurrent, Glow, HotColumns
 from bfsensor.effects.edge_rolloff import EdgeRolloff
 from bfsensor.effects.effect import Effect
-from bfsensor.effects.electronic_memory import ElectronicMemory
+from bfsensor.effects.electronic_memory import ElectronicMemory, OffsetDrift, Settling
 from bfsensor.effects.fringing import Fringing
-from bfsensor.effects.gain_drift import GainDrift
-from bfsensor.effects.gain_nonlinearity import GainNonlinearity
+from bfsensor.effects.gain_drift import GainCurve, GainCycle, GainDrift, GainWarming
+from bfsensor.effects.gain_nonlinearity import (
+    GainKink,
+    GainNonlinearity,
+    LateStart,
+    ResponseCurve,
+)
 from bfsensor.effects.illumination_turbulence import IlluminationTurbulence
 from bfsensor.effects.interpixel_coupling import InterpixelCoupling
 from bfsensor.effects.lateral_diffusion import LateralDiffusion
 from bfsensor.effects.mask_stitch import MaskStitch, WavyMask
-from bfsensor.effects.persistence import Persistence
+from bfsensor.effects.persistence import Persistence, PowerPersistence, TwoTimesPersistence
 from bfsensor.effects.psf_wings import PsfWings
-from bfsensor.effects.saturation import Saturation
+from bfsensor.effects.saturation import DrainedSaturation, Saturation
 from bfsensor.effects.shutter_timing import FlatShutter, ShutterTiming
 from bfsensor.effects.tearing import DivisaderoTearing, Tearing
-from bfsensor.effects.trap_serial import TrapSerial
+from bfsensor.effects.trap_serial import GradualTrap, TrapSerial, TwoTimesTrap
 from bfsensor.effects.tree_rings import RadialTreeRings, TreeRings, UnevenTreeRings
 from bfsensor.effects.voltage_dependence import VoltageDependence
 from bfsensor.errors import EffectError
 
 LIBRARY: tuple[type[Effect], ...] = (
     AdcBits,
+    ShiftedCodes,
+    WideCodes,
     AmpCrosstalk,
     BiasByFrame,
     BiasByRow,
+    BiasByRowWithMemory,
+    SettlingByFrame,
     BrighterFatterAnisotropy,
     BrighterFatterChromatic,
     BrighterFatterLongRange,
     BrighterFatterNonlinear,
     ChargeLoss,
+    FillingLoss,
+    PowerLoss,
     CommonNoise,
     CosmicRays,
     CtiParallel,
     CtiSerial,
+    SerialTraps,
+    TwoSerialTraps,
+    ParallelTraps,
+    TwoParallelTraps,
     DarkCurrent,
-    DivisaderoTearing,
     EdgeRolloff,
-    EdgesNonlinear,
     ElectronicMemory,
-    FlatShutter,
+    Settling,
+    OffsetDrift,
     Fringing,
     GainDrift,
+    GainWarming,
+    GainCycle,
+    GainCurve,
     GainNonlinearity,
+    GainKink,
+    LateStart,
+    ResponseCurve,
     HotColumns,
+    Glow,
     IlluminationTurbulence,
     InterpixelCoupling,
     LateralDiffusion,
     MaskStitch,
     NoiseInTime,
+    FlickerNoise,
     Persistence,
+    PowerPersistence,
+    TwoTimesPersistence,
     Pickup,
     PsfWings,
-    RadialTreeRings,
     Saturation,
+    DrainedSaturation,
     ShutterTiming,
     Tearing,
     TrapSerial,
+    GradualTrap,
+    TwoTimesTrap,
     TreeRings,
     UnevenTreeRings,
     VoltageDependence,
+    DivisaderoTearing,
+    EdgesNonlinear,
+    FlatShutter,
+    RadialTreeRings,
     WavyMask,
 )
 """Classes of all effects, one for each variant.  Those of a device's parameters depend on the

@@ -1,8 +1,9 @@
-"""Persistence: charge of an exposure is trapped and appears in the exposures that follow."""
+"""Persistence: charge of an exposure is trapped and appears in the exposures that follow it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,12 @@ from numpy.typing import NDArray
 from bfsensor.effects.dark_pixels import mean_bias, struck_pixels
 from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Seen, Shot
 from bfsensor.typing import FloatArray
+
+MEMORY = 40
+"""Number of exposures for which pixels remember charge.
+
+Derived: a constant of ten exposures, twice the top of its range, leaves exp(-4) = 2 % of it; twice as
+large, the memory of pixels doubles."""
 
 
 class Persistence(Effect):
@@ -32,7 +39,7 @@ class Persistence(Effect):
 
     word = "persistence"
     stage = "store"
-    parameters = (
+    parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("frac", "", 1e-5, 1e-3, amplitude=True),
         Parameter("tau", "exposure", 0.7, 5.0),
     )
@@ -55,15 +62,18 @@ class Persistence(Effect):
         rng: np.random.Generator,
         memory: dict[str, NDArray],
     ) -> Image:
-        trapped = memory.get(self.word, np.zeros_like(charge))
+        left = np.zeros_like(charge)
+        for later in range(1, MEMORY + 1):
+            before = memory.get(f"{self.word} {shot.number - later}")
+            if before is not None:
+                left += (self._after(np.array(float(later))) * before).astype(charge.dtype)
         # Only the light of an exposure is trapped, not the charge that traps release into it.
-        memory[self.word] = (trapped + self["frac"] * charge) * np.float32(
-            np.exp(-1 / self["tau"])
-        )
-        return charge + rng.poisson(trapped).astype(charge.dtype)
+        memory[f"{self.word} {shot.number}"] = self._trapped(charge).astype(charge.dtype)
+        memory.pop(f"{self.word} {shot.number - MEMORY}", None)
+        return charge + rng.poisson(left).astype(charge.dtype)
 
     def flat_mean(self, axes: Axes, layout: Layout) -> FloatArray:
-        return self._left_at(axes["exposure"], layout)
+        return self._left_at(axes["exposure"], layout) - self._in_bias(layout)
 
     def bias_level(self, axes: Axes, layout: Layout) -> FloatArray:
         return np.where(
@@ -72,7 +82,8 @@ class Persistence(Effect):
 
     def dark_map(self, axes: Axes, layout: Layout) -> FloatArray:
         noise, more = layout.noise, mean_bias(layout)
-        left = self._left_at(axes["exposure"], layout)
+        # Biases hold charge of earlier exposures too, and their mean is subtracted from darks.
+        left = self._left_at(axes["exposure"], layout) - self._in_bias(layout)
         out = np.zeros(len(left))
         for row in np.nonzero(axes["what"] != "column")[0]:
             amp = int(axes["amp"][row])
@@ -101,7 +112,7 @@ class Persistence(Effect):
         gaps = [g for g in zip(numbers[:-1] + 1, numbers[1:], strict=True) if g[0] < g[1]]
         if not gaps or not len(lit):
             return None
-        usual = float(np.sqrt((lit**2).mean()))
+        usual = float(np.sqrt((self._trapped(lit) ** 2).mean()))
         rows = np.ones(len(axes["exposure"]), bool)
         if word == "dark_map":
             rows = axes["what"] == "level"
@@ -111,10 +122,20 @@ class Persistence(Effect):
             for gap in gaps
         ], axis=1)  # fmt: skip
 
+    def _trapped(self, charge: NDArray) -> FloatArray:
+        """Part of a pixel's charge that counts [e-]."""
+        return np.asarray(charge)
+
     def _after(self, later: FloatArray) -> FloatArray:
         """Fraction of a charge that appears ``later`` exposures later; 0 if not later."""
         shown = self["frac"] * np.exp(-np.maximum(later, 0.0) / self["tau"])
         return np.where(later > 0, shown, 0.0)
+
+    def _in_bias(self, layout: Layout) -> float:
+        """Charge of earlier exposures in the mean bias [e-]."""
+        if not layout.biases:
+            return 0.0
+        return float(self._left_at(np.array(layout.biases, float), layout).mean())
 
     def _left_at(self, number: FloatArray, layout: Layout) -> FloatArray:
         """Charge that earlier exposures left in those with these numbers [e-]."""
@@ -122,4 +143,96 @@ class Persistence(Effect):
         later = np.subtract.outer(
             np.asarray(number, float), np.array([s.number for s in lit], float)
         )
-        return np.asarray(self._after(later) @ np.array([s.level for s in lit]))
+        return np.asarray(
+            self._after(later) @ self._trapped(np.array([s.level for s in lit]))
+        )
+
+
+class PowerPersistence(Persistence):
+    """The fraction ``frac`` k^-exponent exp(-k / tau) of a charge appears in the k-th exposure after it.
+
+    Traps of all release times up to ``tau`` release as a power of the time, and faster after tau.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``frac``: 1e-05 to 0.001 (0 changes nothing); ``exponent``: 0 to 3;
+        ``tau`` [exposure]: 3 to 300.
+
+    Examples
+    --------
+    >>> PowerPersistence({"frac": 0.0001, "exponent": 1.0, "tau": 50.0}).name
+    'persistence:power'
+    """
+
+    variant = "power"
+    parameters = (
+        Parameter("frac", "", 1e-5, 1e-3, amplitude=True),
+        Parameter("exponent", "", 0.0, 3.0, law="flat"),
+        Parameter("tau", "exposure", 3.0, 300.0),
+    )
+    source = (
+        "A range of release times gives a power of time: Smith et al. 2008, Proc. SPIE 7021, 70210J, "
+        "theory of image persistence; ranges assumed"
+    )
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        return [
+            {"frac": 1e-4, "exponent": v, "tau": tau}
+            for v in (0.5, 1.5)
+            for tau in (10.0, 60.0)
+        ]
+
+    def _after(self, later: FloatArray) -> FloatArray:
+        k = np.maximum(later, 1.0)
+        shown = self["frac"] * k ** -self["exponent"] * np.exp(-k / self["tau"])
+        return np.where(later > 0, shown, 0.0)
+
+
+class TwoTimesPersistence(Persistence):
+    """Charge above ``threshold`` decays with two constants, the part ``slow`` with ``slow_tau``.
+
+    The fraction frac ((1 - slow) exp(-k / tau) + slow exp(-k / slow_tau)) of it appears in the k-th
+    exposure after it.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``frac``: 1e-05 to 0.001 (0 changes nothing); ``tau`` [exposure]: 0.3 to
+        5; ``slow``: 0.02 to 0.98; ``slow_tau`` [exposure]: 2 to 30; ``threshold`` [e-]: 300 to 100000.
+
+    Examples
+    --------
+    >>> values = {"frac": 1e-4, "tau": 1.0, "slow": 0.2, "slow_tau": 8.0, "threshold": 3e4}
+    >>> TwoTimesPersistence(values).name
+    'persistence:two_times'
+    """
+
+    variant = "two_times"
+    parameters = (
+        Parameter("frac", "", 1e-5, 1e-3, amplitude=True),
+        Parameter("tau", "exposure", 0.3, 5.0),
+        Parameter("slow", "", 0.02, 0.98, law="flat"),
+        Parameter("slow_tau", "exposure", 2.0, 30.0),
+        Parameter("threshold", "e-", 300.0, 1e5),
+    )
+    source = (
+        "Residual images of LSST's e2v sensors, of two causes and above a level: Polin, Snyder, Lage "
+        "& Tyson 2025, JINST 20, P07031; ranges assumed"
+    )
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        return [
+            {"frac": 1e-4, "tau": 1.0, "slow": 0.3, "slow_tau": 8.0, "threshold": level}
+            for level in (3e3, 4e4)
+        ]
+
+    def _trapped(self, charge: NDArray) -> FloatArray:
+        return np.maximum(charge - self["threshold"], 0.0)
+
+    def _after(self, later: FloatArray) -> FloatArray:
+        slow, k = float(np.clip(self["slow"], 0.0, 1.0)), np.maximum(later, 0.0)
+        shown = (1 - slow) * np.exp(-k / self["tau"]) + slow * np.exp(-k / self["slow_tau"])
+        return np.where(later > 0, self["frac"] * shown, 0.0)

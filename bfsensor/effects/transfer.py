@@ -1,12 +1,15 @@
-"""Charge transfer inefficiency: the fractions of a packet that arrive several packets late."""
+"""Charge transfer inefficiency: which part of a packet arrives late, and how late."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.signal import lfilter
 
+from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter
 from bfsensor.typing import FloatArray
 
 LATEST = 6
@@ -120,3 +123,119 @@ def trail_image(
         images, -1, axis
     )
     return np.asarray(images + share * (later - images))
+
+
+PIVOT = 5e4
+"""Signal [e-] at which the parameter ``cti`` of traps is the fraction lost per transfer.
+
+Chosen: the middle of usual ladders of flats, so that errors of ``cti`` and of the power of the
+signal are nearly independent; the predictions do not depend on it."""
+
+TRAPS = (
+    Parameter("cti", "", 1e-7, 5e-6, amplitude=True),
+    Parameter("power", "", 0.2, 1.2, law="flat"),
+    Parameter("tau", "packets", 0.3, 10.0),
+)
+"""Parameters of traps of one kind.  Ranges: those of the plain law; powers from 0.3 to 1 are
+published (Massey et al. 2014 fit 0.48 to 0.58 to HST; 1 is proportional), a margin is added."""
+
+SLOWER = (
+    Parameter("slow", "", 0.02, 0.98, law="flat"),
+    Parameter("slow_tau", "packets", 2.0, 40.0),
+)
+"""Parameters of traps of a second kind: part of the late charge, and their release time."""
+
+
+class Traps(Effect):
+    r"""Traps in every stage of a register: the loss grows with a power of the packet, and lasts.
+
+    A packet of S electrons that had n transfers lacks
+    :math:`D = n\, c\, S\, (S/S_0)^{p-1}` electrons, S_0 = :data:`PIVOT`; they arrive in the packets
+    behind it, :math:`(1 - e^{-1/\tau})\, e^{-(d-1)/\tau}` of them d packets late.  The plain law,
+    one packet late and proportional, is the limit p = 1 and tau = 0.  Subclasses choose the axis.
+    """
+
+    stage = "shift"
+    axis: ClassVar[int] = 1
+    """Axis of the frame along which packets move: 1 for rows, 0 for columns."""
+
+    def _species(self) -> list[tuple[float, float]]:
+        """Parts of the late charge, and what is left of each after a packet has passed."""
+        parts = [(1.0, self["tau"])]
+        if "slow" in self.values:
+            slow = float(np.clip(self["slow"], 0.0, 1.0))
+            parts = [(1 - slow, self["tau"]), (slow, self["slow_tau"])]
+        return [(part, float(np.exp(-1 / tau))) for part, tau in parts]
+
+    def _released(self, late: NDArray[Any]) -> FloatArray:
+        """Fraction of the late charge that is released exactly ``late`` packets late, from 1."""
+        return np.asarray(
+            sum(p * (1 - keep) * keep ** (late - 1.0) for p, keep in self._species())
+        )
+
+    def _lost(self, charge: NDArray[Any]) -> FloatArray:
+        """Charge that one transfer of a packet leaves to later packets [e-]."""
+        full = np.maximum(np.asarray(charge, float), 0.0) / PIVOT
+        return np.asarray(self["cti"] * PIVOT * full ** self["power"])
+
+    def _moved(self, images: NDArray[Any], transfers: FloatArray | float) -> FloatArray:
+        """Lines along the last axis, first packet first, after ``transfers`` of each packet."""
+        lost = self._lost(images) * transfers
+        out = np.asarray(images - lost, float)
+        for part, keep in self._species():
+            out += lfilter([0.0, part * (1 - keep)], [1.0, -keep], lost)
+        return out
+
+    def _lit(self, layout: Layout, amp: NDArray[Any]) -> tuple[FloatArray, FloatArray]:
+        """Packets with light, and packets read before them, by amplifier."""
+        if self.axis == 0:
+            rows = layout.of_amp("rows", amp)
+            return rows, np.zeros_like(rows)
+        return layout.of_amp("columns", amp), layout.of_amp("prescan", amp)
+
+    def _mean_transfers(self, layout: Layout) -> float:
+        """Mean number of transfers of the pixels of all amplifiers."""
+        lit, before = self._lit(layout, np.arange(len(layout.segments)))
+        return float(np.mean(before + (lit + 1) / 2))
+
+    def shift(self, frame: Image, amp: int, layout: Layout) -> Image:
+        if self["cti"] == 0:
+            return frame
+        lines = np.moveaxis(frame, self.axis, -1)
+        moved = self._moved(lines, np.arange(1.0, lines.shape[-1] + 1))
+        return np.moveaxis(moved, -1, self.axis).astype(frame.dtype)
+
+    def _overscan(self, axes: Axes, layout: Layout) -> FloatArray:
+        lit, before = self._lit(layout, axes["amp"])
+        # All packets with light leave charge in the k-th one behind them: the last one most.
+        left = sum(part * keep ** (axes["k"] - 1.0) for part, keep in self._species())
+        return np.asarray(self._lost(axes["level"]) * (before + lit) * left)
+
+    def covariances(self, c: FloatArray, axes: Axes, layout: Layout) -> FloatArray:
+        lit, before = self._lit(layout, axes["amp"])
+        # A fluctuation is delayed by the derivative of the loss.
+        part = self["power"] * self._lost(axes["level"]) / np.maximum(axes["level"], 1.0)
+        part = (part * (before + (lit + 1) / 2)).reshape(-1, 1, 1)
+        axis = self.axis - 2
+        out = c - 2 * part * c
+        lags = np.arange(1, c.shape[axis] // 2)
+        for late, share in zip(lags.tolist(), self._released(lags), strict=True):
+            out += part * share * (np.roll(c, late, axis) + np.roll(c, -late, axis))
+        return np.asarray(out)
+
+    def spot_image(
+        self, images: FloatArray, axes: Mapping[str, float], layout: Layout
+    ) -> FloatArray:
+        if self["cti"] == 0:
+            return images
+        level = axes.get("background", 0.0) * images.sum((-2, -1), keepdims=True)
+        lines = np.moveaxis(np.maximum(images + level, 0.0), self.axis - 2, -1)
+        mean = self._mean_transfers(layout)
+        # The light beside the image leaves charge in it, too: only the change against it counts.
+        flat = np.moveaxis(np.broadcast_to(level, images.shape), self.axis - 2, -1)
+        one = self._moved(lines, mean) - self._moved(flat, mean)
+        two = (self._moved(lines[..., ::-1], mean) - self._moved(flat[..., ::-1], mean))[
+            ..., ::-1
+        ]
+        share = layout.backwards("x" if self.axis else "y")
+        return np.asarray(np.moveaxis((1 - share) * one + share * two, -1, self.axis - 2))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -44,7 +45,7 @@ class TrapSerial(Effect):
 
     word = "trap_serial"
     stage = "shift"
-    parameters = (
+    parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter("size", "e-", 5.0, 100.0, amplitude=True),
         Parameter("tau", "pixel times", 0.7, 4.0),
         Parameter("amp", "", 0, 1, law="whole"),
@@ -77,7 +78,7 @@ class TrapSerial(Effect):
             return None
         out = np.zeros(layout.shape)
         column = segment.x + (segment.columns - 1 if segment.flip_x else 0)
-        held = min(self["size"], max(shot.level - max(self["reach"], 0.0), 0.0))
+        held = float(self._filled(np.array(shot.level)))
         out[segment.y : segment.y + segment.rows, column] = -held / shot.level
         return out
 
@@ -86,8 +87,10 @@ class TrapSerial(Effect):
 
     def serial_overscan(self, axes: Axes, layout: Layout) -> FloatArray:
         # Full after any light above its size: the last pixel of a flat refills what it released.
-        fall = np.exp(-(axes["k"] - 1) / self["tau"])
-        return -np.expm1(-1 / self["tau"]) * self._held(axes) * fall
+        out = np.zeros(len(axes["k"]))
+        for part, tau in self._species():
+            out += part * -np.expm1(-1 / tau) * np.exp(-(axes["k"] - 1) / tau)
+        return out * self._held(axes)
 
     def spot_image(
         self, images: FloatArray, axes: Mapping[str, float], layout: Layout
@@ -109,34 +112,160 @@ class TrapSerial(Effect):
             np.broadcast_to(level, (*images.shape[:-1], 1)).reshape(-1, 1), 0.0
         )
         lines = images[..., order].reshape(-1, images.shape[-1]) + level
-        reached = np.maximum(level[:, 0] - max(self["reach"], 0.0), 0.0)
-        held = np.minimum(reached / -np.expm1(-1 / self["tau"]), self["size"])
-        read = (self._through(lines, held) - level).reshape(images.shape)[..., order]
+        read = (self._through(lines, level[:, 0]) - level).reshape(images.shape)[..., order]
         return images + share * (read - images)
 
-    def _through(self, frame: Image, held: FloatArray | None = None) -> Image:
-        """Rows after the trap, first pixel first; ``held`` [e-] is in the trap before, 0 by default."""
-        size, reach = self["size"], max(self["reach"], 0.0)
-        out = np.empty_like(frame)
-        held = np.zeros(len(frame)) if held is None else held
-        released = -np.expm1(-1 / self["tau"])
-        for column in range(frame.shape[1]):
-            free = held * released
-            held = held - free
-            packet = frame[:, column]
-            caught = np.clip(np.minimum(packet - reach, size - held), 0, None)
-            out[:, column] = packet - caught + free
-            held = held + caught
+    def _through(self, frame: Image, level: FloatArray | None = None) -> Image:
+        """Rows after the trap, first pixel first; ``level`` [e-] is read before, 0 by default."""
+        out = np.array(frame, copy=True)
+        for part, tau in self._species():
+            released = -np.expm1(-1 / tau)
+            held = np.zeros(len(frame))
+            if level is not None:
+                # The level fills the trap until it captures as much as it releases.
+                held = self._before(level, part, released)
+            for column in range(frame.shape[1]):
+                free = held * released
+                held = held - free
+                caught = self._caught(frame[:, column], held, part)
+                out[:, column] += free - caught
+                held = held + caught
         return out
+
+    def _species(self) -> tuple[tuple[float, float], ...]:
+        """Parts of the trap, and their release times [pixel times]."""
+        return ((1.0, self["tau"]),)
+
+    def _caught(self, packet: FloatArray, held: FloatArray, part: float) -> FloatArray:
+        """Charge that a part of the trap, which holds ``held``, takes from packets [e-]."""
+        above = packet - max(self["reach"], 0.0)
+        return np.clip(np.minimum(above, part * self["size"] - held), 0, None)
+
+    def _before(self, level: FloatArray, part: float, released: float) -> FloatArray:
+        """Charge that a part of the trap holds after much light of a level [e-]."""
+        reached = np.maximum(level - max(self["reach"], 0.0), 0.0)
+        return np.minimum(reached / released, part * self["size"])
+
+    def _filled(self, level: FloatArray) -> FloatArray:
+        """Charge in the trap after a flat of a level [e-]."""
+        reached = np.maximum(level - max(self["reach"], 0.0), 0.0)
+        return np.minimum(self["size"], reached)
 
     def _held(self, axes: Axes) -> FloatArray:
         """Charge in the trap after the light of a flat [e-]; 0 in other amplifiers."""
         mine = axes["amp"].astype(int) == int(self["amp"])
-        reached = axes["level"] - max(self["reach"], 0.0)
-        held = np.minimum(self["size"], np.maximum(reached, 0.0))
-        return np.where(mine, held, 0.0)
+        return np.where(mine, self._filled(axes["level"]), 0.0)
 
     def _segment(self, layout: Layout) -> Segment | None:
         """Amplifier of the trap; None if the sensor has no such amplifier."""
         n = int(self["amp"])
         return layout.segments[n] if n < len(layout.segments) else None
+
+
+CORNER = 2.0
+"""Exponent that rounds the corner between the power of the signal and the full trap.
+
+Chosen: with 1 the trap is half full at its ``middle`` and fills slowly (Hill's law), with 20 the
+corner is sharp; the parameter ``corner`` is fitted from here."""
+
+
+class GradualTrap(TrapSerial):
+    r"""A trap that larger packets fill further, up to ``size``.
+
+    It holds :math:`s\, x^p / (1 + x^{pc})^{1/c}` electrons after packets of S = x middle electrons: a
+    power p of small packets, proportional for p = 1, a step for large p.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``size`` [e-]: 5 to 2000 (0 changes nothing); ``tau`` [pixel times]: 0.5 to
+        20; ``amp``: 0 to 1, whole; ``middle`` [e-]: 300 to 100000; ``power``: 0.3 to 6; ``corner``:
+        0.7 to 8.
+
+    Examples
+    --------
+    >>> values = {"size": 20.0, "tau": 2.0, "amp": 0, "middle": 2e4, "power": 1.0, "corner": 2.0}
+    >>> GradualTrap(values).name
+    'trap_serial:gradual'
+    """
+
+    variant = "gradual"
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("size", "e-", 5.0, 2000.0, amplitude=True),
+        Parameter("tau", "pixel times", 0.5, 20.0),
+        Parameter("amp", "", 0, 1, law="whole"),
+        Parameter("middle", "e-", 300.0, 1e5),
+        Parameter("power", "", 0.3, 6.0),
+        Parameter("corner", "", 0.7, 8.0),
+    )
+    source = (
+        "Capture in proportion to the signal up to the trap's size, and by a logistic function of "
+        "the signal: Snyder et al. 2021, JATIS 7, 048002, section 3; by the packet's volume, a power "
+        "of the signal: Massey et al. 2014, MNRAS 439, 887"
+    )
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        return [
+            {"size": 50.0, "tau": 2.0, "amp": float(n), "middle": middle, "power": power,
+             "corner": CORNER} | cls._more()
+            for n in range(len(layout.segments))
+            for middle, power in ((5e3, 1.0), (4e4, 1.0), (4e4, 4.0))
+        ]  # fmt: skip
+
+    @classmethod
+    def _more(cls) -> dict[str, float]:
+        """Start values of further parameters."""
+        return {}
+
+    def _filled(self, level: FloatArray) -> FloatArray:
+        x = np.log(np.maximum(level, 1e-6) / self["middle"])
+        power, corner = self["power"], self["corner"]
+        return np.asarray(
+            self["size"]
+            * np.exp(power * x - np.logaddexp(0.0, power * corner * x) / corner)
+        )
+
+    def _caught(self, packet: FloatArray, held: FloatArray, part: float) -> FloatArray:
+        room = np.minimum(part * self._filled(packet) - held, packet)
+        return np.clip(room, 0, None)
+
+    def _before(self, level: FloatArray, part: float, released: float) -> FloatArray:
+        return part * self._filled(level)
+
+
+class TwoTimesTrap(GradualTrap):
+    """A gradual trap of which the part ``slow`` releases its charge over ``slow_tau``.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``size`` [e-]: 5 to 2000 (0 changes nothing); ``tau`` [pixel times]: 0.5 to
+        20; ``amp``: 0 to 1, whole; ``middle`` [e-]: 300 to 100000; ``power``: 0.3 to 6; ``corner``:
+        0.7 to 8; ``slow``: 0.02 to 0.98; ``slow_tau`` [pixel times]: 2 to 50.
+
+    Examples
+    --------
+    >>> values = {"size": 20.0, "tau": 2.0, "amp": 0, "middle": 2e4, "power": 1.0, "corner": 2.0}
+    >>> TwoTimesTrap(values | {"slow": 0.3, "slow_tau": 9.0}).name
+    'trap_serial:two_times'
+    """
+
+    variant = "two_times"
+    parameters = (
+        *GradualTrap.parameters,
+        Parameter("slow", "", 0.02, 0.98, law="flat"),
+        Parameter("slow_tau", "pixel times", 2.0, 50.0),
+    )
+    source = (
+        "Several traps with release times of their own: Snyder et al. 2021, JATIS 7, 048002, section "
+        "3; ranges assumed"
+    )
+
+    @classmethod
+    def _more(cls) -> dict[str, float]:
+        return {"slow": 0.4, "slow_tau": 10.0, "tau": 1.0}
+
+    def _species(self) -> tuple[tuple[float, float], ...]:
+        slow = float(np.clip(self["slow"], 0.0, 1.0))
+        return (1 - slow, self["tau"]), (slow, self["slow_tau"])

@@ -41,6 +41,11 @@ STANDS_OUT = 5.0
 enters the errors.  Chosen: noise exceeds 5 at one in 2e6 lags; with 10 weaker correlations are
 left out of the errors, which are then too small."""
 
+ROWS = 3
+"""Number of rows between which the covariance of the noise is measured, too.  Chosen: levels of rows
+that keep half of the row before are told from independent ones by the first; with 6, slower ones by
+a half more."""
+
 FRAME_ERROR = 0.1
 """Scatter of an amplifier's bias level, against the others', that is no finding [ADU].  Chosen, to be
 derived from quiet systems: with 0.2, scatter of the level below 0.2 ADU could hardly be found."""
@@ -90,6 +95,7 @@ class BiasChannels:
         self._third: list[FloatArray] = []
         self._strips: list[list[FloatArray]] = []
         self._size = 0
+        self._lags = np.arange(READOUT_LAGS + 1)
         self._condition = Condition()
 
     def add(self, exposure: ExposureInfo, frames: Sequence[Frame]) -> None:
@@ -115,7 +121,8 @@ class BiasChannels:
             noise = _without_outliers((first - second) / np.sqrt(2.0))
             own[:] = noise.ravel()
             long.append(_autocovariance(noise))
-            spectra.append(long[-1][: READOUT_LAGS + 1])
+            self._lags = _lags(*noise.shape)
+            spectra.append(long[-1][self._lags])
             rows.append(_row_excess(noise))
             strips.append(_scatter_of_strips(noise))
         self._last = []
@@ -187,8 +194,9 @@ class BiasChannels:
             mean = np.mean([s[amp] for s in self._spectra], axis=0)
             values.append(mean)
             blocks.append(self._errors(seen, amp) / (self._size * pairs))
-            axes.add(len(mean), self._condition, amp=amp, lag=np.arange(len(mean)),
-                     pulse=np.pad(pulses, (0, len(mean) - len(pulses))))  # fmt: skip
+            near = np.minimum(self._lags, READOUT_LAGS)
+            pulse = np.where(self._lags <= READOUT_LAGS, pulses[near], 0.0)
+            axes.add(len(mean), self._condition, amp=amp, lag=self._lags, pulse=pulse)
         out = [
             Channel("bias_cov", np.concatenate(values), tuple(blocks), axes.columns(), "adu2",
                     self._fold)
@@ -258,7 +266,7 @@ class BiasChannels:
         Bartlett's formula is that of Gaussian noise.  Heavy tails and pulses scatter more: where
         strips of the frames do so significantly, their scatter scales the errors.
         """
-        out = _errors_in_order(seen)
+        out = _errors_in_order(seen, self._lags)
         strips = np.mean([s[amp] for s in self._strips], axis=0) * self._size
         freedom = (PARTS - 1) * len(self._strips)
         ratio, more = strips / np.diag(out)[: len(strips)], np.ones(len(out))
@@ -395,20 +403,30 @@ def _autocovariance(noise: FloatArray) -> FloatArray:
     return np.asarray(irfft(power, size)[:lags] / (n - np.arange(lags)))
 
 
-def _errors_in_order(c: FloatArray) -> FloatArray:
-    """Covariance matrix of sample autocovariances times the length of the series [ADU^4].
+def _lags(rows: int, columns: int) -> NDArray[np.int64]:
+    """Lags of the measured noise [pixel times]: those of near pixels, and of :data:`ROWS` rows.
+
+    Noise of a long memory and levels of rows are alike within a row; between rows they are not.
+    """
+    near = np.arange(min(READOUT_LAGS, max(rows * columns - 1, 0)) + 1)
+    far = columns * np.arange(1, ROWS + 1)
+    # The measured autocovariance ends at a quarter of the frame.
+    return np.concatenate([near, far[(far > near[-1]) & (far < rows * columns // 4)]])
+
+
+def _errors_in_order(c: FloatArray, h: NDArray[np.int64]) -> FloatArray:
+    """Covariance matrix of sample autocovariances at lags ``h``, times the series' length [ADU^4].
 
     Bartlett's formula, cov(c_h, c_k) = sum over m of (c_m c_(m+h-k) + c_m c_(m+h+k)) / n.  The
     sum over a quarter of the frame's lags holds nearly all of it even for a wave that keeps its
     phase through the frame.
     """
     n = len(c)
-    size = next_fast_len(2 * n + 2 * READOUT_LAGS, real=True)
+    size = next_fast_len(2 * n + 2 * int(h[-1]), real=True)
     even = np.zeros(size)
     even[:n] = c
     even[size - n + 1 :] = c[:0:-1]
     g = irfft(rfft(even).real ** 2, size)
-    h = np.arange(READOUT_LAGS + 1)
     return np.asarray(g[np.abs(h[:, None] - h)] + g[h[:, None] + h])
 
 

@@ -30,14 +30,14 @@ REFINED = 2
 with 4, screens take up to twice as long, and minima near a third or fourth start are found, too."""
 
 MANY, LIKELY = 8, 6
-"""Number of starting points above which they are first ranked in one channel of those below, and
+"""Number of starting points above which they are first ranked in the channels below alone, and
 number of those that are then compared in all channels.  Chosen, to be derived: with 16 and 12
 about twice as many predictions of all channels are made; a start that one channel ranks seventh
 is then kept."""
 
-TELLING = "code_hist", "bias_cov", "flat_map"
+TELLING = "code_hist", "bias_cov", "serial_overscan", "flat_map", "flat_mean"
 """Channels that are fast to predict and separate many starting points of one effect (bits, rows,
-positions in a map), in the order of preference."""
+positions in a map, times), in the order of preference."""
 
 ASTRAY = 0.1
 """Relative change of the amplitude by the linear fit above which the template of an effect that
@@ -228,7 +228,7 @@ class Screen:
         starts = [_inside(kind(v)) for v in kind.starts(layout)]
         # Templates of all channels at dozens of places take long; a template of one channel is a
         # weaker filter, with the same false-alarm rate.
-        telling = self._telling(kind) if len(starts) > MANY else None
+        telling = next(iter(self._telling(kind)), None) if len(starts) > MANY else None
         out = []
         for effect in starts:
             try:
@@ -247,13 +247,14 @@ class Screen:
                 out.append(template / length)
         return out
 
-    def _telling(self, kind: type[Effect]) -> tuple[Channel, int] | None:
-        """First channel that separates starting points, and the index of its first value."""
-        word = next((w for w in TELLING if w in kind.touches), "")
-        return next((
+    def _telling(self, kind: type[Effect]) -> list[tuple[Channel, int]]:
+        """Channels that separate starting points, and the indices of their first values."""
+        words = [w for w in TELLING if w in kind.touches]
+        found = [
             (c, int(start)) for c, start in zip(self.fit.channels, self.fit.starts, strict=False)
-            if c.word == word and c.fold == "fit"
-        ), None)  # fmt: skip
+            if c.word in words and c.fold == "fit"
+        ]  # fmt: skip
+        return sorted(found, key=lambda t: words.index(t[0].word))
 
     def _told(self, effect: Effect, channel: Channel) -> FloatArray:
         """Whitened change by an effect in one channel, without the other effects of the fit."""
@@ -314,18 +315,21 @@ class Screen:
         return max(gain, 0.0), best
 
     def _likely(self, kind: type[Effect], starts: list[Effect]) -> list[Effect]:
-        """The LIKELY starting points of greatest gain in one channel; all if they are few."""
+        """The LIKELY starting points of greatest gain in quick channels; all if they are few."""
         telling = self._telling(kind)
-        if len(starts) <= MANY or telling is None:
+        if len(starts) <= MANY or not telling:
             return starts
-        (channel, first), gains = telling, []
-        own = slice(first, first + len(channel))
-        basis, left = self.fit.basis[own], self.fit.left[own]
-        for effect in starts:
-            template = self._told(effect, channel)
-            along = basis.T @ template
-            length = float(template @ template) - float(along @ along)
-            gains.append(float(template @ left) ** 2 / length if length > 0 else 0.0)
+        found, length = np.zeros(len(starts)), np.zeros(len(starts))
+        for channel, first in telling:
+            own = slice(first, first + len(channel))
+            basis, left = self.fit.basis[own], self.fit.left[own]
+            for n, effect in enumerate(starts):
+                template = self._told(effect, channel)
+                along = basis.T @ template
+                # One amplitude in all channels.
+                found[n] += float(template @ left)
+                length[n] += max(float(template @ template) - float(along @ along), 0.0)
+        gains = found**2 / np.where(length > 0, length, np.inf)
         order = np.argsort(gains)[::-1][:LIKELY]
         return [starts[n] for n in order]
 

@@ -346,7 +346,6 @@ def _darks(g: Group) -> Iterator[Pattern]:
     after = x["after"].astype(float)
     for name, here in _amplifiers(x):
         level, struck = (here & (x["what"] == w) for w in ("level", "struck"))
-        column = here & (x["what"] == "column")
         if after.max() > 0:
             yield (
                 "dark after light",
@@ -354,11 +353,12 @@ def _darks(g: Group) -> Iterator[Pattern]:
                 {"amp": name, "what": "after light"},
             )
         yield "struck pixels", np.where(struck, 1.0, 0.0), {"amp": name, "what": "struck"}
-        if name == "all":
-            continue
+    # Columns belong to one amplifier, also where there is no other.
+    for amp in np.unique(x["amp"]):
+        column = (x["amp"] == amp) & (x["what"] == "column")
         for one in np.unique(x["x"][column]):
             yield "dark columns", np.where(column & (x["x"] == one), 1.0, 0.0), {
-                "amp": name, "x": (int(one), int(one) + 1), "what": "column",
+                "amp": int(amp), "x": (int(one), int(one) + 1), "what": "column",
             }  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.flat_channels import TAIL
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
+from bfsensor.diagnose.data.ptc_turnoff import find_turn_off
 from bfsensor.diagnose.model.baseline import Baseline, level_areas
 from bfsensor.diagnose.model.map_predictions import MapChange, shot_at
 from bfsensor.effects.effect import STAGES, Axes, Effect, Law, Layout, Shot
@@ -43,8 +44,18 @@ def layout_of(measured: MeasuredChannels, baseline: Baseline) -> Layout:
             name: float(sum(s.weight**2 / s.flats for s in shares))
             for name, shares in measured.maps.items()
         },
-        sightings=measured.sightings, **card,
+        sightings=measured.sightings, turn_off=_turn_off(measured), **card,
     )  # fmt: skip
+
+
+def _turn_off(measured: MeasuredChannels) -> float:
+    """Lowest level of flats whose variance has collapsed [e-], by the campaign's rough gains."""
+    off = find_turn_off(measured.channels)
+    return (
+        min((v * measured.gains[a] for a, v in off.levels.items()), default=np.inf)
+        if off
+        else np.inf
+    )
 
 
 class EffectChain:
@@ -199,9 +210,8 @@ class EffectChain:
         if channel.word == "flat_mean":
             level = axes["level"]
             out += self.signal(level, axes) - level
-            if self.law.loss:
-                # Light that brings the level m with a loss q: (exp(q m) - 1) / q.
-                out += level - np.expm1(self.law.loss * level) / self.law.loss
+            if self.law.loses:
+                out += level - self.law.light(level)
         out = out / _unit(channel, own, gains)
         if channel.word == "bias_level":
             # Values are variances relative to white noise; those of frames are their logarithms.

@@ -86,14 +86,18 @@ def periodic_covariances(
     # Covariances depend on the even part of the area changes alone, whose transform is real.
     a_k = transform_areas(a, side) - law.loss
     m = np.asarray(levels, float)[:, None, None]
-    if law.bend:
+    if law.bend or law.losses:
         # Integrate over the charge s at which a fluctuation arose; the integrand is smooth.
         nodes, weights = np.polynomial.legendre.leggauss(NODES)
         power = np.zeros(np.broadcast_shapes(a_k.shape, m.shape))
         a_bent = law.bend * (a_k + law.loss)
+        rest = law._replace(loss=0.0)
         for node, weight in zip(0.5 * (nodes + 1), 0.5 * weights, strict=True):
             s = node * m
-            power += weight * m * np.exp(2 * a_k * (m - s) + a_bent * (m**2 - s**2))
+            grown = 2 * a_k * (m - s) + a_bent * (m**2 - s**2)
+            if law.losses:
+                grown = grown - 2 * (rest.lost(m) - rest.lost(s))
+            power += weight * m * np.exp(grown)
     else:
         x = 2 * a_k * m
         small = np.abs(x) < 1e-9

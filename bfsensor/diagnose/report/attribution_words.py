@@ -9,6 +9,7 @@ from bfsensor.diagnose.explain.attribution import Attribution, Found
 from bfsensor.diagnose.model.exchanged_axes import AxesExchanged, says_exchanged
 from bfsensor.diagnose.report.class_words import (
     CLASS_WORDS,
+    LAW_WORDS,
     NAMES,
     PARAMETER_WORDS,
     said_family_p,
@@ -16,6 +17,7 @@ from bfsensor.diagnose.report.class_words import (
     said_value,
 )
 from bfsensor.diagnose.report.nonparametric_words import reported_freely, said_freely
+from bfsensor.effects.effect import Effect
 
 OUTSIDE = "outside_library"
 """Class of a mismatch that no effect of the library explains, in report.json."""
@@ -46,10 +48,11 @@ def reported(attribution: Attribution | None) -> dict[str, Any]:
 
 def _effect(found: Found) -> dict[str, Any]:
     told: dict[str, Any] = {"class": found.effect.word, "parameters": found.intervals()}
-    if found.effect.law_name:
-        told["law"] = found.effect.law_name
     if found.effect.variant:
         told["variant"] = found.effect.variant
+    law = law_of(found.effect)
+    if law is not None:
+        told["law"] = law[0]
     told["gain_chi2"] = found.gain
     told["tied"] = list(found.tied)
     told["source"] = found.effect.source
@@ -100,6 +103,16 @@ def said_of(attribution: Attribution) -> list[str]:
     return out
 
 
+def law_of(effect: Effect) -> tuple[str, str] | None:
+    """Law within an effect's class, as report.json and as sentences have it; None where there is one."""
+    if effect.name in LAW_WORDS:
+        name, said = LAW_WORDS[effect.name]
+        return name, f"here {said}"
+    if effect.law_name:
+        return effect.law_name, f"law: {effect.law_name.replace('_', ' ')}"
+    return None
+
+
 def _said_effect(found: Found, verb: str) -> str:
     """One effect: class, meaning, parameters with units, and the classes that fit as well."""
     word = found.effect.word
@@ -115,8 +128,9 @@ def _said_effect(found: Found, verb: str) -> str:
             f"{words.get(name, name)} = {said_value(word, name, told['value'])}{unit} ({interval})"
         )
     meaning = CLASS_WORDS.get(word, word)
-    if found.effect.law_name:
-        meaning += f"; law: {found.effect.law_name.replace('_', ' ')}"
+    law = law_of(found.effect)
+    if law is not None:
+        meaning += f"; {law[1]}"
     text = f"{word} ({meaning}) {verb}: {', '.join(values)}"
     others = [w for w in found.tied if w != word]
     if others:

@@ -7,6 +7,8 @@ from typing import Any
 
 from bfsensor.diagnose.detect.locate import FAMILY, SMALLEST
 from bfsensor.diagnose.detect.scans import DEVICE, DEVICE_SCAN
+from bfsensor.effects.gain_drift import KNOTS as TIMES
+from bfsensor.effects.gain_nonlinearity import KNOTS as SIGNALS
 
 NAMES = {
     DEVICE: "device's parameters",
@@ -19,16 +21,16 @@ NAMES = {
 """Plain words for each channel."""
 
 CLASS_WORDS = {
-    "cti_serial": "a fraction of the charge stays behind at each serial transfer",
-    "cti_parallel": "a fraction of the charge stays behind at each parallel transfer",
-    "trap_serial": "a trap of fixed size in the serial register",
+    "cti_serial": "some charge stays behind at each serial transfer",
+    "cti_parallel": "some charge stays behind at each parallel transfer",
+    "trap_serial": "a trap at one place of the serial register",
     "electronic_memory": "the amplifier or its clamp remembers earlier pixels",
     "interpixel_coupling": "neighbours share signal after collection, in proportion to the signal",
     "amp_crosstalk": "a fraction of one amplifier's signal appears in another",
     "correlated_noise": "read noise is correlated in time or between amplifiers",
     "bias_instability": "the bias level moves between frames, between rows or along rows",
     "gain_nonlinearity": "the signal in ADU is not proportional to the charge",
-    "adc_bits": "a bit of the analogue-to-digital converter has a wrong weight",
+    "adc_bits": "codes of the analogue-to-digital converter have wrong widths or places",
     "gain_drift": "the gain changes with time",
     "bf_nonlinear": "pixel boundaries do not shift in proportion to the stored charge",
     "bf_chromatic": "the brighter-fatter effect changes with wavelength otherwise than simulated",
@@ -46,7 +48,7 @@ CLASS_WORDS = {
     "charge_loss": "the fraction of light that is collected falls with the stored charge",
     "persistence": "charge is released from earlier exposures",
     "shutter_timing": "exposure times are offset, or unequal over the sensor",
-    "dark_hot": "dark current or hot columns",
+    "dark_hot": "dark current, hot columns, or glow",
     "saturation": "the full well is smaller than the baseline's",
     "fringing": "light interferes within the sensor at long wavelengths",
     "psf_wings": "spots have an extended halo",
@@ -58,14 +60,97 @@ CLASS_WORDS = {
 }
 """Plain words for each class of effects of report.json."""
 
+LAW_WORDS = {
+    "adc_bits": ("bit_weight", "the bit has a wrong weight"),
+    "adc_bits:shifted": ("shifted_codes", "codes with the bit set are moved by a constant"),
+    "adc_bits:wide": (
+        "wide_codes",
+        "every 2^bit-th code is wider, at the cost of the next",
+    ),
+    "bias_instability:frame": ("frames", "the level differs from frame to frame"),
+    "bias_instability:row": ("rows", "the level differs from row to row, without memory"),
+    "bias_instability:row_memory": (
+        "rows_with_memory",
+        "rows remember the level of the row before",
+    ),
+    "bias_instability:ramp": ("ramp", "rows settle exponentially, always alike"),
+    "bias_instability:settling": (
+        "settling",
+        "rows settle, by a size that differs between frames",
+    ),
+    "charge_loss": ("exponential", "the loss is proportional to the charge"),
+    "charge_loss:power": ("power", "the loss grows as a power of the charge"),
+    "charge_loss:filling": ("filling", "the loss saturates, as of traps that fill up"),
+    "correlated_noise:ar1": ("autoregressive", "one relaxation, as of a filter"),
+    "correlated_noise:common": ("common_mode", "white in time, shared by all amplifiers"),
+    "correlated_noise:pickup": ("pickup", "a wave of one period, shared by all amplifiers"),
+    "correlated_noise:flicker": ("flicker", "power that falls with the frequency"),
+    "cti_parallel": ("proportional", "in proportion to the signal, one packet late"),
+    "cti_parallel:traps": ("traps", "a power of the signal, released over several packets"),
+    "cti_parallel:two_traps": (
+        "two_traps",
+        "a power of the signal, with two release times",
+    ),
+    "cti_serial": ("proportional", "in proportion to the signal, one packet late"),
+    "cti_serial:traps": ("traps", "a power of the signal, released over several packets"),
+    "cti_serial:two_traps": ("two_traps", "a power of the signal, with two release times"),
+    "dark_hot:dark": ("uniform", "in all pixels alike"),
+    "dark_hot:glow": ("glow", "around one corner of the sensor"),
+    "dark_hot:hot": ("hot_columns", "in single columns"),
+    "electronic_memory": ("previous_pixel", "of the pixel read before alone"),
+    "electronic_memory:settling": (
+        "settling",
+        "of all pixels before, falling exponentially",
+    ),
+    "electronic_memory:offset_drift": (
+        "offset_drift",
+        "an offset that bright pixels drive",
+    ),
+    "gain_drift": ("linear", "in proportion to time"),
+    "gain_drift:warming": ("warming", "towards a last value, exponentially"),
+    "gain_drift:cycle": ("cycle", "as a sine of time"),
+    "gain_drift:curve": ("curve", "as a free curve of time"),
+    "gain_nonlinearity": ("polynomial", "by a polynomial of the signal"),
+    "gain_nonlinearity:kink": ("kink", "by a change of slope at one level"),
+    "gain_nonlinearity:low_signal": (
+        "low_signal",
+        "the first electrons are lost, or too many",
+    ),
+    "gain_nonlinearity:curve": ("curve", "by a free curve of the signal"),
+    "persistence": ("one_exponential", "released with one time constant"),
+    "persistence:power": ("power", "released as a power of the age"),
+    "persistence:two_times": ("two_exponentials", "above a level, with two time constants"),
+    "saturation": ("blooming", "charge above it spills along the columns"),
+    "saturation:drained": ("drained", "charge above it is lost, or spills in part"),
+    "trap_serial": ("sharp", "full after any packet above its reach"),
+    "trap_serial:gradual": ("gradual", "larger packets fill it further"),
+    "trap_serial:two_times": (
+        "two_times",
+        "larger packets fill it further; two release times",
+    ),
+}
+"""Name and plain words of the law, by the name of an effect, for classes that have several."""
+
 PARAMETER_WORDS: Mapping[str, Mapping[str, str]] = {
-    "cti_serial": {"cti": "fraction left behind per transfer"},
-    "cti_parallel": {"cti": "fraction left behind per transfer"},
+    "cti_serial": {"cti": "fraction left behind per transfer",
+        "power": "power of the signal", "tau": "release time constant",
+        "slow": "part that is released slowly", "slow_tau": "time constant of that part",
+    },
+    "cti_parallel": {"cti": "fraction left behind per transfer",
+        "power": "power of the signal", "tau": "release time constant",
+        "slow": "part that is released slowly", "slow_tau": "time constant of that part",
+    },
     "trap_serial": {
         "size": "charge that the trap holds", "tau": "release time constant",
         "amp": "amplifier (the first is 1)", "reach": "smallest packet that meets the trap",
+        "middle": "signal that fills it", "power": "power of small signals",
+        "corner": "sharpness of the corner below full",
+        "slow": "part that is released slowly", "slow_tau": "time constant of that part",
     },
-    "electronic_memory": {"alpha": "fraction of the pixel read before"},
+    "electronic_memory": {"alpha": "fraction of the pixel read before",
+        "tau": "decay constant", "scale": "offset driven per electron",
+        "threshold": "signal above which it is driven",
+    },
     "interpixel_coupling": {
         "ax": "fraction given to each neighbour in the row",
         "ay": "fraction given to each neighbour in the column",
@@ -75,17 +160,30 @@ PARAMETER_WORDS: Mapping[str, Mapping[str, str]] = {
     "correlated_noise": {
         "rms": "rms of the noise", "corr": "correlation with the pixel read before",
         "period": "period",
+        "exponent": "power of the frequency by which the noise falls",
+        "memory": "time beyond which the noise is white",
     },
     "bias_instability": {
         "rms": "rms of the level", "amp": "excess at the start of a row",
         "length": "settling length",
+        "corr": "correlation with the row before",
     },
     "gain_nonlinearity": {
         "c2": "relative change of the signal at 1e5 e-, linear in the signal",
         "c3": "relative change of the signal at 1e5 e-, quadratic in the signal",
+        "slope": "relative change of the slope", "level": "signal at the kink",
+        "deficit": "charge lost at high signal", "length": "signal by which most of it is lost",
+        **{f"f{n + 1}": f"relative change at {v:g}e5 e-" for n, v in enumerate(SIGNALS)},
     },
-    "adc_bits": {"delta": "error of the bit's weight", "bit": "bit, the lowest is 0"},
-    "gain_drift": {"slope": "relative growth of the signal"},
+    "adc_bits": {
+        "delta": "error of codes, or of the bit's weight", "bit": "bit, the lowest is 0",
+        "place": "wide code, from multiples of 2^bit",
+    },
+    "gain_drift": {
+        "slope": "relative growth of the signal", "amp": "relative change of the signal",
+        "tau": "time constant", "period": "period", "phase": "phase",
+        **{f"g{n}": f"relative change after {n}/{TIMES} of the time" for n in range(1, TIMES + 1)},
+    },
     "bf_nonlinear": {
         "b": "b in the shift k Q (1 + b Q / 2) of a charge Q", "b_y": "the same of edges between rows",
         "near": "inverse distance over which it falls",
@@ -126,17 +224,28 @@ PARAMETER_WORDS: Mapping[str, Mapping[str, str]] = {
         "open": "fraction of rows in which the tear never closes",
         "top": "side from which rows count, 0 the bottom and 1 the top",
     },
-    "charge_loss": {"q": "relative loss of light per stored electron"},
-    "persistence": {"frac": "fraction released", "tau": "decay constant"},
+    "charge_loss": {
+        "q": "relative loss of light per stored electron", "power": "power of the charge",
+        "knee": "charge at which the loss saturates",
+    },
+    "persistence": {
+        "frac": "fraction released", "tau": "decay constant",
+        "exponent": "power of the age by which it falls",
+        "slow": "part that is released slowly", "slow_tau": "time constant of that part",
+        "threshold": "charge above which it is trapped",
+    },
     "shutter_timing": {
         "dt": "exposure beyond the commanded time",
         "shade": "relative change of that from the centre to the last column",
         "rise": "relative change of that from the centre to the last row",
         "iris": "relative fall of that from the centre to the corners",
     },
-    "dark_hot": {"rate": "dark current", "columns": "number of hot columns"}
+    "dark_hot": {"rate": "dark current", "columns": "number of hot columns",
+                 "length": "decay length", "corner": "corner"}
     | {f"x{n}": f"hot column {n}" for n in range(1, 7)},
-    "saturation": {"full_well": "full well"},
+    "saturation": {
+        "full_well": "full well", "drain": "part of the charge above it that is lost",
+    },
     "fringing": {
         "amp": "relative amplitude", "period": "period along a row at the centre",
         "tilt": "tilt of the contours", "phase": "phase",

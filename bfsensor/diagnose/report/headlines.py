@@ -11,31 +11,64 @@ from bfsensor.diagnose.explain.attribution import Attribution, Found
 from bfsensor.diagnose.report.class_words import CLASS_WORDS
 
 HEADLINES: Mapping[str, tuple[str, ...]] = {
-    "cti_serial": ("serial transfer leaves {cti} of the charge behind at each step",),
-    "cti_parallel": ("parallel transfer leaves {cti} of the charge behind at each step",),
+    "cti_serial": (
+        "serial transfer leaves {cti} of 5e4 e- behind at each step, by the power {power} of the "
+        "signal; it comes back within {tau} pixels, {slow} of it within {slow_tau}",
+        "serial transfer leaves {cti} of 5e4 e- behind at each step, by the power {power} of the "
+        "signal; it comes back within {tau} pixels",
+        "serial transfer leaves {cti} of the charge behind at each step",
+    ),
+    "cti_parallel": (
+        "parallel transfer leaves {cti} of 5e4 e- behind at each step, by the power {power} of the "
+        "signal; it comes back within {tau} pixels, {slow} of it within {slow_tau}",
+        "parallel transfer leaves {cti} of 5e4 e- behind at each step, by the power {power} of the "
+        "signal; it comes back within {tau} pixels",
+        "parallel transfer leaves {cti} of the charge behind at each step",
+    ),
     "trap_serial": (
+        "a trap in the serial register of amplifier {amp} is filled by {middle} e-, holds {size} e- and "
+        "releases them within {tau} pixel times",
         "a trap in the serial register of amplifier {amp} holds {size} e- and releases them within "
         "{tau} pixel times",
     ),
-    "electronic_memory": ("{alpha} of each pixel appears in the pixel read next",),
+    "electronic_memory": (
+        "each pixel adds {alpha} of itself to the pixels after it, falling within {tau} pixel times",
+        "pixels above {threshold} e- drive an offset of {scale} of the excess, which decays within "
+        "{tau} pixel times",
+        "{alpha} of each pixel appears in the pixel read next",
+    ),
     "interpixel_coupling": (
         "pixels pass {ax} of their signal to each neighbour in the row, {ay} to each in the column",
     ),
     "amp_crosstalk": ("{c} of the signal of an amplifier appears in the others",),
     "correlated_noise": (
+        "noise of {rms} e- (rms) falls with the frequency as the power {exponent} of it",
         "noise of {rms} e- (rms) repeats with a period of {period} pixel times",
         "noise of {rms} e- (rms) is correlated, by {corr} from one pixel read to the next",
         "amplifiers share noise of {rms} e- (rms)",
     ),
     "bias_instability": (
+        "the bias level of rows moves by {rms} e- (rms) and remembers {corr} of the row before",
+        "rows settle within {length} pixels by an amount that differs between frames by {rms} e- (rms)",
         "rows begin {amp} e- above the bias level and settle within {length} pixels",
         "the bias level moves by {rms} e- (rms)",
     ),
     "gain_nonlinearity": (
+        "the slope of the response changes by {slope} at {level} e-",
+        "the signal lacks {deficit} e-, lost within the first {length} e-",
+        "the response departs from proportion by {f3} at 4e4 e- and by {f6} at 1e5 e-",
         "the signal departs from the charge by {c2} at 1e5 e-, and by {c3} with its square",
     ),
-    "adc_bits": ("bit {bit} of the converter weighs {delta} ADU too much",),
-    "gain_drift": ("the gain changes by {slope} an hour",),
+    "adc_bits": (
+        "every 2^{bit}-th code of the converter is {delta} ADU too wide ({place} from its multiples)",
+        "codes with bit {bit} of the converter set are wrong by {delta} ADU",
+    ),
+    "gain_drift": (
+        "the gain changes by {amp} within {tau} hours",
+        "the gain cycles by {amp} every {period} hours",
+        "the gain has changed by {g3} in the middle of the campaign, and by {g6} at its end",
+        "the gain changes by {slope} an hour",
+    ),
     "bf_nonlinear": (
         "boundary shifts are not in proportion to the charge Q: they go as Q (1 + b Q / 2) with b = "
         "{b} per electron",
@@ -66,16 +99,28 @@ HEADLINES: Mapping[str, tuple[str, ...]] = {
         "columns beside a boundary at {column} of the width are displaced by {amp} pixel, within "
         "{length} pixels",
     ),
-    "charge_loss": ("pixels lose {q} of their light for each stored electron",),
+    "charge_loss": (
+        "pixels lose {q} of their light for each electron at 1e5 e-, by the power {power} of the charge",
+        "pixels lose {q} of their light for each stored electron, ever less above {knee} e-",
+        "pixels lose {q} of their light for each stored electron",
+    ),
     "persistence": (
+        "{frac} of the charge above {threshold} e- comes out in later exposures, within {tau} of them, "
+        "{slow} of it within {slow_tau}",
+        "{frac} of a pixel's charge comes out in the next exposure, then less by the power {exponent} "
+        "of the age",
         "{frac} of a pixel's charge comes out in later exposures, within {tau} of them",
     ),
     "shutter_timing": ("exposures last {dt} s longer than stated",),
     "dark_hot": (
+        "a corner of the sensor glows by {rate} e-/s, within {length} pixels",
         "hot columns, {columns} in number, collect {rate} e-/s",
         "the dark current is {rate} e-/s more than the baseline's",
     ),
-    "saturation": ("pixels are full at {full_well} e-",),
+    "saturation": (
+        "pixels are full at {full_well} e- and lose {drain} of what is above",
+        "pixels are full at {full_well} e-",
+    ),
     "fringing": ("fringes vary the signal by {amp}, {period} pixels apart",),
     "psf_wings": ("{frac} of the light of spots lies in a halo {sigma} pixels wide",),
     "cosmic_rays": ("particles leave {rate} tracks a minute on 256 x 256 pixels",),

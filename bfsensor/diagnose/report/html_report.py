@@ -156,8 +156,9 @@ def _effects(
     for effect in report["effects"]:
         word = effect["class"]
         title = word.replace("_", " ")
-        if "variant" in effect:
-            title += f", {effect['variant']}"
+        kind = effect.get("law", effect.get("variant"))
+        if kind:
+            title += f", {kind.replace('_', ' ')}"
         words = PARAMETER_WORDS.get(word, {})
         rows = [
             [words.get(name, name), said_value(word, name, told["value"]),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bfsensor.diagnose.data.dark_channels import DarkChannels
+from bfsensor.diagnose.detect.scans import _darks
 
 ROWS, COLUMNS, NOISE, BIASES, DARKS = 64, 128, 3.0, 10, 4
 
@@ -70,3 +71,17 @@ def test_a_hot_column_has_the_noise_of_its_own_charge() -> None:
     errors = values[:, HOT] / whitened[:, HOT]
     # Of read noise alone they would be 3 / 20 of it.
     assert errors.mean() == pytest.approx(values[:, HOT].std(ddof=1), rel=0.3)
+
+
+@pytest.mark.parametrize("amplifiers", [1, 2])
+def test_every_column_is_looked_at_also_with_one_amplifier(amplifiers):
+    amp = np.repeat(np.arange(amplifiers), 3)
+    axes = {
+        "amp": amp, "x": np.tile(np.arange(3), amplifiers), "after": np.zeros(len(amp)),
+        "what": np.full(len(amp), "column"),
+    }  # fmt: skip
+    found = [p for p in _darks(SimpleNamespace(axes=axes)) if p[0] == "dark columns"]
+    assert [(w["amp"], w["x"]) for _, _, w in found] == [
+        (n, (x, x + 1)) for n in range(amplifiers) for x in range(3)
+    ]
+    np.testing.assert_array_equal([p[1] for p in found], np.eye(3 * amplifiers))

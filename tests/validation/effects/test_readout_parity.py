@@ -5,14 +5,14 @@ import pytest
 from bfsensor.effects.library import LIBRARY
 from tests.validation.effects.parity import SMALL, disagreements
 from validation.concealed.library import make_effect
-from validation.effects.effect_parity import ENGINES, PLACES, effect_at
+from validation.effects.effect_parity import ENGINES, PLACES, effect_at, known_to_the_sensor
 from validation.effects.effects_on_pixels import compare
 
 WORDS = (
     "cti_serial", "cti_parallel", "trap_serial", "electronic_memory", "amp_crosstalk",
     "correlated_noise", "bias_instability", "gain_nonlinearity", "adc_bits", "gain_drift",
 )  # fmt: skip
-KINDS = [k for k in LIBRARY if k.word in WORDS]
+KINDS = [k for k in LIBRARY if k.word in WORDS and known_to_the_sensor(k)]
 NAMES = [f"{k.word}:{k.variant}".rstrip(":") for k in KINDS]
 
 

@@ -254,15 +254,21 @@ def test_rows_have_the_covariance_that_is_said():
 
 
 @pytest.mark.parametrize(
-    ("delta", "bit"), [(0.6, 2), (-0.6, 2), (1.7, 5), (-1.7, 4), (2.0, 7)]
-)
-def test_codes_are_as_wide_as_is_said(delta, bit):
+    ("variant", "delta", "bit"),
+    [
+        ("", 0.6, 2), ("", -0.6, 2), ("", 1.7, 5), ("", -1.7, 4), ("", 2.0, 7),
+        ("shifted", 3.0, 5), ("shifted", -2.0, 4), ("shifted", 1.0, 2), ("shifted", -2.0, 7),
+        ("wide", 0.4, 3), ("wide", -0.4, 4), ("wide", 0.8, 2),
+    ],
+)  # fmt: skip
+def test_codes_are_as_wide_as_is_said(variant, delta, bit):
     """Codes of a fine ramp, counted."""
-    effect = make_effect("adc_bits", {"delta": delta, "bit": float(bit)})
+    place = {"place": -1.0} if variant == "wide" else {}
+    effect = make_effect("adc_bits", {"delta": delta, "bit": float(bit)} | place, variant)
     fine = np.arange(0, 2048, 1 / 64) + 1 / 128 - 0.5
     codes = np.rint(effect.convert(fine)).astype(int)
-    width = np.bincount(codes, minlength=2048) / 64
-    assert width.sum() == pytest.approx(2048)
+    width = np.bincount(np.maximum(codes, 0), minlength=2048)[:2048] / 64
+    assert width.sum() == pytest.approx(2048, abs=abs(delta) + 1 / 64)
     folded = width.reshape(-1, 64).mean(0)
     multiple = np.arange(64, 2048, 64)
     powers = np.minimum(np.log2(multiple & -multiple).astype(int), 10)
