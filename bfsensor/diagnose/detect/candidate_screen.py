@@ -86,6 +86,8 @@ class Rival:
         folds; nan where less than 5 % of the template's square is in that fold.
     share : float
         Part of the template's square that is in that fold, 0 to 1.
+    law : float
+        Further gain by other laws of the effect, less their charge; not part of ``gain``.
     """
 
     effect: Effect
@@ -94,6 +96,7 @@ class Rival:
     template: FloatArray
     select: float = np.nan
     share: float = 0.0
+    law: float = 0.0
 
     @property
     def refuted(self) -> bool:

@@ -1,10 +1,12 @@
-"""Tolerance for model error: which residuals count beside effects that were found.
+"""Charge for what was tried, and tolerance for the errors of the predictions of effects that were found.
 
-Predictions of effects in closed form are good to about one per cent.  An effect that is detected
-at hundreds of standard deviations therefore leaves residuals of several in the same channels.
-Residuals count only if they exceed :data:`ACCURACY` of the deviate that was explained in their
-channel.  Residuals that count, that no candidate explains, and that noise gives with a probability
-below :data:`OUTSIDE_ALARM` (below 0.01 for a detection) are reported as outside the library.
+Every addition to an explanation, an effect of the library or a group of nonparametric terms, is
+judged by one score: its gain in chi-square less :func:`charge`, which the best of all that was
+tried gains by chance.
+
+A prediction that is wrong by a part rho of itself in every value gives a template with whitened
+unit vector s a deviate of at most rho sum |s| |t|, t being the effect's own whitened change.  What
+a second effect gains within that bound is no evidence for it.
 """
 
 from __future__ import annotations
@@ -12,23 +14,41 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
 
-from bfsensor.diagnose.detect.locate import FAMILY, Finding, Mismatch
+from bfsensor.diagnose.detect.locate import ALARM, FAMILY, Finding, Mismatch
 from bfsensor.diagnose.detect.scans import DEVICE, DEVICE_SEEN
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
+from bfsensor.typing import FloatArray
 
 ACCURACY = 0.02
-"""Part of an effect's own deviate that may be left over by model error.  Measured by ``python -m
+"""Least relative error of an effect's prediction.  Measured by ``python -m
 validation.effects.effect_parity`` (effect_parity.ecsv): the factor on a prediction of more than 10
 sigma that fits pixels best, known to 2 % or better, differs from 1 by 0.5 % in the median, by less
-than 2 % in all 17 cases beyond 100 sigma, but by 2 to 14 % in 5 of all 44.  Chosen, to be derived
-from that spread: with 0.04, a second effect of 3 % of the first one's deviate in a channel would
-pass for model error."""
+than 2 % in all 17 cases beyond 100 sigma."""
 
-OUTSIDE_ALARM = 1e-3
-"""Family-wise probability of remaining residuals below which they are reported as unmodelled by the
-library.  Chosen, to be derived: twice as large reports it for up to two in a thousand campaigns
-that the library explains."""
+SAME = 0.5
+"""Relative error of an effect's prediction up to which what it leaves may be the same effect by another
+law.  Derived: the prediction is then closer to the recordings than to nothing."""
+
+
+def charge(parameters: int, tried: int) -> float:
+    """Chi-square that the best of several candidates gains by noise with probability ALARM.
+
+    Parameters
+    ----------
+    parameters : int
+        Fitted parameters of each candidate, at least 1.
+    tried : int
+        Number of candidates, at least 1 (Bonferroni's bound for independent ones).
+
+    Examples
+    --------
+    >>> round(charge(1, 1), 2), round(charge(1, 100), 2)
+    (6.63, 15.14)
+    """
+    return float(chi2.isf(ALARM / max(tried, 1), max(parameters, 1)))
 
 
 def explained_by_word(before: BaselineFit, after: BaselineFit) -> dict[str, float]:
@@ -37,13 +57,61 @@ def explained_by_word(before: BaselineFit, after: BaselineFit) -> dict[str, floa
     return {word: max(old[word][0] - new[word][0], 0.0) for word in old if word in new}
 
 
+def left_by_word(fit: BaselineFit, left: FloatArray | None = None) -> dict[str, float]:
+    """Chi-square above the degrees of freedom by channel; 0 where noise explains it.
+
+    Parameters
+    ----------
+    fit : BaselineFit
+        A fit.
+    left : ndarray, optional
+        Whitened residuals in place of its own.
+    """
+    residuals = fit.residuals if left is None else left[: len(fit.residuals)]
+    out = {}
+    for word, (_, dof) in fit.chi2().items():
+        own = residuals[fit.of(word)]
+        square = float(own @ own)
+        out[word] = square - dof if square > chi2.isf(ALARM, max(dof, 1e-9)) else 0.0
+    return out
+
+
+def overlap(
+    fit: BaselineFit, template: FloatArray, change: FloatArray, errors: Mapping[str, float]
+) -> float:
+    """Largest deviate of a template by relative errors of a prediction: sum of rho |s| |t|.
+
+    Parameters
+    ----------
+    fit : BaselineFit
+        Fit whose values both belong to.
+    template, change : ndarray, shape (n + priors,) and (n,)
+        Whitened template of any length, and the prediction's own whitened change.
+    errors : mapping of str to float
+        Relative error of the prediction by channel, 0 to 1; absent ones are 1.
+    """
+    length = float(np.sqrt(template @ template))
+    if not length:
+        return 0.0
+    product = np.abs(template[: len(change)]) * np.abs(change) / length
+    words = [c.word for c in fit.channels]
+    return sum(
+        errors.get(word, 1.0) * float(product[start:end].sum())
+        for word, start, end in zip(words, fit.starts, fit.starts[1:], strict=False)
+    )
+
+
 def counts(
-    finding: Finding, mismatch: Mismatch, explained: Mapping[str, float], fits: int = 1
+    finding: Finding,
+    mismatch: Mismatch,
+    explained: Mapping[str, float],
+    errors: Mapping[str, float],
 ) -> bool:
     """Whether a finding exceeds the model error of the effects that were found.
 
-    A deviate :math:`z` counts if :math:`z^2` is above ``ACCURACY**2 * fits`` times the chi-square
-    explained in its channel; a chi-square counts if its excess over the degrees of freedom is.
+    A deviate :math:`z` counts if :math:`z^2` is above the square of the relative error times the
+    chi-square explained in its channel; a chi-square counts if its excess over the degrees of
+    freedom is.
 
     Parameters
     ----------
@@ -53,8 +121,8 @@ def counts(
         Comparison that it belongs to.
     explained : mapping of str to float
         Decrease of the chi-square of each channel by the effects that were found.
-    fits : int
-        Number of those effects; their errors are independent and add in quadrature.
+    errors : mapping of str to float
+        Relative error of their predictions by channel; absent ones are :data:`ACCURACY`.
 
     Returns
     -------
@@ -64,7 +132,7 @@ def counts(
     if finding.word == "bias_cov" and finding.where.get("k") == (0, 0):
         # One read noise is fitted to biases and flats: a model error of flats may show at lag 0.
         own = ("bias_cov", "flat_cov")
-    reach = ACCURACY**2 * sum(explained.get(w, 0.0) for w in own) * max(fits, 1)
+    reach = sum(errors.get(w, ACCURACY) ** 2 * explained.get(w, 0.0) for w in own)
     if finding.family != "chi-square":
         return finding.z**2 > reach
     square, dof = mismatch.chi2[finding.word]
@@ -74,9 +142,9 @@ def counts(
 def stands_out(
     mismatch: Mismatch,
     explained: Mapping[str, float],
+    errors: Mapping[str, float] | None = None,
     *,
-    fits: int = 1,
-    alarm: float | None = None,
+    library: bool = True,
 ) -> bool:
     """Whether any finding exceeds the model error of the effects that were found.
 
@@ -84,21 +152,24 @@ def stands_out(
     ----------
     mismatch : Mismatch
         Comparison of the residuals with noise.
-    explained : mapping of str to float
-        Decrease of the chi-square of each channel by the effects that were found.
-    fits : int
-        Number of those effects.
-    alarm : float, optional
-        Family-wise probability below which a finding is considered; then findings by matched
-        filters of the library are left out.  By default all findings are considered.
+    explained, errors : mapping of str to float
+        See :func:`counts`.
+    library : bool
+        Whether findings by matched filters of the library are considered.
 
     Returns
     -------
     bool
     """
-    if not mismatch.detected:
-        return False
-    limit = np.inf if alarm is None else alarm
-    # A matched filter of the library is explained by the library, hence not outside of it.
-    found = [f for f in mismatch.findings if alarm is None or f.family != FAMILY]
-    return any(f.p_value < limit and counts(f, mismatch, explained, fits) for f in found)
+    return mismatch.detected and any(
+        counts(f, mismatch, explained, errors or {})
+        for f in mismatch.findings
+        if library or f.family != FAMILY
+    )
+
+
+def whole(change: NDArray[np.floating], size: int) -> FloatArray:
+    """Copy of whitened values with zeros in the rows of the priors."""
+    out = np.zeros(size)
+    out[: len(change)] = change
+    return out

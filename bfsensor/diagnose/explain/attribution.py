@@ -7,9 +7,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from bfsensor.diagnose.detect.candidate_screen import Rival
-from bfsensor.diagnose.detect.locate import Mismatch
+from bfsensor.diagnose.detect.locate import ALARM, Mismatch
+from bfsensor.diagnose.detect.model_error import charge
 from bfsensor.diagnose.explain.nonparametric import OpenWorld
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 from bfsensor.diagnose.fit.likelihood_profile import Profile
@@ -28,18 +30,9 @@ ALIKE = 0.95
 log-likelihood difference of 2 :data:`TIED`.  Chosen, to be derived: at 0.95 a tenth of the template's
 square differs; with (1 - cosine) twice as large, rivals that differ in a fifth are listed."""
 
-OUTSIDE = 0.02
-"""Least probability of the class outside_library, where effects leave nothing that stands out.
-Chosen, to be derived: twice as large scales the probabilities of all other classes by 0.96 / 0.98."""
-
 OUTSIDE_WORD = "outside_library"
 """Class, in report.json, of a mismatch that no effect of the library explains."""
 
-
-FAILS = 25.0
-"""Increase of a channel's held-out chi-square by the effects above which the report warns of that
-channel. Chosen, to be derived: two of the 165 concealed trials of commit 829b542 exceeded 12, both
-with wrong fits; twice as large, failures of up to 7 standard deviations pass without a warning."""
 
 WIDENED = 1.12
 """Factor on standard errors in all intervals.  Measured on 141 parameters of concealed trials (commit
@@ -154,7 +147,12 @@ class Attribution:
     notes : tuple of str
         Candidates that could not be fitted, and why.
     free_form : OpenWorld, optional
-        Nonparametric model of the mismatch outside the library, part of ``fit``.
+        Nonparametric model of what the effects leave, part of ``fit``.
+    shares : mapping of str to float
+        Parts of the chi-square above noise explained by 'effects', by other 'laws' of them, by terms
+        'outside' the library, and 'left'; they sum to 1.
+    touched : tuple of str
+        Channels that the effects change.
 
     Examples
     --------
@@ -172,6 +170,8 @@ class Attribution:
     heldout: dict[str, tuple[float, float, int]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     free_form: OpenWorld | None = None
+    shares: Mapping[str, float] = field(default_factory=dict)
+    touched: tuple[str, ...] = ()
 
     @property
     def probability(self) -> dict[str, float]:
@@ -181,12 +181,10 @@ class Attribution:
             for word, p in found.probability.items():
                 out[word] = 1 - (1 - out.get(word, 0.0)) * (1 - p)
         named = out.pop(OUTSIDE_WORD, 0.0)
-        sure = self.open_world and not any(
-            f.effect.word == OUTSIDE_WORD for f in self.found
-        )
-        # 0.9 is chosen, to be derived: with a mismatch left over, effects found beside it are
-        # often parts of the same unmodelled cause, so that they share a probability of 0.1.
-        outside = max(0.9 if sure else OUTSIDE, named)
+        # What neither the effects nor other laws of them take is in doubt, and at least what tests at
+        # the rate ALARM miss.
+        doubt = self.shares.get("outside", 0.0) + self.shares.get("left", 0.0)
+        outside = max(doubt, ALARM, named)
         if not self.found:
             return {OUTSIDE_WORD: 1.0} if self.open_world else {}
         scaled = {w: p * (1 - outside) for w, p in out.items()}
@@ -216,13 +214,27 @@ class Attribution:
         return before / count, after / count
 
     @property
-    def fails_in(self) -> tuple[str, ...]:
-        """Channels whose held-out chi-square the effects raise by more than :data:`FAILS`.
+    def heldout_p(self) -> dict[str, float]:
+        """By touched channel with held-out values: probability that noise gives their chi-square."""
+        return {
+            w: float(chi2.sf(after, n))
+            for w, (_, after, n) in self.heldout.items()
+            if w in self.touched and n
+        }
 
-        A correct effect also raises it, by about 1 for each fitted parameter.
+    @property
+    def fails_in(self) -> tuple[str, ...]:
+        """Channels whose held-out values the explanation contradicts, or makes worse.
+
+        Touched channels in which noise gives the chi-square with a probability below
+        :data:`~bfsensor.diagnose.detect.locate.ALARM`, and channels that are touched or not in which the
+        chi-square rises by more than one parameter gains by chance for each part of the explanation.
         """
+        parts = max(len(self.found), 1)
         return tuple(
-            w for w, (before, after, _) in self.heldout.items() if after - before > FAILS
+            w
+            for w, (before, after, _) in self.heldout.items()
+            if self.heldout_p.get(w, 1.0) < ALARM or after - before > charge(parts, 1)
         )
 
 
@@ -269,6 +281,8 @@ def tied_classes(effect: Effect, ranking: Sequence[Rival]) -> tuple[str, ...]:
     if own is not None:
         for rival in ranking:
             close = 0.5 * (own.gain - rival.gain) < TIED
+            # Where other laws count, they may hide a tie of the laws that are known.
+            close = close or 0.5 * abs(own.gain + own.law - rival.gain - rival.law) < TIED
             if close or (_cosine(own, rival) > ALIKE and own.gain - rival.gain < 4 * TIED):
                 words.append(rival.word)
     return tuple(dict.fromkeys(words))

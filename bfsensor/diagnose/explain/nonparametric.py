@@ -224,18 +224,9 @@ class FreeFit:
     choices: tuple[Choice, ...]
     scores: Mapping[str, float]
     mismatch: Mismatch
-    first: Choice | None = None
-
-    @property
-    def penalty(self) -> float:
-        """Chi-square that chance gives terms chosen from as many; it is not counted as explained."""
-        gain = sum(z * z for c in self.choices for z in c.z)
-        return float(gain - sum(c.score for c in self.choices))
 
 
-def fit_free_form(
-    model: Model, mismatch: Mismatch, *, before: BaselineFit | None = None, seed: int = 1
-) -> FreeFit:
+def fit_free_form(model: Model, mismatch: Mismatch, *, seed: int = 1) -> FreeFit:
     """Add the group of terms that explains most, refit everything, and repeat while residuals stand out.
 
     Parameters
@@ -244,21 +235,15 @@ def fit_free_form(
         Model with or without effects.
     mismatch : Mismatch
         Its residuals that stand out.
-    before : BaselineFit, optional
-        Fit without the effects; residuals within the error of the effects' predictions do not
-        count, and that error is relative to what they explain.  By default the model's own fit.
     seed : int
         Seed of the noise draws that p-values come from.
     """
-    before = model.fit if before is None else before
+    before = model.fit
     choices: list[Choice] = []
     scores: dict[str, float] = {}
-    while stands_out(
-        mismatch, explained_by_word(before, model.fit),
-        fits=len(model.effects) + sum(len(c.terms) for c in choices),
-    ):  # fmt: skip
-        if len(choices) == MOST_GROUPS:
-            break
+    while len(choices) < MOST_GROUPS and stands_out(
+        mismatch, explained_by_word(before, model.fit)
+    ):
         found = compete(Scene(model), mismatch)
         if not found:
             break
@@ -272,7 +257,7 @@ def fit_free_form(
         model = model.with_columns(Columns(terms))
         choices.append(best)
         mismatch = locate_mismatch(model.fit, seed=seed)
-    return FreeFit(model, tuple(choices), scores, mismatch, choices[0] if choices else None)
+    return FreeFit(model, tuple(choices), scores, mismatch)
 
 
 class Columns:

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
-from bfsensor.diagnose.detect.locate import ALARM
+from bfsensor.diagnose.detect.model_error import ACCURACY, charge
 from bfsensor.diagnose.explain.terms import Family, Term
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 from bfsensor.errors import ConvergenceError
@@ -18,19 +17,10 @@ MOST_TERMS = 6
 """Largest number of terms of one family. Chosen, to be derived: twice as many fit finer detail, which
 the select fold mostly refuses."""
 
-ACCURACY = 0.02
-"""Deviate relative to the first term's below which a term counts as an error of the first one's column.
-Chosen, to be derived: twice the error of about 1 % that columns have; twice as large, real terms of 2 to
-4 % of the first are lost."""
-
 SPANNED = 1e-3
 """Least part of a column's square that the fit's parameters do not span; columns below are no terms.
 Chosen: such a column differs from a combination of parameters by 3 % of its norm; twice as large
 removes the terms that are hardest to separate from gains and light."""
-
-SAME = 6.0
-"""Difference of the chi-square up to which another term in the first one's place is listed as explaining
-as much.  Chosen, to be derived: 3 in the log-likelihood, a ratio of 20; twice as large, of 400."""
 
 MOST_ALIKE = 3
 """Largest number of terms that are listed as explaining as much.  Chosen: length of the report only."""
@@ -117,7 +107,7 @@ class Dictionary:
     def critical(self) -> float:
         """Square of the deviate that noise gives the best of all terms with probability ALARM."""
         count = max(int((self.free > 0).sum()), self.family.tried, 1)
-        return float(chi2.isf(ALARM / count, 1))
+        return charge(1, count)
 
     def products(self, left: FloatArray) -> FloatArray:
         """Scalar products of all columns with whitened residuals."""
@@ -167,7 +157,7 @@ class Dictionary:
 
     def _same(self, z: float) -> float:
         """Difference of chi-squares that does not separate two terms, by chance or errors of columns."""
-        return SAME + (ACCURACY * z) ** 2
+        return charge(1, 1) + (ACCURACY * z) ** 2
 
     def alike(self, n: int, *, positive: bool = False) -> tuple[tuple[Term, float], ...]:
         """Other terms that alone explain as much as a given one, with their coefficients."""

@@ -1,13 +1,16 @@
-"""Stepwise attribution: add effects while they explain a baseline's residuals, then compare each."""
+"""Stepwise attribution: effects, their laws and nonparametric terms are added while one score falls."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
 from bfsensor.diagnose.detect.candidate_screen import Rival, Screen
 from bfsensor.diagnose.detect.candidates import (
+    REFITTED,
     candidates_of,
     concerned,
     further,
@@ -15,18 +18,12 @@ from bfsensor.diagnose.detect.candidates import (
     refine,
     seen_of,
     tellable,
-    threshold,
     with_fitted,
     with_hypotheses,
 )
 from bfsensor.diagnose.detect.locate import Mismatch, locate_mismatch
 from bfsensor.diagnose.detect.matched_filters import locate_effects
-from bfsensor.diagnose.detect.model_error import (
-    ACCURACY,
-    OUTSIDE_ALARM,
-    explained_by_word,
-    stands_out,
-)
+from bfsensor.diagnose.detect.model_error import SAME, charge, left_by_word, stands_out
 from bfsensor.diagnose.explain.attribution import (
     LEVELS,
     OUTSIDE_WORD,
@@ -36,13 +33,16 @@ from bfsensor.diagnose.explain.attribution import (
     class_probabilities,
     tied_classes,
 )
+from bfsensor.diagnose.explain.explanation import Explanation
+from bfsensor.diagnose.explain.law_terms import OwnChange, law_choices
 from bfsensor.diagnose.explain.nonparametric import (
+    MOST_GROUPS,
     FreeFit,
     OpenWorld,
     compete,
     explain_outside,
-    fit_free_form,
 )
+from bfsensor.diagnose.explain.pursuit import Choice
 from bfsensor.diagnose.explain.terms import Scene
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 from bfsensor.diagnose.fit.fitted_model import Model, compare_held_out
@@ -52,35 +52,16 @@ from bfsensor.diagnose.model.exchanged_axes import NAMED
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.effect import Effect
 from bfsensor.errors import ConvergenceError
+from bfsensor.typing import FloatArray
 
 MOST = 4
 """Largest number of effects that are added one after another; a mismatch beyond is left over.
-Chosen, to be derived: twice as many double the longest search, and change only campaigns with five or
-more effects."""
-
-WEAK = 6.0
-"""Increase of the chi-square when an effect is left out, below which it is removed again; also the
-least gain of candidates that are tried although noise may reach it.  Chosen, to be derived: one
-parameter gains 6 by chance with a probability of 1.4 %; at 12 (0.05 %) more faint effects are missed."""
+Chosen: twice as many double the longest search, and change only campaigns with five or more effects."""
 
 FAINT = 2
-"""Number of candidates below the noise threshold that are fitted where none is above it.  Chosen, to be
-derived: twice as many cost two more fits and find faint effects whose templates rank third or fourth."""
-
-NEEDED = 0.5
-"""Least ratio of an effect's gain in chi-square beside nonparametric terms to its gain alone.
-Chosen, to be derived: at 1 an effect is kept only if no term takes any part of its gain; at a quarter,
-effects are named that mostly imitate the unmodelled cause."""
-
-FAR_BETTER = 8.0
-"""Chi-square by which one group of nonparametric terms must explain more than the effects, after both
-are charged with what chance gives, to replace them. Chosen, to be derived: a likelihood ratio of
-exp(4) = 55; twice as large asks for 3,000, and wrong effects that leave nothing are named more
-often."""
-
-TAKEN = 9.0
-"""Chi-square that each fitted parameter of an effect is charged with, as it is the best of many
-candidates.  Chosen, to be derived: twice as large replaces more effects by nonparametric terms."""
+"""Number of candidates whose gain is below the charge of the best of all that are fitted where no
+addition is above it.  Chosen: twice as many cost two more fits and find faint effects whose templates
+rank third or fourth."""
 
 WIDTHS = [WIDENED * w for w in LEVELS.values()]
 """Square roots of the rises of the chi-square at which intervals end, 68 % and 95 %."""
@@ -96,17 +77,22 @@ def attribute(
 ) -> Attribution:
     """Find the effects that explain the residuals of a baseline.
 
-    Forward steps: take the candidate with the greatest evidence among those whose gain exceeds
-    the largest gain of noise (false-alarm rate
-    :data:`~bfsensor.diagnose.detect.locate.ALARM` over all candidates), refit everything, scan the new
-    residuals, and repeat until nothing stands out.  Then each effect is taken out once and compared
-    with all candidates in its place: a better one replaces it, equally good ones are listed as tied.
+    Three kinds of additions compete at each step: an effect of the library, another law of an
+    effect that was found (its own change times functions of the channels' coordinates), and a group
+    of nonparametric terms.  Each has one score, its gain in chi-square less what the best of all that
+    was tried gains by chance (:func:`~bfsensor.diagnose.detect.model_error.charge`); of an effect's
+    gain counts only what errors of the effects found before cannot make.  The best one whose score is
+    positive, and whose channels agree no worse on held-out recordings, is added, everything is
+    refitted, and all channels are scanned and the library asked again, until nothing stands out beyond
+    the errors of the predictions.
 
-    A mismatch that is left after that, beyond the error of the effects' predictions (see
-    :mod:`bfsensor.diagnose.detect.model_error`), is outside the library and is fitted with nonparametric
-    terms, first without any effect: effects that explained part of it are named only if the terms
-    cannot replace them.  The search also ends where one group of terms leaves nothing and explains
-    far more than the effects found so far (:data:`FAR_BETTER`).
+    At the end every effect is taken out once: it stays if its gain exceeds its charge, and is
+    replaced where another one scores better.  An effect whose law takes more than the effect
+    itself is not named.
+
+    What nonparametric terms describe is outside the library unless the effects' own predictions,
+    wrong by at most half of themselves in every value, may make it: then it is a part of the
+    effect by another law.
 
     Parameters
     ----------
@@ -119,7 +105,7 @@ def attribute(
     kinds : sequence of type, optional
         Candidate effects; by default :func:`candidates_of` the baseline.
     seed : int
-        Seed of the noise draws that thresholds come from.
+        Seed of the noise draws that p-values come from.
 
     Returns
     -------
@@ -129,209 +115,289 @@ def attribute(
     kinds = candidates_of(predictor.baseline) if kinds is None else kinds
     kinds = tellable(kinds, predictor, fit.channels)
     base = Model(predictor, fit)
-    candidates = (*kinds, *NAMED)
-    first = mismatch
-    model, mismatch, rankings, notes, better = _forward(base, mismatch, candidates, seed)
+    search = _Search((*kinds, *NAMED), seed, mismatch, [])
+    empty = Explanation(base, base, mismatch, max(len(kinds), 1), search.locate)
+    found, places = search.finished(*search.forward(empty))
+    return _attribution(found, places, search)
+
+
+@dataclass(eq=False)
+class _Search:
+    """Candidates of a search, its mismatch, notes, and effects ranked beside the first free terms."""
+
+    kinds: Sequence[type[Effect]]
+    seed: int
+    first: Mismatch
+    notes: list[str]
+    nearest: list[Rival] = field(default_factory=list)
+
+    def locate(self, model: Model) -> Mismatch:
+        """Find what stands out in a model's residuals, by scans and by effects not in it."""
+        return locate_effects(model.predictor, model.fit, self.kinds, seed=self.seed)
+
+    def forward(
+        self, now: Explanation, refused: frozenset[str] = frozenset()
+    ) -> tuple[Explanation, dict[str, list[Rival]]]:
+        """Add what scores best while anything stands out; rankings are by name of the effect."""
+        places: dict[str, list[Rival]] = {}
+        while now.stands_out():
+            step = self._step(now, refused)
+            if step is None:
+                break
+            after, ranking = step
+            if len(after.parts) > len(now.parts):
+                places[after.parts[-1].name] = ranking
+            if not now.free and after.free:
+                self.nearest = ranking
+            now = after
+            wrong = [
+                n
+                for n, p in enumerate(now.parts)
+                if sum(p.by_law.values()) > sum(p.own.values())
+            ]
+            if wrong:
+                # What remains of such an effect is its place alone, which terms describe without it.
+                refused |= {now.parts[n].name for n in wrong}
+                for n in reversed(wrong):
+                    now = now.without(n)
+                now = now.located()
+        return now, {n: r for n, r in places.items() if n in [p.name for p in now.parts]}
+
+    def _step(
+        self, now: Explanation, refused: frozenset[str]
+    ) -> tuple[Explanation, list[Rival]] | None:
+        """The best addition that holds, with the ranking of effects; None if none does."""
+        ranking = self._ranked(now, refused) if len(now.parts) < MOST else []
+        laws = [
+            (n, choice) for n, part in enumerate(now.parts)
+            if part.change is not None
+            for choice in law_choices(part.change, now.model.fit, part.law_terms())
+        ]  # fmt: skip
+        free = (
+            [c for c in compete(Scene(now.model), now.mismatch) if not _taken(c, now)]
+            if len(now.free) < MOST_GROUPS else []
+        )  # fmt: skip
+        good = [r for r in ranking if self._net(now, r) > charge(len(fitted(r.effect)), 1)]
+        good = good[:REFITTED]
+        extra = {r.effect.name: _law_score(now, r) for r in good}
+        best = free[0].score if free else 0.0
+        law = max((c.score for _, c in laws), default=0.0)
+        # Terms that fit better do not replace an effect, or its law, that is wrong by less than
+        # half in norm.
+        near = (1 - SAME**2) * best
+        options: list[tuple[float, Callable[[], Explanation]]] = [
+            (c.score, partial(now.with_law, n, c)) for n, c in laws
+        ]
+        for rival in good:
+            score = self._net(now, rival) - now.charge(rival.effect)
+            # An effect beside others must beat their laws by itself, not with a law of its own.
+            if score > 0 and (not now.parts or score >= law):
+                score += extra[rival.effect.name]
+                options.append((score, partial(now.with_effect, rival.effect)))
+        options.sort(key=lambda o: -o[0])
+        before = sum(score >= near for score, _ in options)
+        options[before:before] = [(c.score, partial(now.with_free, c)) for c in free[:1]]
+        ranking = _with_laws(ranking, extra)
+        for _, add in options:
+            after = self._tried(now, add)
+            if after is not None:
+                return after, ranking
+        return self._faint(now, ranking)
+
+    def _net(self, now: Explanation, rival: Rival) -> float:
+        """Gain of a candidate that errors of what was added before cannot make."""
+        if rival.effect.told_by_scatter:
+            return max(rival.gain - now.reach(rival.effect.touches), 0.0)
+        return now.net(rival.gain, rival.template)
+
+    def _ranked(self, now: Explanation, refused: frozenset[str]) -> list[Rival]:
+        """Effects that may be added, by decreasing evidence; those of the closest gains fitted."""
+        screen = Screen(now.model.predictor, now.model.fit, seen_of(now.mismatch))
+        kinds = further(concerned(self.kinds, now.mismatch), now.model.effects)
+        ranking = with_hypotheses(now.model, kinds, rank(screen, kinds))
+        self.notes += [
+            f"{name}, tried at one place: {why}" for name, why in screen.passed_over.items()
+        ]
+        ranking = [r for r in ranking if not r.refuted and r.effect.name not in refused]
+        # Only effects whose gain is beyond chance are worth a joint fit.
+        good = [r for r in ranking if self._net(now, r) > charge(len(fitted(r.effect)), 1)]
+        others = [r for r in ranking if r not in good]
+        good = refine(now.model, good) if good else []
+        return sorted([*good, *others], key=lambda r: -r.evidence)
+
+    def _tried(
+        self, now: Explanation, add: Callable[[], Explanation]
+    ) -> Explanation | None:
+        """An addition, if its fit converges, its score falls, and held-out recordings agree."""
+        try:
+            after = add()
+        except ConvergenceError as error:
+            self.notes.append(str(error))
+            return None
+        if after.score >= now.score or not holds(now, after):
+            return None
+        return after
+
+    def _faint(
+        self, now: Explanation, ranking: Sequence[Rival]
+    ) -> tuple[Explanation, list[Rival]] | None:
+        """An effect whose gain alone is beyond chance and that leaves nothing.
+
+        The mismatch is beyond noise already, so that one candidate is not charged for the others
+        where it takes all of it.
+        """
+        good = [r for r in ranking if self._net(now, r) > charge(len(fitted(r.effect)), 1)]
+        for rival in good[:FAINT]:
+            try:
+                after = now.with_effect(rival.effect)
+            except ConvergenceError as error:
+                self.notes.append(f"{rival.effect.name}: {error}")
+                continue
+            if not locate_mismatch(after.model.fit, seed=self.seed).detected:
+                return after, list(ranking)
+        return None
+
+    def finished(
+        self, now: Explanation, places: Mapping[str, list[Rival]]
+    ) -> tuple[Explanation, dict[str, list[Rival]]]:
+        """Remove effects that the others make needless, and replace those that score worse."""
+        out: dict[str, list[Rival]] = dict(places)
+        for name in [p.name for p in sorted(now.parts, key=lambda p: sum(p.own.values()))]:
+            n = [p.name for p in now.parts].index(name)
+            if not now.takes_most(n):
+                now = now.without(n).located()
+        again = len(now.parts) + len(now.free) > 1
+        while again:
+            again = False
+            for n, part in enumerate(now.parts):
+                without = now.without(n)
+                template = moved(without.model.fit, now.model.fit)
+                gain = without.model.fit.total - now.model.fit.total
+                if without.net(gain, template) < now.charge(now.model.effects[n]):
+                    now, again = without.located(), True
+                    break
+                law = sum(part.by_law.values())
+                ranking = self._in_place(now, without, n, gain - law)
+                out[part.name] = ranking
+                best = ranking[0]
+                if best.effect.name != part.name:
+                    try:
+                        other, _ = self.forward(without.with_effect(best.effect))
+                    except ConvergenceError:
+                        continue
+                    # The score falls with every exchange, so that the search ends.
+                    if other.score < now.score:
+                        now, again = other, True
+                        break
+        return now, out
+
+    def _in_place(
+        self, now: Explanation, without: Explanation, n: int, gain: float
+    ) -> list[Rival]:
+        """Rank all candidates in the place of one effect."""
+        screen = Screen(without.model.predictor, without.model.fit, seen_of(self.first))
+        kinds = concerned(self.kinds, self.first, now.mismatch)
+        ranking = rank(screen, further(kinds, without.model.effects))
+        name = now.parts[n].name
+        ranking = [r for r in ranking if not r.refuted or r.effect.name == name]
+        ranking = with_fitted(ranking, now.model.effects[n], gain)
+        good = ranking[:REFITTED]
+        return _with_laws(ranking, {r.effect.name: _law_score(without, r) for r in good})
+
+
+def holds(before: Explanation, after: Explanation) -> bool:
+    """Whether held-out recordings agree no worse than chance makes them.
+
+    The chi-square of the held-out values of all channels that the addition changes may rise by no
+    more than its charge.
+    """
+    squares = compare_held_out(before.model, after.model)
+    rise = sum(b - a for a, b, _ in squares.values())
+    paid = (after.score - after.model.fit.total) - (before.score - before.model.fit.total)
+    return rise <= paid
+
+
+def moved(before: BaselineFit, after: BaselineFit) -> FloatArray:
+    """Whitened change of all values between two fits, zero in the rows of the priors of the first."""
+    out = np.zeros(len(before.left))
+    out[: len(before.residuals)] = before.residuals - after.residuals
+    return out
+
+
+def _taken(choice: Choice, now: Explanation) -> bool:
+    """Whether all terms of a choice are in the model already."""
+    there = {t.name for c, *_ in now.free for t in c.terms}
+    return all(t.name in there for t in choice.terms)
+
+
+def _law_score(now: Explanation, rival: Rival) -> float:
+    """Score of the laws that a candidate would need, to first order; 0 if they take more than it."""
+    fit = now.model.fit
+    left = fit.left - rival.template
+    length = float(np.sqrt(rival.template @ rival.template))
+    if not length or not any(
+        left_by_word(fit, left).get(w, 0.0) for w in rival.effect.touches
+    ):
+        return 0.0
+    beside = replace(
+        fit, left=left, basis=np.column_stack([fit.basis, rival.template / length])
+    )
+    effects = (*now.model.effects, rival.effect)
+    change = OwnChange(now.model.predictor, fit.values, effects)
+    choices = law_choices(change, beside)
+    gain = sum(z * z for c in choices for z in c.z)
+    return sum(c.score for c in choices) if gain <= rival.gain else 0.0
+
+
+def _with_laws(ranking: Sequence[Rival], scores: Mapping[str, float]) -> list[Rival]:
+    """Ranking with the scores of other laws, by name of the effect, in the evidences."""
+    out = []
+    for rival in ranking:
+        more = scores.get(rival.effect.name, 0.0)
+        out.append(replace(rival, evidence=rival.evidence + 0.5 * more, law=more))
+    return sorted(out, key=lambda r: -r.evidence)
+
+
+def _attribution(
+    now: Explanation, places: Mapping[str, list[Rival]], search: _Search
+) -> Attribution:
+    """Settle the fit, and state what was found, what is left, and what is outside the library."""
+    outside = [c for c, *_ in now.free if not now.same(c)]
+    last = now.model
     free: OpenWorld | None = None
-    outside = better is not None or _is_outside(base, model, mismatch)
-    if not outside:
-        places = {n: r for n, r in rankings.items() if n < len(model.effects)}
-        judged = concerned(candidates, first, mismatch)
-        found, model, mismatch = _judge(model, places, mismatch, judged, seed)
-        outside = _is_outside(base, model, mismatch)
-    if better is not None:
-        free, model = better
-        found, mismatch = [], free.mismatch
-    elif outside:
-        found, model, mismatch, free = _outside(
-            base, model, mismatch, rankings, concerned(candidates, first, mismatch), seed
-        )
+    model, profiles = _settled(last)
+    mismatch = (
+        now.mismatch if model is last else locate_mismatch(model.fit, seed=search.seed)
+    )
+    if now.free:
+        choices = tuple(c for c, *_ in now.free)
+        scores = {c.family.group: c.score for c in choices}
+        told = explain_outside(
+            now.plain(), mismatch, search.nearest,
+            free=FreeFit(model, choices, scores, mismatch), seed=search.seed,
+        )  # fmt: skip
+        free = told[0] if told is not None else None
+    left = stands_out(
+        mismatch, now.explained(), dict.fromkeys(now.explained(), SAME), library=False
+    )
+    nothing = not now.parts and mismatch.detected
+    found = [
+        _found(model, n, places.get(part.name, []), own)
+        for n, (part, own) in enumerate(zip(now.parts, profiles, strict=True))
+    ]
     named = any(f.effect.word == OUTSIDE_WORD for f in found)
     return Attribution(
         found=tuple(sorted(found, key=lambda f: -f.gain)),
         fit=model.fit,
         predictor=model.predictor,
         mismatch=mismatch,
-        open_world=outside or named,
-        heldout=compare_held_out(base, model),
-        notes=tuple(notes),
+        open_world=bool(outside) or left or nothing or named,
+        heldout=compare_held_out(now.base, model),
+        notes=tuple(search.notes),
         free_form=free,
+        shares=now.shares(outside),
+        touched=now.touched(),
     )
-
-
-def _forward(
-    base: Model, mismatch: Mismatch, kinds: Sequence[type[Effect]], seed: int
-) -> tuple[
-    Model, Mismatch, dict[int, list[Rival]], list[str], tuple[OpenWorld, Model] | None
-]:
-    """Add effects one by one while residuals stand out and a candidate explains them.
-
-    Returns the model, its mismatch, the rankings by number of effects present, notes, and a
-    nonparametric model that explains far more, or None.
-    """
-    model, first = base, mismatch
-    notes: list[str] = []
-    rankings: dict[int, list[Rival]] = {}
-    while len(model.effects) < MOST and stands_out(
-        mismatch, explained_by_word(base.fit, model.fit), fits=len(model.effects)
-    ):
-        screen = Screen(model.predictor, model.fit, seen_of(mismatch))
-        others = further(concerned(kinds, mismatch), model.effects)
-        ranking = with_hypotheses(model, others, rank(screen, others))
-        notes += [
-            f"{name}, tried at one place: {why}" for name, why in screen.passed_over.items()
-        ]
-        critical = threshold(screen, ranking, seed=seed)
-        good = [r for r in ranking if r.gain > critical and not r.refuted]
-        rankings[len(model.effects)] = ranking
-        if good:
-            ranking = refine(model, ranking)
-            good = [r for r in ranking if r.gain > critical and not r.refuted] or good
-            rankings[len(model.effects)] = ranking
-        else:
-            # The mismatch itself is beyond noise already, so that a candidate below the noise of the
-            # best of all candidates may explain it; :func:`_step` asks that it leave nothing.
-            good = [r for r in ranking if r.gain > WEAK and not r.refuted][:FAINT]
-        step = _step(
-            model, good, kinds, seed, notes, sure=bool(good) and good[0].gain > critical
-        )
-        if step is None:
-            break
-        model, mismatch = step
-        better = _better(base, first, model, rankings, seed)
-        if better is not None:
-            return model, mismatch, rankings, notes, better
-    return model, mismatch, rankings, notes, None
-
-
-def _step(
-    model: Model,
-    good: Sequence[Rival],
-    kinds: Sequence[type[Effect]],
-    seed: int,
-    notes: list[str],
-    *,
-    sure: bool,
-) -> tuple[Model, Mismatch] | None:
-    """Fit the first candidate that converges; one below the threshold must leave nothing."""
-    for rival in good:
-        try:
-            further = model.with_effects((*model.effects, rival.effect))
-        except ConvergenceError as error:
-            notes.append(f"{rival.effect.name}: {error}")
-            continue
-        if sure or not locate_mismatch(further.fit, seed=seed).detected:
-            return further, locate_effects(further.predictor, further.fit, kinds, seed=seed)
-    return None
-
-
-def _is_outside(base: Model, model: Model, mismatch: Mismatch) -> bool:
-    """Whether the residuals are outside the library: :mod:`bfsensor.diagnose.detect.model_error`."""
-    explained = explained_by_word(base.fit, model.fit)
-    return stands_out(mismatch, explained, fits=len(model.effects), alarm=OUTSIDE_ALARM)
-
-
-def _outside(
-    base: Model,
-    model: Model,
-    mismatch: Mismatch,
-    rankings: dict[int, list[Rival]],
-    kinds: Sequence[type[Effect]],
-    seed: int,
-) -> tuple[list[Found], Model, Mismatch, OpenWorld | None]:
-    """Fit nonparametric terms to the residuals, and keep the effects that are needed beside them.
-
-    An effect that explains part of an unmodelled cause is not the cause: where terms explain
-    the mismatch without any effect, none is named.  Otherwise an effect stays if its gain beside
-    the terms is more than :data:`NEEDED` of its gain alone.
-    """
-    first = locate_mismatch(base.fit, seed=seed) if model.effects else mismatch
-    alone = fit_free_form(base, first, seed=seed)
-    chosen, effects, ranking = alone, base, rankings.get(0, [])
-    if model.effects:
-        beside = fit_free_form(model, mismatch, before=base.fit, seed=seed)
-        if not _does_without(base, alone, model, beside):
-            chosen, effects = beside, model
-            ranking = rankings.get(len(model.effects), [])
-            kept = _needed(chosen.model, base)
-            if len(kept) < len(model.effects):
-                effects = model.with_effects(kept)
-                left = locate_mismatch(effects.fit, seed=seed)
-                chosen = fit_free_form(effects, left, before=base.fit, seed=seed)
-                ranking = []
-    told = explain_outside(effects, mismatch, ranking, free=chosen, seed=seed)
-    if told is None:
-        free, last, left = None, effects, mismatch
-    else:
-        free, last = told
-        left = chosen.mismatch
-    found = [
-        _found(last, n, _place(last, n, kinds, left), find_profiles(last, n, WIDTHS))
-        for n in range(len(last.effects))
-    ]
-    return found, last, left, free
-
-
-def _better(
-    base: Model,
-    mismatch: Mismatch,
-    model: Model,
-    rankings: Mapping[int, list[Rival]],
-    seed: int,
-) -> tuple[OpenWorld, Model] | None:
-    """Nonparametric model by one group of terms, if it explains far more than the effects do."""
-    least = base.fit.total - model.fit.total - _critical(model.effects) + FAR_BETTER
-    choices = compete(Scene(base), mismatch)
-    if not choices or choices[0].score < least:
-        return None
-    alone = fit_free_form(base, mismatch, seed=seed)
-    gain = base.fit.total - alone.model.fit.total - alone.penalty
-    explained = explained_by_word(base.fit, alone.model.fit)
-    if len(alone.choices) != 1 or gain < least or stands_out(alone.mismatch, explained):
-        return None
-    return explain_outside(base, alone.mismatch, rankings.get(0, []), free=alone, seed=seed)
-
-
-def _does_without(base: Model, alone: FreeFit, model: Model, beside: FreeFit) -> bool:
-    """Whether nonparametric terms alone explain as much as effects with terms beside them.
-
-    Each term and parameter is charged with what chance gives.  Where both models have as many
-    groups, a difference within the error of the predictions (:data:`ACCURACY`) counts as none.
-    """
-    if not alone.choices:
-        return False
-    charged = beside.model.fit.total + beside.penalty + _critical(model.effects)
-    cost = alone.model.fit.total + alone.penalty - charged
-    if len(alone.choices) > len(beside.choices):
-        return bool(cost <= 0)
-    return bool(cost <= ACCURACY**2 * (base.fit.total - model.fit.total))
-
-
-def _place(
-    model: Model, n: int, kinds: Sequence[type[Effect]], mismatch: Mismatch
-) -> list[Rival]:
-    """Rank all candidates in the place of one effect of a model."""
-    others = [e for k, e in enumerate(model.effects) if k != n]
-    without = model.with_effects(others)
-    screen = Screen(without.predictor, without.fit, seen_of(mismatch))
-    return rank(screen, further(kinds, others))
-
-
-def _critical(effects: Sequence[Effect]) -> float:
-    """Chi-square that as many effects take by chance."""
-    return TAKEN * sum(len(fitted(e)) for e in effects)
-
-
-def _needed(model: Model, base: Model) -> list[Effect]:
-    """Effects whose gain nonparametric terms cannot take over."""
-    out = []
-    for n, effect in enumerate(model.effects):
-        others = [e for k, e in enumerate(model.effects) if k != n]
-        gain = model.with_effects(others).fit.total - model.fit.total
-        alone = base.fit.total - base.with_effects([effect]).fit.total
-        if gain > max(_critical([effect]), NEEDED * alone):
-            out.append(effect)
-    return out
 
 
 def _found(
@@ -358,49 +424,3 @@ def _settled(model: Model) -> tuple[Model, list[dict[str, Profile]]]:
         profiles[n] if n in profiles else find_profiles(model, n, WIDTHS)
         for n in range(len(model.effects))
     ]
-
-
-def _judge(
-    model: Model,
-    rankings: dict[int, list[Rival]],
-    mismatch: Mismatch,
-    kinds: Sequence[type[Effect]],
-    seed: int,
-) -> tuple[list[Found], Model, Mismatch]:
-    """Compare each effect with all candidates in its place; remove or replace it where needed."""
-    swapped = True
-    rounds = 0
-    places = dict(rankings)
-    # Three rounds are chosen, to be derived: two effects that replace each other in turn would
-    # otherwise never end; each round costs as many rankings as there are effects.
-    while swapped and len(model.effects) > 1 and rounds < 3:
-        swapped, rounds = False, rounds + 1
-        for n in range(len(model.effects)):
-            others = tuple(e for k, e in enumerate(model.effects) if k != n)
-            without = model.with_effects(others)
-            gain = without.fit.total - model.fit.total
-            if gain < WEAK:
-                model, places, swapped = without, {}, True
-                break
-            screen = Screen(without.predictor, without.fit, seen_of(mismatch))
-            ranking = refine(without, rank(screen, further(kinds, others)))
-            ranking = places[n] = with_fitted(ranking, model.effects[n], gain)
-            here = next(
-                (r for r in ranking if r.effect.name == model.effects[n].name), None
-            )
-            best = ranking[0]
-            # A margin of 1 in the logarithm of the evidence, chosen, to be derived, prevents a
-            # swap between candidates whose evidences differ by less than their approximation.
-            if best.effect.name != model.effects[n].name and (
-                here is None or best.evidence > here.evidence + 1.0
-            ):
-                other = without.with_effects((*others, best.effect))
-                if other.fit.total < model.fit.total:
-                    model, places, swapped = other, {}, True
-                    break
-    last = model
-    model, profiles = _settled(model)
-    if model.effects and (rounds or model is not last):
-        mismatch = locate_mismatch(model.fit, seed=seed)
-    out = [_found(model, n, places.get(n, []), own) for n, own in enumerate(profiles)]
-    return out, model, mismatch

@@ -150,6 +150,12 @@ class Predictor:
             other.start = point[: len(self.names)].copy()
         return other
 
+    def without_columns(self, columns: Sequence[Columns]) -> Predictor:
+        """Make a copy without some of the further linear parameters."""
+        other = copy(self)
+        other.columns = tuple(c for c in self.columns if not any(c is d for d in columns))
+        return other
+
     def with_shifts(
         self,
         edges: tuple[FloatArray, FloatArray],

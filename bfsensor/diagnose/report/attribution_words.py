@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from bfsensor.diagnose.detect.model_error import ACCURACY, OUTSIDE_ALARM
+from bfsensor.diagnose.detect.locate import ALARM
 from bfsensor.diagnose.explain.attribution import Attribution, Found
 from bfsensor.diagnose.model.exchanged_axes import AxesExchanged, says_exchanged
 from bfsensor.diagnose.report.class_words import (
@@ -14,6 +14,7 @@ from bfsensor.diagnose.report.class_words import (
     PARAMETER_WORDS,
     said_family_p,
     said_interval,
+    said_p,
     said_value,
 )
 from bfsensor.diagnose.report.nonparametric_words import reported_freely, said_freely
@@ -63,9 +64,11 @@ def said_of(attribution: Attribution) -> list[str]:
     """Sentences: effects with their parameters, what is left, and chi-squares of held-out data."""
     out = []
     left = attribution.mismatch
-    # An effect "explains" a mismatch only where it does so alone, and nothing that stands out is left.
+    # An effect "explains" a mismatch only where it does so alone, by its own law, nothing that
+    # stands out is left, and held-out values of every channel that it changes agree.
     alone = len(attribution.found) == 1 and not (left.detected or attribution.open_world)
-    verb = "explains it" if alone else "explains part of it"
+    whole = alone and attribution.free_form is None and not attribution.fails_in
+    verb = "explains it" if whole and not _other_law(attribution) else "explains part of it"
     for found in attribution.found:
         if isinstance(found.effect, AxesExchanged):
             out.append(
@@ -73,17 +76,13 @@ def said_of(attribution: Attribution) -> list[str]:
             )
             continue
         out.append(f"{_said_effect(found, verb)}.")
+    out += _said_shares(attribution)
     if attribution.found and attribution.free_form is None:
         out.append(_said_left(attribution))
     named = any(f.effect.word == OUTSIDE for f in attribution.found)
     if attribution.open_world and not (named and attribution.free_form is None):
         what = "the rest" if attribution.found else "it"
         out.append(f"No effect of the library explains {what}.")
-    elif not attribution.found and left.detected:
-        out.append(
-            "No effect of the library explains it; it is too weak to be called outside the "
-            f"library, which takes a family-wise p below {OUTSIDE_ALARM:g}."
-        )
     if attribution.free_form is not None:
         # The residuals are those with the nonparametric terms.
         out += [said_freely(attribution.free_form), _said_left(attribution)]
@@ -96,9 +95,10 @@ def said_of(attribution: Attribution) -> list[str]:
         )
         for word in attribution.fails_in:
             worse, better, n = (attribution.heldout[word][k] for k in (1, 0, 2))
+            p = said_p(attribution.heldout_p.get(word, 1.0))
             out.append(
-                f"There it rises in one channel, {NAMES.get(word, word)} (from {better / n:.2f} to "
-                f"{worse / n:.4g}): do not rely on parameters of effects that act on it."
+                f"One channel does not agree there, {NAMES.get(word, word)} (from {better / n:.2f} to "
+                f"{worse / n:.4g}, p {p}): do not rely on parameters of effects that act on it."
             )
     return out
 
@@ -145,6 +145,33 @@ def _said_left(attribution: Attribution) -> str:
     if not left.detected:
         return f"Nothing else stands out (family-wise p {p})."
     text = f"What is left still stands out (family-wise p {p})"
-    if not attribution.open_world and left.p_value < OUTSIDE_ALARM:
-        text += f", but within the {100 * ACCURACY:g} % to which effects are predicted"
+    if attribution.found and not attribution.open_world:
+        text += ", but errors of the effects' own predictions may make it"
     return f"{text}."
+
+
+def _other_law(attribution: Attribution) -> bool:
+    """Whether a measurable part of the mismatch asks for another law of the effects."""
+    return attribution.shares.get("laws", 0.0) > 0
+
+
+def _said_shares(attribution: Attribution) -> list[str]:
+    """What the effects take by their own laws, and what other laws or causes take beside them."""
+    shares = attribution.shares
+    if not attribution.found or not shares:
+        return []
+    out = []
+    if shares["laws"] > 0:
+        out.append(
+            f"By the law that is printed here, effects take {_percent(shares['effects'])} of the "
+            f"chi-square above noise; another {_percent(shares['laws'])} lies where they act and "
+            "asks for another law of the same class."
+        )
+    if shares["outside"] + shares["left"] > ALARM:
+        rest = _percent(shares["outside"] + shares["left"])
+        out.append(f"A part, {rest} of the chi-square above noise, remains beside them.")
+    return out
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.3g} %"

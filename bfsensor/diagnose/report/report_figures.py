@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from bfsensor.diagnose.data.channels import PER_ELECTRON
-from bfsensor.diagnose.explain.attribution import OUTSIDE as UNKNOWN
+from bfsensor.diagnose.detect.locate import ALARM
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 from bfsensor.diagnose.report.class_words import NAMES
 from bfsensor.diagnose.report.diagnosis_result import Diagnosis
@@ -128,7 +128,7 @@ def _summary(diagnosis: Diagnosis) -> dict[str, Picture]:
         height = 0.7 + 0.32 * len(shown)
         out["classes"] = Picture(
             "Probability that the baseline lacks an effect of each class; at least "
-            f"{100 * UNKNOWN:g} % is kept, by choice, for effects outside the library"
+            f"{100 * ALARM:g} %, or the part that is left, is kept for effects outside the library"
             + ("; classes that these recordings do not distinguish are in orange." if tied else "."),
             (5.2, height), (lambda ax: show.draw_classes(shown, ax, tied=tied),),
         )  # fmt: skip

@@ -264,9 +264,10 @@ def test_a_remainder_counts_against_what_is_explained_in_its_channel(word, count
     finding = Finding("lags", word, 8.0, 1e-12)
     left = Mismatch(1e-12, 0.5, 1e-12, (finding,), {word: (100.0, 100.0)})
     explained = {"serial_overscan": (1.2 * 8.0 / ACCURACY) ** 2, "flat_cov": 50.0}
-    assert counts(finding, left, explained) is counted
+    assert counts(finding, left, explained, {}) is counted
     assert stands_out(left, explained) is counted
-    assert not stands_out(left, explained, alarm=1e-13)
+    # A prediction that is known to be worse may leave as much in either channel.
+    assert not stands_out(left, explained, {"flat_cov": 1.2, "serial_overscan": 1.0})
 
 
 def test_families_compete_on_what_stands_out_alone():

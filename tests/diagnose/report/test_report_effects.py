@@ -7,9 +7,10 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
-from bfsensor.diagnose.detect.locate import locate_mismatch
-from bfsensor.diagnose.explain.attribution import FAILS
+from bfsensor.diagnose.detect.locate import ALARM, locate_mismatch
+from bfsensor.diagnose.detect.model_error import charge
 from bfsensor.diagnose.fit.baseline_fit import held_out
 from bfsensor.diagnose.plan.advice import plan
 from bfsensor.diagnose.report.class_words import (
@@ -93,12 +94,28 @@ def test_report_json_has_plan_advice_and_what_was_not_tested(explained, written)
 
 def test_channels_that_get_worse_on_held_out_recordings_are_reported(explained):
     told = explained.attribution
-    before, _, n = told.heldout["flat_mean"]
-    worse = {**told.heldout, "flat_mean": (before, before + 2 * FAILS, n)}
-    astray = replace(explained, attribution=replace(told, heldout=worse))
-    assert astray.to_report()["heldout"]["fails_in"] == ["flat_mean"]
-    assert f"{NAMES['flat_mean']} (from" in astray.said()
+    before, after, n = told.heldout["flat_mean"]
+    (p,) = (told.heldout_p[w] for w in ["flat_mean"])
+    assert p == pytest.approx(chi2.sf(after, n))
+    for worse in (before + 2 * charge(1, 1), chi2.isf(0.5 * ALARM, n)):
+        held = {**told.heldout, "flat_mean": (before, worse, n)}
+        astray = replace(explained, attribution=replace(told, heldout=held))
+        assert astray.to_report()["heldout"]["fails_in"] == ["flat_mean"]
+        assert f"{NAMES['flat_mean']} (from" in astray.said()
+        # Refuted by recordings that were not fitted, an effect explains nothing.
+        assert "explains it" not in astray.said()
     assert f"{NAMES['flat_mean']} (from" not in explained.said()
+
+
+def test_a_part_that_asks_for_another_law_or_remains_is_said_with_its_share(explained):
+    told = explained.attribution
+    assert "explains it" in explained.said()
+    shares = {"effects": 0.7, "laws": 0.2, "outside": 0.1, "left": 0.0}
+    part = replace(explained, attribution=replace(told, shares=shares))
+    assert "70 % of the chi-square" in part.said() and "another 20 %" in part.said()
+    assert "A part, 10 % of" in part.said() and "explains it" not in part.said()
+    outside = part.to_report()["class_probability"]["outside_library"]
+    assert outside == pytest.approx(0.1)
 
 
 def test_an_effect_explains_only_where_nothing_is_left(explained):
