@@ -66,10 +66,8 @@ def explain_single_value(
     if choice is None:
         return None
     after = model.with_columns(Columns(own[:1]))
-    free = FreeFit(
-        after, (choice,), {SINGLE: choice.score}, locate_mismatch(after.fit, seed=seed),
-        choice,
-    )  # fmt: skip
+    left = locate_mismatch(after.fit, seed=seed)
+    free = FreeFit(after, (choice,), {SINGLE: choice.score}, left)
     kinds = tellable(candidates_of(predictor.baseline), predictor, fit.channels)
     ranking = rank(Screen(predictor, fit, seen_of(mismatch)), kinds)
     told = explain_outside(model, mismatch, ranking, free=free, seed=seed)
