@@ -37,9 +37,13 @@ their errors (if it is also 5 sigma above 1).  Chosen: errors may then be 12 % t
 amplitude; with 1.5, 22 %."""
 
 LAMP_UNKNOWN = 0.02
-"""Relative error of the light of an exposure without a lamp monitor.  Chosen, to be derived from
-shutters and lamps: deviations from linearity below 2 % are then no findings; with 0.04, those
-below 4 %."""
+"""Relative error of the light of an exposure without a lamp monitor, where too few levels are repeated
+to show it.  Chosen, to be derived from shutters and lamps: deviations from linearity below 2 % are then
+no findings; with 0.04, those below 4 %."""
+
+REPEATS = 8
+"""Degrees of freedom from which the scatter of repeated levels is the lamp's error.  Chosen: it is then
+known to 25 %; with 16, to 18 %."""
 
 
 STRUCK = 10.0
@@ -265,6 +269,7 @@ class FlatChannels:
         if not self._ratios:
             # Without a pair no gain is known.
             return out
+        unknown = self._light_scatter()
         for fold, rows in self._means.items():
             values, blocks, axes = [], [], Axes()
             for exposure, condition, amplifiers in rows:
@@ -273,7 +278,7 @@ class FlatChannels:
                 # of many has Poisson noise, although a pixel's variance is less.
                 variance = m * [self._poisson(n) for n in range(len(m))] / pixels + zero
                 known = exposure.lamp is not None
-                error = self._lamp_error if known else LAMP_UNKNOWN
+                error = self._lamp_error if known else unknown
                 values.append(m)
                 blocks.append(np.diag(variance) + error**2 * np.outer(m, m))
                 axes.add(
@@ -288,6 +293,28 @@ class FlatChannels:
                         "adu", fold)
             )  # fmt: skip
         return out
+
+    def _light_scatter(self) -> float:
+        """Relative scatter of the light of exposures without a lamp monitor.
+
+        Levels that were repeated over more than half of the series of flats show flicker and drift
+        of the lamp; without enough of these it is :data:`LAMP_UNKNOWN`.
+        """
+        every = [r for rows in self._means.values() for r in rows if r[0].lamp is None]
+        numbers = [e.number for e, *_ in every]
+        groups: dict[tuple, list[tuple[int, float]]] = {}
+        for exposure, condition, amplifiers in every:
+            if seconds := exposure.exposure_time:
+                light = float(np.mean([m for m, *_ in amplifiers])) / seconds
+                key = condition, self._step(exposure)
+                groups.setdefault(key, []).append((exposure.number, light))
+        square, freedom = 0.0, 0
+        for members in groups.values():
+            at, light_of = np.array(members).T
+            if len(at) > 1 and np.ptp(at) > 0.5 * np.ptp(numbers):
+                square += float(np.square(light_of / light_of.mean() - 1).sum())
+                freedom += len(at) - 1
+        return float(np.sqrt(square / freedom)) if freedom >= REPEATS else LAMP_UNKNOWN
 
     def _poisson(self, amp: int) -> float:
         """Variance of a pixel over its mean in the faintest 30 % of flats [ADU], the inverse gain."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.device.condition import Condition
-from bfsensor.diagnose.data.bench_nuisances import bench_nuisances
+from bfsensor.diagnose.data.bench_nuisances import assumed_errors, bench_nuisances
 from bfsensor.diagnose.data.bias_channels import (
     BiasChannels,
 )
@@ -359,6 +359,7 @@ def measure_channels(
             f"light and level, biases {len(kinds.get('bias', []))} (2 are needed), no dark, no "
             f"spots that could be fitted{'; ' + '; '.join(notes) if notes else ''}"
         )
+    notes += assumed_errors(channels)
     if "bias" not in kinds and any(f.serial_overscan.size == 0 for f in layout):
         notes.append(
             "no bias and no overscan: the zero level is not known and stays in the levels, "

@@ -169,8 +169,13 @@ def _map_columns(channel: Channel, measured: MeasuredChannels) -> dict[str, Floa
         if name == "all":
             for n, spot in enumerate(c for c in measured.cosmetics if c.kind == "dust"):
                 # The light beneath a dust spot is known less well than that beside it.
-                bump = _bump(nx, *spot.x), _bump(ny, *spot.y)
-                out[f"map dust {n}"] = np.where(here, places.product(*bump, size), 0.0)
+                across, down = _bump(nx, *spot.x), _bump(ny, *spot.y)
+                # Its level and its slopes.
+                for slope, pair in enumerate(
+                    ((across, down), (across * u, down), (across, down * v))
+                ):
+                    column = np.where(here, places.product(*pair, size), 0.0)
+                    out[f"map dust {n} {slope}"] = column
         if name == "all" and ring.any():
             out["map rings white"] = np.where(ring, 1.0, 0.0)
     return out
@@ -198,9 +203,9 @@ def _inside(size: int, start: int, stop: int) -> FloatArray:
 
 
 def _bump(size: int, start: int, stop: int) -> FloatArray:
-    """One arch of a squared sine from ``start`` to ``stop``, 0 elsewhere; shape (size,)."""
+    """One arch of a sine from ``start`` to ``stop``, 0 elsewhere; shape (size,)."""
     out, place = np.zeros(size), np.arange(max(start, 0), min(stop, size))
-    out[place] = np.sin(np.pi * (place - start + 0.5) / (stop - start)) ** 2
+    out[place] = np.sin(np.pi * (place - start + 0.5) / (stop - start))
     return out
 
 

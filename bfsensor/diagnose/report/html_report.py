@@ -334,7 +334,7 @@ def _cosmetics(report: Mapping[str, Any]) -> str:
         return ""
     rows = [
         [
-            c["kind"].replace("_", " "), ", ".join(map(str, c["amps"])),
+            c["kind"].replace("_", " "), ", ".join(map(str, c["amps"])) or "all",
             "{} to {}".format(c["x"][0], c["x"][1] - 1), "{} to {}".format(c["y"][0], c["y"][1] - 1),
             f"{c['size']:.3g} {c['unit']}", f"{c['z']:.0f}",
         ]
@@ -342,7 +342,8 @@ def _cosmetics(report: Mapping[str, Any]) -> str:
     ]  # fmt: skip
     titles = ["defect", "amplifier", "columns", "rows", "size", "standard deviations"]
     return (
-        "<h2>Defects of the sensor</h2><p>Repaired in all exposures before anything was measured; "
+        "<h2>Defects of the sensor</h2><p>Repaired in all exposures before anything was measured, "
+        "or, where the bench causes them, subtracted and fitted; "
         f"they are no part of the mismatch.</p>{_table(titles, rows, (4, 5))}"
     )
 

@@ -128,8 +128,9 @@ def test_dust_is_listed_and_no_alarm():
     assert [c.kind for c in dust] == ["dust"] * 2
     for one, (row, column, _, depth) in zip(dust, SHADOWS, strict=True):
         assert one.y[0] <= row < one.y[1] and one.x[0] <= column < one.x[1]
-        # Pixels scatter by 0.3 %, 0.1 % where averaged; the least of some hundred is reported.
-        assert one.size == pytest.approx(-depth, abs=4e-3)
+        # Pixels scatter by 0.3 %, 0.1 % where averaged; the least of some hundred is reported.  The
+        # average over 1.5 pixels takes 2 % off the middle of the narrower one, the light 0.1 %.
+        assert one.size == pytest.approx(-depth, abs=5e-3)
     assert not diagnose_measured(measured, virtual_baseline()).mismatch.detected
 
 
