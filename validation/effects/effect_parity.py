@@ -68,6 +68,7 @@ NEAR = {
     "tree_rings": {"xc": -95.0, "yc": 330.0, "period": 24.0},
     "tree_rings:uneven": {"xc": -95.0, "yc": 330.0, "period": 24.0, "length": 400.0},
     "tearing": {"column": 55 / 128},
+    "tearing:divisadero": {"column": 55 / 128},
 }
 """Shapes whose ranges reach far beyond a small sensor, or far off the middle of one."""
 
@@ -76,6 +77,7 @@ OWN = {
     "tree_rings": {"phase": 0.0},
     "mask_stitch": {"phase": 0.0},
     "tearing": {"open": 0.4},
+    "tearing:divisadero": {"open": 0.4},
     "fringing": {"tilt": 0.6, "xx": 0.7, "xy": -0.5, "yy": 0.4, "phase": 0.0},
     "dark_hot:hot": {f"x{n}": n * 0.61803 % 1 for n in range(1, 7)},
 }
@@ -87,7 +89,10 @@ def effect_at(kind: type[Effect], place: float, width: int = 256) -> Effect:
 
     What the sensor's own effects leave no choice of is theirs, on a sensor of so many columns.
     """
-    values = {p.name: value_at(p, place) for p in kind.parameters}
+    # The sensor's own effects have the plain law: what is more general stays plain.
+    values = {
+        p.name: value_at(p, place) if p.plain is None else p.plain for p in kind.parameters
+    }
     name = f"{kind.word}:{kind.variant}".rstrip(":")
     values |= NEAR.get(name, {}) | OWN.get(name, {})
     if name == "dark_hot:hot":
@@ -107,6 +112,7 @@ def known_to_the_sensor(kind: type[Effect]) -> bool:
 def own_effect(effect: Effect) -> Any:
     """Give the sensor's own effect of the same parameters, which shares no code."""
     fixed = set(OWN.get(effect.name, ()))
+    fixed |= {p.name for p in effect.parameters if p.plain is not None}
     values = {k: v for k, v in effect.values.items() if k not in fixed}
     return make_effect(effect.word, values, effect.variant)
 

@@ -22,12 +22,13 @@ WORDS = (
     "tree_rings", "edge_rolloff", "mask_stitch", "tearing", "fringing", "shutter_timing",
     "illumination_turbulence", "persistence", "dark_hot", "cosmic_rays",
 )  # fmt: skip
-KINDS = [k for k in LIBRARY if k.word in WORDS]
+# Rings of any profile need one that was measured in a map: tests/effects/test_sensor_laws.py.
+KINDS = [k for k in LIBRARY if k.word in WORDS and k.variant != "radial"]
 NAMES = [f"{k.word}:{k.variant}".rstrip(":") for k in KINDS]
 
 
 def test_all_words_have_their_variants():
-    assert len(NAMES) == 12 and {k.word for k in KINDS} == set(WORDS)
+    assert len(NAMES) == 15 and {k.word for k in KINDS} == set(WORDS)
 
 
 @pytest.mark.parametrize("kind", [
@@ -57,7 +58,8 @@ def test_an_effect_of_no_strength_changes_no_bit(kind):
 
 @pytest.mark.parametrize("word", ["edge_rolloff", "shutter_timing", "persistence"])
 def test_a_wrong_amplitude_is_seen(word):
-    right = effect_at(next(k for k in KINDS if k.word == word), 0.9, SMALL.pixels)
+    plain = next(k for k in KINDS if k.word == word and not k.variant)
+    right = effect_at(plain, 0.9, SMALL.pixels)
     found = compare(right.scaled(0.8), size=SMALL, own=own_effect(right))
     said, factor, _ = max(found.values())
     assert said > 10 and factor == pytest.approx(1.25, rel=0.05)
