@@ -378,6 +378,8 @@ class Effect:
     """Whether :meth:`starts` begin from waves or rings that were detected in maps."""
     bends: ClassVar[bool] = False
     """Whether its changes have a part that is quadratic in the amplitude."""
+    keeps_starts: ClassVar[bool] = False
+    """Whether amplitudes at starting points are kept, as changes are not smooth in the amplitude."""
     told_by_scatter: ClassVar[tuple[str, ...]] = ()
     """Channels whose scatter constrains the amplitude: :meth:`modes` are proportional to it there."""
 

@@ -275,6 +275,9 @@ class Screen:
         length = float(template @ template)
         if length <= 0:
             return None
+        if effect.keeps_starts:
+            self._scaled_templates[effect] = template
+            return max(float(template @ (2 * self.fit.left - template)), 0.0), effect
         factor = float(template @ self.fit.left) / length
         if effect.told_by_scatter:
             found = self._by_scatter(effect, template)
