@@ -155,3 +155,25 @@ def progress_bar(unit: str) -> Iterator[Callable[[int, int], None]]:
         yield bar
     finally:
         bar.close()
+
+
+def parse_conditions(
+    ctx: click.Context, param: click.Parameter, values: Sequence[str]
+) -> list[tuple[str, dict[str, str]]]:
+    """Split options ``[FILE:]KEY=VALUE,...`` into the file, empty for all, and its settings."""
+    out = []
+    for text in values:
+        file, colon, rest = text.rpartition(":")
+        if colon and "=" in file:
+            file, rest = "", text
+        given = {}
+        for part in rest.split(","):
+            key, sign, value = part.partition("=")
+            if not sign or not key.strip() or not value.strip():
+                raise click.BadParameter(
+                    f"{text!r} is not of the form [FILE:]KEY=VALUE,..., such as "
+                    "itl.csv:back_bias=-60V,wavelength=620nm"
+                )
+            given[key.strip()] = value.strip()
+        out.append((file, given))
+    return out

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import sys
+import time
 from pathlib import Path
 
 import click
 
-from bfsensor.cli.common import Bar
+from bfsensor.cli.common import Bar, parse_conditions
 
 
 @click.command("diagnose", short_help="Compare recordings with a baseline.")
-@click.argument("campaign", type=click.Path(path_type=Path))
+@click.argument("campaign", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--baseline", metavar="FILE|STEM|DEVICE",
               help="Model that predicts the recordings: edge displacements (.json), a table "
               "(.fits), a GalSim stem, a built-in device, or 'none' for an unknown sensor, whose "
@@ -24,6 +26,23 @@ from bfsensor.cli.common import Bar
     help="Fit this quantity of a baseline device, such as silicon.thickness, within its stated "
     "uncertainty; repeatable; 'all' for every one. The device is simulated again, about 5 s each.",
 )
+@click.option(
+    "--device/--no-device", "device", default=True,
+    help="With tables of a_ij: fit every quantity of a baseline device within its stated "
+    "uncertainty, as --float all does, about half a minute the first time.  [default: --device]",
+)  # fmt: skip
+@click.option(
+    "--at", "conditions", multiple=True, callback=parse_conditions,
+    metavar="[FILE:]KEY=VALUE,...",
+    help="State the conditions of one table of a_ij, or of all: back_bias, wavelength and temperature "
+    "(with units), and level [e-], such as itl.csv:back_bias=-60V,level=40000.  [default: the "
+    "device's; the level is fitted]",
+)  # fmt: skip
+@click.option("--errors", default="scaled", show_default=True,
+              type=click.Choice(["scaled", "stated"]),
+              help="'scaled' multiplies the errors of tables of a_ij by a factor where far lags, at "
+              "which no sensor has a signal, contradict them; 'stated' takes them as they are."
+              )  # fmt: skip
 @click.option(
     "--towards", metavar="TABLE|DEVICE",
     help="The baseline's device at another operating point. The fit may then move the operating "
@@ -53,9 +72,12 @@ from bfsensor.cli.common import Bar
     "--json", "as_json", is_flag=True, help="Print report.json instead of a summary."
 )
 def diagnose(
-    campaign: Path,
+    campaign: tuple[Path, ...],
     baseline: str | None,
     floating: tuple[str, ...],
+    device: bool,
+    conditions: list[tuple[str, dict[str, str]]],
+    errors: str,
     towards: str | None,
     output: Path | None,
     seed: int,
@@ -65,8 +87,8 @@ def diagnose(
 ) -> None:
     """Compare the recordings of CAMPAIGN with a baseline, and explain the difference.
 
-    CAMPAIGN is a folder of raw exposures, or one table of measured a_ij or covariances (ECSV, or
-    LSST's photon transfer dataset).
+    CAMPAIGN is a folder of raw exposures, one table of covariances (ECSV, or LSST's photon transfer
+    dataset), or one or more tables of a_ij of one sensor, each at its own voltage and level.
 
     First the quantities that no baseline knows are fitted: gains, noise, lamp, pixel response, and
     quantities of the device within their stated uncertainty.  The residuals of all channels are
@@ -79,15 +101,18 @@ def diagnose(
       bfsensor diagnose recordings/run_12 --baseline itl_sta3800c --float all
       bfsensor diagnose other_camera --baseline none
       bfsensor diagnose itl_covariances.csv --baseline itl_sta3800c_60
+      bfsensor diagnose a60.csv a40.csv --baseline mine.toml --at a60:back_bias=-60V --at a40:level=40000
       bfsensor diagnose e2v_covariances.csv --baseline e2v_ccd250 --towards e2v_ccd250_70
       bfsensor diagnose recordings/run_12 --predict level=40000,back_bias=-40 --predict flux=5e5
     """
+    from bfsensor.checkpoints import Checkpoints
     from bfsensor.diagnose import diagnosis
     from bfsensor.diagnose.data.reduced_channels import measure_reduced
     from bfsensor.diagnose.model.open_baseline import (
         CampaignSource,
         find_baseline,
-        find_reduced_recording,
+        find_reduced_recordings,
+        is_device,
         simulate_baseline,
         with_physics,
     )
@@ -98,54 +123,73 @@ def diagnose(
         refuse_unheld,
     )
     from bfsensor.diagnose.report.html_report import write_report
+    from bfsensor.diagnose.report.provenance import files_of, provenance_of
     from bfsensor.recording.campaign.campaign import read_campaign
 
-    conditions = read_conditions(asked)
-    folder = output or campaign.with_name(campaign.resolve().stem + "_diagnosis")
-    reduced = find_reduced_recording(campaign)
-    found = (
-        None if reduced is not None else read_campaign(campaign, progress=Bar("headers"))
-    )
+    began = time.monotonic()
+    wanted = read_conditions(asked)
+    first = campaign[0]
+    folder = output or first.with_name(first.resolve().stem + "_diagnosis")
+    reduced = find_reduced_recordings(campaign, conditions)
+    found = None if reduced is not None else read_campaign(first, progress=Bar("headers"))
     named = baseline or (None if found is None else found.baseline)
     if towards is not None and (floating or named is None):
         raise click.UsageError("--towards needs a --baseline, and none of --float")
+    if isinstance(reduced, list) and device and not floating and towards is None:
+        floating = ("all",) if is_device(named) else ()
     if towards is not None:
         predicted = with_operating_point(str(named), towards)
     elif floating:
+        tables = reduced if isinstance(reduced, list) else []
         exposures = () if found is None else found.exposures
-        biases = sorted({e.back_bias for e in exposures if e.back_bias is not None})
-        warm = {round(e.temperature) for e in exposures if e.temperature is not None}
+        states = [(e.back_bias, e.temperature) for e in exposures]
+        states += [(t.condition.back_bias, t.condition.temperature) for t in tables]
+        biases = sorted({b for b, _ in states if b is not None})
+        warm = {round(t) for _, t in states if t is not None}
         predicted = simulate_baseline(
             named, floating, biases, keep=folder, warming=len(warm) > 1,
             progress=Bar("simulations"),
         )  # fmt: skip
-        if explain and named is not None:
+        if explain and named is not None and found is not None:
             predicted = with_physics(predicted, named, keep=folder / "walks")
     else:
         predicted = find_baseline(named, card=None if found is None else found.card)
-    refuse_unheld(conditions, predicted)
+    refuse_unheld(wanted, predicted)
+    read = list(campaign) if found is None else found.files
+    files = files_of(first if found is not None else first.parent, read)
+    options = f"{seed} {explain} {errors} {conditions}"
+    keep = Checkpoints(folder / "unfinished", json.dumps(files), predicted.digest, options)
     if found is None:
         assert reduced is not None
         measured = measure_reduced(reduced, reach=predicted.reach)
         result = diagnosis.diagnose_measured(
-            measured, predicted, campaign=reduced.path.stem, seed=seed, explain=explain
+            measured,
+            predicted,
+            campaign=first.resolve().stem,
+            seed=seed,
+            explain=explain,
+            scaled=errors == "scaled",
+            keep=keep,
         )
     else:
         result = diagnosis.diagnose(
             CampaignSource(found), predicted, campaign=found.name, seed=seed, explain=explain,
-            progress=Bar("pixels"),
+            progress=Bar("pixels"), keep=keep,
             notes=[f"{c.topic}: {c.message}" for c in found.warnings]
             + [f"set aside: {s.path.name}: {s.reason}" for s in found.set_aside],
         )  # fmt: skip
-    written = write_report(result, folder)
+    command = " ".join(["bfsensor", *sys.argv[1:]])
+    told = provenance_of(command, seed=seed, files=files, began=began)
+    written = write_report(result, folder, provenance=told)
     notes: tuple[str, ...] = ()
     predictor, fit = result.accepted
-    if conditions and predictor is not None:
-        prediction = predict_conditions(predictor, fit, conditions)
+    if wanted and predictor is not None:
+        prediction = predict_conditions(predictor, fit, wanted)
         notes = prediction.notes
         written.append(prediction.write(folder / "predicted.ecsv"))
+    keep.clear()
     if as_json:
-        click.echo(json.dumps(result.to_report(), indent=1))
+        click.echo((folder / "report.json").read_text(), nl=False)
         return
     click.echo(result.said())
     click.echo(f"{'channel':22s}{'chi2':>10s}{'dof':>8s}{'ratio':>8s}")

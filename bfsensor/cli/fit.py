@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from bfsensor.cli.common import Bar, device_options, load_device
+from bfsensor.cli.common import Bar, device_options, load_device, parse_conditions
 from bfsensor.errors import BFSensorError, FitError, RecordingError
 
 if TYPE_CHECKING:
@@ -18,28 +18,6 @@ if TYPE_CHECKING:
     from bfsensor.fit.data import DataSet
     from bfsensor.fit.result import FitResult
     from bfsensor.recording.tables.measured import MeasuredTable
-
-
-def parse_conditions(
-    ctx: click.Context, param: click.Parameter, values: Sequence[str]
-) -> list[tuple[str, dict[str, str]]]:
-    """Split options ``[FILE:]KEY=VALUE,...`` into the file, empty for all, and its settings."""
-    out = []
-    for text in values:
-        file, colon, rest = text.rpartition(":")
-        if colon and "=" in file:
-            file, rest = "", text
-        given = {}
-        for part in rest.split(","):
-            key, sign, value = part.partition("=")
-            if not sign or not key.strip() or not value.strip():
-                raise click.BadParameter(
-                    f"{text!r} is not of the form [FILE:]KEY=VALUE,..., such as "
-                    "itl.csv:back_bias=-60V,wavelength=620nm"
-                )
-            given[key.strip()] = value.strip()
-        out.append((file, given))
-    return out
 
 
 @click.command("fit", short_help="Fit a device to measurements.")

@@ -7,22 +7,28 @@ from dataclasses import replace
 
 import numpy as np
 
+from bfsensor.checkpoints import Checkpoints
 from bfsensor.diagnose.data.channels import PER_ELECTRON, step_of
 from bfsensor.diagnose.data.exposure_info import Source
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels, measure_channels
-from bfsensor.diagnose.detect.locate import locate_mismatch
+from bfsensor.diagnose.detect.locate import Mismatch, locate_mismatch
 from bfsensor.diagnose.detect.matched_filters import locate_effects
+from bfsensor.diagnose.explain.single_value import explain_single_value
 from bfsensor.diagnose.explain.stepwise import attribute
 from bfsensor.diagnose.fit.baseline_fit import (
     BaselineFit,
     fit_bounded,
     held_out,
 )
+from bfsensor.diagnose.fit.error_scale import scale_errors
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.diagnose.model.predictor import Predictor
+from bfsensor.diagnose.model.unknown_level import NAME as LEVEL_NAME
+from bfsensor.diagnose.model.unknown_level import float_unknown_level
 from bfsensor.diagnose.plan.advice import RecordingPlan, plan
 from bfsensor.diagnose.report.diagnosis_result import Diagnosis
 from bfsensor.errors import ConvergenceError
+from bfsensor.response.edge_response import LEVEL
 
 
 def diagnose(
@@ -34,6 +40,7 @@ def diagnose(
     notes: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
     explain: bool = True,
+    keep: Checkpoints | None = None,
 ) -> Diagnosis:
     """Compare a campaign's recordings with a baseline, and explain the mismatch.
 
@@ -54,6 +61,8 @@ def diagnose(
     explain : bool
         Whether to find effects that explain a mismatch, and recordings to take next; without it
         the mismatch is only located, which is much faster.
+    keep : Checkpoints, optional
+        Where finished stages are stored and, after an interruption, read.
 
     Returns
     -------
@@ -74,9 +83,16 @@ def diagnose(
         source = CampaignSource(read_campaign("recordings/"))
         print(diagnose(source, find_baseline("itl_sta3800c")).said())
     """
-    measured = measure_channels(source, progress=progress)
+    keep = keep or Checkpoints(None)
+    measured = keep.get("channels", lambda: measure_channels(source, progress=progress))
     return diagnose_measured(
-        measured, baseline, campaign=campaign, seed=seed, notes=notes, explain=explain
+        measured,
+        baseline,
+        campaign=campaign,
+        seed=seed,
+        notes=notes,
+        explain=explain,
+        keep=keep,
     )
 
 
@@ -88,6 +104,8 @@ def diagnose_measured(
     seed: int = 1,
     notes: Sequence[str] = (),
     explain: bool = True,
+    scaled: bool = True,
+    keep: Checkpoints | None = None,
 ) -> Diagnosis:
     """Compare measured channels with a baseline, and explain the mismatch.
 
@@ -106,6 +124,10 @@ def diagnose_measured(
         Warnings from reading the recordings, for the report.
     explain : bool
         Whether to find effects that explain a mismatch, as for :func:`diagnose`.
+    scaled : bool
+        Whether stated errors of a_ij that the scatter of far lags contradicts are scaled by it.
+    keep : Checkpoints, optional
+        As for :func:`diagnose`.
 
     Returns
     -------
@@ -128,17 +150,29 @@ def diagnose_measured(
     >>> diagnose_measured(measured, baseline).mismatch.detected
     False
     """
-    measured = _predictable(measured, baseline)
-    predictor, fit = fit_bounded(measured, baseline)
-    more = _of_free(measured, baseline, fit)
-    if explain:
-        mismatch = locate_effects(predictor, fit, seed=seed)
-    else:
-        mismatch = locate_mismatch(fit, seed=seed)
+    keep = keep or Checkpoints(None)
+    stated = _predictable(measured, baseline)
+    measured = scale_errors(stated, baseline) if scaled else stated
+    baseline = float_unknown_level(measured, baseline)
+    # Channels are stored with their fit again, so that both are the same objects when read.
+    measured, predictor, fit, mismatch = keep.get(
+        "located", lambda: _located(measured, baseline, seed, explain)
+    )
+    more = [
+        *_of_free(measured, baseline, fit),
+        *_of_level(baseline, fit),
+        *_as_stated(stated, measured, baseline, seed),
+    ]
     attribution, advised = None, RecordingPlan()
     if mismatch.detected and explain:
         try:
-            attribution = attribute(predictor, fit, mismatch, seed=seed)
+            attribution = keep.get(
+                "explained",
+                lambda: (
+                    explain_single_value(predictor, fit, mismatch, seed=seed)
+                    or attribute(predictor, fit, mismatch, seed=seed)
+                ),
+            )
         except ConvergenceError as error:
             more.append(f"the mismatch is located, but not explained: {error}")
         else:
@@ -160,6 +194,16 @@ def diagnose_measured(
     )
 
 
+def _located(
+    measured: MeasuredChannels, baseline: Baseline, seed: int, explain: bool
+) -> tuple[MeasuredChannels, Predictor, BaselineFit, Mismatch]:
+    """Channels, the baseline's predictor and fit, and the residuals of the fit that stand out."""
+    predictor, fit = fit_bounded(measured, baseline)
+    if explain:
+        return measured, predictor, fit, locate_effects(predictor, fit, seed=seed)
+    return measured, predictor, fit, locate_mismatch(fit, seed=seed)
+
+
 def _predictable(measured: MeasuredChannels, baseline: Baseline) -> MeasuredChannels:
     """Set channels aside that the nominal baseline cannot predict at all, and name them in a note."""
     predictor, kept, notes = Predictor(measured, baseline), [], []
@@ -176,6 +220,31 @@ def _predictable(measured: MeasuredChannels, baseline: Baseline) -> MeasuredChan
     if not notes:
         return measured
     return replace(measured, channels=tuple(kept), notes=(*measured.notes, *notes))
+
+
+def _of_level(baseline: Baseline, fit: BaselineFit) -> list[str]:
+    """Note on a level of flats that no table states."""
+    if LEVEL_NAME not in fit.pulls:
+        return []
+    errors = dict(zip(fit.names, fit.errors, strict=True))
+    spread = baseline.spread[LEVEL_NAME]
+    level = LEVEL + fit.pulls[LEVEL_NAME] * spread
+    return [
+        f"no table states the level of its flats: {level:.0f} +- "
+        f"{errors[f'device {LEVEL_NAME}'] * spread:.0f} e- was fitted; state it with --at level=, for a "
+        "wrong a_00 can look like another level"
+    ]
+
+
+def _as_stated(
+    stated: MeasuredChannels, measured: MeasuredChannels, baseline: Baseline, seed: int
+) -> list[str]:
+    """Note on the p-value with the errors as stated, where they were scaled."""
+    pairs = zip(stated.channels, measured.channels, strict=True)
+    if all(np.array_equal(a.errors, b.errors) for a, b in pairs):
+        return []
+    found = locate_mismatch(fit_bounded(stated, baseline)[1], seed=seed)
+    return [f"with the errors as stated the family-wise p is {found.p_value:.2g}"]
 
 
 def _of_free(measured: MeasuredChannels, baseline: Baseline, fit: BaselineFit) -> list[str]:

@@ -168,16 +168,28 @@ DATA = Path(__file__).parents[1] / "data"
     ],
 )
 def test_measured_areas_beside_tables(kind, baseline, detected):
-    """Ours at the measured voltage agree with both vendors' sensors; -50 V does not with E2V's."""
+    """With stated errors ours at the measured voltage agree with both sensors; -50 V not with E2V's."""
     path = DATA / f"{kind}_covariances_21oct19.csv"
     predicted = find_baseline(baseline)
     recording = find_reduced_recording(path)
-    found = diagnose_measured(
-        measure_reduced(recording, reach=predicted.reach), predicted, explain=False
-    )
+    measured = measure_reduced(recording, reach=predicted.reach)
+    found = diagnose_measured(measured, predicted, explain=False, scaled=False)
     assert found.mismatch.detected == detected
     (channel,) = found.fit.channels
     assert len(channel) == 24
+
+
+def test_errors_of_far_lags_contradict_what_stated_ones_allow():
+    """Far lags of the ITL table scatter by a tenth of its errors: scaled, no fixed table fits it."""
+    path = DATA / "itl_covariances_21oct19.csv"
+    predicted = find_baseline("itl_sta3800c_60")
+    measured = measure_reduced(find_reduced_recording(path), reach=predicted.reach)
+    found = diagnose_measured(measured, predicted, explain=False)
+    assert found.mismatch.detected
+    (said,) = (n for n in found.notes if "far lags" in n)
+    assert "all errors of the table are multiplied by 0.15" in said
+    (stated,) = (n for n in found.notes if n.startswith("with the errors as stated"))
+    assert float(stated.split()[-1]) > 0.5
 
 
 def test_temperatures_are_in_kelvin_from_the_header_on(tmp_path):

@@ -65,11 +65,14 @@ def diagnose_sbig(folders: Sequence[Path], baseline: Baseline, *, rim: bool) -> 
         return diagnose(CampaignSource(read_campaign(folder)), baseline, explain=False)
 
 
-def diagnose_areas(table: AreaChangeTable, name: str) -> Diagnosis:
-    """Hold measured a_ij against a baseline."""
+def diagnose_areas(table: AreaChangeTable, name: str, *, scaled: bool = False) -> Diagnosis:
+    """Hold measured a_ij against a baseline, with stated errors or with those of far lags."""
     predicted = find_baseline(name)
     return diagnose_measured(
-        measure_reduced(table, reach=predicted.reach), predicted, explain=False
+        measure_reduced(table, reach=predicted.reach),
+        predicted,
+        explain=False,
+        scaled=scaled,
     )
 
 
@@ -209,6 +212,8 @@ def main() -> None:
             found = diagnose_areas(table, name)
             rows += rows_of(found, f"a_ij {kind}", name)
             lags += lags_of(found, f"a_ij {kind}", name)
+            found = diagnose_areas(table, name, scaled=True)
+            rows += rows_of(found, f"a_ij {kind}, errors scaled", name)
         found = diagnose_areas(exchanged(table), names[3])
         rows += rows_of(found, f"a_ij {kind}, axes exchanged", names[3])
     table, ladder, areas = Table(rows), Table(unlike), Table(lags)

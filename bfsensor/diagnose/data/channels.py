@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -237,6 +237,29 @@ class Channel:
             out[part] = np.linalg.cholesky(block) @ given[part]
             start += len(block)
         return out if self.common is None else out + self.common.told(out)
+
+    def take(self, chosen: NDArray[np.bool_]) -> Channel:
+        """Copy with the values of a mask of shape (n,), without noise in common with others.
+
+        Raises
+        ------
+        DiagnosisError
+            The channel has noise in common between blocks, which a part of it cannot keep.
+        """
+        if chosen.all():
+            return self
+        if self.common is not None:
+            raise DiagnosisError(
+                f"{self.word}: values with noise in common cannot be separated"
+            )
+        blocks, start = [], 0
+        for block in self.blocks:
+            part = chosen[start : start + len(block)]
+            if part.any():
+                blocks.append(block[np.ix_(part, part)])
+            start += len(block)
+        axes = {k: v[chosen] for k, v in self.axes.items()}
+        return replace(self, values=self.values[chosen], blocks=tuple(blocks), axes=axes)
 
 
 def step_of(axes: Mapping[str, NDArray]) -> NDArray:

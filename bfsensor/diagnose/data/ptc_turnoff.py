@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -86,7 +85,7 @@ def find_turn_off(channels: Sequence[Channel]) -> TurnOff | None:
 
 def below(channels: Sequence[Channel], off: TurnOff) -> list[Channel]:
     """Channels without the flats and spots that reach full well."""
-    return [_keep(c, _faint(c, off)) for c in channels]
+    return [c.take(_faint(c, off)) for c in channels]
 
 
 def _faint(channel: Channel, off: TurnOff) -> NDArray[np.bool_]:
@@ -102,17 +101,3 @@ def _faint(channel: Channel, off: TurnOff) -> NDArray[np.bool_]:
         width = float(np.prod([v.min() for v in narrow if v.size]))
         keep = x["flux"] / (2 * np.pi * width) < NEARLY * off.electrons
     return keep
-
-
-def _keep(channel: Channel, keep: NDArray[np.bool_]) -> Channel:
-    """Channel with the values of a mask, and the covariance of their errors."""
-    if keep.all():
-        return channel
-    blocks, start = [], 0
-    for block in channel.blocks:
-        part = keep[start : start + len(block)]
-        if part.any():
-            blocks.append(block[np.ix_(part, part)])
-        start += len(block)
-    axes = {k: v[keep] for k, v in channel.axes.items()}
-    return replace(channel, values=channel.values[keep], blocks=tuple(blocks), axes=axes)

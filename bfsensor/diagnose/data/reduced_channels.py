@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,18 +15,40 @@ from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.errors import DiagnosisError
 from bfsensor.recording.tables.area_changes import AreaChangeTable
 from bfsensor.recording.tables.covariance_tables import CovarianceTable
+from bfsensor.response.edge_response import LEVEL
 from bfsensor.typing import FloatArray
 
 
+@dataclass(frozen=True, eq=False)
+class StatedTable:
+    """A table of a_ij with the condition and the level that it was measured at.
+
+    Attributes
+    ----------
+    table : AreaChangeTable
+        The a_ij.
+    condition : Condition
+        Light and voltages; None where they are the baseline's.
+    level : float or None
+        Level of the flats [e-]; where it is None, the a_ij are compared with the response at
+        :data:`bfsensor.response.edge_response.LEVEL`.
+    """
+
+    table: AreaChangeTable
+    condition: Condition = field(default_factory=Condition)
+    level: float | None = None
+
+
 def measure_reduced(
-    recording: AreaChangeTable | CovarianceTable, *, reach: int
+    recording: AreaChangeTable | CovarianceTable | Sequence[StatedTable], *, reach: int
 ) -> MeasuredChannels:
-    """Turn a reduced recording into a campaign of the one channel 'flat_cov'.
+    """Turn reduced recordings into a campaign of the one channel 'flat_cov'.
 
     Parameters
     ----------
-    recording : AreaChangeTable or CovarianceTable
-        Table, for instance from :func:`bfsensor.recording.tables.reduced.find_reduced`.
+    recording : AreaChangeTable, CovarianceTable or sequence of StatedTable
+        Table, for instance from :func:`bfsensor.recording.tables.reduced.find_reduced`, or several
+        tables of a_ij of one sensor.
     reach : int
         Largest lag that the baseline predicts [pixel]; larger ones are left out.
 
@@ -31,44 +56,52 @@ def measure_reduced(
     -------
     MeasuredChannels
         For a_ij: unit 1/e-, no amplifier and so neither gain nor noise; (0, 0) is left out where
-        it was set by the sum of the others.  For covariances: unit e-^2; each amplifier has a
-        gain that starts at 1 and a read noise that starts at 0, both free.
+        it was set by the sum of the others; the axis 'table' is the index of the table.  For
+        covariances: unit e-^2; each amplifier has a gain that starts at 1 and a read noise that
+        starts at 0, both free.
 
     Raises
     ------
     DiagnosisError
         No independent value lies within the reach.
     """
+    if isinstance(recording, CovarianceTable):
+        return _of_covariances(recording, reach)
     if isinstance(recording, AreaChangeTable):
-        return _of_areas(recording, reach)
-    return _of_covariances(recording, reach)
+        recording = (StatedTable(recording),)
+    return _of_areas(recording, reach)
 
 
-def _of_areas(table: AreaChangeTable, reach: int) -> MeasuredChannels:
-    j, i = (np.asarray(index) for index in np.indices(table.a.shape))
-    inside = (i <= reach) & (j <= reach)
-    used = inside & table.independent & (table.errors > 0)
-    if not used.any():
-        raise DiagnosisError(
-            f"{table.path}: no independent a_ij with an error within lags of {reach}"
-        )
-    notes = list(table.warnings) + _beyond(~inside & np.isfinite(table.a), reach)
-    if (inside & table.independent & ~used).any():
-        notes.append(
-            f"{int((inside & table.independent & ~used).sum())} a_ij without an error"
-        )
+def _of_areas(tables: Sequence[StatedTable], reach: int) -> MeasuredChannels:
+    axes, notes = Axes(), []
+    values, errors = [], []
+    for n, stated in enumerate(tables):
+        table = stated.table
+        said = f"{table.path.name}: " if len(tables) > 1 else ""
+        j, i = (np.asarray(index) for index in np.indices(table.a.shape))
+        inside = (i <= reach) & (j <= reach)
+        used = inside & table.independent & (table.errors > 0)
+        if not used.any():
+            raise DiagnosisError(
+                f"{table.path}: no independent a_ij with an error within lags of {reach}"
+            )
+        own = list(table.warnings) + _beyond(~inside & np.isfinite(table.a), reach)
+        without = int((inside & table.independent & ~used).sum())
+        own += [f"{without} a_ij without an error"] * (without > 0)
+        notes += [said + note for note in own]
+        axes.add(
+            int(used.sum()), stated.condition, i=i[used], j=j[used], amp=0, table=n,
+            level=LEVEL if stated.level is None else stated.level, time=0,
+            stated=stated.level is not None,
+        )  # fmt: skip
+        values.append(table.a[used])
+        errors.append(table.errors[used])
     notes.append(
         "errors of a_ij are taken as independent: the table holds no covariances of them"
     )
-    axes = Axes()
-    axes.add(
-        int(used.sum()), Condition(), i=i[used], j=j[used], amp=0,
-        level=1.0, time=0,
-    )  # fmt: skip
-    errors = table.errors[used]
     channel = Channel(
-        "flat_cov", table.a[used], tuple(np.square(errors)[:, None, None]), axes.columns(),
-        PER_ELECTRON,
+        "flat_cov", np.concatenate(values),
+        tuple(np.square(np.concatenate(errors))[:, None, None]), axes.columns(), PER_ELECTRON,
     )  # fmt: skip
     return _measured(channel, (), notes)
 

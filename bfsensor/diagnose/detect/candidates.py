@@ -57,11 +57,13 @@ def tellable(
 ) -> list[type[Effect]]:
     """Candidates that these recordings can constrain.
 
-    Reduced recordings have no pixels, a_ij alone no signal level: effects that need them are
-    left out.
+    Reduced recordings have no pixels, and a_ij of one level say nothing of a dependence on the
+    signal: effects that need them are left out.
     """
     pixels = bool(predictor.layout.segments)
-    levels = any(c.unit != PER_ELECTRON for c in channels)
+    levels = any(
+        c.unit != PER_ELECTRON or len(np.unique(c.axes["level"])) > 1 for c in channels
+    )
     return [k for k in kinds if (pixels or not k.of_pixels) and (levels or not k.of_levels)]
 
 

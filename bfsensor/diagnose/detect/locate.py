@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -14,8 +14,9 @@ from scipy.optimize import brentq
 from scipy.sparse import csr_array
 
 from bfsensor.diagnose.detect.scan_templates import Template
-from bfsensor.diagnose.detect.scans import DEVICE, make_templates
+from bfsensor.diagnose.detect.scans import DEVICE, make_fitted_templates, make_templates
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
+from bfsensor.files import Cache
 from bfsensor.typing import FloatArray
 
 DRAWS = 500
@@ -131,6 +132,10 @@ class Mismatch:
         return self.p_value < ALARM
 
 
+_fixed = Cache(most=1)
+"""Templates of the last channels that were scanned: all fits of a diagnosis scan the same ones."""
+
+
 class Scanner:
     """Statistics of residuals: chi-squares by channel and normalised templates.
 
@@ -152,7 +157,11 @@ class Scanner:
         self.templates: list[Template] = []
         self._blocks: list[csr_array] = []
         inside, norms = [], []
-        for block, some in _stacked(make_templates(fit), len(fit.residuals)):
+        size = len(fit.residuals)
+        fixed = _fixed.get(
+            tuple(fit.channels), lambda: list(_stacked(make_templates(fit.channels), size))
+        )
+        for block, some in chain(fixed, _stacked(make_fitted_templates(fit), size)):
             within = block @ fit.basis[: len(fit.residuals)]
             raw = np.asarray((block * block).sum(1)).ravel()
             left = raw - (within**2).sum(1)
@@ -165,9 +174,7 @@ class Scanner:
             self._blocks.append(kept)
             inside.append(within[keep])
             norms.append(np.sqrt(left[keep]))
-            self.templates += _viewed(
-                [t for t, k in zip(some, keep, strict=True) if k], kept
-            )
+            self.templates += [t for t, k in zip(some, keep, strict=True) if k]
         self._norm = np.concatenate(norms)
         self._inside = inside
         self.words = list(dict.fromkeys(c.word for c in fit.channels))
@@ -217,23 +224,20 @@ def _stacked(
         some.append(template)
         held += len(template.rows)
         if held > BLOCK:
-            yield _as_matrix(some, size), some
+            yield _viewed(some, size)
             some, held = [], 0
     if some:
-        yield _as_matrix(some, size), some
+        yield _viewed(some, size)
 
 
-def _as_matrix(some: list[Template], size: int) -> csr_array:
+def _viewed(some: list[Template], size: int) -> tuple[csr_array, list[Template]]:
+    """Matrix of templates, a template per row, and templates that share its memory."""
     starts = np.concatenate([[0], np.cumsum([len(t.rows) for t in some])])
     columns = np.concatenate([t.rows for t in some]).astype(np.int32)
     weights = np.concatenate([t.weights for t in some])
-    return csr_array((weights, columns, starts.astype(np.int32)), shape=(len(some), size))
-
-
-def _viewed(some: list[Template], matrix: csr_array) -> list[Template]:
-    """Templates that share the memory of a matrix."""
+    matrix = csr_array((weights, columns, starts.astype(np.int32)), shape=(len(some), size))
     parts = [slice(a, b) for a, b in pairwise(matrix.indptr)]
-    return [
+    return matrix, [
         replace(t, rows=matrix.indices[p], weights=matrix.data[p])
         for t, p in zip(some, parts, strict=True)
     ]

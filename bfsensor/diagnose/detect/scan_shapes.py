@@ -26,14 +26,14 @@ REACH = 1.5
 % of the square of exp(-|x| / length); twice as large, 99.8 %."""
 
 
-def own_shapes(g: Group) -> Iterator[Pattern]:
+def own_shapes(g: Group, residuals: FloatArray) -> Iterator[Pattern]:
     """Covariances in the predicted shape of the brighter-fatter effect, by flux and condition.
 
     One template sums the small deviations of all lags if the effect is stronger or weaker than
     predicted as a whole.
     """
     x = g.axes
-    shape = _own_shape(g)
+    shape = _own_shape(g, residuals)
     level = x["level"].astype(float)
     where = {
         "lags": [(0, 0), (1, 0), (0, 1), (1, 1)],
@@ -51,13 +51,13 @@ def own_shapes(g: Group) -> Iterator[Pattern]:
             yield "own shape x condition", np.where(own, shape, 0.0), told
 
 
-def _own_shape(g: Group) -> FloatArray:
+def _own_shape(g: Group, residuals: FloatArray) -> FloatArray:
     """Predicted covariances; the variance lacks what all lags gain (the areas' sum rule)."""
     x = g.axes
     i, j = x["i"].astype(int), x["j"].astype(int)
     weight = np.where(i > 0, 2.0, 1.0) * np.where(j > 0, 2.0, 1.0)
     zero = (i == 0) & (j == 0)
-    shape = np.where(zero, 0.0, g.predicted())
+    shape = np.where(zero, 0.0, g.predicted(residuals))
     folds = np.repeat(np.arange(len(g.members)), [len(c) for c, _ in g.members])
     keys = np.array([
         "/".join(map(str, row)) for row in zip(folds, x["amp"], x["time"], g.condition, strict=True)

@@ -55,10 +55,8 @@ def middle(values: FloatArray, weights: FloatArray) -> tuple[float, float]:
 class Group:
     """All channels of one name (folds, conditions) as one table."""
 
-    def __init__(
-        self, word: str, members: list[tuple[Channel, int]], residuals: FloatArray
-    ) -> None:
-        self.word, self.members, self._residuals = word, members, residuals
+    def __init__(self, word: str, members: list[tuple[Channel, int]]) -> None:
+        self.word, self.members = word, members
         names = [n for n in members[0][0].axes if all(n in c.axes for c, _ in members)]
         self.axes = {n: np.concatenate([c.axes[n] for c, _ in members]) for n in names}
         self.size = sum(len(c) for c, _ in members)
@@ -69,10 +67,10 @@ class Group:
             label_of(condition_at(row)) for row in zip(*columns, strict=True)
         ])  # fmt: skip
 
-    def predicted(self) -> FloatArray:
-        """Prediction of the fit for all values, in the unit of the channel."""
+    def predicted(self, residuals: FloatArray) -> FloatArray:
+        """Prediction of a fit for all values, in the unit of the channel, from its residuals."""
         return np.concatenate([
-            c.values - c.unwhiten(self._residuals[start : start + len(c)])
+            c.values - c.unwhiten(residuals[start : start + len(c)])
             for c, start in self.members
         ])  # fmt: skip
 

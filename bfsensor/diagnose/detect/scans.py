@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,35 +29,59 @@ DEVICE_SEEN = "flat_cov", "spot"
 """Channels that the device's parameters change."""
 
 
-def make_templates(fit: BaselineFit) -> Iterator[Template]:
-    """Make all templates that the channels of a fit allow, one after another.
+def make_templates(channels: Sequence[Channel]) -> Iterator[Template]:
+    """Make all templates that channels allow, whatever is fitted to them, one after another.
 
-    Every template is a pattern in the unit of its channel over all folds of the fit: a power of
-    the flux at one lag, a step in time, a strip of columns.
+    Every template is a pattern in the unit of its channel over all folds: a power of the flux
+    at one lag, a step in time, a strip of columns.
 
     Parameters
     ----------
-    fit : BaselineFit
-        Gives the channels, and the predicted covariances.
+    channels : sequence of Channel
+        Channels of a fit.
 
     Yields
     ------
     template : Template
         Whitened.
     """
-    by_word: dict[str, list[tuple[Channel, int]]] = {}
-    for channel, start in zip(fit.channels, fit.starts, strict=False):
-        by_word.setdefault(channel.word, []).append((channel, int(start)))
     makers = {
         "flat_cov": _covariances, "flat_mean": _means, "flat_map": _maps,
         "serial_overscan": _overscan, "parallel_overscan": _overscan, "bias_cov": _noise,
         "bias_level": _levels, "dark_map": _darks, "spot": _spots, "amp_cross": _single,
         "code_hist": _codes,
     }  # fmt: skip
-    for word, members in by_word.items():
-        group = Group(word, members, fit.residuals)
-        yield from group.templates(makers[word](group))
+    for group in _groups(channels):
+        yield from group.templates(makers[group.word](group))
+
+
+def make_fitted_templates(fit: BaselineFit) -> Iterator[Template]:
+    """Make the templates that depend on a fit: shape of the predicted covariances, device.
+
+    Parameters
+    ----------
+    fit : BaselineFit
+        The fit.
+
+    Yields
+    ------
+    template : Template
+        Whitened.
+    """
+    for group in _groups(fit.channels):
+        if group.word == "flat_cov" and group.members[0][0].unit != PER_ELECTRON:
+            yield from group.templates(own_shapes(group, fit.residuals))
     yield from _device(fit)
+
+
+def _groups(channels: Sequence[Channel]) -> list[Group]:
+    """Channels of one name each, with the index at which their values begin."""
+    by_word: dict[str, list[tuple[Channel, int]]] = {}
+    start = 0
+    for channel in channels:
+        by_word.setdefault(channel.word, []).append((channel, start))
+        start += len(channel)
+    return [Group(word, members) for word, members in by_word.items()]
 
 
 def _device(fit: BaselineFit) -> Iterator[Template]:
@@ -65,12 +89,14 @@ def _device(fit: BaselineFit) -> Iterator[Template]:
 
     The fit moves these parameters against their priors.  A device far from nominal therefore
     leaves residuals along the derivative, in proportion to the pull, and noise a known amount.
+    A parameter that only has a bound has no nominal value to differ from.
     """
     for n, name in enumerate(fit.names[: fit.slopes.shape[1]]):
-        if name.startswith("device "):
+        quantity = name.removeprefix("device ")
+        if quantity != name and quantity not in fit.unknown:
             rows = np.nonzero(fit.slopes[:, n])[0]
             if len(rows):
-                where = {"device": name.removeprefix("device ")}
+                where = {"device": quantity}
                 yield Template(DEVICE_SCAN, DEVICE, rows, fit.slopes[rows, n], where)
 
 
@@ -133,7 +159,6 @@ def _covariances(g: Group) -> Iterator[Pattern]:
             yield "lags together", np.where(here, unit**p, 0.0), {
                 "lags": chosen, "level": (low, high), "power": p, "set": name,
             }  # fmt: skip
-    yield from own_shapes(g)
 
 
 def _means(g: Group) -> Iterator[Pattern]:

@@ -98,7 +98,10 @@ def kernel_families(scene: Scene, *, spots: bool) -> list[Family]:
 
 def _terms(scene: Scene, shape: tuple[int, int]) -> Iterator[Term]:
     """Single edges of either axis, and of both axes alike, by power of the charge."""
-    for p in POWERS:
+    flats = [c for c in scene.model.fit.channels if c.word == "flat_cov"]
+    # a_ij measured at one level say nothing of a power of the charge.
+    levels = {float(v) for c in flats for v in np.unique(c.axes["level"])}
+    for p in POWERS if len(levels) > 1 else POWERS[:1]:
         for axis, along, across in edge_names():
             edges = shifts_of((axis, along, across), shape)
             where = _where(axis, along, across, p)

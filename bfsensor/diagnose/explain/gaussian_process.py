@@ -8,7 +8,7 @@ import numpy as np
 
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.explain.pursuit import Choice, Dictionary
-from bfsensor.diagnose.explain.terms import Family, Scene, Term, lag_family
+from bfsensor.diagnose.explain.terms import SINGLE, Family, Scene, Term, lag_family
 from bfsensor.typing import FloatArray
 
 KNOTS = 5
@@ -41,7 +41,7 @@ def process_choice(scene: Scene) -> Choice | None:
         The term; None where there are no covariances of flats, or noise explains them as well.
     """
     lags = lag_family(scene)
-    if lags is None:
+    if lags is None or lags.group == SINGLE:
         return None
     places = sorted({t.where["lags"][0] for t in lags.terms})
     channels = [c for c in scene.model.fit.channels if c.word == "flat_cov"]

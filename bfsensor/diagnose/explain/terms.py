@@ -22,6 +22,12 @@ from bfsensor.typing import FloatArray
 SCALE = 1e5
 """Signal [e-] at which coefficients of its powers are given.  Defined: the unit in report.json."""
 
+SINGLE = "single values"
+"""Group of terms that change one measured a_ij each."""
+
+AREA_UNIT = 1e-8
+"""Change of an a_ij for a coefficient of 1 [1/e-].  Defined: the unit in report.json."""
+
 LAG_POWERS = (0, 1, 2, 3)
 """Powers of the level in the covariance at one lag.  Chosen: noise, light, and two orders of
 brighter-fatter response; higher ones are so alike over a ladder that none is preferred."""
@@ -175,10 +181,12 @@ def at_lags(
 
 
 def lag_family(scene: Scene) -> Family | None:
-    """Family of covariances of flats at single lags, by power of the level; None without levels."""
+    """Family of covariances at single lags: by power of the level, or single values of a_ij."""
     channels = [c for c in scene.model.fit.channels if c.word == "flat_cov"]
-    if not channels or channels[0].unit == PER_ELECTRON:
+    if not channels:
         return None
+    if channels[0].unit == PER_ELECTRON:
+        return _single_values(channels)
     lags = sorted({
         (int(i), int(j)) for c in channels
         for i, j in zip(c.axes["i"], c.axes["j"], strict=True)
@@ -201,3 +209,25 @@ def lag_family(scene: Scene) -> Family | None:
         for i, j in lags for p in LAG_POWERS
     )  # fmt: skip
     return Family("covariances by lag", terms, ("flat_cov",))
+
+
+def _single_values(channels: list[Channel]) -> Family:
+    """Family of changes of one measured a_ij each, by the index of its row; unit 1e-8 / e-."""
+
+    def column(chosen: Channel, row: int) -> Callable[[Channel], FloatArray | None]:
+        def change(channel: Channel) -> FloatArray | None:
+            here = np.arange(len(channel)) == row
+            return np.where(here, AREA_UNIT, 0.0) if channel is chosen else None
+
+        return change
+
+    terms = tuple(
+        Term(
+            f"a_{int(c.axes['i'][row])}{int(c.axes['j'][row])} of table {int(c.axes['table'][row]) + 1}",
+            {"lags": [(int(c.axes["i"][row]), int(c.axes["j"][row]))], "row": row,
+             "relative": AREA_UNIT / c.values[row], "table": int(c.axes["table"][row])},
+            column(c, row),
+        )
+        for c in channels for row in range(len(c))
+    )  # fmt: skip
+    return Family(SINGLE, terms, ("flat_cov",))

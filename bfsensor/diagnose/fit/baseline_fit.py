@@ -60,6 +60,9 @@ class BaselineFit:
         Assumptions of the prediction, and conditions of the fit, in words.
     converged : bool
         Whether the fit ended at a minimum.
+    unknown : tuple of str
+        Device parameters without a nominal value, which only have a bound: their pull says
+        nothing about the baseline.
     """
 
     channels: tuple[Channel, ...]
@@ -77,6 +80,7 @@ class BaselineFit:
     scores: int = 0
     notes: tuple[str, ...] = ()
     converged: bool = True
+    unknown: tuple[str, ...] = ()
 
     def of(self, word: str) -> NDArray[np.bool_]:
         """Mask of the residuals that belong to channels of one name, shape (n,)."""
@@ -193,6 +197,7 @@ def _as_fit(steps: Steps, *notes: str) -> BaselineFit:
         chance=float(np.linalg.slogdet(np.eye(chance) + steps.modes.T @ steps.modes)[1]),
         notes=(*predictor.notes, *notes, *(() if steps.converged else (UNSETTLED,))),
         converged=steps.converged,
+        unknown=predictor.baseline.not_below,
     )
 
 

@@ -6,11 +6,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit, fit_baseline
 from bfsensor.diagnose.model.predictor import Columns, Predictor, used_channels
 from bfsensor.effects.effect import Effect
 from bfsensor.typing import FloatArray
+
+LEFT_OUT, LAGS_ACROSS = 5, 2
+"""Number of sets of lags of which one at a time is left out of fits, and the weight of the lag in y:
+lag (i, j) belongs to set (i + 2 j) mod 5.  Chosen: a knight's move, by which no two of the five lags
+(0, 0), (1, 0), (0, 1), (2, 0), (0, 2) are in one set; with ten sets each fit would miss half as
+many lags, and take as long twice."""
 
 
 class Model:
@@ -82,9 +88,14 @@ def compare_held_out(before: Model, after: Model) -> dict[str, tuple[float, floa
     Returns
     -------
     dict of str to (float, float, int)
-        By name of the channel: chi-square before, after, and number of values.
+        By name of the channel: chi-square before, after, and number of values.  Tables of a_ij
+        have no held-out fold: each of :data:`LEFT_OUT` sets of lags is predicted by fits to the others.
     """
     out: dict[str, tuple[float, float, int]] = {}
+    for channel in before.fit.channels:
+        if channel.unit == PER_ELECTRON:
+            squares = [_left_out(m, channel) for m in (before, after)]
+            out[channel.word] = squares[0], squares[1], len(channel)
     for channel in used_channels(before.predictor.measured.channels, ("held-out",)):
         if not len(channel):
             continue
@@ -96,3 +107,28 @@ def compare_held_out(before: Model, after: Model) -> dict[str, tuple[float, floa
             old[0] + squares[0], old[1] + squares[1], old[2] + len(channel)
         )  # fmt: skip
     return out
+
+
+def _left_out(model: Model, channel: Channel) -> float:
+    """Chi-square of values of a channel, each predicted by a fit without its set of lags.
+
+    The errors are those of the values and of the prediction, to first order in the parameters.
+    """
+    square = 0.0
+    lags = channel.axes["i"].astype(int) + LAGS_ACROSS * channel.axes["j"].astype(int)
+    for n in range(LEFT_OUT):
+        out = lags % LEFT_OUT == n
+        if not out.any() or out.all():
+            continue
+        predictor, own = model.predictor, channel.take(out)
+        fit = fit_baseline(predictor, [channel.take(~out)])
+        point = fit.values[: len(predictor.names)]
+        here = predictor.predict(own, point)
+        slopes = [predictor.slope(own, point, k, here) for k in range(len(point))]
+        linear = predictor.linear(own)
+        slopes += [linear.get(name, np.zeros(len(own))) for name in fit.names[len(point) :]]
+        change = own.whiten(np.array(slopes).T.reshape(len(own), -1))
+        spread = np.eye(len(own)) + change @ fit.covariance @ change.T
+        left = Model(predictor, fit).left(own)
+        square += float(left @ np.linalg.solve(spread, left))
+    return square

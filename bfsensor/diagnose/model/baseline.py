@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from bfsensor.checkpoints import digest_of
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.exposure_info import numbers_of
 from bfsensor.effects.effect import Effect
@@ -52,6 +53,8 @@ class Baseline:
         Change of the shifts per electron with the level of a flat [pixel/e-^2].
     level : float
         Level [e-] at which the shifts are those of ``edges``, where there are slopes.
+    bounds : mapping of str to (float, float)
+        Least and greatest value, less the nominal one, of parameters that cannot lie outside.
     nominal : mapping of str to float
         Parameter values that ``edges`` were calculated with.
     held : mapping of (wavelength, back_bias) to mapping of str to (dkx, dky)
@@ -85,6 +88,7 @@ class Baseline:
     spread: Mapping[str, float]
     reference: tuple[float, float]
     not_below: tuple[str, ...] = ()
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     slopes: Mapping[tuple[float, float], Edges] = field(default_factory=dict)
     bends: Mapping[tuple[float, float], Edges] = field(default_factory=dict)
     """Half of the second derivative by the level [pixel/e-^3], by condition, where there are slopes."""
@@ -114,6 +118,28 @@ class Baseline:
             raise DiagnosisError(f"{self.name}: no spread for {', '.join(sorted(missing))}")
 
     @property
+    def digest(self) -> str:
+        """SHA-256 of all that the baseline predicts with, 64 hexadecimal digits."""
+        numbers = (
+            self.name, self.reference, self.not_below, self.level, self.temperature,
+            self.spots_bend, sorted(self.bounds.items()), sorted(self.spread.items()),
+            sorted(self.nominal.items()),
+            sorted(self.card.items(), key=str), [str(p) for p in self.pieces],
+        )  # fmt: skip
+        tables: dict[str, Mapping[Any, Edges]] = {
+            "edges": self.edges, "slopes": self.slopes, "bends": self.bends,
+            "warming": self.warming, "derivatives": self.derivatives,
+            **{str(key): of_key for key, of_key in self.held.items()},
+        }  # fmt: skip
+        arrays = [
+            part
+            for name, table in tables.items()
+            for key, (kx, ky) in sorted(table.items(), key=str)
+            for part in (f"{name} {key}".encode(), kx.tobytes(), ky.tobytes())
+        ]
+        return digest_of([repr(numbers).encode(), *arrays])
+
+    @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the free device parameters."""
         return tuple(self.derivatives)
@@ -139,7 +165,8 @@ class Baseline:
         gone = set(names)
         kept = {k: v for k, v in self.derivatives.items() if k not in gone}
         floors = tuple(n for n in self.not_below if n in kept)
-        return replace(self, derivatives=kept, not_below=floors)
+        bounds = {n: ends for n, ends in self.bounds.items() if n in kept}
+        return replace(self, derivatives=kept, not_below=floors, bounds=bounds)
 
     def nearest(self, condition: Condition) -> tuple[float, float]:
         """Find the condition with shifts that is nearest in back bias, then in wavelength.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,22 +16,24 @@ from bfsensor.diagnose.model.cached_response import SPAN, Walk, walk
 from bfsensor.diagnose.model.table_baseline import WAVELENGTHS
 from bfsensor.errors import DeviceError, DiagnosisError
 from bfsensor.files import written_whole
-from bfsensor.response.edge_response import LEVEL
+from bfsensor.response.edge_response import LEVEL, EdgeResponse, mixed, solve_response
 from bfsensor.simulate.edge_field import front_plane
 from bfsensor.typing import Edges
 from bfsensor.units import to_celsius
 
 CELLS, FINE = 16, 32
-"""Mesh cells per pixel of solutions whose differences give derivatives, and of the nominal device.
-Chosen: 32 is the mesh of the shipped tables; mesh errors mostly cancel in a difference, so 16 do.  Twice
-as many cells take about three times as long."""
+"""Mesh cells per pixel of solutions that give derivatives, and of the nominal device. Chosen: 32 is
+the mesh of the shipped tables; derivatives on 16 are right to 0.3 %
+(:class:`~bfsensor.fit.linear_response.Linearise`).  Twice as many cells take about three times as
+long."""
 
-TABLES = "nominal as shipped, differences at 16 cells, at every back bias, with levels"
+TABLES = "nominal as shipped, derivatives linearised at 16 cells, at every back bias, with levels"
 """Method of the shifts, part of the name of cached files: files of other methods are not read."""
 
-STEP = 0.5
-"""Shift of a parameter to either side for its derivative [its uncertainty]. Chosen: twice as large
-makes errors of curvature four times as large; half as large doubles errors of the solutions."""
+STEP = 1e-4
+"""Step over which the device, not its solution, is differentiated by a parameter [its uncertainty].
+Chosen: twice as large doubles the relative error of the one-sided difference, itself of the order of
+the step."""
 
 WARMER = 10.0
 """Temperature step for the derivative of shifts by temperature [K]. Chosen: twice as large doubles
@@ -80,9 +82,8 @@ def baseline_of_device(
     Returns
     -------
     Baseline
-        Shifts at eight wavelengths from 400 to 950 nm and each back bias, with derivatives from
-        central differences of half an uncertainty, or one-sided ones where the device does not
-        exist on the other side.
+        Shifts at eight wavelengths from 400 to 950 nm and each back bias, with derivatives by
+        each parameter from the linearised equations of one solution.
 
     Raises
     ------
@@ -115,7 +116,7 @@ def baseline_of_device(
         own,
         *(b for b in dict.fromkeys(map(float, back_biases)) if abs(b - own) > 0.5),
     ]
-    total, done = len(biases) * (1 + warming + 2 * len(chosen)), 0
+    total, done = len(biases) * (1 + warming + bool(chosen)), 0
 
     def walked(changed: Device, cells: int, levels: Sequence[float] = (LEVEL,)) -> Walk:
         nonlocal done
@@ -136,7 +137,11 @@ def baseline_of_device(
     for bias in biases:
         here = change_parameter(device, "operating_point.back_bias", bias - own)
         found = walked(here, cells, backgrounds)
-        sides = {name: _sides(here, name, known[name], walked) for name in chosen}
+        slopes_of = _derivatives(here, {n: known[n] for n in chosen}) if chosen else None
+        if slopes_of is not None:
+            done += 1
+            if progress is not None:
+                progress(done, total)
         if warming:
             hot = change_parameter(here, "operating_point.temperature", WARMER)
             warm, cold = walked(hot, CELLS), walk(here, cells=CELLS, keep=keep)
@@ -145,10 +150,12 @@ def baseline_of_device(
             edges[key] = found.edges(colour, kelvin)
             if "levels" not in lacks:
                 slopes[key], bends[key] = found.bent(colour, kelvin)
-            held[key] = {
-                name: _slope(up.edges(colour, kelvin), down.edges(colour, kelvin), apart)
-                for name, (up, down, apart) in sides.items()
-            }
+            held[key] = {}
+            if slopes_of is not None:
+                dkx, dky = mixed(
+                    slopes_of.dkx, slopes_of.dky, slopes_of.depths, colour, kelvin
+                )
+                held[key] = dict(zip(chosen, zip(dkx, dky, strict=True), strict=True))
             if warming:
                 warmer[key] = _slope(
                     warm.edges(colour, kelvin + WARMER), cold.edges(colour, kelvin), WARMER
@@ -162,24 +169,20 @@ def baseline_of_device(
     )  # fmt: skip
 
 
-def _sides(
-    device: Device, name: str, spread: float, walked: Callable[..., Walk]
-) -> tuple[Walk, Walk, float]:
-    """Responses with a quantity raised and lowered, and the difference of its values."""
-    sides: dict[float, Walk] = {}
-    refused = ""
-    for by in (STEP * spread, -STEP * spread):
-        try:
-            sides[by] = walked(change_parameter(device, name, by), CELLS)
-        except DeviceError as error:
-            # The shifted device does not exist, such as a negative thickness: one-sided difference.
-            refused = str(error)
-    if not sides:
-        raise DiagnosisError(f"{device.name}: {name!r} cannot be changed: {refused}")
-    if len(sides) == 1:
-        sides[0.0] = walked(device, CELLS)
-    (high, up), (low, down) = sorted(sides.items(), key=lambda s: -s[0])
-    return up, down, high - low
+def _derivatives(device: Device, spreads: Mapping[str, float]) -> EdgeResponse:
+    """Response of a device with derivatives by each of some quantities."""
+    changed, refused = [], ""
+    for name, spread in spreads.items():
+        for step in (STEP * spread, -STEP * spread):
+            try:
+                changed.append((change_parameter(device, name, step), step))
+                break
+            except DeviceError as error:
+                # No device on this side, such as one of negative thickness: step to the other.
+                refused = str(error)
+        else:
+            raise DiagnosisError(f"{device.name}: {name!r} cannot be changed: {refused}")
+    return solve_response(device, cells=CELLS, changed=changed)
 
 
 def _slope(up: Edges, down: Edges, apart: float) -> Edges:

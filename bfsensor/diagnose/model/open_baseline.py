@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from bfsensor.device.device import Device
+from bfsensor.diagnose.data.reduced_channels import StatedTable
 from bfsensor.diagnose.model.baseline import Baseline, read_edges
 from bfsensor.diagnose.model.device_baseline import TABLES, baseline_of_device, write_edges
 from bfsensor.diagnose.model.free_baseline import free_baseline
@@ -20,6 +23,7 @@ from bfsensor.recording.campaign.campaign import Campaign
 from bfsensor.recording.campaign.exposures import Exposure
 from bfsensor.recording.tables.area_changes import AreaChangeTable
 from bfsensor.recording.tables.covariance_tables import CovarianceTable
+from bfsensor.recording.tables.measured import MeasuredTable, read_measured
 from bfsensor.recording.tables.reduced import find_reduced, holds_images
 
 LAMP_ERROR = 1e-3
@@ -143,6 +147,95 @@ def find_reduced_recording(path: Path) -> AreaChangeTable | CovarianceTable | No
             f"{len(tables)} of {len(found)} reduced recordings: {names}"
         )
     return tables[0]
+
+
+def find_reduced_recordings(
+    paths: Sequence[Path], conditions: Sequence[tuple[str, Mapping[str, str]]] = ()
+) -> CovarianceTable | list[StatedTable] | None:
+    """Read reduced recordings of one sensor: a table of covariances, or some tables of a_ij.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        One file or folder, or several files of a_ij.
+    conditions : sequence of (str, mapping of str to str)
+        Name of a file, '' for all, and quantities with units that hold for it, with the keys
+        back_bias, wavelength, temperature and level (a number of electrons); they replace those of
+        its header.
+
+    Returns
+    -------
+    CovarianceTable, list of StatedTable, or None
+        None where the one path is a folder with images: a campaign.
+
+    Raises
+    ------
+    DiagnosisError
+        One of several paths is no table of a_ij, conditions are given for what has none, name a
+        file that is not given, or state gate voltages, which are the device's.
+    """
+    read = {path: find_reduced_recording(path) for path in paths}
+    known = {n for p in paths for n in (str(p), p.name, p.stem)} | {""}
+    for file, _ in conditions:
+        if file not in known:
+            names = ", ".join(p.name for p in paths)
+            raise DiagnosisError(f"--at {file}: not one of the given recordings {names}")
+    tables = [(p, t) for p, t in read.items() if isinstance(t, AreaChangeTable)]
+    if len(tables) < len(paths):
+        if len(paths) > 1 or conditions:
+            odd = next(p for p in paths if not isinstance(read[p], AreaChangeTable))
+            raise DiagnosisError(
+                f"{odd}: several recordings, and --at, are allowed for tables of a_ij only (columns "
+                "i_serial, j_parallel, cov_per_e, err_per_e)"
+            )
+        only = read[paths[0]]
+        assert not isinstance(only, AreaChangeTable)
+        return only
+    return [
+        _stated(p, t, [g for f, g in conditions if f in ("", str(p), p.name, p.stem)])
+        for p, t in tables
+    ]
+
+
+def _stated(
+    path: Path, table: AreaChangeTable, given: Sequence[Mapping[str, str]]
+) -> StatedTable:
+    """Table of a_ij with the condition of its header and of the options, which win."""
+    measured = read_measured(table.path) if table.path.is_file() else MeasuredTable(table)
+    level = None
+    for settings in given:
+        own = dict(settings)
+        if "level" in own:
+            level = _level(path, own.pop("level"))
+        measured = measured.at(own)
+    at = measured.condition
+    if at.gate_high is not None or at.gate_low is not None:
+        raise DiagnosisError(
+            f"{path.name}: gate voltages are those of the baseline's device; state them in its file"
+        )
+    return StatedTable(table, at, level)
+
+
+def _level(path: Path, text: str) -> float:
+    """Level of flats [e-] from the text of an option."""
+    try:
+        level = float(text)
+    except ValueError:
+        level = np.nan
+    if not 0 < level < np.inf:
+        raise DiagnosisError(
+            f"--at {path.name}: level = {text[:40]!r} must be a number of electrons above 0"
+        )
+    return level
+
+
+def is_device(given: str | os.PathLike[str] | None) -> bool:
+    """Whether a baseline's name is that of a device, which can be simulated."""
+    try:
+        Device.load("" if given is None else given)
+    except DeviceError:
+        return False
+    return True
 
 
 def find_baseline(

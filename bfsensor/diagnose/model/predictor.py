@@ -30,11 +30,6 @@ from bfsensor.files import Cache
 from bfsensor.response.edge_response import area_matrix
 from bfsensor.typing import FloatArray
 
-REDUCED_LEVEL = 40_000.0
-"""Background [e-] at which a_ij without a stated level are predicted. Chosen: half of 80,000 e-, the
-level up to which published covariances are usually fitted; twice as large changes a_ij by 40,000 e-
-times their slope with level."""
-
 Columns = Callable[[Channel], dict[str, FloatArray]]
 """Columns of further linear parameters of a channel, by name, in its unit."""
 
@@ -340,6 +335,9 @@ class Predictor:
         """Smallest and largest values that a fit may give the parameters, shape (2, parameters)."""
         plain = len(self.names) - len(self._free)
         free = np.repeat([[-np.inf], [np.inf]], plain, axis=1)
+        for name, ends in self.baseline.bounds.items():
+            row = self.names.index(f"device {name}")
+            free[:, row] = np.array(ends) / self.baseline.spread[name]
         return np.concatenate([free, self._free.limits], axis=1)
 
     def _with_light(self, channel: Channel, gains: FloatArray) -> dict[str, NDArray]:
@@ -441,20 +439,13 @@ class Predictor:
         out = np.empty(len(channel))
         for where, rows in self._rows(channel).items():
             if channel.unit == PER_ELECTRON:
-                edges = self.baseline.edges_on(where, device, REDUCED_LEVEL)
-                a = area_matrix(*edges)
-                if chain is not None:
-                    more = chain.area_change(edges, where)
-                    a = a * (1 + chain.law.bend * REDUCED_LEVEL)
-                    reach = max(more.shape[-1], a.shape[-1]) // 2
-                    a = pad_areas(a, reach) + pad_areas(more, reach)
-                    bent = chain.level_change(where, np.array([REDUCED_LEVEL]), grown=False)
-                    if bent is not None:
-                        a = a + pad_areas(bent[0], reach)
-                y, x0 = (n // 2 for n in a.shape)
-                out[rows] = 0.5 * (
-                    a[y + j[rows], x0 + i[rows]] + a[y - j[rows], x0 + i[rows]]
-                )
+                for level in np.unique(x["level"][rows]):
+                    own = rows[x["level"][rows] == level]
+                    a = self._areas(where, float(level), device, chain)
+                    y, x0 = (n // 2 for n in a.shape)
+                    out[own] = 0.5 * (
+                        a[y + j[own], x0 + i[own]] + a[y - j[own], x0 + i[own]]
+                    )
                 continue
             pairs = np.stack([amp[rows], x["level"][rows]], axis=1)
             groups, first, index = np.unique(
@@ -481,6 +472,25 @@ class Predictor:
             c[:, 0, 0] += noise[groups[:, 0].astype(int)]
             out[rows] = c[index.ravel(), j[rows], i[rows]]
         return out
+
+    def _areas(
+        self,
+        where: Condition,
+        level: float,
+        device: dict[str, float],
+        chain: EffectChain | None,
+    ) -> FloatArray:
+        """Area changes [1/e-] at one condition and level, as tables of a_ij hold them."""
+        edges = self.baseline.edges_on(where, device, level)
+        a = area_matrix(*edges)
+        if chain is None:
+            return a
+        more = chain.area_change(edges, where)
+        a = a * (1 + chain.law.bend * level)
+        reach = max(more.shape[-1], a.shape[-1]) // 2
+        a = pad_areas(a, reach) + pad_areas(more, reach)
+        bent = chain.level_change(where, np.array([level]), grown=False)
+        return a if bent is None else np.asarray(a + pad_areas(bent[0], reach))
 
 
 def _mean_gain(gains: FloatArray) -> float:

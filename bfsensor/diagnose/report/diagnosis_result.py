@@ -24,6 +24,7 @@ from bfsensor.diagnose.plan.advice import RecordingPlan
 from bfsensor.diagnose.plan.gaps import find_untested
 from bfsensor.diagnose.report.attribution_words import reported, said_of
 from bfsensor.diagnose.report.class_words import NAMES, SCAN_WORDS, said_family_p
+from bfsensor.diagnose.report.headlines import headlines
 
 SCHEMA = "bfsensor-diagnosis-1"
 """Name of report.json's layout, under its key 'schema'."""
@@ -221,7 +222,9 @@ class Diagnosis:
         else:
             first = m.findings[0]
             others = self._elsewhere(first)
-            parts = [
+            first_said = headlines(self.attribution) if self.attribution else ""
+            parts = [first_said] if first_said else []
+            parts += [
                 "The recordings differ from the baseline (family-wise p "
                 f"{said_family_p(m.p_value)}), most in the {NAMES[first.word]} "
                 f"({SCAN_WORDS.get(first.family, first.family)}: {abs(first.z):.1f} standard "

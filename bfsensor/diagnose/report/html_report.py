@@ -36,7 +36,12 @@ WHERE_WORDS = {
 """Words and unit of the keys that state where a finding is ('where' in report.json)."""
 
 
-def write_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list[Path]:
+def write_report(
+    diagnosis: Diagnosis,
+    folder: str | os.PathLike[str],
+    *,
+    provenance: Mapping[str, Any] | None = None,
+) -> list[Path]:
     """Write report.json, report.html and, if matplotlib is installed, figures as PNG.
 
     Each file is written under a temporary name and then renamed, so that an interrupted run
@@ -48,6 +53,9 @@ def write_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list[P
         Result to report.
     folder : path-like
         Folder of the files, made if it does not exist.
+    provenance : mapping, optional
+        What made the report, its block of that name: see
+        :func:`~bfsensor.diagnose.report.provenance.provenance_of`.
 
     Returns
     -------
@@ -73,12 +81,19 @@ def write_report(diagnosis: Diagnosis, folder: str | os.PathLike[str]) -> list[P
     written = [p for f in figures for p in f.files]
     report = diagnosis.to_report()
     report["figures"] = [p.name for p in written]
+    report["provenance"] = dict(provenance or {})
     written.append(_write(out / "report.json", json.dumps(report, indent=1) + "\n"))
-    written.append(_write(out / "report.html", to_html(diagnosis, figures)))
+    page = to_html(diagnosis, figures, provenance=provenance)
+    written.append(_write(out / "report.html", page))
     return written
 
 
-def to_html(diagnosis: Diagnosis, figures: Sequence[Drawn]) -> str:
+def to_html(
+    diagnosis: Diagnosis,
+    figures: Sequence[Drawn],
+    *,
+    provenance: Mapping[str, Any] | None = None,
+) -> str:
     """Make the page of a diagnosis as one HTML text with the figures embedded."""
     report = diagnosis.to_report()
     drawn = {f.name: f for f in figures}
@@ -95,6 +110,7 @@ def to_html(diagnosis: Diagnosis, figures: Sequence[Drawn]) -> str:
         _cosmetics(report),
         _not_tested(report),
         _notes(report),
+        _provenance(provenance or {}),
     ]
     body = "".join(p for p in parts if p)
     return f"""<!doctype html>
@@ -344,6 +360,25 @@ def _not_tested(report: Mapping[str, Any]) -> str:
     ]
     table = _table(["class", "reason", "recordings that would show it"], rows)
     return f"<h2>What was not tested</h2>{table}"
+
+
+def _provenance(told: Mapping[str, Any]) -> str:
+    """Table of the provenance: command, time, versions, and hashes of the files that were read."""
+    if not told:
+        return ""
+    plain = {k: v for k, v in told.items() if not isinstance(v, Mapping)}
+    rows = "".join(
+        f"<tr><th>{_text(k.replace('_', ' '))}</th><td>{_text(str(v))}</td></tr>"
+        for k, v in {**plain, **told.get("versions", {})}.items()
+    )
+    files = "".join(
+        f"<tr><th>{_text(name)}</th><td><code>{_text(value)}</code></td></tr>"
+        for name, value in told.get("files", {}).items()
+    )
+    return (
+        f"<details><summary>What made this report</summary><table>{rows}</table>"
+        f"<p>SHA-256 of the files read</p><table>{files}</table></details>"
+    )
 
 
 def _notes(report: Mapping[str, Any]) -> str:

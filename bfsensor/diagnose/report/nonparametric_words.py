@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from bfsensor.diagnose.explain.nonparametric import Coefficient, OpenWorld
+from bfsensor.diagnose.explain.terms import SINGLE
 from bfsensor.diagnose.report.class_words import said_p
 
 NEAR = 30.0
@@ -265,6 +266,22 @@ def _lags(own: Sequence[Coefficient]) -> str:
     )
 
 
+def _single(own: Sequence[Coefficient]) -> str:
+    text = "; ".join(
+        f"a_{c.where['lags'][0][0]}{c.where['lags'][0][1]} by {_amount(c)} 1e-8 / e- "
+        f"({100 * c.value * c.where['relative']:+.1f} % of the measured value)" for c in own[:4]
+    )  # fmt: skip
+    if len(own) > 1:
+        return f"Single a_ij differ from the baseline, in no pattern of shifts: {text}"
+    at = own[0].where["lags"][0]
+    more = (
+        ". All lags together then no longer add up to 0: charge is lost, the gain is wrong for this "
+        "lag, area is gained beyond the lags of the table, or the value is wrong"
+        if tuple(at) == (0, 0) else ""
+    )  # fmt: skip
+    return f"One value is off, and no other supports it: {text}{more}"
+
+
 def _smooth(own: Sequence[Coefficient]) -> str:
     lags = ", ".join(f"({i}, {j})" for i, j in own[0].where["lags"][:6])
     return (
@@ -277,7 +294,7 @@ WORDS: Mapping[str, Callable[[Sequence[Any]], str]] = {
     "boundary shifts": _shifts, "odd boundary shifts": _odd, "readout filter": _filter,
     "pattern of two-pixel parity": _parity, "pattern of position": _places,
     "ripple in readout time": _ripple, "mean by level": _by_level, "mean in time": _in_time,
-    "mean by the exposure before": _before, "covariances by lag": _lags,
+    "mean by the exposure before": _before, "covariances by lag": _lags, SINGLE: _single,
     "smooth covariances over lag and level": _smooth,
 }  # fmt: skip
 """Function that describes the coefficients of each group of nonparametric terms."""

@@ -103,6 +103,16 @@ class Campaign:
         return path if path.exists() else self.settings.baseline
 
     @property
+    def files(self) -> list[Path]:
+        """All files that say anything: frames, set aside ones too, and the folder's texts."""
+        texts = [
+            p for end in ("yaml", "ecsv", "json") for p in self.folder.glob(f"*.{end}")
+        ]
+        named = [p for p in (self.card, self.baseline) if isinstance(p, Path)]
+        frames = [e.path for e in self.exposures] + [s.path for s in self.set_aside]
+        return sorted({*texts, *named, *frames})
+
+    @property
     def spot_grid(self) -> float | None:
         """Pitch of the mask of spots [pixel]; None where campaign.yaml states none."""
         return self.settings.spot_grid

@@ -371,7 +371,12 @@ def floats(table: Table, name: str) -> FloatArray:
     """Column of a table as floats; nan where it is masked or missing."""
     if name not in table.colnames:
         return np.full(len(table), np.nan)
-    return np.asarray(np.ma.filled(np.ma.asarray(table[name], float), np.nan), float)
+    try:
+        return np.asarray(np.ma.filled(np.ma.asarray(table[name], float), np.nan), float)
+    except ValueError as error:
+        raise RecordingError(
+            f"column {name}: {str(error)[:120]}; numbers are allowed"
+        ) from None
 
 
 def whole_numbers(path: Path, table: Table, name: str) -> NDArray[np.int64]:

@@ -1,6 +1,7 @@
 """Reduced recordings and unknown sensors: one channel, near areas that float, pairs of unlike flats."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,6 +13,7 @@ from bfsensor.cli.main import main
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.flat_pairing import RISE, compare_unlike, describe_unlike
 from bfsensor.diagnose.data.reduced_channels import measure_reduced
+from bfsensor.diagnose.detect.scans import DEVICE_SCAN, make_fitted_templates
 from bfsensor.diagnose.diagnosis import diagnose_measured
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.diagnose.model.free_baseline import SPREAD, free_baseline
@@ -116,6 +118,18 @@ def test_free_areas_are_fitted_and_stay_above_0(tmp_path):
     assert "a10" not in found.fit.pulls and "a01" in found.fit.pulls
     assert found.mismatch.detected and [1, 0] in found.location()["lags"]
     assert any("a10 held at 0" in n for n in found.notes)
+
+
+def test_areas_that_only_have_a_bound_are_not_compared_with_a_nominal_value(tmp_path):
+    table = read_area_changes(area_table(tmp_path, seed=35))
+    free = free_baseline()
+    measured = measure_reduced(table, reach=4)
+    fit = diagnose_measured(measured, free, explain=False).fit
+    assert fit.unknown == free.parameters
+    assert DEVICE_SCAN not in {t.family for t in make_fitted_templates(fit)}
+    # The same parameters with a nominal value each are compared with it.
+    known = diagnose_measured(measured, replace(free, not_below=()), explain=False).fit
+    assert DEVICE_SCAN in {t.family for t in make_fitted_templates(known)}
 
 
 def covariances(seed, *, gain=1.0, noise=30.0, extra=0.0, side=1000, matrix=True):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import json
+import time
 from dataclasses import replace
 from importlib.resources import files
 
@@ -12,12 +14,13 @@ import numpy as np
 import pytest
 
 from bfsensor.diagnose.detect.locate import locate_mismatch
-from bfsensor.diagnose.detect.scans import make_templates
+from bfsensor.diagnose.detect.scans import make_fitted_templates, make_templates
 from bfsensor.diagnose.explain.nonparametric import Coefficient, OpenWorld
 from bfsensor.diagnose.fit.baseline_fit import held_out
 from bfsensor.diagnose.plan.advice import plan
 from bfsensor.diagnose.report.diagnosis_result import NAMES, SCHEMA, Diagnosis, _plain
 from bfsensor.diagnose.report.html_report import write_report
+from bfsensor.diagnose.report.provenance import files_of, provenance_of
 from tests.docs.pages import load, tables
 
 PAGES = load("reference_pages")
@@ -86,8 +89,18 @@ def test_the_written_report_is_as_the_schema_says(explained, faults, tmp_path, m
     monkeypatch.setattr(
         "bfsensor.diagnose.report.html_report.draw_figures", lambda diagnosis, folder: []
     )
-    write_report(explained, tmp_path)
-    assert faults(json.loads((tmp_path / "report.json").read_text())) == []
+    (tmp_path / "frame.fits").write_bytes(b"pixels")
+    files = files_of(tmp_path, [tmp_path / "frame.fits", tmp_path / "absent.fits"])
+    told = provenance_of(
+        "bfsensor diagnose run", seed=1, files=files, began=time.monotonic()
+    )
+    write_report(explained, tmp_path, provenance=told)
+    written = json.loads((tmp_path / "report.json").read_text())
+    assert faults(written) == []
+    assert written["provenance"]["files"] == {
+        "frame.fits": hashlib.sha256(b"pixels").hexdigest()
+    }
+    assert hashlib.sha256(b"pixels").hexdigest() in (tmp_path / "report.html").read_text()
 
 
 def objects(value, path=()):
@@ -133,7 +146,7 @@ def test_an_unknown_missing_or_wrong_key_fails(explained, outside, faults, schem
     for key in schema["required"]:
         changed = {k: v for k, v in whole.items() if k != key}
         assert any(key in fault for fault in faults(changed))
-    assert set(whole) <= set(schema["properties"]) == {*whole, "figures"}
+    assert set(whole) <= set(schema["properties"]) == {*whole, "figures", "provenance"}
 
 
 def leaves(part, path=""):
@@ -174,7 +187,7 @@ def test_places_of_all_templates_are_as_the_schema_says(schema, fitted_loss):
     validator = jsonschema.Draft202012Validator(place)
     _, _, fit = fitted_loss
     seen = set()
-    for template in make_templates(fit):
+    for template in (*make_templates(fit.channels), *make_fitted_templates(fit)):
         where = _plain(template.where)
         assert not list(validator.iter_errors(where)), (template.family, where)
         seen |= set(where)

@@ -15,7 +15,7 @@ from bfsensor.diagnose.model.cached_response import Walk
 from bfsensor.diagnose.model.device_baseline import baseline_of_device, write_edges
 from bfsensor.diagnose.model.open_baseline import find_baseline, simulate_baseline
 from bfsensor.errors import DeviceError, DiagnosisError, FitError
-from bfsensor.response.edge_response import area_matrix
+from bfsensor.response.edge_response import EdgeResponse, area_matrix
 from validation.common.virtual_source import virtual_baseline
 from validation.concealed.card import NOMINAL, SPREAD, shifts_at
 
@@ -114,13 +114,22 @@ def test_what_a_device_does_not_have(key):
 def test_a_quantity_at_the_end_of_what_can_be(monkeypatch):
     """Derivatives from the one side on which there is a device; here of a known slope."""
 
+    def shifts(device):
+        return 3.0 * device.gates.gate_oxide - device.gates.field_oxide
+
     def walk(device, *, cells, backgrounds=(0.0,), keep=None):
-        depths = np.array([5.0, 100.0])
-        moved = np.full((len(backgrounds), 2, 11, 11), 3.0 * device.gates.gate_oxide)
-        moved -= device.gates.field_oxide
-        return Walk(tuple(backgrounds), depths, moved, 0.0 * moved)
+        moved = np.full((len(backgrounds), 2, 11, 11), shifts(device))
+        return Walk(tuple(backgrounds), np.array([5.0, 100.0]), moved, 0.0 * moved)
+
+    def solve(device, *, cells, changed):
+        slopes = [(shifts(other) - shifts(device)) / step for other, step in changed]
+        dkx = np.array(slopes)[:, None, None, None] * np.ones((2, 11, 11))
+        return EdgeResponse(
+            np.array([5.0, 100.0]), dkx[0], dkx[0], dkx, 0.0 * dkx, (0.0, 0.0)
+        )
 
     monkeypatch.setattr(device_baseline, "walk", walk)
+    monkeypatch.setattr(device_baseline, "solve_response", solve)
     found = baseline_of_device(
         Device.load("e2v_ccd250"), parameters=["gates.gate_oxide", "gates.field_oxide"]
     )

@@ -1,0 +1,117 @@
+"""A mismatch of measured a_ij that rests on one value: tested by leaving each value out."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from bfsensor.diagnose.data.channels import PER_ELECTRON
+from bfsensor.diagnose.detect.candidate_screen import Screen
+from bfsensor.diagnose.detect.candidates import candidates_of, rank, seen_of, tellable
+from bfsensor.diagnose.detect.locate import ALARM, Mismatch, locate_mismatch
+from bfsensor.diagnose.explain.attribution import Attribution
+from bfsensor.diagnose.explain.nonparametric import Columns, FreeFit, explain_outside
+from bfsensor.diagnose.explain.pursuit import Dictionary
+from bfsensor.diagnose.explain.terms import SINGLE, Family, Scene, lag_family
+from bfsensor.diagnose.fit.baseline_fit import BaselineFit, fit_baseline
+from bfsensor.diagnose.fit.fitted_model import Model
+from bfsensor.diagnose.model.effect_parameters import fitted
+from bfsensor.diagnose.model.predictor import Predictor
+
+
+def explain_single_value(
+    predictor: Predictor, fit: BaselineFit, mismatch: Mismatch, *, seed: int = 1
+) -> Attribution | None:
+    """Describe a mismatch that one value of a table causes alone.
+
+    The value with the largest residual is left out.  If nothing stands out without it, and no
+    effect of the library explains the others better than noise does, then no physics has been
+    seen: one value differs from the baseline.  Effects that would explain it, such as area that
+    is gained beyond the table's lags where a_00 is too negative, are listed.
+
+    Parameters
+    ----------
+    predictor : Predictor
+        Model of the baseline.
+    fit : BaselineFit
+        Its fit to tables of a_ij.
+    mismatch : Mismatch
+        Residuals of that fit that stand out.
+    seed : int
+        Seed of the noise draws.
+
+    Returns
+    -------
+    Attribution or None
+        With one nonparametric term for the value; None where other values stand out as well, or
+        an effect is seen in them, or the channels are no a_ij.
+    """
+    if any(c.unit != PER_ELECTRON for c in fit.channels) or len(fit.channels) != 1:
+        return None
+    channel = fit.channels[0]
+    row = _farthest(fit)
+    others = np.arange(len(channel)) != row
+    kept = channel.take(others)
+    without = fit_baseline(predictor, [kept])
+    left = locate_mismatch(without, seed=seed)
+    if left.detected or _any_effect(Model(predictor, without), left):
+        return None
+    model = Model(predictor, fit)
+    family = lag_family(Scene(model))
+    assert family is not None and family.group == SINGLE
+    own = [t for t in family.terms if t.where["row"] == row]
+    choice = Dictionary(
+        Family(SINGLE, tuple(own), family.words, tried=len(family.terms)), fit
+    ).choose()
+    if choice is None:
+        return None
+    after = model.with_columns(Columns(own[:1]))
+    free = FreeFit(
+        after, (choice,), {SINGLE: choice.score}, locate_mismatch(after.fit, seed=seed),
+        choice,
+    )  # fmt: skip
+    kinds = tellable(candidates_of(predictor.baseline), predictor, fit.channels)
+    ranking = rank(Screen(predictor, fit, seen_of(mismatch)), kinds)
+    told = explain_outside(model, mismatch, ranking, free=free, seed=seed)
+    if told is None:
+        return None
+    world, last = told
+    same = [
+        r.effect.name for r in ranking if r.gain > 0.5 * choice.z[0] ** 2 and not r.refuted
+    ]
+    notes = (
+        [
+            f"would explain this value as well, which no other value supports: {', '.join(same)}"
+        ]
+        if same
+        else []
+    )
+    return Attribution(
+        found=(),
+        fit=last.fit,
+        predictor=last.predictor,
+        mismatch=free.mismatch,
+        open_world=True,
+        notes=tuple(notes),
+        free_form=world,
+    )
+
+
+def _farthest(fit: BaselineFit) -> int:
+    """Index of the value with the largest residual over its own error."""
+    n = len(fit.residuals)
+    own = np.maximum(1 - (fit.basis[:n] ** 2).sum(1), 1e-6)
+    return int(np.argmax(np.abs(fit.residuals) / np.sqrt(own)))
+
+
+def _any_effect(model: Model, mismatch: Mismatch) -> bool:
+    """Whether an effect of the library gains more than noise gives as many parameters."""
+    kinds = tellable(
+        candidates_of(model.predictor.baseline), model.predictor, model.fit.channels
+    )
+    screen = Screen(model.predictor, model.fit, seen_of(mismatch))
+    ranking = rank(screen, kinds)
+    return any(
+        r.gain > chi2.isf(ALARM / max(len(kinds), 1), len(fitted(r.effect)))
+        for r in ranking
+    )

@@ -1,0 +1,139 @@
+"""First sentence of a report: each effect as a physicist would say it, with values and units."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from string import Formatter
+from typing import Any
+
+from bfsensor.diagnose.explain.attribution import Attribution, Found
+from bfsensor.diagnose.report.class_words import CLASS_WORDS
+
+HEADLINES: Mapping[str, tuple[str, ...]] = {
+    "cti_serial": ("serial transfer leaves {cti} of the charge behind at each step",),
+    "cti_parallel": ("parallel transfer leaves {cti} of the charge behind at each step",),
+    "trap_serial": (
+        "a trap in the serial register of amplifier {amp} holds {size} e- and releases them within "
+        "{tau} pixel times",
+    ),
+    "electronic_memory": ("{alpha} of each pixel appears in the pixel read next",),
+    "interpixel_coupling": (
+        "pixels pass {ax} of their signal to each neighbour in the row, {ay} to each in the column",
+    ),
+    "amp_crosstalk": ("{c} of the signal of an amplifier appears in the others",),
+    "correlated_noise": (
+        "noise of {rms} e- (rms) repeats with a period of {period} pixel times",
+        "noise of {rms} e- (rms) is correlated, by {corr} from one pixel read to the next",
+        "amplifiers share noise of {rms} e- (rms)",
+    ),
+    "bias_instability": (
+        "rows begin {amp} e- above the bias level and settle within {length} pixels",
+        "the bias level moves by {rms} e- (rms)",
+    ),
+    "gain_nonlinearity": (
+        "the signal departs from the charge by {c2} at 1e5 e-, and by {c3} with its square",
+    ),
+    "adc_bits": ("bit {bit} of the converter weighs {delta} ADU too much",),
+    "gain_drift": ("the gain changes by {slope} an hour",),
+    "bf_nonlinear": (
+        "boundary shifts are not in proportion to the charge Q: they go as Q (1 + b Q / 2) with b = "
+        "{b} per electron",
+    ),
+    "bf_chromatic": (
+        "boundary shifts change by {kappa} from 620 to 950 nm beyond what was simulated",
+    ),
+    "bf_anisotropy": (
+        "boundary shifts in y exceed those in x by {eps} more than simulated",
+    ),
+    "bf_long_range": (
+        "an electron changes areas by {amp} at 1 pixel, falling with the distance to the power "
+        "-{power}, beyond what was simulated",
+    ),
+    "voltage_dependence": (
+        "boundary shifts grow by {delta} for 20 V less back bias beyond what was simulated",
+    ),
+    "lateral_diffusion": ("spots are wider by a variance of {var} pixel^2",),
+    "tree_rings": (
+        "tree rings displace light by {amp} pixel, {period} pixels from ring to ring",
+        "tree rings displace light by {amp} pixel",
+    ),
+    "edge_rolloff": (
+        "light at the rim is displaced by {amp} pixel, within {length} pixels",
+    ),
+    "mask_stitch": ("every {period} columns a boundary is displaced by {amp} pixel",),
+    "tearing": (
+        "columns beside a boundary at {column} of the width are displaced by {amp} pixel, within "
+        "{length} pixels",
+    ),
+    "charge_loss": ("pixels lose {q} of their light for each stored electron",),
+    "persistence": (
+        "{frac} of a pixel's charge comes out in later exposures, within {tau} of them",
+    ),
+    "shutter_timing": ("exposures last {dt} s longer than stated",),
+    "dark_hot": (
+        "hot columns, {columns} in number, collect {rate} e-/s",
+        "the dark current is {rate} e-/s more than the baseline's",
+    ),
+    "saturation": ("pixels are full at {full_well} e-",),
+    "fringing": ("fringes vary the signal by {amp}, {period} pixels apart",),
+    "psf_wings": ("{frac} of the light of spots lies in a halo {sigma} pixels wide",),
+    "cosmic_rays": ("particles leave {rate} tracks a minute on 256 x 256 pixels",),
+    "illumination_turbulence": (
+        "the illumination changes between frames by {rms} (rms) over {corr} pixels",
+    ),
+}
+"""Sentences of each class, of which the first is used whose parameters the effect has."""
+
+
+def headline(found: Found) -> str:
+    """One effect in a clause, with its values and their 68 % errors.
+
+    Parameters
+    ----------
+    found : Found
+        The effect.
+
+    Returns
+    -------
+    str
+        Without a capital and a full stop.
+    """
+    word = found.effect.word
+    values = {
+        name: _amount(told, whole=name not in found.errors)
+        for name, told in found.intervals().items()
+    }
+    if word == "trap_serial" and "amp" in found.effect.values:
+        values["amp"] = f"{found.effect['amp'] + 1:g}"
+    if word == "device_parameter":
+        return " and ".join(f"{n} of the device is {v}" for n, v in values.items())
+    for text in HEADLINES.get(word, ()):
+        if {name for _, name, _, _ in Formatter().parse(text) if name} <= set(values):
+            return text.format(**values)
+    return CLASS_WORDS.get(word, word)
+
+
+def headlines(attribution: Attribution) -> str:
+    """Sentence that names all effects of an attribution, and whether anything is left; or ''."""
+    own = [headline(f) for f in attribution.found]
+    if not own:
+        return ""
+    text = "; ".join(own)
+    left = attribution.open_world or attribution.mismatch.detected
+    after = "More is left, see below." if left else "Nothing else is left."
+    return f"{text[0].upper()}{text[1:]}. {after}"
+
+
+def _amount(told: Mapping[str, Any], *, whole: bool) -> str:
+    """Value with its error, half of the 68 % interval, to two digits of the error."""
+    value = float(told["value"])
+    if whole or "lo68" not in told:
+        return f"{value:g}"
+    error = 0.5 * (float(told["hi68"]) - float(told["lo68"]))
+    if not (math.isfinite(error) and error > 0):
+        return f"{value:.3g}"
+    # Digits of the value down to the error's second one.
+    ratio = abs(value) / error
+    digits = max(2, min(7, math.floor(math.log10(ratio)) + 3 if ratio > 0 else 2))
+    return f"{value:.{digits}g} +- {error:.2g}"

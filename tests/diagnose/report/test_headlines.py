@@ -1,0 +1,72 @@
+"""The first sentence of a report has values, errors and units, for every class of the library."""
+
+from dataclasses import dataclass
+from string import Formatter
+
+import pytest
+
+from bfsensor.diagnose.explain.attribution import Found
+from bfsensor.diagnose.report.class_words import CLASS_WORDS
+from bfsensor.diagnose.report.headlines import HEADLINES, headline, headlines
+from bfsensor.effects.cti_serial import CtiSerial
+from bfsensor.effects.library import LIBRARY
+from bfsensor.effects.trap_serial import TrapSerial
+
+
+def found_of(kind, errors=0.05):
+    """An effect in the middle of its plausible range, every parameter fitted."""
+    values = {p.name: (p.low + p.high) / 2 for p in kind.parameters}
+    for p in kind.parameters:
+        if p.law == "whole":
+            values[p.name] = float(round(values[p.name]))
+    fitted = {
+        p.name: errors * abs(values[p.name]) + 1e-12
+        for p in kind.parameters if p.law != "whole"
+    }  # fmt: skip
+    return Found(kind(values), 100.0, fitted, {kind.word: 1.0}, (kind.word,))
+
+
+@pytest.mark.parametrize("kind", LIBRARY, ids=lambda k: f"{k.word}:{k.variant}")
+def test_every_class_has_a_headline_with_its_size(kind):
+    text = headline(found_of(kind))
+    assert text != CLASS_WORDS[kind.word] and "{" not in text
+    size = next(p.name for p in kind.parameters if p.amplitude)
+    templates = HEADLINES[kind.word]
+    names = [{n for _, n, _, _ in Formatter().parse(t) if n} for t in templates]
+    used = next(n for n in names if n <= {p.name for p in kind.parameters})
+    assert size in used and "+-" in text
+
+
+def test_values_are_those_of_the_effect():
+    effect = CtiSerial({"cti": 1.1234e-6})
+    found = Found(effect, 100.0, {"cti": 2e-8}, {"cti_serial": 1.0}, ("cti_serial",))
+    assert headline(found) == (
+        "serial transfer leaves 1.123e-06 +- 2.2e-08 of the charge behind at each step"
+    )
+    values = {"size": 30.0, "tau": 1.5, "amp": 0.0, "reach": 100.0}
+    trap = TrapSerial(values)
+    found = Found(
+        trap, 9.0, {"size": 1.0, "tau": 0.1}, {"trap_serial": 1.0}, ("trap_serial",)
+    )
+    assert "of amplifier 1 holds 30 +- 1.1 e-" in headline(found)
+
+
+@dataclass
+class Left:
+    detected: bool
+
+
+@dataclass
+class Told:
+    found: tuple
+    mismatch: Left
+    open_world: bool = False
+
+
+def test_what_is_left_is_said():
+    one = found_of(CtiSerial)
+    assert headlines(Told((one,), Left(False))).endswith("Nothing else is left.")
+    assert headlines(Told((one,), Left(True))).endswith("More is left, see below.")
+    assert headlines(Told((one,), Left(False), open_world=True)).endswith("see below.")
+    assert headlines(Told((), Left(True))) == ""
+    assert headlines(Told((one, one), Left(False))).startswith("Serial transfer")
