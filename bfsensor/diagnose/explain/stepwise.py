@@ -123,25 +123,24 @@ def attribute(
 
 @dataclass(eq=False)
 class _Search:
-    """Candidates of a search, its mismatch, notes, and effects ranked beside the first free terms."""
+    """Candidates of a search, its mismatch, notes, effects beside the first terms, and refused ones."""
 
     kinds: Sequence[type[Effect]]
     seed: int
     first: Mismatch
     notes: list[str]
     nearest: list[Rival] = field(default_factory=list)
+    refused: set[str] = field(default_factory=set)
 
     def locate(self, model: Model) -> Mismatch:
         """Find what stands out in a model's residuals, by scans and by effects not in it."""
         return locate_effects(model.predictor, model.fit, self.kinds, seed=self.seed)
 
-    def forward(
-        self, now: Explanation, refused: frozenset[str] = frozenset()
-    ) -> tuple[Explanation, dict[str, list[Rival]]]:
+    def forward(self, now: Explanation) -> tuple[Explanation, dict[str, list[Rival]]]:
         """Add what scores best while anything stands out; rankings are by name of the effect."""
         places: dict[str, list[Rival]] = {}
-        while now.stands_out():
-            step = self._step(now, refused)
+        while now.mismatch.detected:
+            step = self._step(now)
             if step is None:
                 break
             after, ranking = step
@@ -157,25 +156,26 @@ class _Search:
             ]
             if wrong:
                 # What remains of such an effect is its place alone, which terms describe without it.
-                refused |= {now.parts[n].name for n in wrong}
+                self.refused |= {now.parts[n].name for n in wrong}
                 for n in reversed(wrong):
                     now = now.without(n)
                 now = now.located()
         return now, {n: r for n, r in places.items() if n in [p.name for p in now.parts]}
 
-    def _step(
-        self, now: Explanation, refused: frozenset[str]
-    ) -> tuple[Explanation, list[Rival]] | None:
+    def _step(self, now: Explanation) -> tuple[Explanation, list[Rival]] | None:
         """The best addition that holds, with the ranking of effects; None if none does."""
-        ranking = self._ranked(now, refused) if len(now.parts) < MOST else []
+        ranking = self._ranked(now) if len(now.parts) < MOST else []
+        # What errors of predictions may leave asks for no further terms, but an effect elsewhere in
+        # the same channels may be in it.
+        more = now.stands_out()
         laws = [
             (n, choice) for n, part in enumerate(now.parts)
-            if part.change is not None
+            if more and part.change is not None
             for choice in law_choices(part.change, now.model.fit, part.law_terms())
         ]  # fmt: skip
         free = (
             [c for c in compete(Scene(now.model), now.mismatch) if not _taken(c, now)]
-            if len(now.free) < MOST_GROUPS else []
+            if more and len(now.free) < MOST_GROUPS else []
         )  # fmt: skip
         good = [r for r in ranking if self._net(now, r) > charge(len(fitted(r.effect)), 1)]
         good = good[:REFITTED]
@@ -188,16 +188,18 @@ class _Search:
         options: list[tuple[float, Callable[[], Explanation]]] = [
             (c.score, partial(now.with_law, n, c)) for n, c in laws
         ]
-        for rival in good:
+        ranking, reached = _with_laws(ranking, extra), 0.0
+        for rival in reversed([r for r in ranking if r.effect.name in extra]):
             score = self._net(now, rival) - now.charge(rival.effect)
             # An effect beside others must beat their laws by itself, not with a law of its own.
             if score > 0 and (not now.parts or score >= law):
-                score += extra[rival.effect.name]
-                options.append((score, partial(now.with_effect, rival.effect)))
+                # Effects are tried in the order of their evidence.
+                reached = max(reached, score + rival.law)
+                options.append((reached, partial(now.with_effect, rival.effect)))
+        options.reverse()
         options.sort(key=lambda o: -o[0])
         before = sum(score >= near for score, _ in options)
         options[before:before] = [(c.score, partial(now.with_free, c)) for c in free[:1]]
-        ranking = _with_laws(ranking, extra)
         for _, add in options:
             after = self._tried(now, add)
             if after is not None:
@@ -210,7 +212,7 @@ class _Search:
             return max(rival.gain - now.reach(rival.effect.touches), 0.0)
         return now.net(rival.gain, rival.template)
 
-    def _ranked(self, now: Explanation, refused: frozenset[str]) -> list[Rival]:
+    def _ranked(self, now: Explanation) -> list[Rival]:
         """Effects that may be added, by decreasing evidence; those of the closest gains fitted."""
         screen = Screen(now.model.predictor, now.model.fit, seen_of(now.mismatch))
         kinds = further(concerned(self.kinds, now.mismatch), now.model.effects)
@@ -218,7 +220,9 @@ class _Search:
         self.notes += [
             f"{name}, tried at one place: {why}" for name, why in screen.passed_over.items()
         ]
-        ranking = [r for r in ranking if not r.refuted and r.effect.name not in refused]
+        ranking = [
+            r for r in ranking if not r.refuted and r.effect.name not in self.refused
+        ]
         # Only effects whose gain is beyond chance are worth a joint fit.
         good = [r for r in ranking if self._net(now, r) > charge(len(fitted(r.effect)), 1)]
         others = [r for r in ranking if r not in good]
@@ -350,11 +354,23 @@ def _law_score(now: Explanation, rival: Rival) -> float:
 
 
 def _with_laws(ranking: Sequence[Rival], scores: Mapping[str, float]) -> list[Rival]:
-    """Ranking with the scores of other laws, by name of the effect, in the evidences."""
-    out = []
-    for rival in ranking:
-        more = scores.get(rival.effect.name, 0.0)
-        out.append(replace(rival, evidence=rival.evidence + 0.5 * more, law=more))
+    """Ranking with the scores of other laws, by name of the effect.
+
+    Laws decide where they make what an effect explains more than a quarter less than what another
+    one does (the square of an error by half), and between effects that explain as much by
+    themselves; otherwise the effect counts as it is.
+    """
+    ranking = [replace(r, law=scores.get(r.effect.name, 0.0)) for r in ranking]
+    enough = (1 - SAME**2) * max((r.gain + r.law for r in ranking), default=0.0)
+    out = [
+        replace(
+            r,
+            evidence=r.evidence
+            - 0.5 * max(enough - r.gain - r.law, 0.0)
+            + 0.5 * min(r.law, charge(1, 1)),
+        )
+        for r in ranking
+    ]
     return sorted(out, key=lambda r: -r.evidence)
 
 
