@@ -67,9 +67,8 @@ def explain_single_value(
         return None
     after = model.with_columns(Columns(own[:1]))
     free = FreeFit(
-        after, (choice,), {SINGLE: choice.score}, locate_mismatch(after.fit, seed=seed),
-        choice,
-    )  # fmt: skip
+        after, (choice,), {SINGLE: choice.score}, locate_mismatch(after.fit, seed=seed)
+    )
     kinds = tellable(candidates_of(predictor.baseline), predictor, fit.channels)
     ranking = rank(Screen(predictor, fit, seen_of(mismatch)), kinds)
     told = explain_outside(model, mismatch, ranking, free=free, seed=seed)
