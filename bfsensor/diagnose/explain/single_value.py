@@ -66,8 +66,9 @@ def explain_single_value(
     if choice is None:
         return None
     after = model.with_columns(Columns(own[:1]))
-    left = locate_mismatch(after.fit, seed=seed)
-    free = FreeFit(after, (choice,), {SINGLE: choice.score}, left)
+    free = FreeFit(
+        after, (choice,), {SINGLE: choice.score}, locate_mismatch(after.fit, seed=seed)
+    )
     kinds = tellable(candidates_of(predictor.baseline), predictor, fit.channels)
     ranking = rank(Screen(predictor, fit, seen_of(mismatch)), kinds)
     told = explain_outside(model, mismatch, ranking, free=free, seed=seed)
