@@ -17,6 +17,7 @@ from bfsensor.diagnose.data.exposure_info import (
     condition_at,
     label_of,
     numbers_of,
+    zero_folds,
 )
 from bfsensor.diagnose.data.flat_channels import TAIL
 from bfsensor.diagnose.data.map_channels import MapShare, block_side
@@ -271,6 +272,8 @@ class Forecaster:
     ) -> list[Forecast]:
         serial = word == "serial_overscan"
         axes, blocks = Axes(), []
+        biases = self.measured.counts.get("bias", 0)
+        zeros = sum("fit" in zero_folds(n, biases) for n in range(biases))
         for amp, segment in enumerate(self.measured.segments):
             own = segment.serial_overscan if serial else segment.parallel_overscan
             head = (planned.overscan or own) - TAIL
@@ -278,7 +281,9 @@ class Forecaster:
                 continue
             lines = segment.rows if serial else segment.columns
             noise = self.measured.read_noise[amp]
-            variance = (noise if np.isfinite(noise) else 1.0) ** 2 / (lines * planned.count)
+            variance = (noise if np.isfinite(noise) else 1.0) ** 2 / lines
+            # The mean profile of the biases, which is subtracted, has noise, too.
+            variance *= 1 / planned.count + (1 / zeros if zeros else 0.0)
             blocks.append(variance * (np.eye(head) + 1 / TAIL))
             axes.add(head, condition, amp=amp, time=seconds, level=float(levels[amp]),
                      k=np.arange(1, head + 1))  # fmt: skip
