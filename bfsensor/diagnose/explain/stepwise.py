@@ -350,7 +350,13 @@ def _law_score(now: Explanation, rival: Rival) -> float:
     change = OwnChange(now.model.predictor, fit.values, effects)
     choices = law_choices(change, beside)
     gain = sum(z * z for c in choices for z in c.z)
-    return sum(c.score for c in choices) if gain <= rival.gain else 0.0
+    if gain > rival.gain:
+        return 0.0
+    # Laws cannot take more than the effect leaves above noise where it acts: templates of curves,
+    # whose parameters reached the ends of their ranges, leave more than their joint fits.
+    rows = np.any([fit.of(w) for w in rival.effect.touches], axis=0)
+    above = float(fit.residuals[rows] @ fit.residuals[rows]) - int(rows.sum())
+    return float(np.clip(sum(c.score for c in choices), 0.0, max(above - rival.gain, 0.0)))
 
 
 def _with_laws(ranking: Sequence[Rival], scores: Mapping[str, float]) -> list[Rival]:
