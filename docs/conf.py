@@ -116,7 +116,7 @@ def write_effects() -> None:
     kinds = (*LIBRARY, DeviceParameter)
     lines += [
         "A class is named by what only it can do: where it acts, in which order of readout, and on",
-        "which overscan. Within a class a diagnosis tells the law apart (`law` in report.json):",
+        "which overscan. Within a class a diagnosis names the law (`law` in report.json):",
         "",
         "| class | law | meaning | source |",
         "|---|---|---|---|",

@@ -181,7 +181,8 @@ class SettlingByFrame(ReadNoise):
     def in_order(self, lag: NDArray, width: NDArray) -> FloatArray:
         lag, width = np.broadcast_arrays(np.abs(np.asarray(lag)), np.asarray(width))
         out = np.zeros(lag.shape)
-        for size in np.unique(width):
+        # A reduced recording has frames of no width, and no order of readout.
+        for size in np.unique(width[width > 0]):
             rows = width == size
             shape = self._shape(int(size)) - self._shape(int(size)).mean()
             spectrum = np.abs(np.fft.rfft(shape)) ** 2

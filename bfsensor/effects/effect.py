@@ -416,6 +416,11 @@ class Effect:
         """Name of the law within the class; by default the variant, '' where the class has one law."""
         return self.variant
 
+    def searched(self, layout: Layout) -> int:
+        """Count values that a search has fitted to the same recordings and that the layout holds."""
+        del layout
+        return 0
+
     @classmethod
     def amplitudes(cls) -> tuple[str, ...]:
         """Names of the parameters that are strengths, each 0 effect at its neutral value."""

@@ -1,4 +1,4 @@
-"""Gain non-linearity: the amplifier's response is a curve, bends at a level, or starts late."""
+"""Gain non-linearity: the amplifier's response is a curve, has a kink at a level, or starts late."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ class ResponseCurve(_Response):
 
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
-        # One bend in the middle and one at low signal; the fit frees all values together.
+        # One curvature in the middle and one at low signal; the fit frees all values together.
         return [
             {f"f{n}": 0.01 * f(x) for n, x in enumerate(KNOTS, 1)}
             for f in (lambda x: x * x, lambda x: x * (1 - x))

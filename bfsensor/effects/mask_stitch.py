@@ -135,7 +135,7 @@ class WavyMask(Effect):
             # Straight along the axis: crests tilt by less than one period across the sensor.
             if abs(f[1 - along]) * max(layout.shape) > 1:
                 continue
-            # The sighting's phase is that of the area's sine at the middle, pixel n / 2.
+            # The phase of a detected wave is that of the area's sine at the middle, pixel n / 2.
             turn = s["phase"] if f[along] > 0 else 0.5 - s["phase"]
             rate = abs(float(f[along]))
             phase = turn - rate * (n / 2 + 0.5) - 0.25

@@ -143,7 +143,9 @@ SLOWER = (
     Parameter("slow", "", 0.02, 0.98, law="flat"),
     Parameter("slow_tau", "packets", 2.0, 40.0),
 )
-"""Parameters of traps of a second kind: part of the late charge, and their release time."""
+"""Parameters of traps of a second kind: part of the late charge, and their release time.  Ranges
+assumed: from a fiftieth of the charge, released within 2 to 40 packets; twice as long, the charge
+leaves the overscans that are measured."""
 
 
 class Traps(Effect):

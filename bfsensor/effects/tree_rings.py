@@ -219,6 +219,8 @@ class RadialTreeRings(_Rings):
 
     variant = "radial"
     standing = False
+    # Its profile was fitted to the map, so that it raises no alarm; the scans for rings do.
+    from_sightings = False
     parameters = (
         AMP,
         # The search has chosen the periods: the prior of one is charged, and nothing is fitted.
@@ -239,6 +241,11 @@ class RadialTreeRings(_Rings):
             {n: float(s[n]) for n in names} | {"drift": e, "field": e}
             for s in layout.sightings if s["shape"] == "radial" for e in (0.0, 1.0)
         ]  # fmt: skip
+
+    def searched(self, layout: Layout) -> int:
+        """Frequency, sine and cosine of each wave, but for the amplitude of all."""
+        waves = [s["waves"] for s in layout.sightings if s["shape"] == "radial"]
+        return max(3 * len(waves[0]) - 1, 0) if waves else 0
 
     def profile(self, r: FloatArray, layout: Layout) -> FloatArray:
         waves = [s["waves"] for s in layout.sightings if s["shape"] == "radial"]

@@ -172,13 +172,17 @@ def draw_bias_instability() -> Figure:
     rng = np.random.default_rng(4721)
     white = NOISE * rng.standard_normal((48, 48))
     by_row = parts.make_effect("bias_instability", {"rms": 3.0}, "row")
-    ramp = parts.make_effect("bias_instability", {"amp": 20.0, "length": 12.0}, "ramp")
+    ramp = parts.make_effect("bias_instability", {"rms": 20.0, "length": 12.0}, "settling")
     show(panels[0], white, "without", -15, 15, bar=False)
     show(panels[1], by_row.noise([white], layout, rng)[0], "row by row", -15, 15)
     biases = NOISE * rng.standard_normal((512, 48))
     rows = [e.noise([biases], layout, rng)[0].mean(0) for e in (ramp.scaled(0), ramp)]
     curves(panels[2], np.arange(48), *rows)
-    panels[2].set(xlabel="column [pixel]", ylabel="mean of 512 rows [e⁻]", title="ramp")
+    panels[2].set(
+        xlabel="column [pixel]",
+        ylabel="mean of 512 rows [e⁻]",
+        title="settling of one frame",
+    )
     return figure
 
 

@@ -1,4 +1,4 @@
-"""What a bench adds to every campaign, as report.json lists it: bias structure and drift, pulses, lamp.
+"""Nuisances of a bench in every campaign, for report.json: bias structure, drift, pulses, lamp.
 
 All of it is subtracted or fitted by the channels; the list says that it is there and how large.
 """

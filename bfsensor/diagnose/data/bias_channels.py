@@ -43,8 +43,8 @@ left out of the errors, which are then too small."""
 
 ROWS = 3
 """Number of rows between which the covariance of the noise is measured, too.  Chosen: levels of rows
-that keep half of the row before are told from independent ones by the first; with 6, slower ones by
-a half more."""
+that keep half of the row before differ from independent ones by the first; with 6, slower ones by a
+half more."""
 
 FRAME_ERROR = 0.1
 """Scatter of an amplifier's bias level, against the others', that is no finding [ADU].  Chosen, to be
@@ -214,6 +214,9 @@ class BiasChannels:
             if mean is None:
                 continue
             d = _without_outliers(frame.image - overscan_level(frame) - mean).ravel()
+            if not d.std() > 0:
+                # One bias is its own mean: nothing is left of its noise.
+                continue
             # A mean or a variance left in would be covariances at all lags.
             d = (d - d.mean()) / d.std()
             square, n = d**2 - 1.0, len(d)

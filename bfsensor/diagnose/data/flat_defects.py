@@ -51,7 +51,7 @@ dust spot of 30 pixels; with 31, light must be even over 120 pixels."""
 
 LIGHT = 8
 """Order of the polynomial of the light that dust spots stand out of.  Chosen: cos^4 of the field and a
-stop's shadow are smooth over half of the sensor; with 16, waves of an eighth of the sensor, 32 of 256
+edge of a stop are smooth over half of the sensor; with 16, waves of an eighth of the sensor, 32 of 256
 pixels, are light and wide dust spots with them."""
 
 EDGE = 2.0
@@ -177,7 +177,8 @@ def bad_columns(image: FloatArray) -> list[BadColumns]:
     rows = np.arange(ny)[:, None]
     part = (rows >= first) & (rows < last)
     count = part.sum(0)
-    part_mean = np.where(part, away, 0.0).sum(0) / count
+    # Columns without a usable row have no mean and no defect.
+    part_mean = np.where(part, away, 0.0).sum(0) / np.maximum(count, 1)
     # A column's own median is robust against what a part of it has.
     mean = np.where(count == ny, whole, part_mean)
     z = mean * np.sqrt(count / ny) / scatter

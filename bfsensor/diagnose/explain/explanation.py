@@ -119,7 +119,8 @@ class Explanation:
 
     def charge(self, effect: Effect) -> float:
         """Chi-square that the best of all classes of effects gains by chance."""
-        return charge(len(fitted(effect)), self.tried)
+        searched = effect.searched(self.model.predictor.layout)
+        return charge(len(fitted(effect)) + searched, self.tried)
 
     def stands_out(self) -> bool:
         """Whether residuals are beyond noise and beyond the errors of the effects' predictions."""

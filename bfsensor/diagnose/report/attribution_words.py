@@ -156,7 +156,7 @@ def _other_law(attribution: Attribution) -> bool:
 
 
 def _said_shares(attribution: Attribution) -> list[str]:
-    """What the effects take by their own laws, and what other laws or causes take beside them."""
+    """Shares that the effects take by their own laws, and that other laws or causes take beside them."""
     shares = attribution.shares
     if not attribution.found or not shares:
         return []

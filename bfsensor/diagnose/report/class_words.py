@@ -73,7 +73,6 @@ LAW_WORDS = {
         "rows_with_memory",
         "rows remember the level of the row before",
     ),
-    "bias_instability:ramp": ("ramp", "rows settle exponentially, always alike"),
     "bias_instability:settling": (
         "settling",
         "rows settle, by a size that differs between frames",
@@ -164,7 +163,7 @@ PARAMETER_WORDS: Mapping[str, Mapping[str, str]] = {
         "memory": "time beyond which the noise is white",
     },
     "bias_instability": {
-        "rms": "rms of the level", "amp": "excess at the start of a row",
+        "rms": "rms of the level",
         "length": "settling length",
         "corr": "correlation with the row before",
     },

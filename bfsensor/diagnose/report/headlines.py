@@ -50,7 +50,6 @@ HEADLINES: Mapping[str, tuple[str, ...]] = {
     "bias_instability": (
         "the bias level of rows moves by {rms} e- (rms) and remembers {corr} of the row before",
         "rows settle within {length} pixels by an amount that differs between frames by {rms} e- (rms)",
-        "rows begin {amp} e- above the bias level and settle within {length} pixels",
         "the bias level moves by {rms} e- (rms)",
     ),
     "gain_nonlinearity": (

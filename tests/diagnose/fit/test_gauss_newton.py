@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -25,6 +27,7 @@ class Halo:
     prior_rows = np.array([], int)
     effects = (PsfWings({"frac": 0.01, "sigma": 3.0}),)
     notes = ()
+    baseline = SimpleNamespace(not_below=())
 
     def __init__(self, start):
         self.start = np.array(start, float)

@@ -169,7 +169,7 @@ def test_the_page_is_whole_and_says_it_all(written):
         "Effects found", "What to record next", "Where the recordings differ",
         "Held-out recordings, which were not fitted", "Fitted recordings",
         "Residuals, channel by channel", "Largest deviations from the baseline",
-        "What was not tested", "Notes",
+        "Defects of the sensor", "What was not tested", "Notes",
     ]  # fmt: skip
     text = " ".join(page.words)
     assert "a <small> campaign" in text and "a note" in text
