@@ -10,7 +10,14 @@ from datetime import UTC, datetime
 from typing import Any
 
 from tests.golden.cases import CASES
-from tests.golden.record import RECORD, differences, machine, make_entries, read_record
+from tests.golden.record import (
+    RECORD,
+    differences,
+    machine,
+    make_entries,
+    read_record,
+    same_machine,
+)
 
 
 def main() -> int:
@@ -31,19 +38,19 @@ def main() -> int:
         and (case.quick or not options.quick)
     ]
     here = machine()
-    record = read_record() if RECORD.exists() else {"machine": here, "cases": {}}
-    if options.what == "make" and record["machine"] != here:
-        record = {"machine": here, "cases": {}}
-    bits = record["machine"] == here
-    print("bit for bit" if bits else f"numbers: the record was made on {record['machine']}")
+    record = read_record() if RECORD.exists() else {"cases": {}}
+    alike = [n for n in names if same_machine(n, record, here)]
+    print(
+        f"{len(alike)} of {len(names)} cases were made on this machine: bit for bit; others by numbers"
+    )
     faults = 0
     for name, entry in make_entries(names, options.workers):
         if options.what == "make":
-            record["cases"][name] = entry
+            record["cases"][name] = {"machine": here, **entry}
             _write(record)
             print(f"{name}: {entry['cpu_s']} CPU s", flush=True)
             continue
-        found = differences(name, entry, record, bits=bits)
+        found = differences(name, entry, record, bits=name in alike)
         faults += bool(found)
         print("\n".join(found) or f"{name}: equal, {entry['cpu_s']} CPU s", flush=True)
     if options.what == "make":

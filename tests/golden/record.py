@@ -29,6 +29,11 @@ def machine() -> dict[str, str]:
     }
 
 
+def same_machine(name: str, record: Mapping[str, Any], here: Mapping[str, str]) -> bool:
+    """Whether a case was made on a machine like this one, so that bits can be compared."""
+    return bool(record["cases"].get(name, {}).get("machine") == here)
+
+
 def make_entry(name: str) -> dict[str, Any]:
     """Make a case; give its digests, numbers and the CPU seconds it took."""
     began = time.process_time()
