@@ -33,7 +33,6 @@ from bfsensor.diagnose.data.reduced_channels import measure_reduced
 from bfsensor.diagnose.diagnosis import diagnose_measured
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.diagnose.model.open_baseline import simulate_baseline
-from bfsensor.diagnose.model.predictor import REDUCED_LEVEL
 from bfsensor.diagnose.report.diagnosis_result import Diagnosis
 from bfsensor.recording.tables.area_changes import AreaChangeTable, read_area_changes
 from bfsensor.response.edge_response import LEVEL
@@ -59,7 +58,7 @@ def areas_of(
     baseline: Baseline, shift: dict[str, float] | None = None
 ) -> NDArray[np.float64]:
     """Give a_ij [1/e-] at lags from (0, 0) on, indexed [j, i], of quantities changed by so much."""
-    plane = baseline.areas_on(ANY, shift, REDUCED_LEVEL)
+    plane = baseline.areas_on(ANY, shift, LEVEL)
     n = len(plane) // 2
     return plane[n : n + LAGS, n : n + LAGS]
 

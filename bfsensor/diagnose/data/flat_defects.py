@@ -326,6 +326,9 @@ def dust_spots(image: FloatArray) -> list[tuple[range, range, FloatArray, float]
     for whole, z in chosen:
         fine = np.kron(whole, np.ones((BIN, BIN), bool))
         rows, columns = (np.flatnonzero(fine.any(k)) for k in (1, 0))
+        # In a corner of the sensor the field rolls off along both rims, which is no dust.
+        if {rows[0], rows[-1] - ny + 1} & {0} and {columns[0], columns[-1] - nx + 1} & {0}:
+            continue
         part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         shade = np.where(fine[part], 1.0 + smooth[part], 1.0)
         found.append(

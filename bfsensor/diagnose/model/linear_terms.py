@@ -133,13 +133,6 @@ def _map_columns(channel: Channel, measured: MeasuredChannels) -> dict[str, Floa
         else places.product(u**p, v**q, size)
         for p, q in orders
     }
-    # Where opposite rims get unequal light, pixels at a rim lean out or in by the brighter-fatter
-    # effect.  The area change by a row of charge falls as the square of its distance.  Both rims
-    # have opposite signs, unlike the roll-off of the field there.
-    rims = [np.asarray((1.0 + np.arange(n)) ** -2.0, float) for n in (nx, ny)]
-    rims = [np.asarray(r - r[::-1], float) for r in rims]
-    smooth["rim x"] = places.product(rims[0], np.ones(ny), size)
-    smooth["rim y"] = places.product(np.ones(nx), rims[1], size)
     # Each amplifier was divided by its mean, so that steps between amplifiers are free.
     for amp, s in enumerate(measured.segments[1:], 1):
         inside = np.zeros(nx), np.zeros(ny)

@@ -123,7 +123,7 @@ def test_all_of_the_depths_is_light_that_converts_where_it_is_absorbed(
 @pytest.mark.parametrize("unit", ["adu2", PER_ELECTRON])
 def test_all_of_the_levels_is_a_baseline_with_levels(lacking, folder, unit, monkeypatch):
     """In flats, and in a_ij on a background that is not the baseline's."""
-    monkeypatch.setattr("bfsensor.diagnose.model.predictor.REDUCED_LEVEL", 7e4)
+    monkeypatch.setattr("bfsensor.diagnose.data.reduced_channels.LEVEL", 7e4)
     poor = change_parameter(Device.load("itl_sta3800c"), LEVEL_OF_HOLES, -HOLES)
     full = baseline_of_device(
         poor, back_biases=[-40.0], lacks=["depths"], cells=CELLS, keep=folder

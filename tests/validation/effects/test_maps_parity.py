@@ -28,7 +28,7 @@ NAMES = [f"{k.word}:{k.variant}".rstrip(":") for k in KINDS]
 
 
 def test_all_words_have_their_variants():
-    assert len(NAMES) == 15 and {k.word for k in KINDS} == set(WORDS)
+    assert len(NAMES) == 18 and {k.word for k in KINDS} == set(WORDS)
 
 
 @pytest.mark.parametrize("kind", [
