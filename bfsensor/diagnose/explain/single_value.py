@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2
 
 from bfsensor.diagnose.data.channels import PER_ELECTRON
 from bfsensor.diagnose.detect.candidate_screen import Screen
 from bfsensor.diagnose.detect.candidates import candidates_of, rank, seen_of, tellable
-from bfsensor.diagnose.detect.locate import ALARM, Mismatch, locate_mismatch
+from bfsensor.diagnose.detect.locate import Mismatch, locate_mismatch
+from bfsensor.diagnose.detect.model_error import charge
 from bfsensor.diagnose.explain.attribution import Attribution
 from bfsensor.diagnose.explain.nonparametric import Columns, FreeFit, explain_outside
 from bfsensor.diagnose.explain.pursuit import Dictionary
@@ -75,6 +75,8 @@ def explain_single_value(
     if told is None:
         return None
     world, last = told
+    # Chosen: effects that take more than half of the value's chi-square are listed; at a quarter,
+    # effects of other lags that merely touch it would be, too.
     same = [
         r.effect.name for r in ranking if r.gain > 0.5 * choice.z[0] ** 2 and not r.refuted
     ]
@@ -110,7 +112,4 @@ def _any_effect(model: Model, mismatch: Mismatch) -> bool:
     )
     screen = Screen(model.predictor, model.fit, seen_of(mismatch))
     ranking = rank(screen, kinds)
-    return any(
-        r.gain > chi2.isf(ALARM / max(len(kinds), 1), len(fitted(r.effect)))
-        for r in ranking
-    )
+    return any(r.gain > charge(len(fitted(r.effect)), len(kinds)) for r in ranking)

@@ -230,7 +230,16 @@ def _level(path: Path, text: str) -> float:
 
 
 def is_device(given: str | os.PathLike[str] | None) -> bool:
-    """Whether a baseline's name is that of a device, which can be simulated."""
+    """Whether a baseline's name is that of a device, which can be simulated.
+
+    Raises
+    ------
+    DeviceError
+        The name is that of a device file that cannot be read.
+    """
+    if given is not None and Path(given).suffix == ".toml":
+        Device.load(given)
+        return True
     try:
         Device.load("" if given is None else given)
     except DeviceError:

@@ -18,10 +18,15 @@ from bfsensor.diagnose.fit.baseline_fit import fit_bounded
 from bfsensor.diagnose.fit.error_scale import FAR, scale_errors
 from bfsensor.diagnose.fit.fitted_model import LEFT_OUT, Model, compare_held_out
 from bfsensor.diagnose.model.baseline import Baseline
-from bfsensor.diagnose.model.open_baseline import find_baseline, find_reduced_recordings
+from bfsensor.diagnose.model.free_baseline import free_baseline
+from bfsensor.diagnose.model.open_baseline import (
+    find_baseline,
+    find_reduced_recordings,
+    is_device,
+)
 from bfsensor.diagnose.model.unknown_level import NAME, SPREAD, float_unknown_level
 from bfsensor.effects.bf_long_range import BrighterFatterLongRange
-from bfsensor.errors import DiagnosisError, RecordingError
+from bfsensor.errors import DeviceError, DiagnosisError, RecordingError
 from bfsensor.recording.tables.area_changes import AreaChangeTable
 from bfsensor.response.edge_response import LEVEL, area_matrix
 
@@ -76,6 +81,28 @@ def test_errors_are_those_of_the_far_lags(stated):
     assert (expected == 1.0) == (stated == 1.0)
     np.testing.assert_allclose(channel.errors, expected * stated * ERROR, rtol=1e-9)
     assert any("17 far lags" in note for note in scaled.notes)
+
+
+def test_far_lags_without_any_scatter_scale_nothing():
+    """A table whose far lags are written as 0 beside a baseline that predicts 0 there."""
+    table = table_of(areas_at(), 4)
+    j, i = np.indices(table.a.shape)
+    a = np.where(np.hypot(i, j) > FAR, 0.0, table.a)
+    measured = measure_reduced(replace(table, a=a), reach=4)
+    (channel,) = scale_errors(measured, free_baseline()).channels
+    assert np.all(channel.errors == ERROR)
+
+
+def test_a_device_file_that_cannot_be_read_is_named(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("name = 'mine'\n")
+    with pytest.raises(DeviceError, match="mine"):
+        is_device(path)
+    assert (
+        is_device("itl_sta3800c")
+        and not is_device("lsst_itl_50_32")
+        and not is_device(None)
+    )
 
 
 def test_two_tables_have_a_scale_each():
