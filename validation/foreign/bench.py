@@ -268,8 +268,9 @@ class Bench:
                 frames[k] = frame
         for law in self._at["noise"]:
             frames = law.noise(frames, e)
+        # In single precision one code in 256 lies halfway and would be rounded to the even one.
         codes = [
-            frame / np.float32(gain) + np.float32(offset)
+            frame.astype(np.float64) / gain + offset
             for frame, gain, offset in zip(frames, self.gains, self.offsets, strict=True)
         ]
         if self.with_noise:
