@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from bfsensor.effects.adc_bits import AdcBits, ShiftedCodes, WideCodes
     from bfsensor.effects.amp_crosstalk import AmpCrosstalk
     from bfsensor.effects.bf_anisotropy import BrighterFatterAnisotropy
-    from bfsensor.effects.bf_chromatic import BrighterFatterChromatic
+    from bfsensor.effects.bf_chromatic import AbsorptionChromatic, BrighterFatterChromatic
     from bfsensor.effects.bf_long_range import BrighterFatterLongRange
     from bfsensor.effects.bf_nonlinear import BrighterFatterNonlinear, EdgesNonlinear
     from bfsensor.effects.bias_instability import (
@@ -68,7 +68,7 @@ else:
             "adc_bits": ["AdcBits", "ShiftedCodes", "WideCodes"],
             "amp_crosstalk": ["AmpCrosstalk"],
             "bf_anisotropy": ["BrighterFatterAnisotropy"],
-            "bf_chromatic": ["BrighterFatterChromatic"],
+            "bf_chromatic": ["AbsorptionChromatic", "BrighterFatterChromatic"],
             "bf_long_range": ["BrighterFatterLongRange"],
             "bf_nonlinear": ["BrighterFatterNonlinear", "EdgesNonlinear"],
             "bias_instability": [
@@ -113,6 +113,7 @@ else:
 
 __all__ = [
     "LIBRARY",
+    "AbsorptionChromatic",
     "AdcBits",
     "AmpCrosstalk",
     "BiasByFrame",

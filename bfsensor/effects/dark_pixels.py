@@ -9,7 +9,7 @@ from scipy.stats import poisson
 from bfsensor.effects.effect import Layout
 
 OUTLIER = 6.0
-"""Deviation from which the measurement counts a pixel as struck [sigma of the read noise].
+"""Deviation from which the measurement counts a pixel as struck [sigma of the noise of all pixels].
 
 Defined by ``OUTLIER`` of :mod:`bfsensor.diagnose.data.bias_channels`, which must be equal."""
 
@@ -39,7 +39,8 @@ def struck_pixels(
     Returns
     -------
     part : float
-        Fraction of pixels that deviate by more than :data:`OUTLIER` times the noise.
+        Fraction of pixels that deviate by more than :data:`OUTLIER` times the noise of all pixels,
+        read noise and shot noise of ``level``.
     others : float
         Mean charge of the other pixels [e-]; ``mean`` if all are struck.
 
@@ -47,6 +48,9 @@ def struck_pixels(
     --------
     >>> struck_pixels(-1e-20, 0.0, 5.0), struck_pixels(3000.0, 0.0, 5.0)
     ((0.0, -1e-20), (1.0, 3000.0))
+    >>> part, others = struck_pixels(200.0, 200.0, 5.0)
+    >>> part < 1e-6, round(others, 3)
+    (True, 200.0)
     """
     # At the end of its range an amplitude is 0 up to rounding, which may be negative.
     if not noise > 0 or not mean > 0:
@@ -58,7 +62,7 @@ def struck_pixels(
     else:
         weight, away = np.ones(1), np.array([mean - level])
         wide = float(np.sqrt(noise**2 * (1 + more) + mean))
-    limit = OUTLIER * noise
+    limit = OUTLIER * float(np.sqrt(noise**2 * (1 + more) + max(level, 0.0)))
     low, high = (-limit - away) / wide, (limit - away) / wide
     inside = ndtr(high) - ndtr(low)
     kept = float(weight @ inside)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from bfsensor.effects.adc_bits import AdcBits, ShiftedCodes, WideCodes
 from bfsensor.effects.amp_crosstalk import AmpCrosstalk
 from bfsensor.effects.bf_anisotropy import BrighterFatterAnisotropy
-from bfsensor.effects.bf_chromatic import BrighterFatterChromatic
+from bfsensor.effects.bf_chromatic import AbsorptionChromatic, BrighterFatterChromatic
 from bfsensor.effects.bf_long_range import BrighterFatterLongRange
 from bfsensor.effects.bf_nonlinear import BrighterFatterNonlinear, EdgesNonlinear
 from bfsensor.effects.bias_instability import (
@@ -58,6 +58,7 @@ LIBRARY: tuple[type[Effect], ...] = (
     SettlingByFrame,
     BrighterFatterAnisotropy,
     BrighterFatterChromatic,
+    AbsorptionChromatic,
     BrighterFatterLongRange,
     BrighterFatterNonlinear,
     ChargeLoss,

@@ -13,6 +13,7 @@ from bfsensor.diagnose.data.map_rings import find_radial
 from bfsensor.diagnose.model.effect_chain import EffectChain
 from bfsensor.diagnose.model.map_predictions import area_change
 from bfsensor.effects import (
+    AbsorptionChromatic,
     BrighterFatterAnisotropy,
     BrighterFatterLongRange,
     DivisaderoTearing,
@@ -277,3 +278,19 @@ def test_a_law_without_its_more_general_parameters_is_the_plain_one():
         "amp": 0.1, "length": 3.0, "sides": 0.0, "tail": 0.0, "rim": 1.0
     }  # fmt: skip
     assert plain.law_name == "exponential"
+
+
+@pytest.mark.parametrize("power", [-1.0, 0.0, 0.6, 1.0])
+def test_shifts_go_with_a_power_of_the_absorption_length(power):
+    kx, ky = shifts()
+    lengths = {480: 0.8, 620: 2.9, 950: 80.0}
+    layout = Layout((NY, NX), HALVES, absorption=lengths)
+    effect = AbsorptionChromatic({"kappa": 0.1, "power": power})
+    for wavelength, length in lengths.items():
+        shot = Shot("flat", -1, 2.0, wavelength, -60.0, 173.15)
+        ratios = [long / 2.9 for long in (length, 80.0)]
+        here, end = (np.log(r) if power == 0 else r**power - 1 for r in ratios)
+        found = effect.edges(kx, ky, shot, layout)
+        for shift, old in zip(found, (kx, ky), strict=True):
+            assert shift == pytest.approx((1 + 0.1 * here / end) * old, rel=1e-9)
+    assert np.array_equal(effect.scaled(0.0).edges(kx, ky, SHOT, layout)[0], kx)

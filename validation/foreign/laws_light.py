@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.fft import irfft2, rfft2
 
+from validation.foreign.collection import poisson
 from validation.foreign.device import absorption_length
 from validation.foreign.law import Law, law
 from validation.foreign.laws_silicon import either_sign
@@ -514,10 +515,13 @@ class _Persistence(Law):
             return charge
         past = self.state.setdefault("past", [])
         out = charge.copy()
+        released = np.zeros_like(charge)
         for sequence, left in past:
             age = exposure.sequence - sequence
             if 1 <= age <= self.ages:
-                out += np.float32(self.shares(age)) * left
+                released += np.float32(self.shares(age)) * left
+        # Each electron is released at random.
+        out += poisson(np.maximum(released, 0), self.rng(exposure))
         self.state["past"] = [(s, q) for s, q in past if exposure.sequence - s < self.ages]
         if exposure.lit:
             first = self.captured(charge)

@@ -111,17 +111,20 @@ class Repair(NamedTuple):
         Pixels that take the mean of the nearest good ones of their row.
     near : list of (int, int)
         First column, and the one after the last, of bad columns with those whose edges they shift.
+    zero : float
+        Level of pixels without light, less that of the serial overscan [ADU].
     """
 
     response: FloatArray
     shade: FloatArray
     filled: NDArray[np.bool_]
     near: list[tuple[int, int]]
+    zero: float = 0.0
 
     @classmethod
-    def none(cls, shape: tuple[int, ...]) -> Repair:
+    def none(cls, shape: tuple[int, ...], zero: float = 0.0) -> Repair:
         """Nothing to repair in an image."""
-        return cls(np.ones(shape), np.ones(shape), np.zeros(shape, bool), [])
+        return cls(np.ones(shape), np.ones(shape), np.zeros(shape, bool), [], zero)
 
     def of_image(self, image: FloatArray, zero: float) -> FloatArray:
         """Repair an image whose pixels without light have the value ``zero``."""
@@ -131,7 +134,8 @@ class Repair(NamedTuple):
 
     def made(self, frame: Frame) -> RepairedFrame:
         """Repair a frame; values are rounded to codes again, as those of all other pixels are."""
-        image = self.of_image(frame.image.astype(np.float64), overscan_level(frame))
+        zero = overscan_level(frame) + self.zero
+        image = self.of_image(frame.image.astype(np.float64), zero)
         repaired = self.filled | (self.response != 1.0)
         changed = repaired | (self.shade != 1.0)
         for start, stop in self.near:
@@ -265,10 +269,9 @@ def find_cosmetics(
         return source, ()
     layout = source.read((flats or darks)[0])
     found: list[Cosmetic] = []
-    repairs = [Repair.none(f.image.shape) for f in layout]
-    images = _mean_flats(source, flats)
-    if images:
-        found += _repair_response(repairs, layout, images, source.shape)
+    zeros = _zeros(source, exposures, len(layout))
+    repairs = [Repair.none(f.image.shape, z) for f, z in zip(layout, zeros, strict=True)]
+    # Hot pixels first: in flats they look like light that dust cannot have made.
     for amp, (rate, deviate) in enumerate(_faintest_darks(source, darks)):
         for y, x in np.argwhere(hot_pixels(deviate)).tolist():
             place = _place(layout[amp], range(x, x + 1), range(y, y + 1))
@@ -283,6 +286,9 @@ def find_cosmetics(
                 )
             )
             repairs[amp].filled[y, x] = True
+    images = _mean_flats(source, flats, zeros)
+    if images:
+        found += _repair_response(repairs, layout, images, source.shape)
     changed = any(
         r.filled.any() or (r.response != 1.0).any() or (r.shade != 1.0).any()
         for r in repairs
@@ -417,12 +423,22 @@ def _long(exposures: Sequence[ExposureInfo]) -> list[ExposureInfo]:
     return own[:MOST_READ] if len(own) >= QUIET else []
 
 
-def _mean_flats(source: Source, flats: Sequence[ExposureInfo]) -> list[FloatArray]:
+def _zeros(source: Source, exposures: Sequence[ExposureInfo], count: int) -> list[float]:
+    """Level of a bias by amplifier, less that of its overscan [ADU]; 0 without any bias."""
+    bias = next((e for e in exposures if e.kind == "bias"), None)
+    if bias is None:
+        return [0.0] * count
+    return [float(np.median(_signal(f))) for f in source.read(bias)]
+
+
+def _mean_flats(
+    source: Source, flats: Sequence[ExposureInfo], zeros: Sequence[float]
+) -> list[FloatArray]:
     """Mean relative response of each amplifier's pixels, less one."""
     total: list[FloatArray] = []
     for exposure in flats:
         for n, frame in enumerate(source.read(exposure)):
-            signal = _signal(frame)
+            signal = _signal(frame) - zeros[n]
             level = float(np.median(signal))
             if len(total) <= n:
                 total.append(np.zeros(signal.shape))

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.ndimage import median_filter
+from scipy.stats import chi2
 
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.exposure_info import (
     Axes,
@@ -18,6 +21,7 @@ from bfsensor.diagnose.data.exposure_info import (
     condition_of,
     overscan_level,
 )
+from bfsensor.diagnose.data.lamp_settings import lamp_settings
 from bfsensor.measure.bartlett import bartlett_matrix
 from bfsensor.measure.flat_pairs import flat_covariances
 from bfsensor.typing import FloatArray
@@ -31,10 +35,10 @@ TAIL = 8
 deferred by more pixels is taken for zero level; with 16, overscans up to 16 pixels deep have no
 profile."""
 
-UNEVEN = 1.25
-"""Variance of overscan profiles between exposures over that of white noise, above which it scales
-their errors (if it is also 5 sigma above 1).  Chosen: errors may then be 12 % too small in
-amplitude; with 1.5, 22 %."""
+CHANCE = 0.01
+"""Probability by white noise alone of the scatter of all overscan profiles between exposures, below
+which that scatter scales their errors.  Chosen: in one of a hundred campaigns errors are wrong by what
+scatter itself is uncertain by; with 0.02, in two."""
 
 LAMP_UNKNOWN = 0.02
 """Relative error of the light of an exposure without a lamp monitor, where too few levels are repeated
@@ -62,6 +66,7 @@ class _FlatGroup:
     levels: list[float] = field(default_factory=list)
     times: list[float] = field(default_factory=list)
     hours: list[float] = field(default_factory=list)
+    numbers: list[int] = field(default_factory=list)
     serial: list[FloatArray] = field(default_factory=list)
     parallel: list[FloatArray] = field(default_factory=list)
     clipped: int = 0
@@ -123,6 +128,7 @@ class FlatChannels:
         self._zeros = zeros or {}
         self._steps = steps or {}
         self._lamp_error, self._lags = lamp_error, lags
+        self._lamps: dict[int, tuple[int, float]] = {}
         self._groups: dict[tuple, _FlatGroup] = {}
         self._means: dict[str, list[tuple]] = {}
         self._ratios: dict[int, list[tuple[float, float]]] = {}
@@ -165,6 +171,7 @@ class FlatChannels:
             group.levels.append(found.level)
             group.hours += [self._hours(e) for e, _ in (first, second)]
             group.times += [e.exposure_time or 0.0 for e, _ in (first, second)]
+            group.numbers += [e.number for e, _ in (first, second)]
             group.clipped += found.clipped
             for frame in frames:
                 group.serial.append(profile(frame.serial_overscan, 1))
@@ -232,7 +239,25 @@ class FlatChannels:
 
     def channels(self) -> list[Channel]:
         """Channels 'flat_cov', 'flat_mean' and overscans of all pairs, by fold."""
+        self._set_lamps()
         return [*self._covariances(), *self._mean_levels(), *self._overscans()]
+
+    def _set_lamps(self) -> None:
+        """Find the lamp's setting, and its light, in exposures without a monitor."""
+        taken: dict[Condition, list[tuple[int, float, float]]] = {}
+        for exposure, condition, amplifiers in chain(*self._means.values()):
+            if exposure.lamp is not None:
+                self._lamps[exposure.number] = 0, exposure.lamp
+            elif exposure.exposure_time:
+                level = float(np.mean([m for m, *_ in amplifiers]))
+                taken.setdefault(condition, []).append(
+                    (exposure.number, exposure.exposure_time, level)
+                )
+        for rows in taken.values():
+            numbers, seconds, levels = zip(*rows, strict=True)
+            settings, light = lamp_settings(seconds, levels)
+            for number, setting, lamp in zip(numbers, settings, light, strict=True):
+                self._lamps[number] = int(setting), float(lamp)
 
     def _covariances(self) -> list[Channel]:
         out = []
@@ -249,6 +274,7 @@ class FlatChannels:
                 level = float(np.mean(group.levels))
                 axes.add(
                     len(j), condition, amp=amp, time=_mean_time(group), step=step, level=level,
+                    lamp=float(np.mean([self._lamps.get(n, (0, 1.0))[1] for n in group.numbers])),
                     pairs=len(group.levels), hours=float(np.mean(group.hours)), i=i, j=j,
                     pulse=self._pulse(i, j),
                 )  # fmt: skip
@@ -277,14 +303,14 @@ class FlatChannels:
                 # The brighter-fatter effect moves charge between pixels but conserves it: the sum
                 # of many has Poisson noise, although a pixel's variance is less.
                 variance = m * [self._poisson(n) for n in range(len(m))] / pixels + zero
-                known = exposure.lamp is not None
-                error = self._lamp_error if known else unknown
+                setting, lamp = self._lamps.get(exposure.number, (0, 1.0))
+                error = unknown if exposure.lamp is None else self._lamp_error
                 values.append(m)
                 blocks.append(np.diag(variance) + error**2 * np.outer(m, m))
                 axes.add(
                     len(m), condition, amp=np.arange(len(m)), time=exposure.exposure_time,
                     step=self._step(exposure),
-                    lamp=exposure.lamp if known else 1.0, exposure=exposure.number, level=m,
+                    lamp=lamp, setting=setting, exposure=exposure.number, level=m,
                     mjd=np.nan if exposure.mjd is None else exposure.mjd,
                     hours=self._hours(exposure),
                 )  # fmt: skip
@@ -385,7 +411,7 @@ class FlatChannels:
         """Variance of profiles between exposures over that of white noise, by amplifier.
 
         Rows that fluctuate together, and noise correlated from pixel to pixel, make profiles
-        scatter more than white noise; 1 where no excess is significant.
+        scatter more than white noise; 1 where no excess of all amplifiers is significant.
         """
         seen: dict[int, list[tuple[float, int]]] = {}
         for (_, _, amp, _), group in self._groups.items():
@@ -394,10 +420,9 @@ class FlatChannels:
                 tied = self._lines[name, amp].correlation
                 seen.setdefault(amp, []).append(_scatter(np.array(profiles), tied))
         out = {amp: 1.0 for _, _, amp, _ in self._groups}
-        for amp, both in seen.items():
-            total, freedom = np.sum(both, axis=0)
-            if total / freedom - 1 > max(UNEVEN - 1, 5 * np.sqrt(2 / freedom)):
-                out[amp] = float(total / freedom)
+        every = {amp: np.sum(both, axis=0) for amp, both in seen.items()}
+        if every and chi2.sf(*np.sum(list(every.values()), axis=0)) < CHANCE:
+            out |= {a: max(float(total / n), 1.0) for a, (total, n) in every.items()}
         return out
 
 

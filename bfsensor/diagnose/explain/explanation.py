@@ -179,9 +179,9 @@ class Explanation:
         )
         return bool(np.sqrt(template @ template) < reach)
 
-    def with_effect(self, effect: Effect) -> Explanation:
-        """Add an effect, refit everything, and find what still stands out."""
-        model = self.model.with_effects((*self.model.effects, effect))
+    def with_effect(self, effect: Effect, model: Model | None = None) -> Explanation:
+        """Add an effect, refit everything unless that fit is given, and find what still stands out."""
+        model = model or self.model.with_effects((*self.model.effects, effect))
         effects = model.effects
         change = OwnChange(model.predictor, model.fit.values, effects)
         part = Part(

@@ -123,7 +123,10 @@ def attribute(
 
 @dataclass(eq=False)
 class _Search:
-    """Candidates of a search, its mismatch, notes, effects beside the first terms, and refused ones."""
+    """Candidates of a search, its mismatch, notes, effects beside the first terms, and refused ones.
+
+    ``joint`` holds the joint fits of the present step by candidate.
+    """
 
     kinds: Sequence[type[Effect]]
     seed: int
@@ -131,6 +134,7 @@ class _Search:
     notes: list[str]
     nearest: list[Rival] = field(default_factory=list)
     refused: set[str] = field(default_factory=set)
+    joint: dict[Effect, Model] = field(default_factory=dict)
 
     def locate(self, model: Model) -> Mismatch:
         """Find what stands out in a model's residuals, by scans and by effects not in it."""
@@ -195,7 +199,7 @@ class _Search:
             if score > 0 and (not now.parts or score >= law):
                 # Effects are tried in the order of their evidence.
                 reached = max(reached, score + rival.law)
-                options.append((reached, partial(now.with_effect, rival.effect)))
+                options.append((reached, self._adding(now, rival)))
         options.reverse()
         options.sort(key=lambda o: -o[0])
         before = sum(score >= near for score, _ in options)
@@ -205,6 +209,10 @@ class _Search:
             if after is not None:
                 return after, ranking
         return self._faint(now, ranking)
+
+    def _adding(self, now: Explanation, rival: Rival) -> Callable[[], Explanation]:
+        """Addition of a candidate, by its joint fit where one was made."""
+        return partial(now.with_effect, rival.effect, self.joint.get(rival.effect))
 
     def _net(self, now: Explanation, rival: Rival) -> float:
         """Gain of a candidate that errors of what was added before cannot make."""
@@ -226,7 +234,8 @@ class _Search:
         # Only effects whose gain is beyond chance are worth a joint fit.
         good = [r for r in ranking if self._net(now, r) > charge(len(fitted(r.effect)), 1)]
         others = [r for r in ranking if r not in good]
-        good = refine(now.model, good) if good else []
+        self.joint.clear()
+        good = refine(now.model, good, self.joint) if good else []
         return sorted([*good, *others], key=lambda r: -r.evidence)
 
     def _tried(
@@ -253,7 +262,7 @@ class _Search:
         good = [r for r in ranking if self._net(now, r) > charge(len(fitted(r.effect)), 1)]
         for rival in good[:FAINT]:
             try:
-                after = now.with_effect(rival.effect)
+                after = self._adding(now, rival)()
             except ConvergenceError as error:
                 self.notes.append(f"{rival.effect.name}: {error}")
                 continue

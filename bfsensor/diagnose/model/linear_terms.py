@@ -73,12 +73,17 @@ def _mean_columns(channel: Channel, rows_of: Rows) -> dict[str, FloatArray]:
     x = channel.axes
     out = {}
     light = x["time"] * x["lamp"]
+    setting = x.get("setting", np.zeros(len(channel)))
     for condition, rows in rows_of.items():
         for amp in np.unique(x["amp"][rows]):
-            here = rows[x["amp"][rows] == amp]
-            column = np.zeros(len(channel))
-            column[here] = light[here]
+            here = (x["amp"] == amp) & np.isin(np.arange(len(channel)), rows)
+            column = np.where(here, light, 0.0)
             out[f"light {int(amp)} {label_of(condition)}"] = column
+        # One factor between the lamp's settings, whatever the amplifier.
+        for n in np.unique(setting[rows])[1:]:
+            here = (setting == n) & np.isin(np.arange(len(channel)), rows)
+            column = np.where(here, x["level"], 0.0)
+            out[f"lamp {int(n)} {label_of(condition)}"] = column
     for amp in np.unique(x["amp"]):
         out[f"dark {int(amp)}"] = np.where(x["amp"] == amp, x["time"], 0.0)
     return out

@@ -187,7 +187,10 @@ PARAMETER_WORDS: Mapping[str, Mapping[str, str]] = {
         "b": "b in the shift k Q (1 + b Q / 2) of a charge Q", "b_y": "the same of edges between rows",
         "near": "inverse distance over which it falls",
     },
-    "bf_chromatic": {"kappa": "relative change of the shifts from 620 to 950 nm"},
+    "bf_chromatic": {
+        "kappa": "relative change of the shifts from 620 to 950 nm",
+        "power": "power of the absorption length that it goes with",
+    },
     "bf_anisotropy": {
         "eps": "excess of the shifts in y over those in x, relative",
         "near": "inverse distance over which it falls",

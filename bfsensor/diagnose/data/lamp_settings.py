@@ -1,0 +1,69 @@
+"""Settings of a lamp that no monitor records, from the levels of flats against their exposure times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.typing import FloatArray
+
+LOWER = 0.8
+"""Part of the level of a shorter exposure below which a longer one was taken with less light.  Chosen:
+beyond full well levels of pixels stay or fall by a few per cent, and lamps flicker by less; with 0.9,
+lamps set lower by a tenth are found where they take the brightest flats."""
+
+ALIKE = 1.25
+"""Factor between light per second within which exposures belong to one setting: the inverse of
+:data:`LOWER`."""
+
+
+def lamp_settings(
+    seconds: Sequence[float], levels: Sequence[float]
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Sort flats of one condition by the setting of the lamp.
+
+    With one setting a longer exposure never collects less, whatever the sensor's response.  Flats
+    that do were taken with less light, and so were those of about the same light per second.
+
+    Parameters
+    ----------
+    seconds : sequence of float
+        Exposure times [s], above 0.
+    levels : sequence of float
+        Mean levels [ADU].
+
+    Returns
+    -------
+    settings : ndarray of int, shape (n,)
+        0 is the setting of most flats, 1, 2 and so on those of others.
+    light : ndarray, shape (n,)
+        Median light per second of each flat's setting over that of setting 0.
+
+    Examples
+    --------
+    >>> settings, light = lamp_settings([10, 20, 30, 40, 90], [1.0, 2.0, 3.0, 4.0, 3.0])
+    >>> settings.tolist(), [round(float(x), 2) for x in light]
+    ([0, 0, 0, 0, 1], [1.0, 1.0, 1.0, 1.0, 0.33])
+    """
+    times, level = np.asarray(seconds, float), np.asarray(levels, float)
+    settings, light = np.zeros(len(times), int), np.ones(len(times))
+    rate = level / times
+    order = np.argsort(times, kind="stable")
+    usual = np.ones(len(times), bool)
+    while True:
+        own = order[usual[order]]
+        most = np.maximum.accumulate(level[own])
+        less = own[level[own] < LOWER * most]
+        if not len(less):
+            break
+        # The faintest light first: brighter settings are found in the next round.
+        dimmest = rate[less].min()
+        here = usual & (rate < ALIKE * dimmest) & (rate > dimmest / ALIKE)
+        usual &= ~here
+        settings[here] = settings.max() + 1
+    for n in range(1, settings.max() + 1):
+        here = settings == n
+        light[here] = np.median(rate[here]) / np.median(rate[usual])
+    return settings, light

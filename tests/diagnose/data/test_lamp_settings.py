@@ -1,0 +1,55 @@
+"""Flats taken at another setting of a lamp without a monitor are no physics of the sensor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bfsensor.diagnose.data.lamp_settings import lamp_settings
+from bfsensor.diagnose.data.measure_channels import measure_channels
+from bfsensor.diagnose.diagnosis import diagnose_measured
+from tests.virtual import SMALL, VirtualSource, virtual_baseline
+
+
+def test_two_dimmer_settings_are_told_apart():
+    rng = np.random.default_rng(3)
+    seconds = np.array([5.0, 10, 20, 30, 40, 50, 90, 120, 200, 250])
+    rate = np.array([1.0] * 6 + [1 / 3] * 2 + [0.1] * 2)
+    levels = seconds * rate * (1 + 0.005 * rng.standard_normal(10))
+    settings, light = lamp_settings(seconds, levels)
+    assert len(set(settings[:6])) == len(set(settings[6:8])) == len(set(settings[8:])) == 1
+    assert settings[0] == 0 and len(set(settings)) == 3
+    assert light == pytest.approx(rate, rel=0.02)
+
+
+@pytest.mark.parametrize("response", ["full well", "blooming", "bent"])
+def test_no_response_of_a_sensor_is_a_setting(response):
+    seconds = np.linspace(1.0, 60.0, 12)
+    charge = 3000.0 * seconds
+    levels = {
+        "full well": np.minimum(charge, 9e4),
+        "blooming": np.where(charge > 9e4, 9e4 - 0.05 * (charge - 9e4), charge),
+        "bent": charge * (1 - 0.3 * charge / 1.8e5),
+    }[response]
+    settings, light = lamp_settings(seconds, levels)
+    assert not settings.any() and (light == 1).all()
+
+
+def test_a_lamp_at_a_third_is_no_alarm():
+    source = VirtualSource(seed=7104, size=SMALL)
+    flats = [e for e in source.exposures if e.kind == "flat"]
+    longest = max(e.exposure_time for e in flats)
+    # Headers of half of the flats state three times the time, as those of a lamp at a third would.
+    dim = {e.number for e in flats[len(flats) // 2 :] if e.exposure_time > 0.4 * longest}
+    source.exposures = [
+        replace(e, lamp=None, exposure_time=e.exposure_time * (3 if e.number in dim else 1))
+        if e.kind == "flat"
+        else e
+        for e in source.exposures
+    ]
+    measured = measure_channels(source)
+    means = [c for c in measured.channels if c.word == "flat_mean"]
+    assert any(c.axes["setting"].max() == 1 for c in means)
+    assert not diagnose_measured(measured, virtual_baseline()).mismatch.detected
