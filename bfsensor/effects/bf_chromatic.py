@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -32,7 +33,9 @@ class BrighterFatterChromatic(Effect):
 
     word = "bf_chromatic"
     stage = "collect"
-    parameters = (Parameter("kappa", "", 0.01, 0.2, signed=True, amplitude=True),)
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("kappa", "", 0.01, 0.2, signed=True, amplitude=True),
+    )
     touches = ("flat_cov", "spot")
     law_name = "wavelength"
     source = (

@@ -136,12 +136,18 @@ class Screen:
     seen : sequence of mapping
         Findings of the scans, from which some candidates take their starting points (place,
         period): see :func:`bfsensor.diagnose.detect.candidates.seen_of`.
+    before : mapping of type to Effect, optional
+        Candidates as they were fitted to residuals of fewer effects: further starting points.
     """
 
     def __init__(
-        self, predictor: Predictor, fit: BaselineFit, seen: Sequence[Mapping[str, Any]] = ()
+        self,
+        predictor: Predictor,
+        fit: BaselineFit,
+        seen: Sequence[Mapping[str, Any]] = (),
+        before: Mapping[type[Effect], Effect] | None = None,
     ) -> None:
-        self.fit, self.seen = fit, tuple(seen)
+        self.fit, self.seen, self.before = fit, tuple(seen), before or {}
         self.point = fit.values[: len(predictor.names)]
         self.predictor = predictor.with_effects(
             predictor.effects_at(self.point), self.point
@@ -213,7 +219,8 @@ class Screen:
         """
         starts = [_inside(kind(v)) for v in kind.starts(self.predictor.layout, self.seen)]
         tried = []
-        for effect in self._likely(kind, starts):
+        before = [self.before[kind]] if kind in self.before else []
+        for effect in (*self._likely(kind, starts), *before):
             try:
                 tried.append(self._scaled(effect))
             except BFSensorError as error:

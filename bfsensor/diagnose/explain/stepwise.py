@@ -125,7 +125,8 @@ def attribute(
 class _Search:
     """Candidates of a search, its mismatch, notes, effects beside the first terms, and refused ones.
 
-    ``joint`` holds the joint fits of the present step by candidate.
+    ``joint`` holds the joint fits of the present step by candidate, ``before`` candidates as they
+    were fitted last by their class.
     """
 
     kinds: Sequence[type[Effect]]
@@ -135,6 +136,7 @@ class _Search:
     nearest: list[Rival] = field(default_factory=list)
     refused: set[str] = field(default_factory=set)
     joint: dict[Effect, Model] = field(default_factory=dict)
+    before: dict[type[Effect], Effect] = field(default_factory=dict)
 
     def locate(self, model: Model) -> Mismatch:
         """Find what stands out in a model's residuals, by scans and by effects not in it."""
@@ -222,9 +224,13 @@ class _Search:
 
     def _ranked(self, now: Explanation) -> list[Rival]:
         """Effects that may be added, by decreasing evidence; those of the closest gains fitted."""
-        screen = Screen(now.model.predictor, now.model.fit, seen_of(now.mismatch))
+        screen = Screen(
+            now.model.predictor, now.model.fit, seen_of(now.mismatch), self.before
+        )
         kinds = further(concerned(self.kinds, now.mismatch), now.model.effects)
-        ranking = with_hypotheses(now.model, kinds, rank(screen, kinds))
+        ranked = rank(screen, kinds)
+        self.before |= {type(r.effect): r.effect for r in ranked if r.gain > 0}
+        ranking = with_hypotheses(now.model, kinds, ranked)
         self.notes += [
             f"{name}, tried at one place: {why}" for name, why in screen.passed_over.items()
         ]
