@@ -69,7 +69,7 @@ class MixedModelFit(ABC):
         Whitened columns :math:`L` of unit length.
     prior_rows : ndarray of int
         Indices of the parameters with a prior of mean 0 and width 1.
-    bent : ndarray of bool, shape (p,)
+    curved : ndarray of bool, shape (p,)
         Parameters whose derivatives may hold near a point only.
     renewed : ndarray of bool, shape (p,)
         Parameters whose derivatives are found again at each point; others' serve on.
@@ -78,7 +78,7 @@ class MixedModelFit(ABC):
     random : bool
         Whether there are random effects.
     slopes : ndarray, shape (n, p), optional
-        Whitened derivatives of another fit, which serve until they mislead.
+        Whitened derivatives of another fit, which are used until they mislead.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class MixedModelFit(ABC):
         linear: FloatArray,
         *,
         prior_rows: NDArray[np.int64],
-        bent: NDArray[np.bool_],
+        curved: NDArray[np.bool_],
         renewed: NDArray[np.bool_],
         variances: NDArray[np.int64],
         random: bool,
@@ -111,7 +111,7 @@ class MixedModelFit(ABC):
         self.point = start.astype(float).copy()
         self.total, self.count, self.linear = len(linear), len(start), linear
         self.prior_rows, self._priors = prior_rows, len(prior_rows)
-        self.bent, self._renewed = bent, renewed
+        self.curved, self._renewed = curved, renewed
         self._variances, self._random = variances, random
         self._borrowed = slopes is not None
         self.slopes = np.zeros((self.total, self.count)) if slopes is None else slopes
@@ -268,7 +268,7 @@ class MixedModelFit(ABC):
                 low=low, high=high, relative=NEAR / self.total,
             )  # fmt: skip
             self.point = found.values
-            woken = (idle & self.bent).any() and self._jacobian(self.point)[:, idle].any()
+            woken = (idle & self.curved).any() and self._jacobian(self.point)[:, idle].any()
             if not woken and (own or not found.shrunk):
                 return found.converged
             self._borrowed = False
@@ -289,13 +289,13 @@ class MixedModelFit(ABC):
 
         The linear model may still promise a decrease that no step delivers; residuals with that
         decrease taken off would claim a fit that was not reached.  So parameters are held at the
-        point in the last solution, unless freeing them (all, else all but bent ones) promises less
+        point in the last solution, unless freeing them (all, else all but these) promises less
         than :data:`IDLE`.
         """
         nothing, everything = np.zeros(self.count, bool), np.ones(self.count, bool)
         told = self.solve(self.point, everything)
         square = float(told.left @ told.left)
-        for held in (nothing, self.bent):
+        for held in (nothing, self.curved):
             free = self.solve(self.point, held)
             if square - float(free.left @ free.left) < IDLE:
                 told = free

@@ -29,7 +29,7 @@ scipy's definition."""
 
 
 class Minimum(NamedTuple):
-    """Where a minimisation ended.
+    """Place and manner in which a minimisation ended.
 
     Parameters
     ----------

@@ -70,7 +70,7 @@ class Steps(MixedModelFit):
             borrowed[:, :plain] = slopes[:, :plain]
         self._scored = scored(predictor)
         super().__init__(
-            predictor.start, self._columns(), prior_rows=predictor.prior_rows, bent=effect,
+            predictor.start, self._columns(), prior_rows=predictor.prior_rows, curved=effect,
             renewed=effect | (gains & flats), variances=np.array(sorted(self._scored), int),
             random=any(type(e).modes is not Effect.modes for e in predictor.effects),
             slopes=borrowed,
