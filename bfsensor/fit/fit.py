@@ -37,6 +37,12 @@ Chosen: 0.3 % of correct priors are as far off; twice as large, only gross confl
 STRAIGHT_PROFILES = "profiles are those of linear predictions: parabolas between the bounds"
 """Note of a fit with profiles whose predictions are linear in the parameters."""
 
+UNSETTLED = (
+    "least squares did not converge: values are those of the best point that was found, and errors "
+    "are those of linear predictions there"
+)
+"""Note of a fit whose least squares, or scales of the errors, did not converge."""
+
 ROUNDS = 12
 """Largest number of Gauss-Newton rounds; beyond it the fit is reported as not converged.
 
@@ -120,12 +126,10 @@ def fit_device(
         device has no solution.
     DeviceError
         The device as given is not fully depleted at a condition of the measurements.
-    ConvergenceError
-        The least squares or the scales of the errors do not converge.
 
     Notes
     -----
-    A fit that has not converged after :data:`ROUNDS` rounds is returned, with a note.
+    A fit always ends: one that has not converged is returned at its best point, with a note.
 
     Examples
     --------
@@ -188,6 +192,7 @@ def fit_device(
         posterior.words,
         *([STRAIGHT_PROFILES] if straight else []),
         *settling,
+        *([] if tangent.converged else [UNSETTLED]),
         *([say(mesh)] if mesh else []),
         *notes,
     ]

@@ -5,10 +5,11 @@ The objective
 .. math:: \sum_k \frac{1}{s_k^2} \sum_n \left(\frac{m_n(\theta) - d_n}{\sigma_n}\right)^2
           + \sum_p \left(\frac{\theta_p - \bar\theta_p}{\pi_p}\right)^2
 
-is minimised over the parameters :math:`\theta` by Gauss-Newton steps within bounds, with predictions
-m, data d and errors :math:`\sigma`, prior means :math:`\bar\theta` and widths :math:`\pi`.  The scale
-:math:`s_k` of the errors of data set k makes its scaled chi2 equal to its numbers minus the
-parameters that it determines (variance components by restricted likelihood):
+is minimised over the parameters :math:`\theta` by a trust region within bounds
+(:func:`~bfsensor.inference.trust_region.minimise`), with predictions m, data d and errors
+:math:`\sigma`, prior means :math:`\bar\theta` and widths :math:`\pi`.  The scale :math:`s_k` of the
+errors of data set k makes its scaled chi2 equal to its numbers minus the parameters that it
+determines (variance components by restricted likelihood):
 
 .. math:: s_k^2 = \chi^2_k / (n_k - \mathrm{tr}_k), \qquad
           \mathrm{tr}_k = \mathrm{tr}(J_k C J_k^T) / s_k^2 ,
@@ -18,16 +19,16 @@ with the derivatives :math:`J_k` in units of the stated errors and the posterior
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from bfsensor.device.quantities import Prior
-from bfsensor.errors import ConvergenceError, FitError
+from bfsensor.errors import FitError
 from bfsensor.fit.data import DataSet
 from bfsensor.fit.predictors import DataPredictor, Prediction
+from bfsensor.inference.trust_region import minimise
 from bfsensor.typing import FloatArray
 
 FEWEST = 5.0
@@ -50,7 +51,13 @@ set to 0; twice as large, a quarter of that."""
 ROUNDS = 60
 """Largest number of rounds of least squares with new scales of the errors.
 
-Chosen: beyond it ConvergenceError is raised; twice as large, that takes twice as long."""
+Chosen: beyond it the fit is marked as not converged; twice as large, that takes twice as long."""
+
+STILL, MOST = 1e-10, 200
+"""Step [prior widths] below which least squares end, and the largest number of predictions.
+
+Chosen: differences between neighbouring points of a profile are 1e-3 of its rise, far above; with
+twice as many predictions fits that do not converge take twice as long."""
 
 TOLERANCE = 1e-4
 """Largest relative change of a scale from one round to the next at which scales have converged.
@@ -125,6 +132,9 @@ class FitSolution:
         Value of the objective.
     sensitivity : ndarray, shape (n, p)
         Change of each fitted number, in scaled errors, for one prior width of each parameter.
+    converged : bool
+        Whether the least squares and the scales of the errors have converged; if not, this is the
+        best point that was found.
     """
 
     values: FloatArray
@@ -134,6 +144,7 @@ class FitSolution:
     chi2: FloatArray
     total: float
     sensitivity: FloatArray
+    converged: bool = True
 
 
 def solve(
@@ -159,29 +170,20 @@ def solve(
     Returns
     -------
     solution : FitSolution
-        Minimum with posterior covariance.
-
-    Raises
-    ------
-    ConvergenceError
-        The least squares or the scales do not converge.
+        Minimum with posterior covariance.  The fit always ends: ``converged`` says whether at a
+        minimum, with scales that no longer change.
     """
     known = scales is not None
     s = np.ones(len(problem.sets)) if scales is None else np.asarray(scales, float)
     values = problem.means if start is None else np.array(start, float)
-    history = []
     for _ in range(ROUNDS):
         found = _minimise(problem, s, values, fixed)
         values = found.values
         new = s if known else _rescaled(problem, found)
-        history.append(float(np.max(np.abs(new / s - 1))))
-        if history[-1] < TOLERANCE:
+        if float(np.max(np.abs(new / s - 1))) < TOLERANCE:
             return found
         s = new
-    raise ConvergenceError(
-        f"the scales of the errors still change by {history[-1]:.2g} after {ROUNDS} rounds",
-        history,
-    )
+    return replace(found, converged=False)
 
 
 def _minimise(
@@ -192,37 +194,36 @@ def _minimise(
 ) -> FitSolution:
     """Minimise at fixed scales of the errors, with parameters in units of their prior widths."""
     means, spreads = problem.means, problem.spreads
-    free = np.ones(len(means), bool)
-    whole = np.array(start, float)
+    low, high = (
+        (np.array([getattr(prior, end) for prior in problem.priors]) - means) / spreads
+        for end in ("low", "high")
+    )
+    first = (np.array(start, float) - means) / spreads
     if fixed is not None:
-        free[fixed[0]], whole[fixed[0]] = False, fixed[1]
+        first[fixed[0]] = (fixed[1] - means[fixed[0]]) / spreads[fixed[0]]
+        low[fixed[0]] = high[fixed[0]] = first[fixed[0]]
     last: dict[bytes, tuple[FloatArray, FloatArray]] = {}
 
     def both(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals and slopes, cached: scipy asks for both at the same place, one after the other."""
+        """Residuals and slopes, cached: both are asked for at the same place, one after the other."""
         key = x.tobytes()
         if key not in last:
             last.clear()
-            whole[free] = means[free] + x * spreads[free]
-            last[key] = _residuals(problem, scales, whole)
+            last[key] = _residuals(problem, scales, means + x * spreads)
         return last[key]
 
-    low = np.array([(prior.low - prior.mean) / prior.spread for prior in problem.priors])
-    high = np.array([(prior.high - prior.mean) / prior.spread for prior in problem.priors])
-    x = ((whole - means) / spreads)[free]
-    if free.any():
-        # scipy refuses a start on the bounds.
-        room = 1e-9 * np.minimum(high - low, 1.0)[free]
-        found = least_squares(
-            lambda v: both(v)[0], np.clip(x, low[free] + room, high[free] - room),
-            jac=lambda v: both(v)[1][:, free], bounds=(low[free], high[free]),
-            xtol=1e-10, ftol=1e-12, gtol=1e-10, max_nfev=200,
-        )  # fmt: skip
-        if not found.success:
-            raise ConvergenceError(f"the least squares did not converge: {found.message}")
-        x = found.x
-    residual, slope = both(x)
-    return _solution(problem, scales, _ordered(problem, whole), free, residual, slope)
+    found = minimise(
+        lambda x: both(x)[0], lambda x: both(x)[1], np.clip(first, low, high), low=low, high=high,
+        units=1.0, radius=1.0, still=STILL, evaluations=MOST,
+    )  # fmt: skip
+    whole = means + found.values * spreads
+    if fixed is not None:
+        whole[fixed[0]] = fixed[1]
+    free = np.arange(len(means)) != (-1 if fixed is None else fixed[0])
+    residual, slope = both(found.values)
+    return _solution(
+        problem, scales, _ordered(problem, whole), free, residual, slope, found.converged
+    )
 
 
 def _residuals(
@@ -252,6 +253,7 @@ def _solution(
     free: NDArray[np.bool_],
     residual: FloatArray,
     slope: FloatArray,
+    converged: bool,
 ) -> FitSolution:
     """Posterior of the linear predictions at the minimum, and chi2 of each set there."""
     spreads, p = problem.spreads, len(values)
@@ -274,7 +276,7 @@ def _solution(
         determined[k] = np.einsum("np,pq,nq->", slope[rows], covariance, slope[rows])
     return FitSolution(
         values, covariance * np.outer(spreads, spreads), scales, determined, chi2,
-        float(residual @ residual), slope[:n],
+        float(residual @ residual), slope[:n], converged,
     )  # fmt: skip
 
 

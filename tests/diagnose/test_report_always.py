@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -11,9 +12,11 @@ import pytest
 from bfsensor.diagnose import diagnosis
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.diagnosis import diagnose_measured
-from bfsensor.diagnose.fit import gauss_newton
 from bfsensor.diagnose.fit.baseline_fit import UNSETTLED, fit_baseline
+from bfsensor.diagnose.fit.gauss_newton import Steps
 from bfsensor.errors import ConvergenceError
+from bfsensor.inference import mixed_model
+from bfsensor.inference.trust_region import minimise
 from tests.diagnose.fit.test_gauss_newton import Halo, channel
 from tests.virtual import Effect, Range, make_effect, measure_virtual, virtual_baseline
 
@@ -35,12 +38,12 @@ class Dust(Effect):
 
 
 def test_a_fit_that_does_not_converge_gives_its_best_point(monkeypatch):
-    monkeypatch.setattr(gauss_newton, "ROUNDS", 4)
+    monkeypatch.setattr(mixed_model, "minimise", partial(minimise, evaluations=4))
     halo, one = Halo((0.3, 20.0)), channel((0.02, 3.0))
     fit = fit_baseline(halo, [one])
     assert not fit.converged and UNSETTLED in fit.notes
     assert np.isfinite(fit.values).all() and np.isfinite(fit.residuals).all()
-    start = gauss_newton.Steps(halo, [one])
+    start = Steps(halo, [one])
     start.stay(halo.start)
     assert fit.residuals @ fit.residuals < start.solved.left @ start.solved.left
     monkeypatch.undo()

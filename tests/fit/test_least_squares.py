@@ -10,6 +10,7 @@ import pytest
 from bfsensor.device.condition import Condition
 from bfsensor.device.quantities import Prior
 from bfsensor.errors import FitError
+from bfsensor.fit import least_squares
 from bfsensor.fit.data import select
 from bfsensor.fit.least_squares import LeastSquaresProblem, profile, solve
 from bfsensor.fit.predictors import make_predictors
@@ -148,3 +149,18 @@ def test_a_pair_stays_in_order_and_otherwise_does_not_matter():
     )
     free = solve(problem(data, priors=named, emulator=turned))
     assert free.values[0] == pytest.approx(truth[0], abs=4 * np.sqrt(free.covariance[0, 0]))
+
+
+def test_a_fit_that_does_not_converge_gives_its_best_point(monkeypatch):
+    data = toy_data(toy_emulator(), TRUTH, 12)
+    whole = problem(replace(data, errors=data.errors / 4.0))
+    settled = solve(whole)
+    assert settled.converged
+    monkeypatch.setattr(least_squares, "ROUNDS", 1)
+    early = solve(whole)
+    assert not early.converged and np.isfinite(early.values).all()
+    # One round at the stated errors: their scale of about 4 is not found.
+    assert early.scales[0] == 1.0 and settled.scales[0] > 2.0
+    monkeypatch.undo()
+    monkeypatch.setattr(least_squares, "MOST", 1)
+    assert not solve(whole).converged

@@ -20,6 +20,7 @@ from scipy.stats import chi2
 from bfsensor.diagnose.detect.locate import ALARM, FAMILY, Finding, Mismatch
 from bfsensor.diagnose.detect.scans import DEVICE, DEVICE_SEEN
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
+from bfsensor.inference.evidence import chance_gain
 from bfsensor.typing import FloatArray
 
 ACCURACY = 0.02
@@ -48,7 +49,7 @@ def charge(parameters: int, tried: int) -> float:
     >>> round(charge(1, 1), 2), round(charge(1, 100), 2)
     (6.63, 15.14)
     """
-    return float(chi2.isf(ALARM / max(tried, 1), max(parameters, 1)))
+    return chance_gain(parameters, tried, ALARM)
 
 
 def explained_by_word(before: BaselineFit, after: BaselineFit) -> dict[str, float]:

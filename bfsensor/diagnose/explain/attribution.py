@@ -14,8 +14,7 @@ from bfsensor.diagnose.detect.locate import ALARM, Mismatch
 from bfsensor.diagnose.detect.model_error import charge
 from bfsensor.diagnose.explain.nonparametric import OpenWorld
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
-from bfsensor.diagnose.fit.likelihood_profile import Profile
-from bfsensor.diagnose.fit.local_likelihood import linear_interval
+from bfsensor.diagnose.fit.likelihood_profile import Profile, linear_interval
 from bfsensor.diagnose.model.effect_parameters import widened
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.effect import Effect, Parameter
@@ -82,7 +81,7 @@ class Found:
         or 'hi', at which the chi-square does not rise that far within the range of fits;
         'stopped68' and 'stopped95' list those of them inside the range, where no prediction could
         be made beyond, or the profile became flat.  All other parameters have the intervals
-        of :func:`~bfsensor.diagnose.fit.local_likelihood.linear_interval`.
+        of :func:`~bfsensor.diagnose.fit.likelihood_profile.linear_interval`.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Matching pursuit: choose the few nonparametric terms of a family that explain a fit's residuals."""
+"""Nonparametric terms of a family that explain a fit's residuals, chosen by matching pursuit."""
 
 from __future__ import annotations
 
@@ -7,20 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.detect.model_error import ACCURACY, charge
+from bfsensor.diagnose.detect.locate import ALARM
+from bfsensor.diagnose.detect.model_error import ACCURACY
 from bfsensor.diagnose.explain.terms import Family, Term
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 from bfsensor.errors import ConvergenceError
+from bfsensor.inference.pursuit import Pursuit
 from bfsensor.typing import FloatArray
-
-MOST_TERMS = 6
-"""Largest number of terms of one family. Chosen, to be derived: twice as many fit finer detail, which
-the select fold mostly refuses."""
-
-SPANNED = 1e-3
-"""Least part of a column's square that the fit's parameters do not span; columns below are no terms.
-Chosen: such a column differs from a combination of parameters by 3 % of its norm; twice as large
-removes the terms that are hardest to separate from gains and light."""
 
 MOST_ALIKE = 3
 """Largest number of terms that are listed as explaining as much.  Chosen: length of the report only."""
@@ -63,7 +56,7 @@ class Choice:
     alike: tuple[tuple[Term, float], ...] = ()
 
 
-class Dictionary:
+class Dictionary(Pursuit):
     """Whitened columns of a family's terms, and their projections onto the fit's parameters.
 
     Parameters
@@ -96,18 +89,12 @@ class Dictionary:
             blocks.append(white[used])
             rows.append(int(start) + used)
         empty = np.zeros((0, len(family.terms)))
-        self.x = np.concatenate([empty, *blocks]) * usable
         self.rows = np.concatenate([np.zeros(0, int), *rows])
-        self.u = fit.basis[self.rows].T @ self.x
-        raw = (self.x**2).sum(0)
-        free = raw - (self.u**2).sum(0)
-        self.free = np.where(free > SPANNED * raw, free, 0.0)
-
-    @property
-    def critical(self) -> float:
-        """Square of the deviate that noise gives the best of all terms with probability ALARM."""
-        count = max(int((self.free > 0).sum()), self.family.tried, 1)
-        return charge(1, count)
+        x = np.concatenate([empty, *blocks]) * usable
+        super().__init__(
+            x, fit.basis[self.rows].T @ x, probability=ALARM, accuracy=ACCURACY,
+            simple=np.array([t.simple for t in family.terms], bool), tried=family.tried,
+        )  # fmt: skip
 
     def products(self, left: FloatArray) -> FloatArray:
         """Scalar products of all columns with whitened residuals."""
@@ -118,59 +105,6 @@ class Dictionary:
         out = -self.fit.basis @ self.u[:, n]
         out[self.rows] += self.x[:, n]
         return np.asarray(out)
-
-    def pursue(self, *, positive: bool = False) -> list[tuple[int, float]]:
-        """Take the term of largest deviate, project it out of the others, and repeat."""
-        b, free = self.products(self.fit.left), self.free.copy()
-        first = free.copy()
-        taken: list[FloatArray] = []
-        path: list[tuple[int, float]] = []
-        while len(path) < MOST_TERMS:
-            # A term of which earlier ones span more than 98 % (chosen) would have a coefficient
-            # dominated by their errors.
-            open_ = (free > 0.02 * first) & (free > 0)
-            z = np.where(open_, b / np.sqrt(np.where(open_, free, 1.0)), 0.0)
-            size = z if positive else np.abs(z)
-            n = self._farthest(size)
-            if not len(size) or size[n] ** 2 < self.critical:
-                break
-            if path and size[n] < ACCURACY * abs(path[0][1]):
-                break
-            path.append((n, float(z[n])))
-            new = self.x.T @ self.x[:, n] - self.u.T @ self.u[:, n]
-            for old in taken:
-                new = new - old * old[n]
-            new = new / np.sqrt(free[n])
-            taken.append(new)
-            b = b - new * z[n]
-            free = free - new**2
-        return path
-
-    def _farthest(self, size: FloatArray) -> int:
-        """Index of the largest deviate, or of the best simple term if that explains as much."""
-        if not len(size):
-            return 0
-        best = int(np.argmax(size))
-        simple = np.where([t.simple for t in self.family.terms], size, 0.0)
-        n = int(np.argmax(simple))
-        return n if size[n] ** 2 > size[best] ** 2 - self._same(size[best]) else best
-
-    def _same(self, z: float) -> float:
-        """Difference of chi-squares that does not separate two terms, by chance or errors of columns."""
-        return charge(1, 1) + (ACCURACY * z) ** 2
-
-    def alike(self, n: int, *, positive: bool = False) -> tuple[tuple[Term, float], ...]:
-        """Other terms that alone explain as much as a given one, with their coefficients."""
-        b = self.products(self.fit.left)
-        z = np.where(
-            self.free > 0, b / np.sqrt(np.where(self.free > 0, self.free, 1.0)), 0.0
-        )
-        size = np.where((z > 0) | (not positive), np.abs(z), 0.0)
-        close = size**2 > size[n] ** 2 - self._same(size[n])
-        order = [int(m) for m in np.argsort(-size) if close[m] and m != n]
-        return tuple(
-            (self.family.terms[m], float(b[m] / self.free[m])) for m in order[:MOST_ALIKE]
-        )
 
     def choose(self, *, positive: bool = False) -> Choice | None:
         """Choose the terms beyond noise, as many as lower the select fold's chi-square most.
@@ -185,7 +119,8 @@ class Dictionary:
         Choice or None
             None where no term is beyond noise, or the select fold's chi-square would rise.
         """
-        path = self.pursue(positive=positive)
+        products = self.products(self.fit.left)
+        path = self.pursue(products, positive=positive)
         if not path:
             return None
         templates = np.array([self.template(n) for n, _ in path]).T
@@ -199,24 +134,15 @@ class Dictionary:
             gain = gains[count - 1]
             if gain < 0:
                 return None
+        alike = self.alike(path[0][0], products, positive=positive)
         score = sum(z * z - self.critical for _, z in path[:count])
         coefficients = np.linalg.lstsq(templates[:, :count], self.fit.left, rcond=None)[0]
         return Choice(
             self.family, tuple(self.family.terms[n] for n, _ in path[:count]),
             tuple(z for _, z in path[:count]), float(score), float(gain),
-            templates[:, :count] @ coefficients, self.alike(path[0][0], positive=positive),
+            templates[:, :count] @ coefficients,
+            tuple((self.family.terms[m], c) for m, c in alike[:MOST_ALIKE]),
         )  # fmt: skip
-
-    def gains(self) -> tuple[float, int]:
-        """Decrease of the chi-square with all terms together, and the number of independent ones."""
-        use = np.nonzero(self.free > 0)[0]
-        if not len(use):
-            return 0.0, 0
-        templates = np.array([self.template(int(n)) for n in use]).T
-        scaled = templates / np.sqrt((templates**2).sum(0))
-        q, s, _ = np.linalg.svd(scaled, full_matrices=False)
-        q = q[:, s > 1e-4 * s[0]]
-        return float(((q.T @ self.fit.left) ** 2).sum()), q.shape[1]
 
     @property
     def _select(self) -> NDArray[np.bool_]:

@@ -1,47 +1,28 @@
-"""Likelihood profiles: intervals of an effect's parameters where the chi-square is no parabola.
+"""Likelihood profiles of an effect's parameters about a fit, and fits continued where one is lower.
 
-The ends of an interval of ``w`` standard deviations are where the smallest chi-square with the
-parameter held has risen by ``w^2`` (Wilks' theorem for one parameter).
+The effect's parameters are not linearised; all other parameters of the fit follow to first order:
+their columns are projected out of the residuals.  The statistics are in
+:mod:`bfsensor.inference.likelihood_profile`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from functools import partial
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 
 from bfsensor.diagnose.fit.fitted_model import Model
-from bfsensor.diagnose.fit.local_likelihood import Held, Valley, linear_interval, valley_of
-from bfsensor.diagnose.model.effect_parameters import widened
+from bfsensor.diagnose.fit.gauss_newton import Steps
+from bfsensor.diagnose.model.effect_parameters import fitted, reach_of, widened
 from bfsensor.effects.effect import Effect, Parameter
 from bfsensor.errors import ConvergenceError
+from bfsensor.inference.bounded_lsq import span
+from bfsensor.inference.likelihood_profile import Profile, profiles_in
+from bfsensor.inference.local_likelihood import LocalLikelihood, Ranged
 from bfsensor.typing import FloatArray
 
-POINTS = 7
-"""Largest number of values on one side, the best among them, at which a parameter is held while
-going outwards; up to two more are added at each width.  Chosen, to be derived: with 14, ends that
-are reported as open because six steps did not reach them would be searched for by thirteen, at
-twice the predictions."""
-
-LONGEST = 3.0
-"""Largest factor between successive steps (the smallest is 0.3).  Chosen: six steps that grow by 3
-reach 364 times the first; with 6, 9331 times, and the profile's curve between them is less
-certain."""
-
-NARROW = 0.8
-"""Difference of the roots of the rise [standard deviations] between two neighbouring values that
-bracket an end, below which no value is added between them.  Chosen: with 1.6 ends rest on an
-interpolation over up to twice the distance."""
-
-SEEN = 0.05
-"""Increase of the root of the rise along a step [standard deviations] below which the next step is
-not extrapolated from it but is :data:`LONGEST` times as long.  Chosen: profiles are good to a
-chi-square of 0.02, a root of 0.14, so that a smaller increase may be numerical; with 0.1, more
-steps grow by the full factor."""
-
+__all__ = ["Profile", "find_profiles", "linear_interval", "ranged", "settle", "valley_of"]
 
 LOWER = 0.2
 """Difference by which the lowest chi-square on a profile must be below the fit's for the fit to be
@@ -53,187 +34,104 @@ RESTARTS = 4
 as many doubles the time of a fit that never settles."""
 
 
-@dataclass(frozen=True)
-class Profile:
-    """Likelihood profile: the rise of the chi-square with one parameter, all others refitted.
+def ranged(p: Parameter) -> Ranged:
+    """Range, scale and largest steps of an effect's parameter in fits."""
+    logarithmic = p.law == "log" and not p.signed
+    width = p.high - p.low
+    return Ranged(
+        p.name, *widened(p), logarithmic, p.neutral, p.low, width, partial(reach_of, p)
+    )
 
-    Attributes
+
+def linear_interval(value: float, width: float, p: Parameter) -> tuple[float, float]:
+    """Ends of the interval ``value`` +- ``width``, or of the log-normal one.
+
+    For a positive parameter on a logarithmic scale with a relative error above 15 % the logarithm
+    is taken for Gaussian: a symmetric interval would come near, or cross, its neutral value.
+
+    Parameters
     ----------
-    values : ndarray, shape (n,)
-        Values of the parameter, in its unit, increasing; the best is among them.
-    rises : ndarray, shape (n,)
-        Rise of the chi-square above its smallest value, at least 0.
-    logarithmic : bool
-        Whether ends are interpolated in the logarithm of the parameter's distance from
-        ``neutral``, in which the root of the rise is closer to linear.
-    neutral : float
-        Value at which the parameter has no effect; used if ``logarithmic``.
+    value : float
+        Best value, in the parameter's unit.
+    width : float
+        Standard error, or a multiple of it, in the same unit.
+    p : Parameter
+        Its law, sign and neutral value decide the scale.
+
+    Returns
+    -------
+    low, high : float
+
+    Examples
+    --------
+    >>> p = Parameter("sigma", "um", 0.1, 10.0)
+    >>> linear_interval(2.0, 0.2, p)
+    (1.8, 2.2)
+    >>> [round(v, 3) for v in linear_interval(2.0, 2.0, p)]
+    [0.736, 5.437]
     """
-
-    values: FloatArray
-    rises: FloatArray
-    logarithmic: bool = False
-    neutral: float = 0.0
-
-    def interval(self, width: float) -> tuple[float, float, bool, bool]:
-        """Ends where the chi-square has risen by the square of ``width``.
-
-        Parameters
-        ----------
-        width : float
-            Half-width in standard deviations, above 0: 1 for 68 %, 1.96 for 95 %.
-
-        Returns
-        -------
-        low, high : float
-            Ends, in the parameter's unit; an open end is the last value of the profile.
-        low_closed, high_closed : bool
-            Whether the chi-square rises that far on that side; False says that the end is open.
-
-        Examples
-        --------
-        >>> x = np.linspace(-1.0, 5.0, 13)
-        >>> low, high, closed, open_ = Profile(x, (x - 1) ** 2).interval(3.0)
-        >>> low, closed, round(high, 3), open_
-        (-1.0, False, 4.0, True)
-        """
-        best = int(np.argmin(self.rises))
-        roots = np.sqrt(np.maximum(self.rises, 0.0))
-        place = np.log(self.values - self.neutral) if self.logarithmic else self.values
-        low, low_closed = _crossing(place[best::-1], roots[best::-1], width)
-        high, high_closed = _crossing(place[best:], roots[best:], width)
-        if self.logarithmic:
-            low, high = (self.neutral + float(np.exp(v)) for v in (low, high))
-        # Back from the logarithm an end of the range is not the same to the last bit.
-        low = low if low_closed else float(self.values[0])
-        high = high if high_closed else float(self.values[-1])
-        return low, high, low_closed, high_closed
+    return ranged(p).interval(value, width)
 
 
-def _crossing(place: FloatArray, roots: FloatArray, width: float) -> tuple[float, bool]:
-    """Place, going out from the first, at which a root first reaches a width, and whether it does."""
-    beyond = np.nonzero(roots >= width)[0]
-    if not len(beyond) or len(place) < 2:
-        return float(place[-1]), False
-    last = int(beyond[0])
-    # A monotone cubic (PCHIP), since a polynomial through a bracket may overshoot and cross twice;
-    # it takes its slope at the bracket from one more point on either side.
-    own = slice(0, min(last + 2, len(place)))
-    order = np.argsort(place[own])
-    curve = PchipInterpolator(place[own][order], roots[own][order] - width)
-    inner, outer = sorted((place[last - 1], place[last]))
-    found = [r for r in curve.roots(extrapolate=False) if inner <= r <= outer]
-    return float(found[0] if found else place[last]), True
+def valley_of(model: Model, n: int) -> LocalLikelihood:
+    """Make the chi-square near a fit a function of the parameters of one of its effects.
 
+    The effect is predicted again at each value; all other fitted parameters follow to first
+    order, as they are nearly linear over a few errors.  Random effects of other effects keep the
+    variances of the fit.
 
-class Scale(NamedTuple):
-    """Scale along which a parameter is varied: its own, or the log of its distance from neutral."""
+    Parameters
+    ----------
+    model : Model
+        Fitted, with effects.
+    n : int
+        Index of the effect in ``model.effects``.
 
-    logarithmic: bool
-    neutral: float
-    least: float
+    Returns
+    -------
+    near : object
+        The chi-square as a function of ``model.effects[n]``'s fitted parameters.
+    """
+    predictor, fit, effect = model.predictor, model.fit, model.effects[n]
+    point = fit.values[: len(predictor.names)].copy()
+    rows = np.flatnonzero([m.startswith(f"effect {n} ") for m in predictor.names])
+    around = Steps(predictor, fit.channels)
+    around.point, around.slopes = point, fit.slopes
+    around.linearise_random()
+    design, target = around.problem(point)
+    used = (design**2).sum(0) > 0
+    used[rows] = False
+    # A parameter of another effect at the end of its range cannot follow.
+    low, high = predictor.limits()
+    used[: len(point)] &= (low < point) & (point < high)
+    others = span(design[:, used])
 
-    @classmethod
-    def of(cls, p: Parameter, value: float) -> Scale:
-        """Choose the scale of a parameter with a best value."""
-        away = value - p.neutral
-        logarithmic = p.law == "log" and not p.signed and away > 0
-        return cls(logarithmic, p.neutral if logarithmic else 0.0, 1e-3 * min(p.low, away))
+    def free(columns: FloatArray) -> FloatArray:
+        return np.asarray(columns - others @ (others.T @ columns))
 
-    def place(self, value: float) -> float:
-        """Place of a value on this scale; distances from neutral below ``least`` count as that."""
-        if not self.logarithmic:
-            return value
-        return float(np.log(max(value - self.neutral, self.least)))
+    channels = [
+        (c, int(start), predictor.predict(c, point))
+        for c, start in zip(fit.channels, around.starts, strict=False)
+        if c.word in effect.touches
+    ]
+    before = free(target)
 
-    def value(self, place: float) -> float:
-        """Value at a place on this scale."""
-        return self.neutral + float(np.exp(place)) if self.logarithmic else place
+    def left(values: FloatArray) -> FloatArray:
+        there = point.copy()
+        there[rows] = values
+        change = np.zeros(len(before))
+        for channel, start, here in channels:
+            with np.errstate(over="ignore", invalid="ignore"):
+                moved = predictor.predict(channel, there) - here
+            if not np.isfinite(moved).all():
+                raise ConvergenceError(f"predictions of {channel.word} overflow")
+            change[start : start + len(channel)] = channel.whiten(moved)
+        return before - free(change)
 
-    def first(self, value: float, told: float, p: Parameter) -> float:
-        """First step: to the end by the linear error; without one, a part of the range."""
-        step = abs(self.place(told) - self.place(value))
-        if np.isfinite(step) and step > 0:
-            return min(step, 1.0) if self.logarithmic else step
-        return 0.2 if self.logarithmic else 0.05 * (p.high - p.low)
-
-
-class _Side:
-    """One side of a profile: values outwards from the best until the chi-square has risen enough."""
-
-    def __init__(self, valley: Valley, k: int, scale: Scale, end: float) -> None:
-        self._valley, self._k, self._scale = valley, k, scale
-        self._end = scale.place(end)
-        best = scale.place(float(valley.best[k]))
-        self.places, self.held = [best], [Held(valley.square, valley.best, valley.slopes)]
-
-    def go(self, first: float, widths: Sequence[float]) -> None:
-        """Hold the parameter at values outwards, then at some that bracket each width closely."""
-        step = first
-        while len(self.places) < POINTS:
-            roots = self._roots()
-            wanted = next((w for w in widths if w > roots[-1]), None)
-            if wanted is None:
-                break
-            if len(roots) > 1:
-                last = self.places[-1] - self.places[-2]
-                rate = (roots[-1] - roots[-2]) / abs(last)
-                if roots[-1] - roots[-2] > SEEN:
-                    # 5 % beyond the width, so that the end is bracketed and not extrapolated.
-                    step = (1.05 * wanted - roots[-1]) / rate
-                    step = float(np.clip(step, 0.3 * abs(last), LONGEST * abs(last)))
-                else:
-                    step = LONGEST * abs(last)
-            if not self._add(self._towards(self.places[-1], step), len(self.places)):
-                break
-        for width in widths:
-            self._close_in(width)
-
-    def _towards(self, place: float, step: float) -> float:
-        out = float(np.sign(self._end - place))
-        return place + out * min(step, abs(self._end - place))
-
-    def _add(self, place: float, at: int) -> bool:
-        """Hold the parameter at a place; False if it is held there, or nothing can be predicted."""
-        if any(abs(place - p) < 1e-12 * (1 + abs(p)) for p in self.places):
-            return False
-        value = self._scale.value(place)
-        near = self._nearest(place)
-        try:
-            found = self._valley.hold(self._k, value, near)
-        except ConvergenceError:
-            return False
-        self.places.insert(at, place)
-        self.held.insert(at, found)
-        return True
-
-    def _nearest(self, place: float) -> Held:
-        """Starting point at a place: the other parameters inter- or extrapolated from neighbours."""
-        order = np.argsort(np.abs(np.array(self.places) - place))
-        first = self.held[int(order[0])]
-        if len(order) < 2:
-            moved = self._valley.along(self._k, self._scale.value(place))
-        else:
-            one, two = (self.places[int(n)] for n in order[:2])
-            part = (place - one) / (two - one)
-            moved = first.values + part * (self.held[int(order[1])].values - first.values)
-        return first._replace(values=self._valley.inside(moved))
-
-    def _roots(self) -> list[float]:
-        least = min(h.square for h in self.held)
-        return [float(np.sqrt(max(h.square - least, 0.0))) for h in self.held]
-
-    def _close_in(self, width: float) -> None:
-        """Narrow the bracket of a width below NARROW, by at most two further values."""
-        for _ in range(2):
-            roots = self._roots()
-            at = next((n for n, r in enumerate(roots) if r >= width), 0)
-            if not at or roots[at] - roots[at - 1] < NARROW:
-                return
-            part = (width - roots[at - 1]) / (roots[at] - roots[at - 1])
-            one, two = self.places[at - 1 : at + 1]
-            if not self._add(one + float(np.clip(part, 0.2, 0.8)) * (two - one), at):
-                return
+    parameters = [ranged(p) for p in fitted(effect)]
+    return LocalLikelihood(
+        parameters, point[rows], left, free(design[:, rows]), predictor.steps[rows]
+    )
 
 
 def settle(
@@ -307,28 +205,3 @@ def find_profiles(model: Model, n: int, widths: Sequence[float]) -> dict[str, Pr
     if type(model.effects[n]).modes is not Effect.modes:
         return {}
     return profiles_in(valley_of(model, n), widths)
-
-
-def profiles_in(valley: Valley, widths: Sequence[float]) -> dict[str, Profile]:
-    """Profiles as by :func:`find_profiles`, from a chi-square that is given as a function."""
-    out = {}
-    for k, p in enumerate(valley.parameters):
-        error = float(valley.errors[k])
-        if valley.is_parabola(k, error):
-            continue
-        scale = Scale.of(p, float(valley.best[k]))
-        sides = []
-        for sign, end in zip((-1, 1), widened(p), strict=True):
-            ends = linear_interval(float(valley.best[k]), error, p)
-            told = ends[0 if sign < 0 else 1]
-            side = _Side(valley, k, scale, end)
-            side.go(scale.first(float(valley.best[k]), told, p), widths)
-            sides.append(side)
-        places = np.array([*sides[0].places[:0:-1], *sides[1].places])
-        squares = np.array([h.square for h in (*sides[0].held[:0:-1], *sides[1].held)])
-        if len(places) > 1:
-            out[p.name] = Profile(
-                np.array([scale.value(x) for x in places]), squares - squares.min(),
-                scale.logarithmic, scale.neutral,
-            )  # fmt: skip
-    return out

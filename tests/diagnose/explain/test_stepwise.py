@@ -14,7 +14,7 @@ from bfsensor.diagnose.explain.attribution import class_probabilities, tied_clas
 from bfsensor.diagnose.explain.location import place_effects
 from bfsensor.diagnose.explain.stepwise import attribute
 from bfsensor.diagnose.fit.fitted_model import Model
-from bfsensor.diagnose.fit.local_likelihood import valley_of
+from bfsensor.diagnose.fit.likelihood_profile import valley_of
 from bfsensor.effects.charge_loss import ChargeLoss
 from bfsensor.effects.gain_nonlinearity import GainNonlinearity
 from bfsensor.effects.interpixel_coupling import InterpixelCoupling

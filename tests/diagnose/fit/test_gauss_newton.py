@@ -119,10 +119,9 @@ class Chance(Halo):
 def test_random_effects_are_projected_out(start):
     """Chi-squares and errors of the projected problem are those of the whole one."""
     steps = Steps(Chance(start), [channel((0.02, 3.0))])
-    predicted, residuals = steps.residuals(steps.point)
-    steps.differentiate(np.ones(2, bool), steps.point, predicted)
-    whole = steps.solve(residuals, steps.point, np.ones(2, bool))
-    left, slopes = steps._projected(residuals, steps.point), steps._projected_slopes()
+    steps.differentiate(np.ones(2, bool), steps.point)
+    whole = steps.solve(steps.point, np.ones(2, bool))
+    left, slopes = steps._projected(steps.point), steps._projected_slopes()
     assert len(whole.solution) > 100 and slopes.shape[1] == 2
     assert left @ left == pytest.approx(whole.left @ whole.left, rel=1e-10)
     used = slopes.any(0)

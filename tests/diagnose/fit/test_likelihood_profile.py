@@ -7,12 +7,13 @@ import pytest
 
 from bfsensor.diagnose.explain.attribution import WIDENED, Found
 from bfsensor.diagnose.fit import likelihood_profile as profile
-from bfsensor.diagnose.fit.likelihood_profile import LOWER, Profile, profiles_in, settle
-from bfsensor.diagnose.fit.local_likelihood import Valley, linear_interval
+from bfsensor.diagnose.fit.likelihood_profile import LOWER, linear_interval, ranged, settle
 from bfsensor.diagnose.model.effect_parameters import widened
 from bfsensor.effects.effect import Parameter
 from bfsensor.effects.psf_wings import PsfWings
 from bfsensor.errors import ConvergenceError
+from bfsensor.inference.likelihood_profile import Profile, profiles_in
+from bfsensor.inference.local_likelihood import LocalLikelihood
 
 AMP = Parameter("amp", "", 0.1, 10.0, signed=True, amplitude=True)
 SHAPE = Parameter("shape", "", 0.1, 10.0, law="flat")
@@ -25,7 +26,8 @@ def valley(left, best, parameters=(AMP, SHAPE)):
     slopes = np.stack(
         [(left(best - h * d) - left(best + h * d)) / (2 * h) for d in np.eye(len(best))], 1
     )
-    return Valley(parameters, best, left, slopes, np.full(len(best), 1e-4))
+    own = [ranged(p) for p in parameters]
+    return LocalLikelihood(own, best, left, slopes, np.full(len(best), 1e-4))
 
 
 def test_of_linear_parameters_errors_are_believed():

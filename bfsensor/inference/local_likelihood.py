@@ -1,8 +1,4 @@
-"""The chi-square near a fit as a function of one effect's parameters, all others refitted.
-
-The effect's parameters are not linearised; all other parameters follow to first order: their
-columns are projected out of the residuals.
-"""
+"""The chi-square near a fit as a function of some parameters, all others refitted."""
 
 from __future__ import annotations
 
@@ -12,10 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.fit.fitted_model import Model
-from bfsensor.diagnose.fit.gauss_newton import Steps
-from bfsensor.diagnose.model.effect_parameters import fitted, reach_of, widened
-from bfsensor.effects.effect import Parameter
 from bfsensor.errors import ConvergenceError
 from bfsensor.inference.bounded_lsq import solve_within, span
 from bfsensor.typing import FloatArray
@@ -27,7 +19,7 @@ parabola's, above which the likelihood profile is computed.  An end is then off 
 every chi-square that rises to at most twice the parabola's, or not at all, would pass for one."""
 
 TURNS = 4
-"""Largest number of Gauss-Newton rounds of the effect's other parameters while one is held.
+"""Largest number of Gauss-Newton rounds of the other parameters while one is held.
 Chosen: with fewer than needed the profile lies above the true one and intervals are too narrow; 8
 cost up to twice the predictions where it does not converge."""
 
@@ -36,21 +28,64 @@ DONE = 0.02
 it moves an end at a rise of 1 by 0.02 / 2 = 1 % of the error; twice as large, by 2 %."""
 
 
+class Ranged(NamedTuple):
+    """Range, scale and largest steps of a parameter in a fit.
+
+    Parameters
+    ----------
+    name : str
+        Name of the parameter.
+    low, high : float
+        Range of fits.
+    logarithmic : bool
+        Whether it varies on the logarithm of its distance above ``neutral``.
+    neutral : float
+        Value at which it has no effect.
+    least : float
+        Least plausible distance from ``neutral``.
+    width : float
+        Width of its plausible range.
+    step : callable
+        Gives the smallest and the largest step of a fit from a value.
+    """
+
+    name: str
+    low: float
+    high: float
+    logarithmic: bool
+    neutral: float
+    least: float
+    width: float
+    step: Callable[[float], tuple[float, float]]
+
+    def interval(self, value: float, width: float) -> tuple[float, float]:
+        """Ends of the interval ``value`` +- ``width``, or of the log-normal one.
+
+        For a parameter on a logarithmic scale with a relative error above 15 % the logarithm is
+        taken for Gaussian: a symmetric interval would come near, or cross, its neutral value.
+        """
+        away = value - self.neutral if self.logarithmic else value
+        if self.logarithmic and away > 0 and width > 0.15 * away:
+            factor = float(np.exp(min(width / away, 50.0)))
+            return self.neutral + away / factor, self.neutral + away * factor
+        return value - width, value + width
+
+
 class Held(NamedTuple):
-    """Smallest chi-square with one parameter held, the effect's parameters and derivatives there."""
+    """Smallest chi-square with one parameter held, the parameters and derivatives there."""
 
     square: float
     values: FloatArray
     slopes: FloatArray
 
 
-class Valley:
-    """The chi-square near a fit as a function of one effect's parameters.
+class LocalLikelihood:
+    """The chi-square near a fit as a function of some of its parameters, all others refitted.
 
     Parameters
     ----------
-    parameters : sequence of Parameter
-        Fitted parameters of the effect.
+    parameters : sequence of Ranged
+        Names, ranges and scales of these parameters.
     best : ndarray, shape (p,)
         Their values in the fit.
     left : callable
@@ -76,7 +111,7 @@ class Valley:
 
     def __init__(
         self,
-        parameters: Sequence[Parameter],
+        parameters: Sequence[Ranged],
         best: FloatArray,
         left: Callable[[FloatArray], FloatArray],
         slopes: FloatArray,
@@ -101,7 +136,7 @@ class Valley:
 
     def inside(self, values: FloatArray) -> FloatArray:
         """Values clipped to the ranges of fits."""
-        low, high = np.array([widened(p) for p in self.parameters]).T
+        low, high = np.array([(p.low, p.high) for p in self.parameters]).T
         return np.clip(values, low, high)
 
     def is_parabola(self, k: int, error: float) -> bool:
@@ -112,10 +147,9 @@ class Valley:
         if not (np.isfinite(error) and error > 0):
             return False
         p, best = self.parameters[k], float(self.best[k])
-        low, high = widened(p)
         for width in (1.0, 1.96):
-            for end in linear_interval(best, width * error, p):
-                if not low <= end <= high:
+            for end in p.interval(best, width * error):
+                if not p.low <= end <= p.high:
                     return False
                 if abs(self._rise(k, end) / width**2 - 1) > BENT:
                     return False
@@ -136,7 +170,7 @@ class Valley:
         return float(left @ left) - self.square
 
     def hold(self, k: int, value: float, near: Held) -> Held:
-        """Fit the effect's other parameters with the k-th held, from a point nearby.
+        """Fit the other parameters with the k-th held, from a point nearby.
 
         Derivatives are those of that point, updated after each step (Broyden's rank-one update),
         and computed by finite differences once a step raises the chi-square.
@@ -172,7 +206,7 @@ class Valley:
             return self._kept(Held(float(left @ left), values, near.slopes))
         slopes, fresh = near.slopes.copy(), False
         for _ in range(TURNS):
-            ends = [reach_of(self.parameters[n], float(values[n])) for n in own]
+            ends = [self.parameters[n].step(float(values[n])) for n in own]
             solved = solve_within(slopes[:, own], left, *np.array(ends).T)
             square, step = float(left @ left), solved.solution
             if square - float(solved.left @ solved.left) < DONE:
@@ -219,97 +253,3 @@ class Valley:
             except ConvergenceError:
                 out[:, column] = self.slopes[:, n]
         return out
-
-
-def valley_of(model: Model, n: int) -> Valley:
-    """Make the chi-square near a fit a function of the parameters of one of its effects.
-
-    The effect is predicted again at each value; all other fitted parameters follow to first
-    order, as they are nearly linear over a few errors.  Random effects of other effects keep the
-    variances of the fit.
-
-    Parameters
-    ----------
-    model : Model
-        Fitted, with effects.
-    n : int
-        Index of the effect in ``model.effects``.
-
-    Returns
-    -------
-    near : object
-        The chi-square as a function of ``model.effects[n]``'s fitted parameters.
-    """
-    predictor, fit, effect = model.predictor, model.fit, model.effects[n]
-    point = fit.values[: len(predictor.names)].copy()
-    rows = np.flatnonzero([m.startswith(f"effect {n} ") for m in predictor.names])
-    around = Steps(predictor, fit.channels)
-    around.point, around.slopes = point, fit.slopes
-    around.update_chance()
-    design, target = around.problem(around.residuals(point)[1], point)
-    used = (design**2).sum(0) > 0
-    used[rows] = False
-    # A parameter of another effect at the end of its range cannot follow.
-    low, high = predictor.limits()
-    used[: len(point)] &= (low < point) & (point < high)
-    others = span(design[:, used])
-
-    def free(columns: FloatArray) -> FloatArray:
-        return np.asarray(columns - others @ (others.T @ columns))
-
-    channels = [
-        (c, int(start), predictor.predict(c, point))
-        for c, start in zip(fit.channels, around.starts, strict=False)
-        if c.word in effect.touches
-    ]
-    before = free(target)
-
-    def left(values: FloatArray) -> FloatArray:
-        there = point.copy()
-        there[rows] = values
-        change = np.zeros(len(before))
-        for channel, start, here in channels:
-            with np.errstate(over="ignore", invalid="ignore"):
-                moved = predictor.predict(channel, there) - here
-            if not np.isfinite(moved).all():
-                raise ConvergenceError(f"predictions of {channel.word} overflow")
-            change[start : start + len(channel)] = channel.whiten(moved)
-        return before - free(change)
-
-    return Valley(
-        fitted(effect), point[rows], left, free(design[:, rows]), predictor.steps[rows]
-    )
-
-
-def linear_interval(value: float, width: float, p: Parameter) -> tuple[float, float]:
-    """Ends of the interval ``value`` +- ``width``, or of the log-normal one.
-
-    For a positive parameter on a logarithmic scale with a relative error above 15 % the logarithm
-    is taken for Gaussian: a symmetric interval would come near, or cross, its neutral value.
-
-    Parameters
-    ----------
-    value : float
-        Best value, in the parameter's unit.
-    width : float
-        Standard error, or a multiple of it, in the same unit.
-    p : Parameter
-        Its law, sign and neutral value decide the scale.
-
-    Returns
-    -------
-    low, high : float
-
-    Examples
-    --------
-    >>> p = Parameter("sigma", "um", 0.1, 10.0)
-    >>> linear_interval(2.0, 0.2, p)
-    (1.8, 2.2)
-    >>> [round(v, 3) for v in linear_interval(2.0, 2.0, p)]
-    [0.736, 5.437]
-    """
-    away = value - p.neutral if p.law == "log" else value
-    if p.law == "log" and not p.signed and away > 0 and width > 0.15 * away:
-        factor = float(np.exp(min(width / away, 50.0)))
-        return p.neutral + away / factor, p.neutral + away * factor
-    return value - width, value + width
