@@ -33,6 +33,7 @@ class ElectronicMemory(Effect):
     word = "electronic_memory"
     parameters = (Parameter("alpha", "", 1e-5, 1e-3, signed=True, amplitude=True),)
     touches = ("serial_overscan", "flat_mean", "flat_cov", "flat_map", "spot")
+    standing = True
     source = (
         "Electronic offset drift of ITL sensors, here of one pixel: Snyder et al. 2021, JATIS 7, "
         "048002; range assumed"
@@ -101,6 +102,7 @@ class Settling(Effect):
         Parameter("tau", "pixel times", 0.5, 30.0),
     )
     touches = ("serial_overscan", "flat_mean", "flat_cov", "flat_map", "spot")
+    standing = True
     source = (
         "Exponential settling of a stage of first order: Horowitz & Hill, The Art of Electronics, "
         "section 1.4; Janesick 2001, Scientific Charge-Coupled Devices, SPIE Press, section 6.2; "
@@ -124,7 +126,9 @@ class Settling(Effect):
             # Columns read first have less light before them.
             read = np.arange(s.columns)
             missing = self._sum * np.exp(-read / self["tau"]) / (1 + self._sum)
-            out[s.y : s.y + s.rows, s.sensor_column(read)] = -missing
+            line = np.zeros(s.columns)
+            line[s.sensor_column(read) - s.x] = -missing
+            out[s.y : s.y + s.rows, s.x : s.x + s.columns] = line
         return out
 
     def signal(self, level: FloatArray, axes: Axes, layout: Layout) -> FloatArray:

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import maximum_filter, uniform_filter
 
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.arrays import to_floats
@@ -207,8 +206,7 @@ def find_spots(
     if mask is not None:
         bad |= _fitting("mask", np.asarray(mask, bool), data.shape)
     clean = np.where(bad, -np.inf, data)
-    top = (clean > threshold) & (clean == maximum_filter(clean, 3, mode="nearest"))
-    y, x = np.nonzero(top)
+    y, x = find_peaks(clean, threshold, 3)
     # Brightest first, of equal ones the first in reading order.
     order = np.argsort(-clean[y, x], kind="stable")
     y, x = y[order], x[order]
@@ -216,9 +214,8 @@ def find_spots(
     half = stamp // 2
     ny, nx = data.shape
     inside = (x >= half) & (x < nx - half) & (y >= half) & (y < ny - half)
-    # One bad pixel of nine gives 0.111; 0.05 allows for the filter's rounding errors.
-    spoilt = uniform_filter(bad.astype(float), 3, mode="nearest")[y, x] > 0.05
-    highest = maximum_filter(clean, stamp, mode="nearest")[y, x]
+    spoilt = largest_around(bad, y, x, 3)
+    highest = largest_around(clean, y, x, stamp)
     reasons = {
         "neighbour": ~alone,
         "border": ~inside,
@@ -233,6 +230,75 @@ def find_spots(
     x, y = x[kept], y[kept]
     order = np.lexsort((x, y))
     return SpotList(x[order].astype(np.int64), y[order].astype(np.int64), rejected)
+
+
+def find_peaks(
+    image: NDArray[Any], threshold: float, size: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Find pixels above a threshold that no pixel near them exceeds.
+
+    Only the pixels above the threshold are compared with those around them: in an image of spots
+    these are few, and a filter of the whole image takes ten times as long.
+
+    Parameters
+    ----------
+    image : ndarray, shape (ny, nx)
+        Signals, without nan.
+    threshold : float
+        Value that a peak must exceed.
+    size : int
+        Side of the square around a pixel in which none may exceed it [pixel], odd.
+
+    Returns
+    -------
+    y, x : ndarray of int, shape (n,)
+        Rows and columns of the peaks, in reading order.
+
+    Examples
+    --------
+    >>> image = np.zeros((5, 5))
+    >>> image[1, 2], image[2, 3], image[4, 0] = 9.0, 8.0, 7.0
+    >>> [at.tolist() for at in find_peaks(image, 1.0, 3)]
+    [[1, 4], [2, 0]]
+    """
+    y, x = np.nonzero(image > threshold)
+    # Most pixels of a spot are below one of their nearest neighbours: few are left for the rest.
+    for side in sorted({min(3, size), size}):
+        top = image[y, x] == largest_around(image, y, x, side)
+        y, x = y[top], x[top]
+    return y, x
+
+
+def largest_around(
+    image: NDArray[Any], y: NDArray[np.int64], x: NDArray[np.int64], size: int
+) -> NDArray[Any]:
+    """Largest values of an image in squares around pixels, as far as these lie inside.
+
+    Parameters
+    ----------
+    image : ndarray, shape (ny, nx)
+        Values, without nan.
+    y, x : ndarray of int, shape (n,)
+        Rows and columns of the pixels.
+    size : int
+        Side of the squares [pixel], odd.
+
+    Returns
+    -------
+    largest : ndarray, shape (n,)
+
+    Examples
+    --------
+    >>> largest_around(np.arange(12).reshape(3, 4), np.array([0, 2]), np.array([0, 1]), 3)
+    array([ 5, 10])
+    """
+    steps = np.arange(size) - size // 2
+    out = image[y, x]
+    for dy in steps:
+        row = np.clip(y + dy, 0, image.shape[0] - 1)
+        for dx in steps:
+            np.maximum(out, image[row, np.clip(x + dx, 0, image.shape[1] - 1)], out=out)
+    return out
 
 
 def _check_search(

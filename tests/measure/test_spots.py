@@ -6,10 +6,18 @@ import pickle
 
 import numpy as np
 import pytest
+from scipy.ndimage import maximum_filter
 
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.spot_model import Shape, integrate_gaussian
-from bfsensor.measure.spots import SpotList, Stamps, cut_stamps, find_spots
+from bfsensor.measure.spots import (
+    SpotList,
+    Stamps,
+    cut_stamps,
+    find_peaks,
+    find_spots,
+    largest_around,
+)
 
 SHAPE = Shape(1.0, 1.1)
 
@@ -157,3 +165,15 @@ def test_wrong_searches_are_refused(change, words):
 )
 def test_wrong_arrays_are_refused(make, words):
     assert words in message(make)
+
+
+@pytest.mark.parametrize("size", [3, 9])
+def test_peaks_are_those_of_a_filter_of_the_whole_image(size):
+    """Also where neighbours are equal and at the rims: scipy's filter looks at every pixel."""
+    image = np.random.default_rng(611).integers(0, 30, (90, 70)).astype(float)
+    wanted = (image > 15) & (image == maximum_filter(image, size))
+    y, x = find_peaks(image, 15.0, size)
+    assert len(y) > 50
+    np.testing.assert_array_equal(np.column_stack([y, x]), np.argwhere(wanted))
+    around = maximum_filter(image, 5)[y, x]
+    np.testing.assert_array_equal(largest_around(image, y, x, 5), around)

@@ -90,7 +90,7 @@ class BiasChannels:
         self._cross: list[FloatArray] = []
         self._rows: list[list[tuple[float, float, float]]] = []
         self._levels: list[tuple[ExposureInfo, list[tuple[float, float]]]] = []
-        self._long: list[list[FloatArray]] = []
+        self._long: list[FloatArray] = []
         self._zeros: list[tuple[int, list[tuple[float, float]]]] = []
         self._third: list[FloatArray] = []
         self._strips: list[list[FloatArray]] = []
@@ -128,7 +128,10 @@ class BiasChannels:
         self._last = []
         self._strips.append(strips)
         self._spectra.append(spectra)
-        self._long.append(long)
+        # As long as a quarter of a frame: summed, as many pairs of large frames would not fit.
+        if self._long:
+            long = [a + b for a, b in zip(self._long, long, strict=True)]
+        self._long = long
         self._rows.append(rows)
         flat -= flat.mean(1, keepdims=True)
         self._cross.append(flat @ flat.T / (self._size - (len(flat) > 1)))
@@ -279,8 +282,8 @@ class BiasChannels:
 
     def _seen(self, amp: int) -> FloatArray:
         """Covariances of the noise at all lags, those below STANDS_OUT set to zero [ADU^2]."""
-        c = np.mean([s[amp] for s in self._long], axis=0)
-        error = c[0] / np.sqrt(self._size * len(self._long))
+        c = self._long[amp] / len(self._spectra)
+        error = c[0] / np.sqrt(self._size * len(self._spectra))
         return np.where(np.abs(c) > STANDS_OUT * error, c, 0.0)
 
     def _bias_levels(self) -> Channel:

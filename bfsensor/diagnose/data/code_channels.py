@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.cosmetics import repaired_of
 from bfsensor.diagnose.data.exposure_info import Axes, Frame
+from bfsensor.measure.spots import find_peaks
 from bfsensor.typing import FloatArray
 
 PERIOD = 64
@@ -210,15 +210,16 @@ class CrosstalkChannels:
             np.nan_to_num(i - level) for i, level in zip(images, levels, strict=True)
         ]
         centres = [_spots(s, 100 * n) for s, n in zip(signals, noise, strict=True)]
+        trees = [cKDTree(c) if len(c) else None for c in centres]
         for a, aggressor in enumerate(signals):
             threshold = max(0.2 * float(np.percentile(aggressor, 99.9)), 100 * noise[a])
             rows, columns = np.nonzero(aggressor > threshold)
             for b, victim in enumerate(signals):
-                if a == b or len(rows) < 20 or len(centres[b]) < 4:
+                tree = trees[b]
+                if tree is None or a == b or len(rows) < 20 or len(centres[b]) < 4:
                     continue
                 # A spot's halo is alike on both sides: the point across the victim's own spot
                 # has the same halo and, mostly, no light in the other amplifier.
-                tree = cKDTree(centres[b])
                 distance, which = tree.query(np.column_stack([rows, columns]))
                 y, x = (2 * centres[b][which] - np.column_stack([rows, columns])).T
                 # Far from its spot that point may lie on another one of the victim.
@@ -279,5 +280,4 @@ def _without_trails(
 
 def _spots(signal: FloatArray, threshold: float) -> NDArray[np.int64]:
     """Rows and columns of the peaks of spots, shape (n, 2)."""
-    peaks = (signal == maximum_filter(signal, 9)) & (signal > threshold)
-    return np.argwhere(peaks)
+    return np.column_stack(find_peaks(signal, threshold, 9))

@@ -243,7 +243,9 @@ def without_hot_columns(image: FloatArray, noise: float) -> FloatArray:
     image : ndarray, shape (ny, nx)
         The same array where no column is hot.
     """
-    columns = np.nanmedian(image, axis=0)
+    # numpy's nanmedian takes each column in turn, twenty times slower.
+    median = np.median if np.isfinite(image).all() else np.nanmedian
+    columns = median(image, axis=0)
     excess = columns - np.nanmedian(columns)
     hot = excess > noise * (1.0 + HOT / np.sqrt(image.shape[0]))
     return image - np.where(hot, excess, 0.0) if hot.any() else image

@@ -30,7 +30,7 @@ from bfsensor.files import Cache
 from bfsensor.response.edge_response import area_matrix
 from bfsensor.typing import FloatArray
 
-Spectrum = NDArray[np.complex128]
+Spectrum = NDArray[np.complexfloating[Any, Any]]
 """Half of a two-dimensional Fourier transform, as ``scipy.fft.rfft2`` returns it."""
 
 FAINT = 0.01
@@ -38,8 +38,17 @@ FAINT = 0.01
 changes change the chi-square by less than 1e-4 per value; twice as large, by less than 4e-4."""
 
 KEPT, KEPT_PIXELS = 12, 2_000_000
-"""Largest number of cached changes by single effects, and largest sensor for which they are cached
-[pixel]. Chosen: up to 12 arrays of 16 MB; twice as large doubles memory and changes no result."""
+"""Largest number of cached changes by single effects, and largest sensor for which they are cached,
+and for which maps are predicted in double precision [pixel]. Chosen: up to 12 arrays of 16 MB; twice
+as large doubles memory and changes no result."""
+
+
+def precision_of(shape: tuple[int, int]) -> type[np.float32] | type[np.float64]:
+    """Type of arrays of a sensor: single precision on a large one, in half of the memory and time.
+
+    Rounding is then 1e-7 of a change, which itself is measured to 1e-3 of it at best.
+    """
+    return np.float32 if np.prod(shape) > KEPT_PIXELS else np.float64
 
 
 def shot_at(
@@ -109,31 +118,40 @@ class MapChange:
         for (fold, name), shares in self.measured.maps.items():
             if fold != channel.fold:
                 continue
-            delta = self._spectrum((fold, name), shares)
-            if delta is None or not np.abs(delta).max() > 0:
-                continue
+            delta, change = self._changes((fold, name), shares)
             rows, axes = self._rows.get((channel, name), partial(_rows, channel, name))
-            if len(rows):
+            if not len(rows):
+                continue
+            if delta is None:
+                if change is not None and change.any():
+                    out[rows] = reduce_image(change, axes)
+                continue
+            if change is not None:
+                delta = delta + rfft2(change)
+            if delta.any():
                 out[rows] = reduce_spectrum(delta, self.layout.shape, axes)
         return out
 
-    def _spectrum(
+    def _changes(
         self, name: tuple[str, str], shares: Sequence[MapShare]
-    ) -> Spectrum | None:
-        """Fourier transform of a map's relative change; None without a change."""
+    ) -> tuple[Spectrum | None, NDArray[np.floating[Any]] | None]:
+        """Relative change of a map: the Fourier transform of a part, and the pixels of the other.
+
+        Areas and light are relaxed or cached by their transforms; patterns need none.
+        """
         total: Spectrum | None = None
+        pixels: NDArray[np.floating[Any]] | None = None
         for key, group in self._groups(shares).items():
-            first = group[0]
-            found = [
-                None if one is None else one * factor((*name, *key), group)
-                for one, factor in (
-                    (self._areas(key, first), self._left), (self._light(key, first), self._weights),
-                )
-            ]  # fmt: skip
-            for one in (*found, self._patterns(group)):
-                if one is not None:
-                    total = one if total is None else total + one
-        return total
+            if (areas := self._areas(key, group[0])) is not None:
+                areas = areas * self._left((*name, *key), group)
+                total = areas if total is None else total + areas
+            weight = _weight(group)
+            if weight and (light := self._light(key, group[0])) is not None:
+                light = light * weight
+                total = light if total is None else total + light
+            if (pattern := self._patterns(group)) is not None:
+                pixels = pattern if pixels is None else pixels + pattern
+        return total, pixels
 
     def _groups(self, shares: Sequence[MapShare]) -> dict[tuple, list[MapShare]]:
         """Flats of a map in groups that effects change by the same amount."""
@@ -144,10 +162,6 @@ class MapChange:
                 share
             )
         return out
-
-    def _weights(self, key: tuple, group: Sequence[MapShare]) -> float:
-        del key
-        return float(sum(s.weight for s in group))
 
     def _left(self, key: tuple, group: Sequence[MapShare]) -> FloatArray:
         """Sum of the flats' weights times the remaining fraction of a pattern, by spatial frequency."""
@@ -169,7 +183,8 @@ class MapChange:
         np.add.at(wide, (rows[:, None], columns[None]), a)
         x = rfft2(wide).real * level
         small = np.abs(x) < 1e-9
-        return np.where(small, 1 + x / 2, np.expm1(x) / np.where(small, 1.0, x))
+        left = np.where(small, 1 + x / 2, np.expm1(x) / np.where(small, 1.0, x))
+        return left.astype(precision_of(self.layout.shape), copy=False)
 
     def _areas(self, key: tuple, share: MapShare) -> Spectrum | None:
         """Transform of the relative change of the pixels' areas without charge."""
@@ -188,16 +203,23 @@ class MapChange:
 
         return self._sum("light", key, share, change)
 
-    def _patterns(self, group: Sequence[MapShare]) -> Spectrum | None:
-        """Transform of changes after collection, which depend on each flat's level."""
+    def _patterns(self, group: Sequence[MapShare]) -> NDArray[np.floating[Any]] | None:
+        """Changes after collection, which depend on each flat's level."""
         total: FloatArray | None = None
-        for share in group:
-            shot = self._shot(share)
-            for effect in self.effects:
-                one = effect.pattern(shot, self.layout)
-                if one is not None:
-                    total = share.weight * one + (0.0 if total is None else total)
-        return None if total is None else self._transform(total)
+        for effect in self.effects:
+            # What is equal in all flats is made once.
+            weights = (
+                [(_weight(group), group[0])] if effect.standing
+                else [(s.weight, s) for s in group]
+            )  # fmt: skip
+            for weight, share in weights:
+                one = effect.pattern(self._shot(share), self.layout) if weight else None
+                if one is None:
+                    continue
+                if total is None:
+                    total = np.zeros(self.layout.shape)
+                total += weight * one
+        return None if total is None else self._normalised(total)
 
     def _shot(self, share: MapShare) -> Shot:
         shot = shot_at(self.layout, share.condition, "flat", share.seconds)
@@ -237,13 +259,26 @@ class MapChange:
 
     def _transform(self, change: FloatArray) -> Spectrum:
         """Fourier transform of a relative change, each amplifier divided by its mean."""
-        total = 1.0 + np.broadcast_to(change, self.layout.shape)
+        return np.asarray(rfft2(self._normalised(change)))
+
+    def _normalised(self, change: FloatArray) -> NDArray[np.floating[Any]]:
+        """Relative change with each amplifier divided by its mean."""
+        shape = self.layout.shape
+        total = np.array(np.broadcast_to(change, shape), precision_of(shape))
         for segment in self.layout.segments:
-            part = np.s_[segment.y : segment.y + segment.rows,
+            part = total[segment.y : segment.y + segment.rows,
                          segment.x : segment.x + segment.columns]  # fmt: skip
-            total[part] /= total[part].mean()
-        total -= 1.0
-        return np.asarray(rfft2(total))
+            mean = float(part.mean(dtype=np.float64))
+            part -= mean
+            part /= 1.0 + mean
+        return total
+
+
+def _weight(group: Sequence[MapShare]) -> float:
+    """Sum of the flats' weights; 0 in a ratio of maps, where it is 0 but for rounding."""
+    weights = [s.weight for s in group]
+    total = float(sum(weights))
+    return total if abs(total) > 1e-12 * sum(map(abs, weights)) else 0.0
 
 
 def _rows(channel: Channel, name: str) -> tuple[NDArray[np.int64], Axes]:
@@ -292,7 +327,8 @@ def block_means(change: FloatArray) -> FloatArray:
     ny, nx = change.shape
     side = block_side((ny, nx))
     whole = change[: ny // side * side, : nx // side * side]
-    return np.asarray(whole.reshape(ny // side, side, nx // side, side).mean((1, 3)))
+    boxes = whole.reshape(ny // side, side, nx // side, side)
+    return np.asarray(boxes.mean((1, 3), dtype=np.float64))
 
 
 def block_places(
@@ -324,8 +360,17 @@ def reduce_map(change: FloatArray, axes: Axes) -> FloatArray:
     axes : mapping
         Axes 'what', 'x', 'y' and 'k' of the values.
     """
-    ny, nx = change.shape
-    return reduce_spectrum(rfft2(change), (ny, nx), parts_of(axes))
+    return reduce_image(change, parts_of(axes))
+
+
+def reduce_image(change: NDArray[np.floating[Any]], axes: Axes) -> FloatArray:
+    """Reduce a relative change of each pixel, as :func:`reduce_spectrum` does its transform."""
+    out = np.zeros(len(axes["x"]))
+    column, row = axes["column"], axes["row"]
+    out[column] = change.mean(0, dtype=np.float64)[axes["x"][column].astype(int)]
+    out[row] = change.mean(1, dtype=np.float64)[axes["y"][row].astype(int)]
+    _reduce_rest(out, change, None, axes)
+    return out
 
 
 def reduce_spectrum(delta: Spectrum, shape: tuple[int, int], axes: Axes) -> FloatArray:
@@ -341,29 +386,44 @@ def reduce_spectrum(delta: Spectrum, shape: tuple[int, int], axes: Axes) -> Floa
         From :func:`parts_of`; 'faint': mean square of a change up to which its texture is 0.
     """
     ny, nx = shape
-    column, row, block, ring, texture, chess = (axes[w] for w in PARTS)
     out = np.zeros(len(axes["x"]))
+    column, row = axes["column"], axes["row"]
     out[column] = (irfft(delta[0], n=nx) / ny)[axes["x"][column].astype(int)]
     out[row] = (ifft(delta[:, 0]).real / nx)[axes["y"][row].astype(int)]
-    if not sum(map(len, (block, ring, texture, chess))):
-        return out
-    change = irfft2(delta, s=shape)
+    if any(len(axes[w]) for w in PARTS[2:]):
+        _reduce_rest(out, irfft2(delta, s=shape), delta, axes)
+    return out
+
+
+def _reduce_rest(
+    out: FloatArray,
+    change: NDArray[np.floating[Any]],
+    delta: Spectrum | None,
+    axes: Axes,
+) -> None:
+    """Enter blocks, rings, texture and chess of a change, whose transform may be known, in ``out``."""
+    (ny, nx), shape = change.shape, (change.shape[0], change.shape[1])
+    block, ring, texture, chess = (axes[w] for w in PARTS[2:])
     if len(block):
         out[block] = block_means(change)[block_places(axes, block, shape)]
     if len(chess):
         out[chess] = map_chess(change)[0]
-    if len(ring) or len(texture):
-        # Rings and texture are measured on maps whose smooth shape is removed.
-        q_y, q_x = (smooth_shapes(n) for n in shape)
+    if not len(ring) and not len(texture):
+        return
+    # Rings and texture are measured on maps whose smooth shape is removed.
+    q_y, q_x = (smooth_shapes(n).astype(change.dtype, copy=False) for n in shape)
+    smooth = q_y.T @ change @ q_x
+    if delta is None:
+        rough = np.asarray(rfft2(change - q_y @ smooth @ q_x.T))
+    else:
         (f_y, _), (_, f_x) = (_smooth_spectra(n) for n in shape)
-        smooth = q_y.T @ change @ q_x
+        f_y, f_x = (f.astype(delta.dtype, copy=False) for f in (f_y, f_x))
         rough = delta - f_y @ smooth @ f_x.T
-        power = spectrum_rings(rough, shape)
-        out[ring] = 1e6 * power[(axes["k"][ring] * 2 * RINGS).astype(int)]
-        square = 2 * float((rough.real**2).sum() + (rough.imag**2).sum()) / (ny * nx) ** 2
-        if len(texture) and square > axes.get("faint", 0.0):
-            out[texture] = map_texture(change - q_y @ smooth @ q_x.T)[0]
-    return out
+    power = spectrum_rings(rough, shape)
+    out[ring] = 1e6 * power[(axes["k"][ring] * 2 * RINGS).astype(int)]
+    square = 2 * float((rough.real**2).sum() + (rough.imag**2).sum()) / (ny * nx) ** 2
+    if len(texture) and square > axes.get("faint", 0.0):
+        out[texture] = map_texture(change - q_y @ smooth @ q_x.T)[0]
 
 
 @lru_cache(maxsize=8)
