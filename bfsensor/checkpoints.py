@@ -23,8 +23,10 @@ ARRAYS = frozenset({
     ("numpy.core.multiarray", "scalar"), ("scipy.sparse._csr", "csr_array"),
     ("pathlib", "PosixPath"), ("pathlib", "WindowsPath"), ("builtins", "set"),
     ("builtins", "frozenset"), ("builtins", "complex"), ("builtins", "slice"),
+    ("functools", "partial"),
 })  # fmt: skip
-"""Names outside this package that a stage's file may hold: what arrays and paths are made of."""
+"""Names outside this package that a stage's file may hold: what arrays and paths are made of, and
+partial functions, which then hold functions of this package alone."""
 
 
 class Checkpoints:

@@ -31,6 +31,8 @@ class Pursuit:
         Probability that noise alone gives the best of all columns its gain or more.
     accuracy : float
         Relative error of the columns: what is left of a taken one within it is no further column.
+    squares : ndarray, shape (k,), optional
+        Squares of the columns, for columns in single precision.
     simple : ndarray of bool, shape (k,), optional
         Columns that are preferred to others that explain no more than chance does.
     tried : int
@@ -57,12 +59,13 @@ class Pursuit:
         *,
         probability: float,
         accuracy: float,
+        squares: FloatArray | None = None,
         simple: NDArray[np.bool_] | None = None,
         tried: int = 1,
     ) -> None:
         self.x, self.u, self.simple, self.tried = x, u, simple, tried
         self.probability, self.accuracy = probability, accuracy
-        raw = (x**2).sum(0)
+        raw = (x**2).sum(0) if squares is None else squares
         free = raw - (u**2).sum(0)
         self.free = np.where(free > SPANNED * raw, free, 0.0)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -81,12 +82,7 @@ def process_choice(scene: Scene) -> Choice | None:
     largest = np.abs(grid).max()
     told = [places[n] for n in farthest if np.abs(grid[n]).max() > 0.3 * largest]
 
-    def column(channel: Channel) -> FloatArray | None:
-        if channel.word != "flat_cov":
-            return None
-        parts = [m * t.column(channel) for m, t in zip(mean, terms, strict=True) if m]
-        return np.asarray(np.sum(parts, axis=0))
-
+    column = partial(_summed, mean, terms)
     where = {"lags": told, "levels": np.exp(knots).tolist(), "values": grid.tolist()}
     term = Term("smooth change of covariances", where, column)
     whole = Family("smooth covariances over lag and level", (term,), ("flat_cov",))
@@ -98,6 +94,14 @@ def process_choice(scene: Scene) -> Choice | None:
     )
 
 
+def _summed(mean: FloatArray, terms: Sequence[Term], channel: Channel) -> FloatArray | None:
+    """Change by all terms with their coefficients."""
+    if channel.word != "flat_cov":
+        return None
+    parts = [m * t.column(channel) for m, t in zip(mean, terms, strict=True) if m]
+    return np.asarray(np.sum(parts, axis=0))
+
+
 def _level(scene: Scene, channel: Channel) -> FloatArray:
     x = channel.axes
     return np.asarray(scene.gains[x["amp"].astype(int)] * x["level"])
@@ -106,19 +110,20 @@ def _level(scene: Scene, channel: Channel) -> FloatArray:
 def _terms(
     scene: Scene, places: list[tuple[int, int]], knots: FloatArray
 ) -> Iterator[Term]:
-    def column(lag: tuple[int, int], k: int) -> Callable[[Channel], FloatArray | None]:
-        def change(channel: Channel) -> FloatArray | None:
-            if channel.word != "flat_cov":
-                return None
-            x = channel.axes
-            level = _level(scene, channel)
-            hat = np.interp(np.log(level), knots, np.eye(len(knots))[k])
-            gain = scene.gains[x["amp"].astype(int)]
-            here = (x["i"] == lag[0]) & (x["j"] == lag[1])
-            return np.where(here, UNIT * level * hat / gain**2, 0.0)
-
-        return change
-
     for lag in places:
         for k in range(len(knots)):
-            yield Term(f"{lag} {k}", {"lags": [lag]}, column(lag, k))
+            yield Term(f"{lag} {k}", {"lags": [lag]}, partial(_hat, scene, knots, lag, k))
+
+
+def _hat(
+    scene: Scene, knots: FloatArray, lag: tuple[int, int], k: int, channel: Channel
+) -> FloatArray | None:
+    """Change at one lag that falls linearly from one knot of the level to its neighbours."""
+    if channel.word != "flat_cov":
+        return None
+    x = channel.axes
+    level = _level(scene, channel)
+    hat = np.interp(np.log(level), knots, np.eye(len(knots))[k])
+    gain = scene.gains[x["amp"].astype(int)]
+    here = (x["i"] == lag[0]) & (x["j"] == lag[1])
+    return np.where(here, UNIT * level * hat / gain**2, 0.0)

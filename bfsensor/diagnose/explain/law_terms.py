@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,11 +134,13 @@ def _product(
     change: OwnChange, function: Function, word: str
 ) -> Callable[[Channel], FloatArray | None]:
     """Column of a term: None in channels of other names."""
+    return partial(_times, change, function, word)
 
-    def column(channel: Channel) -> FloatArray | None:
-        return change(channel) * function(channel) if channel.word == word else None
 
-    return column
+def _times(
+    change: OwnChange, function: Function, word: str, channel: Channel
+) -> FloatArray | None:
+    return change(channel) * function(channel) if channel.word == word else None
 
 
 def _functions(channels: Sequence[Channel]) -> Iterator[tuple[str, Function, bool]]:
@@ -185,17 +188,24 @@ def _of(channel: Channel, kind: str | None) -> NDArray[np.bool_]:
 
 
 def _inside(kind: str | None) -> Function:
-    return lambda channel: _of(channel, kind).astype(float)
+    return partial(_is_of, kind)
+
+
+def _is_of(kind: str | None, channel: Channel) -> FloatArray:
+    """1 for values of a kind."""
+    return _of(channel, kind).astype(float)
 
 
 def _at(kind: str | None, axis: str, value: object) -> Function:
-    def function(channel: Channel) -> FloatArray:
-        # A planned recording may lack the coordinate: nothing is known of the law there.
-        if axis not in channel.axes:
-            return np.zeros(len(channel))
-        return (_of(channel, kind) & (channel.axes[axis] == value)).astype(float)
+    return partial(_equals, kind, axis, value)
 
-    return function
+
+def _equals(kind: str | None, axis: str, value: object, channel: Channel) -> FloatArray:
+    """1 for values of a kind at one value of a coordinate."""
+    # A planned recording may lack the coordinate: nothing is known of the law there.
+    if axis not in channel.axes:
+        return np.zeros(len(channel))
+    return (_of(channel, kind) & (channel.axes[axis] == value)).astype(float)
 
 
 def _smooth(kind: str | None, axis: str, values: NDArray, degree: int) -> Function:
@@ -204,14 +214,23 @@ def _smooth(kind: str | None, axis: str, values: NDArray, degree: int) -> Functi
     low, high = (float(v) for v in (values.min(), values.max()))
     if logarithm:
         low, high = np.log(low), np.log(high)
+    return partial(_polynomial, kind, axis, (low, high), logarithm, degree)
+
+
+def _polynomial(
+    kind: str | None,
+    axis: str,
+    ends: tuple[float, float],
+    logarithm: bool,
+    degree: int,
+    channel: Channel,
+) -> FloatArray:
+    """Legendre polynomial between two ends, for values of a kind."""
+    if axis not in channel.axes:
+        return np.zeros(len(channel))
+    low, high = ends
+    x = channel.axes[axis].astype(float)
+    x = np.log(np.maximum(x, 1e-300)) if logarithm else x
+    u = np.clip(2 * (x - low) / (high - low) - 1, -1, 1)
     shape = np.polynomial.legendre.Legendre.basis(degree)
-
-    def function(channel: Channel) -> FloatArray:
-        if axis not in channel.axes:
-            return np.zeros(len(channel))
-        x = channel.axes[axis].astype(float)
-        x = np.log(np.maximum(x, 1e-300)) if logarithm else x
-        u = np.clip(2 * (x - low) / (high - low) - 1, -1, 1)
-        return np.where(_of(channel, kind), shape(u), 0.0)
-
-    return function
+    return np.where(_of(channel, kind), shape(u), 0.0)

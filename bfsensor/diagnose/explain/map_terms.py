@@ -16,6 +16,7 @@ from bfsensor.diagnose.explain.pursuit import Dictionary
 from bfsensor.diagnose.explain.terms import SCALE, Family, Scene, Term
 from bfsensor.diagnose.model.map_predictions import reduce_map
 from bfsensor.diagnose.model.map_shapes import Places
+from bfsensor.effects.effect import Layout
 from bfsensor.typing import FloatArray
 
 POWERS = (0, 1)
@@ -101,7 +102,7 @@ def map_families(scene: Scene) -> list[Family]:
         places: list[Term] = []
         for name, where, along, what in _shapes(scene):
             column = partial(_separable, scene, along, shares)
-            image = partial(np.outer, along[1], along[0])
+            image = partial(_image, along)
             more = (_squared(name + label, image, shares),) if what == "box" else ()
             places.append(Term(name + label, {**where, **told}, column, more=more))
         out.append(Family("pattern of position", tuple(places), ("flat_map",)))
@@ -156,21 +157,26 @@ def _squared(
     name: str, image: Callable[[], FloatArray], shares: Mapping[tuple[str, str], float]
 ) -> Term:
     """Term of rings and texture, which are quadratic in a pattern."""
+    return Term(f"square of {name}", {"square": True}, partial(_square, image, shares))
 
-    def column(channel: Channel) -> FloatArray | None:
-        if channel.word != "flat_map":
-            return None
-        out = np.zeros(len(channel))
-        square = np.isin(channel.axes["what"], ("ring", "texture"))
-        for label in dict.fromkeys(channel.axes["map"]):
-            rows = np.nonzero(square & (channel.axes["map"] == label))[0]
-            share = shares.get((channel.fold, str(label)), 0.0)
-            if share and len(rows):
-                axes = {k: v[rows] for k, v in channel.axes.items()}
-                out[rows] = share**2 * reduce_map(image(), axes)
-        return out
 
-    return Term(f"square of {name}", {"square": True}, column)
+def _square(
+    image: Callable[[], FloatArray],
+    shares: Mapping[tuple[str, str], float],
+    channel: Channel,
+) -> FloatArray | None:
+    """Rings and texture of a pattern given as an image."""
+    if channel.word != "flat_map":
+        return None
+    out = np.zeros(len(channel))
+    square = np.isin(channel.axes["what"], ("ring", "texture"))
+    for label in dict.fromkeys(channel.axes["map"]):
+        rows = np.nonzero(square & (channel.axes["map"] == label))[0]
+        share = shares.get((channel.fold, str(label)), 0.0)
+        if share and len(rows):
+            axes = {k: v[rows] for k, v in channel.axes.items()}
+            out[rows] = share**2 * reduce_map(image(), axes)
+    return out
 
 
 def _parities(
@@ -178,71 +184,78 @@ def _parities(
 ) -> Iterator[tuple[str, dict[str, Any], Callable[[], FloatArray]]]:
     """Odd and even columns, rows and both, on the sensor; columns as they are read out."""
     layout = scene.model.predictor.layout
-
-    def image(by_x: int, by_y: int, read: bool) -> FloatArray:
-        y, x = np.indices(layout.shape)
-        if read:
-            for s in layout.segments:
-                own = np.s_[s.y : s.y + s.rows, s.x : s.x + s.columns]
-                column, row = x[own] - s.x, y[own] - s.y
-                x[own] = s.columns - 1 - column if s.flip_x else column
-                y[own] = s.rows - 1 - row if s.flip_y else row
-        return np.asarray(0.5 - (by_x * x + by_y * y) % 2)
-
     mirrored = any(s.flip_x or s.flip_y for s in layout.segments)
     for by_x, by_y, word in (
         (1, 0, "odd and even columns"), (0, 1, "odd and even rows"), (1, 1, "checkerboard")
     ):  # fmt: skip
-        yield word, {"parity": word}, partial(image, by_x, by_y, False)
+        yield word, {"parity": word}, partial(_parity, layout, by_x, by_y, False)
         if mirrored:
             told = f"{word} in readout order"
-            yield told, {"parity": told}, partial(image, by_x, by_y, True)
+            yield told, {"parity": told}, partial(_parity, layout, by_x, by_y, True)
 
 
-def _shapes(
-    scene: Scene,
-) -> Iterator[tuple[str, dict[str, Any], tuple[FloatArray, FloatArray], str]]:
+def _parity(layout: Layout, by_x: int, by_y: int, read: bool) -> FloatArray:
+    """Half of even less odd places, by column and row of the sensor or as they are read."""
+    y, x = np.indices(layout.shape)
+    if read:
+        for s in layout.segments:
+            own = np.s_[s.y : s.y + s.rows, s.x : s.x + s.columns]
+            column, row = x[own] - s.x, y[own] - s.y
+            x[own] = s.columns - 1 - column if s.flip_x else column
+            y[own] = s.rows - 1 - row if s.flip_y else row
+    return np.asarray(0.5 - (by_x * x + by_y * y) % 2)
+
+
+Along = Callable[[], tuple[FloatArray, FloatArray]]
+"""Makes the factors of a separable shape along x, shape (nx,), and along y, shape (ny,): of thousands of
+shapes of a large sensor, only the one at hand is in memory."""
+
+Line = Callable[[int], FloatArray]
+"""Makes a function of n places, shape (n,)."""
+
+
+def _image(along: Along) -> FloatArray:
+    """Image of a separable shape, shape (ny, nx)."""
+    x, y = along()
+    return np.outer(y, x)
+
+
+def _shapes(scene: Scene) -> Iterator[tuple[str, dict[str, Any], Along, str]]:
     """Separable shapes: name, place, factors along x and y, and kind ('column', 'row' or 'box')."""
     ny, nx = scene.model.predictor.layout.shape
     for what, n in (("column", nx), ("row", ny)):
         axis = AXES[what]
-        place = np.arange(n)
 
-        def both(v: FloatArray, what: str = what) -> tuple[FloatArray, FloatArray]:
-            return (v, np.ones(ny)) if what == "column" else (np.ones(nx), v)
+        def both(make: Line, what: str = what) -> Along:
+            return partial(_across if what == "column" else _down, make, nx, ny)
 
         for one in range(n):
-            yield f"{what} {one}", {axis: (one, one + 1)}, both(1.0 * (place == one)), what
+            yield (
+                f"{what} {one}",
+                {axis: (one, one + 1)},
+                both(partial(_between, one, one + 1)),
+                what,
+            )
         for octave in range(1, OCTAVES + 1):
             width = n / 2**octave
             for k in range(2 ** (octave + 1) - 1):
                 low, high = int(0.5 * k * width), int(np.ceil((0.5 * k + 1) * width))
-                strip = ((place >= low) & (place < high)).astype(np.float64)
-                yield f"{what}s {low} to {high}", {axis: (low, high)}, both(strip), what
+                strip = both(partial(_between, low, high))
+                yield f"{what}s {low} to {high}", {axis: (low, high)}, strip, what
         for length in (2.0, 6.0, 15.0):
-            for side, distance in (("low", place), ("high", n - 1 - place)):
+            for side in ("low", "high"):
                 where = {
                     axis: (0, int(3 * length))
                     if side == "low"
                     else (n - int(3 * length), n)
                 }
                 name = f"{what}s at the {side} end, exp(-d/{length:g})"
-                yield (
-                    name,
-                    where,
-                    both(np.asarray(np.exp(-distance / length), np.float64)),
-                    what,
-                )
+                yield name, where, both(partial(_falling, length, side)), what
         for cycles in range(3, n // 4):
-            phase = 2 * np.pi * cycles * (place + 0.5) / n
-            for part, word in ((np.cos, "cosine"), (np.sin, "sine")):
+            for word in ("cosine", "sine"):
                 told = {"period": n / cycles, "along": axis}
-                yield (
-                    f"{word} along {axis} of {n / cycles:.3g} pixels",
-                    told,
-                    both(part(phase)),
-                    what,
-                )
+                name = f"{word} along {axis} of {n / cycles:.3g} pixels"
+                yield name, told, both(partial(_wave, word, cycles)), what
     for octave in range(1, 4):
         wide, tall = nx / 2**octave, ny / 2**octave
         for a in range(2**octave):
@@ -251,9 +264,44 @@ def _shapes(
                     (int(a * wide), int((a + 1) * wide)),
                     (int(b * tall), int((b + 1) * tall)),
                 )
-                v, w = np.zeros(nx), np.zeros(ny)
-                v[slice(*x)], w[slice(*y)] = 1.0, 1.0
-                yield f"box {x}, {y}", {"x": x, "y": y}, (v, w), "box"
+                box = partial(_box, x, y, nx, ny)
+                yield f"box {x}, {y}", {"x": x, "y": y}, box, "box"
+
+
+def _across(make: Line, nx: int, ny: int) -> tuple[FloatArray, FloatArray]:
+    """A function of x, the same in all rows."""
+    return make(nx), np.ones(ny)
+
+
+def _down(make: Line, nx: int, ny: int) -> tuple[FloatArray, FloatArray]:
+    """A function of y, the same in all columns."""
+    return np.ones(nx), make(ny)
+
+
+def _between(low: int, high: int, n: int) -> FloatArray:
+    """1 from ``low`` to ``high``, 0 elsewhere; shape (n,)."""
+    out = np.zeros(n)
+    out[low:high] = 1.0
+    return out
+
+
+def _falling(length: float, side: str, n: int) -> FloatArray:
+    """Exponential of the distance from the first or the last of n places."""
+    place = np.arange(n)
+    return np.asarray(np.exp(-(place if side == "low" else n - 1 - place) / length))
+
+
+def _wave(word: str, cycles: int, n: int) -> FloatArray:
+    """Sine or cosine with some cycles over n places."""
+    phase = 2 * np.pi * cycles * (np.arange(n) + 0.5) / n
+    return np.asarray(np.cos(phase) if word == "cosine" else np.sin(phase))
+
+
+def _box(
+    x: tuple[int, int], y: tuple[int, int], nx: int, ny: int
+) -> tuple[FloatArray, FloatArray]:
+    """1 inside of some columns and rows, 0 elsewhere."""
+    return _between(*x, nx), _between(*y, ny)
 
 
 def _places(
@@ -270,7 +318,7 @@ def _places(
 
 def _separable(
     scene: Scene,
-    along: tuple[FloatArray, FloatArray],
+    along: Along,
     shares: Mapping[tuple[str, str], float],
     channel: Channel,
 ) -> FloatArray | None:
@@ -278,7 +326,7 @@ def _separable(
     if channel.word != "flat_map":
         return None
     places, names, maps = _places(scene, channel)
-    out = places.product(*along, len(channel))
+    out = places.product(*along(), len(channel))
     factor = np.array([shares.get((channel.fold, str(n)), 0.0) for n in names])
     return np.asarray(out * factor[maps])
 

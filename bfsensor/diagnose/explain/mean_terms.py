@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -66,48 +67,56 @@ def _relative(
     spots: bool = True,
 ) -> Term:
     """Term that multiplies the means of flats, and if ``spots`` the fluxes of spots."""
+    return Term(name, where, partial(_multiplied, change, spots))
 
-    def column(channel: Channel) -> FloatArray | None:
-        x = channel.axes
-        if channel.word == "flat_mean":
-            return np.asarray(x["level"] * change(channel))
-        if channel.word == "spot" and spots:
-            return np.where(x["what"] == "flux", x["flux"] * change(channel), 0.0)
-        return None
 
-    return Term(name, where, column)
+def _multiplied(
+    change: Callable[[Channel], FloatArray], spots: bool, channel: Channel
+) -> FloatArray | None:
+    """Levels of flats, and fluxes of spots, times their relative change."""
+    x = channel.axes
+    if channel.word == "flat_mean":
+        return np.asarray(x["level"] * change(channel))
+    if channel.word == "spot" and spots:
+        return np.where(x["what"] == "flux", x["flux"] * change(channel), 0.0)
+    return None
 
 
 def _by_level(scene: Scene, flats: list[Channel]) -> Iterator[Term]:
     """Terms by power of the level and by single level, for all amplifiers and for each."""
     times = np.unique(np.concatenate([step_of(c.axes) for c in flats]))
 
-    def own(channel: Channel, amp: int | None) -> FloatArray:
-        return np.where(amp is None or channel.axes["amp"] == amp, 1.0, 0.0)
-
-    def power(p: int, amp: int | None) -> Callable[[Channel], FloatArray]:
-        def change(c: Channel) -> FloatArray:
-            level = scene.gains[c.axes["amp"].astype(int)] * c.axes["level"]
-            return np.asarray(own(c, amp) * (level / SCALE) ** p)
-
-        return change
-
-    def single(time: float, amp: int | None) -> Callable[[Channel], FloatArray]:
-        return lambda c: own(c, amp) * (step_of(c.axes) == time)
-
     for amp, label in _amplifiers(scene):
         for p in LEVEL_POWERS:
             yield _relative(
-                f"mean x S^{p}{label}", {"power": p, "amp": amp}, power(p, amp), spots=False
+                f"mean x S^{p}{label}",
+                {"power": p, "amp": amp},
+                partial(_power, scene, p, amp),
+                spots=False,
             )
         for time in times if len(times) > 3 else ():
             level = np.concatenate(
                 [c.axes["level"][step_of(c.axes) == time] for c in flats]
             )
             told = {"level": float(level.mean() * scene.gains.mean()), "amp": amp}
-            yield _relative(
-                f"mean at {time:g} s{label}", told, single(float(time), amp), spots=False
-            )
+            change = partial(_at_step, float(time), amp)
+            yield _relative(f"mean at {time:g} s{label}", told, change, spots=False)
+
+
+def _own(channel: Channel, amp: int | None) -> FloatArray:
+    """1 for values of an amplifier, or of all (None)."""
+    return np.where(amp is None or channel.axes["amp"] == amp, 1.0, 0.0)
+
+
+def _power(scene: Scene, p: int, amp: int | None, channel: Channel) -> FloatArray:
+    """Power of the level in an amplifier."""
+    level = scene.gains[channel.axes["amp"].astype(int)] * channel.axes["level"]
+    return np.asarray(_own(channel, amp) * (level / SCALE) ** p)
+
+
+def _at_step(time: float, amp: int | None, channel: Channel) -> FloatArray:
+    """1 at one level of an amplifier's flats."""
+    return np.asarray(_own(channel, amp) * (step_of(channel.axes) == time))
 
 
 def _amplifiers(scene: Scene) -> list[tuple[int | None, str]]:
@@ -123,19 +132,11 @@ def _in_time(flats: list[Channel], hours: dict[int, float], count: int) -> Itera
     first, last = hours[int(taken[0])], hours[int(taken[-1])]
     span = max(last - first, 1e-9)
 
-    def at(channel: Channel) -> FloatArray:
-        # Planned exposures have no time: they are put at the middle of the campaign.
-        there = [hours.get(int(n), first + span / 2) for n in channel.axes["exposure"]]
-        return np.array(there) - first
-
-    def curve(p: int) -> Callable[[Channel], FloatArray]:
-        return lambda c: np.polynomial.legendre.Legendre.basis(p)(2 * at(c) / span - 1)
-
-    def step(number: int) -> Callable[[Channel], FloatArray]:
-        return lambda c: np.where(c.axes["exposure"] >= number, 1.0, 0.0)
-
+    at = partial(_since, hours, first, span)
     for p in range(1, CURVES + 1):
-        yield _relative(f"mean, order {p} in time", {"order": p}, curve(p))
+        yield _relative(
+            f"mean, order {p} in time", {"order": p}, partial(_curve, at, span, p)
+        )
     most = min(CYCLES, len(taken) // 6)
     for cycles in np.arange(1, most + CYCLE_STEP, CYCLE_STEP):
         for eighth in EIGHTHS:
@@ -144,19 +145,40 @@ def _in_time(flats: list[Channel], hours: dict[int, float], count: int) -> Itera
         yield _relative(
             f"mean from exposure {int(number)}",
             {"exposure": int(number)},
-            step(int(number)),
+            partial(_from_exposure, int(number)),
         )
+
+
+def _since(
+    hours: Mapping[int, float], first: float, span: float, channel: Channel
+) -> FloatArray:
+    """Hours since the first flat."""
+    # Planned exposures have no time: they are put at the middle of the campaign.
+    there = [hours.get(int(n), first + span / 2) for n in channel.axes["exposure"]]
+    return np.array(there) - first
+
+
+def _curve(at: Times, span: float, p: int, channel: Channel) -> FloatArray:
+    """Legendre polynomial of the time over the campaign."""
+    shape = np.polynomial.legendre.Legendre.basis(p)
+    return np.asarray(shape(2 * at(channel) / span - 1))
+
+
+def _from_exposure(number: int, channel: Channel) -> FloatArray:
+    """1 from an exposure on."""
+    return np.where(channel.axes["exposure"] >= number, 1.0, 0.0)
 
 
 def _wave(at: Times, span: float, period: float, phase: float) -> Term:
     """Cosine of the time since the first flat, with a period [h] and a phase [rad]."""
-
-    def change(c: Channel) -> FloatArray:
-        return np.asarray(np.cos(2 * np.pi * at(c) / period - phase))
-
     told = {"period": period, "phase": phase, "wave": (at, span)}
     late = f", {np.degrees(phase) % 360:.0f} degrees late" if phase else ""
+    change = partial(_cosine, at, period, phase)
     return _relative(f"mean, wave of {period:.3g} h{late}", told, change)
+
+
+def _cosine(at: Times, period: float, phase: float, channel: Channel) -> FloatArray:
+    return np.asarray(np.cos(2 * np.pi * at(channel) / period - phase))
 
 
 def refine_wave(choice: Choice, scene: Scene) -> Choice:
@@ -203,17 +225,26 @@ def _after_exposure(scene: Scene) -> Iterator[Term]:
         known[shot.number] = last is None or last.number == shot.number - 1
         last = shot
 
-    def power(p: int) -> Callable[[Channel], FloatArray]:
-        def change(c: Channel) -> FloatArray:
-            numbers = [int(n) for n in c.axes["exposure"]]
-            return np.array([before[n] ** p if known.get(n) else 0.0 for n in numbers])
-
-        return change
-
-    def missing(c: Channel) -> FloatArray:
-        return np.array([0.0 if known.get(int(n)) else 1.0 for n in c.axes["exposure"]])
-
     for p in (1, 2):
-        yield _relative(f"mean x S^{p} of the exposure before", {"power": p}, power(p))
+        yield _relative(
+            f"mean x S^{p} of the exposure before",
+            {"power": p},
+            partial(_before, before, known, p),
+        )
     if not all(known.values()):
-        yield _relative("mean after exposures not given", {"missing": True}, missing)
+        yield _relative(
+            "mean after exposures not given", {"missing": True}, partial(_missing, known)
+        )
+
+
+def _before(
+    before: Mapping[int, float], known: Mapping[int, bool], p: int, channel: Channel
+) -> FloatArray:
+    """Power of the level of the exposure before, 0 where that is not known."""
+    numbers = [int(n) for n in channel.axes["exposure"]]
+    return np.array([before[n] ** p if known.get(n) else 0.0 for n in numbers])
+
+
+def _missing(known: Mapping[int, bool], channel: Channel) -> FloatArray:
+    """1 where the exposure before is not given."""
+    return np.array([0.0 if known.get(int(n)) else 1.0 for n in channel.axes["exposure"]])

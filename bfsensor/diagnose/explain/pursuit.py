@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.detect.locate import ALARM
 from bfsensor.diagnose.detect.model_error import ACCURACY
 from bfsensor.diagnose.explain.terms import Family, Term
@@ -22,6 +24,15 @@ VISIBLE = 0.05
 """Least part of the first template's square in the select fold for that fold to decide how many terms
 are kept. Chosen, to be derived: below it noise would decide; twice as large, more choices go
 unchecked."""
+
+LARGE = 50_000_000
+"""Number of values (of all terms) above which a dictionary holds them in single precision, half of the
+memory.  Chosen: 400 MB, which sensors of 1024 x 1024 pixels stay below; single precision changes a
+deviate by 1e-5 of itself at most."""
+
+CHUNK = 1024
+"""Number of terms that are whitened at a time in a large dictionary.  Chosen: of 20,000 values they take
+160 MB in double precision; with 2048, twice as much and no less time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,14 +80,39 @@ class Dictionary(Pursuit):
 
     def __init__(self, family: Family, fit: BaselineFit) -> None:
         self.family, self.fit = family, fit
-        blocks: list[FloatArray] = []
-        usable = np.ones(len(family.terms), bool)
-        rows: list[NDArray[np.int64]] = []
-        for channel, start in zip(fit.channels, fit.starts, strict=False):
-            if channel.word not in family.words:
-                continue
-            columns = np.zeros((len(channel), len(family.terms)))
-            for n, term in enumerate(family.terms):
+        there = [
+            (c, int(start)) for c, start in zip(fit.channels, fit.starts, strict=False)
+            if c.word in family.words
+        ]  # fmt: skip
+        rows = [start + np.arange(len(c)) for c, start in there]
+        self.rows = np.concatenate([np.zeros(0, int), *rows])
+        shape = len(self.rows), len(family.terms)
+        large = shape[0] * shape[1] > LARGE
+        x = np.empty(shape, np.float32 if large else np.float64)
+        u = np.zeros((fit.basis.shape[1], shape[1]))
+        squares = np.zeros(shape[1])
+        basis, step = fit.basis[self.rows], CHUNK if large else max(shape[1], 1)
+        for first in range(0, shape[1], step):
+            own = slice(first, first + step)
+            white = self._whitened(family.terms[own], [c for c, _ in there])
+            x[:, own], u[:, own] = white, basis.T @ white
+            squares[own] = (white**2).sum(0)
+        if not large:
+            used = np.nonzero(x.any(1))[0]
+            x, self.rows = x[used], self.rows[used]
+        super().__init__(
+            x, u, squares=squares, probability=ALARM, accuracy=ACCURACY,
+            simple=np.array([t.simple for t in family.terms], bool), tried=family.tried,
+        )  # fmt: skip
+
+    @staticmethod
+    def _whitened(terms: Sequence[Term], channels: Sequence[Channel]) -> FloatArray:
+        """Whitened columns of terms in channels, one below the other; 0 where a term is not usable."""
+        usable = np.ones(len(terms), bool)
+        blocks: list[FloatArray] = [np.zeros((0, len(terms)))]
+        for channel in channels:
+            columns = np.zeros((len(channel), len(terms)))
+            for n, term in enumerate(terms):
                 try:
                     found = (term.rough or term.column)(channel)
                 except ConvergenceError:
@@ -84,21 +120,12 @@ class Dictionary(Pursuit):
                     found, usable[n] = None, False
                 if found is not None:
                     columns[:, n] = found
-            white = channel.whiten(columns)
-            used = np.nonzero(white.any(1))[0]
-            blocks.append(white[used])
-            rows.append(int(start) + used)
-        empty = np.zeros((0, len(family.terms)))
-        self.rows = np.concatenate([np.zeros(0, int), *rows])
-        x = np.concatenate([empty, *blocks]) * usable
-        super().__init__(
-            x, fit.basis[self.rows].T @ x, probability=ALARM, accuracy=ACCURACY,
-            simple=np.array([t.simple for t in family.terms], bool), tried=family.tried,
-        )  # fmt: skip
+            blocks.append(channel.whiten(columns))
+        return np.concatenate(blocks) * usable
 
     def products(self, left: FloatArray) -> FloatArray:
         """Scalar products of all columns with whitened residuals."""
-        return np.asarray(self.x.T @ left[self.rows])
+        return np.asarray(self.x.T @ left[self.rows].astype(self.x.dtype), float)
 
     def template(self, n: int) -> FloatArray:
         """Column with the fit's parameters projected out, rows of the priors included."""

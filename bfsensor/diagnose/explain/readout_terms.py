@@ -68,16 +68,18 @@ def _beside_spots(scene: Scene, n: int, p: int) -> Iterator[Term]:
         if w == "crosstalk"
     }  # fmt: skip
 
-    def column(amp: int, other: int, channel: Channel) -> FloatArray | None:
-        if channel.word != "amp_cross":
-            return None
-        x = channel.axes
-        own = (x["amp"] == amp) & (x["other"] == other) & (x["what"] == "crosstalk")
-        return np.where(own, 1.0, 0.0)
-
     for amp, other in sorted(pairs):
         name = f"h_{n} S^{p} taken for crosstalk of {amp + 1} in {other + 1}"
-        yield Term(name, {"crosstalk": (amp, other)}, partial(column, amp, other))
+        yield Term(name, {"crosstalk": (amp, other)}, partial(_crosstalk, amp, other))
+
+
+def _crosstalk(amp: int, other: int, channel: Channel) -> FloatArray | None:
+    """1 for the crosstalk of an amplifier in another."""
+    if channel.word != "amp_cross":
+        return None
+    x = channel.axes
+    own = (x["amp"] == amp) & (x["other"] == other) & (x["what"] == "crosstalk")
+    return np.where(own, 1.0, 0.0)
 
 
 def _column(

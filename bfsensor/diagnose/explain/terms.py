@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,8 @@ class Term:
         Numbers that define the term, such as 'lag', 'power' or 'period'.
     column : callable
         Takes a channel and gives its change for a coefficient of 1, in the channel's unit; None
-        where the term does not change it.
+        where the term does not change it.  A function of a module, or a partial one of it, so that
+        a finished stage with the term can be stored.
     rough : callable, optional
         Faster approximation of ``column``, for searches.
     more : tuple of Term
@@ -117,6 +119,10 @@ class Scene:
 
     model: Model
     kept: Cache = field(default_factory=Cache)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # What is cached can be calculated again.
+        return Scene, (self.model,)
 
     @property
     def gains(self) -> FloatArray:
@@ -192,42 +198,46 @@ def lag_family(scene: Scene) -> Family | None:
         for i, j in zip(c.axes["i"], c.axes["j"], strict=True)
     })  # fmt: skip
 
-    def column(lag: tuple[int, int], p: int) -> Callable[[Channel], FloatArray | None]:
-        def change(channel: Channel) -> FloatArray | None:
-            if channel.word != "flat_cov":
-                return None
-            x = channel.axes
-            gain = scene.gains[x["amp"].astype(int)]
-            here = (x["i"] == lag[0]) & (x["j"] == lag[1])
-            level = gain * x["level"] / SCALE
-            return np.where(here, level**p / gain**2, 0.0)
-
-        return change
-
     terms = tuple(
-        Term(f"covariance ({i}, {j}) x S^{p}", {"lags": [(i, j)], "power": p}, column((i, j), p))
+        Term(f"covariance ({i}, {j}) x S^{p}", {"lags": [(i, j)], "power": p},
+             partial(_at_lag, scene, (i, j), p))
         for i, j in lags for p in LAG_POWERS
     )  # fmt: skip
     return Family("covariances by lag", terms, ("flat_cov",))
 
 
+def _at_lag(
+    scene: Scene, lag: tuple[int, int], p: int, channel: Channel
+) -> FloatArray | None:
+    """Change of the covariance at one lag that goes with the level to the power p."""
+    if channel.word != "flat_cov":
+        return None
+    x = channel.axes
+    gain = scene.gains[x["amp"].astype(int)]
+    here = (x["i"] == lag[0]) & (x["j"] == lag[1])
+    level = gain * x["level"] / SCALE
+    return np.where(here, level**p / gain**2, 0.0)
+
+
 def _single_values(channels: list[Channel]) -> Family:
     """Family of changes of one measured a_ij each, by the index of its row; unit 1e-8 / e-."""
-
-    def column(chosen: Channel, row: int) -> Callable[[Channel], FloatArray | None]:
-        def change(channel: Channel) -> FloatArray | None:
-            here = np.arange(len(channel)) == row
-            return np.where(here, AREA_UNIT, 0.0) if channel is chosen else None
-
-        return change
-
     terms = tuple(
         Term(
             f"a_{int(c.axes['i'][row])}{int(c.axes['j'][row])} of table {int(c.axes['table'][row]) + 1}",
             {"lags": [(int(c.axes["i"][row]), int(c.axes["j"][row]))], "row": row,
              "relative": AREA_UNIT / c.values[row], "table": int(c.axes["table"][row])},
-            column(c, row),
+            partial(_of_row, c, row),
         )
         for c in channels for row in range(len(c))
     )  # fmt: skip
     return Family(SINGLE, terms, ("flat_cov",))
+
+
+def _of_row(chosen: Channel, row: int, channel: Channel) -> FloatArray | None:
+    """Change of the value of one row of a channel."""
+    # A channel that was stored and read again is another object with the same values.
+    if channel.word != chosen.word or not np.array_equal(channel.values, chosen.values):
+        return None
+    if not np.array_equal(channel.axes["table"], chosen.axes["table"]):
+        return None
+    return np.where(np.arange(len(channel)) == row, AREA_UNIT, 0.0)

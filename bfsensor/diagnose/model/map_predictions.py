@@ -264,13 +264,12 @@ class MapChange:
     def _normalised(self, change: FloatArray) -> NDArray[np.floating[Any]]:
         """Relative change with each amplifier divided by its mean."""
         shape = self.layout.shape
-        total = np.array(np.broadcast_to(change, shape), precision_of(shape))
+        total: NDArray[Any] = np.array(np.broadcast_to(change, shape), precision_of(shape))
         for segment in self.layout.segments:
             part = total[segment.y : segment.y + segment.rows,
                          segment.x : segment.x + segment.columns]  # fmt: skip
             mean = float(part.mean(dtype=np.float64))
-            part -= mean
-            part /= 1.0 + mean
+            part[...] = (part - mean) / (1.0 + mean)
         return total
 
 
@@ -322,7 +321,7 @@ def lines_of_map(effect: Effect, channel: Channel, layout: Layout) -> FloatArray
     return out
 
 
-def block_means(change: FloatArray) -> FloatArray:
+def block_means(change: NDArray[np.floating[Any]]) -> FloatArray:
     """Mean values of a map's blocks."""
     ny, nx = change.shape
     side = block_side((ny, nx))
