@@ -310,7 +310,8 @@ class FlatChannels:
                 axes.add(
                     len(m), condition, amp=np.arange(len(m)), time=exposure.exposure_time,
                     step=self._step(exposure),
-                    lamp=lamp, setting=setting, exposure=exposure.number, level=m,
+                    lamp=lamp, setting=setting,
+                    monitored=exposure.lamp is not None, exposure=exposure.number, level=m,
                     mjd=np.nan if exposure.mjd is None else exposure.mjd,
                     hours=self._hours(exposure),
                 )  # fmt: skip
