@@ -9,7 +9,7 @@ from scipy.stats import poisson
 from bfsensor.effects.effect import Layout
 
 OUTLIER = 6.0
-"""Deviation from which the measurement counts a pixel as struck [sigma of the noise of all pixels].
+"""Deviation from which the measurement counts a pixel as struck [sigma of the noise of a usual pixel].
 
 Defined by ``OUTLIER`` of :mod:`bfsensor.diagnose.data.bias_channels`, which must be equal."""
 
@@ -39,7 +39,7 @@ def struck_pixels(
     Returns
     -------
     part : float
-        Fraction of pixels that deviate by more than :data:`OUTLIER` times the noise of all pixels,
+        Fraction of pixels that deviate by more than :data:`OUTLIER` times the noise of a usual pixel,
         read noise and shot noise of ``level``.
     others : float
         Mean charge of the other pixels [e-]; ``mean`` if all are struck.

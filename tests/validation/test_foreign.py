@@ -374,13 +374,14 @@ def test_persistence_decays_with_tau_in_exposures():
     q = np.full((64, 64), 1e5, np.float32)
     one.remember(q, flat)
     later = [
-        one.remember(np.zeros_like(q), replace(EXPOSURES[0], sequence=flat.sequence + n))[
-            0, 0
-        ]
+        one.remember(np.zeros_like(q), replace(EXPOSURES[0], sequence=flat.sequence + n))
         for n in (1, 2, 3)
     ]
-    assert later[0] == pytest.approx(100, rel=1e-4)
-    assert later[1] / later[0] == pytest.approx(np.exp(-1 / one.values["tau"]), rel=1e-4)
+    # Electrons are released at random: 100 e- in 4096 pixels.
+    means = [float(x.mean()) for x in later]
+    assert means[0] == pytest.approx(100, abs=4 * 10 / 64)
+    assert means[1] / means[0] == pytest.approx(np.exp(-1 / one.values["tau"]), abs=0.01)
+    assert later[0].var() == pytest.approx(100, rel=4 * (2 / 4096) ** 0.5)
 
 
 # ------------------------------------------------------------------ seeds and strength

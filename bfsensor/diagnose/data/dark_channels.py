@@ -83,8 +83,8 @@ class DarkChannels:
             bias = self._bias.get(frame.name)
             if bias is not None:
                 image = image - bias
-            # Dark current that is alike in all pixels strikes none, whatever its shot noise.
-            scatter = 1.4826 * float(np.median(np.abs(image - np.median(image))))
+            # Dark current that is alike in neighbours strikes none, whatever its shot noise.
+            scatter = 1.4826 / np.sqrt(2.0) * float(np.median(np.abs(np.diff(image))))
             sigma = max(self._noise.get(frame.name) or 0.0, scatter)
             struck = np.abs(image - np.median(image)) > OUTLIER * sigma
             good = image[~struck]

@@ -14,9 +14,9 @@ LOWER = 0.8
 beyond full well levels of pixels stay or fall by a few per cent, and lamps flicker by less; with 0.9,
 lamps set lower by a tenth are found where they take the brightest flats."""
 
-ALIKE = 1.25
-"""Factor between light per second within which exposures belong to one setting: the inverse of
-:data:`LOWER`."""
+ALIKE = 1 / LOWER
+"""Factor between light per second within which exposures belong to one setting.  Derived: the inverse
+of :data:`LOWER`."""
 
 
 def lamp_settings(

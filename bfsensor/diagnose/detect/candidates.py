@@ -31,7 +31,7 @@ candidates are fitted jointly, up to five in all."""
 HOPELESS, RAISED = 3.0, 8.0
 """Chi-square gain of a candidate's best starting point below which its shape is not fitted, and
 largest factor by which a fit of the shape is taken to raise a gain.  Measured on 574 fits of 30
-development campaigns of ``validation.foreign``: 99 % raised it by less than 5.4, and no candidate that
+development campaigns of another bench: 99 % raised it by less than 5.4, and no candidate that
 was named in the end by more than 7.5."""
 
 AGAIN = 2.0
