@@ -123,10 +123,7 @@ def minimise(
     """
     first = np.array(start, float)
     ends = [np.array(np.broadcast_to(end, first.shape)) for end in (low, high)]
-    begun = residuals(first)
-    if not np.isfinite(begun).all():
-        raise ConvergenceError("residuals are not finite at the first point of a fit")
-    here = slopes(first)
+    begun, here = residuals(first), slopes(first)
     free = np.flatnonzero((ends[0] < ends[1]) & here.any(0))
     if not len(free):
         return Minimum(first, True, False, float(begun @ begun))

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
 from scipy.fft import irfft2, rfft2
+from scipy.optimize import least_squares, minimize
 
-from bfsensor.errors import ConvergenceError
-from bfsensor.inference.trust_region import minimise
 from bfsensor.typing import FloatArray
 
 HIGHEST = 0.2
@@ -138,7 +136,7 @@ def find_rings(
 def _fit(
     law: RingLaw, values: FloatArray, x: FloatArray, y: FloatArray, point: FloatArray
 ) -> tuple[float, dict[str, float]] | None:
-    """Least squares of centre and phase, strength and phase linear and projected out."""
+    """Least squares of centre and phase (Levenberg-Marquardt), strength and phase linear."""
     flat = values.ravel()
 
     def solve(p: FloatArray) -> tuple[float, FloatArray, FloatArray]:
@@ -151,24 +149,37 @@ def _fit(
         model = found @ basis
         return float(((flat - model) ** 2).sum()), np.asarray(found, float), model
 
-    # Half a pixel for the centre, which is hundreds of pixels away.
-    steps = np.diag([0.5, 0.5, *(s or 1e-3 * point[2] for s in law.steps)])
-
-    def slopes(p: FloatArray) -> FloatArray:
-        here = solve(p)[2]
-        return np.stack([(solve(p + d)[2] - here) / d.sum() for d in steps], axis=1)
-
-    # No period below 2 pixels, the Nyquist limit.
-    low = np.array([-np.inf, -np.inf, 2.0, *(-np.inf for _ in law.names[1:])])
-    try:
-        least = minimise(
-            lambda p: solve(p)[2] - flat, slopes, np.maximum(point, low), low=low,
-            relative=1e-3 / flat.size, evaluations=15,
-        )  # fmt: skip
-    except ConvergenceError:
+    # Half a pixel for the centre, which is hundreds of pixels away; damping after Marquardt.
+    steps = np.array([0.5, 0.5, *(s or 1e-3 * point[2] for s in law.steps)])
+    square, found, model = solve(point)
+    damping = 1e-3
+    for _ in range(15):
+        slopes = np.stack([
+            (solve(point + d)[2] - model) / d.sum() for d in np.diag(steps)
+        ])  # fmt: skip
+        normal = slopes @ slopes.T
+        scale = np.sqrt(np.diag(normal))
+        if not np.all(scale > 0):
+            return None
+        normal = normal / np.outer(scale, scale) + damping * np.eye(len(steps))
+        step = np.linalg.solve(normal, slopes @ (flat - model) / scale) / scale
+        new = point + step
+        # No period below 2 pixels, the Nyquist limit.
+        if not new[2] > 2.0:
+            damping *= 8
+            continue
+        left, more, there = solve(new)
+        if left < square:
+            done = square - left < 1e-3
+            point, square, found, model, damping = new, left, more, there, damping / 5
+            if done:
+                break
+        else:
+            damping *= 8
+            if damping > 1e5:
+                break
+    if not np.isfinite(point).all():
         return None
-    point = least.values
-    square, found, _ = solve(point)
     names = ("xc", "yc", *law.names)
     out = dict(zip(names, (float(v) for v in point), strict=True))
     if "sway_phase" in out:
@@ -191,7 +202,7 @@ def _followed(
     best: tuple[float, FloatArray, FloatArray] | None = None
     for middle, width, frequency in _windows(place, mean, weight)[:3]:
         one = _follow(place, mean, weight, middle, width, frequency)
-        if best is None or one[0] < best[0]:
+        if one is not None and (best is None or one[0] < best[0]):
             best = one
     if best is None:
         return []
@@ -261,21 +272,6 @@ def _windows(
     return out
 
 
-class _Waves(NamedTuple):
-    """A wave's residuals in a part of a profile, with derivatives."""
-
-    wave: Callable[[FloatArray, FloatArray], tuple[FloatArray, ...]]
-    u: FloatArray
-    mean: FloatArray
-    weight: FloatArray
-
-    def left(self, p: FloatArray) -> FloatArray:
-        return (self.wave(p, self.u)[0] - self.mean) * self.weight
-
-    def slopes(self, p: FloatArray) -> FloatArray:
-        return self.wave(p, self.u)[3] * self.weight[:, None]
-
-
 def _follow(
     place: FloatArray,
     mean: FloatArray,
@@ -283,7 +279,7 @@ def _follow(
     middle: float,
     width: float,
     frequency: float,
-) -> tuple[float, FloatArray, FloatArray]:
+) -> tuple[float, FloatArray, FloatArray] | None:
     """Fit a wave in ever wider parts of a profile, its phase a polynomial of increasing order.
 
     Returns the chi-square, the phase [cycles] and its derivative [1/pixel] at all radii.
@@ -305,16 +301,11 @@ def _follow(
             u: FloatArray,
             powers: NDArray[np.int64] = powers,
             reach: float = reach,
-        ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-            """Value, phase, its derivative by the radius, and the value's by all parameters."""
-            by_turns = u[:, None] ** powers
-            by_slope = u[:, None] ** np.maximum(powers - 1, 0) * powers / reach
-            turns, slope = by_turns @ p[2:], by_slope @ p[2:]
-            c, s = np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)
-            along, across = p[0] * c - p[1] * s, -2 * np.pi * (p[0] * s + p[1] * c)
-            turned = along[:, None] * by_slope + (slope * across)[:, None] * by_turns
-            slopes = 10 * np.column_stack([slope * c, -slope * s, turned])
-            return 10 * slope * along, turns, slope, slopes
+        ) -> tuple[FloatArray, FloatArray, FloatArray]:
+            turns = (u[:, None] ** powers) @ p[2:]
+            slope = (u[:, None] ** np.maximum(powers - 1, 0) * powers) @ p[2:] / reach
+            angle = 2 * np.pi * turns
+            return 10 * slope * (p[0] * np.cos(angle) - p[1] * np.sin(angle)), turns, slope
 
         if strength is None:
             unit = np.concatenate([[1.0, 0.0], start]), np.concatenate([[0.0, 1.0], start])
@@ -325,15 +316,17 @@ def _follow(
                 )[0],
                 float,
             )
-        one = _Waves(wave, away[own], mean[own], weight[own])
-        found = minimise(
-            one.left, one.slopes, np.concatenate([strength, start]), evaluations=30
-        )
-        strength, phase = found.values[:2], found.values[2:] / reach**powers
+        found = least_squares(
+            lambda p, u=away[own], m=mean[own], w=weight[own], wave=wave: (wave(p, u)[0] - m) * w,
+            np.concatenate([strength, start]), max_nfev=30,
+        )  # fmt: skip
+        strength, phase = found.x[:2], found.x[2:] / reach**powers
+        if not np.isfinite(found.x).all():
+            return None
         if reach >= far:
             if order == ORDERS:
-                _, turns, slope, _ = wave(found.values, away)
-                return found.square, turns, slope
+                _, turns, slope = wave(found.x, away)
+                return 2 * float(found.cost), turns, slope
             order += 1
             continue
         reach, order = min(1.25 * reach, far), min(order + 1, ORDERS)
@@ -399,7 +392,7 @@ def find_radial(
     if not first:
         return None
     best = max(first, key=gain)
-    found = optimize.minimize(
+    found = minimize(
         lambda c: -gain(c), best, method="Nelder-Mead",
         options={
             "initial_simplex": best + step * np.array([[0, 0], [2, 0], [0, 2]]),
@@ -501,17 +494,11 @@ def _waves_of(
 
     # Between frequencies of the grid: the strengths are linear, so that only frequencies are searched.
     width = 0.25 / np.ptp(place)
-
-    def missed(d: FloatArray) -> FloatArray:
-        return np.asarray(target - fitted(np.array(chosen) + width * d)[1])
-
-    better = minimise(
-        missed,
-        # Small against the grid's step of 1, large against rounding.
-        lambda d: np.stack([(missed(d + e) - missed(d)) / 1e-4 for e in 1e-4 * np.eye(len(d))], 1),
-        np.zeros(len(chosen)), low=-2.0, high=2.0, evaluations=20,
+    better = least_squares(
+        lambda d: target - fitted(np.array(chosen) + width * d)[1], np.zeros(len(chosen)),
+        bounds=(-2.0, 2.0), max_nfev=20,
     )  # fmt: skip
-    frequencies = np.array(chosen) + width * better.values
+    frequencies = np.array(chosen) + width * better.x
     parts, model = fitted(frequencies)
     waves = [
         (float(f), float(s), float(c))

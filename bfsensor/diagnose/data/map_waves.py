@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.diagnose.data.map_rings import find_radial, find_rings
-from bfsensor.inference.trust_region import minimise
 from bfsensor.typing import FloatArray
 
 ORDER = 4
@@ -135,6 +134,8 @@ def find_patterns(
     out: list[tuple[float, Wave]] = []
     for start in _plane_waves(values, 2.0 * side / SHORTEST)[:TRIES]:
         wave = _follow(values, start)
+        if wave is None:
+            continue
         gain = float(
             (values**2).sum() - ((values - _model(wave, *_grid(values))[0]) ** 2).sum()
         )
@@ -262,7 +263,7 @@ def _model(wave: Wave, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatA
     )
 
 
-def _follow(values: FloatArray, start: Wave) -> Wave:
+def _follow(values: FloatArray, start: Wave) -> Wave | None:
     """Fit a wave in ever larger parts of a map around the window where it was detected."""
     ny, nx = values.shape
     reach = max(min(ny, nx) / 8, 1.0 / np.hypot(start.fx, start.fy))
@@ -272,7 +273,10 @@ def _follow(values: FloatArray, start: Wave) -> Wave:
         columns = slice(max(int(wave.x - reach), 0), int(wave.x + reach) + 2)
         part = values[rows, columns]
         y, x = np.indices(part.shape, float)
-        wave = _fit(part, x + columns.start, y + rows.start, wave, bent)
+        fitted = _fit(part, x + columns.start, y + rows.start, wave, bent)
+        if fitted is None:
+            return None
+        wave = fitted
         if reach > max(ny, nx):
             return wave
         # Chosen, to be derived: 1.4 doubles the area; much farther the extrapolated phase may be off
@@ -280,25 +284,43 @@ def _follow(values: FloatArray, start: Wave) -> Wave:
         reach, bent = 1.4 * reach, True
 
 
-def _fit(values: FloatArray, x: FloatArray, y: FloatArray, wave: Wave, bent: bool) -> Wave:
-    """Least squares from a wave nearby, to 1e-3 of the chi-square or in 12 points: a start only."""
+def _fit(
+    values: FloatArray, x: FloatArray, y: FloatArray, wave: Wave, bent: bool
+) -> Wave | None:
+    """Least squares from a wave nearby (Levenberg-Marquardt); None where it is singular."""
+    used = np.array([True, True, bent, bent, bent, True, True])
     if not wave.amp:
         _, slopes = _model(wave, x, y)
         both = slopes[..., 5:].reshape(-1, 2)
         parts = np.linalg.lstsq(both, values.ravel(), rcond=None)[0]
         wave = wave._replace(sine=float(parts[0]), cosine=float(parts[1]))
-    first = np.array(wave[2:])
-    held = ~np.array([True, True, bent, bent, bent, True, True])
-    low, high = np.where(held, first, -np.inf), np.where(held, first, np.inf)
-
-    def there(p: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return _model(Wave(wave.x, wave.y, *(float(v) for v in p)), x, y)
-
-    found = minimise(
-        lambda p: (there(p)[0] - values).ravel(), lambda p: there(p)[1].reshape(-1, 7), first,
-        low=low, high=high, relative=1e-3 / values.size, evaluations=12,
-    )  # fmt: skip
-    return Wave(wave.x, wave.y, *(float(v) for v in found.values))
+    here, slopes = _model(wave, x, y)
+    square, damping = float(((values - here) ** 2).sum()), 1e-3
+    # Damping after Marquardt, in units of the normal matrix's diagonal: a fifth of it after a step
+    # that gains, eight times after one that does not; 1e3 allows no step worth taking.
+    for _ in range(12):
+        design = slopes.reshape(-1, 7)[:, used]
+        normal = design.T @ design
+        scale = np.sqrt(np.diag(normal))
+        if not np.all(scale > 0):
+            return None
+        normal = normal / np.outer(scale, scale) + damping * np.eye(used.sum())
+        step = np.linalg.solve(normal, design.T @ (values - here).ravel() / scale) / scale
+        point = np.array(wave[2:])
+        point[used] += step
+        new = Wave(wave.x, wave.y, *(float(v) for v in point))
+        there, steeper = _model(new, x, y)
+        left = float(((values - there) ** 2).sum())
+        if left < square:
+            done = square - left < 1e-3
+            wave, here, slopes, square, damping = new, there, steeper, left, damping / 5
+            if done:
+                break
+        else:
+            damping *= 8
+            if damping > 1e3:
+                break
+    return wave
 
 
 def _circles(wave: Wave, far: float) -> tuple[float, float, float, float]:
