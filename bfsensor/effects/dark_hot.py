@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.effects.dark_pixels import mean_bias, struck_pixels
+from bfsensor.effects.dark_pixels import mean_bias, struck_pixels, usual_noise
 from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Seen, Shot
 from bfsensor.typing import FloatArray
 
@@ -275,7 +275,10 @@ class Glow(Effect):
             return np.zeros(mean.shape), mean
         knots = np.append(0.0, np.geomspace(1e-3 * top, top, 40))
         level = float(np.median(mean))
-        found = np.array([struck_pixels(float(m), level, noise, more) for m in knots])
+        usual = usual_noise(mean, noise, more)
+        found = np.array(
+            [struck_pixels(float(m), level, noise, more, usual) for m in knots]
+        )
         return np.interp(mean, knots, found[:, 0]), np.interp(mean, knots, found[:, 1])
 
     def _light(self, layout: Layout) -> FloatArray:

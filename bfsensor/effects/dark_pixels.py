@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.optimize import brentq
+from scipy.special import ndtr, ndtri
 from scipy.stats import poisson
 
 from bfsensor.effects.effect import Layout
+from bfsensor.typing import FloatArray
 
 OUTLIER = 6.0
 """Deviation from which the measurement counts a pixel as struck [sigma of the noise of a usual pixel].
@@ -20,8 +22,35 @@ Measured, both evaluated at this mean for read noise of 3 to 20 e-: the struck f
 less than 3e-5, the mean of the others by less than 0.2 e-."""
 
 
+def usual_noise(mean: FloatArray, noise: float, more: float = 0.0) -> float:
+    """Noise of a usual pixel [e-]: from the median difference of neighbours, read and shot noise.
+
+    Parameters
+    ----------
+    mean : ndarray
+        Mean dark charge of the pixels [e-].
+    noise, more : float
+        As for :func:`struck_pixels`.
+
+    Examples
+    --------
+    >>> round(usual_noise(np.full(9, 40.0), 3.0), 3)
+    7.0
+    """
+    part = np.linspace(0.005, 0.995, 100)
+    sigma = np.sqrt(noise**2 * (1 + more) + np.maximum(np.quantile(mean, part), 0.0))
+    if sigma[0] == sigma[-1]:
+        return float(sigma[0])
+    half = ndtri(0.75)
+
+    def missed(size: float) -> float:
+        return float(np.mean(2 * ndtr(half * size / sigma) - 1) - 0.5)
+
+    return float(brentq(missed, sigma[0], sigma[-1]))
+
+
 def struck_pixels(
-    mean: float, level: float, noise: float, more: float = 0.0
+    mean: float, level: float, noise: float, more: float = 0.0, usual: float = 0.0
 ) -> tuple[float, float]:
     """Fraction of pixels that count as struck, and the mean of the others.
 
@@ -35,12 +64,14 @@ def struck_pixels(
         Read noise [e-]; 0, where it is not known: no pixel is struck.
     more : float
         Variance that the subtracted mean bias adds, over that of the read noise.
+    usual : float
+        Noise of a usual pixel [e-]; 0 for that of a pixel at ``level``.
 
     Returns
     -------
     part : float
         Fraction of pixels that deviate by more than :data:`OUTLIER` times the noise of a usual pixel,
-        read noise and shot noise of ``level``.
+        read noise and shot noise.
     others : float
         Mean charge of the other pixels [e-]; ``mean`` if all are struck.
 
@@ -62,7 +93,7 @@ def struck_pixels(
     else:
         weight, away = np.ones(1), np.array([mean - level])
         wide = float(np.sqrt(noise**2 * (1 + more) + mean))
-    limit = OUTLIER * float(np.sqrt(noise**2 * (1 + more) + max(level, 0.0)))
+    limit = OUTLIER * (usual or float(np.sqrt(noise**2 * (1 + more) + max(level, 0.0))))
     low, high = (-limit - away) / wide, (limit - away) / wide
     inside = ndtr(high) - ndtr(low)
     kept = float(weight @ inside)

@@ -357,7 +357,9 @@ def test_glow_of_a_corner(corner, strength):
         "x": np.full(2, -1), "temperature": np.full(2, 173.15),
     }  # fmt: skip
     said = effect.dark_map(axes, LAYOUT)
-    assert np.mean(struck) == pytest.approx(said[0], rel=0.03, abs=1.0)
+    # The light rises by up to 4 e- from pixel to pixel here, which adds to differences of neighbours:
+    # 2 % to the limit, 7 % to the number beyond it.
+    assert np.mean(struck) == pytest.approx(said[0], rel=0.08, abs=1.0)
     assert np.mean(level) == pytest.approx(said[1], rel=0.03)
     assert said[1] > 2 * strength
 
