@@ -467,7 +467,9 @@ def _ranked(
     for rows in families:
         largest = drawn[rows].max(0)
         zero[rows] = threshold = np.quantile(largest, 0.8)
-        scale[rows] = (largest[largest > threshold] - threshold).mean()
+        excess = largest[largest > threshold] - threshold
+        # Values of which the fit's parameters take all have no scatter.
+        scale[rows] = excess.mean() if excess.size else 1.0
     drawn -= zero[:, None].astype(np.float32)
     drawn /= scale[:, None].astype(np.float32)
     return zero, scale

@@ -17,9 +17,10 @@ MAP_ORDER, LIGHT_ORDER = 4, 8
 number of half waves on the sensor that describes the light beyond it.  Chosen: with 8 half waves the
 light may vary over a quarter of the sensor; twice as many take up rings of an eighth of it."""
 
-KNOTS = 6
-"""Number of times between which the light of a lamp without a monitor drifts linearly.  Chosen: a lamp
-that walks by 2e-4 an exposure is followed to 5e-4 in a campaign of 100 flats; with 12, to 4e-4."""
+KNOTS, EACH = 6, 8
+"""Largest number of times between which the light of a lamp without a monitor drifts linearly, and
+number of flats for each.  Chosen: a lamp whose light changes by 2e-4 from flat to flat is followed to
+5e-4 in a campaign of 100 flats; with 12 and 4, to 4e-4, and the fit takes twice as many values."""
 
 
 def linear_columns(
@@ -101,15 +102,16 @@ def _drift_columns(channel: Channel, measured: MeasuredChannels) -> dict[str, Fl
         return {}
     flats = [c.axes["exposure"] for c in measured.channels if c.word == "flat_mean"]
     every = np.unique(np.concatenate(flats))
-    knots = np.linspace(float(every[0]), float(every[-1]), KNOTS)
+    count = min(KNOTS, len(every) // EACH)
+    knots = np.linspace(float(every[0]), float(every[-1]), max(count, 1))
     # The constant part is the light itself: one knot stays at 0.
     return {
         f"lamp at {n}": np.where(
             unknown,
-            np.interp(x["exposure"], knots, np.eye(KNOTS)[n]) * x["level"],
+            np.interp(x["exposure"], knots, np.eye(count)[n]) * x["level"],
             0.0,
         )
-        for n in range(1, KNOTS)
+        for n in range(1, count)
     }
 
 
