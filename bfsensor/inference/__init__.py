@@ -1,4 +1,4 @@
-"""Statistics without physics, on NumPy and SciPy: the one engine of all fits, and what goes with it.
+"""Statistics without physics, on NumPy and SciPy: the engine of the diagnosis's and of device fits.
 
 SciPy's :func:`~scipy.optimize.least_squares` (trust region with bounds) and
 :func:`~scipy.optimize.lsq_linear` do the work.  What they lack, and is added here:
