@@ -19,8 +19,8 @@ light may vary over a quarter of the sensor; twice as many take up rings of an e
 
 KNOTS, EACH = 6, 8
 """Largest number of times between which the light of a lamp without a monitor drifts linearly, and
-number of flats for each.  Chosen: a lamp whose light changes by 2e-4 from flat to flat is followed to
-5e-4 in a campaign of 100 flats; with 12 and 4, to 4e-4, and the fit takes twice as many values."""
+number of flats for each.  Chosen: light that changes at random by s a flat departs from a line over
+n flats by s (n / 6)^(1/2), 3.7e-4 for s = 2e-4 in a campaign of 100 flats; with 12 knots, 2.5e-4."""
 
 
 def linear_columns(

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.data.cosmetics import find_cosmetics
+from bfsensor.diagnose.data.cosmetics import RepairedFrame, find_cosmetics
 from bfsensor.diagnose.data.flat_defects import bad_columns, dust_spots
 from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.diagnosis import diagnose_measured
@@ -145,3 +145,51 @@ def test_other_patterns_are_no_dust(name):
         "light": 0.03 * (x / 64) ** 2 - 0.02 * y / 128,
     }[name]
     assert dust_spots(image + 3e-3 * rng.standard_normal(image.shape)) == []
+
+
+class WithoutOverscan(VirtualSource):
+    """The virtual campaign as read by a chain without a serial overscan."""
+
+    def read(self, exposure):
+        frames = super().read(exposure)
+        none = np.zeros((frames[0].image.shape[0], 0), np.float32)
+        return [
+            RepairedFrame(
+                f.name, f.pixels, f.mask, f.image, f.prescan, none, f.parallel_overscan,
+                f.flip_x, f.flip_y, f.origin, np.zeros_like(f.mask), np.zeros_like(f.mask), (),
+            )
+            for f in frames
+        ]  # fmt: skip
+
+
+def test_columns_are_repaired_above_the_level_of_a_bias():
+    source = WithoutOverscan(seed=7105, size=SMALL, effects=[Defects({"part": 1.0})])
+    repaired, found = find_cosmetics(source, source.exposures)
+    columns = {x for c in found if c.kind == "bad_column" for x in range(*c.x)}
+    assert columns == set(COLUMNS)
+    dark = next(e for e in source.exposures if e.kind == "dark")
+    for frame in repaired.read(dark):
+        means = np.median(frame.image, axis=0)
+        # Noise of 2.5 ADU in 128 rows; divided with its level of 1000 ADU, a column rises by 15 or more.
+        assert np.abs(means - np.median(means)).max() < 3.0
+
+
+def test_hot_pixels_do_not_hide_dust():
+    bright = {"part": 30.0}
+    source = VirtualSource(
+        seed=7107, size=SMALL, effects=[Dust({"part": 1.0}), HotPixels(bright)]
+    )
+    _, found = find_cosmetics(source, source.exposures)
+    assert [c.kind for c in found].count("dust") == 2
+
+
+class HotPixels(Effect):
+    """The hot pixels of :class:`Defects`, as bright in flats as in darks."""
+
+    word = "hot_pixels"
+    variants: ClassVar = {"": {"part": Range(0.0, 100.0, amplitude=True)}}
+
+    def store(self, charge, context):
+        for place in PIXELS:
+            charge[place] += self.parameters["part"] * 100.0 * context.exposure.seconds
+        return charge
