@@ -1,4 +1,4 @@
-"""``python -m validation.concealed make|run|open``: campaigns whose truth is sealed until scored."""
+"""``python -m validation.concealed make|run|open|table``: campaigns whose truth is sealed until scored."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from validation.concealed.campaign import write_campaign
 from validation.concealed.effect import Effect
+from validation.concealed.goals import causes, described, goals, splits
 from validation.concealed.library import EFFECTS, draw_effect, draw_effects, make_effect
 from validation.concealed.misses import print_misses
 from validation.concealed.opening import (
@@ -18,9 +19,12 @@ from validation.concealed.opening import (
     add_results,
     open_truths,
     to_row,
+    trial_from_row,
+    write_goals,
     write_summary,
 )
 from validation.concealed.plan import SIZES
+from validation.concealed.rows import read_rows
 from validation.concealed.submit import read_json, run_campaigns
 from validation.concealed.tally import print_lines, tally
 
@@ -218,6 +222,42 @@ def open_(
     click.echo("\nMisses:")
     print_misses(scores, click.echo)
     click.echo(f"\n{output}: {kept} rows added of {len(scores)}; {summary}")
+
+
+@main.command()
+@click.argument("rows", type=click.Path(path_type=Path, exists=True))
+@click.option("--set", "group", help="Rows of this set alone.")
+@click.option("-o", "--output", type=click.Path(path_type=Path),
+              help="ECSV of the table, by part of the trials.")  # fmt: skip
+def table(rows: Path, group: str | None, output: Path | None) -> None:
+    """Print the goals of ROWS, whole and by strength, law and layout, and misses by cause.
+
+    \b
+    Example:
+      python -m validation.concealed table validation/results/independent_campaigns.ecsv
+    """
+    kept = [r for r in read_rows(rows) if group is None or r["set"] == group]
+    if not kept:
+        names = ", ".join(sorted({r["set"] for r in read_rows(rows)}))
+        raise click.UsageError(f"--set {group}: {rows} holds {names or 'no rows'}")
+    trials = [trial_from_row(r) for r in kept]
+    parts = {"all": trials, **splits(trials)}
+    lines = {name: goals(own) for name, own in parts.items()}
+    print_lines(lines["all"], click.echo)
+    for name, own in list(parts.items())[1:]:
+        click.echo(f"\n{name}: {len(own)} campaigns")
+        print_lines([n for n in lines[name] if n.trials], click.echo)
+    by_cause: dict[str, list[str]] = {}
+    for trial in trials:
+        if word := causes(trial.score):
+            by_cause.setdefault(word, []).append(described(trial))
+    for word, own in sorted(by_cause.items(), key=lambda c: -len(c[1])):
+        click.echo(f"\n{word}: {len(own)}")
+        for text in own:
+            click.echo(f"  {text}")
+    if output:
+        write_goals(output, lines, "python -m validation.concealed table")
+        click.echo(f"\n{output}")
 
 
 if __name__ == "__main__":

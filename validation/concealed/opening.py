@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from validation.concealed.goals import Trial, trial_of
 from validation.concealed.rows import append_rows, read_rows, write_rows
 from validation.concealed.score import SCORED, Score, score_campaign
 from validation.concealed.submit import (
@@ -24,7 +25,9 @@ from validation.concealed.submit import (
 from validation.concealed.tally import Line
 
 COMMAND = "python -m validation.concealed open"
-TRUTH_KEYS = ("campaign", "effects", "size", "amplifiers", "seed", "where", "tie_broken")
+TRUTH_KEYS = (
+    "campaign", "effects", "size", "amplifiers", "seed", "where", "tie_broken", "layout",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -129,6 +132,8 @@ def to_row(opened: Opened, level: str, group: str) -> dict[str, Any]:
     """
     score = opened.score()
     truth = {k: opened.truth[k] for k in TRUTH_KEYS if k in opened.truth}
+    if "nuisances" in opened.truth:
+        truth["nuisances"] = [n["kind"] for n in opened.truth["nuisances"]]
     report = None
     if opened.report is not None:
         report = {k: opened.report[k] for k in SCORED if k in opened.report}
@@ -168,6 +173,12 @@ def from_row(row: Mapping[str, Any]) -> Score:
     )
 
 
+def trial_from_row(row: Mapping[str, Any]) -> Trial:
+    """Trial of a row of results of an independent bench's campaign."""
+    truth, report = json.loads(row["truth_json"]), json.loads(row["report_json"])
+    return trial_of(truth, from_row(row), report)
+
+
 def add_results(path: str | Path, rows: Sequence[Mapping[str, Any]], command: str) -> int:
     """Add rows to a file of results; a row of the same commitment stays as it was."""
     return append_rows(path, rows, command, key=("set", "campaign", "commitment"))
@@ -187,3 +198,20 @@ def write_summary(
         for line in lines
     ]  # fmt: skip
     write_rows(path, [*rest, *rows], command)
+
+
+def write_goals(
+    path: str | Path, lines: Mapping[str, Sequence[Line]], command: str
+) -> None:
+    """Write the table of goals, a row for each part of the trials and quantity."""
+    rows = [
+        {
+            "part": part, "quantity": line.quantity, "value": line.value, "low": line.low,
+            "high": line.high, "trials": line.trials, "hits": line.hits, "pass": line.passed,
+            "moonshot": line.moonshot, "reached": line.reached(),
+        }
+        for part, own in lines.items()
+        for line in own
+        if line.trials
+    ]  # fmt: skip
+    write_rows(path, rows, command)

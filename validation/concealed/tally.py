@@ -171,7 +171,7 @@ def tally(scores: Sequence[Score]) -> list[Line]:
     library = [s for s in scores if s.kind in ("single", "several")]
     return [
         share("false alarms on nulls, p < 0.01", (s.detected for s in null)),
-        _evenness([s.p_value for s in null]),
+        evenness([s.p_value for s in null]),
         *_detections([s for s in (*single, *outside) if len(s.classes) == 1]),
         *_names([s for s in single if s.at_least(8)]),
         *_several([s for s in scores if s.kind == "several" and s.at_least(12)]),
@@ -186,7 +186,8 @@ def tally(scores: Sequence[Score]) -> list[Line]:
     ]  # fmt: skip
 
 
-def _evenness(p_values: Sequence[float]) -> Line:
+def evenness(p_values: Sequence[float]) -> Line:
+    """Make the line of a Kolmogorov-Smirnov test of p-values against even ones."""
     p = _finite(p_values)
     value = float(kstest(p, "uniform").pvalue) if len(p) else NAN
     return Line("null p-values against even, KS p", value, NAN, NAN, len(p))

@@ -313,13 +313,12 @@ def _repair_response(
         good.append(repair.of_image(image, -1.0))
         _on_sensor(whole, frame)[...] = good[-1]
         _on_sensor(owner, frame)[...] = amp
-    light, steps = smooth_light(whole, owner)
-    whole -= light + steps
-    whole[owner < 0] = 0.0
     shade, change = np.ones(shape), np.zeros(shape)
-    # Dust beside a column hides that the column stands alone, and a column disturbs dust's shape:
-    # each is sought again in the image without the other.
+    # Dust beside a column hides that the column stands alone, a column disturbs dust's shape, and
+    # shallow dust pulls the light down: each is sought again in the image without the others.
     for _ in range(2):
+        light, steps = smooth_light(whole, owner, shade != 1.0)
+        even = np.where(owner < 0, 0.0, whole - light - steps)
         columns = []
         change[:] = 0.0
         for amp, (frame, image) in enumerate(zip(layout, good, strict=True)):
@@ -328,7 +327,7 @@ def _repair_response(
                 columns.append((amp, one))
                 own = _on_sensor(change, frame)
                 own[:, one.columns.start : one.columns.stop] = one.change
-        dust = dust_spots((1 + whole) / (1 + change) - 1)
+        dust = dust_spots((1 + even) / (1 + change) - 1)
         shade[:] = 1.0
         for rows_of, columns_of, part, _ in dust:
             shade[np.ix_(rows_of, columns_of)] *= part
@@ -340,7 +339,7 @@ def _repair_response(
     # Corners darker than the middle: a slope of the light has one brighter and one darker.
     fall = float(corners.mean() - middle)
     if (outside >= 0).all() and -fall > LEAST:
-        noise = float(np.std(whole[owner >= 0]) / np.sqrt(whole.size))
+        noise = float(np.std(even[owner >= 0]) / np.sqrt(even.size))
         place = (0, shape[1]), (0, shape[0])
         found.append(
             Cosmetic("vignetting", -1, *place, fall, "of the signal", -fall / noise)

@@ -16,6 +16,7 @@ from bfsensor.diagnose.data.exposure_info import (
     Frame,
     condition_of,
     overscan_level,
+    zero_pixels,
 )
 from bfsensor.typing import FloatArray
 
@@ -78,7 +79,7 @@ class DarkChannels:
         lines = _Columns(exposure.exposure_time or 0.0, [], [], [])
         self._names = [f.name for f in frames]
         for frame in frames:
-            over = frame.serial_overscan
+            over = zero_pixels(frame)
             image = frame.image.astype(np.float64) - overscan_level(frame)
             bias = self._bias.get(frame.name)
             if bias is not None:
@@ -90,7 +91,7 @@ class DarkChannels:
             good = image[~struck]
             error = good.var() / good.size
             if over.size:
-                error += float(over.var()) / (over.size // 2)
+                error += float(over.var()) / over.size
             found.append((float(good.mean()), float(error), int(struck.sum()), image.size))
             # A column most of whose pixels deviate is hot, not struck: it keeps its values.
             hot = struck.mean(0) > 0.5

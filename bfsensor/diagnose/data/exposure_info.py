@@ -144,17 +144,20 @@ class Frame(Protocol):
     def origin(self) -> tuple[int, int] | None: ...
 
 
-def overscan_level(frame: Frame) -> float:
-    """Level of a frame's serial overscan [ADU]; 0 without one.
+def zero_pixels(frame: Frame) -> NDArray[np.float32]:
+    """Pixels that give the zero of a frame: half of its serial, or else its parallel, overscan.
 
-    The mean of its second half, which charge deferred from the image does not reach.
+    That half is the one which charge deferred from the image does not reach.  The array is empty
+    where the frame has neither.
     """
-    over = frame.serial_overscan
-    return (
-        float(np.mean(over[:, over.shape[1] // 2 :], dtype=np.float64))
-        if over.size
-        else 0.0
-    )
+    over, below = frame.serial_overscan, frame.parallel_overscan
+    return over[:, over.shape[1] // 2 :] if over.size else below[len(below) // 2 :]
+
+
+def overscan_level(frame: Frame) -> float:
+    """Level of a frame's overscan [ADU], by :func:`zero_pixels`; 0 without one."""
+    over = zero_pixels(frame)
+    return float(np.mean(over, dtype=np.float64)) if over.size else 0.0
 
 
 class Source(Protocol):

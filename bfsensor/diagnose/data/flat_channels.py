@@ -20,6 +20,7 @@ from bfsensor.diagnose.data.exposure_info import (
     Frame,
     condition_of,
     overscan_level,
+    zero_pixels,
 )
 from bfsensor.diagnose.data.lamp_settings import lamp_settings
 from bfsensor.measure.bartlett import bartlett_matrix
@@ -183,9 +184,7 @@ class FlatChannels:
             for k in (0, 1):
                 m = found.means[k]
                 read = self._noise.get(name, 0.0) ** 2
-                zero = (
-                    read / max(frames[k].serial_overscan.size // 2, 1) + read / found.pixels
-                )
+                zero = read / max(zero_pixels(frames[k]).size, 1) + read / found.pixels
                 means[k].append((m, zero, found.pixels))
                 self._ratios.setdefault(n, []).append(
                     (m, (found.covariances[0, 0] - read) / m)
@@ -217,7 +216,7 @@ class FlatChannels:
             good &= np.abs(away) <= STRUCK * max(usual, 1e-300)
             read = self._noise.get(frame.name, 0.0) ** 2
             count = max(int(good.sum()), 1)
-            zero = read / max(frame.serial_overscan.size // 2, 1) + read / count
+            zero = read / max(zero_pixels(frame).size, 1) + read / count
             values.append((float(image[good].mean()) if good.any() else 0.0, zero, count))
         if all(m > 0 for m, *_ in values):
             self._means.setdefault(fold, []).append(

@@ -33,9 +33,9 @@ others.  Chosen: patterns of light and of pixel edges (roll-off at the rim, tear
 amplifiers, rings) are wider or have no quiet side; with 16 and 3, narrow rings are taken for defects."""
 
 LOST = 0.5
-"""Part of the summed magnitudes of the departures that is lacking in all.  Chosen: where edges between
-columns are displaced the sum is 0, where response is lacking it is the whole; at 0.25, tearing of
-unequal sides passes."""
+"""Part of the summed magnitudes of the departures that is lacking in all, and part of what is lacking in
+dust that whole rows and columns do not lack.  Chosen: where edges between columns are displaced the
+sum is 0, where response is lacking it is the whole; at 0.25, tearing of unequal sides passes."""
 
 FEW = 0.1
 """Part of an amplifier's columns, or of a column's pixels, above which none is a defect: they are a
@@ -226,7 +226,9 @@ def _lacking_rows(
 
 
 def smooth_light(
-    image: FloatArray, amplifiers: NDArray[np.int64] | None = None
+    image: FloatArray,
+    amplifiers: NDArray[np.int64] | None = None,
+    apart: NDArray[np.bool_] | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Fit a smooth function of the place to boxes of a mean flat, with a step for each amplifier.
 
@@ -236,6 +238,8 @@ def smooth_light(
         Response of each pixel of the sensor less one.
     amplifiers : ndarray of int, shape (rows, columns), optional
         Index of each pixel's amplifier, below 0 where none reads; by default one reads all.
+    apart : ndarray of bool, shape (rows, columns), optional
+        Pixels that have no part in the fit, such as those beneath dust.
 
     Returns
     -------
@@ -251,6 +255,9 @@ def smooth_light(
     # The median of a box is that of its good pixels.
     values = np.median(boxes, axis=(1, 3)).ravel()
     own = owner[np.ix_(y_at, x_at)].ravel()
+    there = own >= 0
+    if apart is not None:
+        there &= ~apart[np.ix_(y_at, x_at)].ravel()
     powers = [(p, q) for p in range(LIGHT + 1) for q in range(LIGHT + 1 - p) if p + q]
     orders = np.arange(LIGHT + 1)
     # Powers to half of the order, cosines above: those do not run wild at the rims.
@@ -263,13 +270,13 @@ def smooth_light(
     ]
     steps = [(own == n).astype(float) for n in range(int(owner.max()) + 1)]
     design = np.column_stack([*columns, *steps])
-    used = own >= 0
+    used = there
     for _ in range(6):
         found = np.linalg.lstsq(design[used], values[used], rcond=None)[0]
         away = values - design @ found
         middle = np.median(away[used])
         spread = 1.4826 * float(np.median(np.abs(away[used] - middle)))
-        used = (own >= 0) & (np.abs(away - middle) <= OUTSIDE * spread)
+        used = there & (np.abs(away - middle) <= OUTSIDE * spread)
     light = sum(
         c * np.outer(f[1][:, q], f[0][:, p])
         for c, f, (p, q) in zip(found, shapes, powers, strict=False)
@@ -319,6 +326,7 @@ def dust_spots(image: FloatArray) -> list[tuple[range, range, FloatArray, float]
     if sum(z > usual for z in bright) > len(chosen) // 4:
         return []
     found = []
+    rims = np.median(boxes, axis=0) + np.median(boxes, axis=1)[:, None]
     change = image[:ny, :nx] - np.kron(light, np.ones((BIN, BIN)))
     smooth = gaussian_filter(change, SMOOTH)
     # What the average takes off the middle of a dust spot, averaged in turn (Tukey's twicing).
@@ -326,8 +334,8 @@ def dust_spots(image: FloatArray) -> list[tuple[range, range, FloatArray, float]
     for whole, z in chosen:
         fine = np.kron(whole, np.ones((BIN, BIN), bool))
         rows, columns = (np.flatnonzero(fine.any(k)) for k in (1, 0))
-        # In a corner of the sensor the field rolls off along both rims, which is no dust.
-        if {rows[0], rows[-1] - ny + 1} & {0} and {columns[0], columns[-1] - nx + 1} & {0}:
+        # Towards a rim of the sensor the field rolls off along all of it, which is no dust.
+        if (boxes - rims)[whole].sum() > LOST * (boxes - light)[whole].sum():
             continue
         part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         shade = np.where(fine[part], 1.0 + smooth[part], 1.0)

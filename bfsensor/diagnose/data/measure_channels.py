@@ -38,6 +38,7 @@ from bfsensor.diagnose.data.exposure_info import (
     is_held_out,
     numbers_of,
     zero_folds,
+    zero_pixels,
 )
 from bfsensor.diagnose.data.flat_channels import FlatChannels, OverscanZero
 from bfsensor.diagnose.data.flat_pairing import (
@@ -360,7 +361,7 @@ def measure_channels(
             f"spots that could be fitted{'; ' + '; '.join(notes) if notes else ''}"
         )
     notes += assumed_errors(channels)
-    if "bias" not in kinds and any(f.serial_overscan.size == 0 for f in layout):
+    if "bias" not in kinds and any(zero_pixels(f).size == 0 for f in layout):
         notes.append(
             "no bias and no overscan: the zero level is not known and stays in the levels, "
             "read noise is not known"

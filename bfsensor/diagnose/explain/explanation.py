@@ -170,14 +170,28 @@ class Explanation:
     def same(self, choice: Choice) -> bool:
         """Whether what nonparametric terms describe may be an effect of the explanation by another law.
 
-        It may if an error of at most :data:`~bfsensor.diagnose.detect.model_error.SAME` of the
-        effects' own changes, value by value, gives as much.
+        It may if an error of :data:`~bfsensor.diagnose.detect.model_error.SAME` of all that effects
+        of its channels explain gives as much, or one of at most that part of the effects' own
+        changes, value by value.
         """
         fit, template = self.model.fit, choice.template
-        reach = sum(
+        length = float(np.sqrt(template @ template))
+        by_value = sum(
             overlap(fit, template, p.white, dict.fromkeys(p.own, SAME)) for p in self.parts
         )
-        return bool(np.sqrt(template @ template) < reach)
+        by_law = SAME**2 * sum(self.of_effects(w) for w in choice.family.words)
+        return bool(length < max(by_value, np.sqrt(by_law)))
+
+    def of_effects(self, word: str) -> float:
+        """Decrease of the chi-square, in all channels, by the effects that act in one channel.
+
+        The law of an effect may be wrong in a channel where it explains little: the charge that a
+        full row spills, the spots of an exposure that remembers the one before.
+        """
+        acts = [word in e.touches for e in self.model.effects]
+        return sum(
+            sum(p.own.values()) for p, here in zip(self.parts, acts, strict=True) if here
+        )
 
     def with_effect(self, effect: Effect, model: Model | None = None) -> Explanation:
         """Add an effect, refit everything unless that fit is given, and find what still stands out."""

@@ -414,9 +414,8 @@ def _attribution(
             free=FreeFit(model, choices, scores, mismatch), seed=search.seed,
         )  # fmt: skip
         free = told[0] if told is not None else None
-    left = stands_out(
-        mismatch, now.explained(), dict.fromkeys(now.explained(), SAME), library=False
-    )
+    explained = {w: max(c, now.of_effects(w)) for w, c in now.explained().items()}
+    left = stands_out(mismatch, explained, dict.fromkeys(explained, SAME), library=False)
     nothing = not now.parts and mismatch.detected
     found = [
         _found(model, n, places.get(part.name, []), own)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from bfsensor.diagnose.data.cosmetics import RepairedFrame, find_cosmetics
-from bfsensor.diagnose.data.flat_defects import bad_columns, dust_spots
+from bfsensor.diagnose.data.exposure_info import overscan_level
+from bfsensor.diagnose.data.flat_defects import bad_columns, dust_spots, smooth_light
 from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.diagnosis import diagnose_measured
 from tests.virtual import SMALL, Effect, Range, VirtualSource, make_effect, virtual_baseline
@@ -134,17 +135,37 @@ def test_dust_is_listed_and_no_alarm():
     assert not diagnose_measured(measured, virtual_baseline()).mismatch.detected
 
 
-@pytest.mark.parametrize("name", ["tree_rings", "stripe", "rim", "light"])
+@pytest.mark.parametrize("name", ["tree_rings", "stripe", "rim", "corner", "light"])
 def test_other_patterns_are_no_dust(name):
     rng = np.random.default_rng(12)
-    y, x = np.indices((128, 64))
+    y, x = np.indices((128, 128))
     image = {
         "tree_rings": 0.02 * np.sin(2 * np.pi * np.hypot(x + 60, y - 300) / 18),
         "stripe": np.where((x > 20) & (x < 27) & (y < 90), -0.05, 0.0),
         "rim": -0.2 * np.exp(-x / 4.0),
-        "light": 0.03 * (x / 64) ** 2 - 0.02 * y / 128,
+        "corner": -0.01 * (np.exp(-x / 12.0) + np.exp(-y / 12.0)),
+        "light": 0.03 * (x / 128) ** 2 - 0.02 * y / 128,
     }[name]
     assert dust_spots(image + 3e-3 * rng.standard_normal(image.shape)) == []
+
+
+def test_dust_in_a_corner_is_dust():
+    rng = np.random.default_rng(12)
+    y, x = np.indices((128, 96))
+    image = 3e-3 * rng.standard_normal(y.shape)
+    image -= 0.02 * (np.hypot(x - 89, y - 6) < 9)
+    ((rows, columns, _, _),) = dust_spots(image)
+    assert 6 in rows and 89 in columns
+
+
+def test_shallow_dust_does_not_pull_the_light_down():
+    rng = np.random.default_rng(12)
+    y, x = np.indices((128, 128))
+    dusty = np.hypot(x - 45, y - 60) < 18
+    image = 3e-3 * rng.standard_normal(y.shape) - 5e-3 * dusty
+    free, bound = (smooth_light(image, apart=a)[0][dusty].mean() for a in (None, dusty))
+    # Without the dust the error beneath it is that of the pixels around, 1e-4 or so.
+    assert free < -1.5e-3 and abs(bound) < 5e-4
 
 
 class WithoutOverscan(VirtualSource):
@@ -172,6 +193,14 @@ def test_columns_are_repaired_above_the_level_of_a_bias():
         means = np.median(frame.image, axis=0)
         # Noise of 2.5 ADU in 128 rows; divided with its level of 1000 ADU, a column rises by 15 or more.
         assert np.abs(means - np.median(means)).max() < 3.0
+
+
+def test_parallel_overscan_is_the_zero_without_a_serial_one():
+    source = WithoutOverscan(seed=7105, size=SMALL, effects=[])
+    frame = source.read(source.exposures[0])[0]
+    below = frame.parallel_overscan
+    assert overscan_level(frame) == pytest.approx(below[len(below) // 2 :].mean())
+    assert overscan_level(frame) > 900.0
 
 
 def test_hot_pixels_do_not_hide_dust():

@@ -28,7 +28,9 @@ def columns(
         image = NOISE * rng.standard_normal((ROWS, COLUMNS)) + pattern
         image[:, HOT] += rng.poisson(hot, ROWS)
         over = NOISE * rng.standard_normal((ROWS, 24))
-        frame = SimpleNamespace(name="one", image=image, serial_overscan=over)
+        frame = SimpleNamespace(
+            name="one", image=image, serial_overscan=over, parallel_overscan=over[:0]
+        )
         exposure = SimpleNamespace(
             number=number,
             exposure_time=60.0,
