@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import circulant
 from scipy.signal import lfilter
 
 from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter
@@ -218,12 +219,13 @@ class Traps(Effect):
         # A fluctuation is delayed by the derivative of the loss.
         part = self["power"] * self._lost(axes["level"]) / np.maximum(axes["level"], 1.0)
         part = (part * (before + (lit + 1) / 2)).reshape(-1, 1, 1)
-        axis = self.axis - 2
-        out = c - 2 * part * c
-        lags = np.arange(1, c.shape[axis] // 2)
-        for late, share in zip(lags.tolist(), self._released(lags), strict=True):
-            out += part * share * (np.roll(c, late, axis) + np.roll(c, -late, axis))
-        return np.asarray(out)
+        size = c.shape[self.axis - 2]
+        lags = np.arange(1, size // 2)
+        late = np.zeros(size)
+        late[lags] = self._released(lags)
+        moved = circulant(late + np.roll(late[::-1], 1))
+        moved[np.diag_indices(size)] -= 2
+        return np.asarray(c + part * (c @ moved if self.axis else moved @ c))
 
     def spot_image(
         self, images: FloatArray, axes: Mapping[str, float], layout: Layout

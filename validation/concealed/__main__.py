@@ -1,4 +1,4 @@
-"""``python -m validation.concealed make|run|open|table``: campaigns whose truth is sealed until scored."""
+"""``python -m validation.concealed make|run|open|table``: campaigns sealed until scored."""
 
 from __future__ import annotations
 

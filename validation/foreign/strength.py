@@ -19,7 +19,7 @@ The statistics, each with its noise for all exposures of its group:
 
 Projected out: a gain and a lamp level for each amplifier (means and variances in proportion to the
 signal, a constant variance), the card's device parameters with their priors in covariances, each
-spot exposure's flux and place, and one change of the spots' widths.
+spot exposure's flux and place, and a change of the spots' widths at each wavelength, as optics make.
 
 A sum of squares of differences would be biased by what common random numbers do not cancel; so each
 square is the product of two halves of the data.  Accuracy: 15 % against a case worked out by hand;
@@ -355,12 +355,16 @@ class Estimator:
             )
         rows, count = side * side, 4 * len(own)
         devices = self.spot_templates.shape[2]
-        t = np.zeros((rows * len(own), count + 2 + devices))
+        colours = [self.chosen[k].exposure.wavelength for k in exposures]
+        each = {w: count + 2 * n for n, w in enumerate(dict.fromkeys(colours))}
+        first = count + 2 * len(each)
+        t = np.zeros((rows * len(own), first + devices))
         for q, block in enumerate(own):
             t[q * rows : (q + 1) * rows, 4 * q : 4 * q + 4] = block
-            t[q * rows : (q + 1) * rows, count : count + 2] = wide[q]
-            t[q * rows : (q + 1) * rows, count + 2 :] = self.spot_templates[q]
-        prior = np.r_[np.zeros(count + 2), np.ones(devices)]
+            at = each[colours[q]]
+            t[q * rows : (q + 1) * rows, at : at + 2] = wide[q]
+            t[q * rows : (q + 1) * rows, first:] = self.spot_templates[q]
+        prior = np.r_[np.zeros(first), np.ones(devices)]
         form = fitted_product(
             np.concatenate(a), np.concatenate(b), np.concatenate(sigma), t, prior
         )

@@ -15,6 +15,7 @@ from scipy.stats import chi2
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.exposure_info import (
+    NUMBERS,
     Axes,
     ExposureInfo,
     Frame,
@@ -22,7 +23,7 @@ from bfsensor.diagnose.data.exposure_info import (
     overscan_level,
     zero_pixels,
 )
-from bfsensor.diagnose.data.lamp_settings import lamp_settings
+from bfsensor.diagnose.data.lamp_settings import lamp_settings, smoothed_levels
 from bfsensor.measure.bartlett import bartlett_matrix
 from bfsensor.measure.flat_pairs import flat_covariances
 from bfsensor.typing import FloatArray
@@ -314,10 +315,15 @@ class FlatChannels:
                     mjd=np.nan if exposure.mjd is None else exposure.mjd,
                     hours=self._hours(exposure),
                 )  # fmt: skip
+            columns = axes.columns()
+            light = columns["time"] * columns["lamp"]
+            same = [columns[n] for n in (*NUMBERS, "amp", "setting")]
+            columns["level"] = smoothed_levels(columns["level"], light, same)
             out.append(
-                Channel("flat_mean", np.concatenate(values), tuple(blocks), axes.columns(),
-                        "adu", fold)
-            )  # fmt: skip
+                Channel(
+                    "flat_mean", np.concatenate(values), tuple(blocks), columns, "adu", fold
+                )
+            )
         return out
 
     def _light_scatter(self) -> float:

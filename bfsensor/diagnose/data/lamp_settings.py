@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import median_filter
 
 from bfsensor.typing import FloatArray
 
@@ -17,6 +18,10 @@ lamps set lower by a tenth are found where they take the brightest flats."""
 ALIKE = 1 / LOWER
 """Factor between light per second within which exposures belong to one setting.  Derived: the inverse
 of :data:`LOWER`."""
+
+NEAREST = 15
+"""Number of exposures of about the same light whose median is a level.  Chosen: their noise is a third
+of one's; with 31, levels that bend at full well are off by more."""
 
 
 def lamp_settings(
@@ -67,3 +72,44 @@ def lamp_settings(
         here = settings == n
         light[here] = np.median(rate[here]) / np.median(rate[usual])
     return settings, light
+
+
+def smoothed_levels(
+    levels: ArrayLike, light: ArrayLike, groups: Sequence[ArrayLike]
+) -> FloatArray:
+    """Levels of exposures without the flicker of their lamp: light times a local median.
+
+    A prediction in proportion to a measured level follows its noise, so that an effect that changes
+    all levels by a quarter would explain a quarter of the noise.
+
+    Parameters
+    ----------
+    levels : array_like, shape (n,)
+        Measured levels, in any unit.
+    light : array_like, shape (n,)
+        Exposure times, or times by readings of a lamp; where it is not above 0, levels stay.
+    groups : sequence of array_like, shape (n,)
+        Exposures that agree in all of these are compared.
+
+    Returns
+    -------
+    levels : ndarray, shape (n,)
+
+    Examples
+    --------
+    >>> noise = 0.01 * np.random.default_rng(3).standard_normal(40)
+    >>> light = np.arange(1.0, 41.0)
+    >>> found = smoothed_levels(5 * light * (1 + noise), light, ())
+    >>> float(np.std(found / light / 5).round(3)), float(np.std(noise).round(3))
+    (0.002, 0.01)
+    """
+    out, lit = np.array(levels, float), np.asarray(light, float)
+    words = np.array([np.zeros(len(out)), *groups], float)
+    _, group = np.unique(np.nan_to_num(words, nan=-1.0), axis=1, return_inverse=True)
+    for n in range(int(group.max(initial=-1)) + 1):
+        here = np.flatnonzero((group == n) & (lit > 0))
+        here = here[np.argsort(lit[here], kind="stable")]
+        if len(here):
+            ratio = median_filter(out[here] / lit[here], NEAREST, mode="mirror")
+            out[here] = ratio * lit[here]
+    return out

@@ -7,8 +7,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import FOLDS, Channel
-from bfsensor.diagnose.data.exposure_info import Axes, ExposureInfo, condition_of
+from bfsensor.diagnose.data.exposure_info import NUMBERS, Axes, ExposureInfo, condition_of
+from bfsensor.diagnose.data.flat_channels import LAMP_UNKNOWN
+from bfsensor.diagnose.data.lamp_settings import smoothed_levels
 from bfsensor.diagnose.data.spot_places import PlacedSpots
 from bfsensor.errors import MeasurementError
 from bfsensor.measure.spot_fit import fit_spots
@@ -41,6 +44,12 @@ WING_ERROR = 2e-4
 """Systematic error of the part of a spot's flux outside its stamp.  Chosen, to be derived: 0.1
 e- of background in each of the 320 pixels, over a flux of 1.6e5 e-; with 4e-4, wings below that
 part could hardly be found."""
+
+
+EQUAL = 0.01
+"""Relative difference of exposure times up to which exposures are of equal light.  Chosen: shutters
+differ by less than 2 ms in a second; series of levels differ by more.  With 0.02, series of small
+steps are taken for repeated exposures, and fluxes that bend with the level for scatter."""
 
 
 class SpotChannels:
@@ -175,7 +184,9 @@ class SpotChannels:
                     # the scatter between exposures of equal light is the error.  Without enough
                     # of these it is the error of the mean over pinholes, which is larger.
                     scatter = error / value if repeat is None else repeat
-                    variance = (value * np.hypot(scatter, self._lamp_error)) ** 2
+                    unknown = lamp is None and repeat is None
+                    light_error = LAMP_UNKNOWN if unknown else self._lamp_error
+                    variance = (value * np.hypot(scatter, light_error)) ** 2
                 if what == "wings":
                     variance += WING_ERROR**2
                 values.append(np.array([value]))
@@ -184,20 +195,33 @@ class SpotChannels:
                          flux=found["flux"][0], time=exposure.exposure_time or 0.0,
                          background=self._backgrounds[exposure.number],
                          exposure=exposure.number, hours=24.0 * (mjd - self._start))  # fmt: skip
-        return Channel("spot", np.concatenate(values), tuple(blocks), axes.columns(), "",
-                       fold)  # fmt: skip
+        columns = axes.columns()
+        own = np.flatnonzero(columns["what"] == "flux")
+        place = {int(n): k for k, n in enumerate(columns["exposure"][own])}
+        fluxes = smoothed_levels(
+            columns["flux"][own], columns["light"][own], [columns[n][own] for n in NUMBERS]
+        )
+        columns["flux"] = fluxes[[place[int(n)] for n in columns["exposure"]]]
+        return Channel("spot", np.concatenate(values), tuple(blocks), columns, "", fold)
 
     def _flux_scatter(self) -> float | None:
-        """Relative scatter of the fluxes of exposures of equal light; None with too few."""
-        groups: dict[tuple, list[float]] = {}
+        """Relative scatter of the fluxes of exposures of equal light; None with too few.
+
+        Exposure times that differ by less than :data:`EQUAL` are of equal light.
+        """
+        by_condition: dict[Condition, list[tuple[float, float]]] = {}
         for exposure, found, *_ in self._rows:
-            key = (condition_of(exposure), exposure.exposure_time)
-            groups.setdefault(key, []).append(found["flux"][0] / (exposure.lamp or 1.0))
+            seconds = exposure.exposure_time or 0.0
+            light = (seconds or 1.0) * (exposure.lamp or 1.0)
+            rows = by_condition.setdefault(condition_of(exposure), [])
+            rows.append((seconds, found["flux"][0] / light))
         square, number = 0.0, 0
-        for fluxes in groups.values():
-            ratio = np.array(fluxes) / np.mean(fluxes)
-            square += float(((ratio - 1) ** 2).sum())
-            number += len(fluxes) - 1
+        for rows in by_condition.values():
+            seconds_of, rate = np.array(sorted(rows)).T
+            longer = np.diff(seconds_of) > EQUAL * seconds_of[1:]
+            for own in np.split(rate, np.flatnonzero(longer) + 1):
+                square += float(((own / own.mean() - 1) ** 2).sum())
+                number += len(own) - 1
         return float(np.sqrt(square / number)) if number >= REPEATS else None
 
     @property
