@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.cosmetics import repaired_of
+from bfsensor.diagnose.data.cosmetics import recoded_of
 from bfsensor.diagnose.data.exposure_info import Axes, Frame
 from bfsensor.measure.spots import find_peaks
 from bfsensor.typing import FloatArray
@@ -114,7 +114,7 @@ class CodeChannels:
     def add(self, frames: Sequence[Frame]) -> None:
         """Add a flat's raw codes."""
         for amp, frame in enumerate(frames):
-            codes = frame.image[np.isfinite(frame.image) & ~repaired_of(frame)]
+            codes = frame.image[np.isfinite(frame.image) & ~recoded_of(frame)]
             middle = np.median(codes)
             width = 1.4826 * np.median(np.abs(codes - middle))
             if width < 1.25 * PERIOD:

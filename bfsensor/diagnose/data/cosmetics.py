@@ -145,7 +145,7 @@ class Repair(NamedTuple):
             np.where(changed, np.rint(image), frame.image).astype(np.float32),
             frame.prescan, frame.serial_overscan, frame.parallel_overscan,
             frame.flip_x, frame.flip_y, frame.origin, repaired & ~frame.mask, self.filled,
-            tuple(self.near),
+            tuple(self.near), changed,
         )  # fmt: skip
 
 
@@ -169,6 +169,8 @@ class RepairedFrame:
     """Pixels of the mask whose values are replaced by their neighbours'."""
     near: tuple[tuple[int, int], ...]
     """Columns whose edges are shifted by bad columns between them."""
+    recoded: NDArray[np.bool_] | None = None
+    """Pixels whose values were divided and rounded, which are not the converter's codes; None: none."""
 
 
 def reach_of(size: float) -> float:
@@ -229,6 +231,13 @@ def repaired_of(frame: Frame) -> NDArray[np.bool_]:
     """Pixels of a frame with values that are usable in means, although they are no codes."""
     if isinstance(frame, RepairedFrame):
         return frame.repaired
+    return np.zeros(frame.image.shape, bool)
+
+
+def recoded_of(frame: Frame) -> NDArray[np.bool_]:
+    """Pixels of a frame whose values are not those that the converter gave."""
+    if isinstance(frame, RepairedFrame) and frame.recoded is not None:
+        return frame.recoded
     return np.zeros(frame.image.shape, bool)
 
 

@@ -65,11 +65,9 @@ def shot_at(
 class MapChange:
     """Change of the flats' maps by effects.
 
-    A pattern of pixel areas fills pixels unevenly, and the boundary shifts by that charge relax
-    it.  At each spatial frequency, as for fluctuations of the light, a fraction
-    (exp(a m) - 1) / (a m) is left at the level m.  Patterns of the light are taken as wide
-    compared with the shifts' reach, where nothing relaxes; for waves of 40 pixels this leaves 1 %
-    too much.  Changes after collection are not relaxed.
+    A pattern of pixel areas or of the light fills pixels unevenly, and the boundary shifts by that
+    charge relax it.  At each spatial frequency, as for fluctuations of the light, a fraction
+    (exp(a m) - 1) / (a m) is left at the level m.  Changes after collection are not relaxed.
 
     Parameters
     ----------
@@ -142,13 +140,10 @@ class MapChange:
         total: Spectrum | None = None
         pixels: NDArray[np.floating[Any]] | None = None
         for key, group in self._groups(shares).items():
-            if (areas := self._areas(key, group[0])) is not None:
-                areas = areas * self._left((*name, *key), group)
-                total = areas if total is None else total + areas
-            weight = _weight(group)
-            if weight and (light := self._light(key, group[0])) is not None:
-                light = light * weight
-                total = light if total is None else total + light
+            for uneven in (self._areas(key, group[0]), self._light(key, group[0])):
+                if uneven is not None:
+                    uneven = uneven * self._left((*name, *key), group)
+                    total = uneven if total is None else total + uneven
             if (pattern := self._patterns(group)) is not None:
                 pixels = pattern if pixels is None else pixels + pattern
         return total, pixels
