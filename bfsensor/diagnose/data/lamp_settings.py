@@ -21,7 +21,7 @@ of :data:`LOWER`."""
 
 NEAREST = 15
 """Number of exposures of about the same light whose median is a level.  Chosen: their noise is a third
-of one's; with 31, levels that bend at full well are off by more."""
+of one's; with 31, levels near full well are off by more."""
 
 
 def lamp_settings(

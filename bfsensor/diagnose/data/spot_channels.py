@@ -49,7 +49,7 @@ part could hardly be found."""
 EQUAL = 0.01
 """Relative difference of exposure times up to which exposures are of equal light.  Chosen: shutters
 differ by less than 2 ms in a second; series of levels differ by more.  With 0.02, series of small
-steps are taken for repeated exposures, and fluxes that bend with the level for scatter."""
+steps are taken for repeated exposures, and a nonlinear response for scatter."""
 
 
 class SpotChannels:
