@@ -6,14 +6,16 @@ Trials are campaigns whose laws, strengths and nuisances are not the fitter's
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from validation.concealed.conventions import OUTSIDE
-from validation.concealed.score import NAN, Held, Score
+from validation.concealed.same_laws import CYCLES, SAME_LAWS, expected_parameters
+from validation.concealed.score import NAN, Held, Score, snr_of
 from validation.concealed.tally import Line, mean, share
 from validation.concealed.tally import evenness as evenness_of
 
@@ -46,30 +48,6 @@ ASKED = {
 """What is asked by quantity (pass, moonshot), fixed before any campaign of an independent bench was
 made."""
 
-OTHERS = {
-    "amp_crosstalk": ("delayed", "nonlinear"),
-    "bf_anisotropy": ("near",),
-    "bf_chromatic": ("absorption", "window"),
-    "bf_long_range": ("inverse_square",),
-    "bf_nonlinear": ("saturating", "two_axes"),
-    "bias_instability": ("along_rows",),
-    "cosmic_rays": ("worms",),
-    "dark_hot": ("hot_columns",),
-    "device_parameter": ("field",),
-    "fringing": ("rough_layers",),
-    "gain_nonlinearity": ("spline_table",),
-    "illumination_turbulence": ("drifting_cells", "kolmogorov"),
-    "lateral_diffusion": ("depth", "hot_electrons"),
-    "psf_wings": ("exponential", "king"),
-    "saturation": ("spill_back",),
-    "silicon_physics": ("crowding", "hole_screening"),
-    "tearing": ("ragged",),
-    "tree_rings": ("growing_sum",),
-    "voltage_dependence": ("drop", "power"),
-}
-"""Laws of the bench, by class, whose formula no law of ``bfsensor.effects`` has: read by hand from both
-sides.  All others have the formula of a law of the library."""
-
 BANDS = {"below 10": (0.0, 10.0), "10 to 100": (10.0, 100.0), "above 100": (100.0, np.inf)}
 """Projected SNRs by which every rate is split."""
 
@@ -88,6 +66,8 @@ class Trial:
         Whether spots and a serial overscan were recorded.
     nuisances : tuple of str
         What the bench did beside.
+    held : tuple of Held
+        Parameters of effects that were named right, by the truth's own law.
     touched : tuple of float
         Held-out chi-square over values, after, of each channel whose value changed.
     """
@@ -98,13 +78,14 @@ class Trial:
     spots: bool
     overscan: bool
     nuisances: tuple[str, ...]
+    held: tuple[Held, ...]
     touched: tuple[float, ...]
 
     @property
     def library_laws(self) -> bool:
-        """Whether the library has the formula of every law."""
+        """Whether the library has the formula of every law (:mod:`validation.concealed.same_laws`)."""
         pairs = zip(self.score.classes, self.laws, strict=True)
-        return all(law not in OTHERS.get(word, ()) for word, law in pairs)
+        return all(pair in SAME_LAWS for pair in pairs)
 
     @property
     def strongest(self) -> float:
@@ -126,12 +107,36 @@ def trial_of(
         bool(layout.get("spots", True)),
         bool(layout.get("serial_overscan", True)),
         tuple(n if isinstance(n, str) else str(n["kind"]) for n in nuisances),
+        tuple(_held(truth, report or {})),
         tuple(
             float(c["after"])
             for c in channels.values()
             if c["after"] != c["before"] and np.isfinite(c["after"])
         ),
     )
+
+
+def _held(truth: Mapping[str, Any], report: Mapping[str, Any]) -> Iterator[Held]:
+    """Reported parameters beside the truth's, in the report's own definitions."""
+    said = {e["class"]: e for e in reversed(report.get("effects") or ())}
+    for effect in truth["effects"]:
+        own = said.get(effect["class"])
+        if own is None:
+            continue
+        expected = expected_parameters(effect, truth, law=own.get("law") or "")
+        for name, true in expected.items():
+            given = (own.get("parameters") or {}).get(name)
+            # Whole numbers and values that the fit holds have no interval.
+            if not isinstance(given, Mapping) or given.get("lo68") is None:
+                continue
+            value, *ends = (
+                NAN if given.get(k) is None else float(given[k])
+                for k in ("value", "lo68", "hi68", "lo95", "hi95")
+            )
+            turns = 1.0 if (effect["class"], name) in CYCLES else np.inf
+            true = value + math.remainder(true - value, turns)
+            error = abs(value - true) / abs(true) if true else NAN
+            yield Held(effect["class"], name, true, value, *ends, error, snr_of(effect))
 
 
 class Goal(Line):
@@ -169,7 +174,7 @@ def goals(trials: Sequence[Trial]) -> list[Goal]:
     outside = [s for s in scores if s.kind == "outside" and s.detected]
     own = [t for t in single if t.library_laws]
     other = [t for t in single if not t.library_laws]
-    held = [p for t in trials if t.library_laws for p in t.score.parameters]
+    held = [p for t in trials for p in t.held]
     ks = evenness_of([s.p_value for s in null])
 
     def detected(low: float, high: float) -> list[bool]:

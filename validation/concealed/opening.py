@@ -27,6 +27,7 @@ from validation.concealed.tally import Line
 COMMAND = "python -m validation.concealed open"
 TRUTH_KEYS = (
     "campaign", "effects", "size", "amplifiers", "seed", "where", "tie_broken", "layout",
+    "plan", "device", "pixels",
 )  # fmt: skip
 
 

@@ -196,10 +196,10 @@ class SpotChannels:
                          background=self._backgrounds[exposure.number],
                          exposure=exposure.number, hours=24.0 * (mjd - self._start))  # fmt: skip
         columns = axes.columns()
-        own = np.flatnonzero(columns["what"] == "flux")
-        place = {int(n): k for k, n in enumerate(columns["exposure"][own])}
+        lit = np.flatnonzero(columns["what"] == "flux")
+        place = {int(n): k for k, n in enumerate(columns["exposure"][lit])}
         fluxes = smoothed_levels(
-            columns["flux"][own], columns["light"][own], [columns[n][own] for n in NUMBERS]
+            columns["flux"][lit], columns["light"][lit], [columns[n][lit] for n in NUMBERS]
         )
         columns["flux"] = fluxes[[place[int(n)] for n in columns["exposure"]]]
         return Channel("spot", np.concatenate(values), tuple(blocks), columns, "", fold)
