@@ -129,14 +129,23 @@ def _held(truth: Mapping[str, Any], report: Mapping[str, Any]) -> Iterator[Held]
             # Whole numbers and values that the fit holds have no interval.
             if not isinstance(given, Mapping) or given.get("lo68") is None:
                 continue
-            value, *ends = (
-                NAN if given.get(k) is None else float(given[k])
-                for k in ("value", "lo68", "hi68", "lo95", "hi95")
-            )
+            value = float(given["value"])
             turns = 1.0 if (effect["class"], name) in CYCLES else np.inf
             true = value + math.remainder(true - value, turns)
+            ends = *_ends(given, "68", true), *_ends(given, "95", true)
             error = abs(value - true) / abs(true) if true else NAN
             yield Held(effect["class"], name, true, value, *ends, error, snr_of(effect))
+
+
+def _ends(given: Mapping[str, Any], level: str, true: float) -> tuple[float, float]:
+    """Ends of an interval; an open one holds the truth, and one that is open twice says nothing."""
+    is_open = set(given.get(f"open{level}") or ())
+    if is_open >= {"lo", "hi"}:
+        return NAN, NAN
+    low, high = float(given[f"lo{level}"]), float(given[f"hi{level}"])
+    return min(low, true) if "lo" in is_open else low, max(
+        high, true
+    ) if "hi" in is_open else high
 
 
 class Goal(Line):

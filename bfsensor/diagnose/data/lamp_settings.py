@@ -100,8 +100,8 @@ def smoothed_levels(
     >>> noise = 0.01 * np.random.default_rng(3).standard_normal(40)
     >>> light = np.arange(1.0, 41.0)
     >>> found = smoothed_levels(5 * light * (1 + noise), light, ())
-    >>> float(np.std(found / light / 5).round(3)), float(np.std(noise).round(3))
-    (0.002, 0.01)
+    >>> bool(np.std(found / light / 5) < 0.4 * np.std(noise))
+    True
     """
     out, lit = np.array(levels, float), np.asarray(light, float)
     words = np.array([np.zeros(len(out)), *groups], float)

@@ -49,12 +49,15 @@ class Model:
         return Model(predictor, fit_baseline(predictor, self.fit.channels, like=self.fit))
 
     def errors(self, n: int) -> dict[str, float]:
-        """Linear standard errors of the parameters of the n-th effect, by name, in their units."""
+        """Linear standard errors of the parameters of the n-th effect, by name, in their units.
+
+        A parameter that changes no prediction at its value, as beyond the end of its range, has none.
+        """
         start = f"effect {n} "
         return {
             name.split()[-1]: float(e)
             for name, e in zip(self.fit.names, self.fit.errors, strict=True)
-            if name.startswith(start)
+            if name.startswith(start) and e > 0
         }
 
     def left(self, channel: Channel) -> FloatArray:
