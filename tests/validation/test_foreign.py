@@ -426,6 +426,26 @@ def test_projected_snr_grows_with_the_amplitude_and_is_that_of_a_plain_case():
     )
 
 
+def test_what_optics_or_the_card_allow_is_no_signal():
+    plan = Plan("T", (1.0, 20.0, 60.0), wavelengths=(480.0, 950.0), back_biases=())
+    bench = Bench(Layout(pixels=128, spots=26), plan, NOMINAL, 21)
+    estimator = Estimator(bench)
+
+    def squares(key, size, **values):
+        law = LAWS[key](values={**values, "sign": 1.0})
+        law.setting = bench.setting
+        law.set_amplitude(size)
+        return estimator.snr(law)[1]["spots"]
+
+    # one back bias and one temperature: wider optics do the same
+    wider = [squares(("lateral_diffusion", "hot_electrons"), var) for var in (0.05, 0.8)]
+    assert max(wider) < 20
+    assert squares(("lateral_diffusion", "depth"), 0.8) < 20
+    # packets 30 standard deviations higher would not pass for the card's
+    far = squares(("device_parameter", "heights"), 30, _name="h")
+    assert far > 1000
+
+
 # ------------------------------------------------------------------ layouts and files
 def section(text):
     return [int(v) for v in re.findall(r"\d+", text)]

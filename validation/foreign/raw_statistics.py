@@ -91,16 +91,24 @@ def fitted_product(
 ) -> float:
     """a^T W b after the templates (columns) are fitted out of both, with priors on their sizes."""
     w = 1 / sigma
-    a, b = a * w, b * w
     if templates is None or not templates.size:
-        return float(a @ b)
-    t = templates * w[:, None]
-    scale = np.sqrt((t * t).sum(0))
-    keep = scale > 0
-    t = t[:, keep]
-    normal = t.T @ t + np.diag((prior if prior is not None else np.zeros(len(scale)))[keep])
-    normal += np.diag(1e-12 * (t * t).sum(0))
-    return float(a @ b - (a @ t) @ np.linalg.solve(normal, t.T @ b))
+        return float((a * w) @ (b * w))
+    sizes = fitted_sizes(b, sigma, templates, prior)
+    return float((a * w) @ (b * w - (templates * w[:, None]) @ sizes))
+
+
+def fitted_sizes(b: NDArray, sigma: NDArray, templates: NDArray, prior=None) -> NDArray:
+    """Sizes of templates (columns) that fit b best, with priors; 0 for a template without values."""
+    t = templates / sigma[:, None]
+    keep = (t * t).sum(0) > 0
+    part = t[:, keep]
+    normal = part.T @ part
+    normal += np.diag(1e-12 * np.diag(normal))
+    if prior is not None:
+        normal += np.diag(np.asarray(prior)[keep])
+    sizes = np.zeros(templates.shape[1])
+    sizes[keep] = np.linalg.solve(normal, part.T @ (b / sigma))
+    return sizes
 
 
 def smooth(h: NDArray) -> NDArray:

@@ -19,7 +19,9 @@ The statistics, each with its noise for all exposures of its group:
 
 Projected out: a gain and a lamp level for each amplifier (means and variances in proportion to the
 signal, a constant variance), the card's device parameters with their priors in covariances, each
-spot exposure's flux and place, and a change of the spots' widths at each wavelength, as optics make.
+spot exposure's flux and place, and a change of the spots' widths at each wavelength, as optics make:
+the bench is compared with one whose optics have the widths that fit best, so that a change of any size
+that optics could make counts for nothing.
 
 A sum of squares of differences would be biased by what common random numbers do not cancel; so each
 square is the product of two halves of the data.  Accuracy: 15 % against a case worked out by hand;
@@ -29,11 +31,13 @@ README.md has the scatter between seeds.
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import correlate1d
 
 from validation.foreign.bench import (
     MONITOR_ERROR,
@@ -45,9 +49,10 @@ from validation.foreign.bench import (
 from validation.foreign.collection import Edges, Light, Term, collect
 from validation.foreign.device import (
     REACH,
+    REFERENCE,
     SPREAD,
+    Device,
     area_changes,
-    baseline_edges,
     edge_shifts,
 )
 from validation.foreign.law import Law
@@ -58,6 +63,7 @@ from validation.foreign.raw_statistics import (
     comb,
     expose,
     fitted_product,
+    fitted_sizes,
     gain,
     smooth,
     variance_gain,
@@ -71,6 +77,41 @@ LAGS = 5
 
 STAMP = 8
 """Half of the side of a spot's cut-out [pixel]."""
+
+SMALL = 2e-4
+"""Change of a spot's variance [pixel^2] that templates describe; what they leave of it is below one
+standard deviation of the spots of a campaign of size S.  Measured."""
+
+SECOND = (1.0, -2.0, 1.0)
+"""Second difference."""
+
+
+FAR = 3.0
+"""Standard deviations of the card at which the curvature of templates is taken; few devices lie
+beyond.  Chosen."""
+
+
+def changed(device: Device, name: str, sigmas: float) -> Device:
+    """The device with one quantity of its card off by so many standard deviations."""
+    return replace(device, **{name: getattr(device, name) * (1 + sigmas * SPREAD[name])})
+
+
+def _straight_and_curved(
+    nominal: NDArray, near: Sequence[NDArray], far: Sequence[NDArray]
+) -> NDArray:
+    """Templates in columns: changes for one sigma of each quantity, then their curvatures."""
+    straight = [n - nominal for n in near]
+    curved = [f - nominal - FAR * s for f, s in zip(far, straight, strict=True)]
+    return np.column_stack([*straight, *curved])
+
+
+class Optics(Law):
+    """Optics of other widths: variances by wavelength added to the spots [pixel^2]."""
+
+    def spot_shape(self, sx, sy, exposure):
+        """Widths of the spots [pixel]."""
+        x, y = self.values[exposure.wavelength]
+        return np.sqrt(sx**2 + x), np.sqrt(sy**2 + y)
 
 
 class Estimator:
@@ -95,19 +136,17 @@ class Estimator:
         self.spot_templates = self._device_spots()
 
     def _device_templates(self) -> NDArray:
-        """Changes of a_ij for one sigma of each parameter of the card, lags in rows."""
+        """Changes of a_ij for one sigma of each parameter of the card, and curvatures; lags in rows."""
         nominal = self.bench.nominal
-        table = baseline_edges(nominal, [])["derivatives_620_m60"]
-        out = []
-        for name, part in SPREAD.items():
-            d = table[name]
-            a = (
-                area_changes(np.array(d["dkx"]), np.array(d["dky"]))
-                * part
-                * getattr(nominal, name)
-            )
-            out.append(a[REACH : REACH + LAGS, REACH : REACH + LAGS].ravel())
-        return np.array(out).T
+
+        def areas(device: Device) -> NDArray:
+            lags = area_changes(*edge_shifts(device, REFERENCE[0]))
+            return lags[REACH : REACH + LAGS, REACH : REACH + LAGS].ravel()
+
+        return _straight_and_curved(
+            areas(nominal),
+            *([areas(changed(nominal, n, z)) for n in SPREAD] for z in (1, FAR)),
+        )
 
     def snr(self, law: Law) -> tuple[float, dict[str, float]]:
         """Projected SNR of a law, and the squares by statistic."""
@@ -331,11 +370,49 @@ class Estimator:
         exposures = self._of("SPOT")
         if not exposures or not self.lay.spots:
             return 0.0
+        base, optics = self.base, Optics({})
+        for _ in range(8):
+            form, change = self._mean_spots(base, other)
+            if max(np.abs(list(change.values())).ravel()) < SMALL:
+                break
+            for colour, (x, y) in change.items():
+                had = optics.values.get(colour, (0.0, 0.0))
+                # no spot becomes narrower than half of what it was
+                optics.values[colour] = tuple(
+                    max(h + c, -0.75 * s**2)
+                    for h, c, s in zip(had, (x, y), self.bench.spot_sigma, strict=True)
+                )
+            base = self._seen_through(optics)
+        return max(form, 0.0) + sum(
+            max(self._echoes(base, other, k), 0.0) for k in exposures
+        )
+
+    def _seen_through(self, optics: Law) -> Products:
+        """The bench without the law, its spots seen through other optics."""
+        exposures = self._of("SPOT")
+        laws = [*self.bench.laws, optics]
+        twin = Bench(
+            self.lay, self.bench.plan, self.bench.nominal, self.bench.seed, laws=laws
+        )
+        spots = expose(twin, [self.chosen[k] for k in exposures])
+        # nuisances keep the state of their own bench
+        for n in self.bench.laws:
+            n.begin(self.bench.setting)
+        frames, codes = list(self.base.frames), list(self.base.codes)
+        for q, k in enumerate(exposures):
+            frames[k], codes[k] = spots.frames[q], spots.codes[q]
+        return Products(frames, codes)
+
+    def _mean_spots(
+        self, base: Products, other: Products
+    ) -> tuple[float, dict[float, tuple[float, float]]]:
+        """Square of the SNR of mean spots; changes of their variances that fit best [pixel^2]."""
+        exposures = self._of("SPOT")
         a, b, sigma, wide, own = [], [], [], [], []
         side = 2 * STAMP + 1
         for k in exposures:
             n = self.chosen[k].stands_for
-            s0 = self._stamps(k, self._image(self.base, k))
+            s0 = self._stamps(k, self._image(base, k))
             d, mean = (
                 self._stamps(k, self._image(other, k)) - s0,
                 np.maximum(np.median(s0, 0), 0),
@@ -349,9 +426,7 @@ class Estimator:
                 np.column_stack([g.ravel() for g in (mean, gx, gy, np.ones_like(mean))])
             )
             wide.append(
-                np.column_stack(
-                    [np.gradient(gx, axis=1).ravel(), np.gradient(gy, axis=0).ravel()]
-                )
+                np.column_stack([correlate1d(mean, SECOND, x).ravel() for x in (1, 0)])
             )
         rows, count = side * side, 4 * len(own)
         devices = self.spot_templates.shape[2]
@@ -365,15 +440,18 @@ class Estimator:
             t[q * rows : (q + 1) * rows, at : at + 2] = wide[q]
             t[q * rows : (q + 1) * rows, first:] = self.spot_templates[q]
         prior = np.r_[np.zeros(first), np.ones(devices)]
-        form = fitted_product(
-            np.concatenate(a), np.concatenate(b), np.concatenate(sigma), t, prior
+        first_half, second_half = np.concatenate(a), np.concatenate(b)
+        form = fitted_product(first_half, second_half, np.concatenate(sigma), t, prior)
+        sizes = fitted_sizes(
+            (first_half + second_half) / 2, np.concatenate(sigma), t, prior
         )
-        return max(form, 0.0) + sum(max(self._echoes(other, k), 0.0) for k in exposures)
+        # a Gaussian's variance grows by twice the size of its second derivative
+        return form, {w: tuple(2 * sizes[at : at + 2]) for w, at in each.items()}
 
-    def _echoes(self, other: Products, k: int) -> float:
+    def _echoes(self, base: Products, other: Products, k: int) -> float:
         """Squares of regressions on other amplifiers' and the turned image's signal."""
         n, total = self.chosen[k].stands_for, 0.0
-        f0, f1 = self.base.frames[k], other.frames[k]
+        f0, f1 = base.frames[k], other.frames[k]
 
         def regressed(change: NDArray, dark: NDArray, signal: NDArray) -> float:
             # even and odd rows are the halves; what is the same everywhere is no echo
@@ -395,37 +473,42 @@ class Estimator:
                     signal = np.zeros_like(f0[u])
                     signal[:, late:] = f0[u][:, : f0[u].shape[1] - late]
                     total += max(regressed(change[v], dark[v], signal), 0.0)
-        image = self._image(self.base, k)
+        image = self._image(base, k)
         moved = np.clip(self._image(other, k) - image, -2e3, 2e3)
         return total + max(regressed(moved, image < 50, image[::-1, ::-1]), 0.0)
 
     def _device_spots(self) -> NDArray:
-        """Changes of the mean spot for one sigma of each parameter of the card, [exposure, pixel, p]."""
+        """Changes of the mean spot as those of a_ij, [exposure, pixel, p]."""
         if not self.lay.spots:
             return np.zeros((0, 0, 0))
         side, out, shifts = 48, [], {}
         for k in self._of("SPOT"):
             e = self.chosen[k].exposure
-            ix, px, gx = _profile(np.array([side // 2]), self.bench.spot_sigma[:1], side)
-            iy, py, gy = _profile(np.array([side // 2]), self.bench.spot_sigma[1:], side)
+            # all spots of a grid of whole pixels lie alike in their pixels
+            u, v = (p[:1] - np.round(p[:1]) + side // 2 for p in self.bench.spot_places(e))
+            ix, px, gx = _profile(u, self.bench.spot_sigma[:1], side)
+            iy, py, gy = _profile(v, self.bench.spot_sigma[1:], side)
             one = [
                 SPOT_FLUX * u.T @ v
                 for u, v in ((iy, ix), (iy, px), (py, ix), (iy, gx), (gy, ix))
             ]
             light = Light(*(i.astype(np.float32) for i in one), seconds=e.seconds)
             stamps = []
-            for name in (None, *SPREAD):
-                key = (name, e.wavelength, e.back_bias)
+            for name, z in [(None, 0.0), *((n, z) for z in (1.0, FAR) for n in SPREAD)]:
+                key = (name, z, e.wavelength, e.back_bias)
                 if key not in shifts:
                     d = replace(self.bench.nominal, vbb=e.back_bias)
-                    if name:
-                        d = replace(d, **{name: getattr(d, name) * (1 + SPREAD[name])})
-                    shifts[key] = edge_shifts(d, e.wavelength)
+                    shifts[key] = edge_shifts(
+                        changed(d, name, z) if name else d, e.wavelength
+                    )
                 edges = Edges((side, side), [Term(*shifts[key])])
                 q = collect(light, edges, np.random.default_rng(1), noise=False)
                 low, high = side // 2 - STAMP, side // 2 + STAMP + 1
                 stamps.append(q[low:high, low:high].ravel().astype(float))
-            out.append(np.column_stack([s - stamps[0] for s in stamps[1:]]))
+            count = len(SPREAD)
+            out.append(
+                _straight_and_curved(stamps[0], stamps[1 : count + 1], stamps[count + 1 :])
+            )
         return np.array(out)
 
     def _spectra(self, other: Products) -> float:
