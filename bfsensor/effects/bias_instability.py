@@ -105,7 +105,7 @@ class BiasByRowWithMemory(ReadNoise):
     variant = "row_memory"
     parameters = (
         Parameter("rms", "e-", 0.3, 3.0, amplitude=True),
-        Parameter("corr", "", 0.05, 0.99, law="flat"),
+        Parameter("corr", "", 0.05, 0.99, law="flat", ends=(0.0, 0.999)),
     )
     touches = ("bias_cov", "bias_level", "flat_cov")
     source = (

@@ -40,7 +40,7 @@ class NoiseInTime(ReadNoise):
 
     word = "correlated_noise"
     variant = "ar1"
-    parameters = (RMS, Parameter("corr", "", 0.3, 0.95, law="flat"))
+    parameters = (RMS, Parameter("corr", "", 0.3, 0.95, law="flat", ends=(-0.999, 0.999)))
     touches = ("bias_cov", "bias_level", "flat_cov")
     source = "First-order autoregression (Box & Jenkins 1970, section 3.2); range assumed"
 
@@ -94,7 +94,7 @@ class FlickerNoise(ReadNoise):
     variant = "flicker"
     parameters = (
         RMS,
-        Parameter("exponent", "", 0.4, 2.0, law="flat"),
+        Parameter("exponent", "", 0.4, 2.0, law="flat", ends=(0.0, 3.0)),
         Parameter("memory", "pixel times", 3.0, 3000.0),
     )
     touches = ("bias_cov", "bias_level", "flat_cov")

@@ -52,6 +52,8 @@ class Parameter(NamedTuple):
     plain : float, optional
         Value at which a more general law is the plain one; an effect that is made without this
         parameter has it.  None: the value must be given.
+    ends : tuple of float
+        Least and largest value that physics allows; no fit goes beyond.
 
     Examples
     --------
@@ -69,6 +71,7 @@ class Parameter(NamedTuple):
     amplitude: bool = False
     step: float = 0.0
     plain: float | None = None
+    ends: tuple[float, float] = (-np.inf, np.inf)
 
 
 class Segment(NamedTuple):

@@ -234,7 +234,7 @@ class TwoTimesPersistence(Persistence):
     parameters = (
         Parameter("frac", "", 1e-5, 1e-3, amplitude=True),
         Parameter("tau", "exposure", 0.3, 5.0),
-        Parameter("slow", "", 0.02, 0.98, law="flat"),
+        Parameter("slow", "", 0.02, 0.98, law="flat", ends=(0.0, 1.0)),
         Parameter("slow_tau", "exposure", 2.0, 30.0),
         Parameter("threshold", "e-", 300.0, 1e5),
     )
@@ -254,7 +254,7 @@ class TwoTimesPersistence(Persistence):
         return np.maximum(charge - self["threshold"], 0.0)
 
     def _species(self) -> list[tuple[float, float]]:
-        slow = float(np.clip(self["slow"], 0.0, 1.0))
+        slow = self["slow"]
         return [(1 - slow, self["tau"]), (slow, self["slow_tau"])]
 
     def _after(self, later: FloatArray) -> FloatArray:

@@ -193,7 +193,10 @@ class DrainedSaturation(Saturation):
     """
 
     variant = "drained"
-    parameters = (*Saturation.parameters, Parameter("drain", "", 0.0, 1.0, law="flat"))
+    parameters = (
+        *Saturation.parameters,
+        Parameter("drain", "", 0.0, 1.0, law="flat", ends=(0.0, 1.0)),
+    )
     source = (
         "Surface full well and anti-blooming drains: Janesick 2001, Scientific Charge-Coupled "
         "Devices, SPIE Press PM83, section 2.3; shares and range assumed"

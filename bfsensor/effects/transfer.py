@@ -141,7 +141,7 @@ TRAPS = (
 published (Massey et al. 2014 fit 0.48 to 0.58 to HST; 1 is proportional), a margin is added."""
 
 SLOWER = (
-    Parameter("slow", "", 0.02, 0.98, law="flat"),
+    Parameter("slow", "", 0.02, 0.98, law="flat", ends=(0.0, 1.0)),
     Parameter("slow_tau", "packets", 2.0, 40.0),
 )
 """Parameters of traps of a second kind: part of the late charge, and their release time.  Ranges
@@ -166,7 +166,7 @@ class Traps(Effect):
         """Parts of the late charge, and what is left of each after a packet has passed."""
         parts = [(1.0, self["tau"])]
         if "slow" in self.values:
-            slow = float(np.clip(self["slow"], 0.0, 1.0))
+            slow = self["slow"]
             parts = [(1 - slow, self["tau"]), (slow, self["slow_tau"])]
         return [(part, float(np.exp(-1 / tau))) for part, tau in parts]
 

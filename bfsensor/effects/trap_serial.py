@@ -49,7 +49,7 @@ class TrapSerial(Effect):
         Parameter("size", "e-", 5.0, 100.0, amplitude=True),
         Parameter("tau", "pixel times", 0.7, 4.0),
         Parameter("amp", "", 0, 1, law="whole"),
-        Parameter("reach", "e-", 0.0, 1000.0, law="flat"),
+        Parameter("reach", "e-", 0.0, 1000.0, law="flat", ends=(0.0, np.inf)),
     )
     touches = ("serial_overscan", "flat_map", "flat_mean", "spot")
     of_pixels = True
@@ -138,17 +138,17 @@ class TrapSerial(Effect):
 
     def _caught(self, packet: FloatArray, held: FloatArray, part: float) -> FloatArray:
         """Charge that a part of the trap, which holds ``held``, takes from packets [e-]."""
-        above = packet - max(self["reach"], 0.0)
+        above = packet - self["reach"]
         return np.clip(np.minimum(above, part * self["size"] - held), 0, None)
 
     def _before(self, level: FloatArray, part: float, released: float) -> FloatArray:
         """Charge that a part of the trap holds after much light of a level [e-]."""
-        reached = np.maximum(level - max(self["reach"], 0.0), 0.0)
+        reached = np.maximum(level - self["reach"], 0.0)
         return np.minimum(reached / released, part * self["size"])
 
     def _filled(self, level: FloatArray) -> FloatArray:
         """Charge in the trap after a flat of a level [e-]."""
-        reached = np.maximum(level - max(self["reach"], 0.0), 0.0)
+        reached = np.maximum(level - self["reach"], 0.0)
         return np.minimum(self["size"], reached)
 
     def _held(self, axes: Axes) -> FloatArray:
@@ -254,7 +254,7 @@ class TwoTimesTrap(GradualTrap):
     variant = "two_times"
     parameters = (
         *GradualTrap.parameters,
-        Parameter("slow", "", 0.02, 0.98, law="flat"),
+        Parameter("slow", "", 0.02, 0.98, law="flat", ends=(0.0, 1.0)),
         Parameter("slow_tau", "pixel times", 2.0, 50.0),
     )
     source = (
@@ -267,5 +267,5 @@ class TwoTimesTrap(GradualTrap):
         return {"slow": 0.4, "slow_tau": 10.0, "tau": 1.0}
 
     def _species(self) -> tuple[tuple[float, float], ...]:
-        slow = float(np.clip(self["slow"], 0.0, 1.0))
+        slow = self["slow"]
         return (1 - slow, self["tau"]), (slow, self["slow_tau"])

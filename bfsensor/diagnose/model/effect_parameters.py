@@ -61,12 +61,18 @@ def fitted(effect: Effect) -> list[Parameter]:
 
 
 def widened(p: Parameter) -> tuple[float, float]:
-    """Range of a parameter in fits: ten times the plausible one, or half its width beyond it."""
+    """Range of a parameter in fits: ten times the plausible one, or half its width beyond it.
+
+    It ends where what physics allows does.
+    """
     if p.law == "log":
         low = -10 * p.high if p.signed else (0.0 if p.amplitude else 0.3 * p.low)
-        return p.neutral + low, p.neutral + (10 * p.high if p.amplitude else 3 * p.high)
-    reach = 0.5 * (p.high - p.low)
-    return p.low - reach, p.high + reach
+        high = 10 * p.high if p.amplitude else 3 * p.high
+        range_ = p.neutral + low, p.neutral + high
+    else:
+        reach = 0.5 * (p.high - p.low)
+        range_ = p.low - reach, p.high + reach
+    return max(range_[0], p.ends[0]), min(range_[1], p.ends[1])
 
 
 def reach_of(p: Parameter, value: float) -> tuple[float, float]:
