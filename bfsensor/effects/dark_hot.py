@@ -26,6 +26,9 @@ MOST = 6
 Chosen: each takes a parameter ``x1``, ``x2`` ...; twice as large, the search has twice as many
 starts, and up to twelve columns are explained."""
 
+OTHERS = range(2, MOST + 1)
+"""Numbers of the hot columns after the first."""
+
 SURE = 5.0
 """Significance from which a column of darks counts as hot in the starts [sigma].
 
@@ -38,14 +41,14 @@ SOURCE = (
 
 
 class _Dark(Effect):
-    """Dark current of ``rate`` [e-/s] in some columns; subclasses choose them."""
+    """Dark current of ``rate`` [e-/s] in columns, or a part of it; subclasses choose them."""
 
     word = "dark_hot"
     stage = "store"
     source = SOURCE
 
-    def hot(self, layout: Layout) -> NDArray[np.bool_]:
-        """Columns of the sensor with this dark current, boolean, shape (nx,)."""
+    def hot(self, layout: Layout) -> FloatArray:
+        """Part of this dark current in each column of the sensor, shape (nx,)."""
         raise NotImplementedError
 
     def store(
@@ -69,25 +72,26 @@ class _Dark(Effect):
         for amp, segment in enumerate(layout.segments):
             own = np.asarray(axes["amp"]).astype(int) == amp
             read = hot[segment.sensor_column(np.arange(segment.columns))]
-            share = float(read.mean())
+            parts, which, count = np.unique(read, return_inverse=True, return_counts=True)
+            usual = float(np.median(read))
             for mean in np.unique(born[own]):
-                # The measurement counts deviations from the median, which is hot if most columns are.
-                level = mean if share > 0.5 else 0.0
-                part, others = struck_pixels(float(mean), level, noise[amp], more)
-                cold = 0.0 if share < 1 else others
+                # The measurement counts deviations from the median.
+                struck, others = np.transpose([
+                    struck_pixels(float(mean * p), float(mean * usual), noise[amp], more)
+                    if p else (0.0, 0.0) for p in parts
+                ])  # fmt: skip
                 rows = own & (born == mean)
                 what = axes["what"][rows]
-                kept = share * (1 - part) + (1 - share)
-                mixed = (share * (1 - part) * others + (1 - share) * cold) / kept
+                kept = count * (1 - struck)
                 column = np.zeros(len(what))
                 at = what == "column"
                 # The mean of a column excludes its struck pixels, unless they are most of it.
-                value = float(mean) if part > 0.5 else others
-                column[at] = value * (
-                    read[axes["x"][rows][at].astype(int)] - (1.0 if share > 0.5 else 0.0)
-                )
-                struck = share * part * segment.rows * segment.columns
-                out[rows] = np.where(what == "struck", struck, np.where(at, column, mixed))
+                value = np.where(struck > 0.5, mean * parts, others)
+                column[at] = value[which[axes["x"][rows][at].astype(int)]]
+                column[at] -= value[parts == usual].sum()
+                hit = float(struck @ count) * segment.rows
+                mixed = float(kept @ others) / float(kept.sum())
+                out[rows] = np.where(what == "struck", hit, np.where(at, column, mixed))
         return out
 
     def _born(
@@ -126,26 +130,26 @@ class DarkCurrent(_Dark):
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
         return [{"rate": rate} for rate in (0.05, 0.3, 0.7, 1.2)]
 
-    def hot(self, layout: Layout) -> NDArray[np.bool_]:
-        return np.ones(layout.shape[1], bool)
+    def hot(self, layout: Layout) -> FloatArray:
+        return np.ones(layout.shape[1])
 
 
 class HotColumns(_Dark):
-    """Dark current of ``rate`` [e-/s at -100 C] in whole columns, the same in all exposures.
+    """Dark current of ``rate`` [e-/s at -100 C] in one column, and a part of it in others.
 
-    ``columns`` is their number, ``x1``, ``x2`` ... are their places on the sensor from 0; places
-    beyond the number are not used and 0.
+    ``columns`` is their number, ``x1``, ``x2`` ... are their places on the sensor from 0, and ``part2``,
+    ``part3`` ... the dark current of all but the first, over that of the first.
 
     Parameters
     ----------
     values : mapping of str to float
         Plausible ranges: ``rate`` [e-/s]: 1 to 50 (0 changes nothing); ``columns``: 1 to 6, whole;
-        ``x1`` to ``x6`` [pixel]: columns of the sensor from 0, whole.
+        ``x1`` to ``x6`` [pixel]: columns of the sensor from 0, whole; ``part2`` to ``part6``: 0.02 to
+        1, searched but not fitted.
 
     Examples
     --------
-    >>> places = {f"x{n}": 0 for n in range(1, 7)} | {"x1": 17}
-    >>> HotColumns({"rate": 5.0, "columns": 1} | places).name
+    >>> HotColumns({"rate": 5.0, "columns": 2, "x1": 17, "x2": 30, "part2": 0.5}).name
     'dark_hot:hot'
     """
 
@@ -153,7 +157,9 @@ class HotColumns(_Dark):
     parameters = (
         Parameter("rate", "e-/s", 1.0, 50.0, amplitude=True),
         Parameter("columns", "", 1, MOST, law="whole"),
-        *(Parameter(f"x{n}", "pixel", 0, 1e4, law="whole") for n in range(1, MOST + 1)),
+        Parameter("x1", "pixel", 0, 1e4, law="whole"),
+        *(Parameter(f"x{n}", "pixel", 0, 1e4, law="whole", plain=0.0) for n in OTHERS),
+        *(Parameter(f"part{n}", "", 0.02, 1.0, law="whole", plain=1.0) for n in OTHERS),
     )
     touches = ("dark_map", "flat_map")
     by_time = True
@@ -169,19 +175,24 @@ class HotColumns(_Dark):
                     int(amp) if isinstance(amp, int | np.integer) else 0
                 ]
                 column = int(segment.sensor_column(np.array(int(s["x"][0]))))
-                places.setdefault(column, float(s.get("z", SURE)))
+                places[column] = max(places.get(column, 0.0), float(s.get("z", SURE)))
+        order = sorted(places, key=lambda x: -places[x])
         # Only significant ones: a hot column raises the mean, below which others then seem cold.
-        sure = [x for x, z in places.items() if z >= SURE][:MOST] or list(places)[:1]
+        sure = [x for x in order if places[x] >= SURE][:MOST] or order[:1]
+        parts = [places[x] / max(places[sure[0]], SURE) for x in sure]
         return [
             {"rate": rate, "columns": float(count)}
-            | {f"x{n + 1}": float(sure[n]) if n < count else 0.0 for n in range(MOST)}
+            | {f"x{n + 1}": float(sure[n]) for n in range(count)}
+            | {f"part{n + 1}": parts[n] for n in range(1, count)}
             for count in range(1, len(sure) + 1) for rate in (2.0, 20.0)
         ]  # fmt: skip
 
-    def hot(self, layout: Layout) -> NDArray[np.bool_]:
-        out = np.zeros(layout.shape[1], bool)
-        places = [int(self[f"x{n}"]) for n in range(1, int(self["columns"]) + 1)]
-        out[[x for x in places if 0 <= x < len(out)]] = True
+    def hot(self, layout: Layout) -> FloatArray:
+        out = np.zeros(layout.shape[1])
+        for n in range(1, int(self["columns"]) + 1):
+            x = int(self[f"x{n}"])
+            if 0 <= x < len(out):
+                out[x] = self[f"part{n}"] if n > 1 else 1.0
         return out
 
     def pattern(self, shot: Shot, layout: Layout) -> FloatArray | None:

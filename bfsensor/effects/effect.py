@@ -40,7 +40,7 @@ class Parameter(NamedTuple):
         Value of an amplitude at which the effect changes nothing.
     law : str
         Prior of the values inside the range: "log", uniform in the logarithm; "flat", uniform;
-        "whole", whole numbers, which are searched but not fitted.
+        "whole", whole numbers and other values that are searched but not fitted.
     signed : bool
         Whether the value may have either sign.
     amplitude : bool

@@ -54,20 +54,13 @@ def draw_dark_hot() -> Figure:
     """
     figure, panels = row(3)
     layout = make_layout(64, 64, 1)
-    places = {f"x{n}": 0.0 for n in range(1, 9)} | {"x1": 11.0, "x2": 12.0, "x3": 47.0}
-    hot = _hot_columns(places)
+    hot = HotColumns({"rate": 2.0, "columns": 3.0, "x1": 11.0, "x2": 12.0, "x3": 47.0})
     dark = parts.make_effect("dark_hot", {"rate": 0.5}, "dark")
     shot, empty = Shot("dark", 0, 60.0, temperature=173.15), np.zeros((64, 64))
     drawn = (hot.scaled(0), "without"), (hot, "hot columns"), (dark, "dark current")
     for ax, (effect, title) in zip(panels, drawn, strict=True):
         show(ax, _stored(effect, empty, shot, layout, 4735), title, -20, 140)
     return figure
-
-
-def _hot_columns(places: dict[str, float]) -> Effect:
-    """Three hot columns, with as many places as the class has."""
-    known = {p.name: 0.0 for p in HotColumns.parameters} | {"rate": 2.0, "columns": 3.0}
-    return HotColumns({**known, **{n: v for n, v in places.items() if n in known}})
 
 
 @picture("cosmic_rays")

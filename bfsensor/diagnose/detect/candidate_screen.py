@@ -483,7 +483,7 @@ def evidence(
     """
     out = 0.5 * gain
     for p in effect.parameters:
-        if p.law == "whole":
+        if p.law == "whole" and effect[p.name] != p.plain:
             out -= np.log(max(p.high - p.low + 1, 1))
     if not names:
         return out

@@ -117,9 +117,13 @@ def _said_effect(found: Found, verb: str) -> str:
     """One effect: class, meaning, parameters with units, and the classes that fit as well."""
     word = found.effect.word
     units = {p.name: p.unit for p in found.effect.parameters}
+    plain = {p.name: p.plain for p in found.effect.parameters}
     words = PARAMETER_WORDS.get(word, {})
     values = []
     for name, told in found.intervals().items():
+        if name not in found.errors and told["value"] == plain[name]:
+            # It was searched, and the plain law is the best.
+            continue
         # A device's own quantities are in the unit of its file, which the effect does not know.
         unit = f" {units[name]}" if units[name] and name in words else ""
         interval = said_interval(told, "68")

@@ -244,7 +244,8 @@ PARAMETER_WORDS: Mapping[str, Mapping[str, str]] = {
     },
     "dark_hot": {"rate": "dark current", "columns": "number of hot columns",
                  "length": "decay length", "corner": "corner"}
-    | {f"x{n}": f"hot column {n}" for n in range(1, 7)},
+    | {f"x{n}": f"hot column {n}" for n in range(1, 7)}
+    | {f"part{n}": f"dark current of hot column {n} over that of 1" for n in range(2, 7)},
     "saturation": {
         "full_well": "full well", "drain": "part of the charge above it that is lost",
     },

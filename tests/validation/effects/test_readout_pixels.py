@@ -371,3 +371,27 @@ def test_beside_a_hot_column_others_are_not_hot():
     assert {s["columns"] for s in starts} == {1.0}
     place = float(LAYOUT.segments[0].sensor_column(np.array(3)))
     assert {s["x1"] for s in starts} == {place}
+
+
+def test_hot_columns_have_rates_of_their_own():
+    """Columns of pixels, and the channel of darks, have the parts that the effect states."""
+    seen = [
+        {"word": "dark_map", "what": "column", "x": (x, x + 1), "amp": 0, "z": z}
+        for x, z in ((3, 8.0), (5, 40.0), (1, -2.0), (7, 20.0))
+    ]
+    start = next(s for s in HotColumns.starts(LAYOUT, seen) if s["columns"] == 3)
+    assert (start["part2"], start["part3"]) == (0.5, 0.2)
+    hot = HotColumns(start | {"rate": 0.4})
+    places = [int(LAYOUT.segments[0].sensor_column(np.array(x))) for x in (5, 7, 3)]
+    shot, shape = Shot("dark", 0, 10.0, temperature=173.15), (20_000, LAYOUT.shape[1])
+    stored = hot.store(np.zeros(shape), shot, LAYOUT, np.random.default_rng(5), {})
+    mean = stored.mean(0)
+    np.testing.assert_allclose(mean[places], [4.0, 2.0, 0.8], rtol=0.03)
+    assert not np.delete(mean, places).any()
+    axes = {
+        "amp": np.zeros(9), "time": np.full(9, 10.0), "temperature": np.full(9, 173.15),
+        "what": np.array(["column"] * 9), "x": np.arange(9), "y": np.full(9, -1),
+    }  # fmt: skip
+    predicted = hot.dark_map(axes, LAYOUT)
+    np.testing.assert_allclose(predicted[[5, 7, 3]], mean[places], rtol=0.04)
+    assert not np.delete(predicted, [5, 7, 3]).any()
