@@ -25,7 +25,7 @@ from bfsensor.diagnose.model.flat_predictions import (
 )
 from bfsensor.diagnose.model.linear_terms import linear_columns
 from bfsensor.diagnose.model.spot_predictor import SpotPredictor, width_of
-from bfsensor.effects.effect import Effect, Layout
+from bfsensor.effects.effect import Effect, Layout, Shot
 from bfsensor.files import Cache
 from bfsensor.response.edge_response import area_matrix
 from bfsensor.typing import FloatArray
@@ -71,6 +71,8 @@ class Predictor:
         self.layout = layout_of(measured, baseline)
         self.kept = Cache()
         self._of_channels = Cache()
+        # Between two points of a fit the gains seldom change.
+        self._shots = Cache(4)
         self._amps = len(measured.amplifiers)
         self.spots = SpotPredictor(measured, baseline)
         self.notes: list[str] = []
@@ -316,11 +318,15 @@ class Predictor:
         gains, noise = parameters[: self._amps], parameters[self._amps : 2 * self._amps]
         # Levels were calculated with rough gains, which may be off by a quarter.
         scale = _mean_gain(gains) / _mean_gain(np.array(self.layout.gains))
+
+        def at_scale() -> tuple[Shot, ...]:
+            return tuple(s._replace(level=scale * s.level) for s in self.layout.shots)
+
         return replace(
             self.layout,
             gains=tuple(gains.tolist()),
             read_noise=tuple(np.sqrt(np.maximum(noise, 0.0)).tolist()),
-            shots=tuple(s._replace(level=scale * s.level) for s in self.layout.shots),
+            shots=self._shots.get(scale, at_scale),
         )
 
     def effects_at(self, parameters: FloatArray) -> tuple[Effect, ...]:
