@@ -184,8 +184,8 @@ class SpotPredictor:
             if what == "flux":
                 out[rows] += parts @ fluxes
                 continue
-            # Planned exposures have no places yet: their widths do not change.
-            known = np.isin(numbers, list(place_of))
+            # Planned exposures have no places yet, others no prediction: their widths do not change.
+            known = np.isin(numbers, list(place_of)) & (out[rows] > 0)
             rows, own = rows[known], [place_of[n] for n in numbers[known].tolist()]
             if self._gained is None:
                 self._gained = widening(placed, placed)
