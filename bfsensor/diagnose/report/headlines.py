@@ -170,10 +170,19 @@ def headlines(attribution: Attribution) -> str:
 
 
 def _amount(told: Mapping[str, Any], *, whole: bool) -> str:
-    """Value with its error, half of the 68 % interval, to two digits of the error."""
+    """Value with its error, half of the 68 % interval, to two digits of the error.
+
+    Of an interval that is open at one end the other is stated.
+    """
     value = float(told["value"])
     if whole or "lo68" not in told:
         return f"{value:g}"
+    open_ = told.get("open68", ())
+    if len(open_) == 2:
+        return f"{value:.2g} (not constrained)"
+    if open_:
+        low = "hi" in open_
+        return f"{'more' if low else 'less'} than {told['lo68' if low else 'hi68']:.3g}"
     error = 0.5 * (float(told["hi68"]) - float(told["lo68"]))
     if not (math.isfinite(error) and error > 0):
         return f"{value:.3g}"

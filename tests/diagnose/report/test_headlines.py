@@ -7,7 +7,7 @@ import pytest
 
 from bfsensor.diagnose.explain.attribution import Found
 from bfsensor.diagnose.report.class_words import CLASS_WORDS
-from bfsensor.diagnose.report.headlines import HEADLINES, headline, headlines
+from bfsensor.diagnose.report.headlines import HEADLINES, _amount, headline, headlines
 from bfsensor.effects.cti_serial import CtiSerial
 from bfsensor.effects.library import LIBRARY
 from bfsensor.effects.trap_serial import TrapSerial
@@ -70,3 +70,17 @@ def test_what_is_left_is_said():
     assert headlines(Told((one,), Left(False), open_world=True)).endswith("see below.")
     assert headlines(Told((), Left(True))) == ""
     assert headlines(Told((one, one), Left(False))).startswith("Serial transfer")
+
+
+@pytest.mark.parametrize(
+    ("open_", "said"),
+    [
+        ([], "45000 +- 2.5e+02"),
+        (["lo"], "less than 4.52e+04"),
+        (["hi"], "more than 4.47e+04"),
+        (["lo", "hi"], "4.5e+04 (not constrained)"),
+    ],
+)
+def test_an_open_interval_has_no_error(open_, said):
+    told = {"value": 45000.0, "lo68": 44700.0, "hi68": 45200.0, "open68": open_}
+    assert _amount(told, whole=False) == said
