@@ -301,7 +301,10 @@ class _Search:
                 best = ranking[0]
                 if best.effect.name != part.name:
                     try:
-                        other, _ = self.forward(without.with_effect(best.effect))
+                        other = without.with_effect(best.effect)
+                        # Without its laws: others come with what is added to the exchanged one.
+                        if other.score < now.score + law:
+                            other, _ = self.forward(other)
                     except ConvergenceError:
                         continue
                     # The score falls with every exchange, so that the search ends.
