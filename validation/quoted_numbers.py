@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from astropy.table import Row, Table
 
+from validation.concealed.goals import QUOTED, quoted_goal
 from validation.index import Age, read_ages, read_claims
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -473,6 +474,10 @@ def _numbers() -> dict[str, Callable[[Rows], str]]:
         ("linear edges", "linear", "edges"),
     ):  # fmt: skip
         numbers[f"left {short}"] = lambda r, s=sensor, n=name: correction_left(r, s, n)
+    for short in QUOTED:
+        numbers[f"independent {short}"] = lambda r, s=short: quoted_goal(
+            r("independent_goals"), s
+        )
     for sigma in (1.0, 1.5, 2.5):
         numbers[f"beyond {sigma}"] = lambda r, s=sigma: beyond_table(r, s)
     for kind in ("plain", "tile-compressed"):

@@ -7,7 +7,7 @@ Trials are campaigns whose laws, strengths and nuisances are not the fitter's
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,6 +47,21 @@ ASKED = {
 }
 """What is asked by quantity (pass, moonshot), fixed before any campaign of an independent bench was
 made."""
+
+QUOTED = {
+    "alarms": "false alarms on nulls, p < 0.01",
+    "detected": "detected, SNR above 10",
+    "named": "named first right, SNR >= 8, a law of the library",
+    "named other": "named first right, SNR >= 8, another published law",
+    "in class": "truth in the reported class, SNR >= 8",
+    "outside": "'outside the library' claimed, truth in it",
+    "invented": "an effect named beside that is not there",
+    "recall": "two or three effects: recall",
+    "precision": "two or three effects: precision",
+    "held 68": "coverage of 68 % intervals, a law of the library",
+    "held 95": "coverage of 95 % intervals, a law of the library",
+}
+"""Goals of campaigns of an independent bench that pages quote, by short name."""
 
 BANDS = {"below 10": (0.0, 10.0), "10 to 100": (10.0, 100.0), "above 100": (100.0, np.inf)}
 """Projected SNRs by which every rate is split."""
@@ -160,6 +175,13 @@ class Goal(Line):
     def moonshot(self) -> str:
         """What is aimed at."""
         return ASKED.get(self.quantity, ("", ""))[1]
+
+
+def quoted_goal(table: Iterable[Any], short: str) -> str:
+    """Share of a goal of :data:`QUOTED` with its Wilson bounds [%] and its trials, of all campaigns."""
+    (row,) = (r for r in table if (r["part"], r["quantity"]) == ("all", QUOTED[short]))
+    low, high = 100 * row["low"], 100 * row["high"]
+    return f"{100 * row['value']:.0f} % ({low:.0f} to {high:.0f}, of {row['trials']})"
 
 
 def _goal(line: Line) -> Goal:
