@@ -27,7 +27,7 @@ Chosen: each takes a parameter ``x1``, ``x2`` ...; twice as large, the search ha
 starts, and up to twelve columns are explained."""
 
 OTHERS = range(2, MOST + 1)
-"""Numbers of the hot columns after the first."""
+"""Numbers of the hot columns after the first.  Derived from :data:`MOST`."""
 
 SURE = 5.0
 """Significance from which a column of darks counts as hot in the starts [sigma].

@@ -1,0 +1,1 @@
+"""Campaigns of an independent bench: the claim, its rows by ``validation.concealed``."""
