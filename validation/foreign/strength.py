@@ -79,12 +79,11 @@ STAMP = 8
 """Half of the side of a spot's cut-out [pixel]."""
 
 SMALL = 2e-4
-"""Change of a spot's variance [pixel^2] that templates describe; what they leave of it is below one
-standard deviation of the spots of a campaign of size S.  Measured."""
+"""Change of a spot's variance [pixel^2] that templates describe; what they leave of it is at most three
+standard deviations of the spots of a campaign of size S.  Measured."""
 
 SECOND = (1.0, -2.0, 1.0)
 """Second difference."""
-
 
 FAR = 3.0
 """Standard deviations of the card at which the curvature of templates is taken; few devices lie

@@ -539,7 +539,8 @@ def _best_factor(
     p = 2 * float(one @ left), 2 * float(two @ left) - float(one @ one)
     q = -2 * float(one @ two), -float(two @ two)
     # Gain p0 f + p1 f^2 + q0 f^3 + q1 f^4, whose slope is a cubic; a straight line where the second
-    # template is rounding alone, whose roots would be lost in it.
+    # template is rounding alone, whose roots would be lost in it: templates are kept in single
+    # precision, so that rounding gives four times 6e-8 of the first, squared 6e-14.
     straight = float(two @ two) < 1e-12 * float(one @ one)
     roots = np.roots([2 * p[1], p[0]] if straight else [4 * q[1], 3 * q[0], 2 * p[1], p[0]])
     best, most = 0.0, 0.0
