@@ -34,7 +34,7 @@ class BrighterFatterAnisotropy(Effect):
     stage = "collect"
     parameters = (
         Parameter("eps", "", 0.02, 0.3, signed=True, amplitude=True),
-        Parameter("near", "1/pixel", 0.0, 2.0, law="flat", plain=0.0),
+        Parameter("near", "1/pixel", 0.0, 2.0, law="flat", plain=0.0, ends=(0.0, np.inf)),
     )
     touches = ("flat_cov", "spot")
     source = (

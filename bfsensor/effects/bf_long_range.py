@@ -44,7 +44,7 @@ class BrighterFatterLongRange(Effect):
     parameters = (
         Parameter("amp", "1/e-", 5e-9, 1e-7, amplitude=True),
         Parameter("power", "", 0.0, 3.0, law="flat"),
-        Parameter("near", "1/pixel", 0.0, 1.0, law="flat", plain=0.0),
+        Parameter("near", "1/pixel", 0.0, 1.0, law="flat", plain=0.0, ends=(0.0, np.inf)),
     )
     touches = ("flat_cov", "spot")
     source = (

@@ -73,7 +73,7 @@ class EdgesNonlinear(Effect):
     parameters = (
         Parameter("b", "1/e-", 3e-7, 3e-6, signed=True, amplitude=True),
         Parameter("b_y", "1/e-", 3e-7, 3e-6, signed=True, amplitude=True),
-        Parameter("near", "1/pixel", 0.0, 2.0, law="flat"),
+        Parameter("near", "1/pixel", 0.0, 2.0, law="flat", ends=(0.0, np.inf)),
     )
     touches = ("flat_cov", "spot")
     of_levels = True

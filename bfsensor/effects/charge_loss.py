@@ -61,7 +61,7 @@ class PowerLoss(Effect):
     stage = "collect"
     parameters = (
         Parameter("q", "1/e-", 1e-8, 3e-7, amplitude=True),
-        Parameter("power", "", 0.2, 2.0, law="flat"),
+        Parameter("power", "", 0.2, 2.0, law="flat", ends=(0.0, np.inf)),
     )
     touches = ("flat_mean", "flat_cov", "spot")
     source = (

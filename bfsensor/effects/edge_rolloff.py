@@ -42,7 +42,7 @@ class EdgeRolloff(Effect):
         Parameter("amp", "pixel", 0.01, 0.5, signed=True, amplitude=True),
         Parameter("length", "pixel", 1.5, 8.0),
         Parameter("sides", "", -1.0, 1.0, law="flat", plain=0.0),
-        Parameter("tail", "", 0.0, 1.0, law="flat", plain=0.0),
+        Parameter("tail", "", 0.0, 1.0, law="flat", plain=0.0, ends=(0.0, 1.0)),
         Parameter("rim", "", 0, 1, law="whole", plain=1.0),
     )
     touches = ("flat_map",)

@@ -34,7 +34,7 @@ class Parameter(NamedTuple):
         Name and unit, as reports print them; '' without a unit.
     low, high : float
         Plausible range, of the magnitude where ``signed``.  Evidence is computed for this range;
-        fits may go beyond it: amplitudes with law "log" up to ten times ``high``, other such
+        fits may go beyond it: amplitudes with law "log" up to a hundred times ``high``, other such
         parameters by a factor of about three, those with law "flat" by half of its width.
     neutral : float
         Value of an amplitude at which the effect changes nothing.

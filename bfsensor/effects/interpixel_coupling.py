@@ -40,7 +40,7 @@ class InterpixelCoupling(Effect):
     parameters = (
         Parameter("ax", "", 3e-4, 3e-3, amplitude=True),
         Parameter("ay", "", 3e-4, 3e-3, amplitude=True),
-        Parameter("decay", "", 0.0, 0.5, law="flat", plain=0.0),
+        Parameter("decay", "", 0.0, 0.5, law="flat", plain=0.0, ends=(0.0, 1.0)),
     )
     touches = ("flat_cov", "spot")
     source = (

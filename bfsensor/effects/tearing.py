@@ -44,8 +44,8 @@ class Tearing(Effect):
     parameters = (
         Parameter("amp", "pixel", 3e-3, 0.2, signed=True, amplitude=True),
         Parameter("length", "pixel", 1.0, 5.0),
-        Parameter("column", "", 0.0, 1.0, law="flat", step=2e-4),
-        Parameter("open", "", 0.0, 1.0, law="flat"),
+        Parameter("column", "", 0.0, 1.0, law="flat", step=2e-4, ends=(0.0, 1.0)),
+        Parameter("open", "", 0.0, 1.0, law="flat", ends=(-np.inf, 1.0)),
         Parameter("top", "", 0, 1, law="whole", plain=0.0),
     )
     touches = ("flat_map", "flat_cov")

@@ -134,7 +134,7 @@ signal are nearly independent; the predictions do not depend on it."""
 
 TRAPS = (
     Parameter("cti", "", 1e-7, 5e-6, amplitude=True),
-    Parameter("power", "", 0.2, 1.2, law="flat"),
+    Parameter("power", "", 0.2, 1.2, law="flat", ends=(0.0, np.inf)),
     Parameter("tau", "packets", 0.3, 10.0),
 )
 """Parameters of traps of one kind.  Ranges: those of the plain law; powers from 0.3 to 1 are

@@ -1,4 +1,4 @@
-"""Serial trap: a trap of fixed size at the end of the serial register of one amplifier."""
+"""Serial trap: a trap of fixed size at one place of the serial register of one amplifier."""
 
 from __future__ import annotations
 
@@ -19,6 +19,9 @@ from bfsensor.effects.effect import (
 )
 from bfsensor.typing import FloatArray
 
+COLUMN = Parameter("column", "", 0, 4095, law="whole", plain=0.0)
+"""First column that passes the trap, in the order of reading.  Range: registers of sensors of 4k."""
+
 
 class TrapSerial(Effect):
     """A trap captures up to ``size`` electrons at once and releases them over ``tau`` pixel times.
@@ -29,13 +32,15 @@ class TrapSerial(Effect):
     is the number of the amplifier, from 0.  The trap is empty at the beginning of each row, as the
     parallel transfer takes far longer than the release.  After a row of light the k-th pixel of
     the overscan holds size (1 - exp(-1/tau)) exp(-(k-1)/tau) electrons; the captured charge is
-    missing in the first column.
+    missing in the first column that passes the trap, ``column``, counted from 0 as they are read:
+    packets of the columns before it do not meet the trap.
 
     Parameters
     ----------
     values : mapping of str to float
         Plausible ranges: ``size`` [e-]: 5 to 100 (0 changes nothing); ``tau`` [pixel times]: 0.7
-        to 4; ``amp``: 0 to 1, whole; ``reach`` [e-]: 0 to 1000.
+        to 4; ``amp``: 0 to 1, whole; ``reach`` [e-]: 0 to 1000; ``column``: 0 to 4095, whole, 0 if
+        not given.
 
     Examples
     --------
@@ -50,6 +55,7 @@ class TrapSerial(Effect):
         Parameter("tau", "pixel times", 0.7, 4.0),
         Parameter("amp", "", 0, 1, law="whole"),
         Parameter("reach", "e-", 0.0, 1000.0, law="flat", ends=(0.0, np.inf)),
+        COLUMN,
     )
     touches = ("serial_overscan", "flat_map", "flat_mean", "spot")
     of_pixels = True
@@ -62,22 +68,27 @@ class TrapSerial(Effect):
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
         return [
-            {"size": 20.0, "tau": tau, "amp": float(n), "reach": 100.0}
-            for n in range(len(layout.segments))
+            {"size": 20.0, "tau": tau, "amp": float(n), "reach": 100.0, "column": column}
+            for n, column in _places(layout, seen)
             for tau in (0.8, 1.5, 3.0)
         ]
 
     def shift(self, frame: Image, amp: int, layout: Layout) -> Image:
         if amp != int(self["amp"]) or self["size"] == 0:
             return frame
-        return self._through(frame)
+        first = int(self["column"])
+        if not first:
+            return self._through(frame)
+        first += layout.segments[amp].prescan
+        return np.concatenate([frame[:, :first], self._through(frame[:, first:])], axis=1)
 
     def pattern(self, shot: Shot, layout: Layout) -> FloatArray | None:
         segment = self._segment(layout)
-        if segment is None or shot.level <= 0:
+        first = int(self["column"])
+        if segment is None or shot.level <= 0 or first >= segment.columns:
             return None
         out = np.zeros(layout.shape)
-        column = segment.x + (segment.columns - 1 if segment.flip_x else 0)
+        column = segment.x + (segment.columns - 1 - first if segment.flip_x else first)
         held = float(self._filled(np.array(shot.level)))
         out[segment.y : segment.y + segment.rows, column] = -held / shot.level
         return out
@@ -99,9 +110,9 @@ class TrapSerial(Effect):
         if segment is None or self["size"] == 0:
             return images
         # Spots are so far apart that each meets the trap as the background leaves it; the
-        # measurement is a mean over the spots of all amplifiers.
+        # measurement is a mean over the spots of all amplifiers, those before the trap among them.
         share = (
-            segment.columns
+            max(segment.columns - self["column"], 0.0)
             * segment.rows
             / sum(s.columns * s.rows for s in layout.segments)
         )
@@ -162,6 +173,28 @@ class TrapSerial(Effect):
         return layout.segments[n] if n < len(layout.segments) else None
 
 
+def _places(layout: Layout, seen: Sequence[Seen]) -> list[tuple[int, float]]:
+    """Amplifiers with the first column read, and with single columns that stand out in maps."""
+    out = [(n, 0.0) for n in range(len(layout.segments))]
+    for strip in seen:
+        low, high = strip.get("x", (0, 0))
+        single = strip["word"] == "flat_map" and strip.get("what", "column") == "column"
+        if not single or high - low != 1:
+            continue
+        for n, s in enumerate(layout.segments):
+            read = (s.x + s.columns - 1 - low) if s.flip_x else low - s.x
+            if 0 <= read < s.columns and (n, float(read)) not in out:
+                out.append((n, float(read)))
+        if len(out) >= len(layout.segments) + STRIPS:
+            break
+    return out
+
+
+STRIPS = 4
+"""Number of conspicuous columns that are tried as the place of a trap.  Chosen: a trap in two
+amplifiers over one another is in four lists of maps; with 8, twice as many starts are predicted."""
+
+
 CORNER = 2.0
 """Exponent that rounds the corner between the power of the signal and the full trap.
 
@@ -180,7 +213,7 @@ class GradualTrap(TrapSerial):
     values : mapping of str to float
         Plausible ranges: ``size`` [e-]: 5 to 2000 (0 changes nothing); ``tau`` [pixel times]: 0.5 to
         20; ``amp``: 0 to 1, whole; ``middle`` [e-]: 300 to 100000; ``power``: 0.3 to 6; ``corner``:
-        0.7 to 8.
+        0.7 to 8; ``column``: 0 to 4095, whole, 0 if not given.
 
     Examples
     --------
@@ -197,6 +230,7 @@ class GradualTrap(TrapSerial):
         Parameter("middle", "e-", 300.0, 1e5),
         Parameter("power", "", 0.3, 6.0),
         Parameter("corner", "", 0.7, 8.0),
+        COLUMN,
     )
     source = (
         "Capture in proportion to the signal up to the trap's size, and by a logistic function of "
@@ -208,8 +242,8 @@ class GradualTrap(TrapSerial):
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
         return [
             {"size": 50.0, "tau": 2.0, "amp": float(n), "middle": middle, "power": power,
-             "corner": CORNER} | cls._more()
-            for n in range(len(layout.segments))
+             "corner": CORNER, "column": column} | cls._more()
+            for n, column in _places(layout, seen)
             for middle, power in ((5e3, 1.0), (4e4, 1.0), (4e4, 4.0))
         ]  # fmt: skip
 
@@ -242,7 +276,8 @@ class TwoTimesTrap(GradualTrap):
     values : mapping of str to float
         Plausible ranges: ``size`` [e-]: 5 to 2000 (0 changes nothing); ``tau`` [pixel times]: 0.5 to
         20; ``amp``: 0 to 1, whole; ``middle`` [e-]: 300 to 100000; ``power``: 0.3 to 6; ``corner``:
-        0.7 to 8; ``slow``: 0.02 to 0.98; ``slow_tau`` [pixel times]: 2 to 50.
+        0.7 to 8; ``column``: 0 to 4095, whole, 0 if not given; ``slow``: 0.02 to 0.98;
+        ``slow_tau`` [pixel times]: 2 to 50.
 
     Examples
     --------

@@ -5,8 +5,10 @@ import pytest
 
 from bfsensor.diagnose.model.spot_predictions import spill
 from bfsensor.effects.saturation import (
+    BRIGHTEST,
     FAR,
     LAGS,
+    SKEWED,
     UNEVEN,
     UNSURE,
     DrainedSaturation,
@@ -70,7 +72,19 @@ def test_only_flats_near_the_full_well_are_left_open(away, open_):
     assert (known[: LAGS + 1] > 0).all() == (away > 0 and open_)
     aside = axes(light, i=np.array([1]), j=np.array([0]))
     assert effect.modes("flat_cov", aside, None).shape == (1, 0)
-    assert effect.modes("spot", axes(light), None) is None
+    assert effect.modes("serial_overscan", axes(light), None) is None
+
+
+def test_skewness_of_spots_whose_brightest_pixels_are_full_is_left_open():
+    """It jumps where the next pixel fills; fainter spots and widths are predicted."""
+    effect = Saturation({"full_well": FULL})
+    bright, faint = 1.1 * FULL / BRIGHTEST, 0.9 * FULL / BRIGHTEST
+    spots = {
+        "what": np.array(["sigma_x", "skew_x", "skew_y", "skew_x"]),
+        "flux": np.array([bright, bright, bright, faint]),
+    }
+    modes = effect.modes("spot", spots, None)
+    np.testing.assert_array_equal(modes, SKEWED * np.eye(4)[:, 1:3])
 
 
 def test_neutral_leaves_nothing_open():

@@ -53,7 +53,8 @@ class BadColumns(Law):
             int(rng.integers(0, 40)),
         )
         return {
-            "columns": _ints(rng.choice(n, count, replace=False)),
+            # not the last ones: no edge of the sensor is modelled, charge there has none beside it
+            "columns": _ints(3 + rng.choice(n - 6, count, replace=False)),
             "rows": _ints(rng.choice([0, 0, 1, 2], count) * n // 4),
             "size": _rounded(-np.exp(rng.uniform(np.log(0.02), np.log(0.3), count))),
             "pixels": [

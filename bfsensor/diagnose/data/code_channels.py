@@ -20,10 +20,9 @@ PERIOD = 64
 lowest bits, whose codes flats of 1.25 periods width visit alike; with 128, only flats of twice the
 width, four times the signal, could be used."""
 
-BITS = (6, 7, 8, 9, 10)
-"""Bits by which multiples of :data:`PERIOD` are separated, 10 and higher ones together.  Chosen:
-each higher bit has half as many multiples; with twice as many bits, up to 15, the highest has
-one multiple in a converter of 16 bits."""
+BITS = range(6, 16)
+"""Bits by which multiples of :data:`PERIOD` are separated.  Derived: all of a converter of 16 bits above
+the remainders; each higher bit has half as many multiples, and the last one a single one."""
 
 BELOW = (1, 2)
 """Distances below a multiple of the codes that are counted.  Chosen: a wrong weight of a bit by
@@ -168,14 +167,16 @@ class CodeChannels:
 def _steps(
     codes: NDArray[np.int64],
 ) -> dict[int, tuple[NDArray[np.int64], FloatArray, float]]:
-    """For each of :data:`BITS`: counts below its multiples, expected ones, share of all multiples."""
+    """For each of :data:`BITS` that codes reach: counts below its multiples, expected, share."""
     multiple = np.arange(PERIOD, len(codes), PERIOD)
     # The highest power of two in each, by its lowest bit.
-    bit = np.minimum(np.log2(multiple & -multiple).astype(int), BITS[-1])
+    bit = np.log2(multiple & -multiple).astype(int)
     smooth = np.maximum(np.convolve(codes, SMOOTH, "same"), 0.0)
     out = {}
     for b in BITS:
         own = multiple[bit == b]
+        if not len(own):
+            continue
         low, mean = (np.array([h[own - k].sum() for k in BELOW]) for h in (codes, smooth))
         share = float(smooth[own].sum() / max(smooth[multiple].sum(), 1e-9))
         out[b] = low, mean, share

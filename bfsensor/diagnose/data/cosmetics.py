@@ -326,12 +326,12 @@ def _repair_response(
     # Dust beside a column hides that the column stands alone, a column disturbs dust's shape, and
     # shallow dust pulls the light down: each is sought again in the image without the others.
     for _ in range(2):
-        light, steps = smooth_light(whole, owner, shade != 1.0)
+        light, steps = smooth_light((1 + whole) / (1 + change) - 1, owner, shade != 1.0)
         even = np.where(owner < 0, 0.0, whole - light - steps)
         columns = []
         change[:] = 0.0
         for amp, (frame, image) in enumerate(zip(layout, good, strict=True)):
-            here = (1 + image) / _on_sensor(shade, frame) - 1
+            here = (1 + image) / _on_sensor(shade, frame) - 1 - _on_sensor(light, frame)
             for one in bad_columns(here):
                 columns.append((amp, one))
                 own = _on_sensor(change, frame)

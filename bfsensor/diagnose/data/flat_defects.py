@@ -189,6 +189,9 @@ def bad_columns(image: FloatArray) -> list[BadColumns]:
     z = mean * np.sqrt(count / ny) / scatter
     # Neighbours of a clear defect belong to it from half of that deviate on.
     off = np.minimum(np.abs(z) / SURE, np.abs(mean) / LEAST) > 0.5
+    # What lies beside a deep defect, but not next to it, is the shape of the light.
+    strong = off & (np.abs(mean) > FEW * maximum_filter(np.abs(mean), 2 * QUIET + 1))
+    off &= maximum_filter(strong, 3)
     at = np.flatnonzero(off)
     found = []
     # Columns with fewer than QUIET others between them are one defect.
@@ -199,15 +202,48 @@ def bad_columns(image: FloatArray) -> list[BadColumns]:
         alone = not any(s.any() for s in sides) and sum(map(len, sides)) >= QUIET
         # An excess is dark current of a hot column, which the diagnosis explains.
         lost = -float(mean[own].sum()) > LOST * float(size.sum())
+        span = range(int(first[own].min()), int(last[own].max()))
+        lost &= _part_lost(image[span.start : span.stop], off, start, stop, scatter) > LOST
         clear = float(np.min([np.abs(z[own]) / SURE, size / LEAST], axis=0).max()) > 1.0
         if alone and lost and clear and stop - start <= WIDEST:
-            span = range(int(first[own].min()), int(last[own].max()))
             change = np.zeros((ny, stop - start))
             change[:, own - start] = np.where(part[:, own], mean[own], 0.0)
             found.append(
                 BadColumns(range(start, stop), span, change, float(np.abs(z[own]).max()))
             )
     return found if sum(len(d.columns) for d in found) <= FEW * nx else []
+
+
+def _part_lost(
+    image: FloatArray, off: NDArray[np.bool_], start: int, stop: int, scatter: float
+) -> float:
+    """Part of what columns lack that columns beside them do not have more, against others farther away.
+
+    What displaced edges take from columns they give to the columns beside.  Columns that are other
+    defects are left out; at the rim, one side stands for both.  An excess within what columns of a
+    ``scatter`` have by chance is none.
+    """
+    profile, reach = np.median(image, axis=0), WIDEST + QUIET
+    own, beside, count = profile[start:stop].copy(), 0.0, 0
+    bases = []
+    for near, far in (
+        (slice(max(start - reach, 0), start), slice(max(start - 2 * reach, 0), max(start - reach, 0))),
+        (slice(stop, stop + reach), slice(stop + reach, stop + 2 * reach)),
+    ):  # fmt: skip
+        use, others = profile[near][~off[near]], profile[far]
+        if len(use) and len(others):
+            bases.append(float(np.median(others)))
+            beside += float((use - bases[-1]).sum())
+            count += len(use)
+    if not bases:
+        return 1.0
+    own -= np.mean(bases)
+    lacking = -float(np.minimum(own, 0.0).sum())
+    beside *= 2 * reach / count
+    if beside < SURE * scatter * np.sqrt(2 * reach):
+        return 1.0
+    gained = float(np.maximum(own, 0.0).sum()) + beside
+    return (lacking - gained) / lacking if lacking > 0 else 0.0
 
 
 def _lacking_rows(

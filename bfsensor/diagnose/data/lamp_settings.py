@@ -75,7 +75,11 @@ def lamp_settings(
 
 
 def smoothed_levels(
-    levels: ArrayLike, light: ArrayLike, groups: Sequence[ArrayLike]
+    levels: ArrayLike,
+    light: ArrayLike,
+    groups: Sequence[ArrayLike],
+    *,
+    within: float = np.inf,
 ) -> FloatArray:
     """Levels of exposures without the flicker of their lamp: light times a local median.
 
@@ -90,6 +94,9 @@ def smoothed_levels(
         Exposure times, or times by readings of a lamp; where it is not above 0, levels stay.
     groups : sequence of array_like, shape (n,)
         Exposures that agree in all of these are compared.
+    within : float
+        Largest factor between the light of exposures that are compared, above 1: levels of one
+        light say little of those of another where pixels are full.
 
     Returns
     -------
@@ -110,6 +117,8 @@ def smoothed_levels(
         here = np.flatnonzero((group == n) & (lit > 0))
         here = here[np.argsort(lit[here], kind="stable")]
         if len(here):
-            ratio = median_filter(out[here] / lit[here], NEAREST, mode="mirror")
-            out[here] = ratio * lit[here]
+            ends = np.flatnonzero(lit[here][1:] > within * lit[here][:-1]) + 1
+            for own in np.split(here, ends):
+                ratio = median_filter(out[own] / lit[own], NEAREST, mode="mirror")
+                out[own] = ratio * lit[own]
     return out

@@ -78,6 +78,7 @@ class SpotChannels:
             tuple[ExposureInfo, dict[str, tuple[float, float]], NDArray, str]
         ] = []
         self._backgrounds: dict[int, float] = {}
+        self._zeros: dict[int, float] = {}
         self.dropped: dict[str, int] = {}
         self._grids: list[tuple[float, float]] = []
         self.placed: list[PlacedSpots] = []
@@ -143,6 +144,7 @@ class SpotChannels:
             "sigma_y": (fit.sigma_y, float(errors[1])),
         }
         self._backgrounds[exposure.number] = float(np.mean(values.pop("background")))
+        self._zeros[exposure.number] = float(np.mean(values.pop("beyond")))
         flux = values.pop("flux")
         total = float(flux.mean())
         out["flux"] = (total, float(flux.std(ddof=1) / np.sqrt(n)))
@@ -177,6 +179,9 @@ class SpotChannels:
             lamp = exposure.lamp
             light = (exposure.exposure_time or 0.0) * (1.0 if lamp is None else lamp)
             mjd = np.nan if exposure.mjd is None else exposure.mjd
+            # Noise that is skew, as of random telegraph signals, has another mean than without
+            # its largest values, which count in a flux and not in its background.
+            zero = self._zeros[exposure.number]
             for what, (value, error) in found.items():
                 variance = error**2
                 if what == "flux":
@@ -187,8 +192,10 @@ class SpotChannels:
                     unknown = lamp is None and repeat is None
                     light_error = LAMP_UNKNOWN if unknown else self._lamp_error
                     variance = (value * np.hypot(scatter, light_error)) ** 2
+                    variance += (zero * WING**2) ** 2
                 if what == "wings":
-                    variance += WING_ERROR**2
+                    outside = zero * (WING**2 - STAMP**2) / found["flux"][0]
+                    variance += WING_ERROR**2 + outside**2
                 values.append(np.array([value]))
                 blocks.append(np.array([[max(variance, 1e-30)]]))
                 axes.add(1, condition_of(exposure), what=what, light=light,
@@ -199,8 +206,9 @@ class SpotChannels:
         lit = np.flatnonzero(columns["what"] == "flux")
         place = {int(n): k for k, n in enumerate(columns["exposure"][lit])}
         fluxes = smoothed_levels(
-            columns["flux"][lit], columns["light"][lit], [columns[n][lit] for n in NUMBERS]
-        )
+            columns["flux"][lit], columns["light"][lit], [columns[n][lit] for n in NUMBERS],
+            within=1 + EQUAL,
+        )  # fmt: skip
         columns["flux"] = fluxes[[place[int(n)] for n in columns["exposure"]]]
         return Channel("spot", np.concatenate(values), tuple(blocks), columns, "", fold)
 
@@ -272,18 +280,21 @@ def _off(spots: SpotList, filled: NDArray[np.bool_]) -> SpotList:
     return SpotList(spots.x[~near], spots.y[~near], dict(spots.rejected))
 
 
-def _clipped_mean(values: FloatArray) -> FloatArray:
-    """Mean along the last axis without struck pixels and neighbours' light.
+def _clipped_mean(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean along the last axis without struck pixels and neighbours' light, and what they add.
 
     The median would be biased by a tenth of a code where codes of the converter have unequal
-    widths.
+    widths.  What the left out values add to the mean counts each of them as if it lay at the
+    border of those that are used, so that one track does not decide it.
     """
     middle = np.median(values, axis=-1, keepdims=True)
     away = np.abs(values - middle)
     # Predictions have no noise: they are clipped as recordings are.
     usual = np.maximum(np.median(away, axis=-1, keepdims=True), QUIET)
     near = away <= CLIP * usual
-    return np.asarray((values * near).sum(-1) / near.sum(-1))
+    mean = np.asarray((values * near).sum(-1) / near.sum(-1))
+    bordered = np.clip(values, middle - CLIP * usual, middle + CLIP * usual)
+    return mean, np.asarray(bordered.mean(-1) - mean)
 
 
 def stamp_moments(
@@ -308,10 +319,9 @@ def stamp_moments(
     moments : dict of str to ndarray, shape (n,)
         'skew_x', 'skew_y': mean third power of the distance from the centre, with a Gaussian
         weight of sigma 2 pixels [pixel^3]; 'flux': sum over the wide stamp [e-]; 'background':
-        clipped mean of its rim [e- per pixel]; 'wings': part of the flux outside the small stamp.
+        clipped mean of its rim [e- per pixel]; 'beyond': what the clipped pixels
+        would add to it [e- per pixel]; 'wings': part of the flux outside the small stamp.
     """
-    size = stamps.shape[-1]
-    step = np.arange(size) - size // 2
     rim = np.concatenate(
         [
             wide[:, [0, -1]].reshape(len(wide), -1),
@@ -319,16 +329,22 @@ def stamp_moments(
         ],
         axis=1,
     )
-    background = _clipped_mean(rim)[:, None, None]
-    signal = stamps - background
+    level, beyond = _clipped_mean(rim)
+    signal = wide - level[:, None, None]
+    size = wide.shape[-1]
+    step = np.arange(size) - size // 2
     dx, dy = step[None] - x[:, None], step[None] - y[:, None]
+    # In the larger images, whose ends lie where the weight is 0: the ends of the smaller ones are at
+    # other distances from each centre, and wide spots would be skew by their places.
     weight = np.exp(-(dx[:, None] ** 2 + dy[..., None] ** 2) / 8.0)
     flux = (signal * weight).sum((1, 2))
-    total = (wide - background).sum((1, 2))
+    total = signal.sum((1, 2))
+    small = (stamps - level[:, None, None]).sum((1, 2))
     return {
         "skew_x": (signal * weight * dx[:, None] ** 3).sum((1, 2)) / flux,
         "skew_y": (signal * weight * dy[..., None] ** 3).sum((1, 2)) / flux,
         "flux": total,
-        "background": background[:, 0, 0],
-        "wings": 1.0 - signal.sum((1, 2)) / total,
+        "background": level,
+        "beyond": beyond,
+        "wings": 1.0 - small / total,
     }

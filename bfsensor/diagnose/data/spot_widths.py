@@ -53,7 +53,7 @@ def fit_widths(
         Images of n spots [e-], odd sides.
     sigma : (float, float)
         Starting widths along x and y [pixel].
-    centres : ndarray, shape (n, 2)
+    centres : ndarray, shape (n, 2) or (k, n, 2)
         Starting centres (x, y) from the middle of the stamps [pixel].
 
     Returns
@@ -75,7 +75,7 @@ def fit_widths(
     """
     count, n, ny, nx = stamps.shape
     shape = np.tile(np.asarray(sigma, float), (count, 1))
-    x, y = (np.tile(centres[:, axis], (count, 1)) for axis in (0, 1))
+    x, y = np.moveaxis(np.broadcast_to(centres, (count, n, 2)), -1, 0).copy()
     flux = stamps.sum((2, 3))
     background = np.zeros((count, n))
     history: list[float] = []

@@ -117,10 +117,16 @@ class Explanation:
             self.model.fit.total + effects + laws + sum(penalty(c) for c, *_ in self.free)
         )
 
-    def charge(self, effect: Effect) -> float:
-        """Chi-square that the best of all classes of effects gains by chance."""
-        searched = effect.searched(self.model.predictor.layout)
-        return charge(len(fitted(effect)) + searched, self.tried)
+    def charge(self, effect: Effect, tried: int | None = None) -> float:
+        """Chi-square that the best of all classes of effects gains by chance, at all their starts.
+
+        Starts are places, periods or bits that were tried.  ``tried`` are the classes, by default all.
+        """
+        layout = self.model.predictor.layout
+        starts = type(effect).starts(replace(layout, sightings=()))
+        tried = self.tried if tried is None else tried
+        number = len(fitted(effect)) + effect.searched(layout)
+        return charge(number, tried * max(len(starts), 1))
 
     def stands_out(self) -> bool:
         """Whether residuals are beyond noise and beyond the errors of the effects' predictions."""

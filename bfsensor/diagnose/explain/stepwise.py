@@ -265,7 +265,7 @@ class _Search:
         The mismatch is beyond noise already, so that one candidate is not charged for the others
         where it takes all of it.
         """
-        good = [r for r in ranking if self._net(now, r) > charge(len(fitted(r.effect)), 1)]
+        good = [r for r in ranking if self._net(now, r) > now.charge(r.effect, 1)]
         for rival in good[:FAINT]:
             try:
                 after = self._adding(now, rival)()

@@ -10,6 +10,11 @@ from numpy.typing import NDArray
 from bfsensor.effects.effect import Effect, Parameter
 from bfsensor.typing import FloatArray
 
+STRONG = 100.0
+"""Factor on the top of an amplitude's plausible range up to which fits may go.  Chosen: the strongest
+effects of campaigns by another bench are 13 times the top; with 1000, more fits of weak effects of
+other classes run to strengths at which predictions overflow."""
+
 
 class FittedEffects:
     """The free parameters of several effects as one vector.
@@ -61,13 +66,13 @@ def fitted(effect: Effect) -> list[Parameter]:
 
 
 def widened(p: Parameter) -> tuple[float, float]:
-    """Range of a parameter in fits: ten times the plausible one, or half its width beyond it.
+    """Range of a parameter in fits: :data:`STRONG` times the plausible one, or half its width beyond it.
 
     It ends where what physics allows does.
     """
     if p.law == "log":
-        low = -10 * p.high if p.signed else (0.0 if p.amplitude else 0.3 * p.low)
-        high = 10 * p.high if p.amplitude else 3 * p.high
+        low = -STRONG * p.high if p.signed else (0.0 if p.amplitude else 0.3 * p.low)
+        high = STRONG * p.high if p.amplitude else 3 * p.high
         range_ = p.neutral + low, p.neutral + high
     else:
         reach = 0.5 * (p.high - p.low)

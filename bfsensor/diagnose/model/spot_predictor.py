@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from functools import partial
 
@@ -54,12 +54,15 @@ class SpotPredictor:
         self._slopes: Edges | None = None
         self._gained: FloatArray | None = None
         self._kept: dict[Condition, tuple[tuple[NDArray, ...], Found]] = {}
+        self._places: dict[int, FloatArray] = {}
         phases: dict[Condition, list[FloatArray]] = {}
         places = iter(measured.phases)
         for channel in (c for c in measured.channels if c.word == "spot"):
             for row in np.nonzero(channel.axes["what"] == "sigma_x")[0]:
                 condition = condition_of_row(channel, row)
-                phases.setdefault(condition, []).append(next(places))
+                own = next(places)
+                phases.setdefault(condition, []).append(own)
+                self._places[int(channel.axes["exposure"][row])] = own
                 if width_of(condition) not in self.widths:
                     self.widths.append(width_of(condition))
                     self.start += [float(v) for v in channel.values[row : row + 2]]
@@ -154,8 +157,9 @@ class SpotPredictor:
                 found = dict(self._unchanged(condition, state, slopes))
             else:
                 found = self._changed(
-                    condition, edges, slopes, sigma, fluxes, chain, _axes(x, rows)
-                )
+                    condition, edges, slopes, sigma, fluxes, chain, _axes(x, rows),
+                    self._places_of(x["exposure"][rows]),
+                )  # fmt: skip
             found["flux"] = found["flux"] / scale
             for what, values in found.items():
                 here = x["what"][rows] == what
@@ -192,6 +196,13 @@ class SpotPredictor:
             shares = parts[known] * fluxes / fluxes[own, None]
             gained = (shares * self._gained["xy".index(what[-1]), own]).sum(1)
             out[rows] += gained / (2 * out[rows])
+
+    def _places_of(self, numbers: NDArray) -> list[FloatArray] | None:
+        """Places of the spots of exposures within their pixels; None if any is planned only."""
+        found = [self._places.get(int(n)) for n in numbers]
+        return (
+            None if any(f is None for f in found) else [f for f in found if f is not None]
+        )
 
     def _shifts(
         self, condition: Condition, device: Mapping[str, float]
@@ -232,6 +243,7 @@ class SpotPredictor:
         fluxes: FloatArray,
         chain: EffectChain,
         given: Mapping[str, float],
+        places: Sequence[FloatArray] | None,
     ) -> Found:
         """Spots with effects, at a condition; ``given`` are axes for effects after collection."""
         variance, halo, axes = chain.spot_change(condition)
@@ -244,7 +256,7 @@ class SpotPredictor:
             *edges, sigma=wide,
             phases=self._phases[condition], fluxes=fluxes, halo=halo, law=chain.law,
             neighbours=self.measured.neighbours, slopes=slopes,
-            change=partial(chain.spot_image, axes={**axes, **given}),
+            change=partial(chain.spot_image, axes={**axes, **given}), places=places,
         )  # fmt: skip
 
 
