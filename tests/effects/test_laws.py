@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from bfsensor.diagnose.model.effect_parameters import fitted, widened
 from bfsensor.diagnose.model.flat_predictions import periodic_covariances
 from bfsensor.effects.effect import Layout, Segment, Shot
 from bfsensor.effects.library import LIBRARY, make_effect
@@ -430,3 +433,40 @@ def test_every_law_is_off_at_zero():
         assert np.array_equal(off.amplify([frame], SHOTS[1], LAYOUT)[0], frame), kind
         assert np.array_equal(off.shift(frame, 0, LAYOUT), frame), kind
         assert not off.law().lost(5e4), kind
+
+
+@pytest.mark.parametrize("flip", [False, True])
+@pytest.mark.parametrize("first", [0, 17])
+def test_columns_before_a_trap_do_not_meet_it(first, flip):
+    layout = replace(LAYOUT, segments=(SEGMENTS[0]._replace(flip_x=flip),))
+    values = {"size": 80.0, "tau": 2.0, "amp": 0, "reach": 0.0, "column": float(first)}
+    effect = make_effect("trap_serial", values)
+    frame = np.tile(row_of(2e4), (30, 1))
+    change = (effect.shift(frame, 0, layout) - frame)[0, PRESCAN:-OVERSCAN]
+    # Full after its first packet: each later one refills what was released.
+    assert not change[:first].any() and change[first] == pytest.approx(-80.0)
+    np.testing.assert_allclose(change[first + 1 :], 0.0, atol=1e-9)
+    seen = effect.pattern(SHOTS[5], layout)
+    np.testing.assert_allclose(
+        seen[:, ::-1] if flip else seen, np.tile(change / 2e4, (30, 1)), atol=1e-12
+    )
+    place = COLUMNS - 1 - first if flip else first
+    strip = {"word": "flat_map", "what": "column", "x": (place, place + 1)}
+    assert first in {s["column"] for s in effect.starts(layout, [strip])}
+    assert {s["column"] for s in effect.starts(layout)} == {0.0}
+
+
+@pytest.mark.parametrize("kind", LIBRARY, ids=lambda k: k.__name__)
+def test_predictions_are_numbers_at_the_ends_of_ranges(kind):
+    """A power of a negative base is none: fits that went there lost the candidate."""
+    for start in kind.starts(LAYOUT)[:1]:
+        plain = kind(start)
+        for p in fitted(plain):
+            for end in widened(p):
+                if p.amplitude or not np.isfinite(end):
+                    continue
+                effect = plain.with_values(**{p.name: end})
+                with np.errstate(all="ignore"):
+                    image = effect.spot_image(np.ones((1, 1, 5, 5)), {"level": 1e4}, LAYOUT)
+                    lost = effect.law().lost(np.array([0.0, 1e3, 1e5]))
+                assert np.isfinite(image).all() and np.isfinite(lost).all(), (p.name, end)

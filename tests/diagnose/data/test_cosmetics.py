@@ -222,3 +222,28 @@ class HotPixels(Effect):
         for place in PIXELS:
             charge[place] += self.parameters["part"] * 100.0 * context.exposure.seconds
         return charge
+
+
+@pytest.mark.parametrize("length", [1.2, 2.5, 4.0])
+@pytest.mark.parametrize("amp", [0.02, 0.2, -0.2])
+def test_displaced_edges_are_no_bad_columns(amp, length):
+    """What two columns lack beside a tear their neighbours have more."""
+    image = 4e-3 * np.random.default_rng(9).standard_normal((256, 128))
+    away = np.arange(129) - 60.0
+    image += np.diff(-np.sign(away) * amp * np.exp(-np.abs(away) / length))
+    assert bad_columns(image) == []
+    image[:, 100] -= abs(amp)
+    assert [list(d.columns) for d in bad_columns(image)] == [[100]]
+
+
+def test_columns_beside_a_slope_of_light_are_found():
+    """The rim of the light, three columns from a deep defect, is no part of it."""
+    image = 1e-3 * np.random.default_rng(9).standard_normal((256, 128))
+    image[:, 0] += 0.003
+    image[128:, 3] -= 0.25
+    image[:, 7] -= 0.22
+    change = np.zeros(128)
+    for one in bad_columns(image):
+        change[one.columns] += one.change[200]
+    assert np.flatnonzero(np.abs(change) > 0.01).tolist() == [3, 7]
+    assert change[[0, 3, 7]].round(2).tolist() == [0.0, -0.25, -0.22]

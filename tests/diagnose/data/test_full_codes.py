@@ -43,3 +43,17 @@ def test_struck_and_dim_pixels_leave_a_flat_in():
         struck = rng.random(codes.shape) < 2e-3
         codes[struck] += np.rint(sign * rng.exponential(3 * WIDTH, int(struck.sum())))
         assert counted(codes)
+
+
+def test_codes_below_multiples_are_counted_for_each_bit():
+    """A bit of high weight is seen at its own multiples, which are few among those of lower bits."""
+    channels, rng = CodeChannels(), np.random.default_rng(8)
+    for _ in range(4):
+        codes = np.floor(16384 + 130 * rng.standard_normal((200, 200)))
+        codes -= 2.0 * (codes % 16384 >= 8192)
+        channels.add([SimpleNamespace(image=codes.astype(np.float32), repaired=None)])
+    axes = channels.channels()[0].axes
+    values = channels.channels()[0].values
+    missing = (axes["code"] < 0) & (axes["bit"] == 14)
+    assert missing.sum() == 2 and (values[missing] < -0.95).all()
+    assert set(axes["bit"][axes["code"] < 0]) <= set(range(6, 16))

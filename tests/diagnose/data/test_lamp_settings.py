@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bfsensor.diagnose.data.exposure_info import condition_of
-from bfsensor.diagnose.data.lamp_settings import lamp_settings
+from bfsensor.diagnose.data.lamp_settings import lamp_settings, smoothed_levels
 from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.diagnosis import diagnose_measured
 from tests.virtual import SMALL, VirtualSource, virtual_baseline
@@ -55,3 +55,11 @@ def test_a_lamp_at_a_third_is_no_alarm():
     means = [c for c in measured.channels if c.word == "flat_mean"]
     assert any(c.axes["setting"].max() == 1 for c in means)
     assert not diagnose_measured(measured, virtual_baseline()).mismatch.detected
+
+
+def test_levels_of_another_light_say_nothing_where_pixels_are_full():
+    light = np.repeat([7.5, 25.0], 4)
+    levels = np.repeat([2.5e5, 8.2e5], 4) * (1 + 1e-3 * np.tile([-1, 1, 2, -2], 2))
+    found = smoothed_levels(levels, light, (), within=1.01)
+    assert found == pytest.approx(np.repeat([2.5e5, 8.2e5], 4), rel=1.1e-3)
+    assert smoothed_levels(levels, light, ())[-1] > 8.25e5

@@ -6,8 +6,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
-from bfsensor.diagnose.data.spot_channels import SpotChannels
+from bfsensor.diagnose.data.spot_channels import SpotChannels, stamp_moments
 
 SIDE, PITCH, WIDTH, FLUX = 192, 30, 1.1, 2e5
 
@@ -42,3 +43,40 @@ def test_fluxes_scatter_between_exposures_as_their_errors_say(scatter: float) ->
     assert pulls.std(ddof=1) < 1.5
     if scatter:
         assert pulls.std(ddof=1) > 0.55
+
+
+def shot_of(number: int) -> SimpleNamespace:
+    return SimpleNamespace(
+        number=number, exposure_time=5.0, lamp=1.0, wavelength=None, back_bias=None,
+        temperature=None, mjd=None,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("part", [0.0, 0.02])
+def test_fluxes_know_the_error_of_their_zero(part: float) -> None:
+    """Telegraph noise counts in a flux and not in its background, which is clipped."""
+    rng = np.random.default_rng(1618)
+    channels = SpotChannels(read_noise=4.0, lamp_error=2e-4)
+    for number in range(12):
+        image = exposure_of(rng, 0.0) / 40
+        image += 30.0 * (rng.random(image.shape) < part)
+        assert channels.add(shot_of(number), image) is None
+    channel = channels.channels()[0]
+    flux = channel.axes["what"] == "flux"
+    light = FLUX / 40
+    excess = channel.values[flux].mean() - light
+    error = channel.errors[flux].mean()
+    # An excess of a hundred electrons, of five thousand, is no light; without noise of that kind
+    # the error is that of the lamp and of the scatter.
+    assert (excess > 60.0) == bool(part) and (error > 0.3 * excess or not part)
+    assert error < 30.0 or part
+
+
+@pytest.mark.parametrize("width", [1.1, 1.75])
+def test_skewness_does_not_depend_on_the_place_in_the_pixel(width: float) -> None:
+    edges = np.arange(22) - 10.5
+    places = np.array([[0.0, 0.0], [0.4, -0.3], [-0.45, 0.2]])
+    lines = np.diff(ndtr((edges - places[..., None]) / width), axis=-1)
+    wide = 1e5 * lines[:, 1, :, None] * lines[:, 0, None, :]
+    found = stamp_moments(wide[:, 5:-5, 5:-5], wide, *places.T)
+    assert np.abs([found["skew_x"], found["skew_y"]]).max() < 2e-4

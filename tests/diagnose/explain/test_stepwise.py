@@ -10,7 +10,9 @@ import pytest
 from bfsensor.diagnose.detect.candidate_screen import Rival, Screen, evidence
 from bfsensor.diagnose.detect.candidates import with_fitted
 from bfsensor.diagnose.detect.locate import locate_mismatch
+from bfsensor.diagnose.detect.model_error import charge
 from bfsensor.diagnose.explain.attribution import class_probabilities, tied_classes
+from bfsensor.diagnose.explain.explanation import Explanation
 from bfsensor.diagnose.explain.location import place_effects
 from bfsensor.diagnose.explain.stepwise import attribute
 from bfsensor.diagnose.fit.fitted_model import Model
@@ -161,3 +163,13 @@ def test_a_found_effect_says_itself_where_it_is(torn):
     assert 26 <= low < 38 < high <= 52
     none = replace(torn, found=())
     assert place_effects(none, torn.fit, (128, 128), 2) is None
+
+
+def test_an_effect_pays_for_the_places_it_was_tried_at():
+    _, predictor, fit = fit_virtual(seed=7101, effects=())
+    model = Model(predictor, fit)
+    one = Explanation(model, model, locate_mismatch(fit), 60, locate=lambda m: None)
+    loss = ChargeLoss(ChargeLoss.starts(predictor.layout)[0])
+    starts = Tearing.starts(replace(predictor.layout, sightings=()))
+    assert one.charge(loss) == charge(1, 60)
+    assert one.charge(Tearing(starts[0])) == charge(4, 60 * len(starts)) > charge(4, 60) + 8

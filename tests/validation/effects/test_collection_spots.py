@@ -108,3 +108,21 @@ def test_spots_bloom_along_the_column_and_keep_their_charge():
     growth = full["sigma_y"] - plain["sigma_y"]
     assert abs(growth[0]) < 1e-4 and 0.05 < growth[2] < growth[3]
     assert np.all(full["sigma_x"] - plain["sigma_x"] < growth + 1e-4)
+
+
+def test_spots_that_spill_are_predicted_at_their_own_places():
+    """Interpolation between centres, against the prediction of spots at the place itself."""
+    kx, ky = nominal_shifts()
+    law, flux = Law(full_well=6e4), 8e5
+    ask = {"sigma": (1.25, 1.3), "law": law}
+    own = [np.array([[0.05, 0.35]]), np.array([[-0.4, -0.1]]), np.array([[0.45, 0.4]])]
+    phases = np.array([[-0.4, -0.2], [-0.1, 0.4], [0.2, -0.4], [0.4, 0.2]])
+    fluxes = np.full(len(own), flux)
+    found = predict_spots(kx, ky, phases=phases, fluxes=fluxes, places=own, **ask)
+    for n, place in enumerate(own):
+        alone = predict_spots(kx, ky, phases=place, fluxes=fluxes[:1], **ask)
+        for name in ("sigma_x", "sigma_y"):
+            assert found[name][n] == pytest.approx(alone[name][0], abs=3e-3)
+    mean = predict_spots(kx, ky, phases=phases, fluxes=fluxes[:1], **ask)
+    away = np.abs(found["sigma_x"] - mean["sigma_x"])
+    assert away.max() > 5e-3, "the place matters"
