@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -294,9 +295,13 @@ class Glow(Effect):
 
     def _light(self, layout: Layout) -> FloatArray:
         """Glow by pixel of the sensor [e-/s]."""
-        ny, nx = layout.shape
-        right, top = int(self["corner"]) % 2, int(self["corner"]) // 2
-        x = np.arange(nx) + 0.5
-        y = np.arange(ny) + 0.5
-        away = np.hypot((nx - x if right else x)[None], (ny - y if top else y)[:, None])
-        return np.asarray(self["rate"] * np.exp(-away / self["length"]))
+        return self["rate"] * _fall(self["length"], int(self["corner"]), layout.shape)
+
+
+@lru_cache(maxsize=2)
+def _fall(length: float, corner: int, shape: tuple[int, int]) -> FloatArray:
+    """Fall of a glow with the distance from a corner; the same in all exposures."""
+    (ny, nx), right, top = shape, corner % 2, corner // 2
+    x, y = np.arange(nx) + 0.5, np.arange(ny) + 0.5
+    away = np.hypot((nx - x if right else x)[None], (ny - y if top else y)[:, None])
+    return np.asarray(np.exp(-away / length))

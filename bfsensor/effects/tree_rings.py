@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -56,9 +57,8 @@ class _Rings(Effect):
         """Phase at radii [pixel], in cycles."""
         raise NotImplementedError
 
-    def profile(self, r: FloatArray, layout: Layout) -> FloatArray:
+    def profile(self, r: FloatArray) -> FloatArray:
         """Displacement outwards at radii [pixel] over ``amp``."""
-        del layout
         return np.asarray(np.sin(2 * np.pi * self.turns(r)))
 
     def strength(self, shot: Shot, layout: Layout) -> float:
@@ -67,27 +67,46 @@ class _Rings(Effect):
         return self["amp"]
 
     def displacements(self, shot: Shot, layout: Layout) -> Edges | None:
-        ny, nx = layout.shape
         amp = self.strength(shot, layout)
         if not amp:
             return None
-        x, y = np.arange(float(nx)) - self["xc"], np.arange(float(ny))[:, None] - self["yc"]
-        edge_x, edge_y = (
-            np.arange(nx + 1.0) - 0.5 - self["xc"],
-            np.arange(ny + 1.0)[:, None] - 0.5 - self["yc"],
-        )
-        across, up = (
-            amp * self._along(*place, layout)
-            for place in ((edge_x, y, edge_x), (x, edge_y, edge_y))
-        )
-        return across, up
+        across, up = _outwards(self.profile, self["xc"], self["yc"], layout.shape)
+        return amp * across, amp * up
 
-    def _along(
-        self, x: FloatArray, y: FloatArray, axis: FloatArray, layout: Layout
-    ) -> FloatArray:
-        """Component along an axis of the profile at places relative to the centre."""
-        r = np.sqrt(x * x + y * y)
-        return np.asarray(self.profile(r, layout) * (axis / np.maximum(r, 0.5)))
+
+def _outwards(
+    profile: Callable[[FloatArray], FloatArray],
+    xc: float,
+    yc: float,
+    shape: tuple[int, int],
+) -> Edges:
+    """Displacements of edges along the radius from a centre, by a profile of the radius."""
+    ny, nx = shape
+    x, y = np.arange(float(nx)) - xc, np.arange(float(ny))[:, None] - yc
+    edge_x = np.arange(nx + 1.0) - 0.5 - xc
+    edge_y = np.arange(ny + 1.0)[:, None] - 0.5 - yc
+    out = []
+    for along_x, along_y, axis in ((edge_x, y, edge_x), (x, edge_y, edge_y)):
+        r = np.sqrt(along_x * along_x + along_y * along_y)
+        out.append(np.asarray(profile(r) * (axis / np.maximum(r, 0.5))))
+    return out[0], out[1]
+
+
+@lru_cache(maxsize=2)
+def _radial(
+    waves: tuple[tuple[float, ...], ...], xc: float, yc: float, shape: tuple[int, int]
+) -> Edges:
+    """Displacements by a sum of waves of the radius, equal but for a factor in all light."""
+
+    def profile(r: FloatArray) -> FloatArray:
+        # A spline is worst near its ends, so that it goes on for a few knots beyond the radii.
+        near = np.arange(float(r.min()) - 3.0, float(r.max()) + 3.0, 0.5)
+        turn = 2 * np.pi * near
+        out = sum(b * np.sin(f * turn) + c * np.cos(f * turn) for f, b, c in waves)
+        # Waves are longer than five pixels: a cubic through ten points of each is exact to 1e-3.
+        return np.asarray(CubicSpline(near, out)(r))
+
+    return _outwards(profile, xc, yc, shape)
 
 
 class TreeRings(_Rings):
@@ -247,16 +266,14 @@ class RadialTreeRings(_Rings):
         waves = [s["waves"] for s in layout.sightings if s["shape"] == "radial"]
         return max(3 * len(waves[0]) - 1, 0) if waves else 0
 
-    def profile(self, r: FloatArray, layout: Layout) -> FloatArray:
+    def displacements(self, shot: Shot, layout: Layout) -> Edges | None:
         waves = [s["waves"] for s in layout.sightings if s["shape"] == "radial"]
-        # A spline is worst near its ends, so that it goes on for a few knots beyond the radii.
-        near = np.arange(-3.0, float(r.max()) + 3.0, 0.5)
-        out = np.zeros_like(near)
-        for f, sine, cosine in waves[0] if waves else ():
-            turn = 2 * np.pi * f * near
-            out += sine * np.sin(turn) + cosine * np.cos(turn)
-        # Waves are longer than five pixels: a cubic through ten points of each is exact to 1e-3.
-        return np.asarray(CubicSpline(near, out)(r))
+        amp = self.strength(shot, layout)
+        if not (amp and waves):
+            return None
+        own = tuple(tuple(map(float, wave)) for wave in waves[0])
+        across, up = _radial(own, self["xc"], self["yc"], layout.shape)
+        return amp * across, amp * up
 
     def strength(self, shot: Shot, layout: Layout) -> float:
         wavelength, back_bias, _ = layout.reference

@@ -145,13 +145,21 @@ class _Search:
     def forward(self, now: Explanation) -> tuple[Explanation, dict[str, list[Rival]]]:
         """Add what scores best while anything stands out; rankings are by name of the effect."""
         places: dict[str, list[Rival]] = {}
+        # Terms only take what is left: effects that gained nothing before them gain nothing behind
+        # them, and all are asked again where nothing else can be added.
+        asked: list[type[Effect]] | None = None
         while now.mismatch.detected:
-            step = self._step(now)
+            step = self._step(now, asked)
+            if step is None and asked is not None:
+                step = self._step(now)
             if step is None:
                 break
             after, ranking = step
+            asked = None
             if len(after.parts) > len(now.parts):
                 places[after.parts[-1].name] = ranking
+            else:
+                asked = [type(r.effect) for r in ranking if self._beyond_chance(now, r)]
             if not now.free and after.free:
                 self.nearest = ranking
             now = after
@@ -165,12 +173,17 @@ class _Search:
                 self.refused |= {now.parts[n].name for n in wrong}
                 for n in reversed(wrong):
                     now = now.without(n)
-                now = now.located()
+                now, asked = now.located(), None
         return now, {n: r for n, r in places.items() if n in [p.name for p in now.parts]}
 
-    def _step(self, now: Explanation) -> tuple[Explanation, list[Rival]] | None:
-        """The best addition that holds, with the ranking of effects; None if none does."""
-        ranking = self._ranked(now) if len(now.parts) < MOST else []
+    def _step(
+        self, now: Explanation, asked: Sequence[type[Effect]] | None = None
+    ) -> tuple[Explanation, list[Rival]] | None:
+        """The best addition that holds, with the ranking of effects; None if none does.
+
+        ``asked`` are the effects that are ranked, by default all.
+        """
+        ranking = self._ranked(now, asked) if len(now.parts) < MOST else []
         # What errors of predictions may leave asks for no further terms, but an effect elsewhere in
         # the same channels may be in it.
         more = now.stands_out()
@@ -183,8 +196,7 @@ class _Search:
             [c for c in compete(Scene(now.model), now.mismatch) if not _taken(c, now)]
             if more and len(now.free) < MOST_GROUPS else []
         )  # fmt: skip
-        good = [r for r in ranking if self._net(now, r) > charge(len(fitted(r.effect)), 1)]
-        good = good[:REFITTED]
+        good = [r for r in ranking if self._beyond_chance(now, r)][:REFITTED]
         extra = {r.effect.name: _law_score(now, r) for r in good}
         best = free[0].score if free else 0.0
         law = max((c.score for _, c in laws), default=0.0)
@@ -222,12 +234,19 @@ class _Search:
             return max(rival.gain - now.reach(rival.effect.touches), 0.0)
         return now.net(rival.gain, rival.template)
 
-    def _ranked(self, now: Explanation) -> list[Rival]:
+    def _beyond_chance(self, now: Explanation, rival: Rival) -> bool:
+        """Whether a candidate gains more than one of its kind does by chance."""
+        return self._net(now, rival) > charge(len(fitted(rival.effect)), 1)
+
+    def _ranked(
+        self, now: Explanation, asked: Sequence[type[Effect]] | None = None
+    ) -> list[Rival]:
         """Effects that may be added, by decreasing evidence; those of the closest gains fitted."""
         screen = Screen(
             now.model.predictor, now.model.fit, seen_of(now.mismatch), self.before
         )
         kinds = further(concerned(self.kinds, now.mismatch), now.model.effects)
+        kinds = kinds if asked is None else [k for k in kinds if k in asked]
         ranked = rank(screen, kinds)
         self.before |= {type(r.effect): r.effect for r in ranked if r.gain > 0}
         ranking = with_hypotheses(now.model, kinds, ranked)
@@ -238,7 +257,7 @@ class _Search:
             r for r in ranking if not r.refuted and r.effect.name not in self.refused
         ]
         # Only effects whose gain is beyond chance are worth a joint fit.
-        good = [r for r in ranking if self._net(now, r) > charge(len(fitted(r.effect)), 1)]
+        good = [r for r in ranking if self._beyond_chance(now, r)]
         others = [r for r in ranking if r not in good]
         self.joint.clear()
         good = refine(now.model, good, self.joint) if good else []
