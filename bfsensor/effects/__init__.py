@@ -54,7 +54,7 @@ if TYPE_CHECKING:
         PowerPersistence,
         TwoTimesPersistence,
     )
-    from bfsensor.effects.psf_wings import PsfWings
+    from bfsensor.effects.psf_wings import AureoleWings, ExponentialWings, PsfWings
     from bfsensor.effects.saturation import DrainedSaturation, Saturation
     from bfsensor.effects.shutter_timing import FlatShutter, ShutterTiming
     from bfsensor.effects.tearing import DivisaderoTearing, Tearing
@@ -101,7 +101,7 @@ else:
             "library": ["LIBRARY", "make_effect"],
             "mask_stitch": ["MaskStitch", "WavyMask"],
             "persistence": ["Persistence", "PowerPersistence", "TwoTimesPersistence"],
-            "psf_wings": ["PsfWings"],
+            "psf_wings": ["AureoleWings", "ExponentialWings", "PsfWings"],
             "saturation": ["DrainedSaturation", "Saturation"],
             "shutter_timing": ["FlatShutter", "ShutterTiming"],
             "tearing": ["DivisaderoTearing", "Tearing"],
@@ -116,6 +116,7 @@ __all__ = [
     "AbsorptionChromatic",
     "AdcBits",
     "AmpCrosstalk",
+    "AureoleWings",
     "BiasByFrame",
     "BiasByRow",
     "BiasByRowWithMemory",
@@ -136,6 +137,7 @@ __all__ = [
     "EdgesNonlinear",
     "Effect",
     "ElectronicMemory",
+    "ExponentialWings",
     "FillingLoss",
     "FlatShutter",
     "FlickerNoise",

@@ -253,6 +253,11 @@ class Layout:
         return float((area * flipped).sum() / area.sum())
 
 
+Halo = tuple[tuple[float, float], ...]
+"""Gaussians in which parts of the light of spots are: fraction of the light, and the width that is added
+in quadrature [pixel]."""
+
+
 class Law(NamedTuple):
     """Departure of charge collection from boundary shifts proportional to the stored charge.
 
@@ -545,10 +550,10 @@ class Effect:
         del shot, layout
         return None
 
-    def spot_light(self, shot: Shot, layout: Layout) -> tuple[float, float, float]:
-        """Variance added to spots [pixel^2], fraction of their light in a halo, its sigma [pixel]."""
+    def spot_light(self, shot: Shot, layout: Layout) -> tuple[float, Halo]:
+        """Variance added to spots [pixel^2], and the halo that a part of their light is in."""
         del shot, layout
-        return 0.0, 0.0, 1.0
+        return 0.0, ()
 
     # -- on pixels alone
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bfsensor.device import silicon
-from bfsensor.effects.effect import Effect, Layout, Parameter, Shot
+from bfsensor.effects.effect import Effect, Halo, Layout, Parameter, Shot
 from bfsensor.units import BOLTZMANN
 
 
@@ -36,13 +36,13 @@ class LateralDiffusion(Effect):
         "2 (kT / q) d L / V; range assumed"
     )
 
-    def spot_light(self, shot: Shot, layout: Layout) -> tuple[float, float, float]:
+    def spot_light(self, shot: Shot, layout: Layout) -> tuple[float, Halo]:
         wavelength, back_bias, temperature = layout.reference
         usual = shot._replace(
             wavelength=wavelength, back_bias=back_bias, temperature=temperature
         )
         ratio = diffusion_variance(shot, layout) / diffusion_variance(usual, layout)
-        return self["var"] * ratio, 0.0, 1.0
+        return self["var"] * ratio, ()
 
 
 def diffusion_variance(shot: Shot, layout: Layout) -> float:

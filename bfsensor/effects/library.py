@@ -38,7 +38,7 @@ from bfsensor.effects.interpixel_coupling import InterpixelCoupling
 from bfsensor.effects.lateral_diffusion import LateralDiffusion
 from bfsensor.effects.mask_stitch import MaskStitch, WavyMask
 from bfsensor.effects.persistence import Persistence, PowerPersistence, TwoTimesPersistence
-from bfsensor.effects.psf_wings import PsfWings
+from bfsensor.effects.psf_wings import AureoleWings, ExponentialWings, PsfWings
 from bfsensor.effects.saturation import DrainedSaturation, Saturation
 from bfsensor.effects.shutter_timing import FlatShutter, ShutterTiming
 from bfsensor.effects.tearing import DivisaderoTearing, Tearing
@@ -99,6 +99,8 @@ LIBRARY: tuple[type[Effect], ...] = (
     TwoTimesPersistence,
     Pickup,
     PsfWings,
+    ExponentialWings,
+    AureoleWings,
     Saturation,
     DrainedSaturation,
     ShutterTiming,

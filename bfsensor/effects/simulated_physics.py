@@ -10,7 +10,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from bfsensor.effects.device_parameter import add_edges, nearest_edges
-from bfsensor.effects.effect import Effect, Layout, Parameter, Seen, Shot
+from bfsensor.effects.effect import Effect, Halo, Layout, Parameter, Seen, Shot
 from bfsensor.effects.tree_rings import TreeRings
 from bfsensor.typing import Edges, FloatArray
 
@@ -131,12 +131,12 @@ class FieldDiffusion(LeftOut):
     stage = "light"
     touches = ("spot",)
 
-    def spot_light(self, shot: Shot, layout: Layout) -> tuple[float, float, float]:
+    def spot_light(self, shot: Shot, layout: Layout) -> tuple[float, Halo]:
         del layout
         told = self.template
         heat = shot.temperature / told.temperature
         heat = heat if np.isfinite(heat) else 1.0
-        return self["strength"] * heat * _nearest(told.held, shot), 0.0, 1.0
+        return self["strength"] * heat * _nearest(told.held, shot), ()
 
 
 class DopingRings(LeftOut):

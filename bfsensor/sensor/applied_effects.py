@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bfsensor._kernels.counter_rng import uniforms
 from bfsensor._kernels.photons import Light, Pattern
-from bfsensor.effects.effect import Effect, Law, Layout, Segment, Shot
+from bfsensor.effects.effect import Effect, Halo, Law, Layout, Segment, Shot
 from bfsensor.errors import SensorError
 from bfsensor.sensor.effect_edges import EdgeChange, Sides, find_change, mean_shifts
 from bfsensor.sensor.effect_reports import STORED
@@ -165,20 +165,23 @@ class AppliedEffects:
 
     # -- light -------------------------------------------------------------------------
 
-    def _spot_light(self) -> tuple[float, tuple[float, float]]:
-        """Added variance [pixel^2], and share of light in a halo with its sigma [pixel]."""
-        variance, halo = 0.0, (0.0, 1.0)
+    def _spot_light(self) -> tuple[float, Halo]:
+        """Added variance [pixel^2], and the halo that a part of the light is in."""
+        variance = 0.0
+        halo: Halo = ()
         shot = self.shot._replace(kind="spot")
         for effect in self.effects:
-            more, share, sigma = effect.spot_light(shot, self._assumed())
+            more, parts = effect.spot_light(shot, self._assumed())
             variance += more
-            if share:
-                if halo[0]:
+            if any(share for share, _ in parts):
+                if halo:
                     raise SensorError("effects: at most one effect may give light a halo")
-                halo = float(share), float(sigma)
-        if not (variance >= 0 and 0 <= halo[0] <= 1 and halo[1] > 0):
+                halo = tuple((float(share), float(sigma)) for share, sigma in parts)
+        share = sum(part for part, _ in halo)
+        proper = all(part >= 0 and sigma > 0 for part, sigma in halo)
+        if not (variance >= 0 and proper and share <= 1):
             raise SensorError(
-                f"effects: added variance = {variance:g} pixel^2 and share = {halo[0]:g} of a "
+                f"effects: added variance = {variance:g} pixel^2 and share = {share:g} of a "
                 "halo must not be negative, the share not above 1"
             )
         return variance, halo
@@ -264,12 +267,15 @@ class AppliedEffects:
             share = factor[row, column]
             kept = np.where(deviates[:, 0] < share, np.maximum(share, 1.0), 0.0)
             light = light._replace(flux=light.flux * kept)
-        share_of_halo, sigma = self.halo
-        if share_of_halo:
+        if self.halo:
             uniforms(number, _HALO, *keys, deviates)
-            wide = np.nonzero(deviates[:, 0] < share_of_halo)[0]
-            # Given that it is below the share, the uniform is uniform up to it: no second draw.
-            radius = sigma * np.sqrt(-2 * np.log(deviates[wide, 0] / share_of_halo))
+            shares, sigmas = np.array(self.halo).T
+            ends = np.cumsum(shares)
+            wide = np.nonzero(deviates[:, 0] < ends[-1])[0]
+            own = np.searchsorted(ends, deviates[wide, 0], side="right")
+            # Given that it is within a share, the uniform is uniform in it: no second draw.
+            within = 1 - (ends[own] - deviates[wide, 0]) / shares[own]
+            radius = sigmas[own] * np.sqrt(-2 * np.log(within))
             angle = 2 * np.pi * deviates[wide, 1]
             x, y = light.x.copy(), light.y.copy()
             x[wide] += radius * np.cos(angle)

@@ -161,7 +161,7 @@ class EffectSensor(EngineSensor):
         applied, exposure = self._applied, self._exposure
         if applied is None or exposure is None:
             return light
-        if exposure.light_factor is None and not applied.halo[0]:
+        if exposure.light_factor is None and not applied.halo:
             return light
         key = int(exposure.plan.key0), int(exposure.plan.key1)
         number = int(exposure.diagnostics["photons"])

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.ndimage import gaussian_filter
 
 from bfsensor.diagnose.model.effect_parameters import fitted, widened
 from bfsensor.diagnose.model.flat_predictions import periodic_covariances
@@ -470,3 +471,29 @@ def test_predictions_are_numbers_at_the_ends_of_ranges(kind):
                     image = effect.spot_image(np.ones((1, 1, 5, 5)), {"level": 1e4}, LAYOUT)
                     lost = effect.law().lost(np.array([0.0, 1e3, 1e5]))
                 assert np.isfinite(image).all() and np.isfinite(lost).all(), (p.name, end)
+
+
+@pytest.mark.parametrize(
+    ("variant", "law", "lengths"),
+    [
+        ("exponential", lambda r, length: np.exp(-r / length), (2.5, 5.0)),
+        ("aureole", lambda r, length: 1 / (length**2 + r**2), (2.0, 8.0)),
+    ],
+)
+def test_halos_are_sums_of_gaussians(variant, law, lengths):
+    y, x = np.mgrid[-200:201, -200:201]
+    r = np.hypot(x, y)
+    for length in lengths:
+        effect = make_effect("psf_wings", {"frac": 0.02, "length": length}, variant)
+        _, parts = effect.spot_light(SHOTS[1], LAYOUT)
+        assert sum(f for f, _ in parts) == pytest.approx(0.02)
+        said = sum(f * np.exp(-((r / w) ** 2) / 2) / (2 * np.pi * w**2) for f, w in parts)
+        exact = law(r, length)
+        inside = (r > 2) & (r < min(4 * length, 16))
+        ratio = gaussian_filter(said, 1.25)[inside] / gaussian_filter(exact, 1.25)[inside]
+        assert ratio.std() / ratio.mean() < 0.04
+        if variant == "exponential":
+            assert ratio.mean() * exact.sum() == pytest.approx(0.02, rel=0.03)
+    assert make_effect("psf_wings", {"frac": 0.0, "length": 3.0}, variant).spot_light(
+        SHOTS[1], LAYOUT
+    ) == (0.0, ())

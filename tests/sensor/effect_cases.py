@@ -83,7 +83,7 @@ class Wide(Effect):
     )
 
     def spot_light(self, shot, layout):
-        return self["var"], self["frac"], 5.0
+        return self["var"], ((self["frac"], 5.0),)
 
 
 class Shade(Effect):

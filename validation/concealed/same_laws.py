@@ -31,7 +31,7 @@ Not in the table, as the library has no such formula, although it may come near:
     interpixel_coupling     extended            5 x 5 pixels, not all within 3 pixels
     lateral_diffusion       all                 other dependences on wavelength and voltage
     persistence             power_law           ends after 30 exposures, not exponentially
-    psf_wings               all                 the library's halo is a Gaussian
+    psf_wings               king                the library's aureole ends elsewhere
     saturation              spill_back          a soft limit
     silicon_physics         all                 no such effects
     tearing                 ragged              a bent tear that lasts until one exposure
@@ -157,6 +157,11 @@ def _two_kinds(v: Values) -> float:
     return float(_at_pivot(v) * parts)
 
 
+def _behind_prescan(v: Values) -> float:
+    """Register pixel of a trap, the prescan counted; the library counts columns of the image."""
+    return float(v["column"] - v["layout"]["prescan"])
+
+
 _TRAPS = SameLaw("traps", {"cti": _one_kind, "power": _as("beta"), "tau": _as("tau")})
 _TWO_TRAPS = SameLaw(
     "two_traps",
@@ -180,7 +185,7 @@ _TRANSFER = {
     # corner. Fits have a finite corner, on which size, middle and power depend: they are
     # left out.
     ("trap_serial", "linear_capture"): SameLaw(
-        "gradual", {"tau": _as("tau"), "amp": _as("amp")}
+        "gradual", {"tau": _as("tau"), "amp": _as("amp"), "column": _behind_prescan}
     ),
     # Bench: size (S/1e5)^beta without an end; library: the limit middle = infinity.  Size
     # and middle are then one number, and the power depends on the middle of a fit: left
@@ -189,7 +194,7 @@ _TRANSFER = {
         "two_times",
         {
             "tau": _as("tau"), "slow": _as("share2"), "slow_tau": _as("tau2"),
-            "amp": _as("amp"),
+            "amp": _as("amp"), "column": _behind_prescan,
         },
     ),
 }  # fmt: skip
@@ -248,6 +253,9 @@ _CHARGE = {
         "drained", {"full_well": _as("full_well"), "drain": _is(1.0)}
     ),
     ("saturation", "blooming"): SameLaw("blooming", {"full_well": _as("full_well")}),
+    ("psf_wings", "exponential"): SameLaw(
+        "exponential", {"frac": _as("frac"), "length": _as("length")}
+    ),
     ("charge_loss", "exponential"): SameLaw("exponential", {"q": _as("q")}),
     ("charge_loss", "langmuir"): SameLaw("filling", {"q": _as("q"), "knee": _filling_knee}),
     ("charge_loss", "root"): SameLaw(

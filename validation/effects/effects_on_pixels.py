@@ -73,9 +73,13 @@ class OnPixels:
         return {k: v for k, v in out.items() if v}
 
     def spot_light(self, context: Any) -> dict[str, float]:
-        variance, halo, wide = self.effect.spot_light(*self._of(context))
+        variance, parts = self.effect.spot_light(*self._of(context))
         out = {"variance": variance} if variance else {}
-        return out | ({"halo": halo, "halo_sigma": wide} if halo else {})
+        if not parts:
+            return out
+        # That engine draws one Gaussian.
+        ((halo, wide),) = parts
+        return out | {"halo": halo, "halo_sigma": wide}
 
     def light(self, scene: Any, context: Any) -> None:
         shot, layout = self._of(context)

@@ -14,7 +14,7 @@ from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.data.ptc_turnoff import find_turn_off
 from bfsensor.diagnose.model.baseline import Baseline, level_areas
 from bfsensor.diagnose.model.map_predictions import MapChange, shot_at
-from bfsensor.effects.effect import STAGES, Axes, Effect, Law, Layout, Shot
+from bfsensor.effects.effect import STAGES, Axes, Effect, Halo, Law, Layout, Shot
 from bfsensor.files import Cache
 from bfsensor.response.edge_response import area_matrix
 from bfsensor.typing import Edges, FloatArray
@@ -256,19 +256,14 @@ class EffectChain:
             out[rows] = np.mean(change, axis=0)
         return out
 
-    def spot_change(
-        self, condition: Condition
-    ) -> tuple[float, tuple[float, float], Mapping[str, float]]:
-        """Added variance [pixel^2], halo (fraction, width [pixel]) and axes of spots at a condition."""
+    def spot_change(self, condition: Condition) -> tuple[float, Halo, Mapping[str, float]]:
+        """Added variance [pixel^2], halo and axes of spots at a condition."""
         shot = self.shot(condition, "spot")
-        variance, share, wide = 0.0, 0.0, 1.0
-        for effect in self.effects:
-            v, f, s = effect.spot_light(shot, self.layout)
-            variance += v
-            if f:
-                share, wide = f, s
+        each = [effect.spot_light(shot, self.layout) for effect in self.effects]
+        variance = float(sum(v for v, _ in each))
+        halo = tuple(part for _, parts in each for part in parts)
         axes = {k: getattr(shot, k) for k in ("wavelength", "back_bias", "temperature")}
-        return variance, (share, wide), axes
+        return variance, halo, axes
 
     def spot_image(self, images: FloatArray, axes: Mapping[str, float]) -> FloatArray:
         """Mean images of spots [e-] after readout."""

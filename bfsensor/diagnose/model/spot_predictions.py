@@ -14,7 +14,7 @@ from scipy.special import ndtr
 
 from bfsensor.diagnose.data.spot_channels import STAMP, WING, stamp_moments
 from bfsensor.diagnose.data.spot_widths import fit_widths
-from bfsensor.effects.effect import Law
+from bfsensor.effects.effect import Halo, Law
 from bfsensor.errors import ConvergenceError
 from bfsensor.typing import FloatArray
 
@@ -49,9 +49,6 @@ to 0.002 pixel of another bench's campaign; with 4, to 0.005; with 10 it takes f
 
 LINEAR = Law()
 """Collection with shifts proportional to the stored charge, without loss or full well."""
-
-NO_HALO = (0.0, 1.0)
-"""Fraction of the light in a halo, and the halo's added width [pixel].  Defined: none."""
 
 ALONE = (np.inf, 0.0)
 """Distance of the next spots [pixel], and the fraction of places with one.  Defined: none."""
@@ -158,7 +155,7 @@ def grow_spots(
     phases: FloatArray,
     flux: float,
     steps: int = STEPS,
-    halo: tuple[float, float] = NO_HALO,
+    halo: Halo = (),
     neighbours: tuple[float, float] = ALONE,
     law: Law = LINEAR,
     slopes: tuple[FloatArray, FloatArray] | None = None,
@@ -181,8 +178,8 @@ def grow_spots(
         Charge of a whole spot at the end [e-].
     steps : int
         Steps of equal charge; the error falls with the third power of their number.
-    halo : tuple of float
-        Fraction of the light in a wide component, and the sigma that is added to its width in
+    halo : tuple of (float, float)
+        Wide components: fraction of the light in each, and the sigma that is added to its width in
         quadrature [pixel].
     neighbours : tuple of float
         Distance of the next spots in x and y [pixel], and the fraction of those places that hold
@@ -200,10 +197,10 @@ def grow_spots(
         Charge at the end of each step [e-].
     """
     centres = np.asarray(phases, float)
-    parts = [_Light.of(1.0 - halo[0], sigma, centres)]
-    if halo[0]:
-        wide = float(np.hypot(sigma[0], halo[1])), float(np.hypot(sigma[1], halo[1]))
-        parts.append(_Light.of(halo[0], wide, centres, neighbours))
+    parts = [_Light.of(1.0 - sum(share for share, _ in halo), sigma, centres)]
+    for share, added in halo:
+        wide = float(np.hypot(sigma[0], added)), float(np.hypot(sigma[1], added))
+        parts.append(_Light.of(share, wide, centres, neighbours))
     each = flux / steps
     light = each * np.sum([part.whole for part in parts], axis=0)
     # Shifts farther than the image is wide are not needed, so that the periodic array may be small.
@@ -291,7 +288,7 @@ def predict_spots(
     sigma: tuple[float, float],
     phases: FloatArray,
     fluxes: ArrayLike,
-    halo: tuple[float, float] = NO_HALO,
+    halo: Halo = (),
     neighbours: tuple[float, float] = ALONE,
     law: Law = LINEAR,
     slopes: tuple[FloatArray, FloatArray] | None = None,
@@ -364,9 +361,11 @@ def predict_spots(
         mean = _curves(each.mean(1), light, turning=True)
         own = _at_places(each, light, wanted - mean(wanted)[:, -1], _weights(nodes, places))
 
-        def lines(flux: FloatArray) -> FloatArray:
+        def at_places(flux: FloatArray) -> FloatArray:
             # Spots at their own places, which hardly differ in the flux before other changes.
             return np.asarray(own + mean(flux) - mean(wanted))
+
+        lines: Callable[[FloatArray], FloatArray] = at_places
     else:
         lines = _curves(measure(shown), light, turning=spilling or bending)
     if change is None or np.array_equal(change(images[-1]), images[-1]):

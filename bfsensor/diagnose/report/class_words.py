@@ -119,6 +119,9 @@ LAW_WORDS = {
     "persistence": ("one_exponential", "released with one time constant"),
     "persistence:power": ("power", "released as a power of the age"),
     "persistence:two_times": ("two_exponentials", "above a level, with two time constants"),
+    "psf_wings": ("gaussian", "a Gaussian halo"),
+    "psf_wings:exponential": ("exponential", "a halo that falls exponentially"),
+    "psf_wings:aureole": ("aureole", "an aureole that falls as the square of the distance"),
     "saturation": ("blooming", "charge above it spills along the columns"),
     "saturation:drained": ("drained", "charge above it is lost, or spills in part"),
     "trap_serial": ("sharp", "full after any packet above its reach"),
@@ -142,6 +145,7 @@ PARAMETER_WORDS: Mapping[str, Mapping[str, str]] = {
     "trap_serial": {
         "size": "charge that the trap holds", "tau": "release time constant",
         "amp": "amplifier (the first is 1)", "reach": "smallest packet that meets the trap",
+        "column": "columns that are read before it",
         "middle": "signal that fills it", "power": "power of small signals",
         "corner": "sharpness of the corner below full",
         "slow": "part that is released slowly", "slow_tau": "time constant of that part",
@@ -255,7 +259,9 @@ PARAMETER_WORDS: Mapping[str, Mapping[str, str]] = {
         "xx": "curvature of the contours, x x", "xy": "curvature of the contours, x y",
         "yy": "curvature of the contours, y y",
     },
-    "psf_wings": {"frac": "fraction of the light in the halo", "sigma": "added width of the halo"},
+    "psf_wings": {"frac": "fraction of the light in the halo", "sigma": "added width of the halo",
+        "length": "length on which the halo falls",
+    },
     "cosmic_rays": {"rate": "tracks on 256 x 256 pixels"},
     "illumination_turbulence": {
         "rms": "relative rms of the light", "corr": "correlation length",

@@ -26,6 +26,10 @@ HEADLINES: Mapping[str, tuple[str, ...]] = {
         "parallel transfer leaves {cti} of the charge behind at each step",
     ),
     "trap_serial": (
+        "a trap in the serial register of amplifier {amp}, before column {column} as they are read, "
+        "is filled by {middle} e-, holds {size} e- and releases them within {tau} pixel times",
+        "a trap in the serial register of amplifier {amp}, before column {column} as they are read, "
+        "holds {size} e- and releases them within {tau} pixel times",
         "a trap in the serial register of amplifier {amp} is filled by {middle} e-, holds {size} e- and "
         "releases them within {tau} pixel times",
         "a trap in the serial register of amplifier {amp} holds {size} e- and releases them within "
@@ -121,7 +125,10 @@ HEADLINES: Mapping[str, tuple[str, ...]] = {
         "pixels are full at {full_well} e-",
     ),
     "fringing": ("fringes vary the signal by {amp}, {period} pixels apart",),
-    "psf_wings": ("{frac} of the light of spots lies in a halo {sigma} pixels wide",),
+    "psf_wings": (
+        "{frac} of the light of spots lies in a halo {sigma} pixels wide",
+        "{frac} of the light of spots lies in a halo that falls within {length} pixels",
+    ),
     "cosmic_rays": ("particles leave {rate} tracks a minute on 256 x 256 pixels",),
     "illumination_turbulence": (
         "the illumination changes between frames by {rms} (rms) over {corr} pixels",

@@ -28,7 +28,7 @@ def test_widths_are_those_of_the_channels_fit():
     kx, ky = nominal_shifts()
     phases = np.random.default_rng(5).uniform(-0.5, 0.5, (6, 2))
     images = grow_spots(
-        kx, ky, sigma=(1.06, 1.1), phases=phases, flux=9e5, halo=(0.02, 4.0)
+        kx, ky, sigma=(1.06, 1.1), phases=phases, flux=9e5, halo=((0.02, 4.0),)
     )[-1]
     stamps = images[:, 5:-5, 5:-5]
     known = fit_spots(
@@ -71,14 +71,14 @@ def test_halo_of_a_grid_of_spots_reaches_its_neighbours():
     ]
     zero = np.zeros((3, 3))
     mean = grow_spots(
-        zero, zero, sigma=sigma, phases=phases, flux=1e5, steps=2, halo=(share, wide),
+        zero, zero, sigma=sigma, phases=phases, flux=1e5, steps=2, halo=((share, wide),),
         neighbours=(30.0, 7 / 8),
     )[-1]  # fmt: skip
     # float32 scene; what lies beyond the next spots is left out.
     np.testing.assert_allclose(mean[0], np.mean(stamps, axis=0), rtol=2e-3, atol=0.02)
     moments = stamp_moments(mean[:, 5:-5, 5:-5], mean, *phases.T)
     found = predict_spots(
-        zero, zero, sigma=sigma, phases=phases, fluxes=moments["flux"], halo=(share, wide),
+        zero, zero, sigma=sigma, phases=phases, fluxes=moments["flux"], halo=((share, wide),),
         neighbours=(30.0, 7 / 8),
     )  # fmt: skip
     # Read as less than the light was: the halo lies under its own background.
