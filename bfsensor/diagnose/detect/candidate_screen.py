@@ -173,7 +173,12 @@ class Screen:
     def _projected(self, change: NDArray[np.floating]) -> FloatArray:
         out = np.zeros(len(self.fit.left))
         out[: len(change)] = change
-        return np.asarray(out - self.fit.basis @ (self.fit.basis.T @ out))
+        touched = np.flatnonzero(out)
+        if not len(touched):
+            return out
+        # Most effects change few channels.
+        own = slice(touched[0], touched[-1] + 1)
+        return np.asarray(out - self.fit.basis @ (self.fit.basis[own].T @ out[own]))
 
     def _change_of_start(self, effect: Effect) -> FloatArray:
         """Template as :meth:`change` gives it, cached for all screens of an attribution."""

@@ -336,7 +336,9 @@ class _Search:
         self, now: Explanation, without: Explanation, n: int, gain: float
     ) -> list[Rival]:
         """Rank all candidates in the place of one effect."""
-        screen = Screen(without.model.predictor, without.model.fit, seen_of(self.first))
+        screen = Screen(
+            without.model.predictor, without.model.fit, seen_of(self.first), self.before
+        )
         kinds = concerned(self.kinds, self.first, now.mismatch)
         ranking = rank(screen, further(kinds, without.model.effects))
         name = now.parts[n].name
