@@ -242,9 +242,9 @@ class RadialTreeRings(_Rings):
     from_sightings = False
     parameters = (
         AMP,
-        # The search has chosen the periods: the prior of one is charged, and nothing is fitted.
-        PLACE[0]._replace(law="whole"),
-        *PLACE[1:],
+        # The search has chosen periods and centre together with the profile: their priors are charged,
+        # and nothing is fitted, for a profile about one centre holds no other.
+        *(p._replace(law="whole") for p in PLACE),
         Parameter("drift", "", 0.0, 1.0, law="flat"),
         Parameter("field", "", 0.0, 1.0, law="flat"),
     )

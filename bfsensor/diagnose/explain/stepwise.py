@@ -27,10 +27,10 @@ from bfsensor.diagnose.detect.model_error import SAME, charge, left_by_word, sta
 from bfsensor.diagnose.explain.attribution import (
     LEVELS,
     OUTSIDE_WORD,
-    WIDENED,
     Attribution,
     Found,
     class_probabilities,
+    scale_of,
     tied_classes,
 )
 from bfsensor.diagnose.explain.explanation import Explanation
@@ -62,9 +62,6 @@ FAINT = 2
 """Number of candidates whose gain is below the charge of the best of all that are fitted where no
 addition is above it.  Chosen: twice as many cost two more fits and find faint effects whose templates
 rank third or fourth."""
-
-WIDTHS = [WIDENED * w for w in LEVELS.values()]
-"""Square roots of the rises of the chi-square at which intervals end, 68 % and 95 %."""
 
 
 def attribute(
@@ -426,7 +423,8 @@ def _attribution(
     outside = [c for c, *_ in now.free if not now.same(c)]
     last = now.model
     free: OpenWorld | None = None
-    model, profiles = _settled(last)
+    scales = [scale_of(sum(part.own.values())) for part in now.parts]
+    model, profiles = _settled(last, scales)
     mismatch = (
         now.mismatch if model is last else locate_mismatch(model.fit, seed=search.seed)
     )
@@ -442,7 +440,7 @@ def _attribution(
     left = stands_out(mismatch, explained, dict.fromkeys(explained, SAME), library=False)
     nothing = not now.parts and mismatch.detected
     found = [
-        _found(model, n, places.get(part.name, []), own)
+        _found(model, n, places.get(part.name, []), own, scales[n])
         for n, (part, own) in enumerate(zip(now.parts, profiles, strict=True))
     ]
     named = any(f.effect.word == OUTSIDE_WORD for f in found)
@@ -461,26 +459,36 @@ def _attribution(
 
 
 def _found(
-    model: Model, n: int, ranking: Sequence[Rival], profiles: Mapping[str, Profile]
+    model: Model,
+    n: int,
+    ranking: Sequence[Rival],
+    profiles: Mapping[str, Profile],
+    scale: float,
 ) -> Found:
     """One effect of a model, with the candidates that may stand in its place."""
     effect = model.effects[n]
     gain = next((r.gain for r in ranking if r.effect.name == effect.name), np.nan)
     return Found(
         effect, gain, model.errors(n), class_probabilities(ranking),
-        tied_classes(effect, ranking), tuple(ranking), profiles,
+        tied_classes(effect, ranking), tuple(ranking), profiles, scale,
     )  # fmt: skip
 
 
-def _settled(model: Model) -> tuple[Model, list[dict[str, Profile]]]:
-    """Profiles of all effects' parameters, with a new fit where one finds a lower chi-square."""
+def _settled(
+    model: Model, scales: Sequence[float]
+) -> tuple[Model, list[dict[str, Profile]]]:
+    """Profiles of all effects' parameters, with a new fit where one finds a lower chi-square.
+
+    ``scales`` are factors on the standard errors of each effect at which intervals end.
+    """
+    widths = [[scale * w for w in LEVELS.values()] for scale in scales]
     profiles: dict[int, dict[str, Profile]] = {}
     for n in range(len(model.effects)):
-        lower, own = settle(model, n, WIDTHS)
+        lower, own = settle(model, n, widths[n])
         if lower is not model:
             profiles.clear()
         model, profiles[n] = lower, own
     return model, [
-        profiles[n] if n in profiles else find_profiles(model, n, WIDTHS)
+        profiles[n] if n in profiles else find_profiles(model, n, widths[n])
         for n in range(len(model.effects))
     ]

@@ -151,9 +151,14 @@ def headline(found: Found) -> str:
         Without a capital and a full stop.
     """
     word = found.effect.word
+    plain = {
+        p.name for p in found.effect.parameters
+        if p.law == "whole" and p.plain == found.effect[p.name]
+    }  # fmt: skip
     values = {
         name: _amount(told, whole=name not in found.errors)
         for name, told in found.intervals().items()
+        if name not in plain
     }
     if word == "trap_serial" and "amp" in found.effect.values:
         values["amp"] = f"{found.effect['amp'] + 1:g}"
