@@ -85,7 +85,8 @@ class MixedModelFit(ABC):
     point : ndarray, shape (p,)
         Non-linear parameters.
     solved : BoundedSolution
-        The last solution: steps of the non-linear parameters, linear parameters, random effects.
+        The last solution: steps of the non-linear parameters; linear parameters and random effects
+        at the point.
     slopes : ndarray, shape (n, p)
         Whitened derivatives of the predictions.
     modes : ndarray, shape (n, m)
@@ -290,17 +291,18 @@ class MixedModelFit(ABC):
         The linear model may still promise a decrease that no step delivers; residuals with that
         decrease taken off would claim a fit that was not reached.  So parameters are held at the
         point in the last solution, unless freeing them (all, else all but these) promises less
-        than :data:`IDLE`.
+        than :data:`IDLE`.  Linear parameters and random effects are those at the point: a step that
+        promises as little may be long where they follow it.
         """
         nothing, everything = np.zeros(self.count, bool), np.ones(self.count, bool)
         told = self.solve(self.point, everything)
-        square = float(told.left @ told.left)
+        square, here = float(told.left @ told.left), told.solution
         for held in (nothing, self.curved):
             free = self.solve(self.point, held)
             if square - float(free.left @ free.left) < IDLE:
                 told = free
                 break
-        self.solved = told
+        self.solved = told._replace(solution=here)
 
     def stay(self, point: FloatArray) -> None:
         """End at a point that a fit of other values found, whatever the residuals are here.
