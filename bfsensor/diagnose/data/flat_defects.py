@@ -230,8 +230,8 @@ def _part_lost(
         (slice(max(start - reach, 0), start), slice(max(start - 2 * reach, 0), max(start - reach, 0))),
         (slice(stop, stop + reach), slice(stop + reach, stop + 2 * reach)),
     ):  # fmt: skip
-        use, others = profile[near][~off[near]], profile[far]
-        if len(use) and len(others):
+        use, others = profile[near][~off[near]], profile[far][~off[far]]
+        if len(use) and len(others) >= QUIET:
             bases.append(float(np.median(others)))
             beside += float((use - bases[-1]).sum())
             count += len(use)

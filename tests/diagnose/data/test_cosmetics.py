@@ -247,3 +247,10 @@ def test_columns_beside_a_slope_of_light_are_found():
         change[one.columns] += one.change[200]
     assert np.flatnonzero(np.abs(change) > 0.01).tolist() == [3, 7]
     assert change[[0, 3, 7]].round(2).tolist() == [0.0, -0.25, -0.22]
+
+
+def test_a_column_with_others_on_its_one_side_is_found():
+    image = 1e-3 * np.random.default_rng(9).standard_normal((256, 128))
+    image[:, [6, 18, 25]] -= 0.03, 0.08, 0.26
+    found = {x for d in bad_columns(image) for x in d.columns}
+    assert found == {6, 18, 25}
