@@ -8,7 +8,7 @@ from bfsensor.effects.effect import Effect, Halo, Layout, Parameter, Shot
 from bfsensor.typing import FloatArray
 
 FRAC = Parameter("frac", "", 1e-3, 0.05, amplitude=True)
-"""Fraction of the light in the halo.  Range assumed: projectors and antireflection coatings of test
+"""Fraction of the light in the halo.  Chosen: projectors and antireflection coatings of test
 benches; with a top twice as high the evidence of every detection falls by a sixth."""
 
 WIDTHS = np.geomspace(0.3, 3.4, 5)

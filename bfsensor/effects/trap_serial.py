@@ -20,7 +20,8 @@ from bfsensor.effects.effect import (
 from bfsensor.typing import FloatArray
 
 COLUMN = Parameter("column", "", 0, 4095, law="whole", plain=0.0)
-"""First column that passes the trap, in the order of reading.  Range: registers of sensors of 4k."""
+"""First column that passes the trap, in the order of reading.  Chosen: up to registers of sensors of 4k;
+with twice as many, the evidence of a trap at one place falls by a factor of two."""
 
 
 class TrapSerial(Effect):

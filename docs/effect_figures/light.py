@@ -88,17 +88,27 @@ def draw_shutter_timing() -> Figure:
 
 @picture("psf_wings")
 def draw_psf_wings() -> Figure:
-    """Profile of a spot without and with 2 % of its light in a halo, 5 pixels wide."""
+    """Profile of a spot without and with 2 % of its light in a halo: one 5 pixels wide, one that
+    falls exponentially within 5 pixels, and an aureole that falls as the square of the distance.
+    """
     figure, (ax,) = row(1)
     on = parts.make_effect("psf_wings", {"frac": 0.02, "sigma": 5.0})
+    far = {"frac": 0.02, "length": 5.0}
+    others = [
+        parts.make_effect("psf_wings", far, law) for law in ("exponential", "aureole")
+    ]
     profiles = []
-    for effect in (on.scaled(0), on):
-        _, part, wide = effect.spot_light(flat_shot(), make_layout())
-        light = (1 - part) * star(1e5, (49, 49), 24, 24)
-        profiles.append(
-            light + part * star(1e5, (49, 49), 24, 24, float(np.hypot(1.5, wide)))
-        )
-    curves(ax, np.arange(-24, 25), *(p[24] for p in profiles))
+    for effect in (on.scaled(0), on, *others):
+        _, halo = effect.spot_light(flat_shot(), make_layout())
+        light = (1 - sum(part for part, _ in halo)) * star(1e5, (49, 49), 24, 24)
+        for part, wide in halo:
+            sigma = float(np.hypot(1.5, wide))
+            light = light + part * star(1e5, (49, 49), 24, 24, sigma)
+        profiles.append(light)
+    curves(ax, np.arange(-24, 25), *(p[24] for p in profiles[:2]))
+    for profile, name in zip(profiles[2:], ("exponential", "aureole"), strict=True):
+        ax.plot(np.arange(-24, 25), profile[24], "--", lw=1, label=name)
+    ax.legend()
     ax.set(yscale="log", ylim=(0.05, 2e4), xlabel="distance from the centre [pixel]",
            ylabel="signal [e⁻/pixel]")  # fmt: skip
     return figure
@@ -113,7 +123,7 @@ def draw_lateral_diffusion() -> Figure:
     layout, effects = make_layout(), before_and_after("lateral_diffusion", {"var": 0.15})
 
     def width(effect: Effect, bias: float) -> float:
-        added, _, _ = effect.spot_light(flat_shot(back_bias=bias), layout)
+        added, _ = effect.spot_light(flat_shot(back_bias=bias), layout)
         return float(np.sqrt(1.0 + added))
 
     spots = [star(1e5, (15, 15), 7, 7, width(e, -60.0))[7] for e in effects]

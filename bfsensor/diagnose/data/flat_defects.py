@@ -217,11 +217,11 @@ def bad_columns(image: FloatArray) -> list[BadColumns]:
 def _part_lost(
     image: FloatArray, off: NDArray[np.bool_], start: int, stop: int, scatter: float
 ) -> float:
-    """Part of what columns lack that columns beside them do not have more, against others farther away.
+    """Calculate which part of what columns lack is not found in columns beside them.
 
-    What displaced edges take from columns they give to the columns beside.  Columns that are other
-    defects are left out; at the rim, one side stands for both.  An excess within what columns of a
-    ``scatter`` have by chance is none.
+    Both are compared with columns farther away: what displaced edges take from columns they give to
+    those beside.  Columns that are other defects are left out; at the rim, one side stands for both.
+    An excess within what columns of a ``scatter`` have by chance is none.
     """
     profile, reach = np.median(image, axis=0), WIDEST + QUIET
     own, beside, count = profile[start:stop].copy(), 0.0, 0
