@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from bfsensor.checkpoints import Checkpoints
 from bfsensor.diagnose.data.channels import PER_ELECTRON, step_of
@@ -31,6 +32,8 @@ from bfsensor.errors import ConvergenceError
 from bfsensor.response.edge_response import LEVEL
 
 
+# Threads of the linear algebra take 1.7 times the CPU seconds and no less time: matrices are small.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def diagnose(
     source: Source,
     baseline: Baseline,
@@ -96,6 +99,7 @@ def diagnose(
     )
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def diagnose_measured(
     measured: MeasuredChannels,
     baseline: Baseline,
