@@ -331,8 +331,8 @@ def _repair_response(
         columns = []
         change[:] = 0.0
         for amp, (frame, image) in enumerate(zip(layout, good, strict=True)):
-            here = (1 + image) / _on_sensor(shade, frame) - 1 - _on_sensor(light, frame)
-            for one in bad_columns(here):
+            here = (1 + image) / _on_sensor(shade, frame) - 1
+            for one in bad_columns(here, _on_sensor(light, frame)):
                 columns.append((amp, one))
                 own = _on_sensor(change, frame)
                 own[:, one.columns.start : one.columns.stop] = one.change

@@ -142,13 +142,15 @@ def low_pixels(image: FloatArray) -> NDArray[np.bool_]:
     return low if low.mean() < FEW**2 else np.zeros_like(low)
 
 
-def bad_columns(image: FloatArray) -> list[BadColumns]:
+def bad_columns(image: FloatArray, light: FloatArray | None = None) -> list[BadColumns]:
     """Find columns of low response in an amplifier, whole or from a row on.
 
     Parameters
     ----------
     image : ndarray, shape (rows, columns)
         Response of each pixel less one, without single low pixels.
+    light : ndarray, shape (rows, columns), optional
+        Smooth light that the image holds: columns some way off are compared without it.
 
     Returns
     -------
@@ -193,6 +195,7 @@ def bad_columns(image: FloatArray) -> list[BadColumns]:
     strong = off & (np.abs(mean) > FEW * maximum_filter(np.abs(mean), 2 * QUIET + 1))
     off &= maximum_filter(strong, 3)
     at = np.flatnonzero(off)
+    even = image if light is None else image - light
     found = []
     # Columns with fewer than QUIET others between them are one defect.
     for own in np.split(at, np.flatnonzero(np.diff(at) > QUIET) + 1) if len(at) else []:
@@ -203,7 +206,7 @@ def bad_columns(image: FloatArray) -> list[BadColumns]:
         # An excess is dark current of a hot column, which the diagnosis explains.
         lost = -float(mean[own].sum()) > LOST * float(size.sum())
         span = range(int(first[own].min()), int(last[own].max()))
-        lost &= _part_lost(image[span.start : span.stop], off, start, stop, scatter) > LOST
+        lost &= _part_lost(even[span.start : span.stop], off, start, stop, scatter) > LOST
         clear = float(np.min([np.abs(z[own]) / SURE, size / LEAST], axis=0).max()) > 1.0
         if alone and lost and clear and stop - start <= WIDEST:
             change = np.zeros((ny, stop - start))
