@@ -275,6 +275,8 @@ class AppliedEffects:
             own = np.searchsorted(ends, deviates[wide, 0], side="right")
             # Given that it is within a share, the uniform is uniform in it: no second draw.
             within = 1 - (ends[own] - deviates[wide, 0]) / shares[own]
+            # Rounding may leave 0 or less at the lower end of a share, which has no radius.
+            within = np.maximum(within, np.finfo(float).tiny)
             radius = sigmas[own] * np.sqrt(-2 * np.log(within))
             angle = 2 * np.pi * deviates[wide, 1]
             x, y = light.x.copy(), light.y.copy()

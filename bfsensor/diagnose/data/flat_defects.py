@@ -220,11 +220,12 @@ def bad_columns(image: FloatArray, light: FloatArray | None = None) -> list[BadC
 def _part_lost(
     image: FloatArray, off: NDArray[np.bool_], start: int, stop: int, scatter: float
 ) -> float:
-    """Calculate which part of what columns lack is not found in columns beside them.
+    """Calculate the fraction of a defect's missing response that neighbouring columns do not hold.
 
-    Both are compared with columns farther away: what displaced edges take from columns they give to
-    those beside.  Columns that are other defects are left out; at the rim, one side stands for both.
-    An excess within what columns of a ``scatter`` have by chance is none.
+    Defect and neighbours are compared with columns farther away.  Displaced edges only move light:
+    what the columns of a tear lack, their neighbours have more.  Columns that are other defects are
+    left out; at the rim, one side stands for both.  An excess within what columns of a ``scatter``
+    have by chance is none.
     """
     profile, reach = np.median(image, axis=0), WIDEST + QUIET
     own, beside, count = profile[start:stop].copy(), 0.0, 0

@@ -12,8 +12,8 @@ from bfsensor.typing import FloatArray
 
 STRONG = 100.0
 """Factor on the top of an amplitude's plausible range up to which fits may go.  Chosen: the strongest
-effects of campaigns by another bench are 13 times the top; with 1000, more fits of weak effects of
-other classes run to strengths at which predictions overflow."""
+effects of campaigns by another bench are 13 times (loss of charge) and 22 times (coupling) the top;
+with 1000, fits of other classes would run to strengths at which predictions overflow."""
 
 
 class FittedEffects:

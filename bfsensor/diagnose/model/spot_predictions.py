@@ -45,7 +45,7 @@ the noise; twice as large ends one or two rounds earlier."""
 FEW = 5
 """Number of places along x and along y that are combined with one another where charge spills.
 Measured: with 25 combinations, splines between them give widths of spots whose brightest pixels are full
-to 0.002 pixel of another bench's campaign; with 4, to 0.005; with 10 it takes four times as long."""
+of another bench's campaign to 0.006 pixel at worst, 0.002 usually; 10 take four times as long."""
 
 LINEAR = Law()
 """Collection with shifts proportional to the stored charge, without loss or full well."""
