@@ -214,6 +214,10 @@ class _Search:
         options.reverse()
         options.sort(key=lambda o: -o[0])
         before = sum(score >= near for score, _ in options)
+        if free and not before:
+            faint = self._faint(now, ranking, sum(z * z for z in free[0].z))
+            if faint is not None:
+                return faint
         options[before:before] = [(c.score, partial(now.with_free, c)) for c in free[:1]]
         for _, add in options:
             after = self._tried(now, add)
@@ -274,14 +278,17 @@ class _Search:
         return after
 
     def _faint(
-        self, now: Explanation, ranking: Sequence[Rival]
+        self, now: Explanation, ranking: Sequence[Rival], least: float = 0.0
     ) -> tuple[Explanation, list[Rival]] | None:
-        """An effect whose gain alone is beyond chance and that leaves nothing.
+        """An effect whose gain alone is beyond chance, and at least ``least``, that leaves nothing.
 
         The mismatch is beyond noise already, so that one candidate is not charged for the others
-        where it takes all of it.
+        where it takes all of it, as much as nonparametric terms take.
         """
-        good = [r for r in ranking if self._net(now, r) > now.charge(r.effect, 1)]
+        good = [
+            r for r in ranking
+            if self._net(now, r) > max(now.charge(r.effect, 1), least)
+        ]  # fmt: skip
         for rival in good[:FAINT]:
             try:
                 after = self._adding(now, rival)()

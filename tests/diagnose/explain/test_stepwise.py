@@ -14,7 +14,9 @@ from bfsensor.diagnose.detect.model_error import charge
 from bfsensor.diagnose.explain.attribution import class_probabilities, tied_classes
 from bfsensor.diagnose.explain.explanation import Explanation
 from bfsensor.diagnose.explain.location import place_effects
-from bfsensor.diagnose.explain.stepwise import attribute
+from bfsensor.diagnose.explain.nonparametric import compete
+from bfsensor.diagnose.explain.stepwise import _Search, attribute
+from bfsensor.diagnose.explain.terms import Scene
 from bfsensor.diagnose.fit.fitted_model import Model
 from bfsensor.diagnose.fit.likelihood_profile import valley_of
 from bfsensor.effects.charge_loss import ChargeLoss
@@ -103,6 +105,22 @@ def test_a_screen_finds_the_amplitude_to_its_error():
     error = truth / np.sqrt(best.gain)
     # 4 sigma; tau is fitted too, which doubles the error.
     assert abs(best.effect["size"] - truth) < 8 * error + 0.01 * truth
+
+
+def test_an_effect_that_takes_all_stands_before_terms_that_take_less():
+    """However many effects were tried: the mismatch is there, and terms do not describe it better."""
+    predictor, fit, mismatch = fitted(
+        7101, make_effect("tearing", {"amp": 0.006, "length": 2.0, "column": 0.3})
+    )
+    search = _Search(KINDS, 1, mismatch, [])
+    base = Model(predictor, fit)
+    now = Explanation(base, base, mismatch, 10**20, search.locate)
+    (terms, *_) = compete(Scene(base), mismatch)
+    after, ranking = search._step(now)
+    assert [p.name for p in after.parts] == ["tearing"] and not after.free
+    assert ranking[0].gain < now.charge(ranking[0].effect) and terms.score > 0
+    # Terms that take more than any effect are outside the library.
+    assert search._faint(now, ranking, 100.0) is None
 
 
 def rival(kind, values, gain, z, template):
