@@ -9,6 +9,7 @@ import click
 import numpy as np
 from tqdm import tqdm
 
+from validation.concealed.calibration import coverage_by_class, reliability
 from validation.concealed.campaign import write_campaign
 from validation.concealed.effect import Effect
 from validation.concealed.goals import causes, described, goals, splits
@@ -232,6 +233,9 @@ def open_(
 def table(rows: Path, group: str | None, output: Path | None) -> None:
     """Print the goals of ROWS, whole and by strength, law and layout, and misses by cause.
 
+    Then how often classes are true that were given a probability, by tenths of it, and how often
+    intervals hold, by class and parameter.
+
     \b
     Example:
       python -m validation.concealed table validation/results/independent_campaigns.ecsv
@@ -247,6 +251,11 @@ def table(rows: Path, group: str | None, output: Path | None) -> None:
     for name, own in list(parts.items())[1:]:
         click.echo(f"\n{name}: {len(own)} campaigns")
         print_lines([n for n in lines[name] if n.trials], click.echo)
+    lines["probabilities"] = reliability([s for t in trials for s in t.stated])
+    lines["intervals"] = coverage_by_class([h for t in trials for h in t.held])
+    for name in ("probabilities", "intervals"):
+        click.echo(f"\n{name}")
+        print_lines(lines[name], click.echo)
     by_cause: dict[str, list[str]] = {}
     for trial in trials:
         if word := causes(trial.score):

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from validation.concealed.calibration import stated_of
 from validation.concealed.conventions import OUTSIDE
 from validation.concealed.same_laws import CYCLES, SAME_LAWS, expected_parameters
 from validation.concealed.score import NAN, Held, Score, snr_of
@@ -85,6 +86,8 @@ class Trial:
         Parameters of effects that were named right, by the truth's own law.
     touched : tuple of float
         Held-out chi-square over values, after, of each channel whose value changed.
+    stated : tuple of (float, bool)
+        Probability of each class, and whether it is true.
     """
 
     score: Score
@@ -95,6 +98,7 @@ class Trial:
     nuisances: tuple[str, ...]
     held: tuple[Held, ...]
     touched: tuple[float, ...]
+    stated: tuple[tuple[float, bool], ...]
 
     @property
     def library_laws(self) -> bool:
@@ -128,6 +132,7 @@ def trial_of(
             for c in channels.values()
             if c["after"] != c["before"] and np.isfinite(c["after"])
         ),
+        stated_of(truth, report),
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from validation.concealed.calibration import coverage_by_class, reliability, stated_of
 from validation.concealed.goals import (
     ASKED,
     causes,
@@ -139,3 +140,22 @@ def test_every_quantity_has_a_goal_and_nothing_is_reached_without_trials():
     lines = goals([])
     assert [line.quantity for line in lines] == list(ASKED)
     assert all(not line.reached() and not np.isfinite(line.low) for line in lines)
+
+
+def test_probabilities_are_counted_by_tenths_and_unlisted_truths_at_zero():
+    truth = _truth(CTI, KING)
+    report = _report(("cti_serial", "", {}))
+    report["class_probability"] = {"cti_serial": 0.93, "persistence": 0.07}
+    assert set(stated_of(truth, report)) == {(0.93, True), (0.07, False), (0.0, True)}
+    lines = reliability(_trial(truth, report).stated)
+    assert [(n.hits, n.trials) for n in lines] == [(1, 2), (1, 1)]
+    assert stated_of(truth, None) == stated_of(truth, report | {"detected": False}) == ()
+    assert reliability([(1.0, True)])[0].quantity == "given 0.9 to 1.0 (mean 1.000): true"
+
+
+def test_intervals_are_counted_by_class_and_parameter():
+    said = [("cti_serial", "proportional", {"cti": _interval(1.15e-6, 1e-7)})]
+    held = _trial(_truth(CTI), _report(*said)).held
+    lines = {n.quantity: (n.hits, n.trials) for n in coverage_by_class(held)}
+    assert lines == {"cti_serial cti, 68 %": (0, 1), "cti_serial cti, 95 %": (1, 1)}
+    assert coverage_by_class(()) == []
