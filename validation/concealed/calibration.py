@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
-from validation.concealed.score import Held, probability_of
+from validation.concealed.score import Held
 from validation.concealed.tally import Line, share
 
 TENTHS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
@@ -39,7 +39,7 @@ def stated_of(
         return ()
     true = [e["class"] for e in truth["effects"]]
     words = dict.fromkeys([*report["class_probability"], *true])
-    return tuple((probability_of(report, w), w in true) for w in words)
+    return tuple((float(report["class_probability"].get(w, 0.0)), w in true) for w in words)
 
 
 def reliability(stated: Sequence[tuple[float, bool]]) -> list[Line]:

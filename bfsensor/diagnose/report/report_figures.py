@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from bfsensor.diagnose.data.channels import PER_ELECTRON
-from bfsensor.diagnose.detect.locate import ALARM
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 from bfsensor.diagnose.report.class_words import NAMES
 from bfsensor.diagnose.report.diagnosis_result import Diagnosis
@@ -28,6 +27,10 @@ paper; twice as many make report.html about four times as large."""
 VISIBLE = 0.2
 """Change of a pull [standard errors] from which on a second figure, with the effects, is drawn.
 Chosen: a fifth of an error bar is about the size of a mark; twice as large, fewer figures are pairs."""
+
+SHOWN = 0.02
+"""Probability from which on a class is drawn.  Chosen: where a named class is wrong, each of about 40
+other classes has 0.005 to 0.01; half as large, bars of all of them may be drawn."""
 
 LAGS = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
 """Lags (x, y) [pixel] whose pulls are drawn against level.  Chosen: the nearest, where the
@@ -122,13 +125,14 @@ def _summary(diagnosis: Diagnosis) -> dict[str, Picture]:
     attribution = diagnosis.attribution
     if attribution is None:
         return out
-    shown = {w: p for w, p in attribution.probability.items() if p >= 5e-4}
+    shown = {w: p for w, p in attribution.probability.items() if p >= SHOWN}
     if shown:
         tied = [w for f in attribution.found if len(f.tied) > 1 for w in f.tied]
         height = 0.7 + 0.32 * len(shown)
         out["classes"] = Picture(
-            "Probability that the baseline lacks an effect of each class; at least "
-            f"{100 * ALARM:g} %, or the part that is left, is kept for effects outside the library"
+            "Probability that the baseline lacks an effect of each class, by the evidence and by how "
+            "often a class named first was true in campaigns of an independent bench; classes below "
+            f"{100 * SHOWN:g} % share the rest"
             + ("; classes that these recordings do not distinguish are in orange." if tied else "."),
             (5.2, height), (lambda ax: show.draw_classes(shown, ax, tied=tied),),
         )  # fmt: skip

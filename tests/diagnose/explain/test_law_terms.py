@@ -53,7 +53,7 @@ def test_a_class_by_another_law_is_named_and_its_law_said_apart(root):
     assert mismatch.detected and model.fit.chi2()["serial_overscan"][0] > 1e4
     told = attribute(model.predictor, model.fit, mismatch, kinds=KINDS)
     assert [f.effect.word for f in told.found] == ["cti_serial"] and not told.open_world
-    assert told.probability["cti_serial"] > 0.9
+    assert told.probability["cti_serial"] > 0.7
     # The proportional loss takes most; the rest is another power of the level.
     assert 0.5 < told.shares["effects"] < 0.98 and told.shares["laws"] > 0.02
     assert told.shares["outside"] == 0

@@ -11,6 +11,7 @@ from scipy.stats import chi2
 
 from bfsensor.diagnose.detect.locate import ALARM, locate_mismatch
 from bfsensor.diagnose.detect.model_error import charge
+from bfsensor.diagnose.explain.attribution import OUTSIDE_TRUE, OUTSIDE_WORD, RELIABLE
 from bfsensor.diagnose.fit.baseline_fit import held_out
 from bfsensor.diagnose.plan.advice import plan
 from bfsensor.diagnose.report.class_words import (
@@ -114,8 +115,27 @@ def test_a_part_that_asks_for_another_law_or_remains_is_said_with_its_share(expl
     part = replace(explained, attribution=replace(told, shares=shares))
     assert "70 % of the chi-square" in part.said() and "another 20 %" in part.said()
     assert "A part, 10 % of" in part.said() and "explains it" not in part.said()
-    outside = part.to_report()["class_probability"]["outside_library"]
-    assert outside == pytest.approx(0.1)
+
+
+def test_certain_evidence_is_as_probable_as_campaigns_of_others_showed(explained):
+    told = explained.attribution
+    (found,) = told.found
+    sure = replace(found, probability={found.effect.word: 1.0})
+    for outside in (False, True):
+        given = replace(told, found=(sure,), open_world=outside)
+        chances = given.probability
+        assert sum(chances.values()) == pytest.approx(1)
+        assert next(iter(chances)) == found.effect.word
+        assert RELIABLE[outside] < chances[found.effect.word] < RELIABLE[outside] + 0.03
+        others = {
+            w: p for w, p in chances.items() if w not in (found.effect.word, OUTSIDE_WORD)
+        }
+        assert len(others) > 20 and len(set(others.values())) == 1
+        extra = chances[OUTSIDE_WORD] - next(iter(others.values()))
+        assert extra == pytest.approx(OUTSIDE_TRUE if outside else 0)
+    unnamed = replace(told, found=(), open_world=True).probability
+    assert next(iter(unnamed)) == OUTSIDE_WORD
+    assert replace(told, found=(), open_world=False).probability == {}
 
 
 def test_an_effect_explains_only_where_nothing_is_left(explained):
