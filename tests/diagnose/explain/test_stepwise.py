@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -191,3 +192,24 @@ def test_an_effect_pays_for_the_places_it_was_tried_at():
     starts = Tearing.starts(replace(predictor.layout, sightings=()))
     assert one.charge(loss) == charge(1, 60)
     assert one.charge(Tearing(starts[0])) == charge(4, 60 * len(starts)) > charge(4, 60) + 8
+
+
+def test_behind_terms_only_what_gained_is_asked_and_all_before_the_search_ends(monkeypatch):
+    """What gained nothing before terms is asked again only where nothing else is added."""
+    loss = rival(ChargeLoss, {"q": 1e-7}, 400.0, 195.0, [1, 0])
+    bent = rival(GainNonlinearity, {"c2": -5e-3, "c3": -8e-4}, 0.5, 0.1, [0, 1])
+    seen = SimpleNamespace(detected=True)
+    begun = SimpleNamespace(mismatch=seen, parts=(), free=())
+    termed = SimpleNamespace(mismatch=seen, parts=(), free=("terms",))
+    asked_for = []
+
+    def step(now, asked=None):
+        asked_for.append(asked)
+        return (termed, [loss, bent]) if now is begun else None
+
+    search = _Search(KINDS, 1, seen, [])
+    monkeypatch.setattr(search, "_step", step)
+    monkeypatch.setattr(search, "_net", lambda now, r: r.gain)
+    assert search.forward(begun) == (termed, {})
+    assert asked_for == [None, [ChargeLoss], None]
+    assert search.nearest == [loss, bent]
