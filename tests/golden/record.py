@@ -12,6 +12,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from llvmlite.binding import get_host_cpu_name
+from threadpoolctl import threadpool_info
+
 from tests.caching import processor
 from tests.golden.cases import CASES, Product
 
@@ -21,9 +24,16 @@ WIDTH = " width"
 
 
 def machine() -> dict[str, str]:
-    """Give what the last bits depend on: processor, Python, versions of libraries."""
+    """Give what the last bits depend on: processor, kernels for it, Python, versions of libraries.
+
+    Processors of one model name can be of several generations, for which compilers and BLAS have
+    instructions of their own.
+    """
+    blas = {i["architecture"] for i in threadpool_info() if "architecture" in i}
     return {
         "processor": processor(),
+        "compiled_for": get_host_cpu_name(),
+        "blas": " ".join(sorted(blas)),
         "python": platform.python_version(),
         **{name: version(name) for name in PACKAGES},
     }
