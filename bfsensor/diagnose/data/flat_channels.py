@@ -330,7 +330,8 @@ class FlatChannels:
         """Relative scatter of the light of exposures without a lamp monitor.
 
         Levels that were repeated over more than half of the series of flats show flicker and drift
-        of the lamp; without enough of these it is :data:`LAMP_UNKNOWN`.
+        of the lamp.  Without enough of these it is :data:`LAMP_UNKNOWN`, or the scatter of all repeated
+        levels where noise of that size makes it with a probability below :data:`CHANCE`.
         """
         every = [r for rows in self._means.values() for r in rows if r[0].lamp is None]
         numbers = [e.number for e, *_ in every]
@@ -338,15 +339,22 @@ class FlatChannels:
         for exposure, condition, amplifiers in every:
             if seconds := exposure.exposure_time:
                 light = float(np.mean([m for m, *_ in amplifiers])) / seconds
-                key = condition, self._step(exposure)
+                setting, _ = self._lamps.get(exposure.number, (0, 1.0))
+                key = condition, self._step(exposure), setting
                 groups.setdefault(key, []).append((exposure.number, light))
-        square, freedom = 0.0, 0
+        long, short = np.zeros(2), np.zeros(2)
         for members in groups.values():
             at, light_of = np.array(members).T
-            if len(at) > 1 and np.ptp(at) > 0.5 * np.ptp(numbers):
-                square += float(np.square(light_of / light_of.mean() - 1).sum())
-                freedom += len(at) - 1
-        return float(np.sqrt(square / freedom)) if freedom >= REPEATS else LAMP_UNKNOWN
+            scatter = np.array(
+                [np.square(light_of / light_of.mean() - 1).sum(), len(at) - 1]
+            )
+            short += scatter
+            if np.ptp(at) > 0.5 * np.ptp(numbers):
+                long += scatter
+        if long[1] >= REPEATS:
+            return float(np.sqrt(long[0] / long[1]))
+        refuted = chi2.sf(short[0] / LAMP_UNKNOWN**2, short[1]) < CHANCE
+        return float(np.sqrt(short[0] / short[1])) if refuted else LAMP_UNKNOWN
 
     def _poisson(self, amp: int) -> float:
         """Variance of a pixel over its mean in the faintest 30 % of flats [ADU], the inverse gain."""

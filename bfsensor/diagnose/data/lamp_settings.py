@@ -30,7 +30,8 @@ def lamp_settings(
     """Sort flats of one condition by the setting of the lamp.
 
     With one setting a longer exposure never collects less, whatever the sensor's response.  Flats
-    that do were taken with less light, and so were those of about the same light per second.
+    that do were taken with less light, and so were those of about the same light per second, and
+    longer ones that go on from them beyond full well.
 
     Parameters
     ----------
@@ -42,7 +43,7 @@ def lamp_settings(
     Returns
     -------
     settings : ndarray of int, shape (n,)
-        0 is the setting of most flats, 1, 2 and so on those of others.
+        0 is the setting of the most light, 1, 2 and so on dimmer ones, in the order found.
     light : ndarray, shape (n,)
         Median light per second of each flat's setting over that of setting 0.
 
@@ -66,6 +67,11 @@ def lamp_settings(
         # The faintest light first: brighter settings are found in the next round.
         dimmest = rate[less].min()
         here = usual & (rate < ALIKE * dimmest) & (rate > dimmest / ALIKE)
+        # Beyond full well the light per second falls from each exposure to the next longer one.
+        last = order[here[order]][-1]
+        for n in order[times[order] > times[last]]:
+            if usual[n] and rate[last] / ALIKE < rate[n] <= rate[last]:
+                here[n], last = True, n
         usual &= ~here
         settings[here] = settings.max() + 1
     for n in range(1, settings.max() + 1):

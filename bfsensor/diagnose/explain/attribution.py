@@ -227,6 +227,11 @@ class Attribution:
         return dict(sorted(told.items(), key=lambda t: -t[1]))
 
     @property
+    def taken(self) -> float:
+        """Part of the chi-square above noise that effects take, by their own or another law, 0 to 1."""
+        return 1 - self.shares.get("outside", 0.0) - self.shares.get("left", 0.0)
+
+    @property
     def tied(self) -> list[str]:
         """Classes that may be the cause: those found, those tied to them, and outside_library."""
         words = [w for f in self.found for w in f.tied]

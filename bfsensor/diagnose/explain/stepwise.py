@@ -33,7 +33,7 @@ from bfsensor.diagnose.explain.attribution import (
     scale_of,
     tied_classes,
 )
-from bfsensor.diagnose.explain.explanation import Explanation
+from bfsensor.diagnose.explain.explanation import Explanation, Part
 from bfsensor.diagnose.explain.law_terms import OwnChange, law_choices
 from bfsensor.diagnose.explain.nonparametric import (
     MOST_GROUPS,
@@ -320,21 +320,38 @@ class _Search:
                     break
                 law = sum(part.by_law.values())
                 ranking = self._in_place(now, without, n, gain - law)
-                out[part.name] = ranking
-                best = ranking[0]
-                if best.effect.name != part.name:
-                    try:
-                        other = without.with_effect(best.effect)
-                        # Without its laws: others come with what is added to the exchanged one.
-                        if other.score < now.score + law:
-                            other, _ = self.forward(other)
-                    except ConvergenceError:
-                        continue
-                    # The score falls with every exchange, so that the search ends.
-                    if other.score < now.score:
-                        now, again = other, True
-                        break
+                better, out[part.name] = self._exchanged(now, without, part, ranking)
+                if better is not None:
+                    now, again = better, True
+                    break
         return now, out
+
+    def _exchanged(
+        self, now: Explanation, without: Explanation, part: Part, ranking: list[Rival]
+    ) -> tuple[Explanation | None, list[Rival]]:
+        """An explanation that scores better with another effect in one's place, and the ranking there.
+
+        Candidates of more evidence are fitted jointly. One that scores worse has the gain of its joint
+        fit, below that of the effect; one whose fit does not converge has no place in the ranking.
+        """
+        own = next((r for r in ranking if r.effect.name == part.name), None)
+        law = sum(part.by_law.values())
+        above = [r for r in ranking if own is None or r.evidence > own.evidence]
+        for rival in above[:REFITTED]:
+            ranking = [r for r in ranking if r is not rival]
+            try:
+                other = without.with_effect(rival.effect)
+                # Without its laws: others come with what is added to the exchanged one.
+                if other.score < now.score + law:
+                    other, _ = self.forward(other)
+            except ConvergenceError:
+                continue
+            # The score falls with every exchange, so that the search ends.
+            if other.score < now.score:
+                return other, ranking
+            if own is not None:
+                ranking.append(_behind(rival, own, other.score - now.score))
+        return None, sorted(ranking, key=lambda r: -r.evidence)
 
     def _in_place(
         self, now: Explanation, without: Explanation, n: int, gain: float
@@ -350,6 +367,15 @@ class _Search:
         ranking = with_fitted(ranking, now.model.effects[n], gain)
         good = ranking[:REFITTED]
         return _with_laws(ranking, {r.effect.name: _law_score(without, r) for r in good})
+
+
+def _behind(rival: Rival, own: Rival, worse: float) -> Rival:
+    """A candidate whose joint fit scores worse than that of the effect it would replace."""
+    return replace(
+        rival,
+        gain=min(rival.gain, own.gain - worse),
+        evidence=min(rival.evidence, own.evidence - 0.5 * worse),
+    )
 
 
 def holds(before: Explanation, after: Explanation) -> bool:

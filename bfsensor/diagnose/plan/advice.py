@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from bfsensor.diagnose.detect.candidate_screen import Rival
+from bfsensor.diagnose.detect.model_error import SAME
 from bfsensor.diagnose.explain.attribution import Attribution, Found
 from bfsensor.diagnose.fit.fitted_model import Model
 from bfsensor.diagnose.plan.catalogue import Recording, make_recordings
@@ -170,12 +171,18 @@ def plan(
     Returns
     -------
     RecordingPlan
-        Empty where nothing is tied.
+        Empty where nothing is tied, or effects take less than half of what stands out.
     """
     model = Model(attribution.predictor, attribution.fit)
     pairs = [(f, r) for f in attribution.found for r in _tied(f)]
     if not pairs:
         return RecordingPlan()
+    if attribution.taken < SAME:
+        note = (
+            f"no recording is advised: effects take {100 * attribution.taken:.3g} % of the chi-square "
+            "above noise, so that what separates them would leave most of it unexplained"
+        )
+        return RecordingPlan((), (note,))
     here = Forecaster(model.predictor, model.fit)
     if candidates is None:
         candidates = make_recordings(here.usual, here.brightest, here.brightest_spot)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from string import Formatter
 from typing import Any
 
+from bfsensor.diagnose.detect.model_error import SAME
 from bfsensor.diagnose.explain.attribution import Attribution, Found
 from bfsensor.diagnose.report.class_words import CLASS_WORDS
 
@@ -171,11 +172,17 @@ def headline(found: Found) -> str:
 
 
 def headlines(attribution: Attribution) -> str:
-    """Sentence that names all effects of an attribution, and whether anything is left; or ''."""
+    """Sentence that names all effects of an attribution, and whether anything is left; or ''.
+
+    Where effects take less than half of what stands out, that part is stated first.
+    """
     own = [headline(f) for f in attribution.found]
     if not own:
         return ""
     text = "; ".join(own)
+    if attribution.taken < SAME:
+        rest = f"{100 * (1 - attribution.taken):.3g} %"
+        return f"{rest} of what stands out is no effect of the library, see below. Beside it: {text}."
     left = attribution.open_world or attribution.mismatch.detected
     after = "More is left, see below." if left else "Nothing else is left."
     return f"{text[0].upper()}{text[1:]}. {after}"

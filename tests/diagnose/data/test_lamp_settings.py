@@ -25,6 +25,32 @@ def test_two_dimmer_settings_are_told_apart():
     assert light == pytest.approx(rate, rel=0.02)
 
 
+def test_exposures_beyond_full_well_stay_with_their_dimmer_lamp():
+    """Flats of an SBIG ST-7-type CCD: three of a bright lamp, and a ramp whose last ones are full.
+
+    Means above the bias [ADU] of the frames of run 'langford' in Astr480/CCDChar @ ccdc2a3.
+    """
+    seconds = [6.0] * 3 + [
+        5.0,
+        15.0,
+        25.0,
+        35.0,
+        45.0,
+        55.0,
+        65.0,
+        75.0,
+        85.0,
+        90.0,
+        95.0,
+        105.0,
+    ]
+    levels = [17585.0, 17579.0, 17556.0, 1799.0, 6401.0, 11110.0, 15271.0, 19329.0, 23691.0, 27798.0,
+              31122.0, 32996.0, 32429.0, 32341.0, 33963.0]  # fmt: skip
+    settings, light = lamp_settings(seconds, levels)
+    assert settings.tolist() == [0] * 3 + [1] * 12
+    assert light[3:] == pytest.approx(430 / 2930, rel=0.05)
+
+
 @pytest.mark.parametrize("response", ["full well", "blooming", "bent"])
 def test_no_response_of_a_sensor_is_a_setting(response):
     seconds = np.linspace(1.0, 60.0, 12)

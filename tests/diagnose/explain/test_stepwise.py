@@ -25,6 +25,7 @@ from bfsensor.effects.gain_nonlinearity import GainNonlinearity
 from bfsensor.effects.interpixel_coupling import InterpixelCoupling
 from bfsensor.effects.tearing import Tearing
 from bfsensor.effects.trap_serial import TrapSerial
+from bfsensor.errors import ConvergenceError
 from tests.virtual import fit_virtual, make_effect
 
 KINDS = (ChargeLoss, GainNonlinearity, InterpixelCoupling, Tearing, TrapSerial)
@@ -213,3 +214,32 @@ def test_behind_terms_only_what_gained_is_asked_and_all_before_the_search_ends(m
     assert search.forward(begun) == (termed, {})
     assert asked_for == [None, [ChargeLoss], None]
     assert search.nearest == [loss, bent]
+
+
+def test_a_rival_whose_joint_fit_scores_worse_is_behind_and_one_without_a_fit_is_out(
+    monkeypatch,
+):
+    """A screen to first order may promise more than the fit keeps: that is no tie and no doubt."""
+    own = rival(ChargeLoss, {"q": 1e-7}, 400.0, 195.0, [1, 0])
+    worse = rival(GainNonlinearity, {"c2": -5e-3, "c3": -8e-4}, 9e4, 4e4, [0, 1])
+    lost = rival(InterpixelCoupling, {"ax": 1e-3, "ay": 1e-3}, 8e4, 3e4, [0, 1])
+
+    def exchange(effect):
+        if effect is lost.effect:
+            raise ConvergenceError("no fit")
+        return SimpleNamespace(score=1100.0)
+
+    now = SimpleNamespace(score=1000.0)
+    part = SimpleNamespace(name=own.effect.name, by_law={})
+    search = _Search(KINDS, 1, SimpleNamespace(detected=True), [])
+    place = SimpleNamespace(with_effect=exchange)
+    better, ranking = search._exchanged(now, place, part, [worse, lost, own])
+    assert better is None and [r.effect for r in ranking] == [own.effect, worse.effect]
+    assert ranking[1].gain == pytest.approx(300) and ranking[1].evidence == pytest.approx(
+        145
+    )
+    assert tied_classes(own.effect, ranking) == ("charge_loss",)
+    now = SimpleNamespace(score=1200.0)
+    monkeypatch.setattr(search, "forward", lambda other: (other, {}))
+    better, _ = search._exchanged(now, place, part, [worse, lost, own])
+    assert better.score == 1100.0

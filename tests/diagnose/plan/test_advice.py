@@ -214,6 +214,13 @@ def test_nothing_tied_nothing_planned(tied):
     assert not plan(alone).advised and plan(alone).said() == []
 
 
+def test_no_recording_is_advised_where_effects_take_little(tied):
+    shares = {"effects": 0.3, "laws": 0.1, "outside": 0.1, "left": 0.5}
+    none = plan(replace(tied, shares=shares))
+    assert not none.advised and "effects take 40 %" in none.notes[0]
+    assert plan(replace(tied, shares=shares | {"effects": 0.5, "left": 0.3})).advised
+
+
 def test_recordings_cover_what_the_design_names(tied):
     here = Forecaster(tied.predictor, tied.fit)
     made = make_recordings(here.usual, here.brightest, here.brightest_spot)

@@ -61,6 +61,7 @@ class Told:
     found: tuple
     mismatch: Left
     open_world: bool = False
+    taken: float = 1.0
 
 
 def test_what_is_left_is_said():
@@ -70,6 +71,9 @@ def test_what_is_left_is_said():
     assert headlines(Told((one,), Left(False), open_world=True)).endswith("see below.")
     assert headlines(Told((), Left(True))) == ""
     assert headlines(Told((one, one), Left(False))).startswith("Serial transfer")
+    little = headlines(Told((one,), Left(True), taken=0.007))
+    assert little.startswith("99.3 % of what stands out is no effect of the library")
+    assert "Beside it: serial transfer" in little
 
 
 @pytest.mark.parametrize(
