@@ -308,7 +308,7 @@ class _Search:
             n = [p.name for p in now.parts].index(name)
             if not now.takes_most(n):
                 now = now.without(n).located()
-        again = len(now.parts) + len(now.free) > 1
+        again = len(now.parts) + len(now.free) > 1 and not _lost(now)
         while again:
             again = False
             for n, part in enumerate(now.parts):
@@ -367,6 +367,12 @@ class _Search:
         ranking = with_fitted(ranking, now.model.effects[n], gain)
         good = ranking[:REFITTED]
         return _with_laws(ranking, {r.effect.name: _law_score(without, r) for r in good})
+
+
+def _lost(now: Explanation) -> bool:
+    """Whether more stands out that nothing describes than effects take: exchanges would follow it."""
+    shares = now.shares(())
+    return now.mismatch.detected and shares["left"] > shares["effects"]
 
 
 def _behind(rival: Rival, own: Rival, worse: float) -> Rival:

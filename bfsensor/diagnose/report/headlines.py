@@ -181,8 +181,9 @@ def headlines(attribution: Attribution) -> str:
         return ""
     text = "; ".join(own)
     if attribution.taken < SAME:
-        rest = f"{100 * (1 - attribution.taken):.3g} %"
-        return f"{rest} of what stands out is no effect of the library, see below. Beside it: {text}."
+        rest = 100 * (1 - attribution.taken)
+        share = f"{rest:.3g} %" if rest < 99.9 else "More than 99.9 %"
+        return f"{share} of what stands out is no effect of the library, see below. Beside it: {text}."
     left = attribution.open_world or attribution.mismatch.detected
     after = "More is left, see below." if left else "Nothing else is left."
     return f"{text[0].upper()}{text[1:]}. {after}"
