@@ -16,7 +16,7 @@ from bfsensor.diagnose.explain.attribution import class_probabilities, tied_clas
 from bfsensor.diagnose.explain.explanation import Explanation
 from bfsensor.diagnose.explain.location import place_effects
 from bfsensor.diagnose.explain.nonparametric import compete
-from bfsensor.diagnose.explain.stepwise import _Search, attribute
+from bfsensor.diagnose.explain.stepwise import LONGEST, _Search, attribute
 from bfsensor.diagnose.explain.terms import Scene
 from bfsensor.diagnose.fit.fitted_model import Model
 from bfsensor.diagnose.fit.likelihood_profile import valley_of
@@ -243,3 +243,15 @@ def test_a_rival_whose_joint_fit_scores_worse_is_behind_and_one_without_a_fit_is
     monkeypatch.setattr(search, "forward", lambda other: (other, {}))
     better, _ = search._exchanged(now, place, part, [worse, lost, own])
     assert better.score == 1100.0
+
+
+def test_a_search_that_takes_too_long_ends_with_what_it_has(monkeypatch):
+    seen = SimpleNamespace(detected=True)
+    found = SimpleNamespace(mismatch=seen, parts=(), free=())
+    search = _Search(KINDS, 1, seen, [])
+    monkeypatch.setattr(search, "_step", lambda now, asked=None: (found, []))
+    assert not search._late() and search.notes == []
+    search.ends -= 2 * LONGEST
+    assert search.forward(found) == (found, {})
+    (note,) = search.notes
+    assert "ended after 300 CPU seconds" in note
