@@ -11,6 +11,10 @@ from bfsensor.diagnose.detect.model_error import SAME
 from bfsensor.diagnose.explain.attribution import Attribution, Found
 from bfsensor.diagnose.report.class_words import CLASS_WORDS
 
+VAGUE = 1000.0
+"""Error of a value, over the value, above which it is not constrained.  Chosen: the recordings then say
+nothing of its size; with 2000, a value known to within three orders of magnitude is stated."""
+
 HEADLINES: Mapping[str, tuple[str, ...]] = {
     "cti_serial": (
         "serial transfer leaves {cti} of 5e4 e- behind at each step, by the power {power} of the "
@@ -206,6 +210,8 @@ def _amount(told: Mapping[str, Any], *, whole: bool) -> str:
     error = 0.5 * (float(told["hi68"]) - float(told["lo68"]))
     if not (math.isfinite(error) and error > 0):
         return f"{value:.3g}"
+    if error > VAGUE * abs(value) > 0:
+        return f"{value:.2g} (not constrained)"
     # Digits of the value down to the error's second one.
     ratio = abs(value) / error
     digits = max(2, min(7, math.floor(math.log10(ratio)) + 3 if ratio > 0 else 2))

@@ -88,3 +88,9 @@ def test_what_is_left_is_said():
 def test_an_open_interval_has_no_error(open_, said):
     told = {"value": 45000.0, "lo68": 44700.0, "hi68": 45200.0, "open68": open_}
     assert _amount(told, whole=False) == said
+
+
+def test_a_value_within_a_million_of_itself_is_not_constrained():
+    told = {"value": 8.4e-5, "lo68": 2e-15, "hi68": 3.5e6}
+    assert _amount(told, whole=False) == "8.4e-05 (not constrained)"
+    assert _amount(told | {"hi68": 3e-4}, whole=False) == "8.4e-05 +- 0.00015"
