@@ -68,7 +68,8 @@ rank third or fourth."""
 LONGEST = 300.0
 """CPU seconds of a search after which nothing more is added or exchanged, and a note states it.  Chosen:
 of 50 campaigns of an independent bench 42 took less than 190, reading included, and three had not ended
-after 540 to 770; with twice as many, these three have a few more effects or terms."""
+after 540 to 770; with twice as many, these three have a few more effects or terms.  Reports of
+searches that end by it differ between machines of different speed; all others do not."""
 
 
 def attribute(

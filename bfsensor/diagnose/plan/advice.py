@@ -171,7 +171,8 @@ def plan(
     Returns
     -------
     RecordingPlan
-        Empty where nothing is tied, or effects take less than half of what stands out.
+        Empty where no classes are tied; empty with a note where effects explain less than half of
+        the chi-square above noise.
     """
     model = Model(attribution.predictor, attribution.fit)
     pairs = [(f, r) for f in attribution.found for r in _tied(f)]

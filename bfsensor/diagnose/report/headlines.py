@@ -178,7 +178,8 @@ def headline(found: Found) -> str:
 def headlines(attribution: Attribution) -> str:
     """Sentence that names all effects of an attribution, and whether anything is left; or ''.
 
-    Where effects take less than half of what stands out, that part is stated first.
+    Where effects explain less than half of the chi-square above noise, the share that no effect
+    explains is stated first.
     """
     own = [headline(f) for f in attribution.found]
     if not own:
@@ -186,8 +187,8 @@ def headlines(attribution: Attribution) -> str:
     text = "; ".join(own)
     if attribution.taken < SAME:
         rest = 100 * (1 - attribution.taken)
-        share = f"{rest:.3g} %" if rest < 99.9 else "More than 99.9 %"
-        return f"{share} of what stands out is no effect of the library, see below. Beside it: {text}."
+        share = f"{rest:.3g} %" if rest < 99.9 else "more than 99.9 %"
+        return f"No effect of the library explains {share} of what stands out. The smaller part: {text}."
     left = attribution.open_world or attribution.mismatch.detected
     after = "More is left, see below." if left else "Nothing else is left."
     return f"{text[0].upper()}{text[1:]}. {after}"

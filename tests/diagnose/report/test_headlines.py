@@ -72,8 +72,8 @@ def test_what_is_left_is_said():
     assert headlines(Told((), Left(True))) == ""
     assert headlines(Told((one, one), Left(False))).startswith("Serial transfer")
     little = headlines(Told((one,), Left(True), taken=0.007))
-    assert little.startswith("99.3 % of what stands out is no effect of the library")
-    assert "Beside it: serial transfer" in little
+    assert little.startswith("No effect of the library explains 99.3 % of what stands out.")
+    assert "The smaller part: serial transfer" in little
 
 
 @pytest.mark.parametrize(
