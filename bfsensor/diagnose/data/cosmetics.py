@@ -28,6 +28,7 @@ from bfsensor.diagnose.data.flat_defects import (
     LEAST,
     QUIET,
     WIDEST,
+    BadColumns,
     bad_columns,
     dust_spots,
     hot_pixels,
@@ -111,6 +112,8 @@ class Repair(NamedTuple):
         Pixels that take the mean of the nearest good ones of their row.
     near : list of (int, int)
         First column, and the one after the last, of bad columns with those whose edges they shift.
+    hot : ndarray of bool, shape (rows, columns)
+        Filled pixels whose charge is not light's.
     zero : float
         Level of pixels without light, less that of the serial overscan [ADU].
     """
@@ -119,12 +122,14 @@ class Repair(NamedTuple):
     shade: FloatArray
     filled: NDArray[np.bool_]
     near: list[tuple[int, int]]
+    hot: NDArray[np.bool_]
     zero: float = 0.0
 
     @classmethod
     def none(cls, shape: tuple[int, ...], zero: float = 0.0) -> Repair:
         """Nothing to repair in an image."""
-        return cls(np.ones(shape), np.ones(shape), np.zeros(shape, bool), [], zero)
+        filled, hot = np.zeros((2, *shape), bool)
+        return cls(np.ones(shape), np.ones(shape), filled, [], hot, zero)
 
     def of_image(self, image: FloatArray, zero: float) -> FloatArray:
         """Repair an image whose pixels without light have the value ``zero``."""
@@ -145,7 +150,7 @@ class Repair(NamedTuple):
             np.where(changed, np.rint(image), frame.image).astype(np.float32),
             frame.prescan, frame.serial_overscan, frame.parallel_overscan,
             frame.flip_x, frame.flip_y, frame.origin, repaired & ~frame.mask, self.filled,
-            tuple(self.near), changed,
+            tuple(self.near), changed, frame.image, repaired & ~frame.mask & ~self.hot,
         )  # fmt: skip
 
 
@@ -171,6 +176,10 @@ class RepairedFrame:
     """Columns whose edges are shifted by bad columns between them."""
     recoded: NDArray[np.bool_] | None = None
     """Pixels whose values were divided and rounded, which are not the converter's codes; None: none."""
+    recorded: NDArray[np.float32] | None = None
+    """Image before the repair [ADU]."""
+    summed: NDArray[np.bool_] | None = None
+    """Repaired pixels whose recorded values are charge of light."""
 
 
 def reach_of(size: float) -> float:
@@ -200,7 +209,11 @@ def bridged(image: FloatArray, frame: Frame) -> FloatArray:
     A bad column collects less charge, and by the brighter-fatter effect its neighbours more, by an
     amount that differs between levels: neither belongs in maps of the response.
     """
-    ranges = frame.near if isinstance(frame, RepairedFrame) else ()
+    return _bridge(image, frame.near if isinstance(frame, RepairedFrame) else ())
+
+
+def _bridge(image: FloatArray, ranges: Sequence[tuple[int, int]]) -> FloatArray:
+    """Image whose columns in the ranges go on straight from those around them."""
     if not ranges:
         return image
     out = np.array(image)
@@ -239,6 +252,18 @@ def recoded_of(frame: Frame) -> NDArray[np.bool_]:
     if isinstance(frame, RepairedFrame) and frame.recoded is not None:
         return frame.recoded
     return np.zeros(frame.image.shape, bool)
+
+
+def with_defects(frame: Frame) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Recorded image of a frame [ADU], and its pixels of the mask that belong to its mean.
+
+    Columns of low response hold less charge than those beside them and draw in more of what is
+    generated there, or less, by the level: only the sum over all of them is in proportion to the light.
+    """
+    if isinstance(frame, RepairedFrame) and frame.recorded is not None:
+        assert frame.summed is not None
+        return frame.recorded.astype(np.float64), frame.summed
+    return frame.image.astype(np.float64), np.zeros(frame.image.shape, bool)
 
 
 class RepairedSource:
@@ -294,7 +319,7 @@ def find_cosmetics(
                     float(deviate[y, x]),
                 )
             )
-            repairs[amp].filled[y, x] = True
+            repairs[amp].filled[y, x] = repairs[amp].hot[y, x] = True
     images = _mean_flats(source, flats, zeros)
     if images:
         found += _repair_response(repairs, layout, images, source.shape)
@@ -336,7 +361,12 @@ def _repair_response(
                 columns.append((amp, one))
                 own = _on_sensor(change, frame)
                 own[:, one.columns.start : one.columns.stop] = one.change
-        dust = dust_spots((1 + even) / (1 + change) - 1)
+        # Between bad columns more charge is drawn away than dust of some depth hides.
+        for frame, near in zip(layout, _near(layout, columns), strict=True):
+            view = _on_sensor(even, frame)
+            own = (1 + view) / (1 + _on_sensor(change, frame)) - 1
+            view[...] = _bridge(own, near)
+        dust = dust_spots(even)
         shade[:] = 1.0
         for rows_of, columns_of, part, _ in dust:
             shade[np.ix_(rows_of, columns_of)] *= part
@@ -357,12 +387,8 @@ def _repair_response(
         worst = float(one.change.flat[np.abs(one.change).argmax()])
         place = _place(layout[amp], one.columns, one.rows)
         found.append(Cosmetic("bad_column", amp, *place, worst, "of the signal", one.z))
-        reach = int(np.ceil(BRIDGED * reach_of(worst)))
-        # Beyond a border of amplifiers the neighbour's columns are shifted, too.
-        beyond = place[0][0] - reach, place[0][1] + reach
-        for repair, frame in zip(repairs, layout, strict=True):
-            if frame is layout[amp] or _faces(frame, layout[amp]):
-                repair.near.extend(_columns_of(frame, *beyond))
+    for repair, near in zip(repairs, _near(layout, columns), strict=True):
+        repair.near.extend(near)
     for repair, frame in zip(repairs, layout, strict=True):
         own = _on_sensor(change, frame)
         repair.filled[own < DEAD] = True
@@ -374,6 +400,22 @@ def _repair_response(
         size = float(part.min()) - 1.0
         found.append(Cosmetic("dust", int(middle), *place, size, "of the signal", z))
     return found
+
+
+def _near(
+    layout: Sequence[Frame], columns: Sequence[tuple[int, BadColumns]]
+) -> list[list[tuple[int, int]]]:
+    """Columns of each amplifier, in readout order, that are bad or whose edges bad ones shift."""
+    out: list[list[tuple[int, int]]] = [[] for _ in layout]
+    for amp, one in columns:
+        worst = float(np.abs(one.change).max())
+        (start, stop), _ = _place(layout[amp], one.columns, one.rows)
+        reach = int(np.ceil(BRIDGED * reach_of(worst)))
+        # Beyond a border of amplifiers the neighbour's columns are shifted, too.
+        for near, frame in zip(out, layout, strict=True):
+            if frame is layout[amp] or _faces(frame, layout[amp]):
+                near.extend(_columns_of(frame, start - reach, stop + reach))
+    return out
 
 
 def _faces(frame: Frame, other: Frame) -> bool:

@@ -14,6 +14,7 @@ from scipy.stats import chi2
 
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.data.cosmetics import with_defects
 from bfsensor.diagnose.data.exposure_info import (
     NUMBERS,
     Axes,
@@ -183,10 +184,10 @@ class FlatChannels:
                 ):  # fmt: skip
                     self._lines.setdefault((where, n), _Lines()).add(lines)
             for k in (0, 1):
-                m = found.means[k]
+                m, count = self._whole_mean(frames[k], found.means[k], found.pixels)
                 read = self._noise.get(name, 0.0) ** 2
-                zero = read / max(zero_pixels(frames[k]).size, 1) + read / found.pixels
-                means[k].append((m, zero, found.pixels))
+                zero = read / max(zero_pixels(frames[k]).size, 1) + read / count
+                means[k].append((m, zero, count))
                 self._ratios.setdefault(n, []).append(
                     (m, (found.covariances[0, 0] - read) / m)
                 )
@@ -216,9 +217,10 @@ class FlatChannels:
             usual = float(np.median(np.abs(away[good]))) if good.any() else 0.0
             good &= np.abs(away) <= STRUCK * max(usual, 1e-300)
             read = self._noise.get(frame.name, 0.0) ** 2
-            count = max(int(good.sum()), 1)
+            m = float(image[good].mean()) if good.any() else 0.0
+            m, count = self._whole_mean(frame, m, max(int(good.sum()), 1))
             zero = read / max(zero_pixels(frame).size, 1) + read / count
-            values.append((float(image[good].mean()) if good.any() else 0.0, zero, count))
+            values.append((m, zero, count))
         if all(m > 0 for m, *_ in values):
             self._means.setdefault(fold, []).append(
                 (exposure, condition_of(exposure), values)
@@ -229,9 +231,27 @@ class FlatChannels:
 
     def clean(self, frame: Frame) -> FloatArray:
         """Image less the frame's overscan level and the mean bias [ADU]."""
-        image = frame.image.astype(np.float64) - overscan_level(frame)
+        return self._less_bias(frame, frame.image.astype(np.float64))
+
+    def _less_bias(self, frame: Frame, image: FloatArray) -> FloatArray:
         bias = self._bias.get(frame.name)
+        image = image - overscan_level(frame)
         return image if bias is None else image - bias
+
+    def _whole_mean(self, frame: Frame, mean: float, count: int) -> tuple[float, int]:
+        """Mean of a flat with its defects' recorded values [ADU], and the number of its pixels.
+
+        ``mean`` is that of the ``count`` pixels without defects.
+        """
+        image, others = with_defects(frame)
+        if not others.any():
+            return mean, count
+        # Particles stand out of the pixels above and below; beside them, response differs.
+        away = (image - median_filter(image, (5, 1)))[others]
+        struck = away > STRUCK * max(float(np.median(np.abs(away))), 1e-300)
+        values = self._less_bias(frame, image)[others][~struck]
+        total = count + len(values)
+        return float(mean * count + values.sum()) / total, total
 
     def _hours(self, exposure: ExposureInfo) -> float:
         """Time since the first exposure of the campaign [h]; nan where not known."""
