@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import ClassVar
 
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.data.cosmetics import RepairedFrame, find_cosmetics
+from bfsensor.diagnose.data.cosmetics import (
+    Repair,
+    RepairedFrame,
+    _repair_response,
+    find_cosmetics,
+)
 from bfsensor.diagnose.data.exposure_info import overscan_level
 from bfsensor.diagnose.data.flat_defects import bad_columns, dust_spots, smooth_light
 from bfsensor.diagnose.data.measure_channels import measure_channels
@@ -254,3 +260,46 @@ def test_a_column_with_others_on_its_one_side_is_found():
     image[:, [6, 18, 25]] -= 0.03, 0.08, 0.26
     found = {x for d in bad_columns(image) for x in d.columns}
     assert found == {6, 18, 25}
+
+
+class DrawingColumn(Defects):
+    """The columns of low response, the deepest of which draws charge from all others of its amplifier."""
+
+    word = "drawing_column"
+
+    def store(self, charge, context):
+        own = charge[:, :64]
+        # In proportion to the square of the level, as the brighter-fatter effect moves charge.
+        moved = np.rint(3e-8 * own.mean(1, keepdims=True) * own)
+        moved[:, 47] = 0.0
+        own -= moved
+        own[:, 47] += moved.sum(1)
+        return charge
+
+
+def test_charge_that_bad_columns_draw_from_others_is_no_departure_from_linearity():
+    source = VirtualSource(seed=7105, size=SMALL, effects=[DrawingColumn({"part": 1.0})])
+    measured = measure_channels(source)
+    assert any(c.kind == "bad_column" and c.x == (47, 48) for c in measured.cosmetics)
+    mean = next(c for c in measured.channels if c.word == "flat_mean" and c.fold == "fit")
+    a = mean.axes
+    response = mean.values / (a["time"] * a["lamp"])
+    first, second = (response[a["amp"] == n] for n in (0, 1))
+    bright = a["level"][a["amp"] == 0]
+    # Light is common to both amplifiers; without the column's charge the ratio falls by 3e-3.
+    slope = np.polyfit(bright / bright.max(), first / second / np.mean(first / second), 1)[0]
+    assert abs(slope) < 2e-4
+
+
+def test_charge_drawn_from_between_two_columns_is_no_dust():
+    def image_of(drawn):
+        image = 1e-3 * np.random.default_rng(9).standard_normal((128, 128))
+        image[:, [60, 64]] -= 0.13, 0.05
+        image[:, 61:64] -= drawn
+        return image
+
+    frame = SimpleNamespace(image=np.zeros((128, 128)), origin=None, flip_x=False, flip_y=False)
+    for drawn in (0.0, 0.012):
+        repair = Repair.none((128, 128))
+        found = _repair_response([repair], [frame], [image_of(drawn)], (128, 128))
+        assert [c.kind for c in found] == ["bad_column", "bad_column"]
