@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Segment
-from bfsensor.effects.read_noise import ReadNoise, added
+from bfsensor.effects.random_covariances import scatter_of_pairs
+from bfsensor.effects.read_noise import ReadNoise, added, near_lags
 from bfsensor.typing import FloatArray
 
 SOURCE = (
@@ -161,8 +162,8 @@ class SettlingByFrame(ReadNoise):
         Parameter("rms", "e-", 1.0, 30.0, amplitude=True),
         Parameter("length", "pixel", 3.0, 300.0),
     )
-    touches = ("bias_cov", "bias_level", "dark_map", "flat_cov")
-    told_by_scatter = ("bias_level", "dark_map")
+    touches = ("bias_cov", "bias_level", "dark_map", "flat_cov", "flat_mean")
+    told_by_scatter = ("bias_level", "dark_map", "flat_mean")
     bends = True
     source = (
         "Two-dimensional bias that differs between frames of LSST's camera: Utsumi et al. 2024, Proc. "
@@ -191,16 +192,69 @@ class SettlingByFrame(ReadNoise):
             out[rows] = self["rms"] ** 2 * c[lag[rows].astype(int) % int(size)]
         return out
 
+    def bias_level(self, axes: Axes, layout: Layout) -> FloatArray:
+        # All rows of a frame are alike: their means do not vary, as much as covariances at near lags,
+        # which are left out, and the variance of pixels would have them do.
+        out = np.zeros(len(axes["amp"]))
+        widths = layout.frame_width(axes["amp"])
+        for width in map(int, np.unique(widths)):
+            shape = self._shape(width) - self._shape(width).mean()
+            apart = np.correlate(shape, shape, "full")[width:] / width
+            far = float(apart[len(near_lags(width)) :].sum())
+            rows = (widths == width) & (axes["what"] == "rows")
+            out[rows] = 2.0 / width * self["rms"] ** 2 * far
+        return out
+
     def modes(self, word: str, axes: Axes, layout: Layout) -> FloatArray | None:
-        """Scatter of levels that are those of the image above the overscan's, frame by frame."""
+        """Scatter of levels above the overscan's, frame by frame, and of columns of darks."""
+        amps = np.asarray(axes["amp"]).astype(int)
+        if word == "bias_cov":
+            if "pairs" not in axes:
+                return None
+            # Each pair has one size, which all lags have in common.
+            size = self.bias_cov(axes, layout) * np.sqrt(
+                2.0 / np.asarray(axes["pairs"], float)
+            )
+            return np.where(amps[:, None] == np.unique(amps), size[:, None], 0.0)
+        if word == "flat_cov":
+            return scatter_of_pairs(self, axes, layout, lambda *_: np.sqrt(2.0))
         if word not in self.told_by_scatter:
             return None
         apart = np.array([
             self._mean(s.prescan, s.columns, s) - self._mean(s.prescan + s.columns, s.serial_overscan, s)
             for s in layout.segments
         ])  # fmt: skip
-        size = apart[axes["amp"].astype(int)] * (axes["what"] == "level")
-        return np.asarray(self["rms"] * np.diag(size)[:, size != 0])
+        frames = np.asarray(axes["exposure"])
+        if word == "flat_mean":
+            return np.asarray(self["rms"] * np.diag(apart[amps]))
+        what = axes["what"]
+        level = np.where(what == "level", apart[amps], 0.0)
+        if word == "bias_level":
+            return np.asarray(self["rms"] * np.diag(level)[:, level != 0])
+        column = what == "column"
+        for amp, s in enumerate(layout.segments):
+            own = amps == amp
+            shape = self._shape(s.prescan + s.columns)[s.prescan :]
+            x = np.asarray(axes["x"])[own & column].astype(int)
+            level[own & column] = (shape - np.median(shape))[x]
+        long = np.asarray(axes["time"]) == np.max(axes["time"])
+        parts = []
+        for amp in np.unique(amps):
+            darks = np.unique(frames[(amps == amp) & ~column & long])
+            for frame in np.unique(frames[(amps == amp) & ~column]):
+                rows = (amps == amp) & (frames == frame)
+                # Columns are means of the longest darks, each of which has a part of its own in them.
+                part = 1 / len(darks) if frame in darks else 0.0
+                parts.append(
+                    np.where(
+                        rows, level, np.where((amps == amp) & column, part * level, 0.0)
+                    )
+                )
+            if layout.biases:
+                # All have the mean bias in common.
+                size = level / np.sqrt(len(layout.biases))
+                parts.append(np.where(amps == amp, size, 0.0))
+        return np.asarray(self["rms"] * np.transpose(parts)) if parts else None
 
     def _mean(self, first: int, count: int, s: Segment) -> float:
         """Mean of the settling over some columns of a frame."""

@@ -7,8 +7,9 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
-from bfsensor.effects.dark_pixels import mean_bias, struck_pixels, usual_noise
+from bfsensor.effects.dark_pixels import OUTLIER, mean_bias, struck_pixels, usual_noise
 from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Seen, Shot
 from bfsensor.typing import FloatArray
 
@@ -76,21 +77,28 @@ class _Dark(Effect):
             parts, which, count = np.unique(read, return_inverse=True, return_counts=True)
             usual = float(np.median(read))
             for mean in np.unique(born[own]):
-                # The measurement counts deviations from the median.
+                # Levels leave out what deviates from the median of all pixels, columns and numbers of
+                # struck pixels what deviates from that of its column, unless the column is hot.
+                one = float(noise[amp]), more
+                level = float(mean * usual)
                 struck, others = np.transpose([
-                    struck_pixels(float(mean * p), float(mean * usual), noise[amp], more)
-                    if p else (0.0, 0.0) for p in parts
+                    struck_pixels(float(mean * p), level, *one) if p else (0.0, 0.0)
+                    for p in parts
+                ])  # fmt: skip
+                width = float(np.sqrt(one[0] ** 2 * (1 + more) + max(level, 0.0)))
+                beyond = np.array([
+                    struck_pixels(float(mean * p), float(mean * p), *one, width)[0] if p else 0.0
+                    for p in parts
                 ])  # fmt: skip
                 rows = own & (born == mean)
                 what = axes["what"][rows]
                 kept = count * (1 - struck)
                 column = np.zeros(len(what))
                 at = what == "column"
-                # The mean of a column excludes its struck pixels, unless they are most of it.
-                value = np.where(struck > 0.5, mean * parts, others)
+                value = mean * parts
                 column[at] = value[which[axes["x"][rows][at].astype(int)]]
                 column[at] -= value[parts == usual].sum()
-                hit = float(struck @ count) * segment.rows
+                hit = float((beyond * (struck <= 0.5)) @ count) * segment.rows
                 mixed = float(kept @ others) / float(kept.sum())
                 out[rows] = np.where(what == "struck", hit, np.where(at, column, mixed))
         return out
@@ -268,12 +276,23 @@ class Glow(Effect):
             for seconds in np.unique(axes["time"][own]):
                 rows = own & (axes["time"] == seconds)
                 part, kept = self._seen(glow * seconds, float(noise[amp]), more)
-                columns = (kept * (1 - part)).sum(0) / np.maximum((1 - part).sum(0), 1e-9)
+                # Particles in columns stand out of these, by the noise of a usual pixel.
+                charge = glow * seconds
+                limit = OUTLIER * usual_noise(charge, float(noise[amp]), more)
+                away = np.abs(charge - np.median(charge, axis=0))
+                wide = np.sqrt(float(noise[amp]) ** 2 * (1 + more) + charge)
+                cold = part.mean(0) <= 0.5
+                hit = float(
+                    cold
+                    @ (ndtr((away - limit) / wide) + ndtr((-away - limit) / wide)).sum(0)
+                )
+                near = (away <= limit) | ~cold
+                columns = (charge * near).sum(0) / np.maximum(near.sum(0), 1)
                 what, x = axes["what"][rows], axes["x"][rows].astype(int)
                 column = (columns - np.median(columns))[np.clip(x, 0, len(columns) - 1)]
                 level = float((kept * (1 - part)).sum() / max((1 - part).sum(), 1e-9))
                 out[rows] = np.select(
-                    [what == "struck", what == "column"], [float(part.sum()), column], level
+                    [what == "struck", what == "column"], [hit, column], level
                 )
         return out
 

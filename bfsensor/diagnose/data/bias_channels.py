@@ -199,7 +199,8 @@ class BiasChannels:
             blocks.append(self._errors(seen, amp) / (self._size * pairs))
             near = np.minimum(self._lags, READOUT_LAGS)
             pulse = np.where(self._lags <= READOUT_LAGS, pulses[near], 0.0)
-            axes.add(len(mean), self._condition, amp=amp, lag=self._lags, pulse=pulse)
+            axes.add(len(mean), self._condition, amp=amp, lag=self._lags, pulse=pulse,
+                     pairs=pairs)  # fmt: skip
         out = [
             Channel("bias_cov", np.concatenate(values), tuple(blocks), axes.columns(), "adu2",
                     self._fold)
@@ -345,8 +346,12 @@ class BiasChannels:
 
 
 def _without_outliers(noise: FloatArray) -> FloatArray:
-    """Noise less its median, struck pixels set to 0."""
-    return np.where(_struck(noise), 0.0, noise - np.median(noise))
+    """Noise less its median; struck pixels have the medians of their column and row."""
+    noise = noise - np.median(noise)
+    # A level of whole columns or rows, however far out, is noise of the amplifier.
+    level = np.broadcast_to(np.median(noise, axis=0), noise.shape)
+    level = level + np.median(noise - level, axis=1, keepdims=True)
+    return np.where(_struck(noise - level), level, noise)
 
 
 def _struck(noise: FloatArray, limit: float = OUTLIER) -> NDArray[np.bool_]:

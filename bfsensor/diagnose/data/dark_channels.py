@@ -92,10 +92,12 @@ class DarkChannels:
             error = good.var() / good.size
             if over.size:
                 error += float(over.var()) / over.size
-            found.append((float(good.mean()), float(error), int(struck.sum()), image.size))
-            # A column most of whose pixels deviate is hot, not struck: it keeps its values.
+            # Particles stand out of their own column, whose level may be any.  A hot column, whose
+            # shot noise is larger than others', keeps its values.
             hot = struck.mean(0) > 0.5
-            kept = np.where(struck & ~hot, np.nan, image)
+            out = (np.abs(image - np.median(image, axis=0)) > OUTLIER * sigma) & ~hot
+            found.append((float(good.mean()), float(error), int(out.sum()), image.size))
+            kept = np.where(out, np.nan, image)
             lines.means.append(np.nanmean(kept, 0))
             lines.own.append(np.nanvar(kept, 0) / image.shape[0])
             lines.noise.append(float(good.var()) / image.shape[0])

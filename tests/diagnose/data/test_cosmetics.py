@@ -287,7 +287,9 @@ def test_charge_that_bad_columns_draw_from_others_is_no_departure_from_linearity
     first, second = (response[a["amp"] == n] for n in (0, 1))
     bright = a["level"][a["amp"] == 0]
     # Light is common to both amplifiers; without the column's charge the ratio falls by 3e-3.
-    slope = np.polyfit(bright / bright.max(), first / second / np.mean(first / second), 1)[0]
+    slope = np.polyfit(bright / bright.max(), first / second / np.mean(first / second), 1)[
+        0
+    ]
     assert abs(slope) < 2e-4
 
 
