@@ -269,7 +269,8 @@ class Explanation:
             "laws": sum(sum(p.by_law.values()) for p in self.parts)
             + sum(free.values()) - beyond,
             "outside": beyond,
-            "left": sum(left_by_word(self.model.fit).values()),
+            # Channels above their degrees of freedom by chance are not left.
+            "left": sum(left_by_word(self.model.fit).values()) if self.mismatch.detected else 0.0,
         }  # fmt: skip
         total = sum(out.values())
         return {k: v / total if total else 0.0 for k, v in out.items()}

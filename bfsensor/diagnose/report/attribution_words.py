@@ -89,10 +89,10 @@ def said_of(attribution: Attribution) -> list[str]:
     before, after = attribution.chi2dof()
     if (attribution.found or attribution.free_form is not None) and before == before:
         way = "falls" if after < before else "rises"
-        out.append(
-            f"On recordings that were not fitted, chi-square per value {way} from {before:.2f} to "
-            f"{after:.2f}."
-        )
+        change = f"{way} from {before:.2f} to {after:.2f}"
+        if f"{before:.2f}" == f"{after:.2f}":
+            change = f"stays at {after:.2f}"
+        out.append(f"On recordings that were not fitted, chi-square per value {change}.")
         for word in attribution.fails_in:
             worse, better, n = (attribution.heldout[word][k] for k in (1, 0, 2))
             p = said_p(attribution.heldout_p.get(word, 1.0))
