@@ -27,6 +27,13 @@ spacing, above which they are returned.  Chosen, to be derived: two more paramet
 noise with probability 3e-7; with 60, weaker sways begin as even rings."""
 
 
+WAFER = 3e4
+"""Largest distance of the centre of tree rings from the sensor's corner along x and y [pixel].
+Derived: rings grow about the axis of the ingot; a wafer of 300 mm, the largest that is made, holds
+30,000 pixels of 10 um.  Straight waves, as of masks, fit rings about a centre at any distance; with
+60,000, more of these are taken for rings."""
+
+
 class RingLaw(NamedTuple):
     """Law of the phase against the radius: names of its parameters and steps of derivatives.
 
@@ -127,6 +134,9 @@ def find_rings(
         one = _fit(law, values, x, y, np.array([xc, yc, *numbers]))
         if one is not None:
             tried.append(one)
+    tried = [t for t in tried if max(abs(t[1]["xc"]), abs(t[1]["yc"])) < WAFER]
+    if not any("chirp" in t[1] for t in tried):
+        return []
     even = max((t for t in tried if "chirp" in t[1]), key=lambda t: t[0])
     best = max(tried, key=lambda t: t[0])
     # Both are starting points; without a clear gain the simpler law is enough.
@@ -400,6 +410,8 @@ def find_radial(
         },
     )  # fmt: skip
     xc, yc = (float(v) for v in found.x)
+    if max(abs(xc), abs(yc)) >= WAFER:
+        return None
     place, mean, count = _profile(values, x, y, found.x, step)
     # Centres are distinct if a wave of the shortest period is out of phase between them.
     tried = values.size * (step * HIGHEST * 2) ** 2

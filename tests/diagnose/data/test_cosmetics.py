@@ -263,7 +263,7 @@ def test_a_column_with_others_on_its_one_side_is_found():
 
 
 class DrawingColumn(Defects):
-    """The columns of low response, the deepest of which draws charge from all others of its amplifier."""
+    """Columns of low response, the deepest of which draws charge from all others beside it."""
 
     word = "drawing_column"
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from bfsensor.diagnose.data.map_rings import WAFER, find_radial, find_rings
 from bfsensor.diagnose.data.map_waves import find_patterns
 from bfsensor.diagnose.model.map_predictions import area_change
 from bfsensor.effects.effect import Layout, Segment, Shot
@@ -58,3 +59,15 @@ def test_rings_are_followed_from_whichever_wave_leads_to_them(seed):
         UnevenTreeRings({p.name: start[p.name] for p in effect.parameters}), SHOT, layout
     )
     assert ((true - said) ** 2).sum() < 0.05 * (true**2).sum()
+
+
+@pytest.mark.parametrize("far", [2e4, 1e5])
+def test_rings_have_their_centre_on_a_wafer(far):
+    """Waves of a mask are rings about a centre a metre away as well as they are straight."""
+    y, x = np.indices((96, 96)) * 2.0
+    r = np.hypot(x + far, y - 90.0)
+    wave = 8.0 * np.sin(2 * np.pi * (r - far) / 43.0)
+    wave += np.random.default_rng(8).standard_normal(wave.shape)
+    radial = find_radial(wave, x, y, [(-far, 90.0)], least=35.0)
+    rings = find_rings(wave, x, y, (-far, 90.0, 43.0, 0.0))
+    assert (radial is not None) == bool(rings) == (far < WAFER)
