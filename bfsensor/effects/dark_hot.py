@@ -282,10 +282,8 @@ class Glow(Effect):
                 away = np.abs(charge - np.median(charge, axis=0))
                 wide = np.sqrt(float(noise[amp]) ** 2 * (1 + more) + charge)
                 cold = part.mean(0) <= 0.5
-                hit = float(
-                    cold
-                    @ (ndtr((away - limit) / wide) + ndtr((-away - limit) / wide)).sum(0)
-                )
+                beyond = ndtr((away - limit) / wide) + ndtr((-away - limit) / wide)
+                hit = float((beyond * (charge > 0) * cold).sum())
                 near = (away <= limit) | ~cold
                 columns = (charge * near).sum(0) / np.maximum(near.sum(0), 1)
                 what, x = axes["what"][rows], axes["x"][rows].astype(int)
