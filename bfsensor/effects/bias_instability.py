@@ -193,8 +193,9 @@ class SettlingByFrame(ReadNoise):
         return out
 
     def bias_level(self, axes: Axes, layout: Layout) -> FloatArray:
-        # All rows of a frame are alike: their means do not vary, as much as covariances at near lags,
-        # which are left out, and the variance of pixels would have them do.
+        # All rows of a frame are alike, so that their means do not vary: all covariances within a row
+        # add up to 0, and those at far lags are minus the variance and the near ones, which the
+        # measurement subtracts.
         out = np.zeros(len(axes["amp"]))
         widths = layout.frame_width(axes["amp"])
         for width in map(int, np.unique(widths)):

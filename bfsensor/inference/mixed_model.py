@@ -157,7 +157,8 @@ class MixedModelFit(ABC):
         both = np.zeros((self.total + chance, plainly + chance))
         both[: self.total] = np.concatenate([self.linear, self.modes], axis=1)
         both[self.total :, plainly:] = np.eye(chance)
-        self._volume = float(np.linalg.slogdet(both.T @ both)[1])
+        if len(self._variances):
+            self._volume = float(np.linalg.slogdet(both.T @ both)[1])
         self._whole = span(both)
         self._span = self._whole[: self.total]
         self.score = no_score(self.point)
@@ -257,12 +258,13 @@ class MixedModelFit(ABC):
             self.linearise_random()
             # A mode that a large random effect shows clearly is better known than Fisher's information,
             # an expectation over effects of all sizes, says: its step goes too far.
-            for _ in range(HALVED):
+            for _ in range(HALVED if len(self._variances) else 0):
                 if self._likelihood() <= lowest + NEAR:
                     break
                 self.point = 0.5 * (before + self.point)
                 self.linearise_random()
-            before, lowest = self.point, self._likelihood()
+            if len(self._variances):
+                before, lowest = self.point, self._likelihood()
             self.converged = self._descend()
         self._end()
 

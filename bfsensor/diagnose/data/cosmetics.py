@@ -113,7 +113,7 @@ class Repair(NamedTuple):
     near : list of (int, int)
         First column, and the one after the last, of bad columns with those whose edges they shift.
     hot : ndarray of bool, shape (rows, columns)
-        Filled pixels whose charge is not light's.
+        Hot pixels: filled, and left out of means, as their charge is dark current.
     zero : float
         Level of pixels without light, less that of the serial overscan [ADU].
     """
@@ -179,7 +179,7 @@ class RepairedFrame:
     recorded: NDArray[np.float32] | None = None
     """Image before the repair [ADU]."""
     summed: NDArray[np.bool_] | None = None
-    """Repaired pixels whose recorded values are charge of light."""
+    """Repaired pixels whose recorded values count in the mean of a flat: all but hot ones."""
 
 
 def reach_of(size: float) -> float:
@@ -206,8 +206,9 @@ def interpolated(image: FloatArray, bad: NDArray[np.bool_]) -> FloatArray:
 def bridged(image: FloatArray, frame: Frame) -> FloatArray:
     """Image whose bad columns, and those beside them, go on straight from the columns around.
 
-    A bad column collects less charge, and by the brighter-fatter effect its neighbours more, by an
-    amount that differs between levels: neither belongs in maps of the response.
+    A bad column holds less charge and repels less, so that it collects light that falls on its
+    neighbours, more of it at higher levels.  Neither what it lacks nor what they lack belongs in maps of
+    the response.
     """
     return _bridge(image, frame.near if isinstance(frame, RepairedFrame) else ())
 
@@ -255,10 +256,11 @@ def recoded_of(frame: Frame) -> NDArray[np.bool_]:
 
 
 def with_defects(frame: Frame) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Recorded image of a frame [ADU], and its pixels of the mask that belong to its mean.
+    """Recorded image of a frame [ADU], and the masked pixels that count in its mean all the same.
 
-    Columns of low response hold less charge than those beside them and draw in more of what is
-    generated there, or less, by the level: only the sum over all of them is in proportion to the light.
+    A column of low response holds less charge than its neighbours and repels less, so that it collects
+    light that falls on them, more of it at higher levels.  Means of flats are in proportion to the light
+    only if they include the column.
     """
     if isinstance(frame, RepairedFrame) and frame.recorded is not None:
         assert frame.summed is not None
@@ -361,7 +363,7 @@ def _repair_response(
                 columns.append((amp, one))
                 own = _on_sensor(change, frame)
                 own[:, one.columns.start : one.columns.stop] = one.change
-        # Between bad columns more charge is drawn away than dust of some depth hides.
+        # Pixels between bad columns lose charge to them and look like shallow dust.
         for frame, near in zip(layout, _near(layout, columns), strict=True):
             view = _on_sensor(even, frame)
             own = (1 + view) / (1 + _on_sensor(change, frame)) - 1

@@ -63,7 +63,7 @@ def test_rings_are_followed_from_whichever_wave_leads_to_them(seed):
 
 @pytest.mark.parametrize("far", [2e4, 1e5])
 def test_rings_have_their_centre_on_a_wafer(far):
-    """Waves of a mask are rings about a centre a metre away as well as they are straight."""
+    """Straight waves, as of a mask, fit rings about a centre a metre away equally well."""
     y, x = np.indices((96, 96)) * 2.0
     r = np.hypot(x + far, y - 90.0)
     wave = 8.0 * np.sin(2 * np.pi * (r - far) / 43.0)
