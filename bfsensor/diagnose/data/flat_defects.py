@@ -223,18 +223,22 @@ def _part_lost(
     """Calculate the fraction of a defect's missing response that neighbouring columns do not hold.
 
     Defect and neighbours are compared with columns farther away.  Displaced edges only move light:
-    what the columns of a tear lack, their neighbours have more.  Columns that are other defects are
-    left out; at the rim, one side stands for both.  An excess within what columns of a ``scatter``
-    have by chance is none.
+    what the columns of a tear lack, their neighbours have more.  Columns that are other defects, and
+    those beside them, are left out; at the rim, one side stands for both.  An excess within what
+    columns of a ``scatter`` have by chance is none.
     """
     profile, reach = np.median(image, axis=0), WIDEST + QUIET
     own, beside, count = profile[start:stop].copy(), 0.0, 0
     bases = []
+    # Columns beside other defects lack the light that these draw from them.
+    others_off = off.copy()
+    others_off[start:stop] = False
+    clear = ~(off | maximum_filter(others_off, 2 * QUIET + 1))
     for near, far in (
         (slice(max(start - reach, 0), start), slice(max(start - 2 * reach, 0), max(start - reach, 0))),
         (slice(stop, stop + reach), slice(stop + reach, stop + 2 * reach)),
     ):  # fmt: skip
-        use, others = profile[near][~off[near]], profile[far][~off[far]]
+        use, others = profile[near][clear[near]], profile[far][clear[far]]
         if len(use) and len(others) >= QUIET:
             bases.append(float(np.median(others)))
             beside += float((use - bases[-1]).sum())
@@ -380,8 +384,12 @@ def dust_spots(image: FloatArray) -> list[tuple[range, range, FloatArray, float]
     usual = float(smooth[~np.kron(every, np.ones((BIN, BIN), bool))].std())
     # What the average takes off the middle of a dust spot, averaged in turn (Tukey's twicing).
     smooth += gaussian_filter(change - smooth, SMOOTH)
+    known = np.zeros((ny, nx), bool)
     for whole, z in chosen:
-        fine = np.kron(whole, np.ones((BIN, BIN), bool))
+        # Where the margins of two patches overlap, the light that is lacking belongs to one of them.
+        fine = np.kron(whole, np.ones((BIN, BIN), bool)) & ~known
+        if not fine.any():
+            continue
         rows, columns = (np.flatnonzero(fine.any(k)) for k in (1, 0))
         # Towards a rim of the sensor the field rolls off along all of it, which is no dust.
         if (boxes - rims)[whole].sum() > LOST * (boxes - light)[whole].sum():
@@ -393,6 +401,7 @@ def dust_spots(image: FloatArray) -> list[tuple[range, range, FloatArray, float]
         if left[fine[part]].std() > UNEVEN * usual:
             dark = smooth[part]
         shade = np.where(fine[part], 1.0 + dark, 1.0)
+        known |= fine
         found.append(
             (range(rows[0], rows[-1] + 1), range(columns[0], columns[-1] + 1), shade, z)
         )  # fmt: skip

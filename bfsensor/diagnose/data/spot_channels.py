@@ -79,6 +79,7 @@ class SpotChannels:
         ] = []
         self._backgrounds: dict[int, float] = {}
         self._zeros: dict[int, float] = {}
+        self._counting: dict[int, float] = {}
         self.dropped: dict[str, int] = {}
         self._grids: list[tuple[float, float]] = []
         self.placed: list[PlacedSpots] = []
@@ -148,6 +149,7 @@ class SpotChannels:
         flux = values.pop("flux")
         total = float(flux.mean())
         out["flux"] = (total, float(flux.std(ddof=1) / np.sqrt(n)))
+        self._counting[exposure.number] = _counting_variance(total, wide) / int(n)
         for name, column in values.items():
             out[name] = (float(column.mean()), float(column.std(ddof=1) / np.sqrt(n)))
         phases = np.stack([fit.centre_x[used], fit.centre_y[used]], axis=1)
@@ -186,12 +188,16 @@ class SpotChannels:
                 variance = error**2
                 if what == "flux":
                     # Pinholes differ in brightness, and the same ones are seen in all exposures:
-                    # the scatter between exposures of equal light is the error.  Without enough
-                    # of these it is the error of the mean over pinholes, which is larger.
-                    scatter = error / value if repeat is None else repeat
-                    unknown = lamp is None and repeat is None
-                    light_error = LAMP_UNKNOWN if unknown else self._lamp_error
+                    # the scatter between exposures of equal light beyond what counting makes is the
+                    # error.  Without enough of these it is that of the mean over pinholes, which is
+                    # larger and holds the counting.
+                    known = repeat is not None
+                    scatter = repeat if repeat is not None else error / value
+                    light_error = (
+                        LAMP_UNKNOWN if lamp is None and not known else self._lamp_error
+                    )
                     variance = (value * np.hypot(scatter, light_error)) ** 2
+                    variance += self._counting[exposure.number] if known else 0.0
                     variance += (zero * WING**2) ** 2
                 if what == "wings":
                     outside = zero * (WING**2 - STAMP**2) / found["flux"][0]
@@ -213,24 +219,26 @@ class SpotChannels:
         return Channel("spot", np.concatenate(values), tuple(blocks), columns, "", fold)
 
     def _flux_scatter(self) -> float | None:
-        """Relative scatter of the fluxes of exposures of equal light; None with too few.
+        """Relative scatter of fluxes of equal light beyond that of counting; None with too few.
 
         Exposure times that differ by less than :data:`EQUAL` are of equal light.
         """
-        by_condition: dict[Condition, list[tuple[float, float]]] = {}
+        by_condition: dict[Condition, list[tuple[float, float, float]]] = {}
         for exposure, found, *_ in self._rows:
-            seconds = exposure.exposure_time or 0.0
+            seconds, flux = exposure.exposure_time or 0.0, found["flux"][0]
             light = (seconds or 1.0) * (exposure.lamp or 1.0)
             rows = by_condition.setdefault(condition_of(exposure), [])
-            rows.append((seconds, found["flux"][0] / light))
+            rows.append((seconds, flux / light, self._counting[exposure.number] / flux**2))
         square, number = 0.0, 0
         for rows in by_condition.values():
-            seconds_of, rate = np.array(sorted(rows)).T
+            seconds_of, rate, counting = np.array(sorted(rows)).T
             longer = np.diff(seconds_of) > EQUAL * seconds_of[1:]
-            for own in np.split(rate, np.flatnonzero(longer) + 1):
-                square += float(((own / own.mean() - 1) ** 2).sum())
-                number += len(own) - 1
-        return float(np.sqrt(square / number)) if number >= REPEATS else None
+            for own in np.split(np.arange(len(rate)), np.flatnonzero(longer) + 1):
+                left = len(own) - 1
+                square += float(((rate[own] / rate[own].mean() - 1) ** 2).sum())
+                square -= left * float(counting[own].mean())
+                number += left
+        return float(np.sqrt(max(square, 0.0) / number)) if number >= REPEATS else None
 
     @property
     def phases(self) -> list[FloatArray]:
@@ -247,6 +255,30 @@ class SpotChannels:
             return np.inf, 0.0
         pitch, share = np.median(self._grids, axis=0)
         return float(pitch), float(share)
+
+
+def _counting_variance(flux: float, wide: FloatArray) -> float:
+    """Variance of one spot's flux by its electrons and by the noise of its stamp and background [e-^2].
+
+    The noise of a pixel is that of the stamps' rims, of which the background is the mean: the flux is
+    the sum over N pixels less N times the mean of n of them, of variance N (N / n - 1) by their noise.
+    """
+    rim = _rim(wide)
+    away = np.abs(rim - np.median(rim, axis=-1, keepdims=True))
+    noise = (1.4826 * float(np.median(away))) ** 2
+    pixels = wide[0].size
+    return max(flux, 0.0) + noise * pixels * (pixels / rim.shape[-1] - 1.0)
+
+
+def _rim(wide: FloatArray) -> FloatArray:
+    """Outermost pixels of stamps, shape (n, pixels)."""
+    return np.concatenate(
+        [
+            wide[:, [0, -1]].reshape(len(wide), -1),
+            wide[:, 1:-1, [0, -1]].reshape(len(wide), -1),
+        ],
+        axis=1,
+    )
 
 
 def _grid(spots: SpotList) -> tuple[float, float]:
@@ -322,14 +354,7 @@ def stamp_moments(
         clipped mean of its rim [e- per pixel]; 'beyond': what the clipped pixels
         would add to it [e- per pixel]; 'wings': part of the flux outside the small stamp.
     """
-    rim = np.concatenate(
-        [
-            wide[:, [0, -1]].reshape(len(wide), -1),
-            wide[:, 1:-1, [0, -1]].reshape(len(wide), -1),
-        ],
-        axis=1,
-    )
-    level, beyond = _clipped_mean(rim)
+    level, beyond = _clipped_mean(_rim(wide))
     signal = wide - level[:, None, None]
     size = wide.shape[-1]
     step = np.arange(size) - size // 2

@@ -13,7 +13,7 @@ from bfsensor.diagnose.data.spot_channels import SpotChannels, stamp_moments
 SIDE, PITCH, WIDTH, FLUX = 192, 30, 1.1, 2e5
 
 
-def exposure_of(rng: np.random.Generator, scatter: float) -> np.ndarray:
+def exposure_of(rng: np.random.Generator, scatter: float, part: float = 1.0) -> np.ndarray:
     """Gaussian spots on a grid, each of its own brightness [e-]."""
     image = np.zeros((SIDE, SIDE))
     y, x = np.indices(image.shape)
@@ -23,7 +23,7 @@ def exposure_of(rng: np.random.Generator, scatter: float) -> np.ndarray:
             r2 = (x - cx - dx) ** 2 + (y - cy - dy) ** 2
             peak = FLUX * (1 + scatter * rng.standard_normal()) / (2 * np.pi * WIDTH**2)
             image += peak * np.exp(-r2 / (2 * WIDTH**2))
-    return rng.poisson(image) + rng.normal(0.0, 4.0, image.shape)
+    return rng.poisson(part * image) + rng.normal(0.0, 4.0, image.shape)
 
 
 @pytest.mark.parametrize("scatter", [0.0, 0.02])
@@ -67,9 +67,27 @@ def test_fluxes_know_the_error_of_their_zero(part: float) -> None:
     excess = channel.values[flux].mean() - light
     error = channel.errors[flux].mean()
     # An excess of a hundred electrons, of five thousand, is no light; without noise of that kind
-    # the error is that of the lamp and of the scatter.
+    # the error is that of the lamp and of counting 36 times 5,000 electrons.
     assert (excess > 60.0) == bool(part) and (error > 0.3 * excess or not part)
-    assert error < 30.0 or part
+    assert 10.0 < error < 15.0 or part
+
+
+def test_errors_of_faint_spots_are_those_of_counting():
+    """The scatter between exposures of much light says little of those of a fortieth of it."""
+    rng = np.random.default_rng(1619)
+    channels = SpotChannels(read_noise=4.0, lamp_error=1e-6)
+    for number in range(36):
+        shot, part = shot_of(number), 1.0 if number < 24 else 1 / 40
+        shot.exposure_time *= part
+        assert channels.add(shot, exposure_of(rng, 0.0, part)) is None
+    channel = channels.channels()[0]
+    flux = channel.axes["what"] == "flux"
+    for wanted, own in (
+        (FLUX, channel.axes["time"] > 1),
+        (FLUX / 40, channel.axes["time"] < 1),
+    ):
+        pulls = ((channel.values - wanted) / channel.errors)[flux & own]
+        assert 0.6 < pulls.std(ddof=1) < 1.5
 
 
 @pytest.mark.parametrize("width", [1.1, 1.75])
