@@ -1,4 +1,4 @@
-"""Mask stitch: misplaced fields of the mask displace every n-th boundary between columns."""
+"""Mask stitch: misplaced fields of the mask displace every n-th boundary of columns or of rows."""
 
 from __future__ import annotations
 
@@ -22,19 +22,20 @@ Chosen: each adds 57 starts; twice as large, the search takes up to 1.75 times a
 
 
 class MaskStitch(Effect):
-    """Every ``period``-th boundary between columns, from column ``phase``, is displaced by ``amp``.
+    """Every ``period``-th boundary of columns or rows, from number ``phase``, is displaced by ``amp``.
 
-    The column before such a boundary is wider by ``amp`` pixels, the one after it narrower.
+    The column or row before such a boundary is wider by ``amp`` pixels, the one after it narrower.
 
     Parameters
     ----------
     values : mapping of str to float
         Plausible ranges: ``amp`` [pixel]: 0.0005 to 0.01 in magnitude, either sign (0 changes
-        nothing); ``period`` [pixel]: 8 to 64, whole; ``phase`` [pixel]: 0 to 63, whole.
+        nothing); ``period`` [pixel]: 8 to 64, whole; ``phase`` [pixel]: 0 to 63, whole; ``along``: 0
+        for boundaries between columns, 1 for those between rows.
 
     Examples
     --------
-    >>> MaskStitch({"amp": 0.002, "period": 40, "phase": 31}).name
+    >>> MaskStitch({"amp": 0.002, "period": 40, "phase": 31, "along": 0}).name
     'mask_stitch'
     """
 
@@ -44,6 +45,7 @@ class MaskStitch(Effect):
         Parameter("amp", "pixel", 5e-4, 1e-2, signed=True, amplitude=True),
         Parameter("period", "pixel", PERIODS[0], PERIODS[-1], law="whole"),
         Parameter("phase", "pixel", 0, PERIODS[-1] - 1, law="whole"),
+        Parameter("along", "", 0, 1, law="whole", plain=0.0),
     )
     touches = ("flat_map",)
     of_pixels = True
@@ -58,29 +60,31 @@ class MaskStitch(Effect):
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
         """Begin with all periods, with phases of the rim and of boundaries detected in maps."""
-        counted = {(period, 0) for period in PERIODS}
-        places = [
-            (s["x"][0] + s["x"][1]) // 2
-            for s in seen
-            if s.get("what") == "column" and "x" in s and s["x"][1] - s["x"][0] <= 5
-        ]
-        for place in dict.fromkeys(int(p) for p in places[:FOUND]):
-            counted |= {(period, place % period) for period in PERIODS}
+        counted = {(period, 0, along) for period in PERIODS for along in (0, 1)}
+        for along, (what, axis) in enumerate((("column", "x"), ("row", "y"))):
+            places = [
+                (s[axis][0] + s[axis][1]) // 2
+                for s in seen
+                if s.get("what") == what and axis in s and s[axis][1] - s[axis][0] <= 5
+            ]
+            for place in dict.fromkeys(int(p) for p in places[:FOUND]):
+                counted |= {(period, place % period, along) for period in PERIODS}
         return [
-            {"amp": 2e-3, "period": float(period), "phase": float(phase)}
-            for period, phase in sorted(counted)
+            {"amp": 2e-3, "period": float(period), "phase": float(phase), "along": float(along)}
+            for period, phase, along in sorted(counted)
         ]
 
     def displacements(self, shot: Shot, layout: Layout) -> Edges | None:
         ny, nx = layout.shape
-        edge = np.arange(nx + 1)
+        n = ny if self["along"] else nx
+        edge = np.arange(n + 1)
         stitch = edge % int(self["period"]) == int(self["phase"]) % int(self["period"])
-        # The first and the last edge are no boundaries between columns.
+        # The first and the last edge are no boundaries between pixels.
         stitch[[0, -1]] = False
-        return (
-            np.broadcast_to(self["amp"] * stitch, (ny, nx + 1)),
-            np.zeros((ny + 1, nx)),
-        )
+        moved = self["amp"] * stitch
+        if self["along"]:
+            return np.zeros((ny, nx + 1)), np.broadcast_to(moved[:, None], (ny + 1, nx))
+        return np.broadcast_to(moved, (ny, nx + 1)), np.zeros((ny + 1, nx))
 
 
 class WavyMask(Effect):

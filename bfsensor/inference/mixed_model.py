@@ -149,6 +149,11 @@ class MixedModelFit(ABC):
 
     def linearise_random(self) -> None:
         """Compute the modes of the random effects, and the score, at the point."""
+        self._take_modes()
+        self._take_score()
+
+    def _take_modes(self) -> None:
+        """Compute the modes of the random effects at the point, and what they span."""
         self.modes = self.modes_at(self.point)
         # QR of [[L, M], [0, 1]], the rows below being the priors of u: with Q1 the upper rows of
         # its orthonormal columns, 1 - Q1 Q1^T = C^-1 - C^-1 L (L^T C^-1 L)^-1 L^T C^-1 of
@@ -161,8 +166,11 @@ class MixedModelFit(ABC):
             self._volume = float(np.linalg.slogdet(both.T @ both)[1])
         self._whole = span(both)
         self._span = self._whole[: self.total]
+
+    def _take_score(self) -> None:
+        """Compute the score of the variance parameters at the point, for its modes."""
         self.score = no_score(self.point)
-        if len(self._variances) and chance:
+        if len(self._variances) and self.modes.shape[1]:
             self.score = score_of(
                 self.point, self.modes, self.mode_slopes(self.point), self._span,
                 self.whitened(self.point),
@@ -255,14 +263,21 @@ class MixedModelFit(ABC):
         for turn in range(ANEW if self._random else 0):
             if turn and not self._behind():
                 break
-            self.linearise_random()
+            self._take_modes()
             # A mode that a large random effect shows clearly is better known than Fisher's information,
             # an expectation over effects of all sizes, says: its step goes too far.
             for _ in range(HALVED if len(self._variances) else 0):
                 if self._likelihood() <= lowest + NEAR:
                     break
                 self.point = 0.5 * (before + self.point)
-                self.linearise_random()
+                self._take_modes()
+            else:
+                if len(self._variances) and self._likelihood() > lowest + NEAR:
+                    # No step in this direction is a gain: the point before it is the best.
+                    self.point = before
+                    self.linearise_random()
+                    break
+            self._take_score()
             if len(self._variances):
                 before, lowest = self.point, self._likelihood()
             self.converged = self._descend()

@@ -105,6 +105,9 @@ def score_of(
     def free(columns: FloatArray) -> FloatArray:
         return np.asarray(columns - span @ (span.T @ columns))
 
+    # Only modes that some variance parameter changes enter score and information.
+    some_modes = np.any([m.any(0) for m in moved.values()], axis=0)
+    moved, modes = {n: m[:, some_modes] for n, m in moved.items()}, modes[:, some_modes]
     apart, left = free(modes), free(residuals)
     slopes = [free(m) for m in moved.values()]
     strengths = modes.T @ left
@@ -114,12 +117,12 @@ def score_of(
     ])  # fmt: skip
     own = modes.T @ apart
     mixed = [m.T @ apart for m in moved.values()]
-    information = np.array([
-        [float((one.T * other).sum()) + float(((m.T @ s) * own).sum())
-         for other, s in zip(mixed, slopes, strict=True)]
-        for one, m in zip(mixed, moved.values(), strict=True)
-    ])  # fmt: skip
-    sizes, shapes = np.linalg.eigh(0.5 * (information + information.T))
+    information = np.zeros((len(moved), len(moved)))
+    for a, m in enumerate(moved.values()):
+        for b in range(a + 1):
+            both = float((mixed[a].T * mixed[b]).sum()) + float(((m.T @ slopes[b]) * own).sum())
+            information[a, b] = information[b, a] = both
+    sizes, shapes = np.linalg.eigh(information)
     some = sizes > SURE * max(float(sizes.max()), 1e-300)
     root = np.sqrt(sizes[some])
     rows = np.zeros((int(some.sum()), len(point)))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import label
 
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.bias_channels import OUTLIER, STANDS_OUT, TRACK
@@ -64,11 +65,12 @@ class DarkChannels:
         self._biases = biases
         self._tails = np.array(tails, float)
         self._rows: list[
-            tuple[ExposureInfo, float, list[tuple[float, float, int, int]]]
+            tuple[ExposureInfo, float, list[tuple[float, float, int, int, int]]]
         ] = []
         self._columns: list[_Columns] = []
         self._names: list[str] = []
         self._condition = Condition()
+        self._unzeroed = False
 
     def add(
         self, exposure: ExposureInfo, frames: Sequence[Frame], *, after: float = 0.0
@@ -80,6 +82,7 @@ class DarkChannels:
         self._names = [f.name for f in frames]
         for frame in frames:
             over = zero_pixels(frame)
+            self._unzeroed |= not over.size
             image = frame.image.astype(np.float64) - overscan_level(frame)
             bias = self._bias.get(frame.name)
             if bias is not None:
@@ -96,7 +99,11 @@ class DarkChannels:
             # shot noise is larger than others', keeps its values.
             hot = struck.mean(0) > 0.5
             out = (np.abs(image - np.median(image, axis=0)) > OUTLIER * sigma) & ~hot
-            found.append((float(good.mean()), float(error), int(out.sum()), image.size))
+            groups = np.bincount(label(out, np.ones((3, 3)))[0].ravel())[1:]
+            squares = int((groups**2).sum())
+            found.append(
+                (float(good.mean()), float(error), int(out.sum()), squares, image.size)
+            )
             kept = np.where(out, np.nan, image)
             lines.means.append(np.nanmean(kept, 0))
             lines.own.append(np.nanvar(kept, 0) / image.shape[0])
@@ -110,19 +117,21 @@ class DarkChannels:
             return []
         values, blocks, axes = [], [], Axes()
         expected, scatter = self._usual_tails()
+        drift = self._drift() if self._unzeroed else 0.0
         for exposure, after, found in self._rows:
-            level, variance, struck, _ = (
+            level, variance, struck, squares, _ = (
                 np.array(c, float) for c in zip(*found, strict=True)
             )
             amps = np.arange(len(level))
             common = {"amp": amps, "time": exposure.exposure_time or 0.0,
                       "exposure": exposure.number, "after": after}  # fmt: skip
             values.append(level)
-            blocks.append(np.diag(variance))
+            blocks.append(np.diag(variance) + drift)
             axes.add(len(level), self._condition, what="level", x=-1, **common)
-            # Poisson; one is added to the variance, as zero may be counted where a few are expected.
+            # Tracks are Poisson, not their pixels: each counts with the square of its size.  One is
+            # added to the variance, as zero may be counted where a few are expected.
             values.append(struck - expected)
-            blocks.append(np.diag(np.maximum(struck - expected, 0.0) + 1.0 + scatter))
+            blocks.append(np.diag(np.maximum(squares - expected, 0.0) + 1.0 + scatter))
             axes.add(len(level), self._condition, what="struck", x=-1, **common)
         longest = max(c.seconds for c in self._columns)
         chosen = [c for c in self._columns if c.seconds == longest]
@@ -140,6 +149,21 @@ class DarkChannels:
                      time=longest, exposure=-1, after=0.0)  # fmt: skip
         return [Channel("dark_map", np.concatenate(values), tuple(blocks), axes.columns(), "adu",
                         self._fold)]  # fmt: skip
+
+    def _drift(self) -> FloatArray:
+        """Covariance of the zeros of a dark without overscan, by amplifier [ADU^2].
+
+        The bias level drifts between a dark and the biases, by as much as darks differ from a dark
+        current: by the offset of a straight line over the exposure time, and by the scatter about it.
+        """
+        time = np.array([row[0].exposure_time or 0.0 for row in self._rows])
+        level = np.array([[amp[0] for amp in row[2]] for row in self._rows])
+        if len(np.unique(time)) < 2 or len(time) < 3:
+            return np.asarray(level.T @ level / len(level))
+        design = np.column_stack([np.ones(len(time)), time])
+        line = np.linalg.lstsq(design, level, rcond=None)[0]
+        left = level - design @ line
+        return np.asarray(np.outer(line[0], line[0]) + left.T @ left / (len(time) - 2))
 
     def _usual_tails(self) -> tuple[FloatArray, FloatArray]:
         """Pixels in the tails of the noise of a frame by amplifier, and the variance of that number.
@@ -180,7 +204,7 @@ class DarkChannels:
 
     def _rows_of(self, amp: int, mean: FloatArray) -> float:
         """Number of pixels of a column."""
-        return self._rows[0][2][amp][3] / len(mean)
+        return self._rows[0][2][amp][4] / len(mean)
 
 
 def count_tails(

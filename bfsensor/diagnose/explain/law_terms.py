@@ -80,7 +80,8 @@ def law_choices(
     Every law of the class acts where the effect acts: a term is the effect's change times a
     function of one coordinate of the channel (a slope, a curvature, or one of its values), so that it
     vanishes where the effect does.  Terms are chosen by
-    :class:`~bfsensor.diagnose.explain.pursuit.Dictionary`, with its charge for the best of many.
+    :class:`~bfsensor.diagnose.explain.pursuit.Dictionary`, with its charge for the best of many;
+    together they may not be larger than the effect's own change of the channel.
 
     Parameters
     ----------
@@ -102,7 +103,15 @@ def law_choices(
             continue
         family = law_family(change, fit, word, without)
         choice = Dictionary(family, fit).choose() if family.terms else None
-        if choice is not None and choice.score > 0:
+        if choice is None or choice.score <= 0:
+            continue
+        # A correction that is larger than the effect itself is no law of it.
+        own = sum(
+            float(np.square(c.whiten(change(c))).sum())
+            for c in fit.channels
+            if c.word == word
+        )
+        if float(choice.template @ choice.template) <= own:
             out.append(choice)
     return sorted(out, key=lambda c: -c.score)
 

@@ -221,8 +221,8 @@ class _Search:
         # Terms that fit better do not replace an effect, or its law, that is wrong by less than
         # half in norm.
         near = (1 - SAME**2) * best
-        options: list[tuple[float, Callable[[], Explanation]]] = [
-            (c.score, partial(now.with_law, n, c)) for n, c in laws
+        options: list[tuple[float, float, Callable[[], Explanation]]] = [
+            (c.score, near, partial(now.with_law, n, c)) for n, c in laws
         ]
         ranking, reached = _with_laws(ranking, extra), 0.0
         for rival in reversed([r for r in ranking if r.effect.name in extra]):
@@ -231,16 +231,18 @@ class _Search:
             if score > 0 and (not now.parts or score >= law):
                 # Effects are tried in the order of their evidence.
                 reached = max(reached, score + rival.law)
-                options.append((reached, self._adding(now, rival)))
+                needed = near * _where(now, rival, free[0]) if free else 0.0
+                options.append((reached, needed, self._adding(now, rival)))
         options.reverse()
         options.sort(key=lambda o: -o[0])
-        before = sum(score >= near for score, _ in options)
-        if free and not before:
+        first = [o for o in options if o[0] >= o[1]]
+        if free and not first:
             faint = self._faint(now, ranking, sum(z * z for z in free[0].z))
             if faint is not None:
                 return faint
-        options[before:before] = [(c.score, partial(now.with_free, c)) for c in free[:1]]
-        for _, add in options:
+        terms = [(c.score, near, partial(now.with_free, c)) for c in free[:1]]
+        options = [*first, *terms, *(o for o in options if o[0] < o[1])]
+        for *_, add in options:
             after = self._tried(now, add)
             if after is not None:
                 return after, ranking
@@ -426,6 +428,22 @@ def _taken(choice: Choice, now: Explanation) -> bool:
     """Whether all terms of a choice are in the model already."""
     there = {t.name for c, *_ in now.free for t in c.terms}
     return all(t.name in there for t in choice.terms)
+
+
+def _where(now: Explanation, rival: Rival, choice: Choice) -> float:
+    """Part of what terms take that lies in the channels where an effect acts, at least SAME squared.
+
+    Terms that act in more channels than an effect leave the others to other effects.
+    """
+    fit, least = now.model.fit, charge(1, 1)
+    words = {
+        w for w in dict.fromkeys(c.word for c in fit.channels)
+        if float(np.square(rival.template[: len(fit.residuals)][fit.of(w)]).sum()) > least
+    }  # fmt: skip
+    taken = choice.template[: len(fit.residuals)]
+    inside = sum(float(np.square(taken[fit.of(w)]).sum()) for w in words)
+    whole = float(taken @ taken)
+    return max(inside / whole, SAME**2) if words and whole else 1.0
 
 
 def _law_score(now: Explanation, rival: Rival) -> float:

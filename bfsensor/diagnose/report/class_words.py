@@ -42,7 +42,7 @@ CLASS_WORDS = {
     "lateral_diffusion": "electrons diffuse sideways more than simulated",
     "tree_rings": "a circular pattern of pixel areas",
     "edge_rolloff": "field lines lean outwards or inwards near the sensor's edge",
-    "mask_stitch": "a periodic error of column widths from the mask",
+    "mask_stitch": "a periodic error of the widths of columns or rows from the mask",
     "tearing": "columns on either side of a boundary have wrong widths, as with holes redistributed "
     "in the channel stops",
     "charge_loss": "the fraction of light that is collected falls with the stored charge",

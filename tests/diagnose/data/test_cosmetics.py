@@ -314,7 +314,16 @@ def test_a_column_is_found_some_columns_from_a_deep_one():
     image = 4e-3 * np.random.default_rng(11).standard_normal((128, 256))
     image[:, 3] -= 0.02
     image[:, 17] -= 0.26
-    drawn = {15: 12e-4, 16: 34e-4, 18: 33e-4, 19: 18e-4, 20: 12e-4, 21: 9e-4, 22: 6e-4, 24: 3e-4}
+    drawn = {
+        15: 12e-4,
+        16: 34e-4,
+        18: 33e-4,
+        19: 18e-4,
+        20: 12e-4,
+        21: 9e-4,
+        22: 6e-4,
+        24: 3e-4,
+    }
     for column, part in drawn.items():
         image[:, column] -= part
     assert 3 in {x for d in bad_columns(image) for x in d.columns}

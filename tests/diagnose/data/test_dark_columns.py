@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.dark_channels import DarkChannels
 from bfsensor.diagnose.detect.scans import _darks
 
@@ -87,3 +88,51 @@ def test_every_column_is_looked_at_also_with_one_amplifier(amplifiers):
         (n, (x, x + 1)) for n in range(amplifiers) for x in range(3)
     ]
     np.testing.assert_array_equal([p[1] for p in found], np.eye(3 * amplifiers))
+
+
+def darks_of(images: np.ndarray, times: list[float], over: bool = True) -> Channel:
+    """Channel of darks of two amplifiers, shape (darks, 2, rows, columns)."""
+    rng = np.random.default_rng(12)
+    names = "one", "two"
+    darks = DarkChannels(
+        dict.fromkeys(names, np.zeros((ROWS, COLUMNS))), dict.fromkeys(names, NOISE)
+    )
+    for number, (pair, seconds) in enumerate(zip(images, times, strict=True)):
+        zero = NOISE * rng.standard_normal((ROWS, 24 if over else 0))
+        darks.add(
+            SimpleNamespace(
+                number=number, exposure_time=seconds, wavelength=None, back_bias=None,
+                temperature=None,
+            ),
+            [
+                SimpleNamespace(
+                    name=name, image=image, serial_overscan=zero, parallel_overscan=zero[:0]
+                )
+                for name, image in zip(names, pair, strict=True)
+            ],
+        )  # fmt: skip
+    return darks.channels()[0]
+
+
+def test_one_track_of_many_pixels_is_one_event() -> None:
+    images = NOISE * np.random.default_rng(3).standard_normal((4, 2, ROWS, COLUMNS))
+    for k in range(60):
+        images[1, 0, k, 20 + k : 22 + k] += 400.0
+    channel = darks_of(images, [60.0] * 4)
+    struck = channel.axes["what"] == "struck"
+    assert channel.values[struck].max() >= 120
+    # Counted pixel by pixel it is 11 standard deviations.
+    assert np.abs(channel.whiten(channel.values)[struck]).max() < 1.1
+
+
+def test_without_an_overscan_the_zero_of_a_dark_is_not_known() -> None:
+    """The bias level drifts, in both amplifiers by the same in the unit of their gains."""
+    rng = np.random.default_rng(4)
+    drift = np.array([0.4, 1.0, 0.6, -1.5, -2.5, -4.5])[:, None] * np.array([1.0, 1.25])
+    images = NOISE * rng.standard_normal((6, 2, ROWS, COLUMNS)) + drift[..., None, None]
+    times = [60.0, 60.0, 60.0, 15.0, 15.0, 15.0]
+    for over in (False, True):
+        channel = darks_of(images, times, over)
+        level = channel.axes["what"] == "level"
+        square = float(np.square(channel.whiten(channel.values)[level]).sum())
+        assert square < 25 if not over else square > 1000

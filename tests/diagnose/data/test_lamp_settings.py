@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import median_filter
 
 from bfsensor.diagnose.data.exposure_info import condition_of
-from bfsensor.diagnose.data.lamp_settings import lamp_settings, smoothed_levels
+from bfsensor.diagnose.data.lamp_settings import NEAREST, lamp_settings, smoothed_levels
 from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.diagnosis import diagnose_measured
 from tests.virtual import SMALL, VirtualSource, virtual_baseline
@@ -88,4 +89,23 @@ def test_levels_of_another_light_say_nothing_where_pixels_are_full():
     levels = np.repeat([2.5e5, 8.2e5], 4) * (1 + 1e-3 * np.tile([-1, 1, 2, -2], 2))
     found = smoothed_levels(levels, light, (), within=1.01)
     assert found == pytest.approx(np.repeat([2.5e5, 8.2e5], 4), rel=1.1e-3)
-    assert smoothed_levels(levels, light, ())[-1] > 8.25e5
+    # Compared with the other light, they are clearly off it and keep their own levels.
+    found = smoothed_levels(levels, light, ())
+    assert found == pytest.approx(np.repeat([2.5e5, 8.2e5], 4), rel=1.1e-3)
+
+
+def test_levels_follow_a_response_that_bends():
+    """The highest level of a ladder is that of its own flats, not what lower levels let expect."""
+    light = np.repeat(np.linspace(5.0, 50.0, 8), 2)
+    noise = 2e-4 * np.random.default_rng(8).standard_normal(light.size)
+    bent = light * (1 - 0.15 * (light / 50) ** 2)
+    found = smoothed_levels(bent * (1 + noise), light, ())
+    np.testing.assert_allclose(found, bent, rtol=1e-3)
+
+
+def test_levels_of_a_straight_response_are_those_of_many_exposures():
+    light = np.repeat(np.linspace(5.0, 50.0, 8), 6)
+    noise = 1e-3 * np.random.default_rng(9).standard_normal(light.size)
+    found = smoothed_levels(light * (1 + noise), light, ()) / light
+    ratio = median_filter(1 + noise, NEAREST, mode="mirror")
+    np.testing.assert_allclose(found, ratio, rtol=1e-12)

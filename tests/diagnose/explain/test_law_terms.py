@@ -15,8 +15,10 @@ from bfsensor.diagnose.fit.baseline_fit import fit_bounded
 from bfsensor.diagnose.fit.fitted_model import Model
 from bfsensor.diagnose.report.attribution_words import said_of
 from bfsensor.effects.cti_serial import CtiSerial
+from bfsensor.effects.electronic_memory import ElectronicMemory
 from bfsensor.effects.gain_drift import GainDrift
-from tests.virtual import fit_virtual, virtual_baseline
+from bfsensor.effects.shutter_timing import ShutterTiming
+from tests.virtual import fit_virtual, make_effect, virtual_baseline
 
 
 def _deferred(size, power):
@@ -107,3 +109,26 @@ def test_the_charge_is_what_the_best_of_many_gains_by_chance():
     best = (rng.standard_normal((20_000, 30, 2)) ** 2).sum(2).max(1)
     # 200 of 20,000 are expected beyond; 5 sigma.
     assert abs((best > charge(2, 30)).sum() - 200) < 5 * np.sqrt(200)
+
+
+def test_the_law_of_an_effect_takes_no_more_than_the_effect_itself():
+    """An echo changes all means alike and by little: exposures of another length are no law of it."""
+    predictor, fit = fit_virtual(
+        seed=9137,
+        effects=[
+            make_effect("electronic_memory", {"alpha": -1.5e-4}),
+            make_effect("shutter_timing", {"dt": -0.012, "shade": 0.0}),
+        ],
+    )[1:]
+    model = Model(predictor, fit)
+    after = model.with_effects([ElectronicMemory({"alpha": -1.5e-4})])
+    change = OwnChange(after.predictor, after.fit.values, after.effects)
+    flats = after.fit.of("flat_mean")
+    left = float(np.square(after.fit.residuals[flats]).sum())
+    assert left > 3 * float(np.square(change.whitened(after.fit)[flats]).sum())
+    assert "flat_mean" not in [c.family.words[0] for c in law_choices(change, after.fit)]
+    told = attribute(
+        predictor, fit, locate_mismatch(fit), kinds=(ElectronicMemory, ShutterTiming)
+    )
+    assert {f.effect.word for f in told.found} == {"electronic_memory", "shutter_timing"}
+    assert not told.open_world
