@@ -87,7 +87,8 @@ flicker by less; with 1.02, ladders in steps of 2 % are one level."""
 CLEAR = 8.0
 """Departure of the exposures of one light from those near to it above which they keep their own level
 [standard errors].  Chosen: noise reaches it in none of 1e6 campaigns even where the scatter is known
-to a third only; with 16, the response may bend twice as far before levels follow it."""
+to a third only; with 16, the response may depart twice as
+far from a straight line before levels follow it."""
 
 
 def smoothed_levels(
@@ -143,7 +144,7 @@ def smoothed_levels(
 def _without_flicker(ratio: FloatArray, light: FloatArray) -> FloatArray:
     """Local medians of levels over ascending light; those of equal light where these are clearly off.
 
-    Where the response bends, a median over other levels is not that of this one.
+    Where the response is not linear, a median over other levels is not that of this one.
     """
     smooth = median_filter(ratio, NEAREST, mode="mirror")
     equal = np.split(

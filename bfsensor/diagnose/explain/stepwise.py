@@ -431,7 +431,7 @@ def _taken(choice: Choice, now: Explanation) -> bool:
 
 
 def _where(now: Explanation, rival: Rival, choice: Choice) -> float:
-    """Part of what terms take that lies in the channels where an effect acts, at least SAME squared.
+    """Share of the gain of terms in the channels where an effect acts, at least SAME squared.
 
     Terms that act in more channels than an effect leave the others to other effects.
     """
