@@ -260,11 +260,16 @@ def with_defects(frame: Frame) -> tuple[FloatArray, NDArray[np.bool_]]:
 
     A column of low response holds less charge than its neighbours and repels less, so that it collects
     light that falls on them, more of it at higher levels.  Means of flats are in proportion to the light
-    only if they include the column.
+    only if they include the column.  One at the border of an amplifier also collects what falls on the
+    next one: it is left out with all columns beside it, on both sides.
     """
     if isinstance(frame, RepairedFrame) and frame.recorded is not None:
         assert frame.summed is not None
-        return frame.recorded.astype(np.float64), frame.summed
+        summed, width = frame.summed.copy(), frame.summed.shape[1]
+        for start, stop in frame.near:
+            if start == 0 or stop == width:
+                summed[:, start:stop] = False
+        return frame.recorded.astype(np.float64), summed
     return frame.image.astype(np.float64), np.zeros(frame.image.shape, bool)
 
 

@@ -294,6 +294,38 @@ def test_charge_that_bad_columns_draw_from_others_is_no_departure_from_linearity
     assert abs(slope) < 2e-4
 
 
+class ColumnAtABorder(Effect):
+    """The first amplifier's last column is of low response and draws charge from the next one's."""
+
+    word = "column_at_a_border"
+    variants: ClassVar = {"": {"part": Range(0.0, 1.0, amplitude=True)}}
+
+    def light(self, scene, context):
+        response = np.ones(scene.light.shape, np.float32)
+        response[:, 63] = 0.8
+        scene.scale(response)
+
+    def store(self, charge, context):
+        moved = np.rint(1e-6 * charge[:, 64] * charge[:, 64:128].mean(1))
+        charge[:, 64] -= moved
+        charge[:, 63] += moved
+        return charge
+
+
+def test_charge_drawn_across_a_border_is_no_departure_from_linearity():
+    source = VirtualSource(seed=7105, size=SMALL, effects=[ColumnAtABorder({"part": 1.0})])
+    measured = measure_channels(source)
+    assert any(c.kind == "bad_column" and c.x == (63, 64) for c in measured.cosmetics)
+    mean = next(c for c in measured.channels if c.word == "flat_mean" and c.fold == "fit")
+    a = mean.axes
+    response = mean.values / (a["time"] * a["lamp"])
+    first, second = (response[a["amp"] == n] for n in (0, 1))
+    bright = a["level"][a["amp"] == 0]
+    ratio = first / second / np.mean(first / second)
+    # Charge that crosses the border raises the ratio by 2e-3.
+    assert abs(np.polyfit(bright / bright.max(), ratio, 1)[0]) < 4e-4
+
+
 DRAWN = {97: 4.4, 99: 4.4, 100: 3.6, 101: 5.1, 103: 2.7, 104: 2.4, 105: 2.4, 106: 1.2}
 """Part of the light [1e-3] that columns beside two bad ones lack, as in a campaign where dust was
 listed, 1.5 times."""
