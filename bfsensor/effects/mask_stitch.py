@@ -30,8 +30,8 @@ class MaskStitch(Effect):
     ----------
     values : mapping of str to float
         Plausible ranges: ``amp`` [pixel]: 0.0005 to 0.01 in magnitude, either sign (0 changes
-        nothing); ``period`` [pixel]: 8 to 64, whole; ``phase`` [pixel]: 0 to 63, whole; ``along``: 0
-        for boundaries between columns, 1 for those between rows.
+        nothing); ``period`` [pixel]: 8 to 64, whole; ``phase`` [pixel]: 0 to 63, whole;
+        ``along``: 0 to 1, whole: boundaries between columns, or between rows.
 
     Examples
     --------
