@@ -227,27 +227,26 @@ def _part_lost(
     those beside them, are left out; at the rim, one side stands for both.  An excess within what
     columns of a ``scatter`` have by chance is none.
     """
-    profile, reach = np.median(image, axis=0), WIDEST + QUIET
-    own, beside, count = profile[start:stop].copy(), 0.0, 0
-    bases = []
+    profile, reach = np.median(image, axis=0), 2 * QUIET
     # Columns beside other defects lack the light that these draw from them.
     others_off = off.copy()
     others_off[start:stop] = False
-    clear = ~(off | maximum_filter(others_off, 2 * QUIET + 1))
-    for near, far in (
-        (slice(max(start - reach, 0), start), slice(max(start - 2 * reach, 0), max(start - reach, 0))),
-        (slice(stop, stop + reach), slice(stop + reach, stop + 2 * reach)),
-    ):  # fmt: skip
-        use, others = profile[near][clear[near]], profile[far][clear[far]]
-        if len(use) and len(others) >= QUIET:
-            bases.append(float(np.median(others)))
-            beside += float((use - bases[-1]).sum())
-            count += len(use)
+    clear = np.flatnonzero(~(off | maximum_filter(others_off, 2 * QUIET + 1)))
+    near, bases = [], []
+    for side, away in ((clear < start, start - 1 - clear), (clear >= stop, clear - stop)):
+        far = clear[side & (away >= reach) & (away < reach + WIDEST)]
+        if (side & (away < reach)).any() and len(far) >= QUIET:
+            near.append(clear[side & (away < reach)])
+            bases.append((float(far.mean()), float(np.median(profile[far]))))
     if not bases:
         return 1.0
-    own -= np.mean(bases)
+    # Light is a straight line between the columns farther away, level where one side stands for both.
+    (x, low), (y, high) = bases[0], bases[-1]
+    slope = (high - low) / (y - x) if len(bases) == 2 else 0.0
+    beside = sum(float((profile[c] - low - slope * (c - x)).sum()) for c in near)
+    own = profile[start:stop] - low - slope * (np.arange(start, stop) - x)
     lacking = -float(np.minimum(own, 0.0).sum())
-    beside *= 2 * reach / count
+    beside *= 2 * reach / sum(map(len, near))
     if beside < SURE * scatter * np.sqrt(2 * reach):
         return 1.0
     gained = float(np.maximum(own, 0.0).sum()) + beside

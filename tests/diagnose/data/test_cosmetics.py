@@ -378,3 +378,11 @@ def test_grains_whose_margins_overlap_are_repaired_once():
     left = gaussian_filter(image, 3.0)
     # Lacking light that two patches both gave back stood out by 0.02.
     assert np.abs(left).max() < 2 * np.abs(gaussian_filter(clean, 3.0)).max()
+
+
+def test_a_column_is_found_where_the_light_is_brighter_on_its_one_side():
+    """Dust and its rims leave light that changes over ten columns; a tear moves it next to itself."""
+    image = 4e-3 * np.random.default_rng(76).standard_normal((256, 128))
+    image[:, 77:88] += 1.4e-3
+    image[128:, 76] -= 0.02
+    assert 76 in {x for d in bad_columns(image) for x in d.columns}
