@@ -70,7 +70,12 @@ class MaskStitch(Effect):
             for place in dict.fromkeys(int(p) for p in places[:FOUND]):
                 counted |= {(period, place % period, along) for period in PERIODS}
         return [
-            {"amp": 2e-3, "period": float(period), "phase": float(phase), "along": float(along)}
+            {
+                "amp": 2e-3,
+                "period": float(period),
+                "phase": float(phase),
+                "along": float(along),
+            }
             for period, phase, along in sorted(counted)
         ]
 

@@ -120,7 +120,9 @@ def score_of(
     information = np.zeros((len(moved), len(moved)))
     for a, m in enumerate(moved.values()):
         for b in range(a + 1):
-            both = float((mixed[a].T * mixed[b]).sum()) + float(((m.T @ slopes[b]) * own).sum())
+            both = float((mixed[a].T * mixed[b]).sum()) + float(
+                ((m.T @ slopes[b]) * own).sum()
+            )
             information[a, b] = information[b, a] = both
     sizes, shapes = np.linalg.eigh(information)
     some = sizes > SURE * max(float(sizes.max()), 1e-300)

@@ -179,7 +179,9 @@ def draw_mask_stitch() -> Figure:
     """Mean map of flats whose every 40th boundary between columns is off by 0.008 pixel:
     one column is wider, the next narrower.
     """
-    return _draw_map("mask_stitch", {"amp": 0.008, "period": 40, "phase": 17, "along": 0}, 1.0)
+    return _draw_map(
+        "mask_stitch", {"amp": 0.008, "period": 40, "phase": 17, "along": 0}, 1.0
+    )
 
 
 @picture("tearing")
