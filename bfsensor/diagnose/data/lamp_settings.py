@@ -80,15 +80,15 @@ def lamp_settings(
     return settings, light
 
 
-ALIKE = 1.01
+EQUAL_LIGHT = 1.01
 """Largest factor between the light of exposures whose levels are taken to be equal.  Chosen: lamps
 flicker by less; with 1.02, ladders in steps of 2 % are one level."""
 
 CLEAR = 8.0
 """Departure of the exposures of one light from those near to it above which they keep their own level
 [standard errors].  Chosen: noise reaches it in none of 1e6 campaigns even where the scatter is known
-to a third only; with 16, the response may depart twice as
-far from a straight line before levels follow it."""
+to a third only; with 16, the response may depart twice as far from a straight line before levels
+follow it."""
 
 
 def smoothed_levels(
@@ -148,7 +148,7 @@ def _without_flicker(ratio: FloatArray, light: FloatArray) -> FloatArray:
     """
     smooth = median_filter(ratio, NEAREST, mode="mirror")
     equal = np.split(
-        np.arange(len(light)), np.flatnonzero(light[1:] > ALIKE * light[:-1]) + 1
+        np.arange(len(light)), np.flatnonzero(light[1:] > EQUAL_LIGHT * light[:-1]) + 1
     )
     own = [float(np.median(ratio[rows])) for rows in equal]
     away = np.concatenate(

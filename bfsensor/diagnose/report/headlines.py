@@ -102,7 +102,7 @@ HEADLINES: Mapping[str, tuple[str, ...]] = {
     "edge_rolloff": (
         "light at the rim is displaced by {amp} pixel, within {length} pixels",
     ),
-    "mask_stitch": ("every {period} {lines} a boundary is displaced by {amp} pixel",),
+    "mask_stitch": ("every {period} {along} a boundary is displaced by {amp} pixel",),
     "tearing": (
         "columns beside a boundary at {column} of the width are displaced by {amp} pixel, within "
         "{length} pixels",
@@ -168,7 +168,7 @@ def headline(found: Found) -> str:
     if word == "trap_serial" and "amp" in found.effect.values:
         values["amp"] = f"{found.effect['amp'] + 1:g}"
     if word == "mask_stitch":
-        values["lines"] = "rows" if found.effect.values.get("along") else "columns"
+        values["along"] = "rows" if found.effect.values.get("along") else "columns"
     if word == "device_parameter":
         return " and ".join(f"{n} of the device is {v}" for n, v in values.items())
     for text in HEADLINES.get(word, ()):
