@@ -63,10 +63,10 @@ def bench_nuisances(
     size, z = biases.drift()
     if z > CLEAR:
         found.append(Cosmetic("bias_drift", -1, *place, size, "adu", z))
-    pulses = biases.pulses()
+    pulses, z = biases.pulses()
     if pulses.any():
         length = float(pulses.sum())
-        found.append(Cosmetic("popcorn_noise", -1, *place, length, "pixel", CLEAR))
+        found.append(Cosmetic("popcorn_noise", -1, *place, length, "pixel", z))
     elif len(tails):
         number = np.array(tails, float).sum(1)
         z = float(number.sum() / np.sqrt(number.sum() + 1.0))

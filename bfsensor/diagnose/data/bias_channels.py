@@ -32,9 +32,11 @@ above the charge that spots leave behind, so that persistence stays in the level
 of 20 to 40 sigma are in it, too."""
 
 SCATTERED = 3.0
-"""Significance [sigma] above which the scatter of autocovariances between strips of frames replaces
-Bartlett's errors.  Chosen: Gaussian noise exceeds 3 at one in 700 lags, whose errors are then 1.2
-times as large; with 6, errors of pulses' lags may be 1.6 times too small."""
+"""Significance [sigma] above which noise is not Gaussian: by the scatter of autocovariances between
+strips of frames, which then replaces Bartlett's errors, and by third cumulants, which are then
+pulses.  Chosen: Gaussian noise exceeds 3 at one in 700 lags, whose errors are then 1.2 times as
+large; with 6, errors of pulses' lags may be 1.6 times too small, and pulses as high as the noise
+are taken for Gaussian noise."""
 
 STANDS_OUT = 5.0
 """Significance [sigma] above which a covariance of the noise, or an excess of rows or columns,
@@ -192,7 +194,7 @@ class BiasChannels:
         pairs = len(self._spectra)
         values, blocks, axes = [], [], Axes()
         found = [self._seen(amp) for amp in range(len(self._names))]
-        pulses = self.pulses()
+        pulses, _ = self.pulses()
         for amp, seen in enumerate(found):
             mean = np.mean([s[amp] for s in self._spectra], axis=0)
             values.append(mean)
@@ -240,32 +242,37 @@ class BiasChannels:
         error = float(np.sqrt(zeros[..., 1].mean() / zeros.shape[1]))
         return size, size / max(error, 1e-12) / np.sqrt(2.0)
 
-    def pulses(self) -> FloatArray:
-        """Covariance by lag of pulses in the amplifiers' noise, that of lag 1 being 1; 0 without.
+    def pulses(self) -> tuple[FloatArray, float]:
+        """Covariance by lag of pulses in the amplifiers' noise, and the deviate of the pulses.
+
+        The covariance at lag 1 is 1; all are 0 without pulses.
 
         A random telegraph signal of the output transistor has covariances that fall exponentially
         with the lag (Machlup 1954, J. Appl. Phys. 25, 341).  Unlike Gaussian noise, and unlike
         independent noise of any distribution, it has third cumulants between pixels that fall
         alike.  Where these are significant, one exponential is fitted to them and the covariances.
+        Pulses as high as the noise have third cumulants half as significant as their covariances:
+        a limit as high as that of covariances would leave them to be taken for Gaussian noise.
         """
         out = np.zeros(READOUT_LAGS + 1)
         if not self._third or not self._spectra:
-            return out
+            return out, 0.0
         third = np.sum(self._third, axis=0) / np.sqrt(len(self._third))
         shapes = np.exp(
             -np.arange(READOUT_LAGS) / np.geomspace(0.2, 4.0 * READOUT_LAGS, 200)[:, None]
         )
         shapes /= np.sqrt(np.square(shapes).sum(1))[:, None]
         gain = np.square(third @ shapes.T).sum(0)
-        if chi2.sf(gain.max(), len(third)) > norm.sf(STANDS_OUT):
-            return out
+        deviate = float(norm.isf(chi2.sf(gain.max(), len(third))))
+        if deviate < SCATTERED:
+            return out, deviate
         c = np.mean(self._spectra, axis=0)
         away = (
             c[:, 1 : READOUT_LAGS + 1] / c[:, :1] * np.sqrt(self._size * len(self._spectra))
         )
         best = shapes[int(np.argmax(gain + np.square(away @ shapes.T).sum(0)))]
         out[1:] = best / best[0]
-        return out
+        return out, deviate
 
     def _errors(self, seen: FloatArray, amp: int) -> FloatArray:
         """Covariance of an amplifier's autocovariances, times the length of the series [ADU^4].

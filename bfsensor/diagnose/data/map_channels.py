@@ -113,6 +113,7 @@ class MapChannels:
         self._closed = True
         self._total = np.zeros((0, 0), np.float32)
         self._count = np.zeros((0, 0), np.uint16)
+        self._filled = np.zeros(shape, bool)
 
     def add_pair(
         self,
@@ -122,6 +123,7 @@ class MapChannels:
         second: NDArray[np.float32],
         shared: float = 0.0,
         level: float = 0.0,
+        filled: NDArray[np.bool_] | None = None,
     ) -> None:
         """Add a pair of flats, each over its amplifiers' means, less one.
 
@@ -137,6 +139,8 @@ class MapChannels:
             Noise of the mean bias, which all flats share, over the mean level.
         level : float
             Mean level [ADU].
+        filled : ndarray of bool, shape of the sensor, optional
+            Pixels that have values of others in either flat, and with them no noise of their own.
         """
         last = self._groups[-1] if self._groups else None
         if last is None or (last.condition, last.time) != (condition, time):
@@ -154,15 +158,21 @@ class MapChannels:
         # positive covariances beside it; averages over many pixels keep Poisson noise.
         noise = first - second
         noise *= np.float32(np.sqrt(0.5))
-        np.nan_to_num(noise, copy=False)
-        side = LOW
-        ny, nx = (n // side * side for n in self._shape)
-        boxes = noise[:ny, :nx].reshape(ny // side, side, nx // side, side)
-        group.low += float((boxes.mean((1, 3), dtype=np.float64) * side).var())
-        group.high += float(np.diff(noise, axis=1).var(dtype=np.float64)) / 2
+        own = np.isfinite(noise)
+        if filled is not None:
+            own &= ~filled
+            self._filled |= filled
+        noise[~own] = 0.0
+        part = max(float(own.mean()), 1e-30)
+        number = _blocks(own, LOW).sum((1, 3))
+        boxes = _blocks(noise, LOW).sum((1, 3), dtype=np.float64)[number > 0]
+        group.low += (
+            float((boxes / np.sqrt(number[number > 0])).var()) if len(boxes) else 0.0
+        )
+        group.high += float(_steps(noise, own).var(dtype=np.float64)) / 2
         modes = rfft2(noise)
-        group.power += spectrum_rings(modes, self._shape)
-        group.long += long_power(modes, self._shape)
+        group.power += spectrum_rings(modes, self._shape) / part
+        group.long += long_power(modes, self._shape) / part
         group.pairs += 1
         group.shared += shared
         group.level += level
@@ -336,16 +346,16 @@ class MapChannels:
         """
         ny, nx = self._shape
         single = np.sqrt(image.low)
+        good = np.isfinite(image.values)
+        filled = np.where(good, image.values, np.float32(0.0))
+        measured = good & ~self._filled
         if own:
-            steps = np.diff(image.values, axis=1).ravel()
-            steps = steps[np.isfinite(steps)]
+            steps = _steps(image.values, measured)
             steps -= np.median(steps)
             seen = 1.4826 * float(np.median(np.abs(steps, out=steps))) / np.sqrt(2.0)
             del steps
             single = max(single, seen * np.sqrt(image.ratio))
         sigma = np.sqrt(single**2 + image.long)
-        good = np.isfinite(image.values)
-        filled = np.where(good, image.values, np.float32(0.0))
         out: list[tuple[NDArray, NDArray, Mapping[str, object]]] = []
         for what, axis, n in (("column", 0, nx), ("row", 1, ny)):
             count = np.maximum(good.sum(axis), 1)
@@ -370,8 +380,8 @@ class MapChannels:
         mean, x, y = (v.ravel()[noise.kept] for v in (mean, x, y))
         told = {"what": "block", "k": -1.0, "x": x, "y": y}
         out.append((mean, sigma**2 * noise.covariance, told))
-        free = without_shape(filled)
-        power = ring_power(free)
+        free = np.where(measured, without_shape(filled), np.float32(0.0))
+        power = ring_power(free) / max(float(measured.mean()), 1e-30)
         keep = self._modes > 50
         # The lowest frequencies are those of the light's own shape.
         keep[0] = False
@@ -388,8 +398,8 @@ class MapChannels:
                 {"what": "ring", "k": frequency[keep], "x": -1.0, "y": -1.0},
             )
         )
-        texture = map_texture(free)
-        spread = texture_noise(free, texture, int(good.sum()))
+        texture = map_texture(free, measured)
+        spread = texture_noise(free, texture, int(measured.sum()))
         told = {"what": "texture", "k": -1.0, "x": texture.dx, "y": texture.dy}
         out.append((texture.values, spread, told))
         chess, centres = map_chess(filled)
@@ -468,6 +478,11 @@ def _weights(groups: list[_MapGroup]) -> FloatArray:
     """Weights of groups in their mean, by inverse variance of their noise; their sum is 1."""
     weights = np.array([g.weight for g in groups])
     return np.asarray(weights / weights.sum())
+
+
+def _steps(image: NDArray, own: NDArray[np.bool_]) -> NDArray:
+    """Differences of neighbours along rows, of those that both have values of their own."""
+    return np.asarray(np.diff(image, axis=1)[own[:, 1:] & own[:, :-1]])
 
 
 def _blocks(image: NDArray, side: int) -> NDArray:

@@ -38,14 +38,17 @@ class Texture(NamedTuple):
         Mean products [1e-6].
     dx, dy : ndarray, shape (n,)
         Shifts [pixel].
+    products : ndarray, shape (n,)
+        Number of products in each mean.
     """
 
     values: FloatArray
     dx: FloatArray
     dy: FloatArray
+    products: FloatArray
 
 
-def map_texture(image: NDArray) -> Texture:
+def map_texture(image: NDArray, own: NDArray[np.bool_] | None = None) -> Texture:
     """Measure the autocovariance of a map: mean products of pixels (dx, dy) apart.
 
     In the same row and from one row to the next: patterns that go with the time of readout are
@@ -55,7 +58,9 @@ def map_texture(image: NDArray) -> Texture:
     Parameters
     ----------
     image : ndarray, shape (ny, nx)
-        Map of relative response, 0 where nothing is read.
+        Map of relative response, 0 where ``own`` is not set.
+    own : ndarray of bool, shape (ny, nx), optional
+        Pixels with a response of their own; others have no part in any product.  All by default.
 
     Returns
     -------
@@ -64,34 +69,36 @@ def map_texture(image: NDArray) -> Texture:
     Examples
     --------
     >>> wave = np.sin(2 * np.pi * np.arange(64 * 100) / 8.1).reshape(64, 100)
-    >>> values, dx, dy = map_texture(wave)
+    >>> values, dx, dy, _ = map_texture(wave)
     >>> [float(values[(dx == n) & (dy == 0)][0].round(-5)) for n in (4, 8)]
     [-500000.0, 500000.0]
     """
     ny, nx = image.shape
-    columns = image.mean(0, dtype=np.float64)
+    own = np.ones((ny, nx), bool) if own is None else own
+    columns = image.sum(0, dtype=np.float64) / np.maximum(own.sum(0), 1)
     reach = min(FARTHEST, nx // 2)
     side = next_fast_len(nx + reach + 1, real=True)
-    same, following = np.zeros(side), np.zeros(side)
+    same, following, pairs, steps = np.zeros((4, side))
     # Some rows at a time: transforms of large sensors need not be held.
     for start in range(0, ny, STRIPE):
+        here = own[start : start + STRIPE + 1]
         rows = image[start : start + STRIPE + 1]
-        rows = rows - columns - rows.mean(1, dtype=np.float64)[:, None] + columns.mean()
-        modes = rfft(rows, side, axis=1)
-        own = modes[:STRIPE]
-        same += irfft((own.real**2 + own.imag**2).sum(0), side)
-        following += irfft((modes[:-1].conj() * modes[1:]).sum(0), side)
+        means = rows.sum(1, dtype=np.float64) / np.maximum(here.sum(1), 1)
+        rows = np.where(here, rows - columns - means[:, None] + columns.mean(), 0.0)
+        for sums, values in (((same, following), rows), ((pairs, steps), here)):
+            modes = rfft(values, side, axis=1)
+            first = modes[:STRIPE]
+            sums[0][:] += irfft((first.real**2 + first.imag**2).sum(0), side)
+            sums[1][:] += irfft((modes[:-1].conj() * modes[1:]).sum(0), side)
     near, all_ = np.arange(NEAREST, reach + 1), np.arange(-reach, reach + 1)
     all_ = all_[np.abs(all_) >= NEAREST]
+    products = np.maximum(np.rint(np.concatenate([pairs[near], steps[all_]])), 1.0)
+    values = np.concatenate([same[near], following[all_]]) / products
     # Subtracting a row's mean leaves white noise anticorrelated by 1 / nx.
-    values = [
-        same[near] / (ny * (nx - near)) + same[0] / (ny * nx**2),
-        following[all_] / ((ny - 1) * (nx - np.abs(all_))),
-    ]
+    values[: len(near)] += same[0] / max(float(pairs[0]), 1.0) / nx
     dy = np.repeat([0.0, 1.0], [len(near), len(all_)])
-    return Texture(
-        1e6 * np.concatenate(values), np.concatenate([near, all_]).astype(float), dy
-    )
+    dx = np.concatenate([near, all_]).astype(float)
+    return Texture(1e6 * values, dx, dy, products)
 
 
 def texture_noise(image: NDArray, texture: Texture, pixels: int) -> FloatArray:
@@ -113,7 +120,7 @@ def texture_noise(image: NDArray, texture: Texture, pixels: int) -> FloatArray:
     texture : Texture
         Autocovariance of the map.
     pixels : int
-        Number of pixels that are read.
+        Number of pixels with a response of their own; the map is 0 in others.
 
     Returns
     -------
@@ -130,10 +137,9 @@ def texture_noise(image: NDArray, texture: Texture, pixels: int) -> FloatArray:
     [1, 2]
     """
     ny, nx = image.shape
-    products = np.maximum(
-        pixels * (1 - np.abs(texture.dx) / nx) * (1 - texture.dy / ny), 1.0
-    )
-    variance = float(image.var(dtype=np.float64))
+    products = texture.products
+    mean = float(image.mean(dtype=np.float64))
+    variance = float(np.square(image, dtype=np.float64).sum()) / max(pixels, 1) - mean**2
     modes = rfft2(image)
     power = (modes.real**2 + modes.imag**2) / (ny * nx)
     # Means of columns and rows are not part of a texture.

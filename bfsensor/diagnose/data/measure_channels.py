@@ -260,7 +260,7 @@ def measure_channels(
         start=start,
         steps=steps,
         zeros=zeros,
-        pulses=biases.pulses(),
+        pulses=biases.pulses()[0],
     )
     longest: dict[Condition, float] = {}
     for flat in kinds.get("flat", []):
@@ -431,6 +431,7 @@ def _add_to_maps(
 ) -> dict[int, float]:
     """Add a pair of flats to maps and codes; returns the mean level of either [ADU]."""
     levels, departures = {}, []
+    filled = np.zeros(shape, bool)
     for exposure, frames in pair:
         image = np.full(shape, np.nan, np.float32)
         means = []
@@ -438,6 +439,7 @@ def _add_to_maps(
             values = _good(flats, frame)
             means.append(float(np.nanmean(values)))
             place(image, frame, values / means[-1] - 1.0)
+            place(filled, frame, repaired_of(frame))
         levels[exposure.number] = float(np.mean(means))
         departures.append(image)
         codes.add(frames)
@@ -449,6 +451,7 @@ def _add_to_maps(
     maps.add_pair(
         condition_of(first), first.exposure_time or 0.0, departures[0], departures[1],
         level=levels[first.number], shared=float(np.sqrt(np.mean(np.square(noise)))),
+        filled=filled,
     )  # fmt: skip
     return levels
 

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.data.bias_channels import BiasChannels
+from bfsensor.diagnose.data.bias_channels import SCATTERED, STANDS_OUT, BiasChannels
 from bfsensor.diagnose.data.flat_defects import bad_columns, low_pixels
 from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.diagnosis import diagnose_measured
@@ -92,10 +92,24 @@ def test_pulses_are_found_with_their_length():
         noise = 3.0 * rng.standard_normal(SIZE) + 6.0 * telegraph(rng, SIZE, 0.02, 4.0)
         return 1000 + noise.reshape(ROWS, -1)
 
-    found = biases(make).pulses()
+    found, deviate = biases(make).pulses()
+    assert deviate > 10
     # The covariance falls by 1 - 1/4 - 1/196 with each pixel; measured to 10 % with 2e5 pixels.
     assert found[0] == 0 and found[1] == 1
     assert found[2] == pytest.approx(0.745, abs=0.075)
+
+
+def test_pulses_as_high_as_the_noise_are_found():
+    rng = np.random.default_rng(8127)
+
+    def make(frame, amp):
+        noise = 3.0 * rng.standard_normal(SIZE) + 3.0 * telegraph(rng, SIZE, 0.02, 4.0)
+        return 1000 + noise.reshape(ROWS, -1)
+
+    found, deviate = biases(make, 4).pulses()
+    # The covariances are 0.015 of the variance, the third cumulants as much: deviates of 3 to 5.
+    assert SCATTERED < deviate < STANDS_OUT
+    assert found[1] == 1
 
 
 @pytest.mark.parametrize("noise", ["gaussian", "heavy tails", "skewed"])
@@ -112,7 +126,7 @@ def test_other_noise_has_no_pulses(noise):
         tied = 0.2 * white[:-1] if noise == "gaussian" else 0.0
         return 1000 + 3.0 * (white[1:] + tied).reshape(ROWS, -1)
 
-    assert not biases(make).pulses().any()
+    assert not biases(make).pulses()[0].any()
 
 
 @pytest.mark.parametrize(("together", "seen"), [(True, False), (False, True)])
