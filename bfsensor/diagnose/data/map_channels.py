@@ -380,8 +380,10 @@ class MapChannels:
         mean, x, y = (v.ravel()[noise.kept] for v in (mean, x, y))
         told = {"what": "block", "k": -1.0, "x": x, "y": y}
         out.append((mean, sigma**2 * noise.covariance, told))
-        free = np.where(measured, without_shape(filled), np.float32(0.0))
+        free = without_shape(filled)
+        # Pixels that are filled in go on smoothly: zeros would mix columns and rows into the rings.
         power = ring_power(free) / max(float(measured.mean()), 1e-30)
+        free[~measured] = 0.0
         keep = self._modes > 50
         # The lowest frequencies are those of the light's own shape.
         keep[0] = False

@@ -151,10 +151,12 @@ def test_columns_with_values_of_others_have_no_noise_of_their_own() -> None:
     """A tenth of the columns is filled in: the noise of all others is not smaller for it."""
     shape = (160, 160)
     rng = np.random.default_rng(8829)
-    response = 3e-3 * rng.standard_normal(shape)
+    # Of rows, which are means of their own and no part of rings, bridges across columns follow.
+    light = 1e-2 * rng.standard_normal((160, 1)) * np.ones(shape)
+    response = light + 3e-3 * rng.standard_normal(shape)
     filled = np.zeros(shape, bool)
     for start in range(5, 160, 40):
-        filled[:, start : start + 4] = True
+        filled[: 160 if start < 80 else 80, start : start + 4] = True
     maps = {
         name: MapChannels(shape, {HERE: 16.0}) for name in ("told", "not told", "sound")
     }
@@ -163,7 +165,7 @@ def test_columns_with_values_of_others_have_no_noise_of_their_own() -> None:
         for name, each in maps.items():
             images = flats.copy()
             if name != "sound":
-                images[:, filled] = 0.0
+                images[:, filled] = light[filled]
             told = {"filled": filled} if name == "told" else {}
             for a, b in images.astype(np.float32).reshape(2, 2, *shape):
                 each.add_pair(HERE, time, a, b, **told)
@@ -171,7 +173,7 @@ def test_columns_with_values_of_others_have_no_noise_of_their_own() -> None:
     error = {n: c.errors[c.axes["what"] == "row"] for n, c in found.items()}
     # Medians of 22,000 differences, and variances of 330 boxes: to some per cent.
     assert error["told"] == pytest.approx(error["sound"], rel=0.05)
-    assert (error["not told"] < 0.95 * error["sound"]).all()
+    assert (error["not told"] < 0.97 * error["sound"]).all()
     # The response of single pixels is part of the rings' power.
     for what, below in (("ring", found["sound"].values), ("texture", 0.0)):
         rows = found["told"].axes["what"] == what
