@@ -383,3 +383,34 @@ def test_a_column_is_found_where_the_light_is_brighter_on_its_one_side():
     image[:, 77:88] += 1.4e-3
     image[128:, 76] -= 0.02
     assert 76 in {x for d in bad_columns(image) for x in d.columns}
+
+
+def test_three_grains_that_touch_are_three():
+    y, x = np.indices((256, 256))
+    image = 3e-3 * np.random.default_rng(22).standard_normal(y.shape)
+    for cx, cy, radius, hole, depth in (
+        (224.1, 227.3, 14.9, 0.39, 0.0169), (239.3, 197.7, 15.4, 0.30, 0.0293),
+        (195.2, 229.2, 11.7, 0.22, 0.0231),
+    ):  # fmt: skip
+        r = np.hypot(x - cx, y - cy) / radius
+        image -= depth * ((r < 1) & (r > hole))
+    spots = dust_spots(image)
+    assert len(spots) == 3
+    for rows, columns, shade, _ in spots:
+        image[np.ix_(rows, columns)] = (1 + image[np.ix_(rows, columns)]) / shade - 1
+    # A tenth of the deepest, at rims sharper than the average over pixels.
+    assert np.abs(gaussian_filter(image, 3.0)).max() < 0.003
+
+
+def test_defects_may_be_many_where_their_neighbours_are_not_counted():
+    """Three columns of 64, with what each draws from those beside it, are no pattern."""
+    image = 3e-3 * np.random.default_rng(7).standard_normal((256, 64))
+    image[128:, 31] -= 0.1
+    for column, lack in ((45, 0.14), (56, 0.2)):
+        image[:, column] -= lack
+        image[:, [column - 1, column + 1]] -= 3e-3
+    found = {x for d in bad_columns(image) for x in d.columns}
+    assert {31, 45, 56} <= found
+    # Every fifth column is a pattern.
+    image[:, ::5] -= 0.05
+    assert not bad_columns(image)
