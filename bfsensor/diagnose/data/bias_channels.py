@@ -263,7 +263,8 @@ class BiasChannels:
         )
         shapes /= np.sqrt(np.square(shapes).sum(1))[:, None]
         gain = np.square(third @ shapes.T).sum(0)
-        deviate = float(norm.isf(chi2.sf(gain.max(), len(third))))
+        chance = max(float(chi2.sf(gain.max(), len(third))), np.finfo(float).tiny)
+        deviate = float(norm.isf(chance))
         if deviate < SCATTERED:
             return out, deviate
         c = np.mean(self._spectra, axis=0)

@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from bfsensor.diagnose.data.bench_nuisances import bench_nuisances
 from bfsensor.diagnose.data.bias_channels import SCATTERED, STANDS_OUT, BiasChannels
 from bfsensor.diagnose.data.flat_defects import bad_columns, low_pixels
 from bfsensor.diagnose.data.measure_channels import measure_channels
@@ -191,3 +192,14 @@ def test_structure_of_the_bias_is_listed_and_no_alarm():
     assert len(listed) == 2 and all(c.z > 10 for c in listed)
     found = diagnose_measured(measured, virtual_baseline(), explain=False)
     assert not found.mismatch.detected
+
+
+def test_two_lamps_of_one_level_are_no_flicker():
+    flats = [
+        Info(n, "flat", exposure_time=t, lamp=lamp * (1 + 2e-4 * (n % 3)))
+        for n, (t, lamp) in enumerate([(10.0, 0.5), (6.0, 0.8)] * 6)
+    ]
+    steps = dict.fromkeys(range(12), 1.0)
+    found = bench_nuisances(BiasChannels(), {}, [], flats, steps, (ROWS, COLUMNS))
+    assert [c.kind for c in found] == ["lamp_flicker"]
+    assert found[0].size == pytest.approx(2e-4 * np.sqrt(2 / 3), rel=1e-3)

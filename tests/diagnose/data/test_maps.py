@@ -179,3 +179,30 @@ def test_columns_with_values_of_others_have_no_noise_of_their_own() -> None:
         rows = found["told"].axes["what"] == what
         away = ((found["told"].values - below) / found["told"].errors)[rows]
         assert np.square(away).mean() < 1 + 4 * np.sqrt(2 / len(away))
+
+
+def test_steps_between_amplifiers_in_two_rows_are_no_rings() -> None:
+    """Uneven light leaves steps in x and in y, each amplifier being over its own mean."""
+    rng = np.random.default_rng(8830)
+    side = 128
+    y, x = np.indices((side, side)) / side
+    light = 1 - 0.16 * ((x - 0.6) ** 2 + (y - 0.65) ** 2) ** 2
+    amplifiers = [
+        (slice(a, a + side // 2), slice(b, b + side // 2))
+        for a in (0, side // 2)
+        for b in (0, side // 2)
+    ]
+    found = []
+    for shape in (light, np.ones_like(light)):
+        maps = MapChannels((side, side), {HERE: 16.0}, amplifiers=amplifiers)
+        for _ in range(4):
+            flats = shape * (1 + 3e-3 * rng.standard_normal((2, side, side)))
+            for part in amplifiers:
+                flats[(slice(None), *part)] /= flats[(slice(None), *part)].mean()
+            maps.add_pair(HERE, 16.0, *(flats - 1).astype(np.float32))
+        (channel,) = maps.channels()
+        rows = (channel.axes["what"] == "ring") & (channel.axes["k"] > 0)
+        found.append((channel.values / channel.errors)[rows])
+    uneven, even = found
+    assert np.abs(even).max() < 4
+    assert np.abs(uneven).max() < 4
