@@ -150,6 +150,18 @@ class DarkChannels:
         return [Channel("dark_map", np.concatenate(values), tuple(blocks), axes.columns(), "adu",
                         self._fold)]  # fmt: skip
 
+    @property
+    def notes(self) -> list[str]:
+        """Sentences that say what these darks do not show."""
+        times = {row[0].exposure_time or 0.0 for row in self._rows}
+        if not self._unzeroed or len(times) != 1 or self._fold != "fit":
+            return []
+        return [
+            f"darks have no overscan and one exposure time ({times.pop():g} s): their mean level counts "
+            "as drift of the bias, so that dark current which is the same in all pixels is not seen; "
+            "take darks of two exposure times"
+        ]
+
     def _drift(self) -> FloatArray:
         """Covariance of the zeros of a dark without overscan, by amplifier [ADU^2].
 

@@ -360,7 +360,7 @@ def measure_channels(
             f"light and level, biases {len(kinds.get('bias', []))} (2 are needed), no dark, no "
             f"spots that could be fitted{'; ' + '; '.join(notes) if notes else ''}"
         )
-    notes += assumed_errors(channels)
+    notes += [*darks.notes, *assumed_errors(channels)]
     if "bias" not in kinds and any(zero_pixels(f).size == 0 for f in layout):
         notes.append(
             "no bias and no overscan: the zero level is not known and stays in the levels, "

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.dark_channels import DarkChannels
 from bfsensor.diagnose.detect.scans import _darks
 
@@ -90,8 +89,8 @@ def test_every_column_is_looked_at_also_with_one_amplifier(amplifiers):
     np.testing.assert_array_equal([p[1] for p in found], np.eye(3 * amplifiers))
 
 
-def darks_of(images: np.ndarray, times: list[float], over: bool = True) -> Channel:
-    """Channel of darks of two amplifiers, shape (darks, 2, rows, columns)."""
+def darks_of(images: np.ndarray, times: list[float], over: bool = True) -> DarkChannels:
+    """Darks of two amplifiers, shape (darks, 2, rows, columns)."""
     rng = np.random.default_rng(12)
     names = "one", "two"
     darks = DarkChannels(
@@ -111,14 +110,14 @@ def darks_of(images: np.ndarray, times: list[float], over: bool = True) -> Chann
                 for name, image in zip(names, pair, strict=True)
             ],
         )  # fmt: skip
-    return darks.channels()[0]
+    return darks
 
 
 def test_one_track_of_many_pixels_is_one_event() -> None:
     images = NOISE * np.random.default_rng(3).standard_normal((4, 2, ROWS, COLUMNS))
     for k in range(60):
         images[1, 0, k, 20 + k : 22 + k] += 400.0
-    channel = darks_of(images, [60.0] * 4)
+    channel = darks_of(images, [60.0] * 4).channels()[0]
     struck = channel.axes["what"] == "struck"
     assert channel.values[struck].max() >= 120
     # Counted pixel by pixel it is 11 standard deviations.
@@ -132,7 +131,18 @@ def test_without_an_overscan_the_zero_of_a_dark_is_not_known() -> None:
     images = NOISE * rng.standard_normal((6, 2, ROWS, COLUMNS)) + drift[..., None, None]
     times = [60.0, 60.0, 60.0, 15.0, 15.0, 15.0]
     for over in (False, True):
-        channel = darks_of(images, times, over)
+        channel = darks_of(images, times, over).channels()[0]
         level = channel.axes["what"] == "level"
         square = float(np.square(channel.whiten(channel.values)[level]).sum())
         assert square < 25 if not over else square > 1000
+
+
+@pytest.mark.parametrize(
+    ("times", "over", "said"),
+    [((60.0, 60.0), False, 1), ((60.0, 15.0), False, 0), ((60.0, 60.0), True, 0)],
+)
+def test_a_dark_current_that_cannot_be_seen_is_said(times, over, said) -> None:
+    images = NOISE * np.random.default_rng(5).standard_normal((2, 2, ROWS, COLUMNS))
+    notes = darks_of(images, times, over).notes
+    assert len(notes) == said
+    assert all("two exposure times" in note for note in notes)
