@@ -35,6 +35,16 @@ def test_flats_below_the_full_well_are_counted():
     assert counted(np.minimum(flat(), 43_000 + np.rint(3.5 * WIDTH)))
 
 
+def test_dark_corners_leave_a_flat_in():
+    """Light that falls by 3 % towards a corner makes a long lower tail, and none of full pixels."""
+    y, x = np.indices((256, 256)) / 256
+    dim = np.rint(-43_000 * 0.03 * np.maximum(x**2 + y**2 - 0.6, 0.0) ** 2)
+    even = flat(shape=(256, 256))
+    assert counted(even + dim)
+    # Where pixels of the bright half are full, the flat is left out.
+    assert not counted(np.minimum(even + dim, 43_000 + np.rint(2.2 * WIDTH)))
+
+
 def test_struck_and_dim_pixels_leave_a_flat_in():
     """Particles brighten some, dust dims some: one tail is longer, the other is there."""
     rng = np.random.default_rng(8809)
