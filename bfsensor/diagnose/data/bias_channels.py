@@ -251,8 +251,9 @@ class BiasChannels:
         with the lag (Machlup 1954, J. Appl. Phys. 25, 341).  Unlike Gaussian noise, and unlike
         independent noise of any distribution, it has third cumulants between pixels that fall
         alike.  Where these are significant, one exponential is fitted to them and the covariances.
-        Pulses as high as the noise have third cumulants half as significant as their covariances:
-        a limit as high as that of covariances would leave them to be taken for Gaussian noise.
+        Pulses as high as the noise have third cumulants 0.8 times as significant as their
+        covariances, lower ones less in proportion to their height: with the limit of covariances
+        they would be taken for Gaussian noise.
         """
         out = np.zeros(READOUT_LAGS + 1)
         if not self._third or not self._spectra:

@@ -21,7 +21,7 @@ from bfsensor.diagnose.data.exposure_info import Axes, label_of
 from bfsensor.diagnose.data.map_borders import Border, find_borders
 from bfsensor.diagnose.data.map_noise import BlockNoise, block_noise
 from bfsensor.diagnose.data.map_texture import map_texture, texture_noise
-from bfsensor.diagnose.data.map_waves import find_patterns, smooth_shapes, without_shape
+from bfsensor.diagnose.data.map_waves import find_patterns, without_shape, without_steps
 from bfsensor.typing import FloatArray
 
 BLOCKS = 16
@@ -380,7 +380,7 @@ class MapChannels:
         mean, x, y = (v.ravel()[noise.kept] for v in (mean, x, y))
         told = {"what": "block", "k": -1.0, "x": x, "y": y}
         out.append((mean, sigma**2 * noise.covariance, told))
-        free = _without_steps(without_shape(filled), self._amplifiers)
+        free = without_steps(without_shape(filled), self._amplifiers)
         # Pixels that are filled in go on smoothly: zeros would mix columns and rows into the rings.
         power = ring_power(free) / max(float(measured.mean()), 1e-30)
         free[~measured] = 0.0
@@ -480,28 +480,6 @@ def _weights(groups: list[_MapGroup]) -> FloatArray:
     """Weights of groups in their mean, by inverse variance of their noise; their sum is 1."""
     weights = np.array([g.weight for g in groups])
     return np.asarray(weights / weights.sum())
-
-
-def _without_steps(image: NDArray, amplifiers: Sequence[tuple[slice, slice]]) -> NDArray:
-    """A map without smooth shape, less the steps between amplifiers that are its least squares.
-
-    Each amplifier is over its own mean: light that is not even leaves steps.  Those of amplifiers in
-    one row are in the means of columns; those of two rows are in the rings and the texture, too.
-    """
-    if len(amplifiers) < 4:
-        return image
-    q_y, q_x = (smooth_shapes(n) for n in image.shape)
-    # Products of two amplifiers' masks, less their smooth shapes, without making any.
-    smooth = np.array(
-        [np.outer(q_y[y].sum(0), q_x[x].sum(0)).ravel() for y, x in amplifiers]
-    )
-    pixels = [(y.stop - y.start) * (x.stop - x.start) for y, x in amplifiers]
-    sums = [float(image[part].sum(dtype=np.float64)) for part in amplifiers]
-    sizes = np.linalg.pinv(np.diag(pixels) - smooth @ smooth.T, rcond=1e-10) @ sums
-    steps = np.zeros_like(image)
-    for part, size in zip(amplifiers, sizes, strict=True):
-        steps[part] = size
-    return np.asarray(image - without_shape(steps))
 
 
 def _steps(image: NDArray, own: NDArray[np.bool_]) -> NDArray:

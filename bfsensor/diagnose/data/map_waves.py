@@ -54,6 +54,28 @@ def without_shape(image: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(image - q_y @ (q_y.T @ image @ q_x) @ q_x.T, image.dtype)
 
 
+def without_steps(image: NDArray[Any], amplifiers: Sequence[Part]) -> NDArray[Any]:
+    """A map without smooth shape, less the steps between amplifiers that are its least squares.
+
+    Each amplifier is over its own mean: light that is not even leaves steps.  Those of amplifiers in
+    one row are in the means of columns; those of two rows are in the rings and the texture, too.
+    """
+    if len(amplifiers) < 4:
+        return image
+    q_y, q_x = (smooth_shapes(n) for n in image.shape)
+    # Products of two amplifiers' masks, less their smooth shapes, without making any.
+    smooth = np.array(
+        [np.outer(q_y[y].sum(0), q_x[x].sum(0)).ravel() for y, x in amplifiers]
+    )
+    pixels = [(y.stop - y.start) * (x.stop - x.start) for y, x in amplifiers]
+    sums = [float(image[part].sum(dtype=np.float64)) for part in amplifiers]
+    sizes = np.linalg.pinv(np.diag(pixels) - smooth @ smooth.T, rcond=1e-10) @ sums
+    steps = np.zeros_like(image)
+    for part, size in zip(amplifiers, sizes, strict=True):
+        steps[part] = size
+    return np.asarray(image - without_shape(steps))
+
+
 class Wave(NamedTuple):
     """A wave whose phase is quadratic in position, about (x, y) [pixel].
 
