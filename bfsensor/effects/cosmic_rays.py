@@ -42,6 +42,12 @@ TRACKS = 3000
 Measured: ``make_tracks(3000, 100.0, 10.0, rng)`` with twelve seeds gives means of the summed squared
 charges that scatter by 1.2 %."""
 
+TRACK_PIXELS = 3
+"""Touching struck pixels of a dark from which the measurement counts them as one track.
+
+Chosen: three pixels in tails of the noise touch by chance in one of 1e10 frames; with 6, tracks of
+steep muons count as struck pixels."""
+
 LEVELS = np.geomspace(30.0, 1e6, 40)
 """Levels of flats [e-] at which the excess is computed; between them it is interpolated.
 
@@ -53,8 +59,8 @@ class CosmicRays(Effect):
     """Muons leave ``rate`` tracks a minute on 256 x 256 pixels, also during 5 s of readout.
 
     Their flux goes with the square of the cosine of the zenith angle, the sensor being horizontal.
-    In darks, struck pixels are counted.  In flats, charge too weak to be excluded as an outlier adds
-    to the variance and, along the track, to covariances.
+    In darks, tracks are counted, and struck pixels that are in none.  In flats, charge too weak to be
+    excluded as an outlier adds to the variance and, along the track, to covariances.
 
     Parameters
     ----------
@@ -122,10 +128,19 @@ class CosmicRays(Effect):
         return np.asarray(c + added)
 
     def dark_map(self, axes: Axes, layout: Layout) -> FloatArray:
-        out = np.zeros(len(axes["time"]))
-        for rows, (mean, _), (always, _) in self._struck(axes, layout):
-            out[rows] = mean + always
+        out = self._tracks_seen(axes, layout)
+        for rows, mean, _ in self._struck(axes, layout):
+            out[rows] = mean
         return out
+
+    def _tracks_seen(self, axes: Axes, layout: Layout) -> FloatArray:
+        """Tracks in all darks of a campaign, beyond those in as many biases."""
+        found = _tracks(layout.thickness, layout.pixel, layout.shape)
+        # The total exposure time of all darks; biases hold those of the readout.
+        number = self["rate"] * np.asarray(axes["time"], float) / 60.0 / AREA
+        number *= sum(s.rows * s.columns for s in layout.segments)
+        seen = found.counted(OUTLIER * float(np.mean(layout.noise))).mean()
+        return np.where(axes["what"] == "tracks", number * seen, 0.0)
 
     def modes(self, word: str, axes: Axes, layout: Layout) -> FloatArray | None:
         if word == "flat_cov":
@@ -133,12 +148,10 @@ class CosmicRays(Effect):
         if word != "dark_map":
             return None
         rows = np.nonzero(axes["what"] == "struck")[0]
-        out = np.zeros((len(axes["what"]), len(rows) + len(layout.segments)))
-        for amp, (here, (_, spread), (_, common)) in enumerate(self._struck(axes, layout)):
+        out = np.zeros((len(axes["what"]), len(rows)))
+        for here, _, spread in self._struck(axes, layout):
             out[here, np.searchsorted(rows, here)] = spread
-            # Tracks in the biases lower the mean bias, which is subtracted from all darks.
-            out[here, len(rows) + amp] = common
-        return out
+        return np.column_stack([out, np.sqrt(self._tracks_seen(axes, layout))])
 
     def _few(self, amp: int, level: float, time: float, layout: Layout) -> float:
         """Relative scatter of the covariance that the tracks of one pair of flats add."""
@@ -156,14 +169,12 @@ class CosmicRays(Effect):
 
     def _struck(
         self, axes: Axes, layout: Layout
-    ) -> list[tuple[NDArray[np.int64], tuple[FloatArray, FloatArray], tuple[float, float]]]:
-        """Numbers of struck pixels in each amplifier.
+    ) -> list[tuple[NDArray[np.int64], FloatArray, FloatArray]]:
+        """Rows of the channel by amplifier, mean number of struck pixels of each dark, and its scatter.
 
-        Gives the rows of the channel; by dark the mean number and its scatter; and the mean number
-        and scatter of pixels where the mean bias is struck.
+        Pixels in tracks of three pixels and more are not among them.
         """
         found = _tracks(layout.thickness, layout.pixel, layout.shape)
-        biases = len(layout.biases)
         out = []
         for amp, (segment, noise) in enumerate(
             zip(layout.segments, layout.noise, strict=True)
@@ -171,16 +182,11 @@ class CosmicRays(Effect):
             rows = np.nonzero(
                 (axes["what"] == "struck") & (np.asarray(axes["amp"]).astype(int) == amp)
             )[0]
-            pixels = segment.rows * segment.columns
-            number = found.above(OUTLIER * noise)
-            tracks = self._each(np.asarray(axes["time"], float)[rows]) * pixels
-            often = number.mean(), float(np.sqrt((number**2).mean()))
-            before = found.above(OUTLIER * noise * biases)
-            in_biases = float(self._each(0.0)) * pixels * biases
-            out.append((
-                rows, (tracks * often[0], np.sqrt(tracks) * often[1]),
-                (in_biases * float(before.mean()), float(np.sqrt(in_biases * (before**2).mean()))),
-            ))  # fmt: skip
+            number = found.above(OUTLIER * noise, fewer=TRACK_PIXELS)
+            tracks = self._each(np.asarray(axes["time"], float)[rows])
+            tracks = tracks * segment.rows * segment.columns
+            rms = float(np.sqrt((number**2).mean()))
+            out.append((rows, tracks * number.mean(), np.sqrt(tracks) * rms))
         return out
 
 
@@ -199,10 +205,22 @@ class Tracks(NamedTuple):
     charge: FloatArray
     share: FloatArray
 
-    def above(self, limit: float) -> FloatArray:
-        """Mean number of pixels of each track with more charge than ``limit`` [e-]."""
-        weight = np.where(self.charge > limit, self.share, 0.0)
-        return np.asarray(np.bincount(self.owner, weight, self.number), float)
+    def above(self, limit: float, fewer: float = np.inf) -> FloatArray:
+        """Mean number of pixels of each track with more charge than ``limit`` [e-].
+
+        It is 0 for tracks with ``fewer`` such pixels or more.
+        """
+        over = self.charge > limit
+        many = np.bincount(self.owner[over], minlength=self.number) >= fewer
+        weight = np.where(over, self.share, 0.0)
+        return np.where(many, 0.0, np.bincount(self.owner, weight, self.number))
+
+    def counted(self, limit: float) -> FloatArray:
+        """Probability that each track has :data:`TRACK_PIXELS` with more charge than ``limit`` [e-]."""
+        over = (self.charge > limit) & (self.share > 0)
+        number = np.bincount(self.owner[over], minlength=self.number)
+        on_sensor = self.above(limit) / np.maximum(number, 1)
+        return np.where(number >= TRACK_PIXELS, on_sensor, 0.0)
 
 
 def make_tracks(

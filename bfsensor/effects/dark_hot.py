@@ -66,6 +66,14 @@ class _Dark(Effect):
             return charge
         return charge + rng.poisson(mean, charge.shape).astype(charge.dtype)
 
+    def flat_mean(self, axes: Axes, layout: Layout) -> FloatArray:
+        hot = self.hot(layout)
+        part = np.array([
+            hot[s.sensor_column(np.arange(s.columns))].mean() for s in layout.segments
+        ])  # fmt: skip
+        amp = np.asarray(axes["amp"]).astype(int)
+        return part[amp] * self._born(axes["time"], axes["temperature"])
+
     def dark_map(self, axes: Axes, layout: Layout) -> FloatArray:
         noise, more = layout.noise, mean_bias(layout)
         hot = self.hot(layout)
@@ -116,8 +124,8 @@ class _Dark(Effect):
 class DarkCurrent(_Dark):
     """Dark current of ``rate`` [e-/s at -100 C] in every pixel, doubling every 6 K.
 
-    Every fit already has a free dark current proportional to time: only the Poisson noise of this
-    one, in struck pixels of darks, constrains ``rate``.
+    Of recordings whose temperature is not known, every fit has a free dark current proportional to
+    time: only the Poisson noise of this one, in struck pixels of darks, then constrains ``rate``.
 
     Parameters
     ----------
@@ -132,7 +140,7 @@ class DarkCurrent(_Dark):
 
     variant = "dark"
     parameters = (Parameter("rate", "e-/s", 0.02, 1.0, amplitude=True),)
-    touches = ("dark_map",)
+    touches = ("dark_map", "flat_mean")
     of_pixels = True
 
     @classmethod
@@ -170,7 +178,7 @@ class HotColumns(_Dark):
         *(Parameter(f"x{n}", "pixel", 0, 1e4, law="whole", plain=0.0) for n in OTHERS),
         *(Parameter(f"part{n}", "", 0.02, 1.0, law="whole", plain=1.0) for n in OTHERS),
     )
-    touches = ("dark_map", "flat_map")
+    touches = ("dark_map", "flat_map", "flat_mean")
     by_time = True
 
     @classmethod
@@ -235,7 +243,7 @@ class Glow(Effect):
         Parameter("length", "pixel", 10.0, 1000.0),
         Parameter("corner", "", 0, 3, law="whole"),
     )
-    touches = ("dark_map", "flat_map")
+    touches = ("dark_map", "flat_map", "flat_mean")
     by_time = True
     of_pixels = True
     source = (
@@ -265,6 +273,14 @@ class Glow(Effect):
 
     def pattern(self, shot: Shot, layout: Layout) -> FloatArray | None:
         return self._light(layout) * shot.seconds / shot.level if shot.level > 0 else None
+
+    def flat_mean(self, axes: Axes, layout: Layout) -> FloatArray:
+        light = self._light(layout)
+        part = np.array([
+            light[s.y : s.y + s.rows, s.sensor_column(np.arange(s.columns))].mean()
+            for s in layout.segments
+        ])  # fmt: skip
+        return part[np.asarray(axes["amp"]).astype(int)] * np.asarray(axes["time"], float)
 
     def dark_map(self, axes: Axes, layout: Layout) -> FloatArray:
         noise, more = layout.noise, mean_bias(layout)

@@ -89,7 +89,7 @@ class Persistence(Effect):
         # Biases hold charge of earlier exposures too, and their mean is subtracted from darks.
         left = self._left_at(axes["exposure"], layout) - self._in_bias(layout)
         out = np.zeros(len(left))
-        for row in np.nonzero(axes["what"] != "column")[0]:
+        for row in np.nonzero(np.isin(axes["what"], ("level", "struck")))[0]:
             amp = int(axes["amp"][row])
             part, others = struck_pixels(left[row], left[row], noise[amp], more)
             segment = layout.segments[amp]

@@ -16,7 +16,7 @@ from bfsensor.diagnose.data.code_channels import HALO_ERROR
 from bfsensor.diagnose.data.cosmetics import Cosmetic
 from bfsensor.diagnose.data.exposure_info import ExposureInfo, condition_of
 from bfsensor.diagnose.data.flat_channels import LAMP_UNKNOWN
-from bfsensor.diagnose.data.spot_channels import WING_ERROR
+from bfsensor.diagnose.data.spot_channels import BACKGROUND_ERROR, STAMP, WING
 from bfsensor.typing import FloatArray
 
 CLEAR = 5.0
@@ -88,26 +88,35 @@ def assumed_errors(channels: Sequence[Channel]) -> list[str]:
 
     Examples
     --------
-    >>> x = {"what": np.array(["wings"])}
-    >>> wide = Channel("spot", np.zeros(1), (np.array([[8e-8]]),), x, "")
+    >>> x = {"what": np.array(["wings"]), "flux": np.array([3.2e5])}
+    >>> wide = Channel("spot", np.zeros(1), (np.array([[2e-8]]),), x, "")
     >>> assumed_errors([wide])[0][52:]
-    'wings of spots 0.0002 of the flux (effects there look 29 % weaker)'
+    'background beside spots 0.1 e- per pixel (effects on wings look 29 % weaker)'
     """
     kinds = (
-        ("spot", "wings", WING_ERROR, "wings of spots", "of the flux"),
-        ("amp_cross", "crosstalk", HALO_ERROR, "crosstalk", "of the signal"),
-        ("flat_mean", None, LAMP_UNKNOWN, "light without a monitor", "of it"),
-        ("bias_level", "frames", FRAME_ERROR, "levels of bias frames", "ADU"),
-        ("bias_level", "frames", JUMP, "levels of bias frames", "ADU"),
+        (
+            "spot",
+            "wings",
+            BACKGROUND_ERROR,
+            "background beside spots",
+            "e- per pixel",
+            "on wings",
+        ),
+        ("amp_cross", "crosstalk", HALO_ERROR, "crosstalk", "of the signal", "there"),
+        ("flat_mean", None, LAMP_UNKNOWN, "light without a monitor", "of it", "there"),
+        ("bias_level", "frames", FRAME_ERROR, "levels of bias frames", "ADU", "there"),
+        ("bias_level", "frames", JUMP, "levels of bias frames", "ADU", "there"),
     )
     told = []
-    for word, what, floor, name, unit in kinds:
+    for word, what, floor, name, unit, where in kinds:
         shares = []
         for c in (c for c in channels if c.word == word):
             rows = slice(None) if what is None else c.axes["what"] == what
             variance = np.square(c.errors[rows])
             if what == "frames":
                 variance = c.axes["white"][rows]
+            elif what == "wings":
+                variance = variance * (c.axes["flux"][rows] / (WING**2 - STAMP**2)) ** 2
             elif what is None:
                 variance = variance / np.square(c.values)
             shares += (floor**2 / variance).tolist()
@@ -115,7 +124,9 @@ def assumed_errors(channels: Sequence[Channel]) -> list[str]:
         # A floor above the whole error is not the one that was added.
         if 0.02 < share <= 1.0 + 1e-9:
             weaker = 1 - float(np.sqrt(max(1 - share, 0.0)))
-            told.append(f"{name} {floor:g} {unit} (effects there look {weaker:.0%} weaker)")
+            told.append(
+                f"{name} {floor:g} {unit} (effects {where} look {weaker:.0%} weaker)"
+            )
     text = "; ".join(told).replace("%", " %")
     return [f"assumed errors, which these recordings do not give: {text}"] if told else []
 

@@ -86,6 +86,7 @@ class BiasChannels:
         self._fold = fold
         self._last: list[tuple[NDArray[np.float32], float]] = []
         self._sum: dict[str, FloatArray] = {}
+        self._far: dict[str, list[tuple[NDArray[np.int64], FloatArray]]] = {}
         self._names: list[str] = []
         self.frames = 0
         self._spectra: list[list[FloatArray]] = []
@@ -108,7 +109,10 @@ class BiasChannels:
         for frame, zero in zip(frames, zeros, strict=True):
             if frame.name not in self._sum:
                 self._sum[frame.name] = np.zeros(frame.pixels.shape)
-            self._sum[frame.name] += frame.pixels.astype(np.float64) - zero
+            above = frame.pixels.astype(np.float64) - zero
+            self._sum[frame.name] += above
+            far = np.flatnonzero(_struck(above, TRACK))
+            self._far.setdefault(frame.name, []).append((far, above.flat[far]))
         self.frames += 1
         here = [(f.pixels, zero) for f, zero in zip(frames, zeros, strict=True)]
         if not self._last:
@@ -171,13 +175,28 @@ class BiasChannels:
         return zeros
 
     def mean(self, name: str) -> FloatArray | None:
-        """Mean bias of an amplifier's whole frame less its overscan level [ADU]; None without."""
+        """Mean bias of an amplifier's whole frame less its overscan level [ADU]; None without.
+
+        Pixels that are struck in up to half of the frames are left out there.
+        """
         total = self._sum.get(name)
-        return None if total is None else total / self.frames
+        if total is None:
+            return None
+        out = total / self.frames
+        pixels, values = (
+            np.concatenate(part) for part in zip(*self._far[name], strict=True)
+        )
+        often = np.bincount(pixels, minlength=out.size)
+        struck = np.flatnonzero((often > 0) & (2 * often <= self.frames))
+        excess = np.bincount(pixels, values, out.size)
+        left = total.flat[struck] - excess[struck]
+        out.flat[struck] = left / (self.frames - often[struck])
+        return out
 
     def forget_mean(self) -> None:
         """Release the sums that :meth:`mean` divides, which are as large as the sensor."""
         self._sum.clear()
+        self._far.clear()
 
     @property
     def read_noise(self) -> dict[str, float]:

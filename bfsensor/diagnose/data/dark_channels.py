@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from bfsensor.device.condition import Condition
@@ -27,6 +28,40 @@ scatter is taken for their error.  Chosen, to be derived: the scatter by median 
 columns is known to 1.17 / n^(1/2), so that 1.25 is 2.4 sigma for 128 columns (reached by noise
 in 0.8 % of amplifiers) and 4.8 for 512; with 1.5, columns uneven by as much as noise would be
 findings."""
+
+USUAL = 0.02
+"""Standard deviation of the dark current of a usual sensor about 0 at -100 C [e-/s].
+
+Chosen: a tenth of what LSST allows its sensors (0.2 e-/s), three times the 25 e-/h of DECam
+(Flaugher et al. 2015, AJ 150, 150); twice as large, a dark current of 0.12 instead of 0.065 e-/s
+is 3 sigma in darks of 60 s, with :data:`OFFSET`."""
+
+DOUBLING = 6.0
+"""Rise of the temperature for which the usual dark current doubles [K].
+
+Chosen: exact at 235 K (see :mod:`bfsensor.effects.dark_hot`); with 12 K a sensor at -20 C is usual with
+2 instead of 200 e-/s."""
+
+COLD = 173.15
+"""Temperature [K] at which :data:`USUAL` holds.  Derived: -100 C, exactly."""
+
+OFFSET = 0.5
+"""Standard deviation of a dark's level at zero time above that of biases, both over their overscan
+[e-].  Chosen: the charge of a dark current of 0.02 e-/s during the readout and the clearing of
+25 s; twice as large, a dark current of 0.08 instead of 0.065 e-/s is 3 sigma in darks of 60 s."""
+
+LEAST_PIXELS = 3
+"""Touching struck pixels from which they are a track.
+
+Defined by ``TRACK_PIXELS`` of :mod:`bfsensor.effects.cosmic_rays`, which must be equal."""
+
+USUAL_TRACKS = 0.15
+"""Tracks a minute on 256 x 256 pixels of a usual sensor, mean and standard deviation [1/min].
+
+Published for pixels of 10 um: one muon a minute and cm^2 at sea level (Particle Data Group 2022), and
+as many electrons of Compton scattering (Groom 2002, Exp. Astron. 14, 45); pixels of 15 um have 2.3
+times as many.  Twice as large, twice the tracks are needed in long series of darks for any to be
+found."""
 
 HOT = 10.0
 """Excess of a column of an image of spots, beyond one sigma of the noise of a pixel, above which it
@@ -50,6 +85,8 @@ class DarkChannels:
     tails : sequence of sequence of int
         Pixels of each bias and amplifier in the tails of the noise, from :func:`count_tails`; as
         many are expected in a dark, without any particle.
+    groups : sequence of int
+        Groups of such pixels in each bias, from :func:`count_groups`.
     """
 
     def __init__(
@@ -60,13 +97,15 @@ class DarkChannels:
         *,
         biases: int = 0,
         tails: Sequence[Sequence[int]] = (),
+        groups: Sequence[int] = (),
     ) -> None:
         self._bias, self._noise, self._fold = bias, read_noise, fold
         self._biases = biases
         self._tails = np.array(tails, float)
-        self._rows: list[
-            tuple[ExposureInfo, float, list[tuple[float, float, int, int, int]]]
-        ] = []
+        self._groups = np.array(groups, float)
+        self._struck: list[list[tuple[NDArray[np.int64], NDArray[np.int64]]]] = []
+        self._shapes: list[tuple[int, ...]] = []
+        self._rows: list[tuple[ExposureInfo, float, list[tuple[float, float, int]]]] = []
         self._columns: list[_Columns] = []
         self._names: list[str] = []
         self._condition = Condition()
@@ -79,7 +118,9 @@ class DarkChannels:
         self._condition = condition_of(exposure)
         found = []
         lines = _Columns(exposure.exposure_time or 0.0, [], [], [])
+        struck_of = []
         self._names = [f.name for f in frames]
+        self._shapes = [f.image.shape for f in frames]
         for frame in frames:
             over = zero_pixels(frame)
             self._unzeroed |= not over.size
@@ -98,53 +139,70 @@ class DarkChannels:
             # Particles stand out of their own column, whose level may be any.  A hot column, whose
             # shot noise is larger than others', keeps its values.
             hot = struck.mean(0) > 0.5
-            out = (np.abs(image - np.median(image, axis=0)) > OUTLIER * sigma) & ~hot
-            groups = np.bincount(label(out, np.ones((3, 3)))[0].ravel())[1:]
-            squares = int((groups**2).sum())
-            found.append(
-                (float(good.mean()), float(error), int(out.sum()), squares, image.size)
-            )
+            above = image - np.median(image, axis=0)
+            out = (np.abs(above) > OUTLIER * sigma) & ~hot
+            struck_of.append((np.flatnonzero(out), np.flatnonzero(out & (above > 0))))
+            found.append((float(good.mean()), float(error), image.size))
             kept = np.where(out, np.nan, image)
             lines.means.append(np.nanmean(kept, 0))
             lines.own.append(np.nanvar(kept, 0) / image.shape[0])
             lines.noise.append(float(good.var()) / image.shape[0])
         self._rows.append((exposure, after, found))
+        self._struck.append(struck_of)
         self._columns.append(lines)
 
-    def channels(self) -> list[Channel]:
-        """Channel 'dark_map': levels and struck pixels by dark, columns of the longest darks."""
+    def channels(self, gains: Sequence[float] = ()) -> list[Channel]:
+        """Channel 'dark_map': levels and struck pixels by dark, columns of the longest darks.
+
+        Parameters
+        ----------
+        gains : sequence of float
+            Rough gains [e-/ADU]; without them, as without a temperature, the dark current of the
+            sensor may be any, and floats in fits.
+        """
         if not self._rows:
             return []
         values, blocks, axes = [], [], Axes()
         expected, scatter = self._usual_tails()
         drift = self._drift() if self._unzeroed else 0.0
-        for exposure, after, found in self._rows:
-            level, variance, struck, squares, _ = (
-                np.array(c, float) for c in zip(*found, strict=True)
-            )
-            amps = np.arange(len(level))
-            common = {"amp": amps, "time": exposure.exposure_time or 0.0,
+        tracks = 0
+        for (exposure, after, found), out in zip(self._rows, self._apart(), strict=True):
+            level, variance, _ = (np.array(c, float) for c in zip(*found, strict=True))
+            struck, squares, own = np.transpose(out)
+            tracks += int(own.sum())
+            common = {"amp": np.arange(len(level)), "time": exposure.exposure_time or 0.0,
                       "exposure": exposure.number, "after": after}  # fmt: skip
             values.append(level)
             blocks.append(np.diag(variance) + drift)
             axes.add(len(level), self._condition, what="level", x=-1, **common)
-            # Tracks are Poisson, not their pixels: each counts with the square of its size.  One is
+            # Groups are Poisson, not their pixels: each counts with the square of its size.  One is
             # added to the variance, as zero may be counted where a few are expected.
             values.append(struck - expected)
             blocks.append(np.diag(np.maximum(squares - expected, 0.0) + 1.0 + scatter))
-            axes.add(len(level), self._condition, what="struck", x=-1, **common)
+            axes.add(len(struck), self._condition, what="struck", x=-1, **common)
+        for what, error in self._usual(gains).items():
+            values.append(np.zeros(len(error)))
+            blocks.append(np.diag(error**2))
+            axes.add(len(error), self._condition, what=what, x=-1, amp=np.arange(len(error)), time=0.0,
+                     exposure=-1, after=0.0)  # fmt: skip
+        seconds = sum(row[0].exposure_time or 0.0 for row in self._rows)
+        value, square = self._tracks(tracks, seconds)
+        values.append(np.array([value]))
+        blocks.append(np.array([[square]]))
+        axes.add(1, self._condition, what="tracks", x=-1, amp=-1, time=seconds, exposure=-1,
+                 after=0.0)  # fmt: skip
         longest = max(c.seconds for c in self._columns)
         chosen = [c for c in self._columns if c.seconds == longest]
         for amp in range(len(self._names)):
             mean = np.mean([c.means[amp] for c in chosen], axis=0)
             noise = float(np.mean([c.noise[amp] for c in chosen]))
             own = np.mean([c.own[amp] for c in chosen], axis=0)
-            usual = self._column_error(mean, amp, noise, len(chosen)) ** 2
+            plain = self._column_error(mean, amp, noise, len(chosen)) ** 2
             # Dark current of a hot column has shot noise of its own.
             sure = STANDS_OUT * np.sqrt(2.0 / self._rows_of(amp, mean) / len(chosen))
             more = np.where(own > noise * (1 + sure), own - noise, 0.0) / len(chosen)
             values.append(mean - np.median(mean))
-            blocks.extend((usual + more)[:, None, None])
+            blocks.extend((plain + more)[:, None, None])
             axes.add(len(mean), self._condition, what="column", x=np.arange(len(mean)), amp=amp,
                      time=longest, exposure=-1, after=0.0)  # fmt: skip
         return [Channel("dark_map", np.concatenate(values), tuple(blocks), axes.columns(), "adu",
@@ -161,6 +219,58 @@ class DarkChannels:
             "as drift of the bias, so that dark current which is the same in all pixels is not seen; "
             "take darks of two exposure times"
         ]
+
+    def _apart(self) -> Iterator[list[tuple[int, int, int]]]:
+        """Count of each dark and amplifier what :func:`_count` counts.
+
+        Pixels that are struck in another dark are warm or in a glow, and in no track.
+        """
+        again = []
+        for one in zip(*self._struck, strict=True):
+            pixels, often = np.unique(
+                np.concatenate([struck for struck, _ in one]), return_counts=True
+            )
+            again.append(pixels[often > 1])
+        for dark in self._struck:
+            counts = []
+            for (struck, bright), warm, shape in zip(
+                dark, again, self._shapes, strict=True
+            ):
+                mask, once = np.zeros(shape, bool), np.zeros(shape, bool)
+                mask.flat[struck] = True
+                once.flat[np.setdiff1d(bright, warm)] = True
+                counts.append(_count(mask, once))
+            yield counts
+
+    def _tracks(self, found: int, seconds: float) -> tuple[float, float]:
+        """Tracks in all darks less those expected without particles, and the variance of that number.
+
+        The sensor's surroundings may make as many as usual, or none.
+        """
+        darks = len(self._rows)
+        pixels = sum(size for *_, size in self._rows[0][2])
+        usual = USUAL_TRACKS * seconds / 60.0 * pixels / 256**2
+        without = noise = 0.0
+        if n := len(self._groups):
+            without = darks * float(self._groups.mean())
+            scatter = self._groups.var(ddof=1) if n > 1 else 0.0
+            noise = max(without, darks * scatter) * (1 + darks / n)
+        # One is added, as zero may be counted where a few are expected.
+        return found - without, 1.0 + usual + usual**2 + noise
+
+    def _usual(self, gains: Sequence[float]) -> dict[str, FloatArray]:
+        """Errors within which a usual sensor's dark current and its offset are 0, by amplifier [ADU].
+
+        Empty where they may be any.
+        """
+        temperature = self._condition.temperature
+        if not len(gains) or temperature is None:
+            return {}
+        unit = 1 / np.asarray(gains, float)
+        return {
+            "usual": USUAL * 2 ** ((temperature - COLD) / DOUBLING) * unit,
+            "usual offset": OFFSET * unit,
+        }
 
     def _drift(self) -> FloatArray:
         """Covariance of the zeros of a dark without overscan, by amplifier [ADU^2].
@@ -216,7 +326,20 @@ class DarkChannels:
 
     def _rows_of(self, amp: int, mean: FloatArray) -> float:
         """Number of pixels of a column."""
-        return self._rows[0][2][amp][4] / len(mean)
+        return self._rows[0][2][amp][2] / len(mean)
+
+
+def _count(struck: NDArray[np.bool_], once: NDArray[np.bool_]) -> tuple[int, int, int]:
+    """Struck pixels that are in no track, sum of the squares of their groups' sizes, and tracks.
+
+    Tracks are groups of pixels that are struck ``once``, in this dark alone, and are bright.
+    """
+    groups, _ = label(once, np.ones((3, 3)))
+    sizes = np.bincount(groups.ravel())
+    sizes[0] = 0
+    left = struck & (sizes < LEAST_PIXELS)[groups]
+    others = np.bincount(label(left, np.ones((3, 3)))[0].ravel())[1:]
+    return int(left.sum()), int((others**2).sum()), int((sizes >= LEAST_PIXELS).sum())
 
 
 def count_tails(
@@ -240,17 +363,42 @@ def count_tails(
     -------
     counts : list of int
     """
-    out = []
+    away = _away(frames, bias, read_noise, biases)
+    return [int(((a > OUTLIER) & (a < TRACK)).sum()) for a in map(np.abs, away)]
+
+
+def count_groups(
+    frames: Sequence[Frame],
+    bias: dict[str, FloatArray],
+    read_noise: dict[str, float],
+    biases: int,
+) -> int:
+    """Count groups of bright pixels of a bias, in all amplifiers, that would be tracks in a dark.
+
+    Tracks in the other biases raise the mean bias, so that their pixels are dark in this one.
+    Parameters and noise are those of :func:`count_tails`.
+    """
+    return sum(
+        _count(bright := a > OUTLIER, bright)[2]
+        for a in _away(frames, bias, read_noise, biases)
+    )
+
+
+def _away(
+    frames: Sequence[Frame],
+    bias: dict[str, FloatArray],
+    read_noise: dict[str, float],
+    biases: int,
+) -> Iterator[FloatArray]:
+    """Departures of each amplifier's pixels from the mean bias, over the noise; 0 where unknown."""
     for frame in frames:
         sigma, mean = read_noise.get(frame.name, 0.0), bias.get(frame.name)
         if mean is None or not sigma > 0 or biases < 2:
-            out.append(0)
+            yield np.zeros(frame.image.shape)
             continue
-        away = np.abs(frame.image - overscan_level(frame) - mean)
+        away = frame.image - overscan_level(frame) - mean
         # A frame is part of its mean bias; a dark is not.
-        scale = sigma * np.sqrt((1 - 1 / biases) / (1 + 1 / biases))
-        out.append(int(((away > OUTLIER * scale) & (away < TRACK * scale)).sum()))
-    return out
+        yield away / (sigma * np.sqrt((1 - 1 / biases) / (1 + 1 / biases)))
 
 
 class _Columns(NamedTuple):

@@ -26,6 +26,7 @@ from bfsensor.diagnose.data.cosmetics import (
 )
 from bfsensor.diagnose.data.dark_channels import (
     DarkChannels,
+    count_groups,
     count_tails,
     without_hot_columns,
 )
@@ -241,11 +242,13 @@ def measure_channels(
     for each in (biases, late_biases):
         each.forget_mean()
     noise = biases.read_noise
-    tails = []
+    tails, pulses = [], []
     for exposure in quiet:
         if exposure.number in in_mean:
             bias_frames = source.read(exposure)
-            tails.append(count_tails(bias_frames, bias_images, noise, biases.frames))
+            known_noise = bias_images, noise, biases.frames
+            tails.append(count_tails(bias_frames, *known_noise))
+            pulses.append(count_groups(bias_frames, *known_noise))
             biases.add_third(bias_frames, bias_images)
     steps = find_steps(kinds.get("flat", []))
     cosmetics += tuple(bench_nuisances(
@@ -303,8 +306,11 @@ def measure_channels(
         if channel.word == "flat_cov":
             _rough_gains(channel, gains)
     rough = tuple(float(np.median(g)) if g else 1.0 for g in gains)
+    known = rough if all(gains) else ()
     darks, late_darks = (
-        DarkChannels(bias_images, noise, fold, biases=biases.frames, tails=tails)
+        DarkChannels(
+            bias_images, noise, fold, biases=biases.frames, tails=tails, groups=pulses
+        )
         for fold in ("fit", "held-out")
     )
     before: dict[int, float] = {}
@@ -350,9 +356,9 @@ def measure_channels(
             notes.append(f"spots {exposure.number}: {reason}")
     channels = [
         *flats.channels(), *found_maps, *codes.channels(), *biases.channels(),
-        *darks.channels(), *spots.channels(), *crosstalk.channels(),
+        *darks.channels(known), *spots.channels(), *crosstalk.channels(),
         *late_found_maps, *late_codes.channels(), *late_biases.channels(),
-        *late_darks.channels(), *late_crosstalk.channels(),
+        *late_darks.channels(known), *late_crosstalk.channels(),
     ]  # fmt: skip
     if not channels:
         raise MeasurementError(

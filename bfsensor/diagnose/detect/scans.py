@@ -341,10 +341,12 @@ def _levels(g: Group) -> Iterator[Pattern]:
 
 
 def _darks(g: Group) -> Iterator[Pattern]:
-    """Patterns of darks: current after light, struck pixels, single columns."""
+    """Patterns of darks: current, current after light, struck pixels, single columns."""
     x = g.axes
     after = x["after"].astype(float)
     for name, here in _amplifiers(x):
+        if name == -1:
+            continue  # tracks are counted in all amplifiers together
         level, struck = (here & (x["what"] == w) for w in ("level", "struck"))
         if after.max() > 0:
             yield (
@@ -352,7 +354,14 @@ def _darks(g: Group) -> Iterator[Pattern]:
                 np.where(level, after / after.max(), 0.0),
                 {"amp": name, "what": "after light"},
             )
+        if (x["what"] == "usual").any():
+            yield (
+                "dark current",
+                np.where(level, x["time"], 0.0),
+                {"amp": name, "what": "level"},
+            )
         yield "struck pixels", np.where(struck, 1.0, 0.0), {"amp": name, "what": "struck"}
+    yield "tracks", np.where(x["what"] == "tracks", 1.0, 0.0), {"what": "tracks"}
     # Columns belong to one amplifier, also where there is no other.
     for amp in np.unique(x["amp"]):
         column = (x["amp"] == amp) & (x["what"] == "column")

@@ -212,7 +212,7 @@ class EffectChain:
             out += self.signal(level, axes) - level
             if self.law.loses:
                 out += level - self.law.light(level)
-        out = out / _unit(channel, own, gains)
+        out = np.where(_usual(channel), 0.0, out / _unit(channel, own, gains))
         if channel.word == "bias_level":
             # Values are variances relative to white noise; those of frames are their logarithms.
             what, ratio = axes["what"], out / own / axes["white"]
@@ -313,7 +313,8 @@ class EffectChain:
             e.modes(channel.word, axes, self.layout)
             for e in self.effects if channel.word in e.touches
         ]  # fmt: skip
-        parts = [m / _unit(channel, own, gains)[:, None] for m in found if m is not None]
+        unit = np.where(_usual(channel), np.inf, _unit(channel, own, gains))[:, None]
+        parts = [m / unit for m in found if m is not None]
         return np.concatenate([np.zeros((len(channel), 0)), *parts], axis=1)
 
 
@@ -325,6 +326,13 @@ def pad_areas(a: FloatArray, reach: int) -> FloatArray:
     return np.pad(a, [(0, 0)] * (a.ndim - 2) + [(more, more)] * 2)
 
 
+def _usual(channel: Channel) -> NDArray[np.bool_]:
+    """Values that hold the baseline's dark current to that of usual sensors: no effect changes them."""
+    if channel.word != "dark_map":
+        return np.zeros(len(channel), bool)
+    return np.isin(channel.axes["what"], ("usual", "usual offset"))
+
+
 def _unit(channel: Channel, own: FloatArray, gains: FloatArray) -> FloatArray:
     """Electrons (or their square) per unit of each value."""
     if channel.unit == "adu2" and "other" in channel.axes:
@@ -333,5 +341,6 @@ def _unit(channel: Channel, own: FloatArray, gains: FloatArray) -> FloatArray:
         return np.asarray(own**2)
     if channel.unit != "adu":
         return np.ones(len(channel))
-    counted = channel.axes["what"] == "struck" if "what" in channel.axes else False
+    what = channel.axes.get("what")
+    counted = np.isin(what, ("struck", "tracks")) if what is not None else False
     return np.where(counted, 1.0, own)

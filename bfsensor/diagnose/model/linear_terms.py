@@ -135,14 +135,17 @@ def _level_columns(channel: Channel) -> dict[str, FloatArray]:
 
 
 def _dark_columns(channel: Channel) -> dict[str, FloatArray]:
+    """Dark current and its offset, which values of usual sensors hold near 0; level of columns."""
     x = channel.axes
-    out = {}
-    level, column = x["what"] == "level", x["what"] == "column"
-    for amp in np.unique(x["amp"]):
+    out, what = {}, x["what"]
+    for amp in np.unique(x["amp"][what == "level"]):
         here = x["amp"] == amp
-        out[f"dark {int(amp)}"] = np.where(here & level, x["time"], 0.0)
-        out[f"dark level {int(amp)}"] = np.where(here & level, 1.0, 0.0)
-        out[f"dark column {int(amp)}"] = np.where(here & column, 1.0, 0.0)
+        for name, each, usual in (
+            ("dark", x["time"], "usual"), ("dark level", 1.0, "usual offset")
+        ):  # fmt: skip
+            column = np.where(what == "level", each, np.where(what == usual, 1.0, 0.0))
+            out[f"{name} {int(amp)}"] = np.where(here, column, 0.0)
+        out[f"dark column {int(amp)}"] = np.where(here & (what == "column"), 1.0, 0.0)
     return out
 
 

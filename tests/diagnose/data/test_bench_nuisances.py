@@ -203,3 +203,17 @@ def test_two_lamps_of_one_level_are_no_flicker():
     found = bench_nuisances(BiasChannels(), {}, [], flats, steps, (ROWS, COLUMNS))
     assert [c.kind for c in found] == ["lamp_flicker"]
     assert found[0].size == pytest.approx(2e-4 * np.sqrt(2 / 3), rel=1e-3)
+
+
+def test_tracks_in_single_biases_are_not_in_their_mean_but_fixed_structure_is():
+    """A track of 5000 ADU in one of 12 frames would be a dent of 400 ADU in every other exposure."""
+    rng = np.random.default_rng(8131)
+    channels = BiasChannels()
+    for n in range(12):
+        pixels = 1000 + 3.0 * rng.standard_normal((ROWS, COLUMNS + OVERSCAN))
+        pixels[:, 7] += 400.0
+        pixels[10 + 4 * (n % 3), 20:30] += 5000.0 * (n < 3)
+        channels.add(Info(n), [Bias(pixels.astype(np.float32), "amp")])
+    mean = channels.mean("amp")
+    assert np.abs(np.delete(mean, 7, axis=1)).max() < 6 * 3.0 / 9**0.5
+    np.testing.assert_allclose(mean[:, 7].mean(), 400.0, atol=1.0)

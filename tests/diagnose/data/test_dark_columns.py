@@ -7,8 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.data.dark_channels import DarkChannels
+from bfsensor.diagnose.data.dark_channels import DarkChannels, count_groups
 from bfsensor.diagnose.detect.scans import _darks
+from bfsensor.diagnose.model.linear_terms import linear_columns
 
 ROWS, COLUMNS, NOISE, BIASES, DARKS = 64, 128, 3.0, 10, 4
 
@@ -89,7 +90,12 @@ def test_every_column_is_looked_at_also_with_one_amplifier(amplifiers):
     np.testing.assert_array_equal([p[1] for p in found], np.eye(3 * amplifiers))
 
 
-def darks_of(images: np.ndarray, times: list[float], over: bool = True) -> DarkChannels:
+def darks_of(
+    images: np.ndarray,
+    times: list[float],
+    over: bool = True,
+    temperature: float | None = None,
+) -> DarkChannels:
     """Darks of two amplifiers, shape (darks, 2, rows, columns)."""
     rng = np.random.default_rng(12)
     names = "one", "two"
@@ -101,7 +107,7 @@ def darks_of(images: np.ndarray, times: list[float], over: bool = True) -> DarkC
         darks.add(
             SimpleNamespace(
                 number=number, exposure_time=seconds, wavelength=None, back_bias=None,
-                temperature=None,
+                temperature=temperature,
             ),
             [
                 SimpleNamespace(
@@ -118,10 +124,13 @@ def test_one_track_of_many_pixels_is_one_event() -> None:
     for k in range(60):
         images[1, 0, k, 20 + k : 22 + k] += 400.0
     channel = darks_of(images, [60.0] * 4).channels()[0]
-    struck = channel.axes["what"] == "struck"
-    assert channel.values[struck].max() >= 120
+    what = channel.axes["what"]
+    assert channel.values[what == "tracks"] == [1.0]
     # Counted pixel by pixel it is 11 standard deviations.
-    assert np.abs(channel.whiten(channel.values)[struck]).max() < 1.1
+    assert (
+        np.abs(channel.whiten(channel.values)[np.isin(what, ("struck", "tracks"))]).max()
+        < 1.1
+    )
 
 
 def test_without_an_overscan_the_zero_of_a_dark_is_not_known() -> None:
@@ -146,3 +155,58 @@ def test_a_dark_current_that_cannot_be_seen_is_said(times, over, said) -> None:
     notes = darks_of(images, times, over).notes
     assert len(notes) == said
     assert all("two exposure times" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("kelvin", "gains", "sigma"),
+    [(173.15, (2.0, 2.0), 1.3), (253.15, (2.0, 2.0), 12000.0), (None, (2.0, 2.0), None),
+     (173.15, (), None)],
+)  # fmt: skip
+def test_levels_of_darks_are_held_against_the_dark_current_of_usual_sensors(
+    kelvin: float | None, gains: tuple[float, ...], sigma: float | None
+) -> None:
+    images = NOISE * np.random.default_rng(3).standard_normal((4, 2, ROWS, COLUMNS)) + 10.0
+    channel = darks_of(images, [60.0] * 4, temperature=kelvin).channels(gains)[0]
+    what = channel.axes["what"]
+    if sigma is None:
+        assert not np.char.startswith(what.astype(str), "usual").any()
+        return
+    # 20 e- in 60 s are 0.33 e-/s; both amplifiers have a dark current of their own.
+    columns = linear_columns(channel, {}, None)
+    known = np.isin(what, ("level", "usual", "usual offset"))
+    design = channel.whiten(np.column_stack(list(columns.values())))[known]
+    data = channel.whiten(channel.values)[known]
+    left = data - design @ np.linalg.lstsq(design, data, rcond=None)[0]
+    assert left @ left == pytest.approx(2 * (20 / sigma) ** 2, rel=0.1, abs=8.0)
+
+
+def test_a_track_is_counted_once_and_warm_pixels_are_none() -> None:
+    images = NOISE * np.random.default_rng(3).standard_normal((4, 2, ROWS, COLUMNS))
+    images[:, 1, 5, 10:14] += 300.0
+    for n in range(3):
+        images[n, n % 2, 20 + n, 30:39] += 300.0
+    channel = darks_of(images, [60.0] * 4).channels()[0]
+    what = channel.axes["what"]
+    assert channel.values[what == "tracks"] == [3.0]
+    usual = 0.15 * 4 * 2 * ROWS * COLUMNS / 256**2
+    assert channel.errors[what == "tracks"] == pytest.approx(np.sqrt(1 + usual + usual**2))
+    struck = (what == "struck") & (channel.axes["amp"] == 1)
+    np.testing.assert_array_equal(channel.values[struck], [4.0] * 4)
+
+
+def test_tracks_in_other_biases_are_not_groups_of_a_bias() -> None:
+    """A track of one bias is a tenth as dark a group in the nine others, by the mean bias."""
+    rng = np.random.default_rng(8)
+    images = NOISE * rng.standard_normal((BIASES, ROWS, COLUMNS))
+    images[0, 5, 10:20] += 500.0
+    zero = np.zeros((ROWS, 24))
+    counts = [
+        count_groups(
+            [SimpleNamespace(
+                name="one", image=image, serial_overscan=zero, parallel_overscan=zero[:0]
+            )],
+            {"one": images.mean(0)}, {"one": NOISE}, BIASES,
+        )
+        for image in images
+    ]  # fmt: skip
+    assert counts == [1] + [0] * 9

@@ -1,0 +1,67 @@
+"""Dark current in flats, and tracks in darks, as predicted and as counted in simulated exposures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import label
+
+from bfsensor.diagnose.data.dark_channels import LEAST_PIXELS
+from bfsensor.diagnose.data.dark_channels import OUTLIER as MEASURED
+from bfsensor.effects import make_effect
+from bfsensor.effects.cosmic_rays import OUTLIER, TRACK_PIXELS
+from bfsensor.effects.effect import Layout, Segment, Shot
+
+ROWS, COLUMNS, NOISE, DARKS = 128, 96, 5.0, 40
+SEGMENTS = tuple(
+    Segment(x, 0, COLUMNS, ROWS, serial_overscan=8)
+    for x in (0, COLUMNS)
+)  # fmt: skip
+LAYOUT = Layout(
+    (ROWS, 2 * COLUMNS), SEGMENTS, shots=(), gains=(1.0, 1.0), read_noise=(NOISE, NOISE),
+    thickness=100.0, pixel=10.0,
+)  # fmt: skip
+
+
+def axes(**given: object) -> dict[str, np.ndarray]:
+    return {name: np.asarray(value) for name, value in given.items()}
+
+
+def test_the_measurement_counts_what_the_effect_predicts() -> None:
+    assert (LEAST_PIXELS, MEASURED) == (TRACK_PIXELS, OUTLIER)
+
+
+def test_tracks_of_darks() -> None:
+    effect = make_effect("cosmic_rays", {"rate": 30.0})
+    rng, found = np.random.default_rng(5), 0
+    for number in range(DARKS):
+        dark = effect.store(
+            np.zeros(LAYOUT.shape), Shot("dark", number, 60.0), LAYOUT, rng, {}
+        )
+        groups = label(dark > OUTLIER * NOISE, np.ones((3, 3)))[0]
+        found += int((np.bincount(groups.ravel())[1:] >= TRACK_PIXELS).sum())
+    x = axes(what=["tracks"], amp=[-1], time=[60.0 * DARKS], x=[-1], exposure=[-1])
+    said = effect.dark_map(x, LAYOUT)[0]
+    # Darks here also hold the tracks of the readout, 5 s of 65.
+    assert found * 60 / 65 == pytest.approx(said, abs=4 * said**0.5)
+    assert said > 200
+    np.testing.assert_allclose(effect.modes("dark_map", x, LAYOUT)[:, -1], said**0.5)
+
+
+@pytest.mark.parametrize(
+    ("variant", "values"),
+    [("dark", {"rate": 0.5}), ("hot", {"rate": 40.0, "columns": 1, "x1": COLUMNS + 3}),
+     ("glow", {"rate": 2.0, "length": 40.0, "corner": 1})],
+)  # fmt: skip
+def test_dark_current_is_in_means_of_flats(variant: str, values: dict[str, float]) -> None:
+    effect = make_effect("dark_hot", values, variant)
+    flat = effect.store(
+        np.zeros(LAYOUT.shape), Shot("flat", 0, 200.0), LAYOUT, np.random.default_rng(6), {}
+    )
+    means = [flat[:, s.x : s.x + COLUMNS].mean() for s in SEGMENTS]
+    x = axes(
+        amp=[0, 1], time=[200.0, 200.0], temperature=[173.15, 173.15], level=[1e4, 1e4]
+    )
+    said = effect.flat_mean(x, LAYOUT)
+    np.testing.assert_allclose(means, said, rtol=0.03, atol=0.02)
+    assert said[1] > 50
