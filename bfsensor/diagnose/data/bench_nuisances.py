@@ -89,9 +89,9 @@ def assumed_errors(channels: Sequence[Channel]) -> list[str]:
     Examples
     --------
     >>> x = {"what": np.array(["wings"]), "flux": np.array([3.2e5])}
-    >>> wide = Channel("spot", np.zeros(1), (np.array([[2e-8]]),), x, "")
+    >>> wide = Channel("spot", np.zeros(1), (np.array([[5e-9]]),), x, "")
     >>> assumed_errors([wide])[0][52:]
-    'background beside spots 0.1 e- per pixel (effects on wings look 29 % weaker)'
+    'background beside spots 0.05 e- per pixel (effects on wings look 29 % weaker)'
     """
     kinds = (
         (

@@ -462,7 +462,7 @@ def _measure(
     stamps = wide[..., margin:-margin, margin:-margin]
     fit = fit_widths(stamps, sigma, centres)
     moments = stamp_moments(
-        stamps.reshape(count * n, STAMP, STAMP), wide.reshape(count * n, WING, WING),
+        wide.reshape(count * n, WING, WING),
         fit.centre_x.ravel(), fit.centre_y.ravel(),
     )  # fmt: skip
     means = [moments[name].reshape(count, n).mean(1) for name in MEASURED[2:]]
