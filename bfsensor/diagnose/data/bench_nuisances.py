@@ -16,7 +16,7 @@ from bfsensor.diagnose.data.code_channels import HALO_ERROR
 from bfsensor.diagnose.data.cosmetics import Cosmetic
 from bfsensor.diagnose.data.exposure_info import ExposureInfo, condition_of
 from bfsensor.diagnose.data.flat_channels import LAMP_UNKNOWN
-from bfsensor.diagnose.data.spot_channels import BACKGROUND_ERROR, STAMP, WING
+from bfsensor.diagnose.data.spot_channels import BACKGROUND_ERROR, STAMP, TAIL_ERROR, WING
 from bfsensor.typing import FloatArray
 
 CLEAR = 5.0
@@ -94,19 +94,13 @@ def assumed_errors(channels: Sequence[Channel]) -> list[str]:
     'background beside spots 0.05 e- per pixel (effects on wings look 29 % weaker)'
     """
     kinds = (
-        (
-            "spot",
-            "wings",
-            BACKGROUND_ERROR,
-            "background beside spots",
-            "e- per pixel",
-            "on wings",
-        ),
+        ("spot", "wings", BACKGROUND_ERROR, "background beside spots", "e- per pixel", "on wings"),
+        ("spot", "wings", TAIL_ERROR, "tails of spots", "of themselves", "on wings"),
         ("amp_cross", "crosstalk", HALO_ERROR, "crosstalk", "of the signal", "there"),
         ("flat_mean", None, LAMP_UNKNOWN, "light without a monitor", "of it", "there"),
         ("bias_level", "frames", FRAME_ERROR, "levels of bias frames", "ADU", "there"),
         ("bias_level", "frames", JUMP, "levels of bias frames", "ADU", "there"),
-    )
+    )  # fmt: skip
     told = []
     for word, what, floor, name, unit, where in kinds:
         shares = []
@@ -115,20 +109,32 @@ def assumed_errors(channels: Sequence[Channel]) -> list[str]:
             variance = np.square(c.errors[rows])
             if what == "frames":
                 variance = c.axes["white"][rows]
+            elif floor == TAIL_ERROR:
+                variance = variance / np.maximum(np.square(c.values[rows]), 1e-300)
             elif what == "wings":
                 variance = variance * (c.axes["flux"][rows] / (WING**2 - STAMP**2)) ** 2
             elif what is None:
                 variance = variance / np.square(c.values)
             shares += (floor**2 / variance).tolist()
-        share = float(np.median(shares)) if shares else 0.0
-        # A floor above the whole error is not the one that was added.
-        if 0.02 < share <= 1.0 + 1e-9:
-            weaker = 1 - float(np.sqrt(max(1 - share, 0.0)))
-            told.append(
-                f"{name} {floor:g} {unit} (effects {where} look {weaker:.0%} weaker)"
-            )
-    text = "; ".join(told).replace("%", " %")
+        told += _told(shares, f"{name} {floor:g} {unit}", where)
+    for c in (c for c in channels if c.word == "dark_map"):
+        level, usual = (c.axes["what"] == w for w in ("level", "usual"))
+        size = float(np.median(c.errors[usual])) if usual.any() else 0.0
+        parts = (size * c.axes["time"][level]) ** 2
+        shares = (parts / (parts + np.square(c.errors[level]))).tolist()
+        told += _told(shares, f"dark current {size:.2g} ADU/s", "on levels of darks")
+    text = "; ".join(dict.fromkeys(told)).replace("%", " %")
     return [f"assumed errors, which these recordings do not give: {text}"] if told else []
+
+
+def _told(shares: Sequence[float], what: str, where: str) -> list[str]:
+    """Sentence on what an assumed error costs, by its shares of variances; empty below 1 %."""
+    share = float(np.median(shares)) if len(shares) else 0.0
+    # A floor above the whole error is not the one that was added.
+    if not 0.02 < share <= 1.0 + 1e-9:
+        return []
+    weaker = 1 - float(np.sqrt(max(1 - share, 0.0)))
+    return [f"{what} (effects {where} look {weaker:.0%} weaker)"]
 
 
 def _structure(image: FloatArray, noise: float) -> tuple[float, float]:

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from bfsensor.diagnose.data.bench_nuisances import assumed_errors
 from bfsensor.diagnose.data.dark_channels import DarkChannels, count_groups
 from bfsensor.diagnose.detect.scans import _darks
 from bfsensor.diagnose.model.linear_terms import linear_columns
@@ -210,3 +211,11 @@ def test_tracks_in_other_biases_are_not_groups_of_a_bias() -> None:
         for image in images
     ]  # fmt: skip
     assert counts == [1] + [0] * 9
+
+
+def test_the_assumed_dark_current_is_told_with_what_it_costs() -> None:
+    images = NOISE * np.random.default_rng(3).standard_normal((4, 2, ROWS, COLUMNS))
+    darks = darks_of(images, [60.0] * 4, temperature=173.15)
+    (told,) = assumed_errors(darks.channels((2.0, 2.0)))
+    assert "dark current 0.01 ADU/s (effects on levels of darks look 8" in told
+    assert not assumed_errors(darks.channels())
