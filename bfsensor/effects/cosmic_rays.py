@@ -45,8 +45,8 @@ charges that scatter by 1.2 %."""
 TRACK_PIXELS = 3
 """Touching struck pixels of a dark from which the measurement counts them as one track.
 
-Chosen: three pixels in tails of the noise touch by chance in one of 1e10 frames; with 6, tracks of
-steep muons count as struck pixels."""
+Chosen: Gaussian noise strikes 2e-9 of the pixels, so that three of 256 x 256 touch by chance in one of
+1e20 frames; with 6, tracks of steep muons count as struck pixels."""
 
 LEVELS = np.geomspace(30.0, 1e6, 40)
 """Levels of flats [e-] at which the excess is computed; between them it is interpolated.

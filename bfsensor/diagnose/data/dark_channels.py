@@ -20,6 +20,7 @@ from bfsensor.diagnose.data.exposure_info import (
     overscan_level,
     zero_pixels,
 )
+from bfsensor.effects.dark_hot import DOUBLING, REFERENCE
 from bfsensor.typing import FloatArray
 
 UNEVEN = 1.25
@@ -32,18 +33,9 @@ findings."""
 USUAL = 0.02
 """Standard deviation of the dark current of a usual sensor about 0 at -100 C [e-/s].
 
-Chosen: a tenth of what LSST allows its sensors (0.2 e-/s), three times the 25 e-/h of DECam
-(Flaugher et al. 2015, AJ 150, 150); twice as large, a dark current of 0.12 instead of 0.065 e-/s
-is 3 sigma in darks of 60 s, with :data:`OFFSET`."""
-
-DOUBLING = 6.0
-"""Rise of the temperature for which the usual dark current doubles [K].
-
-Chosen: exact at 235 K (see :mod:`bfsensor.effects.dark_hot`); with 12 K a sensor at -20 C is usual with
-2 instead of 200 e-/s."""
-
-COLD = 173.15
-"""Temperature [K] at which :data:`USUAL` holds.  Derived: -100 C, exactly."""
+Chosen: three times the 25 e-/h that DECam requires of its sensors at most; sensors that have more by
+nature, as where light leaks in, are reported with a dark current.  Twice as large, 0.12 instead of
+0.065 e-/s is 3 sigma in darks of 60 s, with :data:`OFFSET`."""
 
 OFFSET = 0.5
 """Standard deviation of a dark's level at zero time above that of biases, both over their overscan
@@ -268,7 +260,7 @@ class DarkChannels:
             return {}
         unit = 1 / np.asarray(gains, float)
         return {
-            "usual": USUAL * 2 ** ((temperature - COLD) / DOUBLING) * unit,
+            "usual": USUAL * 2 ** ((temperature - REFERENCE) / DOUBLING) * unit,
             "usual offset": OFFSET * unit,
         }
 

@@ -53,9 +53,9 @@ spots depart from the prediction by 0.014; twice as large, wings must hold twice
 in bright spots."""
 
 TAIL_ERROR = 0.1
-"""Relative error of what a Gaussian spot itself has in the wings.  Chosen: in three campaigns without
-effects, whose spots have 0.05 to 0.1 % there, wings of all bright spots depart by 5 % of it, for the
-brighter-fatter effect so far out is not predicted better; twice as large, wings of wide spots must
+"""Relative error of the wings that are predicted for Gaussian spots.  Chosen: in three campaigns without
+effects, where these hold 0.05 to 0.11 % of the flux, bright spots depart by 4 to 6 % of them, which is
+how well the brighter-fatter effect is predicted so far out; twice as large, wings of wide spots must
 hold twice the light to be found."""
 
 

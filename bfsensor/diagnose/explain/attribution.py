@@ -52,8 +52,8 @@ leave out the closed forms' errors, curvature and tails."""
 TYPICAL = 0.001
 """Relative error of an effect's prediction (one standard deviation).  Measured on 123 parameters of
 campaigns of the independent bench that this code is not scored on: 76 and 94 % of their true values
-lie in intervals of 68 and 95 %; with 0.002, 77 and 95 %, with 0, 70 and 94 %, but parameters of
-effects above 500 sigma then depart by 3 to 15 standard errors."""
+lie in intervals of 68 and 95 %; with 0.002, 77 and 95 %, with 0, 70 and 94 %.  None of these covers
+five parameters of effects above 300 sigma, which depart by 3 to 12 standard errors."""
 
 
 def scale_of(gain: float) -> float:

@@ -414,3 +414,14 @@ def test_defects_may_be_many_where_their_neighbours_are_not_counted():
     # Every fifth column is a pattern.
     image[:, ::5] -= 0.05
     assert not bad_columns(image)
+
+
+def test_a_shallow_grain_of_dust_is_listed():
+    """Its boxes are 4 standard deviations deep, a block of a map over it 6."""
+    y, x = np.indices((256, 256))
+    image = 3e-3 * np.random.default_rng(2).standard_normal(x.shape)
+    image -= 1.7e-3 * (np.hypot(x - 103.5, y - 123.2) < 8.3)
+    ((rows, columns, _, z),) = dust_spots(image)
+    assert 123 in rows
+    assert 103 in columns
+    assert 4 < z < 5
