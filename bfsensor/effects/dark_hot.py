@@ -9,15 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from bfsensor.device.parts import Material
 from bfsensor.effects.dark_pixels import OUTLIER, mean_bias, struck_pixels, usual_noise
 from bfsensor.effects.effect import Axes, Effect, Image, Layout, Parameter, Seen, Shot
 from bfsensor.typing import FloatArray
-
-DOUBLING = 6.0
-"""Rise of the temperature that doubles the rate [K].
-
-Chosen: exact for a rate that goes with exp(-E_g / 2kT) at 235 K; at 173 K that law doubles in 3.1 K.
-Twice as large, the predicted dark current 10 K above the reference is 1.8 instead of 3.2 times it."""
 
 REFERENCE = 173.15
 """Temperature [K] for which rates are defined: -100 C, exactly."""
@@ -37,9 +32,39 @@ SURE = 5.0
 Chosen: twice as large, columns between 5 and 10 sigma begin as cold, unless none is hotter."""
 
 SOURCE = (
-    "Widenhorn et al. 2002, Proc. SPIE 4669, 193; Widenhorn et al. 2010, J. Appl. Phys. 107 "
-    "(222 to 291 K); ranges assumed"
+    "Generation in depleted silicon: Sah, Noyce & Shockley 1957, Proc. IRE 45, 1228; Widenhorn et al. "
+    "2002, Proc. SPIE 4669, 193; Widenhorn et al. 2010, J. Appl. Phys. 107 (222 to 291 K); ranges assumed"
 )
+
+
+def warmth(temperature: FloatArray | float) -> FloatArray:
+    """Dark current at a temperature over that at :data:`REFERENCE`, 1 where the temperature is NaN.
+
+    Depleted silicon generates charge at traps in the middle of the band gap in proportion to the
+    intrinsic density, T^(3/2) exp(-E_g / 2kT), which doubles in 3.1 K at 173 K and in 5.7 K at 235 K.
+    Of neutral silicon, above some 260 K, and of traps elsewhere in the gap it rises faster (Widenhorn
+    et al. 2002: E_g / 2 to E_g).
+
+    Parameters
+    ----------
+    temperature : float or ndarray
+        Temperature [K].
+
+    Returns
+    -------
+    ndarray, shape of ``temperature``
+        Ratio of the two dark currents.
+
+    Examples
+    --------
+    >>> warmth([173.15, 193.15]).round(1)
+    array([ 1. , 57.4])
+    """
+    kelvin = np.nan_to_num(np.asarray(temperature, float), nan=REFERENCE)
+    each, which = np.unique(kelvin, return_inverse=True)
+    usual = Material().intrinsic_density(REFERENCE)
+    ratio = np.array([Material().intrinsic_density(t) / usual for t in each.tolist()])
+    return ratio[which].reshape(kelvin.shape)
 
 
 class _Dark(Effect):
@@ -115,14 +140,11 @@ class _Dark(Effect):
         self, seconds: FloatArray | float, temperature: FloatArray | float
     ) -> FloatArray:
         """Mean dark charge of a pixel of these columns [e-]."""
-        warm = np.nan_to_num(np.asarray(temperature, float), nan=REFERENCE) - REFERENCE
-        return np.asarray(
-            self["rate"] * np.asarray(seconds, float) * 2 ** (warm / DOUBLING)
-        )
+        return np.asarray(self["rate"] * np.asarray(seconds, float) * warmth(temperature))
 
 
 class DarkCurrent(_Dark):
-    """Dark current of ``rate`` [e-/s at -100 C] in every pixel, doubling every 6 K.
+    """Dark current of ``rate`` [e-/s at -100 C] in every pixel; :func:`warmth` says it elsewhere.
 
     Of recordings whose temperature is not known, every fit has a free dark current proportional to
     time: only the Poisson noise of this one, in struck pixels of darks, then constrains ``rate``.

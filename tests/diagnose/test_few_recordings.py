@@ -193,7 +193,7 @@ def test_errors_of_far_lags_contradict_what_stated_ones_allow():
 
 
 def test_temperatures_are_in_kelvin_from_the_header_on(tmp_path):
-    """A mistake of 273 K would change a dark current that doubles every 6 K by a factor of 5e13."""
+    """A mistake of 273 K would change a dark current that doubles in 3 K by a factor of 2e10."""
     write(
         tmp_path, [("BIAS", 0.0, 0, -95.0)] * 2 + [("FLAT", 5.0, 2e4, -95.0)] * 2, seed=73
     )

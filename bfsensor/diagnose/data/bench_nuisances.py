@@ -17,6 +17,7 @@ from bfsensor.diagnose.data.cosmetics import Cosmetic
 from bfsensor.diagnose.data.exposure_info import ExposureInfo, condition_of
 from bfsensor.diagnose.data.flat_channels import LAMP_UNKNOWN
 from bfsensor.diagnose.data.spot_channels import BACKGROUND_ERROR, STAMP, TAIL_ERROR, WING
+from bfsensor.effects.dark_hot import warmth
 from bfsensor.typing import FloatArray
 
 CLEAR = 5.0
@@ -120,9 +121,11 @@ def assumed_errors(channels: Sequence[Channel]) -> list[str]:
     for c in (c for c in channels if c.word == "dark_map"):
         level, usual = (c.axes["what"] == w for w in ("level", "usual"))
         size = float(np.median(c.errors[usual])) if usual.any() else 0.0
-        parts = (size * c.axes["time"][level]) ** 2
+        parts = (size * (c.axes["time"] * warmth(c.axes["temperature"]))[level]) ** 2
         shares = (parts / (parts + np.square(c.errors[level]))).tolist()
-        told += _told(shares, f"dark current {size:.2g} ADU/s", "on levels of darks")
+        told += _told(
+            shares, f"dark current {size:.2g} ADU/s at -100 C", "on levels of darks"
+        )
     text = "; ".join(dict.fromkeys(told)).replace("%", " %")
     return [f"assumed errors, which these recordings do not give: {text}"] if told else []
 

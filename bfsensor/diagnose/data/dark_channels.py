@@ -20,7 +20,7 @@ from bfsensor.diagnose.data.exposure_info import (
     overscan_level,
     zero_pixels,
 )
-from bfsensor.effects.dark_hot import DOUBLING, REFERENCE
+from bfsensor.effects.dark_hot import warmth
 from bfsensor.typing import FloatArray
 
 UNEVEN = 1.25
@@ -41,6 +41,12 @@ OFFSET = 0.5
 """Standard deviation of a dark's level at zero time above that of biases, both over their overscan
 [e-].  Chosen: the charge of a dark current of 0.02 e-/s during the readout and the clearing of
 25 s; twice as large, a dark current of 0.08 instead of 0.065 e-/s is 3 sigma in darks of 60 s."""
+
+ALIKE = 0.1
+"""Share by which dark currents differ, at most, of darks whose columns are averaged.
+
+Chosen: temperatures in headers scatter by 0.1 to 0.4 K, which is 2 to 9 %; twice as large, darks up
+to a kelvin apart are averaged, and a hot column of the coldest is 20 % off."""
 
 LEAST_PIXELS = 3
 """Touching struck pixels from which they are a track.
@@ -98,18 +104,19 @@ class DarkChannels:
         self._struck: list[list[tuple[NDArray[np.int64], NDArray[np.int64]]]] = []
         self._shapes: list[tuple[int, ...]] = []
         self._rows: list[tuple[ExposureInfo, float, list[tuple[float, float, int]]]] = []
+        self._conditions: list[Condition] = []
         self._columns: list[_Columns] = []
         self._names: list[str] = []
-        self._condition = Condition()
         self._unzeroed = False
 
     def add(
         self, exposure: ExposureInfo, frames: Sequence[Frame], *, after: float = 0.0
     ) -> None:
         """Add a dark; ``after`` is the mean level [ADU] of the exposure before it."""
-        self._condition = condition_of(exposure)
+        condition = condition_of(exposure)
+        self._conditions.append(condition)
         found = []
-        lines = _Columns(exposure.exposure_time or 0.0, [], [], [])
+        lines = _Columns(exposure.exposure_time or 0.0, condition, [], [], [])
         struck_of = []
         self._names = [f.name for f in frames]
         self._shapes = [f.image.shape for f in frames]
@@ -158,7 +165,9 @@ class DarkChannels:
         expected, scatter = self._usual_tails()
         drift = self._drift() if self._unzeroed else 0.0
         tracks = 0
-        for (exposure, after, found), out in zip(self._rows, self._apart(), strict=True):
+        for (exposure, after, found), condition, out in zip(
+            self._rows, self._conditions, self._apart(), strict=True
+        ):
             level, variance, _ = (np.array(c, float) for c in zip(*found, strict=True))
             struck, squares, own = np.transpose(out)
             tracks += int(own.sum())
@@ -166,25 +175,28 @@ class DarkChannels:
                       "exposure": exposure.number, "after": after}  # fmt: skip
             values.append(level)
             blocks.append(np.diag(variance) + drift)
-            axes.add(len(level), self._condition, what="level", x=-1, **common)
+            axes.add(len(level), condition, what="level", x=-1, **common)
             # Groups are Poisson, not their pixels: each counts with the square of its size.  One is
             # added to the variance, as zero may be counted where a few are expected.
             values.append(struck - expected)
             blocks.append(np.diag(np.maximum(squares - expected, 0.0) + 1.0 + scatter))
-            axes.add(len(struck), self._condition, what="struck", x=-1, **common)
+            axes.add(len(struck), condition, what="struck", x=-1, **common)
         for what, error in self._usual(gains).items():
             values.append(np.zeros(len(error)))
             blocks.append(np.diag(error**2))
-            axes.add(len(error), self._condition, what=what, x=-1, amp=np.arange(len(error)), time=0.0,
-                     exposure=-1, after=0.0)  # fmt: skip
+            axes.add(len(error), self._conditions[-1], what=what, x=-1, amp=np.arange(len(error)),
+                     time=0.0, exposure=-1, after=0.0)  # fmt: skip
         seconds = sum(row[0].exposure_time or 0.0 for row in self._rows)
         value, square = self._tracks(tracks, seconds)
         values.append(np.array([value]))
         blocks.append(np.array([[square]]))
-        axes.add(1, self._condition, what="tracks", x=-1, amp=-1, time=seconds, exposure=-1,
+        axes.add(1, self._conditions[-1], what="tracks", x=-1, amp=-1, time=seconds, exposure=-1,
                  after=0.0)  # fmt: skip
-        longest = max(c.seconds for c in self._columns)
-        chosen = [c for c in self._columns if c.seconds == longest]
+        most = max(self._columns, key=lambda c: c.dark)
+        chosen = [
+            c for c in self._columns
+            if c.seconds == most.seconds and c.dark >= (1 - ALIKE) * most.dark
+        ]  # fmt: skip
         for amp in range(len(self._names)):
             mean = np.mean([c.means[amp] for c in chosen], axis=0)
             noise = float(np.mean([c.noise[amp] for c in chosen]))
@@ -195,8 +207,8 @@ class DarkChannels:
             more = np.where(own > noise * (1 + sure), own - noise, 0.0) / len(chosen)
             values.append(mean - np.median(mean))
             blocks.extend((plain + more)[:, None, None])
-            axes.add(len(mean), self._condition, what="column", x=np.arange(len(mean)), amp=amp,
-                     time=longest, exposure=-1, after=0.0)  # fmt: skip
+            axes.add(len(mean), most.condition, what="column", x=np.arange(len(mean)), amp=amp,
+                     time=most.seconds, exposure=-1, after=0.0)  # fmt: skip
         return [Channel("dark_map", np.concatenate(values), tuple(blocks), axes.columns(), "adu",
                         self._fold)]  # fmt: skip
 
@@ -251,18 +263,14 @@ class DarkChannels:
         return found - without, 1.0 + usual + usual**2 + noise
 
     def _usual(self, gains: Sequence[float]) -> dict[str, FloatArray]:
-        """Errors within which a usual sensor's dark current and its offset are 0, by amplifier [ADU].
+        """Errors within which a usual sensor's dark current and its offset are 0, by amplifier.
 
-        Empty where they may be any.
+        Of the dark current at -100 C [ADU/s], and of the offset [ADU].  Empty where they may be any.
         """
-        temperature = self._condition.temperature
-        if not len(gains) or temperature is None:
+        if not len(gains) or any(c.temperature is None for c in self._conditions):
             return {}
         unit = 1 / np.asarray(gains, float)
-        return {
-            "usual": USUAL * 2 ** ((temperature - REFERENCE) / DOUBLING) * unit,
-            "usual offset": OFFSET * unit,
-        }
+        return {"usual": USUAL * unit, "usual offset": OFFSET * unit}
 
     def _drift(self) -> FloatArray:
         """Covariance of the zeros of a dark without overscan, by amplifier [ADU^2].
@@ -397,11 +405,18 @@ class _Columns(NamedTuple):
     """Columns of one dark, by amplifier."""
 
     seconds: float
+    condition: Condition
     means: list[FloatArray]
     own: list[FloatArray]
     """Variance of each column's mean from its own pixels [ADU^2]."""
     noise: list[float]
     """Variance of a column's mean from all pixels [ADU^2]."""
+
+    @property
+    def dark(self) -> float:
+        """Exposure time [s] that makes as much dark current at -100 C."""
+        kelvin = self.condition.temperature
+        return self.seconds * float(warmth(np.nan if kelvin is None else kelvin))
 
 
 def without_hot_columns(image: FloatArray, noise: float) -> FloatArray:

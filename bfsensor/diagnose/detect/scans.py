@@ -11,6 +11,7 @@ from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel, step_of
 from bfsensor.diagnose.detect.scan_shapes import boundaries, boxes, frames, own_shapes
 from bfsensor.diagnose.detect.scan_templates import Group, Pattern, Template
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
+from bfsensor.effects.dark_hot import warmth
 
 POWERS = (0, 1, 2, 3)
 """Powers of the signal level with which covariances are scanned.  Chosen: noise is constant, shot
@@ -357,7 +358,7 @@ def _darks(g: Group) -> Iterator[Pattern]:
         if (x["what"] == "usual").any():
             yield (
                 "dark current",
-                np.where(level, x["time"], 0.0),
+                np.where(level, x["time"] * warmth(x["temperature"]), 0.0),
                 {"amp": name, "what": "level"},
             )
         yield "struck pixels", np.where(struck, 1.0, 0.0), {"amp": name, "what": "struck"}

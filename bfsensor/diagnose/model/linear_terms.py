@@ -10,6 +10,7 @@ from bfsensor.diagnose.data.cosmetics import BRIDGED, Cosmetic, reach_of
 from bfsensor.diagnose.data.exposure_info import label_of
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.model.map_shapes import Places
+from bfsensor.effects.dark_hot import warmth
 from bfsensor.typing import FloatArray
 
 MAP_ORDER, LIGHT_ORDER = 4, 8
@@ -141,7 +142,7 @@ def _dark_columns(channel: Channel) -> dict[str, FloatArray]:
     for amp in np.unique(x["amp"][what == "level"]):
         here = x["amp"] == amp
         for name, each, usual in (
-            ("dark", x["time"], "usual"), ("dark level", 1.0, "usual offset")
+            ("dark", x["time"] * warmth(x["temperature"]), "usual"), ("dark level", 1.0, "usual offset")
         ):  # fmt: skip
             column = np.where(what == "level", each, np.where(what == usual, 1.0, 0.0))
             out[f"{name} {int(amp)}"] = np.where(here, column, 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import numpy as np
@@ -95,7 +96,7 @@ def darks_of(
     images: np.ndarray,
     times: list[float],
     over: bool = True,
-    temperature: float | None = None,
+    temperature: float | Sequence[float] | None = None,
 ) -> DarkChannels:
     """Darks of two amplifiers, shape (darks, 2, rows, columns)."""
     rng = np.random.default_rng(12)
@@ -103,12 +104,13 @@ def darks_of(
     darks = DarkChannels(
         dict.fromkeys(names, np.zeros((ROWS, COLUMNS))), dict.fromkeys(names, NOISE)
     )
+    kelvin = np.broadcast_to(np.array(temperature, object), (len(times),))
     for number, (pair, seconds) in enumerate(zip(images, times, strict=True)):
         zero = NOISE * rng.standard_normal((ROWS, 24 if over else 0))
         darks.add(
             SimpleNamespace(
                 number=number, exposure_time=seconds, wavelength=None, back_bias=None,
-                temperature=temperature,
+                temperature=kelvin[number],
             ),
             [
                 SimpleNamespace(
@@ -160,7 +162,7 @@ def test_a_dark_current_that_cannot_be_seen_is_said(times, over, said) -> None:
 
 @pytest.mark.parametrize(
     ("kelvin", "gains", "sigma"),
-    [(173.15, (2.0, 2.0), 1.3), (253.15, (2.0, 2.0), 12000.0), (None, (2.0, 2.0), None),
+    [(173.15, (2.0, 2.0), 1.3), (183.15, (2.0, 2.0), 10.5), (None, (2.0, 2.0), None),
      (173.15, (), None)],
 )  # fmt: skip
 def test_levels_of_darks_are_held_against_the_dark_current_of_usual_sensors(
@@ -179,6 +181,30 @@ def test_levels_of_darks_are_held_against_the_dark_current_of_usual_sensors(
     data = channel.whiten(channel.values)[known]
     left = data - design @ np.linalg.lstsq(design, data, rcond=None)[0]
     assert left @ left == pytest.approx(2 * (20 / sigma) ** 2, rel=0.1, abs=8.0)
+
+
+def test_darks_of_two_temperatures_have_one_dark_current() -> None:
+    """Trap-assisted generation is 57 times as large at -80 C as at -100 C: .01 and .57 e-/s are one."""
+    images = NOISE * np.random.default_rng(3).standard_normal((4, 2, ROWS, COLUMNS))
+    images[2:] += 0.57 * 60 / 2
+    images[2:, 0, :, 7] += 40.0
+    images[:2, 0, :, 7] += 40.0 / 57.4
+    channel = darks_of(
+        images, [60.0] * 4, temperature=[173.15] * 2 + [193.15] * 2
+    ).channels((2.0, 2.0))[0]
+    columns = linear_columns(channel, {}, None)
+    level = np.isin(channel.axes["what"], ("level", "usual", "usual offset"))
+    design = channel.whiten(np.column_stack(list(columns.values())))[level]
+    data = channel.whiten(channel.values)[level]
+    left = data - design @ np.linalg.lstsq(design, data, rcond=None)[0]
+    assert left @ left < 20.0
+    hot = (
+        (channel.axes["what"] == "column")
+        & (channel.axes["x"] == 7)
+        & (channel.axes["amp"] == 0)
+    )
+    assert channel.values[hot] == pytest.approx([40.0], abs=4 * channel.errors[hot][0])
+    assert channel.axes["temperature"][hot] == [193.15]
 
 
 def test_a_track_is_counted_once_and_warm_pixels_are_none() -> None:
@@ -217,5 +243,5 @@ def test_the_assumed_dark_current_is_told_with_what_it_costs() -> None:
     images = NOISE * np.random.default_rng(3).standard_normal((4, 2, ROWS, COLUMNS))
     darks = darks_of(images, [60.0] * 4, temperature=173.15)
     (told,) = assumed_errors(darks.channels((2.0, 2.0)))
-    assert "dark current 0.01 ADU/s (effects on levels of darks look 8" in told
+    assert "dark current 0.01 ADU/s at -100 C (effects on levels of darks look 8" in told
     assert not assumed_errors(darks.channels())
