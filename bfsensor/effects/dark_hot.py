@@ -33,7 +33,8 @@ Chosen: twice as large, columns between 5 and 10 sigma begin as cold, unless non
 
 SOURCE = (
     "Generation in depleted silicon: Sah, Noyce & Shockley 1957, Proc. IRE 45, 1228; Widenhorn et al. "
-    "2002, Proc. SPIE 4669, 193; Widenhorn et al. 2010, J. Appl. Phys. 107 (222 to 291 K); ranges assumed"
+    "2002, Proc. SPIE 4669, 193; Widenhorn et al. 2010, J. Appl. Phys. 107 (222 to 291 K); ranges "
+    "assumed"
 )
 
 

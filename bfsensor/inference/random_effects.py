@@ -133,7 +133,7 @@ def score_of(
 
 
 def likeliest(
-    modes: FloatArray, left: FloatArray, one: FloatArray, two: FloatArray
+    sizes: FloatArray, along: FloatArray, products: FloatArray
 ) -> tuple[float, float]:
     r"""Likelihood gain of an effect that changes means and scatter, maximised over its amplitude.
 
@@ -146,12 +146,12 @@ def likeliest(
 
     Parameters
     ----------
-    modes : ndarray, shape (n, m)
-        :math:`M`, whitened, a fit's parameters projected out.
-    left : ndarray, shape (n,)
-        Residuals :math:`r` of the fit.
-    one, two : ndarray, shape (n,)
-        :math:`t_1` and :math:`t_2`, whitened and projected likewise.
+    sizes : ndarray, shape (m,)
+        Squares of the singular values of :math:`M`, whitened, a fit's parameters projected out.
+    along : ndarray, shape (3, m)
+        :math:`r^T M v`, :math:`t_1^T M v` and :math:`t_2^T M v` with its right singular vectors.
+    products : ndarray, shape (3, 3)
+        Scalar products of :math:`r`, :math:`t_1` and :math:`t_2`.
 
     Returns
     -------
@@ -162,18 +162,16 @@ def likeliest(
     Examples
     --------
     >>> noise = np.random.default_rng(2).normal(0, 5.0, 400)
-    >>> gain, factor = likeliest(np.eye(400), noise, 0 * noise, 0 * noise)
+    >>> along, products = np.zeros((3, 400)), np.zeros((3, 3))
+    >>> along[0], products[0, 0] = noise, noise @ noise
+    >>> gain, factor = likeliest(np.ones(400), along, products)
     >>> gain > 1000, round(factor)
     (True, 5)
     """
-    sizes, shapes = np.linalg.eigh(modes.T @ modes)
-    sizes = np.maximum(sizes, 0.0)
-    along = [shapes.T @ (modes.T @ v) for v in (left, one, two)]
-    products = np.array([left, one, two]) @ np.array([left, one, two]).T
     gains = []
     for f in FACTORS:
         weights = np.array([1.0, -f, -(f**2)])
-        inner = f * (weights @ np.array(along))
+        inner = f * (weights @ along)
         wide = 1 + f**2 * sizes
         square = weights @ products @ weights - float((inner**2 / wide).sum())
         gains.append(products[0, 0] - square - float(np.log(wide).sum()))

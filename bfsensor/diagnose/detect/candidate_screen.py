@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.detect.scatter import scatter_of
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
-from bfsensor.diagnose.fit.random_effects import likeliest, scatter_of
 from bfsensor.diagnose.model.effect_parameters import fitted, widened
 from bfsensor.diagnose.model.map_predictions import lines_of_map
 from bfsensor.diagnose.model.predictor import Predictor
@@ -328,15 +328,13 @@ class Screen:
     ) -> tuple[float, Effect] | None:
         """Gain at the amplitude of greatest likelihood by scatter; None if below SCATTERED."""
         fit = self.fit
-        own = scatter_of(self.predictor, fit.channels, fit.starts, effect, self.point)
-        modes = np.concatenate([own, np.zeros((len(fit.left) - len(own), own.shape[1]))])
-        modes -= fit.basis @ (fit.basis.T @ modes)
+        scatter = scatter_of(self.predictor, fit, effect, self.point)
         nothing = np.zeros(len(fit.left))
-        if likeliest(modes, fit.left, nothing, nothing)[0] < SCATTERED:
+        if scatter.likeliest(fit.left, nothing, nothing)[0] < SCATTERED:
             return None
         other = self._change_of_start(effect.scaled(0.5))
         one, two = 4 * other - template, 2 * template - 4 * other
-        gain, factor = likeliest(modes, fit.left, one, two)
+        gain, factor = scatter.likeliest(fit.left, one, two)
         best = _inside(effect.scaled(factor))
         self._scaled_templates[best] = factor * one + factor**2 * two
         self._scattered.add(best)

@@ -8,15 +8,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.model.predictor import Predictor
-from bfsensor.effects.effect import Effect
-from bfsensor.inference.random_effects import likeliest
 from bfsensor.typing import FloatArray
-
-__all__ = ["likeliest", "mode_slope", "scatter_of", "scored"]
 
 
 def scored(predictor: Predictor) -> dict[int, tuple[str, ...]]:
@@ -57,43 +52,3 @@ def mode_slope(
         out[row : row + rows, column : column + columns] = part
         row, column = row + rows, column + columns
     return out
-
-
-def scatter_of(
-    predictor: Predictor,
-    channels: Sequence[Channel],
-    starts: NDArray[np.int64],
-    effect: Effect,
-    values: FloatArray,
-) -> FloatArray:
-    """Whitened modes of one effect in the channels whose scatter constrains it.
-
-    Parameters
-    ----------
-    predictor : Predictor
-        Predicts the channels; its effects are replaced by ``effect`` alone.
-    channels : sequence of Channel
-        All channels.
-    starts : ndarray of int, shape (channels + 1,)
-        Index at which the values of each channel begin, and the number of all.
-    effect : Effect
-        With a variance parameter (``told_by_scatter`` not empty).
-    values : ndarray, shape (p,)
-        Non-linear parameters of ``predictor``.
-
-    Returns
-    -------
-    modes : ndarray, shape (n, m)
-        Rows of all values; zero in channels whose scatter does not constrain the effect.
-    """
-    total = int(starts[-1])
-    parts = [np.zeros((total, 0))]
-    alone = predictor.with_effects((effect,), values)
-    point = alone.start
-    for channel, start in zip(channels, starts, strict=False):
-        if channel.word in effect.told_by_scatter:
-            own = channel.whiten(alone.modes(channel, point))
-            whole = np.zeros((total, own.shape[1]))
-            whole[start : start + len(channel)] = own
-            parts.append(whole)
-    return np.concatenate(parts, axis=1)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from bfsensor.diagnose.data.channels import Channel
+from bfsensor.diagnose.detect import scatter
+from bfsensor.diagnose.detect.scatter import scatter_of
 from bfsensor.diagnose.fit.gauss_newton import Steps
-from bfsensor.diagnose.fit.random_effects import likeliest
 from bfsensor.effects.illumination_turbulence import IlluminationTurbulence
+from bfsensor.errors import FitError
+from bfsensor.inference.random_effects import likeliest
 
 COUNT = 80
 STRENGTHS = np.geomspace(300.0, 3e4, COUNT)
@@ -96,10 +101,57 @@ def test_gain_before_a_fit_is_that_of_the_likelihood():
     one, two = rng.normal(0, 0.5, (2, COUNT))
     left = 2 * one + 4 * two + 2 * modes @ rng.standard_normal(30)
     left += rng.standard_normal(COUNT)
-    gain, factor = likeliest(modes, left, one, two)
+    _, sizes, right = np.linalg.svd(modes, full_matrices=False)
+    vectors = np.array([left, one, two])
+    gain, factor = likeliest(sizes**2, vectors @ modes @ right.T, vectors @ vectors.T)
     covariance = np.eye(COUNT) + factor**2 * modes @ modes.T
     after = left - factor * one - factor**2 * two
     square = float(after @ np.linalg.solve(covariance, after))
     square += float(np.linalg.slogdet(covariance)[1])
     assert gain == pytest.approx(float(left @ left) - square, rel=1e-9)
     assert factor == pytest.approx(2.0, rel=0.15)
+
+
+class Modes:
+    """Predictor of one effect that changes two of three channels by given modes."""
+
+    start = np.zeros(0)
+
+    def __init__(self, modes: dict[str, np.ndarray]) -> None:
+        self._modes = modes
+
+    def with_effects(self, effects, values):
+        return self
+
+    def modes(self, channel, point):
+        return self._modes[channel.word]
+
+
+def test_a_candidate_is_weighed_as_with_its_modes_written_out(monkeypatch):
+    rng = np.random.default_rng(8)
+    words, n = ("bias_level", "flat_cov", "flat_mean"), 20
+    channels = [SimpleNamespace(word=w, whiten=lambda a: 0.5 * a) for w in words]
+    given = {
+        "bias_level": rng.normal(size=(n, 3)),
+        "flat_mean": np.diag(rng.uniform(1, 3, n)),
+    }
+    effect = SimpleNamespace(told_by_scatter=("bias_level", "flat_mean"), name="settling")
+    basis = np.linalg.qr(rng.normal(size=(3 * n + 2, 5)))[0]
+    fit = SimpleNamespace(channels=channels, starts=np.arange(0, 4 * n, n), basis=basis)
+    vectors = rng.normal(size=(3, 3 * n + 2))
+    vectors -= vectors @ basis @ basis.T
+    whole = np.zeros((3 * n + 2, n + 3))
+    whole[:n, :3], whole[2 * n : 3 * n, 3:] = (
+        0.5 * given["bias_level"],
+        0.5 * given["flat_mean"],
+    )
+    whole -= basis @ (basis.T @ whole)
+    _, sizes, right = np.linalg.svd(whole, full_matrices=False)
+    wanted = likeliest(sizes**2, vectors @ whole @ right.T, vectors @ vectors.T)
+    found = scatter_of(Modes(given), fit, effect, np.zeros(0))
+    assert found.likeliest(*vectors) == pytest.approx(wanted, rel=1e-9)
+    monkeypatch.setattr(scatter, "MOST", n - 1)
+    with pytest.raises(
+        FitError, match="settling has 20 independent changes in flat_mean; at most 19"
+    ):
+        scatter_of(Modes(given), fit, effect, np.zeros(0))
