@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from bfsensor.diagnose.data.spot_channels import SpotChannels, stamp_moments
+from bfsensor.diagnose.data.spot_channels import STAMP, WING, SpotChannels, stamp_moments
 
 SIDE, PITCH, WIDTH, FLUX = 192, 30, 1.1, 2e5
 
@@ -110,3 +110,23 @@ def test_wings_do_not_depend_on_places_within_pixels():
     ]
     assert np.ptp(wings) < 1e-5
     assert wings.mean() == pytest.approx(1.6e-3, rel=0.02)
+
+
+@pytest.mark.parametrize(("light", "tail"), [(40.0, 2e-3), (0.05, 2e-3), (40.0, 0.0)])
+def test_wings_are_known_to_a_part_of_the_background_and_of_their_tail(light, tail):
+    """Pixels of wings hold 0.05 e- more or less than those beside; tails are as uncertain as themselves."""
+    image = exposure_of(np.random.default_rng(4), 0.0) * light
+    y, x = np.indices(image.shape)
+    for cy in range(20, SIDE - 15, PITCH):
+        for cx in range(20, SIDE - 15, PITCH):
+            ring = np.abs(np.hypot(x - cx, y - cy) - 7.5) < 0.6
+            image += tail * light * FLUX / 40 * ring
+    channels = SpotChannels(read_noise=4.0, lamp_error=1e-6)
+    assert channels.add(shot_of(0), image) is None
+    channel = channels.channels()[0]
+    (wings,) = np.flatnonzero(channel.axes["what"] == "wings")
+    floor = 0.05 * (WING**2 - STAMP**2) / channel.axes["flux"][wings]
+    tenth = 0.1 * abs(channel.values[wings])
+    assert channel.errors[wings] > np.hypot(floor, tenth)
+    # Beside them there is only the scatter between 36 spots.
+    assert channel.errors[wings] ** 2 < 2 * (floor**2 + tenth**2) or light < 1 or not tail
