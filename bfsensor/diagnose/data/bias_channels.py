@@ -277,13 +277,15 @@ class BiasChannels:
         out = np.zeros(READOUT_LAGS + 1)
         if not self._third or not self._spectra:
             return out, 0.0
-        third = np.sum(self._third, axis=0) / np.sqrt(len(self._third))
         shapes = np.exp(
             -np.arange(READOUT_LAGS) / np.geomspace(0.2, 4.0 * READOUT_LAGS, 200)[:, None]
         )
         shapes /= np.sqrt(np.square(shapes).sum(1))[:, None]
-        gain = np.square(third @ shapes.T).sum(0)
-        chance = max(float(chi2.sf(gain.max(), len(third))), np.finfo(float).tiny)
+        each = np.array(self._third) @ shapes.T
+        # Third cumulants of correlated noise scatter by more than those of white noise.
+        scatter = each.var(0, ddof=1) if len(each) > 1 else 1.0
+        gain = (len(each) * each.mean(0) ** 2 / np.maximum(scatter, 1.0)).sum(0)
+        chance = max(float(chi2.sf(gain.max(), each.shape[1])), np.finfo(float).tiny)
         deviate = float(norm.isf(chance))
         if deviate < SCATTERED:
             return out, deviate

@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from bfsensor.diagnose.data.bench_nuisances import bench_nuisances
 from bfsensor.diagnose.data.bias_channels import SCATTERED, STANDS_OUT, BiasChannels
@@ -217,3 +218,16 @@ def test_tracks_in_single_biases_are_not_in_their_mean_but_fixed_structure_is():
     mean = channels.mean("amp")
     assert np.abs(np.delete(mean, 7, axis=1)).max() < 6 * 3.0 / 9**0.5
     np.testing.assert_allclose(mean[:, 7].mean(), 400.0, atol=1.0)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_noise_that_remembers_the_pixel_before_has_no_pulses(seed):
+    """Third cumulants of Gaussian noise are 0, but scatter by more where neighbours are alike."""
+    rng = np.random.default_rng(8200 + seed)
+
+    def make(frame, amp):
+        noise = 4.0 * rng.standard_normal(SIZE)
+        noise += 16.0 * lfilter([0.8], [1.0, -0.6], rng.standard_normal(SIZE))
+        return 1000 + noise.reshape(ROWS, -1)
+
+    assert not biases(make, 16, 2).pulses()[0].any()
