@@ -114,7 +114,7 @@ def test_wings_do_not_depend_on_places_within_pixels():
 
 @pytest.mark.parametrize(("light", "tail"), [(40.0, 2e-3), (0.05, 2e-3), (40.0, 0.0)])
 def test_wings_are_known_to_a_part_of_the_background_and_of_their_tail(light, tail):
-    """Pixels of wings hold 0.05 e- more or less than those beside; tails are as uncertain as themselves."""
+    """Pixels of wings hold 0.05 e- more or less than those beside; a tail is known to a tenth of it."""
     image = exposure_of(np.random.default_rng(4), 0.0) * light
     y, x = np.indices(image.shape)
     for cy in range(20, SIDE - 15, PITCH):
