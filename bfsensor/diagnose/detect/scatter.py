@@ -1,4 +1,4 @@
-"""How well the scatter of values is explained by a candidate, before it is fitted."""
+"""The scatter of values that a candidate explains, weighed before the candidate is fitted."""
 
 from __future__ import annotations
 
