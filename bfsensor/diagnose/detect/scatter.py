@@ -17,8 +17,8 @@ from bfsensor.typing import FloatArray
 MOST = 2000
 """Largest number of modes of a candidate that is weighed by scatter.
 
-Chosen: their eigenvectors take some 10 CPU s, and a fit has as many columns more; twice as many take
-80 CPU s for each starting point."""
+Chosen: their eigenvectors take 3 CPU s, and a fit has as many columns more; twice as many take 22 CPU
+s for each starting point."""
 
 
 class Scatter(NamedTuple):
