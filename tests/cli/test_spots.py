@@ -63,6 +63,7 @@ def test_spots_that_are_there_are_kept(finished):
 SLOW = pytest.mark.slow  # tests/test_sweep.py has these executors in every run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind", ["process", pytest.param("dask", marks=SLOW), pytest.param("parsl", marks=SLOW)]
 )

@@ -58,6 +58,7 @@ def test_rows_figure_and_summary_are_written(finished):
 SLOW = pytest.mark.slow  # tests/test_sweep.py has these executors in every run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind", ["process", pytest.param("dask", marks=SLOW), pytest.param("parsl", marks=SLOW)]
 )
@@ -72,6 +73,7 @@ def test_every_executor_gives_the_same_bits(finished, tmp_path, kind):
     same_numbers(here, there)
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on(finished, tmp_path):
     """``kill -9`` after the first point, the same command again: the same bits, not redone."""
     work = tmp_path / "k.ecsv.points"

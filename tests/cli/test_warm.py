@@ -67,6 +67,7 @@ def test_what_warm_compiled_is_not_compiled_again():
     assert recorder.buffer == []
 
 
+@pytest.mark.slow
 @pytest.mark.skipif("NUMBA_DISABLE_JIT" in os.environ, reason="nothing is compiled")
 def test_a_first_star_compiles_few_functions_and_no_solver(tmp_path):
     bare = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_LOCATOR_CLASSES"}

@@ -140,6 +140,7 @@ def test_the_command_diagnoses_a_folder(tmp_path):
     assert none.exit_code == 1 and "nothing: not a baseline" in none.stderr
 
 
+@pytest.mark.slow
 def test_a_device_far_from_nominal_is_reported_and_not_absorbed(tmp_path):
     """A parameter that the fit moves far from its nominal value is a finding, in words too."""
     measured, predictor, fit = fit_virtual(seed=8112)

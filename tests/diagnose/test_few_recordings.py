@@ -124,6 +124,7 @@ def sbig(request):
     return request.param, diagnose_measured(measured, free_baseline(), explain=False)
 
 
+@pytest.mark.slow
 def test_sbig_readout_not_brighter_fatter(sbig):
     """The biases' serial lag is -0.032 of the variance; flats' changes its sign with the level."""
     name, found = sbig
@@ -139,6 +140,7 @@ def test_sbig_readout_not_brighter_fatter(sbig):
     assert "lag (1, 0) changes its sign" in said[1]
 
 
+@pytest.mark.slow
 def test_sbig_unequal_flats_give_means_alone(sbig):
     """One pair each has covariances: of a triple, and of three flats whose first is 13 % off."""
     name, found = sbig

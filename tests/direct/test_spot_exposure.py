@@ -48,6 +48,7 @@ def test_the_centre_loses_what_its_neighbours_gain(spot):
     assert change.sum() == 0
 
 
+@pytest.mark.slow
 def test_the_same_plan_gives_the_same_bits(spot):
     again = simulate_spot(small(), 2)
     assert np.array_equal(again.on, spot.on) and np.array_equal(again.off, spot.off)

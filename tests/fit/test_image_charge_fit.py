@@ -52,6 +52,7 @@ def test_the_share_of_the_dipole_is_not_known(noiseless):
     assert fit.dipole[1] < 0.1 * fit.dipole[0]
 
 
+@pytest.mark.slow
 def test_offset_is_found_and_without_it_chi2_says_so():
     """Switched off, an offset of two standard errors cannot hide among 25 lags."""
     a, sigma = truth(), np.full((5, 5), 1e-10)
@@ -92,6 +93,7 @@ def test_errors_cover_and_chi2_is_chi2():
     assert np.std(wrong) == pytest.approx(np.sqrt(7 / 25), abs=0.15)
 
 
+@pytest.mark.slow
 def test_what_ends_at_a_bound_has_no_error():
     """Boundaries between columns sealed at the charge's own height cannot come lower."""
     low = dataclasses.replace(TRUE, column_height=TRUE.charge_height + 0.01)
@@ -103,6 +105,7 @@ def test_what_ends_at_a_bound_has_no_error():
     assert "offset" not in fit.bounded
 
 
+@pytest.mark.slow
 def test_lags_left_out_count_for_nothing(noiseless):
     a, sigma = truth(), np.full((5, 5), 1e-10)
     used = np.ones(a.shape, bool)
@@ -117,6 +120,7 @@ def test_lags_left_out_count_for_nothing(noiseless):
     assert fit.chi2 < 0.01
 
 
+@pytest.mark.slow
 def test_written_and_read_back_equal(tmp_path):
     line = dataclasses.replace(TRUE, drift_field=((0.0, 0.7), (100.0, 0.4)))
     a = truth(4)

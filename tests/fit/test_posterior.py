@@ -67,6 +67,7 @@ def test_second_derivatives_are_found():
     np.testing.assert_allclose(found.second, expected, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["free", "bound", "unknown"])
 def test_draws_have_the_moments_of_a_banana(case):
     priors = PRIORS

@@ -342,8 +342,8 @@ ANISOTROPY = ("bf_anisotropy", {"eps": 0.1}, "")
 DIAGNOSES = {
     "diagnosis/null": (lambda: _diagnosis(771, "T"), True),
     "diagnosis/tearing": (lambda: _diagnosis(7101, "T", TEAR), True),
-    "diagnosis/trap_serial": (lambda: _diagnosis(31, "T", TRAP), True),
-    "diagnosis/echo": (lambda: _diagnosis(2203, "T", ECHO), True),
+    "diagnosis/trap_serial": (lambda: _diagnosis(31, "T", TRAP), False),
+    "diagnosis/echo": (lambda: _diagnosis(2203, "T", ECHO), False),
     "diagnosis/tree_rings": (lambda: _diagnosis(411, "S", RINGS), False),
     "diagnosis/gain_nonlinearity": (lambda: _diagnosis(412, "S", NONLINEAR), False),
     "diagnosis/turbulence": (lambda: _diagnosis(413, "S", TURBULENCE), False),

@@ -54,6 +54,7 @@ def two_processes(tmp_path_factory):
 # -- a sensor for each detector ------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings(BEYOND)
 def test_an_itl_and_an_e2v_detector_in_two_processes(two_processes, tmp_path):
     """Each detector has the table and the rings of its own, and the bits of that table by name."""

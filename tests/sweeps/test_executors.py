@@ -71,6 +71,7 @@ def test_points_run_side_by_side(tmp_path):
         assert time.perf_counter() - begin < 0.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", EXECUTORS)
 def test_every_executor_gives_the_same(tmp_path, kind):
     """On real local workers."""

@@ -185,6 +185,7 @@ class Structure(Effect):
         return out
 
 
+@pytest.mark.slow
 def test_structure_of_the_bias_is_listed_and_no_alarm():
     measured = measure_channels(
         VirtualSource(seed=8128, size=SMALL, effects=[Structure({"part": 1.0})])

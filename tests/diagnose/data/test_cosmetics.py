@@ -69,6 +69,7 @@ def test_defects_are_listed_where_they_are(measured):
         assert one.amp == place[1] // 64 and one.unit == "adu/s"
 
 
+@pytest.mark.slow
 def test_defects_are_no_alarm_and_in_the_report(measured):
     found = diagnose_measured(measured, virtual_baseline())
     assert not found.mismatch.detected
@@ -126,6 +127,7 @@ class Dust(Effect):
             scene.scale(1 - self.parameters["part"] * depth * shadow)
 
 
+@pytest.mark.slow
 def test_dust_is_listed_and_no_alarm():
     source = VirtualSource(seed=7107, size=SMALL, effects=[Dust({"part": 1.0})])
     measured = measure_channels(source)

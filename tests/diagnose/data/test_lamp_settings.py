@@ -65,6 +65,7 @@ def test_no_response_of_a_sensor_is_a_setting(response):
     assert not settings.any() and (light == 1).all()
 
 
+@pytest.mark.slow
 def test_a_lamp_at_a_third_is_no_alarm():
     source = VirtualSource(seed=7112, size=SMALL)
     flats = [e for e in source.exposures if e.kind == "flat"]

@@ -55,6 +55,7 @@ def counts(measured):
     return {(c.word, c.fold): len(c) for c in measured.channels}
 
 
+@pytest.mark.slow
 def test_pairs_and_folds_are_those_of_equal_times(equal, unequal):
     measured = measure_channels(unequal)
     assert counts(measured) == counts(measure_channels(equal))

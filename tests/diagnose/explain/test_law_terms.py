@@ -50,6 +50,7 @@ def root():
     return _located(8.0, 0.5)
 
 
+@pytest.mark.slow
 def test_a_class_by_another_law_is_named_and_its_law_said_apart(root):
     model, mismatch = root
     assert mismatch.detected and model.fit.chi2()["serial_overscan"][0] > 1e4
@@ -63,6 +64,7 @@ def test_a_class_by_another_law_is_named_and_its_law_said_apart(root):
     assert "asks for another law" in said and "explains it" not in said
 
 
+@pytest.mark.slow
 def test_without_other_laws_the_same_mismatch_is_described_freely(root, monkeypatch):
     model, mismatch = root
     monkeypatch.setattr(stepwise, "law_choices", lambda *a: [])
@@ -111,6 +113,7 @@ def test_the_charge_is_what_the_best_of_many_gains_by_chance():
     assert abs((best > charge(2, 30)).sum() - 200) < 5 * np.sqrt(200)
 
 
+@pytest.mark.slow
 def test_the_law_of_an_effect_takes_no_more_than_the_effect_itself():
     """An echo changes all means alike and by little: exposures of another length are no law of it."""
     predictor, fit = fit_virtual(

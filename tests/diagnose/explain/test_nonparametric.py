@@ -138,6 +138,7 @@ def _dimmer(x0, x1, y0, y1):
     return _changed("flat_map", change)
 
 
+@pytest.mark.slow
 def test_a_patch_of_the_sensor_that_is_dimmer_in_all_flats():
     found, _ = _explained(_dimmer(64, 96, 32, 64))
     assert found.group == "pattern of position"
@@ -176,6 +177,7 @@ def _campaign(*effects):
     return measure_virtual(seed=9137, size=SMALL, effects=effects)
 
 
+@pytest.mark.slow
 def test_a_kernel_that_is_odd_in_y():
     found, _ = _explained(_campaign(_OddInY({})))
     assert found.group == "odd boundary shifts"
@@ -333,6 +335,7 @@ def _after_bright(amp):
     return _changed("flat_mean", change)
 
 
+@pytest.mark.slow
 def test_an_effect_that_leaves_nothing_is_not_believed_where_a_free_form_explains_far_more():
     # Levels follow one another up and down a ladder: much looks like the exposure's own.
     model, mismatch = _located(_after_bright(7e-4))
@@ -347,6 +350,7 @@ def test_an_effect_that_leaves_nothing_is_not_believed_where_a_free_form_explain
     assert abs(own.value + 7e-4) < 3 * own.error
 
 
+@pytest.mark.slow
 def test_a_nonlinear_gain_is_not_outside_the_library():
     def change(x, values):
         return 2e-3 * values * x["level"] * 2.17 / 1e5

@@ -109,6 +109,7 @@ def test_a_screen_finds_the_amplitude_to_its_error():
     assert abs(best.effect["size"] - truth) < 8 * error + 0.01 * truth
 
 
+@pytest.mark.slow
 def test_an_effect_that_takes_all_stands_before_terms_that_take_less():
     """However many effects were tried: the mismatch is there, and terms do not describe it better."""
     predictor, fit, mismatch = fitted(

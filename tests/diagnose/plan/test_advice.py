@@ -214,6 +214,7 @@ def test_nothing_tied_nothing_planned(tied):
     assert not plan(alone).advised and plan(alone).said() == []
 
 
+@pytest.mark.slow
 def test_no_recording_is_advised_where_effects_take_little(tied):
     shares = {"effects": 0.3, "laws": 0.1, "outside": 0.1, "left": 0.5}
     none = plan(replace(tied, shares=shares))

@@ -125,6 +125,7 @@ OPEN = ("class_probability", "channels", "parameters", "exposures", "keeps", "co
 """Mappings by names that differ between campaigns."""
 
 
+@pytest.mark.slow
 def test_an_unknown_missing_or_wrong_key_fails(explained, outside, faults, schema):
     whole = json.loads(json.dumps(outside.to_report()))
     checked = 0

@@ -171,6 +171,7 @@ def pulls_or_none(curve):
         return None
 
 
+@pytest.mark.slow
 def test_no_turnoff_is_found_where_there_is_none():
     """The next level is far away and the fit below it poor: its error must count."""
     levels = np.geomspace(3e3, 1.1e5, 18)
