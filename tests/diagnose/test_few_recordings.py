@@ -67,7 +67,7 @@ def test_biases_are_the_zero_of_flats_without_overscan(tmp_path):
     assert not any("zero level" in n for n in found.notes)
     # Without an overscan a bias says nothing of the image's level above it.
     (level,) = (c for c in found.measured.channels if c.word == "bias_level")
-    assert set(level.axes["what"]) == {"rows"}
+    assert set(level.axes["what"]) == {"rows", "usual rows"}
 
 
 def test_a_coupling_of_pixels_is_found_at_two_levels(tmp_path):

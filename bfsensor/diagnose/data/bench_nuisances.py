@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from bfsensor.diagnose.data.bias_channels import FRAME_ERROR, JUMP, BiasChannels
+from bfsensor.diagnose.data.bias_channels import FRAME_ERROR, JUMP, ROW_ERROR, BiasChannels
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.code_channels import HALO_ERROR
 from bfsensor.diagnose.data.cosmetics import Cosmetic
@@ -101,6 +101,7 @@ def assumed_errors(channels: Sequence[Channel]) -> list[str]:
         ("flat_mean", None, LAMP_UNKNOWN, "light without a monitor", "of it", "there"),
         ("bias_level", "frames", FRAME_ERROR, "levels of bias frames", "ADU", "there"),
         ("bias_level", "frames", JUMP, "levels of bias frames", "ADU", "there"),
+        ("bias_level", "rows", ROW_ERROR, "levels of rows", "ADU", "on rows"),
     )  # fmt: skip
     told = []
     for word, what, floor, name, unit, where in kinds:
@@ -110,6 +111,9 @@ def assumed_errors(channels: Sequence[Channel]) -> list[str]:
             variance = np.square(c.errors[rows])
             if what == "frames":
                 variance = c.axes["white"][rows]
+            elif what == "rows":
+                usual = np.square(floor**2 * c.axes["same_row"][rows])
+                variance = floor**2 * (1.0 + variance / usual)
             elif floor == TAIL_ERROR:
                 variance = variance / np.maximum(np.square(c.values[rows]), 1e-300)
             elif what == "wings":

@@ -57,6 +57,11 @@ JUMP = 1.0
 Published: bias jumps of LSST sensors are typically above 1 ADU (SITCOMTN-148, Rubin Observatory
 2024)."""
 
+ROW_ERROR = 0.05
+"""Scatter of the levels of an amplifier's rows that is no finding [ADU]: its square is the error of the
+variance that usual sensors have, 0.  Chosen, to be derived from quiet systems: with 0.1, levels that
+scatter by 0.2 ADU would be found at 4 sigma at most, with 0.05 at 16."""
+
 TOGETHER = 0.9
 """Part of the variance of the amplifiers' bias levels that one common drift has, above which it gives
 their relative sensitivities.  Chosen: two amplifiers that jump independently reach it in none of a
@@ -97,7 +102,7 @@ class BiasChannels:
         self._zeros: list[tuple[int, list[tuple[float, float]]]] = []
         self._third: list[FloatArray] = []
         self._strips: list[list[FloatArray]] = []
-        self._size = 0
+        self._size, self._width = 0, 1
         self._lags = np.arange(READOUT_LAGS + 1)
         self._condition = Condition()
 
@@ -119,7 +124,7 @@ class BiasChannels:
             self._last = here
             return
         # Each frame is used in one difference only, so that the differences are independent.
-        self._size = here[0][0].size
+        self._size, self._width = here[0][0].size, here[0][0].shape[1]
         flat = np.empty((len(here), self._size))
         spectra, long, rows, strips = [], [], [], []
         for own, (a, zero_a), (b, zero_b) in zip(flat, self._last, here, strict=True):
@@ -220,8 +225,9 @@ class BiasChannels:
             blocks.append(self._errors(seen, amp) / (self._size * pairs))
             near = np.minimum(self._lags, READOUT_LAGS)
             pulse = np.where(self._lags <= READOUT_LAGS, pulses[near], 0.0)
+            same = np.clip(1.0 - self._lags / self._width, 0.0, None)
             axes.add(len(mean), self._condition, amp=amp, lag=self._lags, pulse=pulse,
-                     pairs=pairs)  # fmt: skip
+                     pairs=pairs, same_row=same)  # fmt: skip
         out = [
             Channel("bias_cov", np.concatenate(values), tuple(blocks), axes.columns(), "adu2",
                     self._fold)
@@ -282,10 +288,11 @@ class BiasChannels:
         )
         shapes /= np.sqrt(np.square(shapes).sum(1))[:, None]
         each = np.array(self._third) @ shapes.T
+        gain = len(each) * each.mean(0) ** 2
         # Third cumulants of correlated noise scatter by more than those of white noise.
         scatter = each.var(0, ddof=1) if len(each) > 1 else 1.0
-        gain = (len(each) * each.mean(0) ** 2 / np.maximum(scatter, 1.0)).sum(0)
-        chance = max(float(chi2.sf(gain.max(), each.shape[1])), np.finfo(float).tiny)
+        clear = (gain / np.maximum(scatter, 1.0)).sum(0).max()
+        chance = max(float(chi2.sf(clear, each.shape[1])), np.finfo(float).tiny)
         deviate = float(norm.isf(chance))
         if deviate < SCATTERED:
             return out, deviate
@@ -293,7 +300,7 @@ class BiasChannels:
         away = (
             c[:, 1 : READOUT_LAGS + 1] / c[:, :1] * np.sqrt(self._size * len(self._spectra))
         )
-        best = shapes[int(np.argmax(gain + np.square(away @ shapes.T).sum(0)))]
+        best = shapes[int(np.argmax((gain + np.square(away @ shapes.T)).sum(0)))]
         out[1:] = best / best[0]
         return out, deviate
 
@@ -335,13 +342,14 @@ class BiasChannels:
             values.append(value)
             blocks.append(np.diag(np.maximum(more * error, apart) ** 2))
             axes.add(len(one), self._condition, amp=np.arange(len(one)), exposure=2 * n,
-                     what="rows", white=white)  # fmt: skip
+                     what="rows", white=white, same_row=self._share_of_far_lags() / white)  # fmt: skip
         for exposure, levels in self._levels:
             level, variance = np.array(levels).T
             values.append(level)
             blocks.append(np.diag(variance))
             axes.add(len(level), self._condition, amp=np.arange(len(level)),
-                     exposure=exposure.number, what="level", white=variance)  # fmt: skip
+                     exposure=exposure.number, what="level", white=variance,
+                     same_row=0.0)  # fmt: skip
         if len(self._zeros) > 2:
             zeros = np.array([z for _, z in sorted(self._zeros)])
             own, amps = _contrasts(zeros[..., 0])
@@ -356,9 +364,22 @@ class BiasChannels:
             n = len(zeros)
             blocks.append((3.0 * n - 4.0) / (n - 1.0) ** 2 * np.eye(len(white)))
             axes.add(len(white), self._condition, amp=amps, exposure=-1,
-                     what="frames", white=white)  # fmt: skip
+                     what="frames", white=white, same_row=0.0)  # fmt: skip
+        amps = np.arange(len(self._names))
+        values.append(np.zeros(len(amps)))
+        blocks.append(ROW_ERROR**4 * np.eye(len(amps)))
+        axes.add(len(amps), self._condition, amp=amps, exposure=-1, what="usual rows", white=1.0,
+                 same_row=1.0)  # fmt: skip
         return Channel("bias_level", np.concatenate(values), tuple(blocks), axes.columns(), "adu",
                        self._fold)  # fmt: skip
+
+    def _share_of_far_lags(self) -> float:
+        """Variance of a row's mean, for rows of independent levels of unit variance, at far lags.
+
+        Near lags are values of 'bias_cov'.
+        """
+        lag = np.arange(len(near_lags(self._width)) + 1.0, self._width)
+        return 2.0 / self._width * float((1.0 - lag / self._width).sum())
 
     def _shared(self, found: list[FloatArray], pairs: int) -> Channel:
         """Covariance of the noise between amplifiers at the same readout time."""

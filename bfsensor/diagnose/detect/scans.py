@@ -331,7 +331,7 @@ def _noise(g: Group) -> Iterator[Pattern]:
 def _levels(g: Group) -> Iterator[Pattern]:
     """Patterns of bias levels by amplifier and exposure."""
     x = g.axes
-    for what in dict.fromkeys(x["what"]):
+    for what in (w for w in dict.fromkeys(x["what"]) if w != "usual rows"):
         for name, here in _amplifiers(x):
             rows = here & (x["what"] == what)
             yield "bias", np.where(rows, 1.0, 0.0), {"amp": name, "what": str(what)}

@@ -56,9 +56,9 @@ def linear_columns(
     if channel.word == "spot":
         return _spot_columns(channel, rows)
     if channel.word in ("bias_cov", "flat_cov"):
-        return _pulse_columns(channel)
+        return _pulse_columns(channel) | _row_columns(channel)
     if channel.word == "bias_level":
-        return _level_columns(channel)
+        return _level_columns(channel) | _row_columns(channel)
     if channel.word == "code_hist":
         return _code_columns(channel)
     return {}
@@ -123,6 +123,15 @@ def _pulse_columns(channel: Channel) -> dict[str, FloatArray]:
         return {}
     own = {int(a): np.where(x["amp"] == a, shape, 0.0) for a in np.unique(x["amp"])}
     return {f"pulses {amp}": column for amp, column in own.items() if column.any()}
+
+
+def _row_columns(channel: Channel) -> dict[str, FloatArray]:
+    """Variance of the levels of each amplifier's rows, which values of usual sensors hold near 0."""
+    x, shape = channel.axes, channel.axes.get("same_row")
+    if shape is None:
+        return {}
+    own = {int(a): np.where(x["amp"] == a, shape, 0.0) for a in np.unique(x["amp"])}
+    return {f"row noise {amp}": column for amp, column in own.items() if column.any()}
 
 
 def _level_columns(channel: Channel) -> dict[str, FloatArray]:
