@@ -62,7 +62,7 @@ def test_a_diagnosis_goes_on_where_it_was_interrupted(tmp_path, monkeypatch, sta
     monkeypatch.setattr(diagnosis, "locate_effects", again)
     if stage == "plan":
         # The explanation holds nonparametric terms, which are stored as all else is.
-        assert json.loads((tmp_path / "whole" / "report.json").read_text())["open_world"]
+        assert json.loads((tmp_path / "whole" / "report.json").read_text())["free_form"]
         monkeypatch.setattr(diagnosis, "attribute", again)
         monkeypatch.setattr(diagnosis, "explain_single_value", again)
     result = run("cut")

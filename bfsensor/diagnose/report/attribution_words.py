@@ -35,13 +35,13 @@ def reported(attribution: Attribution | None) -> dict[str, Any]:
             "free_form": None,
         }
     effects: list[dict[str, Any]] = [_effect(f) for f in attribution.found]
-    if attribution.open_world and not any(e["class"] == OUTSIDE for e in effects):
+    if attribution.outside and not any(e["class"] == OUTSIDE for e in effects):
         effects.append({"class": OUTSIDE, "parameters": {}})
     return {
         "effects": effects,
         "class_probability": attribution.probability,
         "equivalence_class": attribution.tied,
-        "open_world": attribution.open_world,
+        "open_world": attribution.outside,
         "free_form": reported_freely(attribution.free_form),
         "p_value_after": attribution.mismatch.p_value,
     }
@@ -82,7 +82,11 @@ def said_of(attribution: Attribution) -> list[str]:
     named = any(f.effect.word == OUTSIDE for f in attribution.found)
     if attribution.open_world and not (named and attribution.free_form is None):
         what = "the rest" if attribution.found else "it"
-        out.append(f"No effect of the library explains {what}.")
+        chance = attribution.probability[OUTSIDE]
+        out.append(
+            f"No effect of the library explains {what}; the probability that its physics is outside "
+            f"the library is {chance:.2f}."
+        )
     if attribution.free_form is not None:
         # The residuals are those with the nonparametric terms.
         out += [said_freely(attribution.free_form), _said_left(attribution)]

@@ -14,6 +14,7 @@ from bfsensor.diagnose.detect.model_error import charge
 from bfsensor.diagnose.explain.attribution import OUTSIDE_TRUE, OUTSIDE_WORD, RELIABLE
 from bfsensor.diagnose.fit.baseline_fit import held_out
 from bfsensor.diagnose.plan.advice import plan
+from bfsensor.diagnose.report.attribution_words import reported
 from bfsensor.diagnose.report.class_words import (
     CLASS_WORDS,
     NAMES,
@@ -126,16 +127,40 @@ def test_certain_evidence_is_as_probable_as_campaigns_of_others_showed(explained
         chances = given.probability
         assert sum(chances.values()) == pytest.approx(1)
         assert next(iter(chances)) == found.effect.word
-        assert RELIABLE[outside] < chances[found.effect.word] < RELIABLE[outside] + 0.03
+        assert RELIABLE < chances[found.effect.word] < RELIABLE + 0.03
         others = {
             w: p for w, p in chances.items() if w not in (found.effect.word, OUTSIDE_WORD)
         }
         assert len(others) > 20 and len(set(others.values())) == 1
         extra = chances[OUTSIDE_WORD] - next(iter(others.values()))
-        assert extra == pytest.approx(OUTSIDE_TRUE if outside else 0)
+        assert extra == pytest.approx(OUTSIDE_TRUE[True] if outside else 0)
     unnamed = replace(told, found=(), open_world=True).probability
     assert next(iter(unnamed)) == OUTSIDE_WORD
+    assert OUTSIDE_TRUE[False] < unnamed[OUTSIDE_WORD] < OUTSIDE_TRUE[False] + 0.03
     assert replace(told, found=(), open_world=False).probability == {}
+
+
+def test_outside_is_claimed_only_where_it_is_more_probable_than_not(explained):
+    """What a named effect leaves is another law of it more often than physics outside the library."""
+    beside = replace(explained.attribution, open_world=True)
+    alone = replace(beside, found=())
+    assert [t.outside for t in (explained.attribution, beside, alone)] == [
+        False,
+        False,
+        True,
+    ]
+    told = reported(beside)
+    assert OUTSIDE_WORD not in told["equivalence_class"] and not told["open_world"]
+    assert OUTSIDE_WORD not in [e["class"] for e in told["effects"]]
+    told = reported(alone)
+    assert told["equivalence_class"] == [OUTSIDE_WORD] and told["open_world"]
+    assert [e["class"] for e in told["effects"]] == [OUTSIDE_WORD]
+    chance = beside.probability[OUTSIDE_WORD]
+    sentences = replace(explained, attribution=beside).said()
+    assert (
+        f"explains the rest; the probability that its physics is outside the library is {chance:.2f}"
+        in (sentences)
+    )
 
 
 def test_an_effect_explains_only_where_nothing_is_left(explained):
