@@ -17,6 +17,7 @@ from scipy.ndimage import (
     maximum,
     maximum_filter,
     median_filter,
+    minimum,
 )
 
 from bfsensor.typing import FloatArray
@@ -481,14 +482,21 @@ def _dark_patches(
         bright += (top / scatter).tolist()
         # Dust spots that touch are apart at a greater depth.
         for edge in (EDGE, 2 * EDGE, 4 * EDGE):
-            groups, _ = label((mean < -edge * scatter) & ~taken)
-            for n in range(1, int(groups.max()) + 1):
-                parts = _grains(groups == n)
-                depths = [-float(mean[p & (groups == n)].min(initial=0.0)) for p in parts]
+            groups, number = label((mean < -edge * scatter) & ~taken)
+            deepest = -np.atleast_1d(minimum(mean, groups, np.arange(1, number + 1)))
+            windows = find_objects(groups)
+            # Large maps have thousands of groups that are too shallow, and all are small parts.
+            for n in np.flatnonzero(deepest >= least):
+                # The mask of a patch is wider than the patch by two boxes.
+                window = tuple(slice(max(w.start - 3, 0), w.stop + 3) for w in windows[n])
+                own, values = groups[window] == n + 1, mean[window]
+                parts = _grains(own)
+                depths = [-float(values[p & own].min(initial=0.0)) for p in parts]
                 if not all(map(_is_round, parts)) or min(depths) < least:
                     continue
                 for part, depth in zip(parts, depths, strict=True):
-                    whole = binary_dilation(part, iterations=2)
+                    whole = np.zeros_like(taken)
+                    whole[window] = binary_dilation(part, iterations=2)
                     taken |= whole
                     out.append((whole, depth / scatter))
     return out, bright

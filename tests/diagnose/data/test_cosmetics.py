@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
+from bfsensor.diagnose.data import flat_defects
 from bfsensor.diagnose.data.cosmetics import (
     Repair,
     RepairedFrame,
@@ -165,6 +166,21 @@ def test_dust_in_a_corner_is_dust():
     image -= 0.02 * (np.hypot(x - 89, y - 6) < 9)
     ((rows, columns, _, _),) = dust_spots(image)
     assert 6 in rows and 89 in columns
+
+
+def test_the_work_on_a_patch_does_not_grow_with_the_map(monkeypatch):
+    """Noise makes patches in proportion to a map's area: none may be looked at in all of the map."""
+    seen = []
+    grains = flat_defects._grains
+    monkeypatch.setattr(
+        flat_defects, "_grains", lambda patch: seen.append(patch.size) or grains(patch)
+    )
+    y, x = np.indices((512, 512))
+    image = 3e-3 * np.random.default_rng(9).standard_normal(y.shape)
+    image -= 0.03 * np.exp(-0.5 * ((x - 300) ** 2 + (y - 511) ** 2) / 5**2)
+    assert len(dust_spots(image)) == 1
+    boxes = (512 // flat_defects.BIN) ** 2
+    assert max(seen) < boxes / 50 and sum(seen) < boxes
 
 
 def test_shallow_dust_does_not_pull_the_light_down():
