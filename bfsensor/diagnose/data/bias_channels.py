@@ -58,9 +58,9 @@ Published: bias jumps of LSST sensors are typically above 1 ADU (SITCOMTN-148, R
 2024)."""
 
 ROW_ERROR = 0.05
-"""Scatter of the levels of an amplifier's rows that is no finding [ADU]: its square is the error of the
-variance that usual sensors have, 0.  Chosen, to be derived from quiet systems: with 0.1, levels that
-scatter by 0.2 ADU would be found at 4 sigma at most, with 0.05 at 16."""
+"""Scatter of the levels of an amplifier's rows that is no finding [ADU].  The fit holds the variance of
+these levels to 0, with the square of this as its error.  Chosen, to be derived from quiet systems: with
+0.1, levels that scatter by 0.2 ADU would be found at 4 sigma at most, with 0.05 at 16."""
 
 TOGETHER = 0.9
 """Part of the variance of the amplifiers' bias levels that one common drift has, above which it gives

@@ -88,8 +88,8 @@ HEADLINES: Mapping[str, tuple[str, ...]] = {
         "boundary shifts in y exceed those in x by {eps} more than simulated",
     ),
     "bf_long_range": (
-        "an electron changes areas by {amp} at 1 pixel, falling with the distance to the power "
-        "-{power}, beyond what was simulated",
+        "an electron changes areas by {amp} at 1 pixel, divided by the distance to the power "
+        "{power}, beyond what was simulated",
     ),
     "voltage_dependence": (
         "boundary shifts grow by {delta} for 20 V less back bias beyond what was simulated",
