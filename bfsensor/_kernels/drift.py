@@ -11,7 +11,7 @@ import numba
 import numpy as np
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _cell(nodes, value, guess):
     """Index of the interval that holds ``value``, searched from the last one."""
     i = guess
@@ -23,7 +23,7 @@ def _cell(nodes, value, guess):
     return i
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _weights(nodes, i, value, w, d):
     """Weights of nodes i-1 .. i+2 for the value (``w``) and the derivative (``d``)."""
     h0 = nodes[i] - nodes[i - 1]
@@ -57,7 +57,7 @@ def _weights(nodes, i, value, w, d):
     d[3] = g1 * c1
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def gradient(phi, xs, ys, zs, x, y, z, cell, weights, out):
     """Write the gradient of the potential [V/um] at a point to ``out``; ``cell`` keeps the interval."""
     i = _cell(xs, x, cell[0])
@@ -100,7 +100,7 @@ def gradient(phi, xs, ys, zs, x, y, z, cell, weights, out):
     out[2] = gz
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _slope_along(phi, xs, ys, zs, p, sign, cell, weights, g, out):
     """Unit vector along (``sign`` = 1) or against the electron drift."""
     gradient(phi, xs, ys, zs, p[0], p[1], p[2], cell, weights, g)
@@ -130,7 +130,7 @@ all the way, and a wrong decision leads to a second bisection.  Twice as large g
 boundaries in more time."""
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def turns(a, b, c, d):
     """Largest difference of the directions within a step from that at its start, squared."""
     first = 0.0
@@ -143,7 +143,7 @@ def turns(a, b, c, d):
     return max(first, middle, last)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def find_well(
     phi,
     xs,
@@ -210,7 +210,7 @@ def find_well(
         out[m] = p[m]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _sides(
     phi, xs, ys, zs, point, axis, edge, a, b, zone, coarseness, max_steps, scratch, cell, turn,
     leave,
@@ -231,7 +231,7 @@ def _sides(
     return below, end[axis] > edge
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _bisect(
     phi, xs, ys, zs, point, axis, edge, a, b, tolerance, zone, coarseness, max_steps, scratch,
     cell, turn, leave,
@@ -268,7 +268,7 @@ def _bisect(
     return a, b
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def bisect_edge(
     phi,
     xs,
@@ -323,7 +323,7 @@ def bisect_edge(
     return failed
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def trace_up(phi, xs, ys, zs, seeds, depths, ratio, out):
     """Follow field lines from seeds up to each depth, against the electron drift.
 
@@ -389,7 +389,7 @@ def trace_up(phi, xs, ys, zs, seeds, depths, ratio, out):
             out[n, m, 1] = y
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def trace_down(phi, xs, ys, zs, starts, zone, coarseness, max_steps, out_path, out_length):
     """Follow electrons down; ``out_path`` (n, max_steps, 3) gets the points, ``out_length`` how many."""
     scratch = np.zeros((13, 4))

@@ -30,7 +30,7 @@ class Changes(NamedTuple):
     steps: np.ndarray
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _bends(nodes, i, value, b):
     """Weights of nodes i-1 .. i+2 for the second derivative."""
     h0 = nodes[i] - nodes[i - 1]
@@ -52,7 +52,7 @@ def _bends(nodes, i, value, b):
     b[3] = g1 * c1
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _field_and_changes(phi, changes, xs, ys, zs, p, cell, weights, g, hess, out):
     """Write the gradient, its derivatives (xx, xy, xz, yy, yz, zz) and the changes' gradients (n, 3)."""
     i = _cell(xs, p[0], cell[0])
@@ -116,7 +116,7 @@ def _field_and_changes(phi, changes, xs, ys, zs, p, cell, weights, g, hess, out)
             out[n + q, m] = (out[n + q, m] - g[m]) / changes.steps[q]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _descent(phi, changes, xs, ys, zs, p, delta, cell, weights, g, hess, push, out_p, out):
     """Unit vector along the drift, and how the deviations ``delta`` (n + 1, 3) grow.
 
@@ -147,7 +147,7 @@ def _descent(phi, changes, xs, ys, zs, p, delta, cell, weights, g, hess, push, o
         out[q, 2] = (ez - along * vz) * norm
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def boundary_changes(
     phi,
     changes,
@@ -242,7 +242,7 @@ def boundary_changes(
                 break
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _ascent(phi, changes, xs, ys, zs, p, delta, cell, weights, g, hess, push, out_p, out):
     """Slopes dx/dz and dy/dz of a field line, and how deviations (n, 2) grow with z."""
     _field_and_changes(phi, changes, xs, ys, zs, p, cell, weights, g, hess, push)
@@ -262,7 +262,7 @@ def _ascent(phi, changes, xs, ys, zs, p, delta, cell, weights, g, hess, push, ou
         out[q, 1] = yx * x + yy * y + (push[q, 1] - ay * push[q, 2]) * up
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def trace_changes_up(
     phi, changes, xs, ys, zs, seeds, first, axis, depths, ratio, out, out_slopes
 ):

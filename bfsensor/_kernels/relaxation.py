@@ -39,72 +39,105 @@ def fill_halo(a, periodic_x, periodic_y):
 
 
 @numba.njit(cache=True, error_model="numpy")
+def eliminate(carriers, cy, cz, centre, kind, north, south, inverse_dy, pivots):
+    """Write the inverse pivots of all columns, eliminated from the gates up.
+
+    ``cy``, ``cz`` and ``centre`` are packed, ``[kind, odd or even, z, column]``; ``centre`` is the sum
+    of the x and z links and ``cd``.  ``pivots`` is ``[odd or even, y, z, column]``.
+    """
+    _, ny, nz, n = pivots.shape
+    n_front = carriers.shape[1]
+    one = pivots.dtype.type(1.0)
+    for even in range(2):
+        for j in range(1, ny - 1):
+            g = kind[j]
+            ay = north[j] + south[j]
+            w = inverse_dy[j]
+            for k in range(nz):
+                out = pivots[even, j, k]
+                for m in range(n):
+                    out[m] = centre[g, even, k, m] + ay * cy[g, even, k, m]
+                if k < n_front:
+                    for m in range(min(n, (carriers.shape[2] - 1 - even) // 2)):
+                        out[m] += carriers[j, k, 1 + even + 2 * m] * w
+                if k > 0:
+                    for m in range(n):
+                        lower = cz[g, even, k - 1, m]
+                        out[m] -= lower * lower * pivots[even, j, k - 1, m]
+                for m in range(n):
+                    out[m] = one / out[m]
+
+
+@numba.njit(cache=True, error_model="numpy")
 def relax_columns(
     phi,
     rhs,
-    carriers,
-    cx,
+    pivots,
+    left,
+    right,
     cy,
     cz,
-    centre,
     kind,
     north,
     south,
     inverse_dy,
     colour,
-    mask,
     work,
-    pivot,
 ):
     """Solve every column (fixed x, y) of one colour exactly along z, in place.
 
-    ``rhs`` is the charge of each node; ``centre`` the sum of the x and z links and ``cd``;
-    ``mask`` (2, nx) is one where a column belongs to the colour in an even or odd row.
-    ``work`` and ``pivot`` are scratch, shape (nz, nx).  Both colours of a row are
-    eliminated, which keeps the inner loops contiguous, and only one is stored.  The loops
-    are kept short so that the compiler can prove them free of aliasing and vectorise.
+    ``rhs`` is the charge of each node, ``pivots`` what :func:`eliminate` wrote.  The links ``left``,
+    ``right``, ``cy`` and ``cz`` are packed, ``[kind, odd or even, z, column]``: columns of odd number
+    first (counted with the halo), as those of one colour in a row have one parity.  ``work`` is
+    scratch, shape (nz, columns).  The loops are kept short so that the compiler can prove them
+    free of aliasing and vectorise.
     """
     ny, nz, nx = phi.shape
-    n_front = carriers.shape[1]
-    one = np.float32(1.0)
     for j in range(1, ny - 1):
         g = kind[j]
         an = north[j]
         as_ = south[j]
-        ay = an + as_
         w = inverse_dy[j]
-        parity = (j + colour) % 2
+        even = (j + colour) % 2
+        first = 1 + even
+        n = (nx - first) // 2
         for k in range(nz):
-            for i in range(1, nx - 1):
-                pivot[k, i] = centre[g, k, i] + ay * cy[g, k, i]
-            if k < n_front:
-                for i in range(1, nx - 1):
-                    pivot[k, i] += carriers[j, k, i] * w
-            if k > 0:
-                for i in range(1, nx - 1):
-                    lower = cz[g, k - 1, i]
-                    pivot[k, i] -= lower * lower * pivot[k - 1, i]
-            for i in range(1, nx - 1):
-                pivot[k, i] = one / pivot[k, i]
-            for i in range(1, nx - 1):
-                work[k, i] = rhs[j, k, i] * w + cy[g, k, i] * (
+            out = work[k]
+            for m in range(n):
+                out[m] = rhs[j, k, first + 2 * m] * w
+            for m in range(n):
+                i = first + 2 * m
+                out[m] += cy[g, even, k, m] * (
                     an * phi[j + 1, k, i] + as_ * phi[j - 1, k, i]
                 )
-            for i in range(1, nx - 1):
-                work[k, i] += (
-                    cx[g, k, i] * phi[j, k, i + 1] + cx[g, k, i - 1] * phi[j, k, i - 1]
+            for m in range(n):
+                i = first + 2 * m
+                out[m] += (
+                    right[g, even, k, m] * phi[j, k, i + 1]
+                    + left[g, even, k, m] * phi[j, k, i - 1]
                 )
             if k > 0:
-                for i in range(1, nx - 1):
-                    work[k, i] += cz[g, k - 1, i] * work[k - 1, i]
-            for i in range(1, nx - 1):
-                work[k, i] *= pivot[k, i]
+                for m in range(n):
+                    out[m] += cz[g, even, k - 1, m] * work[k - 1, m]
+            for m in range(n):
+                out[m] *= pivots[even, j, k, m]
         for k in range(nz - 1, -1, -1):
+            out = work[k]
             if k < nz - 1:
-                for i in range(1, nx - 1):
-                    work[k, i] += cz[g, k, i] * pivot[k, i] * work[k + 1, i]
+                for m in range(n):
+                    out[m] += cz[g, even, k, m] * pivots[even, j, k, m] * work[k + 1, m]
+            for m in range(n):
+                phi[j, k, first + 2 * m] = out[m]
+
+
+@numba.njit(cache=True)
+def packed(field, out):
+    """Copy the inner columns of ``field``, ``[kind, z, x]``, to ``[kind, odd or even, z, column]``."""
+    kinds, nz, nx = field.shape
+    for g in range(kinds):
+        for k in range(nz):
             for i in range(1, nx - 1):
-                phi[j, k, i] += mask[parity, i] * (work[k, i] - phi[j, k, i])
+                out[g, (i + 1) % 2, k, (i - 1) // 2] = field[g, k, i]
 
 
 @numba.njit(cache=True)

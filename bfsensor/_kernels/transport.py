@@ -50,7 +50,7 @@ class Pace(NamedTuple):
     most: int
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def step_words(electron, step, stream, key0, key1):
     """Four random words of an electron's step: 1 its noise, 2 the surface, 3 a collision."""
     return philox(
@@ -59,7 +59,7 @@ def step_words(electron, step, stream, key0, key1):
     )  # fmt: skip
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _normals(electron, step, key0, key1, out):
     """Three normal deviates."""
     a, b, c, d = step_words(electron, step, 1, key0, key1)
@@ -72,7 +72,7 @@ def _normals(electron, step, key0, key1, out):
     out[2] = radius * cosine
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _fold(value, low, high, periodic):
     """Place of the domain where a coordinate belongs, and the sign of its axis there."""
     if low <= value <= high:
@@ -86,7 +86,7 @@ def _fold(value, low, high, periodic):
     return low + 2.0 * width - part, -1.0
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _field(phi, xs, ys, zs, room, p, cell, weights, out):
     """Gradient of the potential [V/um] at a point, in the domain or beyond."""
     x, sign_x = _fold(p[0], room.box[0], room.box[1], room.periodic_x)
@@ -96,7 +96,7 @@ def _field(phi, xs, ys, zs, room, p, cell, weights, out):
     out[1] *= sign_y
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _floor_height(surface, x):
     """Height of the silicon surface [um] at a place."""
     distance = 0.5 * surface[4] - abs(x - surface[4] * np.round(x / surface[4]))
@@ -107,7 +107,7 @@ def _floor_height(surface, x):
     return surface[1] + (surface[0] - surface[1]) * ramp
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _arrived(zone, x, y, z):
     if z >= zone[4]:
         return False
@@ -116,7 +116,7 @@ def _arrived(zone, x, y, z):
     return abs(ox) < zone[2] and abs(oy) < zone[3]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _confine(room, p, word):
     """Bring a point back into the silicon; True if the back surface took it."""
     if p[2] > room.thickness:
@@ -130,7 +130,7 @@ def _confine(room, p, word):
     return False
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _begin(room, starts, n, p, path, length):
     """Put an electron where it is set free, and begin its path."""
     for m in range(3):
@@ -142,7 +142,7 @@ def _begin(room, starts, n, p, path, length):
         length[n] = 1
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _keep_path(path, length, n, p):
     if path.shape[0] > 0 and length[n] < path.shape[1]:
         for m in range(3):
@@ -211,7 +211,7 @@ def walk(
         out_fate[n] = fate
 
 
-@numba.njit(cache=True, inline="always")
+@numba.njit(cache=True, inline="always", error_model="numpy")
 def _mobility(size, law):
     """Jacoboni's law: low-field mobility, critical field and exponent in ``law``."""
     return law[0] / (1.0 + (size / law[1]) ** law[2]) ** (1.0 / law[2])

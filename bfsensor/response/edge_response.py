@@ -21,11 +21,10 @@ from bfsensor.response.vertices import vertex_fractions
 from bfsensor.simulate.boundaries import TURN, Feet, PixelBoundaries, find_boundaries
 from bfsensor.simulate.boundary_tangent import boundary_changes
 from bfsensor.simulate.far_field import FarField
-from bfsensor.simulate.mesh import Surfaces, make_mesh
-from bfsensor.simulate.moved_mesh import move_mesh
-from bfsensor.simulate.poisson import Electrostatics, Potential
+from bfsensor.simulate.mesh import Surfaces
+from bfsensor.simulate.pixel_array import PixelArray
+from bfsensor.simulate.poisson import Potential
 from bfsensor.simulate.tangent import TOLERANCE, PotentialChange, Tangent
-from bfsensor.simulate.unit_cell import tile
 from bfsensor.typing import Edges, FloatArray
 
 LEVEL = 40_000.0
@@ -267,18 +266,10 @@ def solve_response(
     if period % 2 or period <= 2 * REACH + 2:
         raise TableError(f"period = {period} pixels must be even and above {2 * REACH + 2}")
     began = time.process_time()
-    model = device if laid_for is None else laid_for
-    fine, small = (
-        move_mesh(
-            make_mesh(model, pixels=(n, n), cells=cells, refine_z=refine_z), model, device
-        )
-        for n in (period, 1)
+    array = PixelArray(
+        device, period=period, cells=cells, refine_z=refine_z, laid_for=laid_for
     )
-    unit_solver, solver = Electrostatics(device, small), Electrostatics(device, fine)
-    unit = unit_solver.solve(level, start=unit_solver.solve(0.0).phi)
-    charges = np.full(solver.pixel_shape, level)
-    charges[0, 0] += CHARGE
-    potential = solver.solve(charges, start=tile(unit, fine))
+    unit, potential = array.unit(level), array.solve(level + CHARGE, level)
     depths = np.array(response_depths(device))
     feet: list[Feet] = []
     lines = find_boundaries(
@@ -294,7 +285,7 @@ def solve_response(
     moved = edges.moved(lines)
     kx, ky = edges.mean(moved)
     middle = time.process_time()
-    tangent = Tangent(solver, potential, Tangent(unit_solver, unit))
+    tangent = Tangent(array.solver, potential, Tangent(array.unit_solver, unit))
     changes = [tangent.change(*c, tolerance=tolerance) for c in changed]
     dkx, dky = np.zeros((2, len(changes), *kx.shape))
     if changes:

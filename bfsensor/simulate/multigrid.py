@@ -36,9 +36,8 @@ class _Level:
     solution: NDArray[np.float32]
     charge: NDArray[np.float32]
     residual: NDArray[np.float32]
-    mask: NDArray[np.float32]
+    pivots: NDArray[np.float32]
     work: NDArray[np.float32]
-    pivot: NDArray[np.float32]
     weight_x: NDArray[np.float32]
     weight_y: NDArray[np.float32]
     periodic: tuple[bool, bool]
@@ -60,9 +59,10 @@ class Multigrid:
             coarser = _coarsen(level)
             self.levels.append(_make_level(level))
             level = coarser
+        self.set_carriers(np.zeros_like(self.levels[0].carriers))
         self.cycles = 0
 
-    def set_carriers(self, carriers: FloatArray) -> None:
+    def set_carriers(self, carriers: NDArray[np.floating]) -> None:
         """Set the derivative of the mobile charge [e-/V] in the front planes, on every level."""
         self.levels[0].carriers[...] = carriers
         for upper, lower in zip(self.levels[:-1], self.levels[1:], strict=True):
@@ -70,6 +70,12 @@ class Multigrid:
             relaxation.restrict(
                 upper.carriers, upper.weight_x, upper.weight_y, lower.carriers
             )
+        for level in self.levels:
+            c = level.coefficients
+            relaxation.eliminate(
+                level.carriers, c["packed_cy"], c["packed_cz"], c["centre"], c["kind"], c["north"],
+                c["south"], c["inverse_dy"], level.pivots,
+            )  # fmt: skip
 
     def cycle(self, charge: FloatArray, out: FloatArray) -> None:
         """Write the approximate solution of ``A out = charge`` to ``out``."""
@@ -82,9 +88,8 @@ class Multigrid:
     def _relax(self, level: _Level, colour: int) -> None:
         c = level.coefficients
         relaxation.relax_columns(
-            level.solution, level.charge, level.carriers, c["cx"], c["cy"], c["cz"],
-            c["centre"], c["kind"], c["north"], c["south"], c["inverse_dy"], colour,
-            level.mask, level.work, level.pivot,
+            level.solution, level.charge, level.pivots, c["left"], c["right"], c["packed_cy"],
+            c["packed_cz"], c["kind"], c["north"], c["south"], c["inverse_dy"], colour, level.work,
         )  # fmt: skip
         relaxation.fill_halo(level.solution, *level.periodic)
 
@@ -126,7 +131,6 @@ def _make_level(fine: Coefficients) -> _Level:
     cx_left = np.zeros_like(fine.cx)
     cx_left[:, :, 1:] = fine.cx[:, :, :-1]
     centre = fine.cx + cx_left + fine.cz + cz_below + fine.cd
-    parity = (np.arange(nx + 2) % 2).astype(single)
     inverse_dy = np.zeros(ny + 2, single)
     inverse_dy[1:-1] = 1.0 / fine.dy[1:-1]
     coefficients: dict[str, NDArray] = {
@@ -134,7 +138,11 @@ def _make_level(fine: Coefficients) -> _Level:
         "cy": fine.cy.astype(single),
         "cz": fine.cz.astype(single),
         "cd": fine.cd.astype(single),
-        "centre": centre.astype(single),
+        "centre": _packed(centre, 1.0),
+        "left": _packed(cx_left),
+        "right": _packed(fine.cx),
+        "packed_cy": _packed(fine.cy),
+        "packed_cz": _packed(fine.cz),
         "kind": fine.kind,
         "north": fine.north.astype(single),
         "south": fine.south.astype(single),
@@ -147,13 +155,20 @@ def _make_level(fine: Coefficients) -> _Level:
         solution=np.zeros(shape, single),
         charge=np.zeros(shape, single),
         residual=np.zeros(shape, single),
-        mask=np.stack([parity, 1 - parity]),
-        work=np.zeros((nz, nx + 2), single),
-        pivot=np.zeros((nz, nx + 2), single),
+        pivots=np.zeros((2, ny + 2, nz, (nx + 1) // 2), single),
+        work=np.zeros((nz, (nx + 1) // 2), single),
         weight_x=interpolation_weights(mesh.x, mesh.side_x, mesh.period[0]).astype(single),
         weight_y=interpolation_weights(mesh.y, mesh.side_y, mesh.period[1]).astype(single),
         periodic=(mesh.side_x == "periodic", mesh.side_y == "periodic"),
     )
+
+
+def _packed(field: FloatArray, rest: float = 0.0) -> NDArray[np.float32]:
+    """Columns of odd number, then of even; where there is none of the latter, ``rest``."""
+    kinds, nz, nx = field.shape
+    out = np.full((kinds, 2, nz, (nx - 1) // 2), rest, np.float32)
+    relaxation.packed(field.astype(np.float32), out)
+    return out
 
 
 def interpolation_weights(nodes: FloatArray, side: str, period: float) -> FloatArray:

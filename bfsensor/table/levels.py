@@ -22,9 +22,8 @@ from bfsensor.response.periodic_images import PERIOD, SAMPLES, without_images
 from bfsensor.response.vertices import vertex_fractions
 from bfsensor.simulate.boundaries import find_boundaries
 from bfsensor.simulate.far_field import FarField
-from bfsensor.simulate.mesh import Surfaces, make_mesh
-from bfsensor.simulate.poisson import Electrostatics
-from bfsensor.simulate.unit_cell import solve_unit_cell, tile
+from bfsensor.simulate.mesh import Surfaces
+from bfsensor.simulate.pixel_array import PixelArray
 from bfsensor.table.table_plan import TablePlan, storage_height
 from bfsensor.typing import FloatArray
 
@@ -76,13 +75,12 @@ class Level:
 
 
 @lru_cache(maxsize=1)
-def _workshop(device_text: str, cells: int, refine_z: int) -> tuple[Any, Any, Any]:
-    """Build device, solver and mesh; cached, so that a process does it once for all its levels."""
+def _workshop(device_text: str, cells: int, refine_z: int) -> tuple[Any, PixelArray]:
+    """Build device and solvers; cached, so that a process does it once for all its levels."""
     from bfsensor.device.device import Device
 
     device = Device.from_toml(device_text)
-    mesh = make_mesh(device, pixels=(PERIOD, PERIOD), cells=cells, refine_z=refine_z)
-    return device, Electrostatics(device, mesh), mesh
+    return device, PixelArray(device, period=PERIOD, cells=cells, refine_z=refine_z)
 
 
 def solve_level(plan: TablePlan, charge: float, background: float) -> Level:
@@ -101,8 +99,8 @@ def solve_level(plan: TablePlan, charge: float, background: float) -> Level:
         Displacements at the plan's depths; 0 at and below the height of the stored charge.
     """
     began = time.process_time()
-    device, solver, mesh = _workshop(plan.device.to_toml(), plan.cells, plan.refine_z)
-    unit = solve_unit_cell(device, background, cells=plan.cells, refine_z=plan.refine_z)
+    device, array = _workshop(plan.device.to_toml(), plan.cells, plan.refine_z)
+    unit, mesh = array.unit(background), array.mesh
     n = 2 * plan.reach + 1
     nd = len(plan.depths)
     fractions = vertex_fractions(plan.vertices)
@@ -116,9 +114,7 @@ def solve_level(plan: TablePlan, charge: float, background: float) -> Level:
         return Level(
             corners, horizontal, vertical, 0, 0, 0.0, time.process_time() - began, 0.0
         )
-    charges = np.full(solver.pixel_shape, background)
-    charges[0, 0] = charge
-    potential = solver.solve(charges, start=tile(unit, mesh))
+    potential = array.solve(charge, background)
     depths = np.array(plan.depths)
     fixed = depths <= storage_height(device) + 1e-9
     moved = tuple(np.zeros(shape) for shape in shapes)
