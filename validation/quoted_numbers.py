@@ -362,6 +362,7 @@ def _numbers() -> dict[str, Callable[[Rows], str]]:
         "sweep itl 01": lambda r: f"{sweep_error(r, ITL, 16, '01'):.0f}",
         "sweep e2v 10": lambda r: f"{sweep_error(r, E2V, 16, '10'):.0f}",
         "sweep e2v 01": lambda r: f"{sweep_error(r, E2V, 16, '01'):.0f}",
+        "sweep 32": lambda r: sweep_worst(r, 32),
         "sweep 48": lambda r: sweep_worst(r, 48),
         "sweep 48 seconds": lambda r: span(select(r("sweep_mesh"), cells=48)["cpu_s"], ".0f"),
         "growth galsim x": lambda r: growth(r, "galsim", 0, 0),

@@ -37,7 +37,7 @@ from bfsensor.errors import SweepError
 @click.option("--full-pixel", default=0.0, metavar="Q",
               help="Also compute the area changes around one pixel of Q electrons among empty "
               "pixels [e-]; 0 switches it off.  [default: 0]")  # fmt: skip
-@click.option("--cells", type=int, help="Mesh cells per pixel.  [default: 16]")
+@click.option("--cells", type=int, help="Mesh cells per pixel.  [default: 32]")
 @click.option("--accuracy", type=float,
               help="Choose the mesh by the relative accuracy of area changes, as 'bfsensor table' "
               "does; not with --cells.")  # fmt: skip

@@ -13,8 +13,9 @@ from bfsensor.device.device import Device
 from bfsensor.device.quantities import Prior
 from bfsensor.fit.device_at import device_at
 from bfsensor.fit.linear_response import LinearEmulator, LinearResponse
-from bfsensor.response.edge_response import LEVEL, mixed, response_depths
+from bfsensor.response.edge_response import LEVEL
 from bfsensor.response.emulator_nodes import Node, solve_nodes
+from bfsensor.response.light import conversion_depths, mixed
 from bfsensor.typing import FloatArray
 
 Shifts = tuple[FloatArray, FloatArray]
@@ -76,7 +77,7 @@ def solve_shifts(
     for condition, (here, key) in devices.items():
         kx, ky = found[nodes[key].at][0]
         out[condition] = mixed(
-            kx, ky, np.array(response_depths(here)), condition.wavelength,
+            kx, ky, np.array(conversion_depths(here)), condition.wavelength,
             here.operating_point.temperature,
         )  # fmt: skip
     return out

@@ -13,7 +13,8 @@ from bfsensor.device.quantities import Prior
 from bfsensor.errors import FitError
 from bfsensor.fit.device_at import device_at
 from bfsensor.fit.predictors import PredictedEdges, held
-from bfsensor.response.edge_response import area_matrix, mixed, solve_response
+from bfsensor.response.edge_response import area_matrix, solve_response
+from bfsensor.response.light import mixed
 from bfsensor.typing import FloatArray
 
 STEP = 1e-4

@@ -32,12 +32,11 @@ from bfsensor.response.edge_response import (
     LEVEL,
     REFINE_Z,
     area_matrix,
-    mixed,
-    response_depths,
     solve_response,
 )
 from bfsensor.response.emulator_nodes import Node, make_node, solve_nodes
 from bfsensor.response.expansion import EmulatorCheck, ExpandedResponse, Expansion, expand
+from bfsensor.response.light import conversion_depths, mixed
 from bfsensor.typing import FloatArray
 
 SCHEMA = "bfsensor emulator 1"
@@ -256,7 +255,7 @@ class DeviceEmulator:
                 own = values[self.parameters.index(name)] - parameter_value(device, name)
                 device = change_parameter(device, name, own)
         return mixed(
-            shifts[0], shifts[1], np.array(response_depths(device)), condition.wavelength,
+            shifts[0], shifts[1], np.array(conversion_depths(device)), condition.wavelength,
             device.operating_point.temperature,
         )  # fmt: skip
 

@@ -16,7 +16,14 @@ from bfsensor.device.device import Device
 from bfsensor.device.parameters import change_parameter
 from bfsensor.errors import ConvergenceError, DeviceError, FitError
 from bfsensor.files import written_whole
-from bfsensor.response.edge_response import EdgeResponse, solve_response
+from bfsensor.response.edge_response import (
+    CHARGE,
+    PRECISION,
+    REACH,
+    VERTICES,
+    EdgeResponse,
+    solve_response,
+)
 from bfsensor.typing import FloatArray
 
 STEP = 1e-4
@@ -58,13 +65,15 @@ class Node:
     names: tuple[str, ...]
     steps: tuple[float, ...]
     at: tuple[int, int, int]
+    precision: float = PRECISION
 
     @property
     def key(self) -> str:
         """Digest of everything that determines the result."""
         text = "\n".join([
-            "node 2", bfsensor.__version__, self.device, self.laid_for,
-            f"{self.level:.9g} {self.cells} {self.refine_z}",
+            "node 3", bfsensor.__version__, self.device, self.laid_for,
+            f"{self.level:.9g} {self.cells} {self.refine_z} {self.precision:g}",
+            f"{CHARGE} {VERTICES} {REACH}",
             *(f"{n} {s:.9g}" for n, s in zip(self.names, self.steps, strict=True)),
         ])  # fmt: skip
         return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -114,6 +123,7 @@ def solve_node(node: Node) -> EdgeResponse:
         refine_z=node.refine_z,
         laid_for=laid_for,
         changed=changed,
+        precision=node.precision,
     )
 
 

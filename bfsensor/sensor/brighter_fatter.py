@@ -517,7 +517,7 @@ class BrighterFatterSensor(EffectSensor):
         height = self.table.thickness - self.conversion_depth
         first = float(self.table.depths[0])
         if self.depth and height < _COVERED * first:
-            from bfsensor.table.table_plan import storage_height
+            from bfsensor.response.light import storage_height
 
             # Where charge is stored nothing moves, and below it neither.
             if first > storage_height(self._device) + 1.0:

@@ -23,12 +23,11 @@ import numpy as np
 import bfsensor
 from bfsensor.device.device import Device
 from bfsensor.errors import BFSensorError, SweepError
+from bfsensor.response.edge_response import CHARGE, LEVEL
 from bfsensor.sweeps.axes import WAVELENGTH, Swept, combine
 from bfsensor.sweeps.executors import run_points
 from bfsensor.sweeps.points import (
     CELLS,
-    LEVEL,
-    STEP,
     PointResponse,
     SweepPoint,
     solve_point,
@@ -74,8 +73,8 @@ def sweep_device(
         Charge of one full pixel among empty ones [e-] for the area changes around it; 0 leaves
         them out.
     cells : int
-        Mesh cells a pixel, even, at least 8.  A level takes 0.4 CPU seconds at 8, 1.4 at 16 and
-        3.6 at 32; a point takes two levels, one of them for the full well, and a third with
+        Mesh cells a pixel, even, at least 8.  A level takes 1 CPU second at 8, 3 at 16 and
+        8 at 32; a point takes two levels, one of them for the full well, and a third with
         ``full_pixel``.
     work : Path
         Folder that keeps finished points; a run that finds points there does not repeat them.
@@ -154,7 +153,7 @@ def sweep_device(
     return DeviceSweep.make(
         rows, np.abs(fine / coarse - 1), swept, places,
         {
-            "command": command, "version": bfsensor.__version__, "level": level, "step": STEP,
+            "command": command, "version": bfsensor.__version__, "level": level, "step": CHARGE,
             "full_pixel": full_pixel, "cells": cells, "error_cells": partner_cells(cells),
             "no_error": refused[0] if refused else "", "device": device.to_toml().splitlines(),
         },

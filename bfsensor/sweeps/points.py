@@ -11,54 +11,34 @@ from pathlib import Path
 import numpy as np
 
 import bfsensor
-from bfsensor.device import silicon
 from bfsensor.device.depletion import check_depleted
 from bfsensor.device.device import Device
 from bfsensor.errors import BFSensorError, SweepError
 from bfsensor.files import written_whole
+from bfsensor.response.edge_response import (
+    CHARGE,
+    REACH,
+    REFINE_Z,
+    VERTICES,
+    EdgeResponse,
+    area_matrix,
+    solve_response,
+)
+from bfsensor.response.light import conversion_weights
+from bfsensor.simulate.boundaries import BISECTION
+from bfsensor.simulate.poisson import AREA_PER_VOLT
 from bfsensor.simulate.well import full_well
 from bfsensor.sweeps.rows import LAGS
 from bfsensor.table.build import build_table
 from bfsensor.table.table import DistortionTable
-from bfsensor.table.table_plan import TablePlan, default_depths
+from bfsensor.table.table_plan import TablePlan
 from bfsensor.typing import FloatArray
 
-LEVEL = 40_000.0
-"""Charge of all pixels about which the response is taken [e-].
-
-Chosen: the mean over the exposure of a flat of 80,000 e-.  On 16 cells, at
-twice the level a_00 changes by -3.3 % (ITL) and +0.7 % (E2V), other a_ij by up to 10 %."""
-
-STEP = 5_000.0
-"""Charge of the source pixel over the background [e-].
-
-Chosen: small, because the response is differential, and large against the solver's iteration
-error.  On 16 cells, twice the step weakens a_00 of the two LSST devices by 0.3 and 0.5 %, and no
-a_ij changes by more than 1.4 %."""
-
-CELLS = 16
+CELLS = 32
 """Mesh cells a pixel.
 
-Chosen: on 64 cells a_01 is 4 % (ITL) and 9 % (E2V) smaller, and E2V's a_10 is 14 % larger; on
-twice as many a level takes 2.6 times as long."""
-
-_REACH = 4
-"""Largest pixel offset of a point's table, of which offsets 0 to 2 are used.
-
-Chosen: 5 changes the a_ij of the two LSST devices by 0.2 % at most (on 16 cells).  Twice as many do
-not fit into the solver's period of 12 pixels."""
-
-_VERTICES = 32
-"""Vertices a side of a pixel in a point's table.
-
-Chosen: twice as many change a_10 of the two LSST devices by 0.1 and 0.3 %, the other a_ij by
-0.2 % at most (on 16 cells)."""
-
-_SLABS = 48
-"""Slabs of silicon between which the response is linear in depth, for light of a wavelength.
-
-Chosen: twice as many change the a_ij of the two LSST devices in light of 900 nm by 0.1 % at
-most."""
+Measured (``python -m validation.boundaries.sweep_mesh``): the nearest a_ij are within 0.9 % (ITL) and
+3.2 % (E2V's a_10) of 64 cells; 16 cells are off by 4 and 14 %, and take a third of the time."""
 
 
 @dataclass(frozen=True)
@@ -94,8 +74,8 @@ class SweepPoint:
     def key(self) -> str:
         """Digest of all inputs of the response: device, charges, mesh, constants, version."""
         text = "\n".join([
-            "sweep 1", bfsensor.__version__, self.device_text,
-            f"{self.level:.9g} {self.full_pixel:.9g} {self.cells} {STEP} {_REACH} {_VERTICES} "
+            "sweep 2", bfsensor.__version__, self.device_text,
+            f"{self.level:.9g} {self.full_pixel:.9g} {self.cells} {CHARGE} {REACH} {VERTICES} "
             f"{self.with_table}",
         ])  # fmt: skip
         return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -205,48 +185,8 @@ class PointResponse:
         """
         if wavelength is None:
             return self.a[-1], self.areas[-1]
-        weights = light_weights(self.depths, wavelength, temperature)
+        weights = conversion_weights(self.depths, wavelength, temperature)
         return np.tensordot(weights, self.a, 1), np.tensordot(weights, self.areas, 1)
-
-
-def light_weights(depths: FloatArray, wavelength: float, temperature: float) -> FloatArray:
-    r"""Weights of depths for the mean, over converting light, of a response linear between them.
-
-    .. math:: w_k = \int h_k(z)\, \frac{e^{-(T - z) / \ell}}{\ell}\, dz \Big/
-        \int \frac{e^{-(T - z) / \ell}}{\ell}\, dz, \qquad \ell = \ell(\lambda, \text{K}),
-
-    with hat functions h_k, in closed form.  Light that passes through the silicon or converts
-    below the first depth, where nothing moves, is left out; none is reflected at the gates.
-
-    Parameters
-    ----------
-    depths : ndarray, shape (nd,)
-        Conversion depths [um above the gates], ascending, the last one the back surface.
-    wavelength : float
-        Vacuum wavelength of the light [nm].
-    temperature : float
-        Temperature of the silicon [K]; with the wavelength it gives
-        :func:`bfsensor.device.silicon.absorption_length`.
-
-    Returns
-    -------
-    weights : ndarray, shape (nd,)
-        Weights of the depths, at least 0; their sum is 1.
-
-    Examples
-    --------
-    >>> light_weights(np.array([0.0, 50.0, 100.0]), 400.0, 173.0).round(3)
-    array([0.   , 0.004, 0.996])
-    """
-    # 1 m stands for an infinite length: the little light that converts is then uniform in depth.
-    length = min(float(silicon.absorption_length(wavelength, temperature)), 1e6)
-    reaching = np.exp(-(depths[-1] - depths) / length)
-    converted = np.diff(reaching)
-    upper = reaching[1:] - converted * length / np.diff(depths)
-    weights = np.zeros(len(depths))
-    weights[1:] += upper
-    weights[:-1] += converted - upper
-    return weights / weights.sum()
 
 
 def solve_point(point: SweepPoint) -> PointResponse:
@@ -287,42 +227,36 @@ def _solve(point: SweepPoint, began: float) -> PointResponse:
     device = Device.from_toml(point.device_text)
     check_depleted(device)
     well = full_well(device, cells=min(point.cells, 16))
-    top = max(point.level + STEP, point.full_pixel)
+    top = max(point.level + CHARGE, point.full_pixel)
     if top > well:
         raise SweepError(
             f"level or full pixel needs {top:,.0f} e- in a pixel, above its full well, "
             f"{well:,.0f} e-"
         )
-    lowest, _, *higher = default_depths(device)
-    # Without the depth 2 um into the silicon, whose boundaries take as long as all others.
-    levels = (lowest, *higher)
     area = device.pixel.pitch_x * device.pixel.pitch_y
-    between = np.linspace(levels[0], levels[-1], _SLABS + 1)[1:-1]
-    depths = np.unique([*levels, *between])
 
-    def build(charge: float, background: float) -> DistortionTable:
-        return build_table(
-            TablePlan(
-                device, (background, charge), (background,), levels, _VERTICES, _REACH,
-                point.cells, 0, well,
-            )
-        )  # fmt: skip
+    def response(level: float, charge: float) -> tuple[EdgeResponse, FloatArray]:
+        """Response by depth, and its a_ij at lags from 0 [1/e-]; symmetry makes others equal."""
+        found = solve_response(
+            device, level=level, charge=charge, cells=point.cells, precision=BISECTION
+        )
+        near = slice(REACH + 1, REACH + 1 + LAGS)
+        return found, area_matrix(found.kx, found.ky)[:, near, near]
 
-    def changes(table: DistortionTable) -> FloatArray:
-        """Area changes at lags from 0 [um^2]; the device's symmetry makes the others equal."""
-        at = {"charge": float(table.charges[1]), "background": float(table.backgrounds[0])}
-        near = slice(_REACH, _REACH + LAGS)
-        return np.array([
-            table.area_changes(**at, depth=float(z))[near, near] for z in depths
-        ])  # fmt: skip
-
-    table = build(point.level + STEP, point.level)
-    a = changes(table) / (STEP * area)
+    found, a = response(point.level, CHARGE)
     areas = np.full_like(a, np.nan)
     if point.full_pixel:
-        areas = changes(build(point.full_pixel, 0.0))
+        areas = response(0.0, point.full_pixel)[1] * point.full_pixel * area
+    table = None
+    if point.with_table:
+        charges = point.level, point.level + CHARGE
+        table = build_table(
+            TablePlan(
+                device, charges, charges[:1], tuple(found.depths), VERTICES, REACH, point.cells,
+                REFINE_Z, well,
+            )
+        )  # fmt: skip
     return PointResponse(
-        depths, a, areas, well, time.process_time() - began,
-        table.errors["iteration, worst case [um2]"] / (STEP * area),
-        table=table if point.with_table else None,
+        found.depths, a, areas, well, time.process_time() - began,
+        AREA_PER_VOLT * found.error_volts / (CHARGE * area), table=table,
     )  # fmt: skip

@@ -18,13 +18,14 @@ import numpy as np
 
 from bfsensor.errors import TableError
 from bfsensor.files import written_whole
+from bfsensor.response.light import storage_height
 from bfsensor.response.periodic_images import PERIOD, SAMPLES, without_images
 from bfsensor.response.vertices import vertex_fractions
 from bfsensor.simulate.boundaries import find_boundaries
 from bfsensor.simulate.far_field import FarField
 from bfsensor.simulate.mesh import Surfaces
 from bfsensor.simulate.pixel_array import PixelArray
-from bfsensor.table.table_plan import TablePlan, storage_height
+from bfsensor.table.table_plan import TablePlan
 from bfsensor.typing import FloatArray
 
 

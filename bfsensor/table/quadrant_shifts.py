@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import PchipInterpolator
 
 from bfsensor.errors import TableError
+from bfsensor.response.light import conversion_weights
 from bfsensor.response.vertices import vertex_fractions
 from bfsensor.table.table import DistortionTable
 from bfsensor.typing import FloatArray
@@ -18,12 +18,6 @@ _PROBE = 100.0
 
 Chosen: the response is nearly linear there; twice the charge changes the a_ij of the two LSST
 devices by 4e-4 at most."""
-
-_HEIGHTS = 400
-"""Slices of silicon in which light of given wavelengths converts.
-
-Chosen: twice as many change the a_ij of the two LSST devices by 8e-4 at most at 900 nm and by
-1e-6 at 500 nm."""
 
 
 class QuadrantShifts(NamedTuple):
@@ -111,8 +105,8 @@ def quadrant_shifts(
 
     Notes
     -----
-    Light that crosses the silicon is left out.  Between the table's depths shifts are
-    monotone cubics in the logarithm of depth.  Shifts by image charges in 100 um of silicon fall
+    Light that crosses the silicon is left out.  Between the table's depths shifts are linear, as in
+    the sensors.  Shifts by image charges in 100 um of silicon fall
     faster than the tail of -1.35, which is 1.0 to 1.4 times too large at 5 pixels and 1.3 to
     2.4 times at 7.
 
@@ -139,16 +133,11 @@ def quadrant_shifts(
     by_depth = [_at_depth(table, background, depth) for depth in table.depths]
     north, east = (np.array([shifts[k] for shifts in by_depth]) for k in (0, 1))
     weights = np.eye(len(table.depths))[-1]
-    heights = table.depths
     if wavelengths is not None:
-        heights, weights = _conversion(table, wavelengths, photons, temperature)
+        weights = _conversion(table, wavelengths, photons, temperature)
     elif photons is not None:
         raise TableError("photons are given without wavelengths: give both")
-    means = []
-    for values in (north, east):
-        if len(table.depths) > 1 and wavelengths is not None:
-            values = PchipInterpolator(np.log(table.depths), values)(np.log(heights))
-        means.append(np.tensordot(weights, values, 1))
+    means = [np.tensordot(weights, values, 1) for values in (north, east)]
     return _extended(QuadrantShifts(*means), table.pitch, lags, tail_slope)
 
 
@@ -179,8 +168,8 @@ def _conversion(
     wavelengths: ArrayLike,
     photons: ArrayLike | None,
     temperature: float | None,
-) -> tuple[FloatArray, FloatArray]:
-    """Heights [um] and the share of the converting light that converts at each."""
+) -> FloatArray:
+    """Weights of the table's depths for all light that converts."""
     from bfsensor.device.device import Device
     from bfsensor.device.silicon import absorption_length
 
@@ -199,18 +188,19 @@ def _conversion(
         raise TableError("photons must be finite, not negative, and not all 0")
     if len(table.depths) == 1:
         raise TableError("a table of one depth has no shifts by wavelength")
-    inverse = 1 / np.asarray(absorption_length(waves, temperature), float)
-    # Distances below the back surface, in slices that are narrow there: blue light is absorbed
-    # within a fraction of 1 um.
-    depths = np.concatenate([[0.0], np.geomspace(1e-3, table.thickness, _HEIGHTS)])
-    kept = np.exp(-np.outer(depths, inverse)) @ flux
-    weights = -np.diff(kept)
-    if not weights.sum() > 1e-6 * flux.sum():
+    converts = -np.expm1(
+        -table.thickness / np.asarray(absorption_length(waves, temperature), float)
+    )
+    shares = flux * converts
+    if not shares.sum() > 1e-6 * flux.sum():
         raise TableError(
             f"wavelengths = {waves} nm: none of this light converts in the silicon"
         )
-    middle = table.thickness - 0.5 * (depths[1:] + depths[:-1])
-    return np.clip(middle, table.depths[0], table.depths[-1]), weights / weights.sum()
+    by_wave = [
+        conversion_weights(table.depths, w, temperature, thickness=table.thickness)
+        for w in waves
+    ]
+    return np.asarray(shares @ np.array(by_wave) / shares.sum())
 
 
 def _extended(

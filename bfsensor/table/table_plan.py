@@ -14,9 +14,8 @@ import numpy as np
 import bfsensor
 from bfsensor.device.depletion import check_depleted
 from bfsensor.errors import TableError
+from bfsensor.response.light import conversion_depths, storage_height
 from bfsensor.response.periodic_images import PERIOD
-from bfsensor.simulate.boundaries import SPLIT_HEIGHT
-from bfsensor.simulate.mesh import Surfaces
 from bfsensor.simulate.well import full_well
 
 if TYPE_CHECKING:
@@ -40,13 +39,6 @@ BACKGROUND_FRACTIONS = (0.0, 0.25, 0.5, 0.8)
 
 Chosen: the response varies more slowly with the background than with the charge; twice as many
 levels would take twice as long."""
-
-STORAGE_DEPTH = 0.3
-"""Depth of the stored charge below the channel's silicon surface [um].
-
-Measured: the mean depth of the electrons is within 0.07 um of this in the built-in devices at
-20,000 to 150,000 e- (``tests/table/test_build.py``); a device with deeper implants stores deeper,
-and the lowest depth of its table is then too low by the difference."""
 
 
 @dataclass(frozen=True)
@@ -108,33 +100,6 @@ class TablePlan:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def default_depths(device: Device) -> tuple[float, ...]:
-    """Return up to seven conversion depths [um above the gates], from the charge to the back.
-
-    At the first, the height of the stored charge (:data:`STORAGE_DEPTH` into the silicon of the
-    channel), nothing moves; the second is the lowest from which every electron drifts to one
-    definite well.  The response rises over one pixel pitch and is nearly flat beyond four; in
-    thin devices the depths of two and four pitches are left out.
-    """
-    surfaces = Surfaces.of(device)
-    thickness = device.silicon.thickness
-    pitch = 0.5 * (device.pixel.pitch_x + device.pixel.pitch_y)
-    deepest = max(surfaces.silicon_channel, surfaces.silicon_stop)
-    low = (deepest + 2.0, deepest + SPLIT_HEIGHT)
-    inner = [
-        d for d in (pitch, 2.0 * pitch, 4.0 * pitch) if low[1] + 1 < d < 0.8 * thickness
-    ]
-    return (storage_height(device), *low, *inner, thickness)
-
-
-def storage_height(device: Device) -> float:
-    """Return the height above the gates [um] at and below which boundaries are taken as fixed.
-
-    It is the height of the stored charge, :data:`STORAGE_DEPTH` into the silicon of the channel.
-    """
-    return Surfaces.of(device).silicon_channel + STORAGE_DEPTH
-
-
 def plan_table(
     device: Device,
     *,
@@ -160,7 +125,7 @@ def plan_table(
         :data:`BACKGROUND_FRACTIONS` of the full well, rounded to two digits.
     depths : sequence of float, optional
         Conversion depths [um above the gates], ascending, from the height of the stored charge
-        to the thickness; by default :func:`default_depths`.
+        to the thickness; by default :func:`~bfsensor.response.light.conversion_depths`.
     vertices : int
         Vertices a side between the corners, at least 2.
     pixels : int
@@ -222,7 +187,7 @@ def plan_table(
         if len(values) < 1 or any(b <= a for a, b in pairwise(values)):
             raise TableError(f"{name}s {list(values)} must ascend")
     if depths is None:
-        depths = default_depths(device)
+        depths = conversion_depths(device)
     low, high = storage_height(device), device.silicon.thickness
     for depth in depths:
         if not low - 1e-9 <= depth <= high:

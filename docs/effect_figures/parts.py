@@ -15,7 +15,8 @@ from bfsensor.diagnose.model.table_baseline import edges_by_depth
 from bfsensor.effects.effect import Effect, Layout, Segment, Shot
 from bfsensor.effects.library import make_effect
 from bfsensor.plots.style import BLACK, RED, new_figure
-from bfsensor.response.edge_response import area_matrix, conversion_weights
+from bfsensor.response.edge_response import area_matrix
+from bfsensor.response.light import conversion_weights
 from bfsensor.table.quadrant_shifts import quadrant_shifts
 from bfsensor.table.table import DistortionTable
 from bfsensor.typing import Edges
@@ -94,7 +95,7 @@ def star(
 def shifts(wavelength: float = 620.0) -> Edges:
     """Shifts of edges per electron of the shipped ITL device about 40,000 e- [pixel/e-]."""
     table, (kx, ky) = by_depth()
-    weights = conversion_weights(table.depths, table.thickness, wavelength, 173.0)
+    weights = conversion_weights(table.depths, wavelength, 173.0, thickness=table.thickness)
     return np.tensordot(weights, kx, 1), np.tensordot(weights, ky, 1)
 
 

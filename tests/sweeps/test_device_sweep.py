@@ -5,17 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from bfsensor.device import silicon
 from bfsensor.device.device import Device
 from bfsensor.errors import SweepError
+from bfsensor.response.edge_response import CHARGE, LEVEL, REFINE_Z
 from bfsensor.sweeps.axes import parse_swept
 from bfsensor.sweeps.device_sweep import sweep_device
 from bfsensor.sweeps.points import (
-    LEVEL,
-    STEP,
     PointResponse,
     SweepPoint,
-    light_weights,
 )
 from bfsensor.sweeps.rows import DeviceSweep
 from bfsensor.table.build import build_table
@@ -63,11 +60,11 @@ def test_response_is_that_of_a_table_about_the_level(swept):
     made, _ = swept
     depths = (0.9, 5.0, 20.0, 100.0)
     table = build_table(
-        TablePlan(ITL, (LEVEL, LEVEL + STEP), (LEVEL,), depths, 32, 4, 8, 0, 1.5e5)
+        TablePlan(ITL, (LEVEL, LEVEL + CHARGE), (LEVEL,), depths, 32, 4, 8, REFINE_Z, 1.5e5)
     )
-    change = table.area_changes(charge=LEVEL + STEP, background=LEVEL, depth=100.0)
+    change = table.area_changes(charge=LEVEL + CHARGE, background=LEVEL, depth=100.0)
     # 400 nm: mean depth 0.2 um below the back, where the response changes by 1e-4 per um.
-    np.testing.assert_allclose(made.a[0], change[4:7, 4:7] / (STEP * 100.0), rtol=2e-3)
+    np.testing.assert_allclose(made.a[0], change[4:7, 4:7] / (CHARGE * 100.0), rtol=5e-3)
     # The area that the full pixel lost is not what flats see: 80,000 e- on empty neighbours.
     assert abs(made.areas[0, 0, 0] / 8e6 / made.a[0, 0, 0] - 1) > 5e-3
 
@@ -97,8 +94,8 @@ def test_tables_are_written(swept):
     assert names == ["point_0000.fits", "point_0002.fits"]
     table = DistortionTable.read(folder / "tables" / "point_0002.fits")
     assert Device.from_toml(table.device_text).operating_point.back_bias == -60
-    change = table.area_changes(charge=LEVEL + STEP, background=LEVEL, depth=100.0)
-    assert change[4, 4] / (STEP * 100) == pytest.approx(made.a[2, 0, 0], rel=2e-3)
+    change = table.area_changes(charge=LEVEL + CHARGE, background=LEVEL, depth=100.0)
+    assert change[4, 4] / (CHARGE * 100) == pytest.approx(made.a[2, 0, 0], rel=2e-3)
 
 
 def test_written_and_read_back_equal(swept, tmp_path):
@@ -123,10 +120,10 @@ def test_what_numpy_refuses_is_a_reason(monkeypatch):
     """At -1 V boundary lines between pixels are missing, and numpy refuses to interpolate."""
     import bfsensor.sweeps.points as library
 
-    def fail(plan):
+    def fail(device, **options):
         raise ValueError("array of sample points is empty")
 
-    monkeypatch.setattr(library, "build_table", fail)
+    monkeypatch.setattr(library, "solve_response", fail)
     found = library.solve_point(SweepPoint(ITL.to_toml(), LEVEL, 0.0, 8))
     assert found.reason == "ValueError: array of sample points is empty"
     assert np.isnan(found.a).all()
@@ -140,28 +137,6 @@ def test_two_gates_may_pass_one_another():
     assert (raised.operating_point.gate_low, raised.operating_point.gate_high) == (3, 12)
     crossed = _device_at(ITL, over("gate_low=3V", "gate_high=2V"), (0, 0))
     assert isinstance(crossed, str) and "gate_low" in crossed
-
-
-@pytest.mark.parametrize("wavelength", [400.0, 700.0, 950.0, 1100.0, 1500.0])
-def test_light_weights_are_mean_responses(wavelength):
-    """Against photons drawn one by one: a response linear between the depths."""
-    depths = np.array([1.0, 5.0, 20.0, 50.0, 100.0])
-    response = np.array([0.0, 0.4, 0.8, 0.97, 1.0])
-    weights = light_weights(depths, wavelength, 173.0)
-    assert weights.sum() == pytest.approx(1, abs=1e-12)
-    length = min(float(silicon.absorption_length(wavelength, 173.0)), 1e9)
-    uniform = np.random.default_rng(771).uniform(size=400_000)
-    # Depths of the photons that convert in the silicon above the first depth.
-    z = 100.0 + length * np.log1p(-uniform * -np.expm1(-99.0 / length))
-    drawn = np.interp(z, depths, response)
-    sigma = drawn.std() / np.sqrt(len(drawn))
-    assert weights @ response == pytest.approx(drawn.mean(), abs=4 * sigma + 1e-9)
-
-
-def test_temperature_moves_where_light_converts():
-    depths = np.linspace(0.9, 100.0, 40)
-    cold, warm = (light_weights(depths, 950.0, t) @ depths for t in (173.0, 293.0))
-    assert warm - cold > 3.0  # warmer silicon absorbs nearer to the back
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import pytest
 from bfsensor.device.device import Device, builtin_devices
 from bfsensor.device.parts import Ripple
 from bfsensor.errors import DeviceError, TableError
+from bfsensor.response.light import conversion_depths, storage_height
 from bfsensor.simulate.boundaries import lowest_depth
 from bfsensor.simulate.unit_cell import solve_unit_cell
 from bfsensor.simulate.well import barrier, full_well
@@ -15,7 +16,7 @@ from bfsensor.table import build
 from bfsensor.table.assess import assess, superposition_error
 from bfsensor.table.build import build_table
 from bfsensor.table.levels import Level, _workshop, solve_level
-from bfsensor.table.table_plan import default_depths, plan_table, storage_height
+from bfsensor.table.table_plan import plan_table
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +97,7 @@ def test_default_plan_covers_the_well(device):
     assert len([q for q in plan.charges if q > 0]) >= 6
     assert plan.charges[-1] == pytest.approx(0.9 * plan.full_well, rel=0.05)
     assert plan.backgrounds[-1] == pytest.approx(0.8 * plan.full_well, rel=0.05)
-    assert plan.depths == default_depths(device)
+    assert plan.depths == conversion_depths(device)
     assert plan.depths[-1] == device.silicon.thickness
 
 

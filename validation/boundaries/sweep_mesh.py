@@ -12,7 +12,8 @@ from typing import Any
 from astropy.table import Table
 
 from bfsensor.device.device import Device
-from bfsensor.sweeps.points import LEVEL, SweepPoint, solve_point
+from bfsensor.response.edge_response import LEVEL
+from bfsensor.sweeps.points import SweepPoint, solve_point
 from validation.common.write_results import RESULTS, write_results
 
 DEVICES = ("itl_sta3800c", "e2v_ccd250")

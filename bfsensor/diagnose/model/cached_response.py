@@ -2,36 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-import bfsensor
 from bfsensor.device.device import Device
-from bfsensor.diagnose.model.table_baseline import CHARGE, edges_by_depth
 from bfsensor.errors import DiagnosisError
-from bfsensor.files import written_whole
-from bfsensor.response.edge_response import LEVEL, REACH, VERTICES, mixed, response_depths
-from bfsensor.table.build import build_table
-from bfsensor.table.table_plan import TablePlan
+from bfsensor.response.edge_response import LEVEL, REFINE_Z
+from bfsensor.response.emulator_nodes import Node, solve_nodes
+from bfsensor.response.light import conversion_depths, mixed
+from bfsensor.simulate.boundaries import BISECTION
 from bfsensor.typing import Edges, FloatArray
 
 SPAN = 25_000.0
 """Distance of the outer two of three backgrounds from :data:`~bfsensor.response.edge_response.LEVEL`
 [e-].  Chosen: the three then span most of a flat's levels, 15,000 to 65,000 e-; twice as large would
 put the lowest below 0; half as large, errors of the second derivative are four times as large."""
-
-BEYOND = 50 * CHARGE
-"""Charge step above the background that shifts per electron are taken over [e-], 5,000. Chosen: twice
-as large doubles the share of the change with charge in it; half as large, errors of boundaries
-double."""
-
-FORMAT = "walk"
-"""First word of the text that cached files are named after; changing it makes old files unused."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,54 +96,18 @@ def walk(
     device : Device
         Mirror-symmetric device.
     cells : int
-        Cells of the mesh per pixel; about 0.4 CPU seconds per background at 8, 1.4 at 16, 3.6 at
+        Cells of the mesh per pixel; about 1 CPU second per background at 8, 3 at 16, 8 at
         32.
     backgrounds : sequence of float
         One background, or three equidistant ones [e-].
     keep : Path, optional
         Folder in which results are cached, by device, mesh, background and package version.
     """
-    depths = response_depths(device)
-    both = [_at(device, cells, float(b), depths, keep) for b in backgrounds]
-    kx, ky = (np.array([b[n] for b in both]) for n in range(2))
-    return Walk(tuple(map(float, backgrounds)), np.array(depths), kx, ky)
-
-
-def _at(
-    device: Device,
-    cells: int,
-    background: float,
-    depths: tuple[float, ...],
-    keep: Path | None,
-) -> Edges:
-    """Shifts by depth at one background, calculated or read from the cache."""
-    text = "\n".join([
-        f"{FORMAT} 1", bfsensor.__version__, device.physics, f"{cells} {VERTICES} {REACH}",
-        " ".join(f"{v:.9g}" for v in (background, *depths)),
-    ])  # fmt: skip
-    name = f"walk_{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
-    path = None if keep is None else keep / name
-    if path is not None and path.exists():
-        return _read(path)
-    # The full well is given, not calculated: that would take as long as the table.
-    plan = TablePlan(
-        device, (background, background + BEYOND), (background,), depths, VERTICES, REACH,
-        cells, 0, max(4 * background, 2e5),
-    )  # fmt: skip
-    kx, ky = edges_by_depth(build_table(plan), background=background)
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with written_whole(path, DiagnosisError) as beside, open(beside, "wb") as stream:
-            np.savez(stream, kx=kx, ky=ky)
-    return kx, ky
-
-
-def _read(path: Path) -> Edges:
-    try:
-        with path.open("rb") as stream, np.load(stream) as data:
-            return data["kx"], data["ky"]
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise DiagnosisError(
-            f"{path}: not a finished file of boundary shifts; delete it to calculate it again "
-            f"({error})"
-        ) from None
+    text = device.physics
+    nodes = [
+        Node(text, text, float(b), cells, REFINE_Z, (), (), (n, -1, 0), precision=BISECTION)
+        for n, b in enumerate(backgrounds)
+    ]
+    found = solve_nodes(nodes, keep=keep, progress=None, executor=None)
+    kx, ky = (np.array([found[node.at][0][n] for node in nodes]) for n in range(2))
+    return Walk(tuple(map(float, backgrounds)), np.array(conversion_depths(device)), kx, ky)

@@ -16,7 +16,8 @@ from bfsensor.diagnose.model.cached_response import SPAN, Walk, walk
 from bfsensor.diagnose.model.table_baseline import WAVELENGTHS
 from bfsensor.errors import DeviceError, DiagnosisError
 from bfsensor.files import written_whole
-from bfsensor.response.edge_response import LEVEL, EdgeResponse, mixed, solve_response
+from bfsensor.response.edge_response import LEVEL, EdgeResponse, solve_response
+from bfsensor.response.light import mixed
 from bfsensor.simulate.edge_field import front_plane
 from bfsensor.typing import Edges
 from bfsensor.units import to_celsius

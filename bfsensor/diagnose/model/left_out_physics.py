@@ -36,7 +36,8 @@ from bfsensor.effects.simulated_physics import (
     ring_parameters,
 )
 from bfsensor.errors import DeviceError
-from bfsensor.response.edge_response import LEVEL, conversion_weights
+from bfsensor.response.edge_response import LEVEL
+from bfsensor.response.light import conversion_weights
 from bfsensor.simulate.edge_field import front_plane, solve_edge
 from bfsensor.simulate.edge_shift import trace_edge
 from bfsensor.typing import Edges, FloatArray
@@ -277,7 +278,7 @@ def _of_light(drift: Drift, values: FloatArray, wavelength: float, kelvin: float
     """Mean of values by height, weighted by the fraction of light that converts there."""
     heights = drift.heights
     # Weights of values at these heights, linear between them.
-    weights = conversion_weights(heights, float(heights[-1]), wavelength, kelvin)
+    weights = conversion_weights(heights, wavelength, kelvin)
     return float(weights @ values)
 
 
@@ -370,7 +371,7 @@ def _rim(device: Device, here: dict[float, Device], colours: list[float]) -> typ
     for bias, one in here.items():
         depths, shifts = rim_shifts(dataclasses.replace(one, edge=device.edge or GUARD))
         for w in colours:
-            weights = conversion_weights(depths, float(depths[-1]), w, kelvin)
+            weights = conversion_weights(depths, w, kelvin)
             held.append(((w, bias), weights @ shifts))
     return left_out(
         EdgeFieldLeftOut, "edge_rolloff", "simulated", Rim(tuple(held)),

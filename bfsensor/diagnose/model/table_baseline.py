@@ -13,7 +13,7 @@ from bfsensor.device.device import Device
 from bfsensor.device.shipped import tables_dir
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.errors import BFSensorError, DiagnosisError
-from bfsensor.response.edge_response import conversion_weights
+from bfsensor.response.light import conversion_weights
 from bfsensor.response.vertices import vertex_fractions
 from bfsensor.table.galsim_format import read_galsim
 from bfsensor.table.table import DistortionTable
@@ -92,7 +92,9 @@ def baseline_of_table(given: str | os.PathLike[str]) -> Baseline:
     by_depth = [edges_by_depth(table, background=level) for level in levels]
     for wavelength in WAVELENGTHS:
         key = wavelength, float(bias)
-        weights = conversion_weights(table.depths, table.thickness, wavelength, temperature)
+        weights = conversion_weights(
+            table.depths, wavelength, temperature, thickness=table.thickness
+        )
         at = [_seen(by, weights) for by in by_depth]
         edges[key] = at[len(at) // 2]
         if one_level:
@@ -223,7 +225,9 @@ def edges_at(
     kx, ky : ndarray, shape (2 reach + 3, 2 reach + 3)
         Shifts, with a ring of pixels around the table's whose outer edges do not move.
     """
-    weights = conversion_weights(table.depths, table.thickness, wavelength, temperature)
+    weights = conversion_weights(
+        table.depths, wavelength, temperature, thickness=table.thickness
+    )
     return _seen(edges_by_depth(table, background=background), weights)
 
 
