@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     "--at", "conditions", multiple=True, callback=parse_conditions,
     metavar="[FILE:]KEY=VALUE,...",
     help="State the conditions of one recording, or of all: back_bias, gate_high, gate_low, "
-    "wavelength, temperature (with units), sigma (of spots, in pixels). Stated quantities are not "
+    "wavelength, temperature (with units), level (e- in every pixel; 0: the limit at none, as fits to "
+    "covariances give it; else 40000), sigma (of spots, in pixels). Stated quantities are not "
     "fitted for that recording.  [default: the device's]",
 )  # fmt: skip
 @click.option("--hold", multiple=True, type=click.Path(path_type=Path), metavar="FILE",
@@ -47,6 +48,9 @@ if TYPE_CHECKING:
 @click.option("--profile", "profiles", multiple=True, metavar="NAME",
               help="Also compute the profile likelihood of this fitted quantity; "
               "repeatable.")  # fmt: skip
+@click.option("--readout", default=0, show_default=True, type=click.IntRange(min=0),
+              help="Let the readout add a free term at so many lags along a row: they are compared "
+              "with the device, not fitted, and the term is what the device leaves.")  # fmt: skip
 @click.option("--cells", default=16, show_default=True, help="Mesh cells per pixel.")
 @click.option(
     "--finer", type=click.IntRange(min=0),
@@ -77,6 +81,7 @@ def fit(
     lags: int,
     errors: str,
     profiles: tuple[str, ...],
+    readout: int,
     cells: int,
     finer: int | None,
     curved: bool,
@@ -97,8 +102,9 @@ def fit(
       B-F slopes [% / 50 ke-]  axis, slope, slope_error
       saturation levels [e-]   saturation, saturation_error
       diffusion widths [um]    diffusion, diffusion_error
+      full-depletion voltage   full_depletion, full_depletion_error  [V, signed as the back bias]
 
-    The last three may have columns back_bias, gate_high and gate_low, the voltages of each row;
+    The last four may have columns back_bias, gate_high and gate_low, the voltages of each row;
     the header of an ECSV table may state them for all rows in an entry 'conditions'.
 
     Prints a table of the fitted quantities; the last line is chi2 per number, with the errors as
@@ -107,7 +113,7 @@ def fit(
     \b
     Examples:
       bfsensor fit itl_sta3800c_60 itl.csv --free all --free back_bias:5V -o itl_fit
-      bfsensor fit itl_sta3800c itl.csv slopes.csv --free all --at itl.csv:back_bias=-60V
+      bfsensor fit itl_sta3800c itl.csv slopes.csv --free all --at itl.csv:back_bias=-60V,level=0
       bfsensor fit itl_sta3800c slopes.csv --hold itl.csv --free silicon.background_doping
     """
     from bfsensor.device.quantities import with_priors
@@ -118,6 +124,8 @@ def fit(
     loaded = load_device(device, settings)
     read = [(path, read_measured(path)) for path in (*recordings, *hold)]
     sets = _data_sets(read, conditions, len(recordings), lags, errors == "scaled")
+    if readout:
+        sets = _with_readout(sets, readout)
     priors = _choose_priors(loaded, free, sets)
     names = [prior.name for prior in priors]
     chosen = [_resolve(name, names) for name in profiles]
@@ -313,6 +321,19 @@ def _data_sets(
                 except RecordingError as error:
                     raise FitError(f"--at {file}: {error}") from None
         out.append(data_set(measured, lags=lags, fitted=n < fitted, scaled=scaled))
+    return out
+
+
+def _with_readout(sets: Sequence[DataSet], lags: int) -> list[DataSet]:
+    """Give the data sets with the lags of a readout set aside, in every fitted set of a_ij."""
+    from bfsensor.fit.data import apart_from_readout
+
+    out: list[DataSet] = []
+    for data in sets:
+        areas = data.kind == "areas" and data.fitted
+        out.extend(apart_from_readout(data, lags) if areas else [data])
+    if len(out) == len(sets):
+        raise FitError("--readout: none of the fitted recordings holds a_ij")
     return out
 
 

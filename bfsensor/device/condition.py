@@ -1,4 +1,4 @@
-"""Condition of an exposure: wavelength or filter, sensor temperature and voltages."""
+"""Condition of an exposure: wavelength or filter, sensor temperature, voltages and level."""
 
 from __future__ import annotations
 
@@ -23,6 +23,9 @@ class Condition:
         Back bias [V], signed as in device files.
     gate_high, gate_low : float or None
         Voltages of the collecting and of the barrier gates [V].
+    level : float or None
+        Charge in every pixel about which a response was measured [e-]; 0 for the a_ij of a fit to
+        covariances at several levels, which are the limit at none.
 
     Examples
     --------
@@ -36,6 +39,7 @@ class Condition:
     back_bias: float | None = None
     gate_high: float | None = None
     gate_low: float | None = None
+    level: float | None = None
 
     def __str__(self) -> str:
         words = []
@@ -49,4 +53,6 @@ class Condition:
             words.append(f"gates {self.gate_low:g}/{self.gate_high:g} V")
         if self.temperature is not None:
             words.append(f"{self.temperature:.4g} K")
+        if self.level is not None:
+            words.append(f"level {self.level:g} e-")
         return ", ".join(words) or "not known"

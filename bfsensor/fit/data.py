@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,14 +16,15 @@ from bfsensor.recording.tables.measured import MeasuredTable
 from bfsensor.recording.tables.setting_tables import SettingTable
 from bfsensor.typing import FloatArray
 
-KINDS = ("areas", "slopes", "saturation", "diffusion")
-"""Kinds of data sets: a_ij, B-F slopes, saturation levels, diffusion widths."""
+KINDS = ("areas", "slopes", "saturation", "diffusion", "depletion")
+"""Kinds of data sets: a_ij, B-F slopes, saturation levels, diffusion widths, full-depletion voltages."""
 
 UNITS = {
     "areas": "1 / electron",
     "slopes": "%",
     "saturation": "electron",
     "diffusion": "um",
+    "depletion": "V",
 }
 """Unit of the numbers of each kind; slopes are per cent of a pixel for 50,000 e-."""
 
@@ -32,7 +33,7 @@ LAGS = 4
 
 Chosen: beyond it the published a_ij are noise; twice as large, 56 more numbers are fitted."""
 
-ASSUMED = {"saturation": 0.02, "diffusion": 0.05}
+ASSUMED = {"saturation": 0.02, "diffusion": 0.05, "depletion": 0.05}
 """Relative errors of values that have none in their table.
 
 Chosen; a note of the fit states it.  Twice as large, such values weigh a quarter as much, unless the
@@ -56,7 +57,7 @@ class DataSet:
         Name in tables and figures.
     kind : str
         'areas' [1/e-], 'slopes' [% of a pixel for 50,000 e-], 'saturation' [e-] or
-        'diffusion' [um].
+        'diffusion' [um] or 'depletion' [V].
     values, errors : ndarray, shape (n,)
         Values in the unit of the kind, and their standard errors, above 0, including that of the
         prediction (:data:`MODEL_ERROR`).
@@ -289,9 +290,56 @@ def select(data: DataSet, keep: Sequence[bool] | NDArray[np.bool_], name: str) -
     )  # fmt: skip
 
 
+def apart_from_readout(data: DataSet, lags: int) -> tuple[DataSet, DataSet]:
+    """Set aside the lags along a row, to which memory of the readout adds.
+
+    Covariances that the readout makes follow the order in which pixels are read: they act at (1, 0),
+    (2, 0) and further along a row, not across rows.  A free term at each of these lags takes its
+    value out of the fit of a device; what the device then leaves there is the term.
+
+    Parameters
+    ----------
+    data : DataSet
+        Kind 'areas', fitted.
+    lags : int
+        Largest lag that is set aside [pixel], 1 or more.
+
+    Returns
+    -------
+    device, readout : DataSet
+        The lags that the device is fitted to, and those that are compared with it.
+
+    Raises
+    ------
+    FitError
+        The data are not a_ij, none lies at such a lag, or nothing else is left.
+
+    Examples
+    --------
+    >>> a = np.array([[-1e-6, 1e-7, 3e-8], [2e-7, 5e-8, 1e-8]])
+    >>> device, readout = apart_from_readout(area_data("two", a, 0.1 * abs(a)), 1)
+    >>> device.labels, readout.labels
+    (('(0,0)', '(0,1)', '(1,1)', '(2,0)', '(2,1)'), ('(1,0)',))
+    """
+    if data.kind != "areas":
+        raise FitError(f"{data.name}: a readout acts on a_ij, not on {data.kind}")
+    i, j = data.places.T
+    along = (j == 0) & (i >= 1) & (i <= lags)
+    if not along.any() or along.all():
+        raise FitError(
+            f"{data.name}: of {len(i)} lags {int(along.sum())} are (1,0) to ({lags},0); some must be, "
+            "and others be left for the device"
+        )
+    return select(data, ~along, data.name), replace(
+        select(data, along, f"{data.name}, readout"), fitted=False
+    )
+
+
 def _joined(own: Condition, common: Condition) -> Condition:
     """Condition of a row, completed by that of the file where the row states nothing."""
-    fields = ("wavelength", "filter", "temperature", "back_bias", "gate_high", "gate_low")
+    fields = (
+        "wavelength", "filter", "temperature", "back_bias", "gate_high", "gate_low", "level",
+    )  # fmt: skip
     return Condition(
         **{
             key: getattr(common, key) if getattr(own, key) is None else getattr(own, key)

@@ -22,9 +22,8 @@ from bfsensor.device.device import Device
 from bfsensor.device.quantities import Prior
 from bfsensor.errors import FitError
 from bfsensor.fit.full_solutions import Shifts, solve_shifts
-from bfsensor.fit.linear_response import LinearResponse
+from bfsensor.fit.linear_response import LinearResponse, level_of
 from bfsensor.fit.predictors import Emulator
-from bfsensor.response.edge_response import LEVEL
 from bfsensor.typing import FloatArray
 
 FINER = 48
@@ -161,7 +160,8 @@ class Finer:
         first, last = self.ratios[0][1], self.ratios[int(np.argmin(near))][1]
         return {
             "cells": self.coarse, "finer": self.cells, "finer_refine_z": REFINE_Z,
-            "level": LEVEL, "version": bfsensor.__version__, "solutions": len(self.ratios),
+            "level": sorted({level_of(c) for c in self.conditions}),
+            "version": bfsensor.__version__, "solutions": len(self.ratios),
             "ratios": [
                 {
                     "condition": str(condition), "finer_over_own": ratio.tolist(),

@@ -333,8 +333,9 @@ def _remarks(result: FitResult, priors: Sequence[Prior]) -> list[str]:
                 f"{prior.name} is at a bound, beyond which it has no meaning: its error is too small"
             )
     kinds = {one.kind for one in result.sets}
-    if kinds & {"saturation", "diffusion"}:
+    if kinds & {"saturation", "diffusion", "depletion"}:
         out.append(
-            "saturation levels and diffusion widths are predicted linearly in the parameters"
+            "saturation levels, diffusion widths and full-depletion voltages are predicted linearly "
+            "in the parameters"
         )
     return out

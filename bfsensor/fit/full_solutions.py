@@ -12,8 +12,7 @@ from bfsensor.device.condition import Condition
 from bfsensor.device.device import Device
 from bfsensor.device.quantities import Prior
 from bfsensor.fit.device_at import device_at
-from bfsensor.fit.linear_response import LinearEmulator, LinearResponse
-from bfsensor.response.edge_response import LEVEL
+from bfsensor.fit.linear_response import LinearEmulator, LinearResponse, level_of
 from bfsensor.response.emulator_nodes import Node, solve_nodes
 from bfsensor.response.light import conversion_depths, mixed
 from bfsensor.typing import FloatArray
@@ -67,8 +66,8 @@ def solve_shifts(
     for condition in dict.fromkeys(conditions):
         here = device_at(device, condition, priors, values)
         node = Node(
-            here.physics, device_at(device, condition).physics, LEVEL, cells, refine_z, (), (),
-            (len(nodes), -1, 0),
+            here.physics, device_at(device, condition).physics, level_of(condition), cells,
+            refine_z, (), (), (len(nodes), -1, 0),
         )  # fmt: skip
         devices[condition] = here, node.key
         nodes.setdefault(node.key, node)

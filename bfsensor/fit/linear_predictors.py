@@ -1,4 +1,4 @@
-"""Linear predictors of saturation levels and diffusion widths about the nominal device.
+"""Linear predictors of saturation levels, diffusion widths and full-depletion voltages.
 
 Emulators do not predict these.  Each setting is solved at the nominal values, and again half a prior
 width to either side of every free parameter: the time grows with the number of free parameters.
@@ -7,6 +7,7 @@ width to either side of every free parameter: the time grows with the number of 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -19,6 +20,7 @@ from bfsensor.fit.data import DataSet
 from bfsensor.fit.device_at import device_at
 from bfsensor.fit.predictors import TangentPredictor, Tangents, held
 from bfsensor.sensor.drift_field import solve_drift
+from bfsensor.simulate.full_depletion import back_field, full_depletion_voltage
 from bfsensor.simulate.mesh import make_mesh
 from bfsensor.simulate.poisson import Electrostatics
 from bfsensor.simulate.unit_cell import solve_unit_cell, tile
@@ -41,6 +43,11 @@ CHARGE_STEP = 0.02
 
 Chosen: twice as large, the barrier's curvature over 4 instead of 2 % of the full well enters."""
 
+BIAS_STEP = 1.0
+"""Step of the back bias for the derivative of the field at the back [V].
+
+Chosen: the field is nearly linear in the bias; twice as large gives the same to 1e-3."""
+
 START = 2.0
 """Height above the gates below which electrons are taken not to diffuse any more [um].
 
@@ -51,7 +58,7 @@ silicon is 2 % shorter."""
 def make_tangents(
     device: Device, *, cells: int = 8, progress: Callable[[int, int], None] | None = None
 ) -> dict[str, Tangents]:
-    """Make the makers of linear predictors of saturation levels and diffusion widths.
+    """Make the makers of linear predictors of saturation, diffusion and full depletion.
 
     Parameters
     ----------
@@ -65,16 +72,17 @@ def make_tangents(
     Returns
     -------
     makers : dict of str to callable
-        Functions of a data set and the priors, for 'saturation' and 'diffusion'.
+        Functions of a data set and the priors, for 'saturation', 'diffusion' and 'depletion'.
 
     Examples
     --------
     >>> sorted(make_tangents(Device.load("itl_sta3800c")))
-    ['diffusion', 'saturation']
+    ['depletion', 'diffusion', 'saturation']
     """
     return {
         "saturation": partial(_tangent, device, cells, progress, _well_at),
         "diffusion": partial(_tangent, device, cells, progress, _width_at),
+        "depletion": partial(_tangent, device, cells, progress, _depletion_at),
     }
 
 
@@ -177,6 +185,33 @@ def _barrier(device: Device, charge: float, cells: int) -> float:
     charges[0, 0] = charge
     start = tile(solve_unit_cell(device, 0.0, cells=cells), mesh)
     return barrier(solver.solve(charges, start=start, tolerance=1e-4))
+
+
+def _depletion_at(
+    device: Device,
+    condition: Condition,
+    priors: Sequence[Prior],
+    middle: FloatArray,
+    cells: int,
+) -> tuple[float, FloatArray]:
+    r"""Full-depletion voltage [V] and its derivatives by the parameters.
+
+    There the field at the back F vanishes, so that
+    :math:`dV/dp = -(\partial F/\partial p) / (\partial F/\partial V)`.
+    """
+    voltage = full_depletion_voltage(device_at(device, condition), cells=cells)
+
+    def field(values: FloatArray | None, bias: float = voltage) -> float:
+        there = replace(condition, back_bias=bias)
+        return back_field(device_at(device, there, priors, values), cells=cells)
+
+    here = field(None)
+    by_bias = (field(None, voltage - BIAS_STEP) - here) / -BIAS_STEP
+    slopes = np.zeros(len(priors))
+    for n in _free(priors, replace(condition, back_bias=voltage)):
+        if priors[n].name not in (SPILL, DIFFUSION):
+            slopes[n] = -_slope(field, middle, n, priors[n].spread, here) / by_bias
+    return voltage, slopes
 
 
 def _width_at(

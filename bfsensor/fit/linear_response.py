@@ -13,7 +13,7 @@ from bfsensor.device.quantities import Prior
 from bfsensor.errors import FitError
 from bfsensor.fit.device_at import device_at
 from bfsensor.fit.predictors import PredictedEdges, held
-from bfsensor.response.edge_response import area_matrix, solve_response
+from bfsensor.response.edge_response import LEVEL, area_matrix, solve_response
 from bfsensor.response.light import mixed
 from bfsensor.typing import FloatArray
 
@@ -143,7 +143,7 @@ class Linearise:
                 changed.append((device(values - step), -step[n]))
         here = device(values)
         found = solve_response(
-            here, cells=self.cells, changed=changed,
+            here, level=level_of(condition), cells=self.cells, changed=changed,
             laid_for=device_at(self.device, condition),
         )  # fmt: skip
         at = condition.wavelength, here.operating_point.temperature
@@ -151,6 +151,11 @@ class Linearise:
         dkx, dky = np.zeros((2, len(names), *kx.shape))
         dkx[free], dky[free] = mixed(found.dkx, found.dky, found.depths, *at)
         return LinearResponse(kx, ky, dkx, dky)
+
+
+def level_of(condition: Condition) -> float:
+    """Charge in every pixel about which a response is taken at a condition [e-]."""
+    return LEVEL if condition.level is None else condition.level
 
 
 def _lags(areas: FloatArray) -> FloatArray:

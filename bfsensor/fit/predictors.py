@@ -204,7 +204,7 @@ def make_predictors(
     priors : sequence of Prior
         Priors of all free parameters, in the order of the fit.
     tangents : mapping of str to callable, optional
-        Makers of predictors for the kinds 'saturation' and 'diffusion'.
+        Makers of predictors for the kinds 'saturation', 'diffusion' and 'depletion'.
     late : bool
         Whether the emulator is supplied later: predicting areas and slopes before is an error.
 

@@ -219,6 +219,10 @@ class DeviceEmulator:
                 f"values = {given.tolist()} must be {len(self.nominal)} finite numbers: "
                 f"{', '.join(self.parameters)}"
             )
+        if asked.level not in (None, self.level):
+            raise FitError(
+                f"the emulator was built at a level of {self.level:g} e-, not {asked.level:g} e-"
+            )
         found = self._expansions.get(_point(asked))
         if found is None:
             known = "; ".join(str(c) for c in self.conditions)

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from bfsensor.simulate.edge_shift import EdgeShift, trace_edge
     from bfsensor.simulate.far_field import FarField
     from bfsensor.simulate.field import Field
+    from bfsensor.simulate.full_depletion import full_depletion_voltage
     from bfsensor.simulate.image_charge import (
         area_changes,
         displace_boundaries,
@@ -33,6 +34,7 @@ else:
             "edge_shift": ["EdgeShift", "trace_edge"],
             "far_field": ["FarField"],
             "field": ["Field"],
+            "full_depletion": ["full_depletion_voltage"],
             "image_charge": ["area_changes", "displace_boundaries", "trace_boundaries"],
             "mesh": ["Mesh", "Surfaces", "make_mesh"],
             "poisson": ["Electrostatics", "Potential"],
@@ -59,6 +61,7 @@ __all__ = [
     "boundary_changes",
     "displace_boundaries",
     "find_boundaries",
+    "full_depletion_voltage",
     "full_well",
     "make_mesh",
     "solve_edge",

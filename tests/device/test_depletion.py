@@ -15,7 +15,7 @@ from bfsensor.direct.flat_exposure import FlatPlan
 from bfsensor.direct.spot_exposure import SpotPlan
 from bfsensor.errors import DeviceError, TableError
 from bfsensor.response.emulator import DeviceEmulator
-from bfsensor.simulate.unit_cell import solve_unit_cell
+from bfsensor.simulate.full_depletion import full_depletion_voltage
 from bfsensor.sweeps.points import SweepPoint, solve_point
 from bfsensor.units import VACUUM_PERMITTIVITY
 from tests.simulate.cases import flat_device
@@ -32,41 +32,6 @@ def with_values(device, **values):
     return device
 
 
-def back_slope(device, charge):
-    """Slope [V/um] of the solver's mean potential at the back contact."""
-    unit = solve_unit_cell(device, charge, cells=16)
-    weights = []
-    for nodes in (unit.mesh.y, unit.mesh.x):
-        gaps = np.diff(nodes)
-        weights.append(np.concatenate([gaps, [0.0]]) + np.concatenate([[0.0], gaps]))
-    mean = np.tensordot(unit.phi[-2:], np.outer(*weights), 2) / np.outer(*weights).sum()
-    step = unit.mesh.z[-1] - unit.mesh.z[-2]
-    # The doping makes the potential a parabola: its slope at the back differs by this much from
-    # the slope between the last two nodes.
-    half = 0.5 * step * device.silicon.background_doping / PERMITTIVITY
-    return (mean[1] - mean[0]) / step - half
-
-
-def solved_full_depletion(device, charge=0.0):
-    """Back bias [V] at which the solver's field vanishes, so many electrons in every pixel."""
-    # A bracket in units of the drop across the bulk; the slope is nearly linear in the bias,
-    # so that three secants suffice.
-    low, high = -1.5, -0.9
-    silicon = device.silicon
-    drop = abs(silicon.background_doping) * silicon.thickness**2 / (2 * PERMITTIVITY)
-    low, high = low * drop - 5.0, high * drop - 2.0
-
-    def slope(bias):
-        return back_slope(device.with_value("back_bias", f"{bias} V"), charge)
-
-    left, right = slope(low), slope(high)
-    for _ in range(3):
-        low, high, left = high, high - right * (high - low) / (right - left), right
-        right = slope(high)
-    assert abs(right) < 1e-4  # V/um, 0.01 V of the bias
-    return high
-
-
 def test_planar_device_by_hand():
     # Gate 3 V, oxide 0.15 um of 4.3, silicon 99.85 um with -2.4 e-/um^3 and no implants:
     # the oxide holds the charge of the whole bulk, -239.64 e-/um^2.
@@ -77,6 +42,10 @@ def test_planar_device_by_hand():
     assert found.full_depletion_voltage == pytest.approx(3.0 + oxide + bulk, abs=1e-6)
     assert (found.lowest, found.highest) == (0.0, 100.0)
     assert found.depth == pytest.approx(99.85)
+    # The solver shares no formula with this.
+    assert full_depletion_voltage(flat_device(), cells=8) == pytest.approx(
+        3.0 + oxide + bulk, abs=0.02
+    )
 
 
 def test_implants_and_charge_at_the_interface_of_a_planar_device():
@@ -156,14 +125,14 @@ def test_full_depletion_voltage_is_where_the_field_of_the_solver_vanishes(name, 
     # estimate were chosen.  Without gates and channel the estimate is off by 4 V and more,
     # without the field between columns by 2 to 5 V.
     assert find_depletion(device).full_depletion_voltage == pytest.approx(
-        solved_full_depletion(device), abs=1.0
+        full_depletion_voltage(device), abs=1.0
     )
 
 
 @pytest.mark.parametrize(("device", "expected"), [(ITL, 0.51), (E2V, 1.07)])
 def test_stored_charge_asks_for_a_more_negative_back_bias(device, expected):
     # The docstring's numbers; 8 cells a pixel instead of 16 move them by 0.02 V.
-    empty, half, full = (solved_full_depletion(device, q) for q in (0.0, 5e4, 1e5))
+    empty, half, full = (full_depletion_voltage(device, q) for q in (0.0, 5e4, 1e5))
     assert empty - full == pytest.approx(expected, abs=0.03)
     assert empty - half == pytest.approx(0.5 * expected, rel=0.1)
     # An even sheet 0.3 um deep would take more: stops and barriers hold part of the pixel.

@@ -9,7 +9,7 @@ import pytest
 
 from bfsensor.device.condition import Condition
 from bfsensor.errors import FitError
-from bfsensor.fit.data import MODEL_ERROR, area_data, data_set, select
+from bfsensor.fit.data import MODEL_ERROR, apart_from_readout, area_data, data_set, select
 from bfsensor.recording.tables.measured import read_measured
 
 DATA = Path(__file__).parents[1] / "data"
@@ -61,3 +61,12 @@ def test_selection_and_refusals():
         area_data("nine", np.nan * a, a)
     with pytest.raises(FitError, match=r"must both be \(ny, nx\)"):
         area_data("nine", a, a[0])
+
+
+def test_a_readout_takes_its_lags_out_of_the_fit():
+    a = np.arange(1, 10).reshape(3, 3) * 1e-8
+    device, readout = apart_from_readout(area_data("flats", a, 0.1 * a), 2)
+    assert readout.labels == ("(1,0)", "(2,0)") and not readout.fitted
+    assert device.fitted and len(device.values) == 7 and "(0,1)" in device.labels
+    with pytest.raises(FitError, match=r"flats: of 1 lags 0 are \(1,0\) to \(2,0\)"):
+        apart_from_readout(area_data("flats", a, 0.1 * a, lags=0), 2)

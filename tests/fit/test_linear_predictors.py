@@ -10,6 +10,7 @@ import pytest
 
 from bfsensor import Device
 from bfsensor.device.condition import Condition
+from bfsensor.device.depletion import find_depletion
 from bfsensor.device.parts import ElectronTransport
 from bfsensor.device.quantities import DIFFUSION, Prior, choose_priors
 from bfsensor.errors import FitError
@@ -17,6 +18,7 @@ from bfsensor.fit.data import DataSet
 from bfsensor.fit.device_at import device_at, fitted_device
 from bfsensor.fit.linear_predictors import SPILL, START, make_tangents
 from bfsensor.simulate.edge_field import front_plane
+from bfsensor.simulate.full_depletion import full_depletion_voltage
 from bfsensor.simulate.well import full_well
 from bfsensor.units import VACUUM_PERMITTIVITY
 
@@ -76,6 +78,29 @@ def test_diffusion_is_einsteins_in_a_nearly_even_field():
     assert slopes[0, 2] == 0.0
     held = make_tangents(DEVICE)["diffusion"](data("diffusion", at), priors[1:])
     assert held(middle[1:])[0] == pytest.approx(width)
+
+
+def test_the_full_depletion_voltage_follows_the_parameters():
+    names = "silicon.background_doping", "silicon.thickness", "back_bias:5 V"
+    priors = choose_priors(DEVICE, names)
+    predictor = make_tangents(DEVICE)["depletion"](data("depletion", Condition()), priors)
+    middle = np.array([prior.mean for prior in priors])
+    voltage, slopes = predictor(middle)
+    assert voltage[0] == pytest.approx(full_depletion_voltage(DEVICE, cells=8), abs=0.02)
+    # Of an evenly doped slab: q N T^2 / 2 eps.
+    drop = voltage[0] - find_depletion(DEVICE).front_potential
+    assert slopes[0, 0] == pytest.approx(drop / middle[0], rel=0.1)
+    assert slopes[0, 1] == pytest.approx(2 * drop / middle[1], rel=0.1)
+    # The bias at which the sensor is operated does not matter.
+    assert slopes[0, 2] == 0
+    for n in (0, 1):
+        moved = middle + 0.5 * priors[n].spread * (np.arange(3) == n)
+        solved = full_depletion_voltage(
+            device_at(DEVICE, Condition(), priors, moved), cells=8
+        )
+        assert predictor(moved)[0][0] - voltage[0] == pytest.approx(
+            solved - voltage[0], rel=0.1
+        )
 
 
 def test_a_device_holds_its_fitted_width():

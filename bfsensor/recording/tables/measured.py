@@ -73,7 +73,7 @@ class MeasuredTable:
         ----------
         given : mapping of str to str
             Quantities with units such as ``{'back_bias': '-60 V'}``, with the keys of
-            :data:`CONDITIONS` and ``sigma`` [pixel]; the other parts stay.
+            :data:`CONDITIONS`, ``level`` [e-] and ``sigma`` [pixel]; the other parts stay.
 
         Returns
         -------
@@ -100,12 +100,13 @@ def parse_condition(given: Mapping[str, Any]) -> tuple[dict[str, Any], float | N
     ----------
     given : mapping of str to str
         Quantities with units, with the keys of :data:`CONDITIONS`; ``sigma``, a width from 0.1 to
-        10 pixels, has none.
+        10 pixels, and ``level``, the charge in every pixel about which a response was measured, 0 e-
+        or more, may have none.
 
     Returns
     -------
     fields : dict of str to float
-        Voltages [V], temperature [K] and wavelength [nm], as :class:`Condition` has them.
+        Voltages [V], temperature [K], wavelength [nm] and level [e-], as :class:`Condition` has them.
     sigma : float or None
         The width [pixel]; None where it is not given.
 
@@ -129,11 +130,14 @@ def parse_condition(given: Mapping[str, Any]) -> tuple[dict[str, Any], float | N
                 if not 0.1 < sigma < 10:
                     raise RecordingError(f"sigma = {text!r} must be from 0.1 to 10 pixels")
                 continue
+            if key == "level":
+                fields[key] = _electrons(text)
+                continue
             kind, factor = CONDITIONS[key]
             fields[key] = round(to_internal(text, kind) * factor, 9)
         except KeyError:
             raise RecordingError(
-                f"{key!r} is not a condition; conditions are {', '.join(CONDITIONS)}, sigma"
+                f"{key!r} is not a condition; conditions are {', '.join(CONDITIONS)}, level, sigma"
             ) from None
         except DeviceError as error:
             raise RecordingError(f"{key}: {error}") from None
@@ -146,6 +150,18 @@ def parse_condition(given: Mapping[str, Any]) -> tuple[dict[str, Any], float | N
     return fields, sigma
 
 
+def _electrons(text: str) -> float:
+    try:
+        level = float(text.removesuffix("e-").strip())
+    except ValueError:
+        level = -1.0
+    if not 0 <= level < np.inf:
+        raise RecordingError(
+            f"level = {text!r} must be the charge in every pixel, 0 e- or more, such as 40000"
+        )
+    return level
+
+
 def read_measured(path: str | os.PathLike[str]) -> MeasuredTable:
     r"""Read measured a_ij, slopes, saturation levels or diffusion widths.
 
@@ -156,7 +172,7 @@ def read_measured(path: str | os.PathLike[str]) -> MeasuredTable:
         dataset, or a table by setting (:func:`~bfsensor.recording.read_setting_table`).  The
         header of an ECSV file may have an entry ``conditions``: quantities with units such as
         ``{back_bias: -60 V, wavelength: 620 nm}``, of back_bias, gate_high, gate_low, temperature
-        and wavelength, and ``sigma``, the width of spots [pixel].
+        and wavelength, ``level`` [e-], and ``sigma``, the width of spots [pixel].
 
     Returns
     -------

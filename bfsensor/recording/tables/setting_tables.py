@@ -1,4 +1,4 @@
-"""Tables with one number for each setting: B-F slopes, saturation levels, diffusion widths."""
+"""Tables with one number for each setting: slopes, full wells, diffusion, full depletion."""
 
 from __future__ import annotations
 
@@ -40,13 +40,16 @@ KINDS = {
     "slopes": _Form(("slope", "meas_pct_per_50ke"), ("slope_error", "meas_err"), True),
     "saturation": _Form(("saturation", "sat_level_e"), ("saturation_error",), False),
     "diffusion": _Form(("diffusion",), ("diffusion_error",), False),
+    "depletion": _Form(("full_depletion",), ("full_depletion_error",), False),
 }
 """Columns of each kind of table, in the units of :class:`SettingTable`."""
 
 
 @dataclass(frozen=True, eq=False)
 class SettingTable:
-    """Measured slopes, saturation levels or diffusion widths, each with its own condition.
+    """Measured slopes, saturation levels, diffusion widths or full-depletion voltages.
+
+    Each value has its own condition.
 
     Attributes
     ----------
@@ -54,7 +57,8 @@ class SettingTable:
         File of the table.
     kind : str
         'slopes', rise of a spot's rms width for 50,000 e- in its central pixel [% of a pixel],
-        'saturation' [e-] or 'diffusion' [um].
+        'saturation' [e-], 'diffusion' [um] or 'depletion', the back bias from which on all of the
+        silicon is depleted [V, signed as in device files].
     values, errors : ndarray, shape (n,)
         Values and their standard errors; errors are nan where the table has none.
     axes : tuple of str
@@ -97,14 +101,14 @@ def is_setting_table(names: list[str]) -> str | None:
 
 
 def read_setting_table(path: str | os.PathLike[str]) -> SettingTable:
-    r"""Read slopes, saturation levels or diffusion widths, comma-separated or ECSV.
+    r"""Read slopes, saturation levels, diffusion widths or full-depletion voltages, CSV or ECSV.
 
     Parameters
     ----------
     path : path-like
         Table with the columns of one of :data:`KINDS`: ``slope`` [% of a pixel for 50,000 e-] with
-        ``axis``, 'x' or 'y'; ``saturation`` [e-]; or ``diffusion`` [um]; each may have
-        ``..._error``.  Columns of :data:`SETTINGS` are optional: ``back_bias``, ``gate_high``,
+        ``axis``, 'x' or 'y'; ``saturation`` [e-]; ``diffusion`` [um]; or ``full_depletion`` [V]; each
+        may have ``..._error``.  Columns of :data:`SETTINGS` are optional: ``back_bias``, ``gate_high``,
         ``gate_low`` [V], ``wavelength`` [nm], ``temperature`` [K].
 
     Returns

@@ -105,3 +105,15 @@ def test_conditions_that_are_none(tmp_path, given, message):
         read_measured(path).at(given)
     with pytest.raises(RecordingError, match=r"none\.csv: no such file"):
         read_measured(tmp_path / "none.csv")
+
+
+def test_a_recording_states_the_level_of_its_response(tmp_path):
+    path = tmp_path / "areas.csv"
+    path.write_text(AREAS)
+    measured = read_measured(path)
+    assert measured.condition.level is None
+    assert measured.at({"level": "0"}).condition.level == 0
+    assert measured.at({"level": "2.5e4 e-"}).condition.level == 25_000
+    for wrong in ("-1", "many", "inf", "nan"):
+        with pytest.raises(RecordingError, match=r"level = .* 0 e- or more, such as 40000"):
+            measured.at({"level": wrong})
