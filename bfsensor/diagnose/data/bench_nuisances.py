@@ -16,7 +16,13 @@ from bfsensor.diagnose.data.code_channels import HALO_ERROR
 from bfsensor.diagnose.data.cosmetics import Cosmetic
 from bfsensor.diagnose.data.exposure_info import ExposureInfo, condition_of
 from bfsensor.diagnose.data.flat_channels import LAMP_UNKNOWN
-from bfsensor.diagnose.data.spot_channels import BACKGROUND_ERROR, STAMP, TAIL_ERROR, WING
+from bfsensor.diagnose.data.spot_channels import (
+    BACKGROUND_ERROR,
+    STAMP,
+    TAIL_ERROR,
+    WING,
+    WINGS_ALIKE,
+)
 from bfsensor.effects.dark_hot import warmth
 from bfsensor.typing import FloatArray
 
@@ -97,6 +103,7 @@ def assumed_errors(channels: Sequence[Channel]) -> list[str]:
     kinds = (
         ("spot", "wings", BACKGROUND_ERROR, "background beside spots", "e- per pixel", "on wings"),
         ("spot", "wings", TAIL_ERROR, "tails of spots", "of themselves", "on wings"),
+        ("spot", "wings", WINGS_ALIKE, "wings of all spots alike", "of the flux", "on wings"),
         ("amp_cross", "crosstalk", HALO_ERROR, "crosstalk", "of the signal", "there"),
         ("flat_mean", None, LAMP_UNKNOWN, "light without a monitor", "of it", "there"),
         ("bias_level", "frames", FRAME_ERROR, "levels of bias frames", "ADU", "there"),
@@ -114,6 +121,9 @@ def assumed_errors(channels: Sequence[Channel]) -> list[str]:
             elif what == "rows":
                 usual = np.square(floor**2 * c.axes["same_row"][rows])
                 variance = floor**2 * (1.0 + variance / usual)
+            elif floor == WINGS_ALIKE:
+                own = np.maximum(variance - floor**2, 1e-300)
+                variance = np.array([floor**2 + 1 / np.sum(1 / own)] if own.size else [])
             elif floor == TAIL_ERROR:
                 variance = variance / np.maximum(np.square(c.values[rows]), 1e-300)
             elif what == "wings":

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from bfsensor.diagnose.data.spot_channels import STAMP, WING, SpotChannels, stamp_moments
+from bfsensor.diagnose.data.spot_channels import (
+    STAMP,
+    WING,
+    WINGS_ALIKE,
+    SpotChannels,
+    stamp_moments,
+)
 
 SIDE, PITCH, WIDTH, FLUX = 192, 30, 1.1, 2e5
 
@@ -130,3 +136,17 @@ def test_wings_are_known_to_a_part_of_the_background_and_of_their_tail(light, ta
     assert channel.errors[wings] > np.hypot(floor, tenth)
     # Beside them there is only the scatter between 36 spots.
     assert channel.errors[wings] ** 2 < 2 * (floor**2 + tenth**2) or light < 1 or not tail
+
+
+def test_many_exposures_do_not_make_wings_of_spots_at_the_same_places_surer():
+    """Whatever lies beside the spots lies there in all exposures: 40 know it no better than 10."""
+    rng = np.random.default_rng(5)
+    channels = SpotChannels(read_noise=4.0, lamp_error=1e-6)
+    for number in range(12):
+        assert channels.add(shot_of(number), exposure_of(rng, 0.0) * 40) is None
+    channel = channels.channels()[0]
+    wings = channel.axes["what"] == "wings"
+    alike = channel.whiten(wings.astype(float))
+    # The error of a departure that all have alike.
+    assert alike @ alike < WINGS_ALIKE**-2
+    assert (np.diff(np.flatnonzero(wings)) == 1).all() and wings.sum() == 12
