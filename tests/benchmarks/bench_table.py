@@ -16,11 +16,10 @@ import numpy as np
 from astropy.table import Table
 
 from bfsensor.device.device import Device
+from bfsensor.response.light import conversion_depths
 from bfsensor.response.periodic_images import PERIOD
 from bfsensor.simulate.boundaries import find_boundaries
-from bfsensor.simulate.mesh import make_mesh
-from bfsensor.simulate.poisson import Electrostatics
-from bfsensor.simulate.unit_cell import solve_unit_cell, tile
+from bfsensor.simulate.pixel_array import PixelArray
 from bfsensor.table.levels import solve_level
 from bfsensor.table.table_plan import plan_table
 
@@ -33,41 +32,39 @@ def cpu() -> float:
 
 
 def memory_bandwidth() -> float:
-    """Bytes a second of ``a = b + s c`` on one thread (STREAM triad, best of five)."""
-    n = 8_000_000
-    b, c, a = np.ones(n), np.ones(n), np.zeros(n)
+    """Bytes a second of ``a = a + b`` in single precision on one thread, best of five."""
+    n = 16_000_000
+    a, b = np.ones(n, np.float32), np.ones(n, np.float32)
     best = 0.0
     for _ in range(5):
         began = time.perf_counter()
-        np.multiply(c, 3.0, out=a)
         np.add(a, b, out=a)
-        best = max(best, 5 * 8 * n / (time.perf_counter() - began))
+        best = max(best, 3 * 4 * n / (time.perf_counter() - began))
     return best
 
 
 def bench(name: str, cells: int, bandwidth: float) -> dict[str, object]:
     """Solve and trace one level and the next one; compilation is done before."""
     device = Device.load(name)
-    charges = np.zeros(1)
     began = cpu()
-    mesh = make_mesh(device, pixels=(PERIOD, PERIOD), cells=cells)
-    solver = Electrostatics(device, mesh)
-    start = tile(solve_unit_cell(device, 0.0, cells=cells), mesh)
-    charges = np.zeros(solver.pixel_shape)
-    charges[0, 0] = 1e5
+    array = PixelArray(device, period=PERIOD, cells=cells)
+    array.unit(0.0)
     setup = cpu() - began
+    mesh, solver = array.mesh, array.solver
     began, cycles = cpu(), solver.multigrid.cycles
-    solution = solver.solve(charges, start=start)
+    solution = array.solve(1e5, 0.0)
     solve = cpu() - began
     cycles = solver.multigrid.cycles - cycles
     began = cpu()
-    find_boundaries(solution, [5.0, 10.0, 20.0, 40.0, 100.0], reach=4, samples=24)
+    # The first of a table's depths is where nothing moves.
+    find_boundaries(solution, conversion_depths(device)[1:], reach=4, samples=24)
     trace = cpu() - began
     nodes = int(np.prod(mesh.shape))
     # One V(1,1) cycle, fine level, single precision: four half sweeps read and write the
-    # solution and read the charge (12 bytes), residual 12, transfers 16; coarser levels a third
-    # more. An iteration adds the operator and the vector updates in double precision, 120 bytes.
-    moved = cycles * nodes * (4 / 3 * (4 * 12 + 12 + 16) + 120)
+    # solution and read charge and pivots (16 bytes), residual 12, transfers 16; coarser levels a
+    # third more; the start from coarser arrays is not counted.  An iteration adds the operator and
+    # the vector updates in double precision, 120 bytes.
+    moved = cycles * nodes * (4 / 3 * (4 * 16 + 12 + 16) + 120)
     return {
         "device": name, "cells": cells, "nodes": nodes, "setup_cpu_s": round(setup, 2),
         "solve_cpu_s": round(solve, 2), "trace_cpu_s": round(trace, 2), "cycles": cycles,
