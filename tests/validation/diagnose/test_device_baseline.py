@@ -125,7 +125,7 @@ def test_a_quantity_at_the_end_of_what_can_be(monkeypatch):
         slopes = [(shifts(other) - shifts(device)) / step for other, step in changed]
         dkx = np.array(slopes)[:, None, None, None] * np.ones((2, 11, 11))
         return EdgeResponse(
-            np.array([5.0, 100.0]), dkx[0], dkx[0], dkx, 0.0 * dkx, (0.0, 0.0)
+            np.array([5.0, 100.0]), dkx[0], dkx[0], dkx, 0.0 * dkx, (0.0, 0.0), 0.0
         )
 
     monkeypatch.setattr(device_baseline, "walk", walk)
