@@ -393,7 +393,7 @@ class Electrostatics:
         """A first guess without carriers: linear solution, held above the hole level."""
         c = self.coefficients
         self._stiffness[...] = 0.0
-        # Else the cycles would hold the carriers of what was solved before.
+        # The multigrid cycles still hold the carriers of the last solution: take them out.
         self.multigrid.set_carriers(self._stiffness)
         phi = np.zeros(self._shape)
         conductor = c.conductor[c.kind[1:-1]]
@@ -554,8 +554,10 @@ class Electrostatics:
     def _forcing(self, expected: float, tolerance: float) -> float:
         """Relative error at which a linear system ends, for a Newton step of an expected size [V].
 
-        An error below that of Newton's quadratic term, the step over kT, or below the half of what
-        may be left in the end, gains nothing (Eisenstat & Walker 1996, SIAM J. Sci. Comput. 17, 16).
+        Newton's method neglects the square of its step: a part, step / kT, of the step is wrong
+        however well its linear system is solved.  The system is therefore solved to that part, or to
+        half of the tolerance where that is larger (Eisenstat & Walker 1996, SIAM J. Sci. Comput. 17,
+        16).
         """
         worth_while = max(expected / self._kt, 0.5 * tolerance / (_SAFETY * expected))
         return float(np.clip(worth_while, _FORCING[0], _FORCING[1]))

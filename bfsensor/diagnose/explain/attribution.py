@@ -42,8 +42,8 @@ where none is."""
 OUTSIDE_TRUE = {True: 0.11, False: 0.55}
 """Probability that the physics is outside the library where a mismatch is left that no effect explains:
 with an effect named beside it (True), and with none (False).  Measured on the same campaigns, those of
-several effects too: 2 of 18, and 6 of 11.  In the other 16 of the 18 another law of what is named, or
-another effect of the library, had left the mismatch."""
+several effects too: what was left was outside in 2 of 18, and in 6 of 11.  In the other 16 of the 18 it
+came of another law of the named effect, or of another effect of the library."""
 
 WIDENED = 1.12
 """Factor on standard errors in all intervals.  Measured on 141 parameters of concealed trials (commit
