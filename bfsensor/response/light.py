@@ -26,8 +26,8 @@ LOWEST = 2.0
 
 Measured: at 1.3 um a_00 of the ITL device on 8 to 16 cells is 1.4 to 60 times that on 24 cells, as
 electrons there drift to no definite well; at 2 um, at back biases of -50 and -30 V, it is within 17 %,
-that of E2V on 12 and 16 cells within 10 %, but on 8 cells twice as large.  Below, the response is taken as
-linear down to the stored charge."""
+that of E2V on 12 and 16 cells within 10 %, but on 8 cells twice as large.  Below, the response is
+taken as linear down to the stored charge."""
 
 BETWEEN = 6
 """Number of heights between that of bisection and the back surface, at a constant ratio.
