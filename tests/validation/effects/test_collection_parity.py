@@ -41,7 +41,7 @@ RANGES = {
     "voltage_dependence": ({"delta": 0.02}, {"delta": -0.08}, {"delta": 0.3}),
     "lateral_diffusion": ({"var": 0.005}, {"var": 0.03}, {"var": 0.2}),
     "psf_wings": (
-        {"frac": 1e-3, "sigma": 3.0}, {"frac": 7e-3, "sigma": 5.0}, {"frac": 0.05, "sigma": 8.0},
+        {"frac": 1e-3, "sigma": 3.0}, {"frac": 7e-3, "sigma": 5.0}, {"frac": 0.05, "sigma": 7.0},
     ),
     "charge_loss": ({"q": 1e-8}, {"q": 5e-8}, {"q": 3e-7}),
     "interpixel_coupling": (
