@@ -24,8 +24,9 @@ that half as many cells resolve it; a period of 6 has four times the nodes."""
 _START_TOLERANCE = 1e-4
 """Iteration error of the solutions that only make a start [V].
 
-Chosen: the start made of them is off by 1 mV through their cells; at twice the value it hardly
-changes, and a solution does not depend on it beyond its own tolerance."""
+Chosen: the start made of them is off by 1 to 60 mV, as the first Newton step then shows, through
+their cells; at twice the value it hardly changes, and a solution does not depend on it beyond its own
+tolerance."""
 
 _FEWEST_CELLS = 16
 """Cells a pixel below which an array starts from repeated unit cells.
