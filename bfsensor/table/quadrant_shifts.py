@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import PchipInterpolator
 
 from bfsensor.errors import TableError
 from bfsensor.response.light import conversion_weights
@@ -18,6 +19,12 @@ _PROBE = 100.0
 
 Chosen: the response is nearly linear there; twice the charge changes the a_ij of the two LSST
 devices by 4e-4 at most."""
+
+
+_BETWEEN = 20
+"""Heights for each interval of the table's depths, between which shifts count as linear.
+
+Chosen: the table's cubics are then met to 1e-4; twice as many meet them four times as well."""
 
 
 class QuadrantShifts(NamedTuple):
@@ -105,10 +112,10 @@ def quadrant_shifts(
 
     Notes
     -----
-    Light that crosses the silicon is left out.  Between the table's depths shifts are linear, as in
-    the sensors.  Shifts by image charges in 100 um of silicon fall
-    faster than the tail of -1.35, which is 1.0 to 1.4 times too large at 5 pixels and 1.3 to
-    2.4 times at 7.
+    Light that crosses the silicon is left out.  Between the table's depths shifts are monotone
+    cubics in the logarithm of depth, as in the sensors.  Shifts by image charges in 100 um of
+    silicon fall faster than the tail of -1.35, which is 1.0 to 1.4 times too large at 5 pixels and
+    1.3 to 2.4 times at 7.
 
     Examples
     --------
@@ -132,12 +139,16 @@ def quadrant_shifts(
         )
     by_depth = [_at_depth(table, background, depth) for depth in table.depths]
     north, east = (np.array([shifts[k] for shifts in by_depth]) for k in (0, 1))
-    weights = np.eye(len(table.depths))[-1]
+    heights, weights = table.depths, np.eye(len(table.depths))[-1]
     if wavelengths is not None:
-        weights = _conversion(table, wavelengths, photons, temperature)
+        heights, weights = _conversion(table, wavelengths, photons, temperature)
     elif photons is not None:
         raise TableError("photons are given without wavelengths: give both")
-    means = [np.tensordot(weights, values, 1) for values in (north, east)]
+    means = []
+    for values in (north, east):
+        if len(heights) > len(table.depths):
+            values = PchipInterpolator(np.log(table.depths), values)(np.log(heights))
+        means.append(np.tensordot(weights, values, 1))
     return _extended(QuadrantShifts(*means), table.pitch, lags, tail_slope)
 
 
@@ -168,8 +179,8 @@ def _conversion(
     wavelengths: ArrayLike,
     photons: ArrayLike | None,
     temperature: float | None,
-) -> FloatArray:
-    """Weights of the table's depths for all light that converts."""
+) -> tuple[FloatArray, FloatArray]:
+    """Heights [um], the table's depths and others between, and their weights for the light."""
     from bfsensor.device.device import Device
     from bfsensor.device.silicon import absorption_length
 
@@ -196,11 +207,14 @@ def _conversion(
         raise TableError(
             f"wavelengths = {waves} nm: none of this light converts in the silicon"
         )
+    last, between = np.arange(len(table.depths) - 1), np.linspace(0, 1, _BETWEEN + 1)[:-1]
+    at = np.append((last[:, None] + between).ravel(), len(table.depths) - 1.0)
+    heights = np.exp(np.interp(at, np.arange(len(table.depths)), np.log(table.depths)))
     by_wave = [
-        conversion_weights(table.depths, w, temperature, thickness=table.thickness)
+        conversion_weights(heights, w, temperature, thickness=table.thickness)
         for w in waves
     ]
-    return np.asarray(shares @ np.array(by_wave) / shares.sum())
+    return heights, np.asarray(shares @ np.array(by_wave) / shares.sum())
 
 
 def _extended(

@@ -51,8 +51,8 @@ def test_all_who_ask_get_the_same_response(wavelength, answers):
     np.testing.assert_allclose(diagnosis, sweep, rtol=1e-9)
     np.testing.assert_allclose(fit[:2, :2], sweep[:2, :2], rtol=1e-3)
     np.testing.assert_allclose(fit, sweep, rtol=6e-3)
-    # A table's mesh is not halved in z: 0.4 % at (1, 0), 0.33 % at (0, 0), less elsewhere.
-    np.testing.assert_allclose(export[:2, :2], sweep[:2, :2], rtol=5e-3)
+    # A table's mesh is not halved in z, 0.4 %, and it is cubic between depths instead of linear, 0.2 %.
+    np.testing.assert_allclose(export[:2, :2], sweep[:2, :2], rtol=6e-3)
 
 
 @pytest.fixture(scope="module")
