@@ -60,7 +60,7 @@ class SweepPoint:
 
     Examples
     --------
-    >>> len(SweepPoint(Device.load("itl_sta3800c").to_toml(), LEVEL, 0.0, CELLS).key)
+    >>> len(SweepPoint(Device.load("itl_sta3800c").to_toml(), 40e3, 0.0, CELLS).key)
     16
     """
 
@@ -206,7 +206,7 @@ def solve_point(point: SweepPoint) -> PointResponse:
     Examples
     --------
     >>> undepleted = Device.load("e2v_ccd250").with_value("back_bias", "-5 V")
-    >>> solve_point(SweepPoint(undepleted.to_toml(), LEVEL, 0.0, 8)).reason.partition(" = ")[0]
+    >>> solve_point(SweepPoint(undepleted.to_toml(), 40e3, 0.0, 8)).reason.partition(" = ")[0]
     'e2v_ccd250: back_bias'
     """
     began = time.process_time()

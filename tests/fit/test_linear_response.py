@@ -7,26 +7,41 @@ from bfsensor import Device
 from bfsensor.device.condition import Condition
 from bfsensor.device.quantities import choose_priors
 from bfsensor.errors import FitError
+from bfsensor.fit import full_solutions, linear_response
 from bfsensor.fit.full_solutions import solve_shifts
 from bfsensor.fit.linear_response import Linearise
 from bfsensor.response.edge_response import area_matrix, solve_response
+from bfsensor.simulate.boundaries import BISECTION
 
 
-def test_a_response_is_taken_at_the_level_of_its_recording():
+def test_a_response_is_taken_at_the_level_of_its_recording(monkeypatch):
     """The centre of an empty ITL sensor loses more than that of one filled half."""
     device = Device.load("itl_sta3800c")
+    coarse = {"cells": 8, "refine_z": 0, "precision": BISECTION}
+    monkeypatch.setattr(
+        linear_response, "solve_response",
+        lambda device, *, level, cells, changed, laid_for: solve_response(
+            device, level=level, changed=changed, laid_for=laid_for, **coarse
+        ),
+    )  # fmt: skip
     levels = Condition(), Condition(level=0.0), Condition(level=80_000.0)
-    linearise = Linearise(device, (), levels, cells=8)
     none = np.zeros(0)
-    usual, empty, full = (
-        linearise(none).predict(none, condition).areas[0, 0] for condition in levels
-    )
+    found = Linearise(device, (), levels, cells=8)(none)
+    usual, empty, full = (found.predict(none, c).areas[0, 0] for c in levels)
     assert empty < 1.01 * usual < 1.02 * full < 0
-    alone = solve_response(device, level=0.0, cells=8).edges(None, 173.0)
-    middle = len(alone[0]) // 2
-    assert empty == pytest.approx(area_matrix(*alone)[middle, middle], rel=1e-12)
-    solved = solve_shifts(device, (), none, levels, cells=8, refine_z=1)
-    assert len({s[0].tobytes() for s in solved.values()}) == 3
+    alone = area_matrix(*solve_response(device, level=0.0, **coarse).edges(None, 173.0))
+    middle = len(alone) // 2
+    assert empty == pytest.approx(alone[middle, middle], rel=1e-12)
+    monkeypatch.setattr(
+        full_solutions, "solve_nodes",
+        lambda nodes, **options: (
+            asked.extend(node.level for node in nodes) or {}
+        ),
+    )  # fmt: skip
+    asked: list[float] = []
+    with pytest.raises(KeyError):  # nothing is solved here
+        solve_shifts(device, (), none, levels, cells=8, refine_z=0)
+    assert asked == [40_000.0, 0.0, 80_000.0]
 
 
 @pytest.mark.slow

@@ -17,8 +17,9 @@ from bfsensor.simulate.mean_field import STEPS, mean_drift_field
 def test_shipped_tables_hold_the_field_of_their_device(name):
     table = DistortionTable.load(name)
     field = mean_drift_field(Device.from_toml(table.device_text))
-    # Solved on another processor: round-off of potentials of tens of volts.
-    assert np.allclose(table.drift_field, field, rtol=0, atol=1e-9)
+    # The iteration that solved the tables' potentials went on to 1e-9 V; today's ends below the
+    # tolerance of 1e-6 V, which is 3e-8 V/um of fields of 0.2 to 20 V/um.
+    assert np.allclose(table.drift_field, field, rtol=0, atol=1e-7)
 
 
 def test_a_table_without_it_is_read_and_gives_the_same_drift(tmp_path):

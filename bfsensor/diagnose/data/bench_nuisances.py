@@ -97,8 +97,10 @@ def assumed_errors(channels: Sequence[Channel]) -> list[str]:
     --------
     >>> x = {"what": np.array(["wings"]), "flux": np.array([3.2e5])}
     >>> wide = Channel("spot", np.zeros(1), (np.array([[5e-9]]),), x, "")
-    >>> assumed_errors([wide])[0][52:]
+    >>> assumed_errors([wide])[0][52:].split("; ")[0]
     'background beside spots 0.05 e- per pixel (effects on wings look 29 % weaker)'
+    >>> assumed_errors([wide])[0][52:].split("; ")[1]
+    'wings of all spots alike 4e-05 of the flux (effects on wings look 18 % weaker)'
     """
     kinds = (
         ("spot", "wings", BACKGROUND_ERROR, "background beside spots", "e- per pixel", "on wings"),
