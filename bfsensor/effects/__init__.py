@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from bfsensor.effects.edge_rolloff import EdgeRolloff
     from bfsensor.effects.effect import Effect, Law, Layout, Parameter, Segment, Shot
     from bfsensor.effects.electronic_memory import ElectronicMemory, OffsetDrift, Settling
-    from bfsensor.effects.fringing import Fringing
+    from bfsensor.effects.fringing import Fringing, RoughFringes
     from bfsensor.effects.gain_drift import GainCurve, GainCycle, GainDrift, GainWarming
     from bfsensor.effects.gain_nonlinearity import (
         GainKink,
@@ -87,7 +87,7 @@ else:
             "edge_rolloff": ["EdgeRolloff"],
             "effect": ["Effect", "Law", "Layout", "Parameter", "Segment", "Shot"],
             "electronic_memory": ["ElectronicMemory", "OffsetDrift", "Settling"],
-            "fringing": ["Fringing"],
+            "fringing": ["Fringing", "RoughFringes"],
             "gain_drift": ["GainCurve", "GainCycle", "GainDrift", "GainWarming"],
             "gain_nonlinearity": [
                 "GainKink",
@@ -169,6 +169,7 @@ __all__ = [
     "PsfWings",
     "RadialTreeRings",
     "ResponseCurve",
+    "RoughFringes",
     "Saturation",
     "Segment",
     "SerialTraps",

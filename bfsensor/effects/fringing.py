@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
+from scipy.fft import irfft2, rfft2, rfftfreq
 
 from bfsensor.effects.effect import Effect, Layout, Parameter, Seen, Shot
 from bfsensor.typing import FloatArray
@@ -14,6 +16,12 @@ RED = 900.0
 
 Derived from :func:`bfsensor.device.silicon.absorption_length` at 173 K: 100 um of silicon lets 5 % of
 the light of 900 nm cross twice, but 0.3 % at 850 nm.  Other thicknesses move this."""
+
+LONGEST = 16.0
+"""Longest period of rough fringes [pixel] whose power is predicted.
+
+Derived: two blocks of 8 pixels, whose means show the places of longer waves; sensors with larger
+blocks could have twice as much."""
 
 
 class Fringing(Effect):
@@ -90,6 +98,73 @@ class Fringing(Effect):
         )
         turns = height / self["period"] + self["phase"]
         return np.asarray(1 + self["amp"] * np.sin(2 * np.pi * turns))
+
+
+class RoughFringes(Effect):
+    r"""Response at 900 nm and beyond varies as fringes of silicon of irregular thickness.
+
+    Where the thickness varies by more than a half-wave, the power of :math:`\cos \phi(x, y)` at a
+    frequency is the part of the sensor that has this gradient of the phase (Woodward 1952).  For a
+    random surface gradients are Gaussian, and so is the power by frequency k,
+
+    .. math:: S(k) \propto A^2 e^{-k^2 P^2},
+
+    with P the period at the root mean square frequency.  Only the power of the pattern is predicted,
+    with the places of one random pattern: waves along an axis and those longer than :data:`LONGEST`,
+    which means of rows, columns and blocks of pixels would show, are left out.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Plausible ranges: ``amp``: 0.0001 to 0.02, root mean square (0 changes nothing); ``period``
+        [pixel]: 3 to 30.
+
+    Examples
+    --------
+    >>> RoughFringes({"amp": 0.001, "period": 8.0}).name
+    'fringing:rough'
+    """
+
+    word = "fringing"
+    variant = "rough"
+    law_name = "rough"
+    stage = "light"
+    parameters = (
+        Parameter("amp", "", 1e-4, 2e-2, amplitude=True),
+        Parameter("period", "pixel", 3.0, 30.0),
+    )
+    touches = ("flat_map",)
+    of_pixels = True
+    bends = True
+    source = (
+        "Woodward 1952, RRE Technical Note 666 (spectrum of waves of wide phase modulation); Guo et al. "
+        "2023, PASP 135, 034503 (LSST sensors: random thickness); the Gaussian and the range are assumed"
+    )
+
+    @classmethod
+    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+        return [{"amp": 1e-3, "period": period} for period in (4.0, 7.0, 12.0, 20.0)]
+
+    def light_map(self, shot: Shot, layout: Layout) -> FloatArray | None:
+        if not shot.wavelength >= RED or not self["amp"]:
+            return None
+        modes, k2 = _white_modes(layout.shape)
+        power = np.exp(-k2 * self["period"] ** 2)
+        whole = float(power.sum())
+        power[k2 < LONGEST**-2.0] = 0.0
+        power[0], power[:, 0] = 0.0, 0.0
+        ny, nx = layout.shape
+        # White noise of variance 1 has the same power in each of about ny nx / 2 modes.
+        size = self["amp"] * np.sqrt(power / whole * power.size)
+        return 1 + np.asarray(irfft2(modes * size, s=(ny, nx)))
+
+
+@lru_cache(maxsize=2)
+def _white_modes(shape: tuple[int, int]) -> tuple[np.ndarray, FloatArray]:
+    """Transform of one pattern of white noise, and squares of the frequency [pixel^-2]."""
+    white = np.random.default_rng(1952).standard_normal(shape)
+    k2 = np.fft.fftfreq(shape[0])[:, None] ** 2 + rfftfreq(shape[1]) ** 2
+    return np.asarray(rfft2(white)), np.asarray(k2)
 
 
 def _wavelength(name: str) -> float:

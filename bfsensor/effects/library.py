@@ -25,7 +25,7 @@ from bfsensor.effects.dark_hot import DarkCurrent, Glow, HotColumns
 from bfsensor.effects.edge_rolloff import EdgeRolloff
 from bfsensor.effects.effect import Effect
 from bfsensor.effects.electronic_memory import ElectronicMemory, OffsetDrift, Settling
-from bfsensor.effects.fringing import Fringing
+from bfsensor.effects.fringing import Fringing, RoughFringes
 from bfsensor.effects.gain_drift import GainCurve, GainCycle, GainDrift, GainWarming
 from bfsensor.effects.gain_nonlinearity import (
     GainKink,
@@ -78,6 +78,7 @@ LIBRARY: tuple[type[Effect], ...] = (
     Settling,
     OffsetDrift,
     Fringing,
+    RoughFringes,
     GainDrift,
     GainWarming,
     GainCycle,

@@ -37,11 +37,16 @@ SMOOTH = 2 * np.pad(_BOX, PERIOD // 2) - np.convolve(_BOX, _BOX)
 over one period removes any pattern of period 64, and twice it less its square (convolution) leaves
 a parabola unchanged."""
 
-CLEAR = 7.0
-"""Distance [pixel] from an amplifier's own spots, and from its edges, beyond which crosstalk is
-measured.  Chosen: Gaussian spots of 1.1 pixel have fallen below 1e-8 of their peak there, also
-those beyond an edge, which are in another amplifier; with 14, spots 28 pixels apart or nearer
-leave no pixel between them."""
+CLEAR = 6.4
+"""Distance [widths of the victim's spots] from an amplifier's own spots, and from its edges, beyond
+which crosstalk is measured.  Chosen: half a pixel nearer, where the far side of a spot may be,
+Gaussian spots of 1.1 pixel or more have fallen below 1e-7 of their peak, also those beyond an edge,
+which are in another amplifier; with 12.8, spots of 1.1 pixel that are 28 pixels apart or nearer leave
+no pixel between them."""
+
+SIDE = 9
+"""Half side [pixel] of the square in which a spot is the brightest pixel, and in which its light is
+summed.  Chosen: four widths of spots of 2.2 pixel; with 18, spots 28 pixels apart are taken for one."""
 
 HALO_ERROR = 5e-6
 """Crosstalk that unequal sides of spots' halos may imitate, added to the errors.  Chosen, to be
@@ -243,12 +248,18 @@ class CrosstalkChannels:
         ]
         centres = [_spots(s, 100 * n) for s, n in zip(signals, noise, strict=True)]
         trees = [cKDTree(c) if len(c) else None for c in centres]
+        widths = [_width(s, c) for s, c in zip(signals, centres, strict=True)]
         for a, aggressor in enumerate(signals):
             threshold = max(0.2 * float(np.percentile(aggressor, 99.9)), 100 * noise[a])
             rows, columns = np.nonzero(aggressor > threshold)
             for b, victim in enumerate(signals):
-                tree = trees[b]
-                if tree is None or a == b or len(rows) < 20 or len(centres[b]) < 4:
+                tree, clear = trees[b], CLEAR * widths[b]
+                if (
+                    tree is None
+                    or a == b
+                    or not clear
+                    or min(len(rows), 5 * len(centres[b])) < 20
+                ):
                     continue
                 # A spot's halo is alike on both sides: the point across the victim's own spot
                 # has the same halo and, mostly, no light in the other amplifier.
@@ -257,9 +268,9 @@ class CrosstalkChannels:
                 # Far from its spot that point may lie on another one of the victim.
                 across, _ = tree.query(np.column_stack([y, x]))
                 use = (
-                    (np.minimum(distance, across) > CLEAR)
-                    & _is_inside(rows, columns, victim.shape)
-                    & _is_inside(y, x, victim.shape)
+                    (np.minimum(distance, across) > clear)
+                    & _is_inside(rows, columns, victim.shape, clear)
+                    & _is_inside(y, x, victim.shape, clear)
                 )
                 aside = columns - centres[b][which][:, 1]
                 r, c, y, x, aside = rows[use], columns[use], y[use], x[use], aside[use]
@@ -275,11 +286,11 @@ class CrosstalkChannels:
 
     def channels(self) -> list[Channel]:
         """Channel 'amp_cross': fraction of the signal of ``amp`` that is seen in ``other``."""
-        if not self._sums:
+        pairs = sorted(p for p, (_, down) in self._sums.items() if down > 0)
+        if not pairs:
             return []
         axes = Axes()
         nothing = Condition()
-        pairs = sorted(p for p, (_, down) in self._sums.items() if down > 0)
         values = np.array([self._sums[p][0] / self._sums[p][1] for p in pairs])
         axes.add(len(pairs), nothing, amp=[p[0] for p in pairs], other=[p[1] for p in pairs],
                  what="crosstalk")  # fmt: skip
@@ -288,11 +299,11 @@ class CrosstalkChannels:
 
 
 def _is_inside(
-    y: NDArray[np.int64], x: NDArray[np.int64], shape: tuple[int, ...]
+    y: NDArray[np.int64], x: NDArray[np.int64], shape: tuple[int, ...], clear: float
 ) -> NDArray[np.bool_]:
-    """Mask of pixels that are at least CLEAR from an image's edges."""
+    """Mask of pixels that are at least ``clear`` from an image's edges [pixel]."""
     ny, nx = shape
-    return (y >= CLEAR) & (y < ny - CLEAR) & (x >= CLEAR) & (x < nx - CLEAR)
+    return (y >= clear) & (y < ny - clear) & (x >= clear) & (x < nx - clear)
 
 
 def _without_trails(
@@ -312,4 +323,18 @@ def _without_trails(
 
 def _spots(signal: FloatArray, threshold: float) -> NDArray[np.int64]:
     """Rows and columns of the peaks of spots, shape (n, 2)."""
-    return np.column_stack(find_peaks(signal, threshold, 9))
+    return np.column_stack(find_peaks(signal, threshold, SIDE))
+
+
+def _width(signal: FloatArray, centres: NDArray[np.int64]) -> float:
+    """Median width of spots [pixel], from second moments of their light; 0 without whole spots."""
+    away = np.arange(-SIDE, SIDE + 1.0)
+    found = []
+    for y, x in centres:
+        cut = signal[max(y - SIDE, 0) : y + SIDE + 1, max(x - SIDE, 0) : x + SIDE + 1]
+        if cut.shape == (len(away), len(away)):
+            sums = np.stack([cut.sum(0), cut.sum(1)])
+            first, second = sums @ away / sums.sum(1), sums @ away**2 / sums.sum(1)
+            # A pixel's side adds 1/12 to the variance.
+            found.append(float((second - first**2).mean()) - 1 / 12)
+    return float(np.sqrt(max(np.median(found), 0.0))) if found else 0.0

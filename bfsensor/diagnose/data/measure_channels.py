@@ -41,7 +41,11 @@ from bfsensor.diagnose.data.exposure_info import (
     zero_folds,
     zero_pixels,
 )
-from bfsensor.diagnose.data.flat_channels import FlatChannels, OverscanZero
+from bfsensor.diagnose.data.flat_channels import (
+    FlatChannels,
+    OverscanZero,
+    leave_out_struck,
+)
 from bfsensor.diagnose.data.flat_pairing import (
     Flat,
     PairFinder,
@@ -436,23 +440,23 @@ def _add_to_maps(
     shape: tuple[int, int],
 ) -> dict[int, float]:
     """Add a pair of flats to maps and codes; returns the mean level of either [ADU]."""
-    levels, departures = {}, []
     filled = np.zeros(shape, bool)
-    for exposure, frames in pair:
-        image = np.full(shape, np.nan, np.float32)
-        means = []
-        for frame in frames:
-            values = _good(flats, frame)
-            means.append(float(np.nanmean(values)))
-            place(image, frame, values / means[-1] - 1.0)
+    departures = [np.full(shape, np.nan, np.float32) for _ in pair]
+    means: list[list[float]] = [[] for _ in pair]
+    for both in zip(*(frames for _, frames in pair), strict=True):
+        values = [_good(flats, frame) for frame in both]
+        leave_out_struck(*values)
+        for frame, own, image, mean in zip(both, values, departures, means, strict=True):
+            mean.append(float(np.nanmean(own)))
+            place(image, frame, own / mean[-1] - 1.0)
             place(filled, frame, repaired_of(frame))
-        levels[exposure.number] = float(np.mean(means))
-        departures.append(image)
+    for _, frames in pair:
         codes.add(frames)
+    levels = {e.number: float(np.mean(m)) for (e, _), m in zip(pair, means, strict=True)}
     first, (_, frames) = pair[0][0], pair[1]
     noise = [
         biases.read_noise.get(f.name, 0.0) / np.sqrt(max(biases.frames, 1)) / m
-        for f, m in zip(frames, means, strict=True)
+        for f, m in zip(frames, means[1], strict=True)
     ]
     maps.add_pair(
         condition_of(first), first.exposure_time or 0.0, departures[0], departures[1],

@@ -254,7 +254,7 @@ PARAMETER_WORDS: Mapping[str, Mapping[str, str]] = {
         "full_well": "full well", "drain": "part of the charge above it that is lost",
     },
     "fringing": {
-        "amp": "relative amplitude", "period": "period along a row at the centre",
+        "amp": "relative amplitude", "period": "period (smooth fringes: along a row at the centre)",
         "tilt": "tilt of the contours", "phase": "phase",
         "xx": "curvature of the contours, x x", "xy": "curvature of the contours, x y",
         "yy": "curvature of the contours, y y",

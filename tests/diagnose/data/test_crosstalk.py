@@ -18,13 +18,15 @@ def spots_over_a_border(crosstalk: float) -> CrosstalkChannels:
         rng = np.random.default_rng(seed)
         edge = np.arange(2 * SIZE + 1) - 0.5
 
-        def along(start: float, stop: int, edge=edge, rng=rng) -> np.ndarray:
-            places = np.arange(start, stop, PITCH)
+        def along(places: np.ndarray, stop: int, edge=edge, rng=rng) -> np.ndarray:
             places = places + rng.uniform(-0.4, 0.4, len(places))
-            return np.diff(ndtr((edge[: stop + 1] - places[:, None]) / 1.1), axis=1)
+            return np.diff(ndtr((edge[: stop + 1] - places[:, None]) / 1.1), axis=1).sum(0)
 
-        # SIZE is a multiple of the pitch: every eighth column lies on the border.
-        image = 6e5 * along(15.0, SIZE).sum(0)[:, None] * along(0.4, 2 * SIZE).sum(0)
+        # From the border, the amplifiers' own columns are 17 + 30 n and 30 n pixels away.
+        x = np.r_[12.4:SIZE - 20:PITCH, SIZE - 0.1, SIZE + 29.5:2 * SIZE:PITCH]  # fmt: skip
+        image = 6e5 * np.outer(
+            along(np.arange(15.0, SIZE, PITCH), SIZE), along(x, 2 * SIZE)
+        )
         left, right = image[:, :SIZE][:, ::-1], image[:, SIZE:]
         frames = [left + crosstalk * right, right + crosstalk * left]
         out.add([f + NOISE * rng.standard_normal(f.shape) for f in frames], [NOISE, NOISE])
@@ -71,3 +73,27 @@ def test_other_spots_of_the_amplifier_are_no_crosstalk(crosstalk, apart) -> None
     assert np.all(np.abs(channel.values - crosstalk) < 4 * channel.errors)
     if apart > 7 and crosstalk:
         assert np.all(channel.values > 6 * channel.errors)
+
+
+@pytest.mark.parametrize("width", [1.1, 1.9])
+def test_the_far_side_of_a_wide_spot_is_no_crosstalk(width) -> None:
+    """Spots of 1.9 pixel, 7.6 pixels from the other amplifier's: their halos differ by its 1e-3."""
+    out = CrosstalkChannels()
+    edge = np.arange(SIZE + 1) - 0.5
+    places = np.arange(15.3, SIZE - 12, PITCH)
+
+    def light(places: np.ndarray) -> np.ndarray:
+        return np.diff(ndtr((edge - places[:, None]) / width), axis=1).sum(0)
+
+    for seed in range(8661, 8669):
+        rng = np.random.default_rng(seed)
+        left, right = (
+            6e5 * np.outer(light(places), light(p)) for p in (places, places + 7.6)
+        )
+        out.add(
+            [f + NOISE * rng.standard_normal(f.shape) for f in (left, right)],
+            [NOISE, NOISE],
+        )
+    for channel in out.channels():
+        assert np.all(np.abs(channel.values) < 4 * channel.errors)
+    assert bool(out.channels()) == (width < 1.5)
