@@ -17,6 +17,7 @@ from bfsensor.simulate.boundaries import (
     PixelBoundaries,
     find_boundaries,
 )
+from bfsensor.simulate.hole_layer import hole_layer_error
 from bfsensor.simulate.mesh import make_mesh
 from bfsensor.simulate.poisson import Electrostatics, Potential
 from bfsensor.simulate.unit_cell import solve_unit_cell, tile
@@ -244,8 +245,10 @@ def assess(plan: TablePlan) -> dict[str, float]:
     _workshop.cache_clear()
     charge = 0.5 * plan.full_well
     star = {offset: charge * part for offset, part in STAR.items()}
+    unit = solve_unit_cell(plan.device, 0.0, cells=_CELLS, refine_z=plan.refine_z)
     return {
         **mesh,
+        "hole layer [V]": hole_layer_error(unit),
         "tracing [um]": tracing_error(plan),
         "superposition, x pair at half full well [%]": 100
         * superposition_error(plan, {(0, 0): charge, (1, 0): charge}),

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import random
 import subprocess
 import sys
@@ -17,6 +18,8 @@ from tests.virtual import make_effect, write_campaign
 
 FREE = "date", "seconds", "cpu_seconds", "host", "command"
 """Parts of the provenance that differ between runs; the command names another folder here."""
+
+CHILDREN = "children_user", "children_system"
 
 
 def report(folder):
@@ -105,21 +108,32 @@ def test_ten_kills_at_random_moments(tmp_path):
             str(tmp_path / name),
         ]
 
-    def timed(name):
-        began = time.monotonic()
-        subprocess.run(command(name), check=True, stdout=subprocess.DEVNULL)
-        return time.monotonic() - began
+    def spent(run):
+        """CPU seconds of what ``run`` starts and waits for."""
+        before = os.times()
+        run()
+        after = os.times()
+        return sum(getattr(after, n) - getattr(before, n) for n in CHILDREN)
 
-    whole = timed("whole")
-    moments = random.Random(9)
-    lost = {}
-    for n in range(10):
-        moment = moments.uniform(2.0, whole)
-        process = subprocess.Popen(command(f"cut{n}"), stdout=subprocess.DEVNULL)
+    def finish(name):
+        subprocess.run(command(name), check=True, stdout=subprocess.DEVNULL)
+
+    def kill(name, moment):
+        process = subprocess.Popen(command(name), stdout=subprocess.DEVNULL)
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(timeout=moment)
         process.kill()
         process.wait()
-        lost[round(moment)] = round(moment + timed(f"cut{n}") - whole)
+
+    began = time.monotonic()
+    whole = spent(lambda: finish("whole"))
+    seconds = time.monotonic() - began
+    moments = random.Random(9)
+    lost = {}
+    for n in range(10):
+        moment = moments.uniform(2.0, seconds)
+        used = spent(lambda moment=moment, n=n: kill(f"cut{n}", moment))
+        used += spent(lambda n=n: finish(f"cut{n}"))
+        lost[round(moment)] = round(used - whole)
         assert report(tmp_path / f"cut{n}") == report(tmp_path / "whole")
-    print(f"{whole:.0f} s; seconds lost by the moment of the kill: {lost}")
+    print(f"{whole:.0f} CPU s; CPU s lost by the moment of the kill [s]: {lost}")

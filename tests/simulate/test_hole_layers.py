@@ -16,6 +16,7 @@ from scipy.sparse.linalg import spsolve
 from bfsensor.device.device import Device
 from bfsensor.device.parts import BuriedChannel, ChannelStop, GateStack, Implant
 from bfsensor.simulate.discretise import carrier_region
+from bfsensor.simulate.hole_layer import hole_layer_error
 from bfsensor.simulate.mesh import Surfaces, make_mesh
 from bfsensor.simulate.poisson import Electrostatics
 from bfsensor.simulate.unit_cell import solve_unit_cell
@@ -138,13 +139,17 @@ def channel_top(phi: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def column() -> dict[float, np.ndarray]:
-    """Reference along z under a gate of -8 V, for three levels of the holes."""
+    """Reference along z under a gate of -8 V: largest potential, and that of the surface.
+
+    For three levels of the holes.
+    """
     out = {}
     for level in (-40.0, 0.0, 2.0):
         device = striped_device(-8.0, -8.0 + 1e-9, level)
         fine, finer = (reference(device, np.zeros(1), h) for h in (5e-4, 2.5e-4))
         assert abs(channel_top(fine[1])[0] - channel_top(finer[1])[0]) < 3e-4
-        out[level] = np.array([channel_top(finer[1])[0]])
+        z, phi = finer
+        out[level] = np.array([channel_top(phi)[0], phi[np.argmin(np.abs(z - 0.1)), 0]])
     return out
 
 
@@ -185,6 +190,14 @@ def test_a_change_of_the_hole_level_acts_as_in_the_reference(column) -> None:
             - ours(-8.0, -8.0 + 1e-9, 0.0, refine).phi[:, 0, 0].max()
         )
         assert found == pytest.approx(wanted, rel=5e-3)
+
+
+def test_the_stated_error_is_that_of_the_surface(column) -> None:
+    for refine in (0, 1, 2):
+        mine = ours(-8.0, -8.0 + 1e-9, 0.0, refine)
+        surface = mine.phi[np.argmin(np.abs(mine.mesh.z - 0.1)), 0, 0]
+        assert hole_layer_error(mine) == pytest.approx(surface - column[0.0][1], rel=0.16)
+    assert hole_layer_error(ours(-8.0, -8.0 + 1e-9, -40.0, 0)) == 0.0
 
 
 @pytest.mark.slow

@@ -196,6 +196,8 @@ _KEEP = click.option("--keep", type=click.Path(path_type=Path), required=True,
 @_DRAWS
 @_RESISTIVITY
 @_KEEP
+@click.option("--level", default=0.0, show_default=True,
+              help="Level [e-] of the flats that responded; 0: the limit at no charge.")  # fmt: skip
 @click.pass_obj
 def areas(
     reference: Path,
@@ -205,6 +207,7 @@ def areas(
     draws: int,
     resistivity: bool,
     keep: Path,
+    level: float,
 ) -> None:
     """Fit the a_ij of 2019."""
     device = Device.load(DEVICES[vendor])
@@ -216,11 +219,13 @@ def areas(
     )
     device = with_priors(device, priors)
     data = data_set(read_measured(reference / f"{vendor}_covariances_21oct19.csv"))
+    data = replace(data, conditions=tuple(replace(c, level=level) for c in data.conditions))
+    at = (Condition(level=level),)
     begin = time.process_time()
     result = fit_device(
-        device, [data], priors, None,
-        linearise=make_finer(device, priors, (Condition(),), cells, finer, keep),
-        solved=make_solved(device, priors, (Condition(),), finer, keep), draws=draws,
+        device, [data], priors, None, draws=draws,
+        linearise=make_finer(device, priors, at, cells, finer, keep),
+        solved=make_solved(device, priors, at, finer, keep),
         source=f"bfsensor fit of {data.name}, 24 lags; errors are correlated: fit.json",
     )  # fmt: skip
     seconds = time.process_time() - begin
