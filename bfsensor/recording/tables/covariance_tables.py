@@ -184,7 +184,12 @@ def read_covariances(path: str | os.PathLike[str]) -> CovarianceTable:
     if unit not in ("electron", "adu"):
         raise RecordingError(f"{path}: unit = {unit!r} is not 'electron' or 'adu'")
     factor = gain**2 if unit == "adu" else np.ones(n)
-    factor = factor / 2 if table.meta.get("difference", False) else factor
+    difference = table.meta.get("difference", False)
+    if not isinstance(difference, bool):
+        raise RecordingError(
+            f"{path}: header entry difference = {str(difference)[:80]!r} is not true or false"
+        )
+    factor = factor / 2 if difference else factor
     warnings = []
     if "sigma" in table.colnames:
         error = floats(table, "sigma") * factor

@@ -98,6 +98,14 @@ def test_adu_and_differences(tmp_path, gain):
         read_covariances(path)
 
 
+@pytest.mark.parametrize("word", ["no", "false", 0, 2.0])
+def test_a_difference_is_true_or_false(tmp_path, word):
+    """Any text is true in Python, and covariances would be halved."""
+    path = write(covariances(), tmp_path / "c.ecsv", difference=word)
+    with pytest.raises(RecordingError, match=r"c.ecsv: header entry difference = .* is not true"):
+        read_covariances(path)
+
+
 @pytest.mark.parametrize(
     ("factor", "words"),
     [(2.0, "of a difference of two flats"), (0.5, "halved twice"), (5.0, "ADU taken")],
