@@ -12,7 +12,7 @@ from bfsensor.device.quantities import quantities
 from bfsensor.device.shipped import tables_dir
 from bfsensor.fit.prediction_error import DRAWS
 from bfsensor.fit.result import FitResult
-from bfsensor.response.edge_response import CHARGE, LEVEL
+from bfsensor.response.edge_response import CHARGE
 from bfsensor.table.table import DistortionTable
 
 FITTED = {"itl_sta3800c_2019": "itl_sta3800c_60", "e2v_ccd250_2019": "e2v_ccd250_70"}
@@ -42,16 +42,15 @@ def test_sensor_by_name_shows_what_was_measured(name):
     assert table.device_text == Device.load(name).to_toml()
     fit = FitResult.read(tables_dir() / name / "fit.json")
     (data,) = fit.sets
-    change = table.area_changes(
-        charge=LEVEL + CHARGE, background=LEVEL, depth=table.thickness
-    )
+    # The fits are to the limit at no charge.
+    change = table.area_changes(charge=CHARGE, background=0.0, depth=table.thickness)
     a = change[table.reach :, table.reach :] / (CHARGE * table.pitch[0] * table.pitch[1])
     i, j = data.places.T
-    # The nearest four lags without (0, 0): 0.5 % (ITL), 0.8 % (E2V), from the meshes and from the
-    # table between its levels; fits whose areas were multiplied by one ratio had 1.4 %.
+    # The nearest four lags without (0, 0): 1.7 % (ITL), from the table between no charge and its
+    # first (1.2 %) and from the meshes.
     near = np.isin([f"{i},{j}" for i, j in data.places], ("1,0", "0,1", "1,1", "2,0"))
     assert near.sum() == 4
-    assert np.max(np.abs((a[j, i] / data.after)[near] - 1)) < 0.01
+    assert np.max(np.abs((a[j, i] / data.after)[near] - 1)) < 0.02
     assert np.max(np.abs((a[j, i] / data.values)[:3] - 1)) < 0.05
     before = DistortionTable.read(tables_dir() / FITTED[name] / "table.fits")
     assert before.device_text != table.device_text
