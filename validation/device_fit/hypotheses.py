@@ -4,7 +4,7 @@
 hypothesis, all else alike, with the errors of the shipped fit (scaled there by the scatter of its
 lags; the seed paper's as stated) held:
 
-- 'as shipped': response of a flat of 40,000 e-, light converting at the back surface, the card's priors;
+- 'flat of 40,000 e-': its response, light converting at the back surface, the priors of the card;
 - 'zero level': the limit at no charge, which a fit of covariances against level gives (not of the seed
   paper's covariances, which are of one level);
 - 'red light': 950 nm;
@@ -54,7 +54,7 @@ RESULTS = ROOT / "validation" / "results" / "device_hypotheses.ecsv"
 COMMAND = "python -m validation.device_fit.hypotheses REFERENCE"
 
 HYPOTHESES: dict[str, frozenset[str]] = {
-    "as shipped": frozenset(),
+    "flat of 40,000 e-": frozenset(),
     "zero level": frozenset({"level"}),
     "red light": frozenset({"light"}),
     "doping by resistivity": frozenset({"doping"}),
