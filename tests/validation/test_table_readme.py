@@ -2,7 +2,7 @@
 
 import pytest
 
-from validation.boundaries.table_readme import ERRORS, TABLES, renewed
+from validation.table_readme import ERRORS, TABLES, renewed
 
 PAGES = [p for p in sorted(TABLES.glob("*/README.md")) if ERRORS in p.read_text()]
 

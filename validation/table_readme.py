@@ -1,6 +1,6 @@
 """What the pages of shipped tables say of them, made from the tables.
 
-``python -m validation.boundaries.table_readme [NAME...]`` rewrites in ``tables/NAME/README.md`` lines
+``python -m validation.table_readme [NAME...]`` rewrites in ``tables/NAME/README.md`` lines
 that begin with :data:`MADE` and :data:`CHANGES`, the table of estimated errors, and of fitted devices
 those of lags and parameters, from ``fit.json``; nothing is solved.
 """
@@ -18,7 +18,7 @@ from bfsensor.device.quantities import describe, quantities
 from bfsensor.fit.result import FitResult
 from bfsensor.table.table import DistortionTable
 
-TABLES = Path(__file__).parents[2] / "tables"
+TABLES = Path(__file__).parents[1] / "tables"
 MADE = "`table.fits`, made by "
 CHANGES = "For 100,000 e- on an empty background"
 ERRORS = "| estimated error (in the header) | |"
