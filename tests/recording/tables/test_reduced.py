@@ -102,7 +102,9 @@ def test_adu_and_differences(tmp_path, gain):
 def test_a_difference_is_true_or_false(tmp_path, word):
     """Any text is true in Python, and covariances would be halved."""
     path = write(covariances(), tmp_path / "c.ecsv", difference=word)
-    with pytest.raises(RecordingError, match=r"c.ecsv: header entry difference = .* is not true"):
+    with pytest.raises(
+        RecordingError, match=r"c.ecsv: header entry difference = .* is not true"
+    ):
         read_covariances(path)
 
 
