@@ -89,7 +89,7 @@ class DistortionTable:
     --------
     >>> table = DistortionTable.load("itl_sta3800c")
     >>> table
-    <DistortionTable of itl_sta3800c, 7 charges, 4 backgrounds, 7 depths, 9 x 9 pixels>
+    <DistortionTable of itl_sta3800c, 7 charges, 4 backgrounds, 10 depths, 9 x 9 pixels>
     >>> change = table.area_changes(charge=50000.0, depth=95.0)
     >>> bool(change[4, 4] < 0 < change[4, 5] < change[5, 4])
     True
