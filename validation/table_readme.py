@@ -51,8 +51,9 @@ def with_table(text: str, table: DistortionTable) -> str:
     changes = (
         f"{CHANGES} and conversion at {HEIGHT:g} um the area changes [um^2] are {listed}."
     )
+    new = {MADE: made, CHANGES: changes}
     lines = [
-        next((new for new in (made, changes) if line.startswith(new[:20])), line)
+        next((new[start] for start in new if line.startswith(start)), line)
         for line in text.splitlines()
     ]
     errors = [f"| {name} | {value:.3g} |" for name, value in sorted(table.errors.items())]

@@ -137,8 +137,9 @@ class RoughFringes(Effect):
     of_pixels = True
     bends = True
     source = (
-        "Woodward 1952, RRE Technical Note 666 (spectrum of waves of wide phase modulation); Guo et al. "
-        "2023, PASP 135, 034503 (LSST sensors: random thickness); the Gaussian and the range are assumed"
+        "Woodward 1952, Telecommunications Research Establishment, Memorandum 666 (spectrum of waves of "
+        "wide phase modulation; a test holds it to such waves); Guo et al. 2023, PASP 135, 034503 (LSST "
+        "sensors: random thickness); the Gaussian and the range are assumed"
     )
 
     @classmethod

@@ -2,10 +2,10 @@
 
 ``python -m validation.device_fit.device_fit REFERENCE areas itl|e2v`` fits the a_ij of October 2019
 (``REFERENCE/{itl,e2v}_covariances_21oct19.csv``, Poisson_CCD repository @ 876adb8), 24 lags without
-(0, 0), which the sum rule had set.  Voltages are not stated with them; the simulation that was
-published beside them had those of ``itl_sta3800c_60`` and ``e2v_ccd250_70``, whose chi2 before any
-fit is 0.4 and 0.03 of that at the settings of GalSim's tables.  Back bias (5 V) and gates (0.5 V)
-are free with priors.
+(0, 0), which the sum rule had set, as the limit at no charge (``--level``).  Voltages are not stated
+with them; the simulation that was published beside them had those of ``itl_sta3800c_60`` and
+``e2v_ccd250_70``, whose chi2 before any fit is 0.4 and 0.03 of that at the settings of GalSim's
+tables.  Back bias (5 V) and gates (0.5 V) are free with priors.
 
 ``seed`` fits one ITL device to the covariances and B-F slopes at -60 V, +4/-8 V of the seed paper
 (Lage, Bradshaw and Tyson 2017, figure 9; voltages stated and held) and predicts what it was not

@@ -254,12 +254,9 @@ class CrosstalkChannels:
             rows, columns = np.nonzero(aggressor > threshold)
             for b, victim in enumerate(signals):
                 tree, clear = trees[b], CLEAR * widths[b]
-                if (
-                    tree is None
-                    or a == b
-                    or not clear
-                    or min(len(rows), 5 * len(centres[b])) < 20
-                ):
+                if tree is None or a == b or not clear:
+                    continue
+                if len(rows) < 20 or len(centres[b]) < 4:
                     continue
                 # A spot's halo is alike on both sides: the point across the victim's own spot
                 # has the same halo and, mostly, no light in the other amplifier.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from bfsensor.diagnose.data.flat_channels import leave_out_struck
 
@@ -36,3 +37,15 @@ def test_noise_and_what_both_flats_have_stay() -> None:
         flat[20, 20] += 5e4
     leave_out_struck(first, second)
     assert np.isfinite(first).all() and np.isfinite(second).all()
+
+
+def test_a_tear_in_one_flat_stays() -> None:
+    """A boundary that is displaced by 0.15 pixel gives one column what the next one lacks."""
+    first, second, _ = pair_of_flats()
+    second[:, 54] *= 1.15
+    second[:, 55] *= 0.85
+    leave_out_struck(first, second)
+    assert np.isfinite(first).mean() > 0.999 and np.isfinite(second).mean() > 0.999
+    assert np.nanmean(second[:, 54] / first[:, 54]) == pytest.approx(
+        1.15 * 1.003, rel=0.005
+    )
