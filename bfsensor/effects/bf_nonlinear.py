@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -33,7 +34,7 @@ class BrighterFatterNonlinear(Effect):
     stage = "collect"
     parameters = (Parameter("b", "1/e-", 3e-7, 3e-6, signed=True, amplitude=True),)
     touches = ("flat_cov", "spot")
-    of_levels = True
+    needs: ClassVar[tuple[str, ...]] = ("levels",)
     source = (
         "Astier et al. 2019, A&A 629, A36, question shifts proportional to charge and fit a term "
         "a b; law of one b and range assumed"
@@ -76,7 +77,7 @@ class EdgesNonlinear(Effect):
         Parameter("near", "1/pixel", 0.0, 2.0, law="flat", ends=(0.0, np.inf)),
     )
     touches = ("flat_cov", "spot")
-    of_levels = True
+    needs: ClassVar[tuple[str, ...]] = ("levels",)
     source = (
         "Coefficients b_ij differ between lags: Astier & Regnault 2023, A&A 670, A118; higher "
         "orders evolve anisotropically with flux: Broughton et al. 2024, PASP 136, 045003; exponential "

@@ -163,8 +163,8 @@ class SettlingByFrame(ReadNoise):
         Parameter("length", "pixel", 3.0, 300.0),
     )
     touches = ("bias_cov", "bias_level", "dark_map", "flat_cov", "flat_mean")
-    told_by_scatter = ("bias_level", "dark_map", "flat_mean")
-    bends = True
+    scatters = ("bias_level", "dark_map", "flat_mean")
+    response = "quadratic"
     source = (
         "Two-dimensional bias that differs between frames of LSST's camera: Utsumi et al. 2024, Proc. "
         "SPIE 13103; an exponential along rows, as of a clamp that settles; range assumed"
@@ -219,7 +219,7 @@ class SettlingByFrame(ReadNoise):
             return np.where(amps[:, None] == np.unique(amps), size[:, None], 0.0)
         if word == "flat_cov":
             return scatter_of_pairs(self, axes, layout, lambda *_: np.sqrt(2.0))
-        if word not in self.told_by_scatter:
+        if word not in self.scatters:
             return None
         apart = np.array([
             self._mean(s.prescan, s.columns, s) - self._mean(s.prescan + s.columns, s.serial_overscan, s)

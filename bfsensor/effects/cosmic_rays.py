@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache, partial
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,7 +77,7 @@ class CosmicRays(Effect):
     stage = "store"
     parameters = (Parameter("rate", "1/min", 0.3, 30.0, amplitude=True),)
     touches = ("dark_map", "flat_cov")
-    of_pixels = True
+    needs: ClassVar[tuple[str, ...]] = ("pixels",)
     source = (
         "Groom 2002, Exp. Astron. 14, 45 (straight muon tracks in thick CCDs; the muon rate is "
         "irreducible); about one a minute and cm^2 at sea level: Particle Data Group 2022, Prog. "

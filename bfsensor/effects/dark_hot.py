@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,7 +165,7 @@ class DarkCurrent(_Dark):
     variant = "dark"
     parameters = (Parameter("rate", "e-/s", 0.02, 1.0, amplitude=True),)
     touches = ("dark_map", "flat_mean")
-    of_pixels = True
+    needs: ClassVar[tuple[str, ...]] = ("pixels",)
 
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
@@ -202,7 +203,7 @@ class HotColumns(_Dark):
         *(Parameter(f"part{n}", "", 0.02, 1.0, law="whole", plain=1.0) for n in OTHERS),
     )
     touches = ("dark_map", "flat_map", "flat_mean")
-    by_time = True
+    maps_vary = "exposure"
 
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
@@ -267,8 +268,8 @@ class Glow(Effect):
         Parameter("corner", "", 0, 3, law="whole"),
     )
     touches = ("dark_map", "flat_map", "flat_mean")
-    by_time = True
-    of_pixels = True
+    maps_vary = "exposure"
+    needs: ClassVar[tuple[str, ...]] = ("pixels",)
     source = (
         "Glow of an output amplifier, which falls with the distance from it: Janesick 2001, Scientific "
         "Charge-Coupled Devices, SPIE Press, section 7.2; ranges assumed"

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from bfsensor.effects.effect import Effect, Layout, Parameter, Seen, Shot
+from bfsensor.effects.effect import Layout, Parameter, Seen, Shot
+from bfsensor.effects.family import TemplateEffect, TemplateFamily
 from bfsensor.errors import EffectError
 from bfsensor.typing import Edges, FloatArray
 
@@ -40,8 +41,8 @@ class Floating(NamedTuple):
     slopes: tuple[tuple[tuple[float, float], Edges], ...]
 
 
-class DeviceParameter(Effect):
-    """Boundary shifts of a device with another value of one parameter; one class for each parameter.
+class DeviceParameter(TemplateEffect):
+    """Boundary shifts of a device with another value of one parameter; one family for each parameter.
 
     The only parameter of the effect is the true value.  Unlike the free parameter of the same name
     in a fit of the baseline, it has no Gaussian prior around the nominal value.  Shifts change
@@ -68,21 +69,19 @@ class DeviceParameter(Effect):
         "Derivatives of a simulation by the parameters of its device, as Astier & Regnault "
         "2023, A&A 670, A118, fit theirs; range assumed"
     )
-    floating: ClassVar[Floating]
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _restore, (self.floating, dict(self.values))
 
     @classmethod
-    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+    def template_starts(
+        cls, of: TemplateFamily, layout: Layout, seen: Sequence[Seen]
+    ) -> list[dict[str, float]]:
         del layout, seen
-        own = cls.floating
+        own: Floating = of.template
         middle = np.sqrt(NEAREST * FARTHEST) * own.spread
         return [{own.name: own.nominal + sign * float(middle)} for sign in (1.0, -1.0)]
 
     def edges(self, kx: FloatArray, ky: FloatArray, shot: Shot, layout: Layout) -> Edges:
         del layout
-        own = self.floating
+        own: Floating = self.template
         change = self[own.name] - own.nominal
         if change == 0.0:
             return kx, ky
@@ -113,8 +112,8 @@ def device_parameters(
     derivatives: Mapping[str, Conditions],
     spread: Mapping[str, float],
     nominal: Mapping[str, float],
-) -> tuple[type[DeviceParameter], ...]:
-    """Make the candidates of a baseline: one class of effects for each free parameter.
+) -> tuple[TemplateFamily, ...]:
+    """Make the candidates of a baseline: one family of effects for each free parameter.
 
     Parameters
     ----------
@@ -126,8 +125,8 @@ def device_parameters(
 
     Returns
     -------
-    kinds : tuple of type
-        Subclasses of :class:`DeviceParameter`, named ``device_parameter:NAME``.
+    kinds : tuple of TemplateFamily
+        Families of :class:`DeviceParameter`, named ``device_parameter:NAME``.
 
     Raises
     ------
@@ -152,29 +151,21 @@ def device_parameters(
             raise EffectError(
                 f"device_parameter: spread of {name} = {spread[name]!r} must be above 0"
             )
-        held = tuple(slopes.items())
-        out.append(_kind(Floating(name, float(nominal[name]), float(spread[name]), held)))
-    return tuple(out)
-
-
-_KINDS: dict[tuple[Any, ...], type[DeviceParameter]] = {}
-
-
-def _kind(own: Floating) -> type[DeviceParameter]:
-    """Class of a parameter; the same object for equal arrays, so that copies of effects are equal."""
-    key = (*own[:3], tuple((c, *(a.tobytes() for a in pair)) for c, pair in own.slopes))
-    if key not in _KINDS:
-        parameter = Parameter(
-            own.name, "unit of the device file", NEAREST * own.spread, FARTHEST * own.spread,
+        own = Floating(
+            name, float(nominal[name]), float(spread[name]), tuple(slopes.items())
+        )
+        value = Parameter(
+            name, "unit of the device file", NEAREST * own.spread, FARTHEST * own.spread,
             neutral=own.nominal, signed=True, amplitude=True,
         )  # fmt: skip
-        _KINDS[key] = type(
-            f"DeviceParameter_{own.name}", (DeviceParameter,),
-            {"floating": own, "variant": own.name, "parameters": (parameter,),
-             "__doc__": DeviceParameter.__doc__, "__module__": __name__},
-        )  # fmt: skip
-    return _KINDS[key]
-
-
-def _restore(own: Floating, values: dict[str, float]) -> DeviceParameter:
-    return _kind(own)(values)
+        out.append(
+            TemplateFamily(
+                DeviceParameter,
+                DeviceParameter.word,
+                name,
+                own,
+                DeviceParameter.source,
+                (value,),
+            )
+        )
+    return tuple(out)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -46,15 +47,15 @@ class EdgeRolloff(Effect):
         Parameter("rim", "", 0, 1, law="whole", plain=1.0),
     )
     touches = ("flat_map",)
-    of_pixels = True
-    bends = True
+    needs: ClassVar[tuple[str, ...]] = ("pixels",)
+    response = "quadratic"
     source = (
         "Spots displaced near the edge of an LSST prototype: Bradshaw et al. 2015, JINST 10, C04034 "
         "(arXiv 1507.02683); glowing edges of DECam: Plazas, Bernstein & Sheldon 2014, JINST 9, C04001; "
         "a power of the distance for a line charge outside the rim, an exponential for a screened one: "
         "electrostatics; range assumed"
     )
-    standing = True
+    maps_vary = "nothing"
 
     @property
     def law_name(self) -> str:

@@ -315,7 +315,7 @@ class Law(NamedTuple):
         return np.asarray(np.exp(self.lost(at)) @ (weights * t) * charge)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Effect:
     """One physical effect with values of its parameters; each subclass is one effect.
 
@@ -372,23 +372,17 @@ class Effect:
     """Names of the channels that it can change."""
     source: ClassVar[str] = ""
     """Publication of its law and of the range of its parameters, or that they are assumed."""
-    by_time: ClassVar[bool] = False
-    """Whether :meth:`light_map`, :meth:`displacements` or :meth:`pattern` depend on the exposure
-    time or the level."""
-    standing: ClassVar[bool] = False
-    """Whether :meth:`light_map`, :meth:`displacements` and :meth:`pattern` are equal in all flats."""
-    of_pixels: ClassVar[bool] = False
-    """Whether its predictions need the amplifiers' pixels, which reduced recordings do not have."""
-    of_levels: ClassVar[bool] = False
-    """Whether only recordings at several levels constrain it: a table of a_ij without levels could
-    equally be that of another device."""
-    from_sightings: ClassVar[bool] = False
-    """Whether :meth:`starts` begin from waves or rings that were detected in maps."""
-    bends: ClassVar[bool] = False
-    """Whether its changes have a part that is quadratic in the amplitude."""
-    keeps_starts: ClassVar[bool] = False
-    """Whether amplitudes at starting points are kept, as changes are not smooth in the amplitude."""
-    told_by_scatter: ClassVar[tuple[str, ...]] = ()
+    needs: ClassVar[tuple[str, ...]] = ()
+    """What recordings must have for the effect to be sought: 'pixels', which reduced recordings do
+    not have; 'levels', as a table of a_ij of one level could equally be that of another device;
+    'sightings', waves or rings detected in maps, from which :meth:`starts` begin."""
+    maps_vary: ClassVar[str] = "condition"
+    """With what :meth:`light_map`, :meth:`displacements` and :meth:`pattern` change: 'nothing', equal
+    in all flats; 'condition', wavelength, back bias and temperature; 'exposure', also time or level."""
+    response: ClassVar[str] = "linear"
+    """How changes of channels depend on the amplitude: 'linear'; 'quadratic', with a part of either
+    order; 'rough', not smooth, so that amplitudes at starting points are kept."""
+    scatters: ClassVar[tuple[str, ...]] = ()
     """Channels whose scatter constrains the amplitude: :meth:`modes` are proportional to it there."""
 
     def __post_init__(self) -> None:
@@ -408,11 +402,26 @@ class Effect:
     def __reduce__(self) -> tuple[type[Effect], tuple[dict[str, float]]]:
         return type(self), (dict(self.values),)
 
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Effect):
+            return NotImplemented
+        return self.family == other.family and self.values == other.values
+
     def __hash__(self) -> int:
-        return hash((type(self), tuple(sorted(self.values.items()))))
+        return hash((self.family, tuple(sorted(self.values.items()))))
 
     def __getitem__(self, name: str) -> float:
         return self.values[name]
+
+    @property
+    def family(self) -> Any:
+        """What makes this effect from values: its class, or the family that holds its template."""
+        return type(self)
+
+    @classmethod
+    def changes(cls, *methods: str) -> bool:
+        """Whether the effect has any of these methods of its own, so that it may change something."""
+        return any(getattr(cls, m) is not getattr(Effect, m) for m in methods)
 
     @property
     def name(self) -> str:
@@ -429,10 +438,9 @@ class Effect:
         del layout
         return 0
 
-    @classmethod
-    def amplitudes(cls) -> tuple[str, ...]:
+    def amplitudes(self) -> tuple[str, ...]:
         """Names of the parameters that are strengths, each 0 effect at its neutral value."""
-        return tuple(p.name for p in cls.parameters if p.amplitude)
+        return tuple(p.name for p in self.parameters if p.amplitude)
 
     def is_neutral(self) -> bool:
         """Whether every amplitude has its neutral value, so that predictions do not change by a bit."""
@@ -440,7 +448,7 @@ class Effect:
 
     def with_values(self, **values: float) -> Self:
         """Return a copy with some parameters changed, given by name."""
-        return type(self)({**self.values, **values})
+        return self.family({**self.values, **values})
 
     def scaled(self, factor: float) -> Self:
         """Return a copy with the distance of every amplitude from neutral multiplied by ``factor``."""

@@ -33,7 +33,7 @@ class ElectronicMemory(Effect):
     word = "electronic_memory"
     parameters = (Parameter("alpha", "", 1e-5, 1e-3, signed=True, amplitude=True),)
     touches = ("serial_overscan", "flat_mean", "flat_cov", "flat_map", "spot")
-    standing = True
+    maps_vary = "nothing"
     source = (
         "Electronic offset drift of ITL sensors, here of one pixel: Snyder et al. 2021, JATIS 7, "
         "048002; range assumed"
@@ -102,7 +102,7 @@ class Settling(Effect):
         Parameter("tau", "pixel times", 0.5, 30.0),
     )
     touches = ("serial_overscan", "flat_mean", "flat_cov", "flat_map", "spot")
-    standing = True
+    maps_vary = "nothing"
     source = (
         "Exponential settling of a stage of first order: Horowitz & Hill, The Art of Electronics, "
         "section 1.4; Janesick 2001, Scientific Charge-Coupled Devices, SPIE Press, section 6.2; "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 from scipy.fft import irfft2, rfft2, rfftfreq
@@ -62,9 +63,8 @@ class Fringing(Effect):
         Parameter("phase", "cycle", -0.5, 0.5, law="flat"),
     )
     touches = ("flat_map",)
-    of_pixels = True
-    from_sightings = True
-    bends = True
+    needs: ClassVar[tuple[str, ...]] = ("pixels", "sightings")
+    response = "quadratic"
     source = (
         "Howell 2012, PASP 124, 263 (small variations of thickness make the pattern; from about "
         "700 nm in thinned CCDs); range of thick ones assumed"
@@ -134,8 +134,8 @@ class RoughFringes(Effect):
         Parameter("period", "pixel", 3.0, 30.0),
     )
     touches = ("flat_map",)
-    of_pixels = True
-    bends = True
+    needs: ClassVar[tuple[str, ...]] = ("pixels",)
+    response = "quadratic"
     source = (
         "Woodward 1952, Telecommunications Research Establishment, Memorandum 666 (spectrum of waves of "
         "wide phase modulation; a test holds it to such waves); Guo et al. 2023, PASP 135, 034503 (LSST "

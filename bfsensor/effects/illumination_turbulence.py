@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import ClassVar
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -45,9 +46,9 @@ class IlluminationTurbulence(Effect):
         Parameter("corr", "pixel", 10.0, 60.0),
     )
     touches = ("flat_cov", "flat_mean")
-    of_pixels = True
-    bends = True
-    told_by_scatter = ("flat_mean",)
+    needs: ClassVar[tuple[str, ...]] = ("pixels",)
+    response = "quadratic"
+    scatters = ("flat_mean",)
     source = (
         "Banovetz et al. 2024, arXiv 2411.13386 (1e-3 from peak to peak in differenced flats); a "
         "Gaussian correlation and the range are assumed"

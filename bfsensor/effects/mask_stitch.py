@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -48,13 +49,13 @@ class MaskStitch(Effect):
         Parameter("along", "", 0, 1, law="whole", plain=0.0),
     )
     touches = ("flat_map",)
-    of_pixels = True
-    bends = True
+    needs: ClassVar[tuple[str, ...]] = ("pixels",)
+    response = "quadratic"
     source = (
         "Pixel sizes that vary by 0.3 % in an LSST prototype: Baumer & Roodman 2015, JINST 10, "
         "C05024 (arXiv 1504.06088); that they repeat with the mask's field, and the range, are assumed"
     )
-    standing = True
+    maps_vary = "nothing"
     law_name = "step"
 
     @classmethod
@@ -122,14 +123,13 @@ class WavyMask(Effect):
         Parameter("along", "", 0, 1, law="whole"),
     )
     touches = ("flat_map",)
-    of_pixels = True
-    from_sightings = True
-    bends = True
+    needs: ClassVar[tuple[str, ...]] = ("pixels", "sightings")
+    response = "quadratic"
     source = (
         "Periodic pixel sizes of LSST prototypes: Kotov et al. 2010, NIM A 652, 524; Smith & Rahmer "
         "2008, Proc. SPIE 7021; range assumed"
     )
-    standing = True
+    maps_vary = "nothing"
 
     @classmethod
     def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:

@@ -44,7 +44,7 @@ class Persistence(Effect):
         Parameter("tau", "exposure", 0.7, 5.0),
     )
     touches = ("dark_map", "flat_mean", "bias_level", "spot")
-    of_pixels = True
+    needs: ClassVar[tuple[str, ...]] = ("pixels",)
     source = (
         "Polin, Snyder, Lage & Tyson 2025, JINST 20, P07031 (arXiv 2502.05418: residual charge in "
         "LSST's e2v sensors); an exponential in exposures and its range are assumed"

@@ -85,7 +85,7 @@ class Saturation(Effect):
         ),  # a tenth of the noise of a flat, on which scale its mean saturates
     )
     touches = ("flat_mean", "flat_cov", "spot")
-    keeps_starts = True
+    response = "rough"
     source = (
         "Blooming along the column past the barrier phases: Janesick 2001, Scientific "
         "Charge-Coupled Devices, SPIE Press PM83; even sharing and range assumed"

@@ -53,7 +53,7 @@ class ShutterTiming(Effect):
         "et al. 2005; an iris: Zissell 2000, JAAVSO 28, 149; 0.07 s in one camera: Lee 2016, J. Korean "
         "Astron. Soc. 49, 6; range assumed"
     )
-    by_time = True
+    maps_vary = "exposure"
 
     @property
     def law_name(self) -> str:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
-import pickle
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bfsensor.effects.device_parameter import add_edges, nearest_edges
-from bfsensor.effects.effect import Effect, Halo, Layout, Parameter, Seen, Shot
+from bfsensor.effects.effect import Halo, Layout, Parameter, Seen, Shot
+from bfsensor.effects.family import TemplateEffect, TemplateFamily
 from bfsensor.effects.tree_rings import TreeRings
 from bfsensor.typing import Edges, FloatArray
 
@@ -55,6 +54,10 @@ class Rings(NamedTuple):
     periods: FloatArray
     held: tuple[tuple[Key, FloatArray], ...]
 
+    def size(self, period: float, shot: Shot) -> float:
+        """Amplitude at strength 1 [pixel], for a period [pixel] and the condition of a shot."""
+        return float(np.interp(period, self.periods, _nearest(self.held, shot)))
+
 
 class Rim(NamedTuple):
     """Displacements [pixel], inwards, of the boundaries 0, 1, ... from the edge of the array."""
@@ -62,21 +65,17 @@ class Rim(NamedTuple):
     held: tuple[tuple[Key, FloatArray], ...]
 
 
-class LeftOut(Effect):
-    """Physics missing in the baseline, with ``strength``; :func:`left_out` makes the classes."""
+class LeftOut(TemplateEffect):
+    """Physics missing in the baseline, with ``strength``; :func:`left_out` makes the families."""
 
     stage = "collect"
     parameters = (STRENGTH,)
-    template: ClassVar[Any]
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        kind = type(self)
-        given = kind.word, kind.variant, kind.template, kind.source, kind.parameters
-        return _restore, (kind.__mro__[1], given, dict(self.values))
 
     @classmethod
-    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
-        del layout, seen
+    def template_starts(
+        cls, of: TemplateFamily, layout: Layout, seen: Sequence[Seen]
+    ) -> list[dict[str, float]]:
+        del of, layout, seen
         return [{"strength": 1.0}]
 
 
@@ -149,23 +148,19 @@ class DopingRings(LeftOut):
     touches = ("flat_map",)
 
     @classmethod
-    def starts(cls, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
+    def template_starts(
+        cls, of: TemplateFamily, layout: Layout, seen: Sequence[Seen]
+    ) -> list[dict[str, float]]:
         usual = Shot("flat", 0, 1.0, *layout.reference)
         out = []
         for values in TreeRings.starts(layout, seen):
-            size = cls._size(values["period"], usual)
+            size = of.template.size(values["period"], usual)
             shape = {k: v for k, v in values.items() if k != "amp"}
             out.append({"strength": values["amp"] / size} | shape)
         return out
 
-    @classmethod
-    def _size(cls, period: float, shot: Shot) -> float:
-        """Amplitude at strength 1 [pixel], for a period [pixel] and the condition of a shot."""
-        told = cls.template
-        return float(np.interp(period, told.periods, _nearest(told.held, shot)))
-
     def displacements(self, shot: Shot, layout: Layout) -> Edges | None:
-        size = self._size(self["period"], shot)
+        size = self.template.size(self["period"], shot)
         shape = {k: v for k, v in self.values.items() if k != "strength"}
         rings = TreeRings({"amp": self["strength"] * size} | shape)
         return rings.displacements(shot, layout)
@@ -226,27 +221,24 @@ def ring_parameters(size: float) -> tuple[Parameter, ...]:
     return (strength, *shape)
 
 
-_KINDS: dict[str, type[LeftOut]] = {}
-
-
 def left_out(
-    base: type[LeftOut],
+    effect: type[LeftOut],
     word: str,
     variant: str,
     template: Any,
     source: str,
     parameters: tuple[Parameter, ...] = (STRENGTH,),
-) -> type[LeftOut]:
-    """Make a class of effects for physics missing in a baseline; the same class for equal inputs.
+) -> TemplateFamily:
+    """Make a family of effects for physics missing in a baseline.
 
     Parameters
     ----------
-    base : type
+    effect : type
         Class of this module that applies the template.
     word, variant : str
         Name in the taxonomy, and the variant that distinguishes it from others of this name.
     template : Moved, QuadraticTemplate, DiffusionWidths, Rings or Rim
-        Simulated change, of the type that ``base`` takes.
+        Simulated change, of the type that ``effect`` takes.
     source : str
         Origin of the template, for reports.
     parameters : tuple of Parameter
@@ -254,30 +246,16 @@ def left_out(
 
     Returns
     -------
-    kind : type
-        Subclass of ``base``.
+    family : TemplateFamily
+        Called with values of the parameters, it makes the effect.
 
     Examples
     --------
     >>> k = np.zeros((3, 3)); k[1, 1] = -1e-6
     >>> template = Moved((((620.0, -50.0), (k, k.T)),))
-    >>> kind = left_out(MovedEdges, "free_holes", "", template, "a test")
+    >>> family = left_out(MovedEdges, "free_holes", "", template, "a test")
     >>> shot = Shot("flat", 0, 1.0, 620.0, -50.0, 173.15)
-    >>> float(kind({"strength": 0.5}).edges(k, k.T, shot, None)[0][1, 1])
+    >>> float(family({"strength": 0.5}).edges(k, k.T, shot, None)[0][1, 1])
     -1.5e-06
     """
-    given = word, variant, template, source, parameters
-    key = hashlib.sha256(pickle.dumps((base.__name__, given))).hexdigest()
-    if key not in _KINDS:
-        _KINDS[key] = type(
-            f"{base.__name__}_{word}", (base,),
-            {"word": word, "variant": variant, "template": template, "source": source,
-             "parameters": parameters, "__doc__": base.__doc__, "__module__": __name__},
-        )  # fmt: skip
-    return _KINDS[key]
-
-
-def _restore(
-    base: type[LeftOut], given: tuple[Any, ...], values: Mapping[str, float]
-) -> LeftOut:
-    return left_out(base, *given)(values)
+    return TemplateFamily(effect, word, variant, template, source, parameters)

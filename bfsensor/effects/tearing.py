@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 from scipy.special import ndtr
@@ -49,13 +50,13 @@ class Tearing(Effect):
         Parameter("top", "", 0, 1, law="whole", plain=0.0),
     )
     touches = ("flat_map", "flat_cov")
-    of_pixels = True
-    bends = True
+    needs: ClassVar[tuple[str, ...]] = ("pixels",)
+    response = "quadratic"
     source = (
         "Juramy et al. 2020, Proc. SPIE 11454, 1145412 (arXiv 2002.09439: holes in channel stops "
         "moved by clocks, worst beside segments' edges); exponential, rows and range are assumed"
     )
-    standing = True
+    maps_vary = "nothing"
     law_name = "same_way"
 
     @classmethod

@@ -59,7 +59,7 @@ class TrapSerial(Effect):
         COLUMN,
     )
     touches = ("serial_overscan", "flat_map", "flat_mean", "spot")
-    of_pixels = True
+    needs: ClassVar[tuple[str, ...]] = ("pixels",)
     source = (
         "Single-species trap with instant capture, beyond a depth in the well ('notch'): ArCTIc, "
         "Massey et al. 2014, MNRAS 439, 887; range of reach assumed; "

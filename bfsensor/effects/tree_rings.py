@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -34,14 +35,13 @@ class _Rings(Effect):
     word = "tree_rings"
     stage = "collect"
     touches = ("flat_map",)
-    of_pixels = True
-    from_sightings = True
-    bends = True
+    needs: ClassVar[tuple[str, ...]] = ("pixels", "sightings")
+    response = "quadratic"
     source = (
         "Plazas, Bernstein & Sheldon 2014, PASP 126, 750 (DECam); Baumer, Davis & Roodman 2017, "
         "PASP 129, 084502; range assumed"
     )
-    standing = True
+    maps_vary = "nothing"
 
     @classmethod
     def sighted(cls, layout: Layout) -> list[dict[str, float]]:
@@ -237,9 +237,9 @@ class RadialTreeRings(_Rings):
     """
 
     variant = "radial"
-    standing = False
+    maps_vary = "condition"
     # Its profile was fitted to the map, so that it raises no alarm; the scans for rings do.
-    from_sightings = False
+    needs: ClassVar[tuple[str, ...]] = ("pixels",)
     parameters = (
         AMP,
         # The search has chosen periods and centre together with the profile: their priors are charged,

@@ -310,9 +310,9 @@ def seen_along(effect: Effect, direction: NDArray[np.float64], seed: int) -> flo
     predictor = Predictor(measured, virtual_baseline())
     fit = fit_baseline(predictor, used_channels(measured.channels, FOLDS))
     n = len(fit.residuals)
-    if n + len(predictor.prior_rows) != len(direction):
+    if n + len(predictor.space.prior_rows) != len(direction):
         return float("nan")
-    priors = [-fit.values[k] for k in predictor.prior_rows]
+    priors = [-fit.values[k] for k in predictor.space.prior_rows]
     return float(fit.residuals @ direction[:n] + priors @ direction[n:])
 
 

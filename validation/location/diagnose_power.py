@@ -315,7 +315,7 @@ def pixel_campaign(case: Case, signature: Signature, seed: int) -> Table:
     found = Locator(fit, seed=seed).locate()
     row: dict[str, Any] = {"effect": case.word, "seed": seed, "factor": round(factor, 4)}
     n = len(fit.residuals)
-    if n + len(predictor.prior_rows) == len(signature.direction):
+    if n + len(predictor.space.prior_rows) == len(signature.direction):
         # The fitted amplitude of the signature: about 8 with an error of 1.
         row["seen"] = round(float(fit.residuals @ signature.direction[:n]), 2)
     row |= {"p": found.p_value, "p_chi2": found.p_chi2, "p_scans": found.p_scans}

@@ -22,6 +22,7 @@ from bfsensor.diagnose.model.effect_parameters import fitted, widened
 from bfsensor.diagnose.model.map_predictions import lines_of_map
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.effect import Effect, Layout, Parameter
+from bfsensor.effects.family import EffectFamily
 from bfsensor.errors import BFSensorError, ConvergenceError
 from bfsensor.files import Cache
 from bfsensor.typing import FloatArray
@@ -145,7 +146,7 @@ class Screen:
         predictor: Predictor,
         fit: BaselineFit,
         seen: Sequence[Mapping[str, Any]] = (),
-        before: Mapping[type[Effect], Effect] | None = None,
+        before: Mapping[EffectFamily, Effect] | None = None,
     ) -> None:
         self.fit, self.seen, self.before = fit, tuple(seen), before or {}
         self.point = fit.values[: len(predictor.names)]
@@ -207,7 +208,7 @@ class Screen:
             out[start : start + len(channel)] = channel.whiten(moved)
         return out
 
-    def tried(self, kind: type[Effect]) -> list[tuple[float, Effect]]:
+    def tried(self, kind: EffectFamily) -> list[tuple[float, Effect]]:
         """Starting points of a kind of effect at their best amplitudes, by decreasing gain.
 
         The change by the effect is linear, or quadratic, in the amplitude, which is fitted.
@@ -233,7 +234,7 @@ class Screen:
                 self.passed_over[effect.name] = str(error)
         return sorted((t for t in tried if t is not None), key=lambda t: -t[0])
 
-    def shapes(self, kind: type[Effect], layout: Layout) -> list[FloatArray]:
+    def shapes(self, kind: EffectFamily, layout: Layout) -> list[FloatArray]:
         """Unit templates of a kind of effect at its starting points (matched filters).
 
         With more than :data:`MANY` starting points, templates of one channel only.
@@ -272,7 +273,7 @@ class Screen:
                 out.append(template / length)
         return out
 
-    def _telling(self, kind: type[Effect]) -> list[tuple[Channel, int]]:
+    def _telling(self, kind: EffectFamily) -> list[tuple[Channel, int]]:
         """Channels that separate starting points, and the indices of their first values."""
         words = [w for w in TELLING if w in kind.touches]
         found = [
@@ -297,11 +298,11 @@ class Screen:
         length = float(template @ template)
         if length <= 0:
             return None
-        if effect.keeps_starts:
+        if effect.response == "rough":
             self._scaled_templates[effect] = template
             return max(float(template @ (2 * self.fit.left - template)), 0.0), effect
         factor = float(template @ self.fit.left) / length
-        if effect.told_by_scatter:
+        if effect.scatters:
             found = self._by_scatter(effect, template)
             if found is not None:
                 return found
@@ -309,7 +310,7 @@ class Screen:
         if factor <= 0 and not signed:
             self._scaled_templates[effect] = template
             return 0.0, effect
-        if not effect.bends or abs(factor - 1) < ASTRAY:
+        if effect.response == "linear" or abs(factor - 1) < ASTRAY:
             best = _inside(effect.scaled(factor))
             self._scaled_templates[best] = factor * template
             return factor**2 * length, best
@@ -340,7 +341,7 @@ class Screen:
         self._scattered.add(best)
         return max(gain, 0.0), best
 
-    def _likely(self, kind: type[Effect], starts: list[Effect]) -> list[Effect]:
+    def _likely(self, kind: EffectFamily, starts: list[Effect]) -> list[Effect]:
         """The LIKELY starting points of greatest gain in quick channels; all if they are few."""
         telling = self._telling(kind)
         if len(starts) <= MANY or not telling:

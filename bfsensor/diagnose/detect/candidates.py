@@ -19,6 +19,7 @@ from bfsensor.diagnose.model.exchanged_axes import NAMED
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.device_parameter import device_parameters
 from bfsensor.effects.effect import Effect
+from bfsensor.effects.family import EffectFamily
 from bfsensor.effects.library import LIBRARY
 from bfsensor.errors import ConvergenceError
 
@@ -48,7 +49,7 @@ REFITTED = 5
 the joint fits of one step take up to twice as long."""
 
 
-def candidates_of(baseline: Baseline) -> tuple[type[Effect], ...]:
+def candidates_of(baseline: Baseline) -> tuple[EffectFamily, ...]:
     """All candidates for a baseline: the library of effects, and the device's own parameters."""
     own = device_parameters(
         baseline.derivatives_by_condition(), baseline.spread, baseline.nominal
@@ -57,8 +58,8 @@ def candidates_of(baseline: Baseline) -> tuple[type[Effect], ...]:
 
 
 def tellable(
-    kinds: Sequence[type[Effect]], predictor: Predictor, channels: Sequence[Channel]
-) -> list[type[Effect]]:
+    kinds: Sequence[EffectFamily], predictor: Predictor, channels: Sequence[Channel]
+) -> list[EffectFamily]:
     """Candidates that these recordings can constrain.
 
     Reduced recordings have no pixels, and a_ij of one level say nothing of a dependence on the
@@ -68,34 +69,35 @@ def tellable(
     levels = any(
         c.unit != PER_ELECTRON or len(np.unique(c.axes["level"])) > 1 for c in channels
     )
-    return [k for k in kinds if (pixels or not k.of_pixels) and (levels or not k.of_levels)]
+    lacking = {w for w, there in (("pixels", pixels), ("levels", levels)) if not there}
+    return [k for k in kinds if not lacking & set(k.needs)]
 
 
-def name_of(kind: type[Effect]) -> str:
+def name_of(kind: EffectFamily) -> str:
     """Name of a class of effect, with its variant where there are several: 'word:variant'."""
     return f"{kind.word}:{kind.variant}" if kind.variant else kind.word
 
 
-def concerned(kinds: Sequence[type[Effect]], *seen: Mismatch) -> list[type[Effect]]:
+def concerned(kinds: Sequence[EffectFamily], *seen: Mismatch) -> list[EffectFamily]:
     """Candidates that change any channel in which a finding was made."""
     words = {f.word for mismatch in seen for f in mismatch.findings}
     words |= set(DEVICE_SEEN) if DEVICE in words else set()
     return [k for k in kinds if words & set(k.touches)]
 
 
-def further(kinds: Sequence[type[Effect]], effects: Sequence[Effect]) -> list[type[Effect]]:
+def further(kinds: Sequence[EffectFamily], effects: Sequence[Effect]) -> list[EffectFamily]:
     """Candidates that are not yet in the model."""
     there = {e.name for e in effects}
     return [k for k in kinds if name_of(k) not in there]
 
 
-def rank(screen: Screen, kinds: Sequence[type[Effect]]) -> list[Rival]:
+def rank(screen: Screen, kinds: Sequence[EffectFamily]) -> list[Rival]:
     """Best fit of each kind of effect, by decreasing evidence."""
     starts = sorted((t for t in map(screen.tried, kinds) if t), key=lambda t: -t[0][0])
     found: list[Rival] = []
     best = 0.0
     for tried in starts:
-        again = type(tried[0][1]) in screen.before
+        again = tried[0][1].family in screen.before
         rival = screen.best(tried, least=max(HOPELESS, best / (AGAIN if again else RAISED)))
         if rival is not None:
             found.append(rival)
@@ -104,7 +106,7 @@ def rank(screen: Screen, kinds: Sequence[type[Effect]]) -> list[Rival]:
 
 
 def with_hypotheses(
-    model: Model, kinds: Sequence[type[Effect]], ranking: Sequence[Rival]
+    model: Model, kinds: Sequence[EffectFamily], ranking: Sequence[Rival]
 ) -> list[Rival]:
     """Fit named hypotheses about the baseline jointly, if a device parameter is far from nominal.
 
@@ -128,7 +130,7 @@ def with_hypotheses(
     """
     pulled = any(abs(v) > PULLED for v in model.fit.pulls.values())
     named = [k for k in kinds if k in NAMED] if pulled else []
-    out = [r for r in ranking if type(r.effect) not in named]
+    out = [r for r in ranking if r.effect.family not in named]
     for kind in named:
         start = kind({p.name: 0.5 * (p.low + p.high) for p in kind.parameters})
         try:

@@ -27,7 +27,7 @@ from bfsensor.diagnose.detect.locate import ALARM, FAMILY, Finding, Known, Locat
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 from bfsensor.diagnose.model.effect_parameters import fitted
 from bfsensor.diagnose.model.predictor import Predictor
-from bfsensor.effects.effect import Effect
+from bfsensor.effects.family import EffectFamily
 
 LOOKED = 1e4
 """Number of independent waves that maps are searched for; the p-value of an effect that starts at a
@@ -43,7 +43,7 @@ time: the p-value is then doubled (Bonferroni's correction for scans and filters
 def locate_effects(
     predictor: Predictor,
     fit: BaselineFit,
-    kinds: Sequence[type[Effect]] | None = None,
+    kinds: Sequence[EffectFamily] | None = None,
     *,
     seed: int = 1,
 ) -> Mismatch:
@@ -85,8 +85,8 @@ def alarms_of(predictor: Predictor, fit: BaselineFit, *, seed: int = 1) -> dict[
 
 
 def _candidates(
-    predictor: Predictor, fit: BaselineFit, kinds: Sequence[type[Effect]] | None = None
-) -> Sequence[type[Effect]]:
+    predictor: Predictor, fit: BaselineFit, kinds: Sequence[EffectFamily] | None = None
+) -> Sequence[EffectFamily]:
     """Effects that these channels can constrain and that are not in the fit yet."""
     if kinds is None:
         kinds = candidates_of(predictor.baseline)
@@ -94,7 +94,7 @@ def _candidates(
     return further(kinds, predictor.effects_at(fit.values[: len(predictor.names)]))
 
 
-def known_shapes(screen: Screen, kinds: Sequence[type[Effect]]) -> list[Known]:
+def known_shapes(screen: Screen, kinds: Sequence[EffectFamily]) -> list[Known]:
     """Matched filters of effects at all their starting points, which do not depend on the data."""
     unseen = replace(screen.predictor.layout, sightings=())
     out = []
@@ -107,12 +107,12 @@ def known_shapes(screen: Screen, kinds: Sequence[type[Effect]]) -> list[Known]:
 
 
 def _with_sighted(
-    screen: Screen, kinds: Sequence[type[Effect]], mismatch: Mismatch
+    screen: Screen, kinds: Sequence[EffectFamily], mismatch: Mismatch
 ) -> Mismatch:
     """Add effects that start at fringes detected in maps, their p-values corrected for the search."""
     if not screen.predictor.layout.sightings:
         return mismatch
-    for kind in (k for k in kinds if k.from_sightings):
+    for kind in (k for k in kinds if "sightings" in k.needs):
         rival = screen.best(screen.tried(kind)[:1])
         # Negative evidence: parameters far outside their plausible ranges can follow any noise.
         if rival is None or rival.refuted or rival.evidence < 0:
@@ -134,7 +134,7 @@ def _with_sighted(
     return mismatch
 
 
-def trials_of(kind: type[Effect], screen: Screen) -> float:
+def trials_of(kind: EffectFamily, screen: Screen) -> float:
     """Number of independent trials of a kind of effect that starts at detected fringes."""
     return max(len(kind.starts(screen.predictor.layout, screen.seen)), 1) * LOOKED
 

@@ -64,7 +64,7 @@ def scatter_of(
     fit : BaselineFit
         Fit whose parameters are projected out.
     effect : Effect
-        With a variance parameter (``told_by_scatter`` not empty).
+        With a variance parameter (``scatters`` not empty).
     values : ndarray, shape (p,)
         Non-linear parameters of ``predictor``.
 
@@ -77,7 +77,7 @@ def scatter_of(
     point = alone.start
     blocks = []
     for channel, start in zip(fit.channels, fit.starts, strict=False):
-        if channel.word in effect.told_by_scatter:
+        if channel.word in effect.scatters:
             own = alone.modes(channel, point)
             if own.shape[1] > MOST:
                 raise FitError(

@@ -123,7 +123,7 @@ class Explanation:
         Starts are places, periods or bits that were tried.  ``tried`` are the classes, by default all.
         """
         layout = self.model.predictor.layout
-        starts = type(effect).starts(replace(layout, sightings=()))
+        starts = effect.family.starts(replace(layout, sightings=()))
         tried = self.tried if tried is None else tried
         number = len(fitted(effect)) + effect.searched(layout)
         return charge(number, tried * max(len(starts), 1))

@@ -52,6 +52,7 @@ from bfsensor.diagnose.model.effect_parameters import fitted
 from bfsensor.diagnose.model.exchanged_axes import NAMED
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.effect import Effect
+from bfsensor.effects.family import EffectFamily
 from bfsensor.errors import ConvergenceError
 from bfsensor.typing import FloatArray
 
@@ -77,7 +78,7 @@ def attribute(
     fit: BaselineFit,
     mismatch: Mismatch,
     *,
-    kinds: Sequence[type[Effect]] | None = None,
+    kinds: Sequence[EffectFamily] | None = None,
     seed: int = 1,
 ) -> Attribution:
     """Find the effects that explain the residuals of a baseline.
@@ -135,7 +136,7 @@ class _Search:
     is added.
     """
 
-    kinds: Sequence[type[Effect]]
+    kinds: Sequence[EffectFamily]
     seed: int
     first: Mismatch
     notes: list[str]
@@ -143,7 +144,7 @@ class _Search:
     refused: set[str] = field(default_factory=set)
     ends: float = field(default_factory=lambda: time.process_time() + LONGEST)
     joint: dict[Effect, Model] = field(default_factory=dict)
-    before: dict[type[Effect], Effect] = field(default_factory=dict)
+    before: dict[EffectFamily, Effect] = field(default_factory=dict)
 
     def locate(self, model: Model) -> Mismatch:
         """Find what stands out in a model's residuals, by scans and by effects not in it."""
@@ -154,7 +155,7 @@ class _Search:
         places: dict[str, list[Rival]] = {}
         # Terms only take what is left: effects that gained nothing before them gain nothing behind
         # them, and all are asked again where nothing else can be added.
-        asked: list[type[Effect]] | None = None
+        asked: list[EffectFamily] | None = None
         while now.mismatch.detected and not self._late():
             step = self._step(now, asked)
             if step is None and asked is not None:
@@ -166,7 +167,7 @@ class _Search:
             if len(after.parts) > len(now.parts):
                 places[after.parts[-1].name] = ranking
             else:
-                asked = [type(r.effect) for r in ranking if self._beyond_chance(now, r)]
+                asked = [r.effect.family for r in ranking if self._beyond_chance(now, r)]
             if not now.free and after.free:
                 self.nearest = ranking
             now = after
@@ -195,7 +196,7 @@ class _Search:
         return late
 
     def _step(
-        self, now: Explanation, asked: Sequence[type[Effect]] | None = None
+        self, now: Explanation, asked: Sequence[EffectFamily] | None = None
     ) -> tuple[Explanation, list[Rival]] | None:
         """The best addition that holds, with the ranking of effects; None if none does.
 
@@ -254,7 +255,7 @@ class _Search:
 
     def _net(self, now: Explanation, rival: Rival) -> float:
         """Gain of a candidate that errors of what was added before cannot make."""
-        if rival.effect.told_by_scatter:
+        if rival.effect.scatters:
             return max(rival.gain - now.reach(rival.effect.touches), 0.0)
         return now.net(rival.gain, rival.template)
 
@@ -263,7 +264,7 @@ class _Search:
         return self._net(now, rival) > charge(len(fitted(rival.effect)), 1)
 
     def _ranked(
-        self, now: Explanation, asked: Sequence[type[Effect]] | None = None
+        self, now: Explanation, asked: Sequence[EffectFamily] | None = None
     ) -> list[Rival]:
         """Effects that may be added, by decreasing evidence; those of the closest gains fitted."""
         screen = Screen(
@@ -272,7 +273,7 @@ class _Search:
         kinds = further(concerned(self.kinds, now.mismatch), now.model.effects)
         kinds = kinds if asked is None else [k for k in kinds if k in asked]
         ranked = rank(screen, kinds)
-        self.before |= {type(r.effect): r.effect for r in ranked if r.gain > 0}
+        self.before |= {r.effect.family: r.effect for r in ranked if r.gain > 0}
         ranking = with_hypotheses(now.model, kinds, ranked)
         self.notes += [
             f"{name}, tried at one place: {why}" for name, why in screen.passed_over.items()

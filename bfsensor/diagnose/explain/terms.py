@@ -136,7 +136,7 @@ class Scene:
         p, baseline = self.model.predictor, self.model.predictor.baseline
         return {
             name: float(self.model.fit.values[row]) * baseline.spread[name]
-            for name, row in zip(baseline.parameters, p.prior_rows, strict=True)
+            for name, row in zip(baseline.parameters, p.space.prior_rows, strict=True)
         }
 
     def changed_by(self, effect: Effect, channel: Channel) -> FloatArray:

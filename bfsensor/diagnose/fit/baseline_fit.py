@@ -187,8 +187,8 @@ def _as_fit(steps: Steps, *notes: str) -> BaselineFit:
         basis=solved.basis,
         starts=steps.starts,
         pulls={
-            predictor.names[n].removeprefix("device "): float(steps.point[n])
-            for n in predictor.prior_rows
+            str(predictor.space.parameters[n].owner): float(steps.point[n])
+            for n in predictor.space.prior_rows
         },
         covariance=solved.covariance / np.outer(unit, unit),
         left=solved.left,

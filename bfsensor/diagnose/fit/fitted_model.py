@@ -8,6 +8,7 @@ import numpy as np
 
 from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit, fit_baseline
+from bfsensor.diagnose.model.effect_parameters import fitted
 from bfsensor.diagnose.model.predictor import Columns, Predictor, used_channels
 from bfsensor.effects.effect import Effect
 from bfsensor.typing import FloatArray
@@ -53,11 +54,11 @@ class Model:
 
         A parameter that changes no prediction at its value, as beyond the end of its range, has none.
         """
-        start = f"effect {n} "
+        rows = self.predictor.space.rows("effect", n)
         return {
-            name.split()[-1]: float(e)
-            for name, e in zip(self.fit.names, self.fit.errors, strict=True)
-            if name.startswith(start) and e > 0
+            p.name: float(self.fit.errors[row])
+            for p, row in zip(fitted(self.effects[n]), rows, strict=True)
+            if self.fit.errors[row] > 0
         }
 
     def left(self, channel: Channel) -> FloatArray:

@@ -15,7 +15,6 @@ from scipy.linalg import block_diag
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.fit.random_effects import mode_slope, scored
 from bfsensor.diagnose.model.predictor import Predictor
-from bfsensor.effects.effect import Effect
 from bfsensor.errors import ConvergenceError
 from bfsensor.inference.mixed_model import MixedModelFit
 from bfsensor.typing import FloatArray
@@ -53,10 +52,7 @@ class Steps(MixedModelFit):
         self.predictor, self.channels = predictor, channels
         self.starts = np.concatenate([[0], np.cumsum([len(c) for c in channels])])
         self._last: tuple[FloatArray, list[FloatArray], FloatArray] | None = None
-        effect, gains = (
-            np.char.startswith(np.array(predictor.names, str), start)
-            for start in ("effect ", "gain ")
-        )
+        effect, gains = predictor.space.of("effect"), predictor.space.of("gain")
         # An effect in electrons on means of flats [ADU] makes them depend on the gains, whose
         # derivatives are then found again in each round, too.
         flats = any("flat_mean" in e.touches for e in predictor.effects)
@@ -70,9 +66,9 @@ class Steps(MixedModelFit):
             borrowed[:, :plain] = slopes[:, :plain]
         self._scored = scored(predictor)
         super().__init__(
-            predictor.start, self._columns(), prior_rows=predictor.prior_rows, curved=effect,
+            predictor.start, self._columns(), prior_rows=predictor.space.prior_rows, curved=effect,
             renewed=effect | (gains & flats), variances=np.array(sorted(self._scored), int),
-            random=any(type(e).modes is not Effect.modes for e in predictor.effects),
+            random=any(e.changes("modes") for e in predictor.effects),
             slopes=borrowed,
         )  # fmt: skip
 
@@ -92,7 +88,7 @@ class Steps(MixedModelFit):
 
     def limits(self) -> FloatArray:
         """Smallest and largest values of the parameters, shape (2, p)."""
-        return self.predictor.limits()
+        return self.predictor.space.limits
 
     def modes_at(self, point: FloatArray) -> FloatArray:
         """Whitened modes of the effects' random effects at a point, shape (n, m)."""

@@ -15,7 +15,7 @@ import numpy as np
 from bfsensor.diagnose.fit.fitted_model import Model
 from bfsensor.diagnose.fit.gauss_newton import Steps
 from bfsensor.diagnose.model.effect_parameters import fitted, reach_of, widened
-from bfsensor.effects.effect import Effect, Parameter
+from bfsensor.effects.effect import Parameter
 from bfsensor.errors import ConvergenceError
 from bfsensor.inference.bounded_lsq import span
 from bfsensor.inference.likelihood_profile import Profile, profiles_in
@@ -94,7 +94,7 @@ def valley_of(model: Model, n: int) -> LocalLikelihood:
     """
     predictor, fit, effect = model.predictor, model.fit, model.effects[n]
     point = fit.values[: len(predictor.names)].copy()
-    rows = np.flatnonzero([m.startswith(f"effect {n} ") for m in predictor.names])
+    rows = predictor.space.rows("effect", n)
     around = Steps(predictor, fit.channels)
     around.point, around.slopes = point, fit.slopes
     around.linearise_random()
@@ -102,7 +102,7 @@ def valley_of(model: Model, n: int) -> LocalLikelihood:
     used = (design**2).sum(0) > 0
     used[rows] = False
     # A parameter of another effect at the end of its range cannot follow.
-    low, high = predictor.limits()
+    low, high = predictor.space.limits
     used[: len(point)] &= (low < point) & (point < high)
     others = span(design[:, used])
 
@@ -130,7 +130,7 @@ def valley_of(model: Model, n: int) -> LocalLikelihood:
 
     parameters = [ranged(p) for p in fitted(effect)]
     return LocalLikelihood(
-        parameters, point[rows], left, free(design[:, rows]), predictor.steps[rows]
+        parameters, point[rows], left, free(design[:, rows]), predictor.space.steps[rows]
     )
 
 
@@ -159,7 +159,7 @@ def settle(
         Profiles of that model by the name of the parameter.
     """
     for _ in range(RESTARTS):
-        if type(model.effects[n]).modes is not Effect.modes:
+        if model.effects[n].changes("modes"):
             return model, {}
         valley = valley_of(model, n)
         profiles = profiles_in(valley, widths)
@@ -202,6 +202,6 @@ def find_profiles(model: Model, n: int, widths: Sequence[float]) -> dict[str, Pr
     dict of str to Profile
         Profiles by the name of the parameter; empty if linear intervals stand for all.
     """
-    if type(model.effects[n]).modes is not Effect.modes:
+    if model.effects[n].changes("modes"):
         return {}
     return profiles_in(valley_of(model, n), widths)

@@ -15,16 +15,13 @@ from bfsensor.typing import FloatArray
 
 
 def scored(predictor: Predictor) -> dict[int, tuple[str, ...]]:
-    """Variance parameters by their index in ``predictor.names``, with the channels they enter."""
-    out = {}
-    for n, name in enumerate(predictor.names):
-        if name.startswith("effect "):
-            number = int(name.split()[1])
-            some = predictor.effects[number : number + 1]
-            words = some[0].told_by_scatter if some else ()
-            if words:
-                out[n] = words
-    return out
+    """Variance parameters by their index in ``predictor.space``, with the channels they enter."""
+    return {
+        int(row): effect.scatters
+        for n, effect in enumerate(predictor.effects)
+        if effect.scatters
+        for row in predictor.space.rows("effect", n)
+    }
 
 
 def mode_slope(
@@ -36,13 +33,13 @@ def mode_slope(
 ) -> FloatArray:
     """Derivative of the whitened modes of some channels by a parameter, 0 in all others."""
     there = point.copy()
-    there[n] += predictor.steps[n]
+    there[n] += predictor.space.steps[n]
     parts = []
     for channel in channels:
         here = predictor.modes(channel, point)
         if channel.word in words and here.shape[1]:
             change = predictor.modes(channel, there) - here
-            parts.append(channel.whiten(change) / predictor.steps[n])
+            parts.append(channel.whiten(change) / predictor.space.steps[n])
         else:
             parts.append(np.zeros_like(here))
     out = np.zeros((sum(len(p) for p in parts), sum(p.shape[1] for p in parts)))

@@ -14,7 +14,7 @@ import numpy as np
 from bfsensor.checkpoints import digest_of
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.exposure_info import numbers_of
-from bfsensor.effects.effect import Effect
+from bfsensor.effects.family import EffectFamily
 from bfsensor.errors import DiagnosisError
 from bfsensor.response.edge_response import area_matrix
 from bfsensor.typing import Edges, FloatArray
@@ -101,7 +101,7 @@ class Baseline:
     warming: Mapping[Key, Edges] = field(default_factory=dict)
     temperature: float = np.nan
     spots_bend: bool = False
-    pieces: tuple[type[Effect], ...] = ()
+    pieces: tuple[EffectFamily, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.edges:

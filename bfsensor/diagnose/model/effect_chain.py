@@ -111,11 +111,7 @@ class EffectChain:
         own = (
             "edges", "law", "level_response", "bend_edges", "spot_light", "spot_image", "signal",
         )  # fmt: skip
-        return all(
-            getattr(type(e), name) is getattr(Effect, name)
-            for e in self.effects
-            for name in own
-        )
+        return not any(e.changes(*own) for e in self.effects)
 
     def area_change(self, edges: Edges, condition: Condition) -> FloatArray:
         """Change that effects make to the area changes of given shifts [1/e-]."""

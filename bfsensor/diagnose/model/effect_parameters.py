@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bfsensor.effects.effect import Effect, Parameter
+from bfsensor.inference.parameters import FreeParameter, ParameterSpace
 from bfsensor.typing import FloatArray
 
 STRONG = 100.0
@@ -16,48 +16,37 @@ effects of campaigns by another bench are 13 times (loss of charge) and 22 times
 with 1000, fits of other classes would run to strengths at which predictions overflow."""
 
 
-class FittedEffects:
-    """The free parameters of several effects as one vector.
+def parameters_of(effects: Sequence[Effect]) -> ParameterSpace:
+    """Make the free parameters of several effects, which belong to the effect's place among them.
 
     Parameters
     ----------
     effects : sequence of Effect
         Effects with the values at which the fit starts.
 
-    Attributes
-    ----------
-    effects : tuple of Effect
-        The same effects.
-    names : tuple of str
-        Names of the parameters in a fit.
-    start, steps : ndarray, shape (n,)
-        Start values, and steps of numerical derivatives, in the parameters' units.
-    limits : ndarray, shape (2, n)
-        Smallest and largest values that a fit may give them.
+    Returns
+    -------
+    space : ParameterSpace
+        Of kind 'effect'.
     """
-
-    def __init__(self, effects: Sequence[Effect] = ()) -> None:
-        self.effects = tuple(effects)
-        self._each = [(n, e, p) for n, e in enumerate(self.effects) for p in fitted(e)]
-        self.names = tuple(f"effect {n} {e.name} {p.name}" for n, e, p in self._each)
-        self.start = np.array([e[p.name] for _, e, p in self._each], float)
-        self.steps = np.array([_step(e, p) for _, e, p in self._each], float)
-        self.limits = np.array([widened(p) for *_, p in self._each], float).reshape(-1, 2).T
-
-    def __len__(self) -> int:
-        return len(self._each)
-
-    def at(self, values: FloatArray) -> tuple[Effect, ...]:
-        """Make the effects with given parameters, shape (n,)."""
-        left = iter(values)
-        return tuple(
-            e.with_values(**{p.name: float(next(left)) for p in fitted(e)})
-            for e in self.effects
+    return ParameterSpace(
+        tuple(
+            FreeParameter(
+                f"effect {n} {e.name} {p.name}", "effect", n, e[p.name], _step(e, p), False,
+                *widened(p),
+            )
+            for n, e in enumerate(effects)
+            for p in fitted(e)
         )
+    )  # fmt: skip
 
-    def touch(self, word: str) -> NDArray[np.bool_]:
-        """Mask of the parameters that a channel can depend on."""
-        return np.array([word in e.touches for _, e, _ in self._each], bool)
+
+def effects_at(effects: Sequence[Effect], values: FloatArray) -> tuple[Effect, ...]:
+    """Make the effects with given free parameters, shape (n,)."""
+    left = iter(values)
+    return tuple(
+        e.with_values(**{p.name: float(next(left)) for p in fitted(e)}) for e in effects
+    )
 
 
 def fitted(effect: Effect) -> list[Parameter]:

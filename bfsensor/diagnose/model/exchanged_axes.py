@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bfsensor.effects.effect import Effect, Layout, Parameter, Shot
+from bfsensor.effects.family import EffectFamily
 from bfsensor.typing import Edges, FloatArray
 
 
@@ -31,7 +32,7 @@ class AxesExchanged(Effect):
         return kx + amp * (ky.T - kx), ky + amp * (kx.T - ky)
 
 
-NAMED: tuple[type[Effect], ...] = (AxesExchanged,)
+NAMED: tuple[EffectFamily, ...] = (AxesExchanged,)
 """All hypotheses outside the library."""
 
 

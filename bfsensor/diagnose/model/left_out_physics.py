@@ -20,7 +20,7 @@ from bfsensor.device.parts import Edge, EdgeStrip
 from bfsensor.diagnose.model.baseline import Baseline, Key
 from bfsensor.diagnose.model.cached_response import SPAN, Walk, walk
 from bfsensor.diagnose.model.device_baseline import FINE, WARMER
-from bfsensor.effects.effect import Effect
+from bfsensor.effects.family import EffectFamily
 from bfsensor.effects.simulated_physics import (
     BentResponse,
     DiffusionWidths,
@@ -94,7 +94,7 @@ SOURCE = "Differences of simulated tables with and without: {}"
 
 def physics_left_out(
     device: Device, baseline: Baseline, *, cells: int = CELLS, keep: Path | None = None
-) -> tuple[type[Effect], ...]:
+) -> tuple[EffectFamily, ...]:
     """Make candidate effects for physics that a device's baseline leaves out.
 
     Parameters
@@ -177,7 +177,7 @@ def physics_left_out(
                     levels.append(((w, bias), both))
         return Moved(tuple(edges), bent=_as_bent(levels))
 
-    found: list[type[Effect]] = [
+    found: list[EffectFamily] = [
         left_out(
             MovedEdges, "free_holes", "", differences(LEVEL_OF_HOLES, HOLES),
             SOURCE.format(f"quasi-Fermi level of the stops' holes {HOLES:g} V higher"),
@@ -223,7 +223,7 @@ def _levels(
     kelvin: float,
     cells: int,
     keep: Path | None,
-) -> type[Effect]:
+) -> EffectFamily:
     levels: list[tuple[Key, tuple[Edges, Edges]]] = []
     for bias, one in here.items():
         walked = walk(one, cells=cells, backgrounds=BACKGROUNDS, keep=keep)
@@ -241,7 +241,7 @@ def _depths(
     cells: int,
     keep: Path | None,
     bent: bool,
-) -> type[Effect]:
+) -> EffectFamily:
     edges: list[tuple[Key, Edges]] = []
     warming: list[tuple[Key, Edges]] = []
     levels: list[tuple[Key, tuple[Edges, Edges]]] = []
@@ -284,7 +284,7 @@ def _of_light(drift: Drift, values: FloatArray, wavelength: float, kelvin: float
 
 def _diffusion(
     drifts: dict[float, Drift], colours: list[float], device: Device
-) -> type[Effect]:
+) -> EffectFamily:
     kelvin = device.operating_point.temperature
     area = device.pixel.pitch_x * device.pixel.pitch_y
     held = tuple(
@@ -348,7 +348,7 @@ def ring_shifts(
 
 def _rings(
     drifts: dict[float, Drift], colours: list[float], device: Device
-) -> type[Effect]:
+) -> EffectFamily:
     kelvin = device.operating_point.temperature
     held = []
     for bias, drift in drifts.items():
@@ -365,7 +365,7 @@ def _rings(
     )  # fmt: skip
 
 
-def _rim(device: Device, here: dict[float, Device], colours: list[float]) -> type[Effect]:
+def _rim(device: Device, here: dict[float, Device], colours: list[float]) -> EffectFamily:
     kelvin = device.operating_point.temperature
     held = []
     for bias, one in here.items():

@@ -104,8 +104,8 @@ class MapChange:
         # Arrays as large as the sensor: those of one gain and device at a time.
         state = self._gain, *self._device.values()
         self._evened = kept.get("evened", partial(Cache, 1)).get(state, Cache)
-        self._by_time = any(e.by_time for e in self.effects)
-        self._standing = all(e.standing for e in self.effects)
+        self._by_time = any(e.maps_vary == "exposure" for e in self.effects)
+        self._standing = all(e.maps_vary == "nothing" for e in self.effects)
         self._made: dict[tuple, Spectrum | None] = {}
 
     def of(self, channel: Channel) -> FloatArray:
@@ -204,7 +204,7 @@ class MapChange:
         for effect in self.effects:
             # What is equal in all flats is made once.
             weights = (
-                [(_weight(group), group[0])] if effect.standing
+                [(_weight(group), group[0])] if effect.maps_vary == "nothing"
                 else [(s.weight, s) for s in group]
             )  # fmt: skip
             for weight, share in weights:
@@ -249,7 +249,7 @@ class MapChange:
         """Change by one effect, cached where there are several effects and the sensor is small."""
         if len(self.effects) == 1 or np.prod(self.layout.shape) > KEPT_PIXELS:
             return change(effect, shot)
-        key = word, effect, None if effect.standing else shot
+        key = word, effect, None if effect.maps_vary == "nothing" else shot
         return self._parts.get(key, lambda: change(effect, shot))
 
     def _transform(self, change: FloatArray) -> Spectrum:

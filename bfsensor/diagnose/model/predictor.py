@@ -17,7 +17,7 @@ from bfsensor.diagnose.data.map_channels import MapShare
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.diagnose.model.effect_chain import ADDED, EffectChain, layout_of, pad_areas
-from bfsensor.diagnose.model.effect_parameters import FittedEffects
+from bfsensor.diagnose.model.effect_parameters import effects_at, parameters_of
 from bfsensor.diagnose.model.flat_predictions import (
     flat_covariances_of,
     periodic_covariances,
@@ -27,6 +27,7 @@ from bfsensor.diagnose.model.linear_terms import linear_columns
 from bfsensor.diagnose.model.spot_predictor import SpotPredictor, width_of
 from bfsensor.effects.effect import Effect, Layout, Shot
 from bfsensor.files import Cache
+from bfsensor.inference.parameters import FreeParameter, ParameterSpace
 from bfsensor.response.edge_response import area_matrix
 from bfsensor.typing import FloatArray
 
@@ -54,10 +55,11 @@ class Predictor:
 
     Attributes
     ----------
-    names : tuple of str
-        Names of the nonlinear parameters.
-    start, steps : ndarray, shape (n,)
-        Start values, and steps of numerical derivatives.
+    space : ParameterSpace
+        Nonlinear parameters: of kind 'gain' and 'noise' by amplifier, 'device' by quantity, 'width'
+        by wavelength and temperature, 'effect' by place among the effects.
+    effects : tuple of Effect
+        Effects added to the baseline, with their start values.
     notes : list of str
         Assumptions for the report.
     kept : Cache
@@ -77,22 +79,26 @@ class Predictor:
         self.spots = SpotPredictor(measured, baseline)
         self.notes: list[str] = []
         noise = [0.0 if not np.isfinite(n) else n**2 for n in measured.read_noise]
-        self.names = (
-            *(f"gain {a}" for a in range(self._amps)),
-            *(f"noise {a}" for a in range(self._amps)),
-            *(f"device {p}" for p in baseline.parameters),
-            *(f"sigma_{axis} {width}" for width in self.spots.widths for axis in "xy"),
-        )
-        self.start = np.array([
-            *measured.gains, *noise, *(0.0 for _ in baseline.parameters), *self.spots.start,
-        ])  # fmt: skip
-        self.steps = np.array([
-            *(1e-3 * g for g in measured.gains), *(0.01 * max(n, 0.1) for n in noise),
-            *(0.1 for _ in baseline.parameters), *(2e-3 for _ in self.spots.start),
-        ])  # fmt: skip
-        n, p = 2 * self._amps, len(baseline.parameters)
-        self.prior_rows = np.arange(n, n + p)
-        """Indices of the parameters with a prior of mean 0 and standard deviation 1."""
+        own = [
+            FreeParameter(f"gain {a}", "gain", a, g, 1e-3 * g)
+            for a, g in enumerate(measured.gains)
+        ]
+        own += [
+            FreeParameter(f"noise {a}", "noise", a, n, 0.01 * max(n, 0.1))
+            for a, n in enumerate(noise)
+        ]
+        for name in baseline.parameters:
+            ends = np.array(baseline.bounds.get(name, (-np.inf, np.inf)))
+            low, high = ends / baseline.spread[name]
+            own.append(
+                FreeParameter(f"device {name}", "device", name, 0.0, 0.1, True, low, high)
+            )
+        widths = [(width, axis) for width in self.spots.widths for axis in "xy"]
+        own += [
+            FreeParameter(f"sigma_{axis} {width}", "width", width, start, 2e-3)
+            for (width, axis), start in zip(widths, self.spots.start, strict=True)
+        ]
+        self.space = ParameterSpace(tuple(own))
         self._noise_told = _noise_told(measured)
         if not self._noise_told.all():
             names = [
@@ -117,13 +123,18 @@ class Predictor:
                 )
 
         self.columns: tuple[Columns, ...] = ()
-        self._free = FittedEffects()
-        self._add(effects)
+        self.effects = tuple(effects)
+        self.space += parameters_of(self.effects)
 
     @property
-    def effects(self) -> tuple[Effect, ...]:
-        """Effects added to the baseline, with their start values."""
-        return self._free.effects
+    def names(self) -> tuple[str, ...]:
+        """Names of the nonlinear parameters."""
+        return self.space.names
+
+    @property
+    def start(self) -> FloatArray:
+        """Values at which fits of the nonlinear parameters start, shape (n,)."""
+        return self.space.start
 
     def with_effects(
         self, effects: Sequence[Effect], point: FloatArray | None = None
@@ -138,10 +149,11 @@ class Predictor:
             Start values of the parameters other than the effects'.
         """
         other = copy(self)
-        plain = len(self.names) - len(self._free)
-        other.names, other.steps = self.names[:plain], self.steps[:plain]
-        other.start = (self.start if point is None else point)[:plain].copy()
-        other._add(effects)
+        plain = self.space.without("effect")
+        if point is not None:
+            plain = plain.started(point[: len(plain)])
+        other.effects = tuple(effects)
+        other.space = plain + parameters_of(other.effects)
         return other
 
     def with_columns(self, columns: Columns, point: FloatArray | None = None) -> Predictor:
@@ -149,7 +161,7 @@ class Predictor:
         other = copy(self)
         other.columns = (*self.columns, columns)
         if point is not None:
-            other.start = point[: len(self.names)].copy()
+            other.space = self.space.started(point[: len(self.space)])
         return other
 
     def without_columns(self, columns: Sequence[Columns]) -> Predictor:
@@ -225,13 +237,6 @@ class Predictor:
         if maps:
             other.measured = replace(self.measured, maps={**self.measured.maps, **maps})
         return other
-
-    def _add(self, effects: Sequence[Effect]) -> None:
-        """Append the parameters of effects."""
-        self._free = FittedEffects(effects)
-        self.names = (*self.names, *self._free.names)
-        self.start = np.append(self.start, self._free.start)
-        self.steps = np.append(self.steps, self._free.steps)
 
     def predict(
         self,
@@ -331,20 +336,11 @@ class Predictor:
 
     def effects_at(self, parameters: FloatArray) -> tuple[Effect, ...]:
         """Make the effects with given parameters."""
-        return self._free.at(parameters[len(parameters) - len(self._free) :])
+        return effects_at(self.effects, parameters[self.space.of("effect")])
 
     def _rows(self, channel: Channel) -> Rows:
         """Indices of a channel's values by condition; cached, as channels do not change."""
         return self._of_channels.get(("rows", channel), lambda: rows_by_condition(channel))
-
-    def limits(self) -> FloatArray:
-        """Smallest and largest values that a fit may give the parameters, shape (2, parameters)."""
-        plain = len(self.names) - len(self._free)
-        free = np.repeat([[-np.inf], [np.inf]], plain, axis=1)
-        for name, ends in self.baseline.bounds.items():
-            row = self.names.index(f"device {name}")
-            free[:, row] = np.array(ends) / self.baseline.spread[name]
-        return np.concatenate([free, self._free.limits], axis=1)
 
     def _with_light(self, channel: Channel, gains: FloatArray) -> dict[str, NDArray]:
         """Axes of a channel; for flats also 'light': electrons of a linear response to the lamp."""
@@ -369,29 +365,28 @@ class Predictor:
 
     def depends(self, channel: Channel) -> NDArray[np.bool_]:
         """Mask of the parameters that a channel can depend on; others need no derivative."""
-        names = np.array(self.names)
-        device = np.char.startswith(names, "device")
-        sigma = np.char.startswith(names, "sigma")
-        plain = self._baseline_depends(channel, device, sigma)
-        plain[len(names) - len(self._free) :] |= self._free.touch(channel.word)
-        return plain
+        space = self.space
+        out = space.of(*self._baseline_kinds(channel))
+        for n, noisy in enumerate(self._noise_told):
+            if not noisy:
+                out[space.rows("noise", n)] = False
+        for n, effect in enumerate(self.effects):
+            if channel.word in effect.touches:
+                out[space.rows("effect", n)] = True
+        return out
 
-    def _baseline_depends(
-        self, channel: Channel, device: NDArray[np.bool_], sigma: NDArray[np.bool_]
-    ) -> NDArray[np.bool_]:
-        a, names = self._amps, np.array(self.names)
-        gain = np.char.startswith(names, "gain")
-        noise = np.char.startswith(names, "noise")
-        noise[a : 2 * a] &= self._noise_told
+    def _baseline_kinds(self, channel: Channel) -> tuple[str, ...]:
+        """Kinds of the parameters that a channel depends on without effects, or through their units."""
         if channel.word == "flat_cov":
-            return device if channel.unit == PER_ELECTRON else gain | noise | device
+            reduced = channel.unit == PER_ELECTRON
+            return ("device",) if reduced else ("gain", "noise", "device")
         if channel.word == "spot":
-            return gain | device | sigma
+            return "gain", "device", "width"
         if channel.word == "flat_mean" and any(
             "flat_mean" in e.touches for e in self.effects
         ):
-            return gain
-        return noise if channel.word == "bias_cov" else np.zeros(len(names), bool)
+            return ("gain",)
+        return ("noise",) if channel.word == "bias_cov" else ()
 
     def slope(
         self,
@@ -402,26 +397,26 @@ class Predictor:
     ) -> FloatArray:
         """Derivative of a channel by parameter ``n``, given the prediction ``here``."""
         step = parameters.copy()
-        step[n] += self.steps[n]
-        if channel.word == "spot" and self.names[n].startswith("sigma"):
+        own = self.space.parameters[n]
+        step[n] += own.step
+        if channel.word == "spot" and own.kind == "width":
             # A width changes only spots of its own wavelength and temperature.
-            first = self.names.index(next(m for m in self.names if m.startswith("sigma")))
-            only = self.spots.widths[(n - first) // 2]
+            only = str(own.owner)
             moved = self.predict(channel, step, only=only)
             out = np.zeros(len(channel))
             for condition, rows in self._rows(channel).items():
                 if width_of(condition) == only:
-                    out[rows] = (moved[rows] - here[rows]) / self.steps[n]
+                    out[rows] = (moved[rows] - here[rows]) / own.step
             return out
-        ratio = self.names[n].startswith("gain") or self.names[n].endswith(" full_well")
+        ratio = own.kind == "gain" or own.name.endswith(" full_well")
         if channel.word == "flat_mean" and ratio:
             # Saturated flats constrain full well over gain to 1e-5, so that a one-sided difference
             # would bias the fit: take a central one.
             back = parameters.copy()
-            back[n] -= self.steps[n]
+            back[n] -= own.step
             both = self.predict(channel, step) - self.predict(channel, back)
-            return both / (2 * self.steps[n])
-        return (self.predict(channel, step) - here) / self.steps[n]
+            return both / (2 * own.step)
+        return (self.predict(channel, step) - here) / own.step
 
     def linear(self, channel: Channel) -> dict[str, FloatArray]:
         """Columns of the linear parameters by name; the same name is the same parameter."""

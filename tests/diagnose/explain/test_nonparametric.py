@@ -308,7 +308,7 @@ def test_the_process_leaves_to_parameters_what_is_theirs():
     # What a gain and a device parameter other by five of their errors do to covariances.
     null, _ = _null_located()
     point = null.fit.values[: len(null.predictor.names)].copy()
-    for name in ("gain 0", null.predictor.names[null.predictor.prior_rows[0]]):
+    for name in ("gain 0", null.predictor.names[null.predictor.space.prior_rows[0]]):
         row = null.predictor.names.index(name)
         point[row] += 5 * null.fit.errors[row]
     measured = _null()

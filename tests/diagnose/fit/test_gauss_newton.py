@@ -11,6 +11,7 @@ from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.fit.gauss_newton import Steps
 from bfsensor.effects.illumination_turbulence import IlluminationTurbulence
 from bfsensor.effects.psf_wings import PsfWings
+from bfsensor.inference.parameters import FreeParameter, ParameterSpace
 
 PLACES = np.linspace(0.0, 6.0, 40)
 
@@ -23,14 +24,31 @@ def light(frac, sigma):
 class Halo:
     """One channel: a halo whose width is hardly known, above a level."""
 
-    names = ("effect 0 psf_wings frac", "effect 0 psf_wings sigma")
-    prior_rows = np.array([], int)
+    prior = False
     effects = (PsfWings({"frac": 0.01, "sigma": 3.0}),)
     notes = ()
     baseline = SimpleNamespace(not_below=())
 
     def __init__(self, start):
-        self.start = np.array(start, float)
+        frac, sigma = start
+        self.space = ParameterSpace(
+            (
+                FreeParameter(
+                    "effect 0 psf_wings frac", "effect", 0, frac, 1e-3, False, 0.0, 0.5
+                ),
+                FreeParameter(
+                    "effect 0 psf_wings sigma",
+                    "effect",
+                    0,
+                    sigma,
+                    1e-3,
+                    self.prior,
+                    0.1,
+                    30.0,
+                ),
+            )
+        )
+        self.names, self.start = self.space.names, self.space.start
 
     def predict(self, channel, point):
         del channel
@@ -51,9 +69,6 @@ class Halo:
     def modes(self, channel, point):
         del point
         return np.zeros((len(channel), 0))
-
-    def limits(self):
-        return np.array([[0.0, 0.1], [0.5, 30.0]])
 
 
 def channel(truth, seed=3):
@@ -102,8 +117,7 @@ def test_a_step_that_does_harm_is_not_reported_as_gain():
 class Chance(Halo):
     """An effect with more random effects than values, and a width with a prior."""
 
-    prior_rows = np.array([1])
-    steps = np.array([1e-3, 1e-3])
+    prior = True
     effects = (IlluminationTurbulence({"rms": 1e-3, "corr": 20.0}),)
 
     def modes(self, channel, point):

@@ -151,7 +151,7 @@ class Fitted:
         self.total = float(bent(self.values) @ bent(self.values))
         self.fit = self
 
-    modes = PsfWings.modes
+    changes = PsfWings.changes
 
     def with_values(self, amp, shape):
         return Fitted([amp, shape], self.refused)

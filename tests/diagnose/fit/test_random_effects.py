@@ -13,6 +13,7 @@ from bfsensor.diagnose.detect.scatter import scatter_of
 from bfsensor.diagnose.fit.gauss_newton import Steps
 from bfsensor.effects.illumination_turbulence import IlluminationTurbulence
 from bfsensor.errors import FitError
+from bfsensor.inference.parameters import FreeParameter, ParameterSpace
 from bfsensor.inference.random_effects import likeliest
 
 COUNT = 80
@@ -23,13 +24,21 @@ STRENGTHS = np.geomspace(300.0, 3e4, COUNT)
 class Shaken:
     """Predicts values of one level, which an effect makes scatter and else leaves as they are."""
 
-    names = ("effect 0 illumination_turbulence rms",)
-    prior_rows = np.array([], int)
     effects = (IlluminationTurbulence({"rms": 1e-3, "corr": 20.0}),)
-    steps = np.array([1e-6])
 
     def __init__(self, start: float) -> None:
-        self.start = np.array([start])
+        one = FreeParameter(
+            "effect 0 illumination_turbulence rms",
+            "effect",
+            0,
+            start,
+            1e-6,
+            False,
+            0.0,
+            0.1,
+        )
+        self.space = ParameterSpace((one,))
+        self.names, self.start = self.space.names, self.space.start
 
     def predict(self, channel, point):
         del point
@@ -45,9 +54,6 @@ class Shaken:
     def modes(self, channel, point):
         del channel
         return np.diag(point[0] * STRENGTHS)
-
-    def limits(self):
-        return np.array([[0.0], [0.1]])
 
 
 def channel(amplitude: float, seed: int) -> Channel:
@@ -88,7 +94,7 @@ def test_errors_are_those_of_the_scatter():
 
 
 def test_an_amplitude_that_no_channel_constrains_stays(monkeypatch):
-    monkeypatch.setattr(IlluminationTurbulence, "told_by_scatter", ())
+    monkeypatch.setattr(IlluminationTurbulence, "scatters", ())
     steps = Steps(Shaken(3e-4), [channel(1e-3, 0)])
     steps.go()
     assert steps.point[0] == 3e-4 and len(steps.score.target) == 0
@@ -135,7 +141,7 @@ def test_a_candidate_is_weighed_as_with_its_modes_written_out(monkeypatch):
         "bias_level": rng.normal(size=(n, 3)),
         "flat_mean": np.diag(rng.uniform(1, 3, n)),
     }
-    effect = SimpleNamespace(told_by_scatter=("bias_level", "flat_mean"), name="settling")
+    effect = SimpleNamespace(scatters=("bias_level", "flat_mean"), name="settling")
     basis = np.linalg.qr(rng.normal(size=(3 * n + 2, 5)))[0]
     fit = SimpleNamespace(channels=channels, starts=np.arange(0, 4 * n, n), basis=basis)
     vectors = rng.normal(size=(3, 3 * n + 2))

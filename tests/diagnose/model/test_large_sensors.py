@@ -59,7 +59,7 @@ def test_a_standing_pattern_is_that_of_each_flat(monkeypatch):
     once = _changes(EFFECTS[0])
     # Maps that are divided by another one have the same pattern in both.
     assert every.sum() < len(every) and not once[~every].any()
-    monkeypatch.setattr(Settling, "standing", False)
+    monkeypatch.setattr(Settling, "maps_vary", "condition")
     each = _changes(EFFECTS[0])
     np.testing.assert_allclose(
         once[every], each[every], atol=1e-9 * float(np.linalg.norm(each)), rtol=0
