@@ -373,14 +373,14 @@ class Effect:
     source: ClassVar[str] = ""
     """Publication of its law and of the range of its parameters, or that they are assumed."""
     needs: ClassVar[tuple[str, ...]] = ()
-    """What recordings must have for the effect to be sought: 'pixels', which reduced recordings do
-    not have; 'levels', as a table of a_ij of one level could equally be that of another device;
-    'sightings', waves or rings detected in maps, from which :meth:`starts` begin."""
+    """Words for properties that recordings must have if the effect is to be sought: 'pixels', which
+    reduced recordings do not have; 'levels', as a table of a_ij of one level could equally be that
+    of another device; 'patterns', fringes or rings detected in maps, from which :meth:`starts` begin."""
     maps_vary: ClassVar[str] = "condition"
     """With what :meth:`light_map`, :meth:`displacements` and :meth:`pattern` change: 'nothing', equal
     in all flats; 'condition', wavelength, back bias and temperature; 'exposure', also time or level."""
     response: ClassVar[str] = "linear"
-    """How changes of channels depend on the amplitude: 'linear'; 'quadratic', with a part of either
+    """Dependence of the changes of channels on the amplitude: 'linear'; 'quadratic', with a part of either
     order; 'rough', not smooth, so that amplitudes at starting points are kept."""
     scatters: ClassVar[tuple[str, ...]] = ()
     """Channels whose scatter constrains the amplitude: :meth:`modes` are proportional to it there."""
@@ -415,7 +415,7 @@ class Effect:
 
     @property
     def family(self) -> Any:
-        """What makes this effect from values: its class, or the family that holds its template."""
+        """Callable that makes this effect from values: its class, or the family with its template."""
         return type(self)
 
     @classmethod

@@ -27,7 +27,7 @@ class TemplateFamily:
     word, variant : str
         Name in the taxonomy, and the variant that distinguishes it from others of this name.
     template : object
-        What ``effect`` takes, such as simulated changes of the boundary shifts.
+        Data that ``effect`` acts by, such as simulated changes of the boundary shifts.
     source : str
         Origin of the template, for reports.
     parameters : tuple of Parameter
@@ -62,7 +62,7 @@ class TemplateFamily:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """What recordings must have, as :attr:`Effect.needs`."""
+        """Properties that recordings must have, as :attr:`Effect.needs`."""
         return self.effect.needs
 
     def starts(self, layout: Layout, seen: Sequence[Seen] = ()) -> list[dict[str, float]]:
@@ -71,7 +71,7 @@ class TemplateFamily:
 
 
 EffectFamily = type[Effect] | TemplateFamily
-"""What is called with values of parameters to make an effect."""
+"""Callable that makes an effect from values of its parameters."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -63,7 +63,7 @@ class Fringing(Effect):
         Parameter("phase", "cycle", -0.5, 0.5, law="flat"),
     )
     touches = ("flat_map",)
-    needs: ClassVar[tuple[str, ...]] = ("pixels", "sightings")
+    needs: ClassVar[tuple[str, ...]] = ("pixels", "patterns")
     response = "quadratic"
     source = (
         "Howell 2012, PASP 124, 263 (small variations of thickness make the pattern; from about "

@@ -123,7 +123,7 @@ class WavyMask(Effect):
         Parameter("along", "", 0, 1, law="whole"),
     )
     touches = ("flat_map",)
-    needs: ClassVar[tuple[str, ...]] = ("pixels", "sightings")
+    needs: ClassVar[tuple[str, ...]] = ("pixels", "patterns")
     response = "quadratic"
     source = (
         "Periodic pixel sizes of LSST prototypes: Kotov et al. 2010, NIM A 652, 524; Smith & Rahmer "

@@ -35,7 +35,7 @@ class _Rings(Effect):
     word = "tree_rings"
     stage = "collect"
     touches = ("flat_map",)
-    needs: ClassVar[tuple[str, ...]] = ("pixels", "sightings")
+    needs: ClassVar[tuple[str, ...]] = ("pixels", "patterns")
     response = "quadratic"
     source = (
         "Plazas, Bernstein & Sheldon 2014, PASP 126, 750 (DECam); Baumer, Davis & Roodman 2017, "

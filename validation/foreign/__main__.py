@@ -11,6 +11,7 @@ from tqdm import tqdm
 from validation.common.run_header import run_header
 from validation.foreign.accuracy import accuracy_rows, faults_of
 from validation.foreign.campaign import Wish, make_set
+from validation.foreign.departures import make_departures
 from validation.foreign.laws import CLASSES, LAWS
 from validation.foreign.nuisances import NUISANCES
 
@@ -86,6 +87,22 @@ def make(
     click.echo(
         f"{out}: {len(made)} campaigns made, {count - len(made)} were there; truths in {sealed}"
     )
+
+
+@main.command()
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option("--truth-folder", type=click.Path(path_type=Path), default=None,
+              help="Where truths are sealed [OUT_sealed, beside OUT].")  # fmt: skip
+def departures(out: Path, truth_folder: Path | None) -> None:
+    """Make the six campaigns of :mod:`validation.foreign.departures` in OUT.
+
+    \b
+    Example:
+      python -m validation.foreign departures departures
+    """
+    sealed = truth_folder or out.with_name(out.resolve().name + "_sealed")
+    made = make_departures(out, sealed)
+    click.echo(f"{out}: {len(made)} campaigns made; truths in {sealed}")
 
 
 @main.command()

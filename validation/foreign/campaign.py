@@ -171,14 +171,17 @@ class Made:
         return all(n.values.get("monitor", True) for n in self.nuisances)
 
 
-def draw_campaign(wish: Wish, number: int, salt: str, name: str) -> Made:
-    """Draw layout, plan, device, nuisances, laws and strengths of one campaign."""
+def draw_campaign(
+    wish: Wish, number: int, salt: str, name: str, layout: Layout | None = None
+) -> Made:
+    """Draw layout, plan, device, nuisances, laws and strengths; a layout that is given stays."""
     rng = rng_of(wish, number, salt)
     chosen = classes_of(wish, number, salt)
     needs = frozenset().union(*(LAWS[c].needs for c in chosen))
     without = frozenset().union(*(LAWS[c].beside for c in chosen))
     pixels = SIZES[wish.size].pixels
-    layout = draw_layout(rng, wish.size, pixels, needs)
+    drawn = draw_layout(rng, wish.size, pixels, needs)
+    layout = drawn if layout is None else layout
     plan = draw_plan(rng, wish.size, bool(layout.spots), needs)
     key = str(rng.choice(list(DEVICES), p=[0.6, 0.2, 0.2]))
     seed = int(rng.integers(2**31))

@@ -17,7 +17,7 @@ from bfsensor.typing import FloatArray
 
 WORDS = (
     "flat_cov", "flat_mean", "flat_map", "serial_overscan", "parallel_overscan", "bias_cov",
-    "bias_level", "dark_map", "spot", "amp_cross", "code_hist", "time",
+    "bias_level", "dark_map", "spot", "amp_cross", "code_hist",
 )  # fmt: skip
 """Names of all channels."""
 

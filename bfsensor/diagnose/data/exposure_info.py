@@ -15,6 +15,11 @@ from bfsensor.units import to_celsius
 NUMBERS = ("wavelength", "back_bias", "temperature")
 """Axes of a channel that hold the condition of its values [nm, V, K]; nan where not known."""
 
+LAMP_ERROR = 1e-3
+"""Relative error of a lamp monitor reading, of recordings and of planned ones, where none is stated.
+Chosen, to be derived: twice as large halves the significance of nonlinearity, drift and loss in the
+means of flats."""
+
 
 def condition_of(exposure: ExposureInfo) -> Condition:
     """Condition of an exposure, rounded to 0.01 nm, V and K so that repeated headers agree."""

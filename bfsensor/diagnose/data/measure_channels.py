@@ -31,6 +31,7 @@ from bfsensor.diagnose.data.dark_channels import (
     without_hot_columns,
 )
 from bfsensor.diagnose.data.exposure_info import (
+    LAMP_ERROR,
     ExposureInfo,
     Frame,
     Source,
@@ -93,6 +94,8 @@ class MeasuredChannels:
         Sentences on what could not be measured, and why.
     lamp_known : bool
         Whether every flat has a reading of the lamp monitor.
+    lamp_error : float
+        Relative error of such a reading.
     counts : mapping of str to int
         Number of exposures of each kind.
     unlike : tuple of UnlikePair
@@ -124,6 +127,7 @@ class MeasuredChannels:
     shape: tuple[int, int]
     notes: tuple[str, ...] = ()
     lamp_known: bool = True
+    lamp_error: float = LAMP_ERROR
     counts: Mapping[str, int] = field(default_factory=dict)
     unlike: tuple[UnlikePair, ...] = ()
     segments: tuple[Segment, ...] = ()
@@ -388,6 +392,7 @@ def measure_channels(
         shape=source.shape,
         notes=tuple(notes),
         lamp_known=all(e.lamp is not None for e in kinds.get("flat", [])),
+        lamp_error=source.lamp_error,
         counts={k: len(v) for k, v in kinds.items()},
         unlike=tuple(unlike),
         segments=tuple(_segment(f) for f in layout),

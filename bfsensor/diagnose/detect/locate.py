@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.sparse import csr_array
 
-from bfsensor.diagnose.detect.scan_templates import Template
 from bfsensor.diagnose.detect.scans import DEVICE, make_fitted_templates, make_templates
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
+from bfsensor.diagnose.kinds.scan_templates import Template
 from bfsensor.files import Cache
 from bfsensor.typing import FloatArray
 

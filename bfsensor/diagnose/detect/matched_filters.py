@@ -112,7 +112,7 @@ def _with_sighted(
     """Add effects that start at fringes detected in maps, their p-values corrected for the search."""
     if not screen.predictor.layout.sightings:
         return mismatch
-    for kind in (k for k in kinds if "sightings" in k.needs):
+    for kind in (k for k in kinds if "patterns" in k.needs):
         rival = screen.best(screen.tried(kind)[:1])
         # Negative evidence: parameters far outside their plausible ranges can follow any noise.
         if rival is None or rival.refuted or rival.evidence < 0:

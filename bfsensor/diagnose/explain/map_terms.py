@@ -14,8 +14,8 @@ from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.map_channels import RINGS, ring_modes
 from bfsensor.diagnose.explain.pursuit import Dictionary
 from bfsensor.diagnose.explain.terms import SCALE, Family, Scene, Term
+from bfsensor.diagnose.kinds.map_shapes import Places
 from bfsensor.diagnose.model.map_predictions import reduce_map
-from bfsensor.diagnose.model.map_shapes import Places
 from bfsensor.effects.effect import Layout
 from bfsensor.typing import FloatArray
 

@@ -9,21 +9,15 @@ from numpy.typing import NDArray
 
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel
-from bfsensor.diagnose.data.flat_channels import TAIL
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.data.ptc_turnoff import find_turn_off
+from bfsensor.diagnose.kinds import KINDS
 from bfsensor.diagnose.model.baseline import Baseline, level_areas
 from bfsensor.diagnose.model.map_predictions import MapChange, shot_at
 from bfsensor.effects.effect import STAGES, Axes, Effect, Halo, Law, Layout, Shot
 from bfsensor.files import Cache
 from bfsensor.response.edge_response import area_matrix
 from bfsensor.typing import Edges, FloatArray
-
-ADDED = (
-    "flat_mean", "serial_overscan", "parallel_overscan", "bias_cov", "bias_level", "dark_map",
-    "amp_cross", "code_hist",
-)  # fmt: skip
-"""Channels whose change an effect calculates by its method of the same name."""
 
 ROUNDS = 4
 """Number of fixed-point iterations that invert the signal's law. Derived: each multiplies the error
@@ -193,28 +187,19 @@ class EffectChain:
     def added(
         self, channel: Channel, gains: FloatArray, axes: dict[str, NDArray]
     ) -> FloatArray:
-        """Change of one of the channels :data:`ADDED`, in its unit; ``axes`` with levels in ADU."""
+        """Change of a channel by all effects, in its unit; ``axes`` with levels in ADU."""
+        kind = KINDS[channel.word]
         own, axes = self._in_electrons(channel, gains, axes)
         out = np.zeros(len(channel))
         for effect in self.effects:
-            if channel.word in effect.touches:
-                out += getattr(effect, channel.word)(axes, self.layout)
-            if channel.word in ("serial_overscan", "parallel_overscan"):
-                out -= self._in_overscan(effect, channel.word, axes, TAIL)
-            if channel.word == "flat_mean":
-                out -= self._in_overscan(effect, "serial_overscan", axes, None)
+            out += kind.change(effect, axes, self.layout)
         if channel.word == "flat_mean":
             level = axes["level"]
             out += self.signal(level, axes) - level
             if self.law.loses:
                 out += level - self.law.light(level)
         out = np.where(_usual(channel), 0.0, out / _unit(channel, own, gains))
-        if channel.word == "bias_level":
-            # Values are variances relative to white noise; those of frames are their logarithms.
-            what, ratio = axes["what"], out / own / axes["white"]
-            out = np.where(what == "rows", ratio, out)
-            out = np.where(what == "frames", np.log1p(np.maximum(ratio, 0.0)), out)
-        return np.asarray(out)
+        return np.asarray(kind.in_unit(out, own, axes))
 
     def _in_electrons(
         self, channel: Channel, gains: FloatArray, axes: dict[str, NDArray]
@@ -229,28 +214,6 @@ class EffectChain:
         if channel.word == "dark_map":
             axes["after"] = own * axes["after"]
         return own, axes
-
-    def _in_overscan(
-        self, effect: Effect, word: str, axes: dict[str, NDArray], last: int | None
-    ) -> FloatArray:
-        """Mean change of an overscan's last pixels, or of its second half, by an effect [e-]."""
-        out = np.zeros(len(axes["amp"]))
-        if word not in effect.touches:
-            return out
-        depth = self.layout.of_amp(word, axes["amp"]).astype(int)
-        for deep in np.unique(depth[depth > 0]):
-            rows = depth == deep
-            here = {k: v[rows] for k, v in axes.items()}
-            first = deep // 2 if last is None else deep - last
-            pixels = range(first + 1, deep + 1)
-            change = [
-                getattr(effect, word)(
-                    {**here, "k": np.full(rows.sum(), float(k))}, self.layout
-                )
-                for k in pixels
-            ]
-            out[rows] = np.mean(change, axis=0)
-        return out
 
     def spot_change(self, condition: Condition) -> tuple[float, Halo, Mapping[str, float]]:
         """Added variance [pixel^2], halo and axes of spots at a condition."""

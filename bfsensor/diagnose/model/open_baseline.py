@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from bfsensor.device.device import Device
+from bfsensor.diagnose.data.exposure_info import LAMP_ERROR
 from bfsensor.diagnose.data.reduced_channels import StatedTable
 from bfsensor.diagnose.model.baseline import Baseline, read_edges
 from bfsensor.diagnose.model.device_baseline import TABLES, baseline_of_device, write_edges
@@ -25,10 +26,6 @@ from bfsensor.recording.tables.area_changes import AreaChangeTable
 from bfsensor.recording.tables.covariance_tables import CovarianceTable
 from bfsensor.recording.tables.measured import MeasuredTable, read_measured
 from bfsensor.recording.tables.reduced import find_reduced, holds_images
-
-LAMP_ERROR = 1e-3
-"""Relative error of a lamp monitor reading, where campaign.yaml states none. Chosen, to be derived:
-twice as large halves the significance of nonlinearity, drift and loss in the means of flats."""
 
 
 class CampaignSource:

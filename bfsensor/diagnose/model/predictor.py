@@ -15,15 +15,15 @@ from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel, step_of
 from bfsensor.diagnose.data.exposure_info import label_of
 from bfsensor.diagnose.data.map_channels import MapShare
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
+from bfsensor.diagnose.kinds import KINDS
 from bfsensor.diagnose.model.baseline import Baseline
-from bfsensor.diagnose.model.effect_chain import ADDED, EffectChain, layout_of, pad_areas
+from bfsensor.diagnose.model.effect_chain import EffectChain, layout_of, pad_areas
 from bfsensor.diagnose.model.effect_parameters import effects_at, parameters_of
 from bfsensor.diagnose.model.flat_predictions import (
     flat_covariances_of,
     periodic_covariances,
     quadrant,
 )
-from bfsensor.diagnose.model.linear_terms import linear_columns
 from bfsensor.diagnose.model.spot_predictor import SpotPredictor, width_of
 from bfsensor.effects.effect import Effect, Layout, Shot
 from bfsensor.files import Cache
@@ -33,6 +33,95 @@ from bfsensor.typing import FloatArray
 
 Columns = Callable[[Channel], dict[str, FloatArray]]
 """Columns of further linear parameters of a channel, by name, in its unit."""
+
+
+class _AtPoint:
+    """Predictor at values of its parameters, as kinds of channels ask it."""
+
+    def __init__(self, predictor: Predictor, values: FloatArray, only: str | None) -> None:
+        self._predictor, self._values, self._only = predictor, values, only
+        amps = predictor.space.of("gain").sum()
+        self._gains, self.noise = values[:amps], values[amps : 2 * amps]
+        self._chain, self._device = predictor.chain(values), predictor.device(values)
+
+    def covariances(self, channel: Channel) -> FloatArray:
+        """Covariances of flats, or a_ij, with all effects."""
+        gains, chain, device = self._gains, self._chain, self._device
+        baseline = self._predictor.baseline
+        x = channel.axes
+        i, j = x["i"].astype(int), x["j"].astype(int)
+        amp = x["amp"].astype(int)
+        lags = int(max(i.max(), j.max()))
+        out = np.empty(len(channel))
+        for where, rows in self._predictor.rows(channel).items():
+            if channel.unit == PER_ELECTRON:
+                for level in np.unique(x["level"][rows]):
+                    own = rows[x["level"][rows] == level]
+                    a = self._areas(where, float(level))
+                    y, x0 = (n // 2 for n in a.shape)
+                    out[own] = 0.5 * (
+                        a[y + j[own], x0 + i[own]] + a[y - j[own], x0 + i[own]]
+                    )
+                continue
+            pairs = np.stack([amp[rows], x["level"][rows]], axis=1)
+            groups, first, index = np.unique(
+                pairs, axis=0, return_index=True, return_inverse=True
+            )
+            own = gains[groups[:, 0].astype(int)]
+            levels = own * groups[:, 1]
+            if chain is None:
+                a = baseline.flat_areas(where, device, levels)
+                c = flat_covariances_of(a, levels, lags=lags) / own[:, None, None] ** 2
+            else:
+                lit = self._predictor.with_light(channel, gains)
+                axes = {k: v[rows[first]] for k, v in lit.items()} | {"level": levels}
+                axes["level"] = levels = chain.collected(levels, axes)
+                edges = baseline.at(where, device)[0]
+                more = chain.area_change(edges, where)
+                a = baseline.flat_areas(where, device, levels)
+                reach = max(more.shape[-1], a.shape[-1]) // 2
+                a = pad_areas(a, reach) + pad_areas(more, reach)
+                bent = chain.level_change(edges, where, levels)
+                if bent is not None:
+                    a = a + pad_areas(bent, reach)
+                whole = periodic_covariances(a, levels, law=chain.law)
+                c = quadrant(chain.covariances(whole, axes), lags) / own[:, None, None] ** 2
+            c[:, 0, 0] += self.noise[groups[:, 0].astype(int)]
+            out[rows] = c[index.ravel(), j[rows], i[rows]]
+        return out
+
+    def _areas(self, where: Condition, level: float) -> FloatArray:
+        """Area changes [1/e-] at one condition and level, as tables of a_ij hold them."""
+        edges = self._predictor.baseline.edges_on(where, self._device, level)
+        a = area_matrix(*edges)
+        if self._chain is None:
+            return a
+        more = self._chain.area_change(edges, where)
+        a = a * (1 + self._chain.law.bend * level)
+        reach = max(more.shape[-1], a.shape[-1]) // 2
+        a = pad_areas(a, reach) + pad_areas(more, reach)
+        bent = self._chain.level_change(edges, where, np.array([level]), grown=False)
+        return a if bent is None else np.asarray(a + pad_areas(bent[0], reach))
+
+    def spots(self, channel: Channel) -> FloatArray:
+        """Widths, fluxes and wings of spots, with all effects."""
+        one = self._predictor
+        return one.spots.predict(
+            channel, one.rows(channel), self._gains, self._device,
+            self._values[len(self._gains) + len(self.noise) + len(one.baseline.parameters) :],
+            only=self._only, chain=self._chain,
+        )  # fmt: skip
+
+    def map_change(self, channel: Channel) -> FloatArray:
+        """Change of maps by all effects."""
+        return self._chain.map_change(channel) if self._chain else np.zeros(len(channel))
+
+    def added(self, channel: Channel) -> FloatArray:
+        """Change of a channel by all effects, each by its method of that name."""
+        if self._chain is None:
+            return np.zeros(len(channel))
+        axes = self._predictor.with_light(channel, self._gains)
+        return self._chain.added(channel, self._gains, axes)
 
 
 class Predictor:
@@ -113,7 +202,7 @@ class Predictor:
         exact = {
             condition: baseline.at(condition)[1]
             for c in measured.channels if c.word in ("flat_cov", "spot")
-            for condition in self._rows(c)
+            for condition in self.rows(c)
         }  # fmt: skip
         for condition, held in exact.items():
             if not held:
@@ -261,28 +350,7 @@ class Predictor:
         ndarray, shape (n,)
             Prediction in the channel's unit.
         """
-        a = self._amps
-        chain = self.chain(parameters)
-        gains, noise = parameters[:a], parameters[a : 2 * a]
-        count = len(self.baseline.parameters)
-        device = self._device(parameters)
-        if channel.word == "flat_cov":
-            return self._flat_cov(channel, gains, noise, device, chain)
-        if channel.word == "spot":
-            return self.spots.predict(
-                channel, self._rows(channel), gains, device,
-                parameters[2 * a + count :], only=only, chain=chain,
-            )  # fmt: skip
-        out = np.zeros(len(channel))
-        if channel.word == "bias_cov":
-            own = noise[channel.axes["amp"].astype(int)]
-            out = np.where(channel.axes["lag"] == 0, own, 0.0)
-        if chain is not None:
-            if channel.word in ADDED:
-                out = out + chain.added(channel, gains, self._with_light(channel, gains))
-            elif channel.word == "flat_map":
-                out = out + chain.map_change(channel)
-        return out
+        return KINDS[channel.word].predict(channel, _AtPoint(self, parameters, only))
 
     def chain(self, parameters: FloatArray) -> EffectChain | None:
         """Chain of the effects at given parameters; None without effects."""
@@ -295,7 +363,7 @@ class Predictor:
             self.baseline,
             self.kept,
             # Relaxation of patterns hardly depends on gain and device: the start values do.
-            (_mean_gain(self.start[: self._amps]), self._device(self.start)),
+            (_mean_gain(self.start[: self._amps]), self.device(self.start)),
         )
 
     def modes(self, channel: Channel, parameters: FloatArray) -> FloatArray:
@@ -308,9 +376,9 @@ class Predictor:
         if chain is None:
             return np.zeros((len(channel), 0))
         gains = parameters[: self._amps]
-        return chain.modes(channel, gains, self._with_light(channel, gains))
+        return chain.modes(channel, gains, self.with_light(channel, gains))
 
-    def _device(self, parameters: FloatArray) -> dict[str, float]:
+    def device(self, parameters: FloatArray) -> dict[str, float]:
         """Device parameters less their nominal values, in their units."""
         own = parameters[2 * self._amps : 2 * self._amps + len(self.baseline.parameters)]
         return {
@@ -338,11 +406,11 @@ class Predictor:
         """Make the effects with given parameters."""
         return effects_at(self.effects, parameters[self.space.of("effect")])
 
-    def _rows(self, channel: Channel) -> Rows:
+    def rows(self, channel: Channel) -> Rows:
         """Indices of a channel's values by condition; cached, as channels do not change."""
         return self._of_channels.get(("rows", channel), lambda: rows_by_condition(channel))
 
-    def _with_light(self, channel: Channel, gains: FloatArray) -> dict[str, NDArray]:
+    def with_light(self, channel: Channel, gains: FloatArray) -> dict[str, NDArray]:
         """Axes of a channel; for flats also 'light': electrons of a linear response to the lamp."""
         if channel.word not in ("flat_mean", "flat_cov") or channel.unit == PER_ELECTRON:
             return dict(channel.axes)
@@ -355,7 +423,7 @@ class Predictor:
         x = channel.axes
         light = x["time"] * x.get("lamp", np.array(1.0))
         out = np.zeros(len(channel))
-        for rows in self._rows(channel).values():
+        for rows in self.rows(channel).values():
             for amp in np.unique(x["amp"][rows]):
                 here = rows[x["amp"][rows] == amp]
                 ratio = x["level"][here] / np.maximum(light[here], 1e-300)
@@ -366,7 +434,8 @@ class Predictor:
     def depends(self, channel: Channel) -> NDArray[np.bool_]:
         """Mask of the parameters that a channel can depend on; others need no derivative."""
         space = self.space
-        out = space.of(*self._baseline_kinds(channel))
+        changed = any(channel.word in e.touches for e in self.effects)
+        out = space.of(*KINDS[channel.word].depends(channel, changed=changed))
         for n, noisy in enumerate(self._noise_told):
             if not noisy:
                 out[space.rows("noise", n)] = False
@@ -374,19 +443,6 @@ class Predictor:
             if channel.word in effect.touches:
                 out[space.rows("effect", n)] = True
         return out
-
-    def _baseline_kinds(self, channel: Channel) -> tuple[str, ...]:
-        """Kinds of the parameters that a channel depends on without effects, or through their units."""
-        if channel.word == "flat_cov":
-            reduced = channel.unit == PER_ELECTRON
-            return ("device",) if reduced else ("gain", "noise", "device")
-        if channel.word == "spot":
-            return "gain", "device", "width"
-        if channel.word == "flat_mean" and any(
-            "flat_mean" in e.touches for e in self.effects
-        ):
-            return ("gain",)
-        return ("noise",) if channel.word == "bias_cov" else ()
 
     def slope(
         self,
@@ -404,7 +460,7 @@ class Predictor:
             only = str(own.owner)
             moved = self.predict(channel, step, only=only)
             out = np.zeros(len(channel))
-            for condition, rows in self._rows(channel).items():
+            for condition, rows in self.rows(channel).items():
                 if width_of(condition) == only:
                     out[rows] = (moved[rows] - here[rows]) / own.step
             return out
@@ -420,79 +476,10 @@ class Predictor:
 
     def linear(self, channel: Channel) -> dict[str, FloatArray]:
         """Columns of the linear parameters by name; the same name is the same parameter."""
-        out = linear_columns(channel, self._rows(channel), self.measured)
+        out = KINDS[channel.word].columns(channel, self.rows(channel), self.measured)
         for more in self.columns:
             out |= more(channel)
         return out
-
-    def _flat_cov(
-        self,
-        channel: Channel,
-        gains: FloatArray,
-        noise: FloatArray,
-        device: dict[str, float],
-        chain: EffectChain | None,
-    ) -> FloatArray:
-        x = channel.axes
-        i, j = x["i"].astype(int), x["j"].astype(int)
-        amp = x["amp"].astype(int)
-        lags = int(max(i.max(), j.max()))
-        out = np.empty(len(channel))
-        for where, rows in self._rows(channel).items():
-            if channel.unit == PER_ELECTRON:
-                for level in np.unique(x["level"][rows]):
-                    own = rows[x["level"][rows] == level]
-                    a = self._areas(where, float(level), device, chain)
-                    y, x0 = (n // 2 for n in a.shape)
-                    out[own] = 0.5 * (
-                        a[y + j[own], x0 + i[own]] + a[y - j[own], x0 + i[own]]
-                    )
-                continue
-            pairs = np.stack([amp[rows], x["level"][rows]], axis=1)
-            groups, first, index = np.unique(
-                pairs, axis=0, return_index=True, return_inverse=True
-            )
-            own = gains[groups[:, 0].astype(int)]
-            levels = own * groups[:, 1]
-            if chain is None:
-                a = self.baseline.flat_areas(where, device, levels)
-                c = flat_covariances_of(a, levels, lags=lags) / own[:, None, None] ** 2
-            else:
-                lit = self._with_light(channel, gains)
-                axes = {k: v[rows[first]] for k, v in lit.items()} | {"level": levels}
-                axes["level"] = levels = chain.collected(levels, axes)
-                edges = self.baseline.at(where, device)[0]
-                more = chain.area_change(edges, where)
-                a = self.baseline.flat_areas(where, device, levels)
-                reach = max(more.shape[-1], a.shape[-1]) // 2
-                a = pad_areas(a, reach) + pad_areas(more, reach)
-                bent = chain.level_change(edges, where, levels)
-                if bent is not None:
-                    a = a + pad_areas(bent, reach)
-                whole = periodic_covariances(a, levels, law=chain.law)
-                c = quadrant(chain.covariances(whole, axes), lags) / own[:, None, None] ** 2
-            c[:, 0, 0] += noise[groups[:, 0].astype(int)]
-            out[rows] = c[index.ravel(), j[rows], i[rows]]
-        return out
-
-    def _areas(
-        self,
-        where: Condition,
-        level: float,
-        device: dict[str, float],
-        chain: EffectChain | None,
-    ) -> FloatArray:
-        """Area changes [1/e-] at one condition and level, as tables of a_ij hold them."""
-        edges = self.baseline.edges_on(where, device, level)
-        a = area_matrix(*edges)
-        if chain is None:
-            return a
-        more = chain.area_change(edges, where)
-        a = a * (1 + chain.law.bend * level)
-        reach = max(more.shape[-1], a.shape[-1]) // 2
-        a = pad_areas(a, reach) + pad_areas(more, reach)
-        bent = chain.level_change(edges, where, np.array([level]), grown=False)
-        return a if bent is None else np.asarray(a + pad_areas(bent[0], reach))
 
 
 def _mean_gain(gains: FloatArray) -> float:

@@ -30,11 +30,6 @@ from bfsensor.measure.bartlett import bartlett_matrix
 from bfsensor.typing import FloatArray
 from bfsensor.units import to_celsius
 
-LAMP_ERROR = 2e-4
-"""Relative error of the lamp in planned exposures that state none, whatever the campaign's own is.
-Chosen, to be derived: twice as large lowers expected chi-square differences that rest on the lamp, at
-most to a quarter."""
-
 SETTLED = 3
 """Number of fixed-point iterations for the mean of a flat, on which effects depend. Derived: effects
 change the mean by a few per cent, so that each round leaves a few per cent of the error and three
@@ -217,7 +212,8 @@ class Forecaster:
         """Mean level of all planned exposures together, one value for each amplifier."""
         noise = np.nan_to_num(np.array(self.measured.read_noise))
         pixels = np.array([s.rows * s.columns for s in self.measured.segments], float)
-        error = planned.lamp_error if np.isfinite(planned.lamp_error) else LAMP_ERROR
+        own = planned.lamp_error
+        error = own if np.isfinite(own) else self.measured.lamp_error
         last = max(self.measured.shots, key=lambda s: s.number, default=None)
         level = self._rates(condition) * planned.rate * seconds * self._reading(planned)
         for _ in range(SETTLED):

@@ -33,7 +33,7 @@ class Planned:
     lamp : float
         Reading of the lamp monitor, in the campaign's unit.
     lamp_error : float
-        Relative error of that reading.
+        Relative error of that reading; nan: that of the campaign's monitor.
     rate : float
         Light relative to the campaign's.
     overscan : int

@@ -7,17 +7,11 @@ from typing import Any
 
 from bfsensor.diagnose.detect.locate import FAMILY, SMALLEST
 from bfsensor.diagnose.detect.scans import DEVICE, DEVICE_SCAN
+from bfsensor.diagnose.kinds import KINDS
 from bfsensor.effects.gain_drift import KNOTS as TIMES
 from bfsensor.effects.gain_nonlinearity import KNOTS as SIGNALS
 
-NAMES = {
-    DEVICE: "device's parameters",
-    "flat_cov": "covariances of flats", "flat_mean": "mean of flats against the lamp",
-    "flat_map": "flats against position", "serial_overscan": "serial overscan",
-    "parallel_overscan": "parallel overscan", "bias_cov": "noise in readout order",
-    "bias_level": "bias levels", "dark_map": "darks", "spot": "spots",
-    "amp_cross": "amplifiers against one another", "code_hist": "converter codes",
-}  # fmt: skip
+NAMES = {DEVICE: "device's parameters"} | {word: kind.title for word, kind in KINDS.items()}
 """Plain words for each channel."""
 
 CLASS_WORDS = {

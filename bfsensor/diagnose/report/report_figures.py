@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from bfsensor.diagnose.data.channels import PER_ELECTRON
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
+from bfsensor.diagnose.kinds import KINDS
+from bfsensor.diagnose.kinds.channel_kind import Picture
 from bfsensor.diagnose.report.class_words import NAMES
 from bfsensor.diagnose.report.diagnosis_result import Diagnosis
 from bfsensor.plots import residuals as show
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Draw = Callable[["Axes"], None]
 DOTS = 130
 """Resolution of the figures [dots per inch].  Chosen: half a page wide they are sharp on screens and
 paper; twice as many make report.html about four times as large."""
@@ -31,18 +30,6 @@ Chosen: a fifth of an error bar is about the size of a mark; twice as large, few
 SHOWN = 0.02
 """Probability from which on a class is drawn.  Chosen: where a named class is wrong, each of about 40
 other classes has 0.005 to 0.01; half as large, bars of all of them may be drawn."""
-
-LAGS = ((0, 0), (1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
-"""Lags (x, y) [pixel] whose pulls are drawn against level.  Chosen: the nearest, where the
-brighter-fatter effect is largest; more lags make the figure unreadable and change no result."""
-
-
-class Picture(NamedTuple):
-    """One figure: caption, size (width, height) [inch], and panels drawn one below the other."""
-
-    caption: str
-    size: tuple[float, float]
-    parts: tuple[Draw, ...]
 
 
 class Drawn(NamedTuple):
@@ -178,54 +165,10 @@ def _pictures(
             "priors (grey band: 1).", (5.2, 0.9 + 0.32 * len(fit.pulls)),
             (lambda ax: show.draw_parameters(fit.pulls, errors, ax),),
         )  # fmt: skip
-    if "flat_cov" in found:
-        channel, pulls = found["flat_cov"]
-        caption = "Covariances of flats: pulls (residual over standard error) by lag"
-        panels: list[Draw] = [lambda ax: show.draw_lags(channel.axes, pulls, ax)]
-        if channel.unit != PER_ELECTRON:
-            caption += ", weighted by the square of the level, and of the nearest lags against level"
-            panels.append(
-                lambda ax: show.draw_lag_levels(channel.axes, pulls, ax, lags=LAGS)
-            )
-        out["flat_cov"] = Picture(f"{caption}.", (5.2, 3.5 * len(panels)), tuple(panels))
-    if "flat_mean" in found:
-        channel_m, pulls_m = found["flat_mean"]
-        left = channel_m.unwhiten(pulls_m) / np.maximum(channel_m.values, 1e-9)
-        out["flat_mean"] = Picture(
-            "Means of flats: residuals [%] against level [1000 ADU].", (5.2, 3.4),
-            (lambda ax: show.draw_means(channel_m.axes, left, ax),),
-        )  # fmt: skip
-    for word in ("serial_overscan", "parallel_overscan"):
-        if word in found:
-            channel_o, pulls_o = found[word]
-            residual = channel_o.unwhiten(pulls_o)
-            out[word] = Picture(
-                f"{NAMES[word].capitalize()}: residuals of the mean profile [ADU] of the brightest "
-                "flats.", (5.2, 3.4),
-                (lambda ax, c=channel_o, r=residual: show.draw_overscan(c.axes, r, c.errors, ax),),  # type: ignore[misc]
-            )  # fmt: skip
-    if "flat_map" in found:
-        channel_p, pulls_p = found["flat_map"]
-        out["flat_map"] = Picture(
-            "Flats against position, the light's smooth shape removed: pulls of blocks, columns and "
-            "rows.",
-            (5.2, 7.0),
-            (lambda ax: show.draw_map(channel_p.axes, pulls_p, ax, name="all"),
-             lambda ax: show.draw_profile(channel_p.axes, pulls_p, ax, name="all")),
-        )  # fmt: skip
-    if "spot" in found:
-        channel_s, pulls_s = found["spot"]
-        out["spot"] = Picture(
-            "Spots: pulls of widths, flux, asymmetry and wings against flux [million e-].", (5.2, 3.6),
-            (lambda ax: show.draw_spots(channel_s.axes, pulls_s, ax),),
-        )  # fmt: skip
-    if "bias_cov" in found:
-        channel_n, pulls_n = found["bias_cov"]
-        out["bias_cov"] = Picture(
-            "Covariances of the noise in biases: pulls against lag in readout order [pixel].",
-            (5.2, 3.4),
-            (lambda ax: show.draw_noise(channel_n.axes, pulls_n, ax),),
-        )  # fmt: skip
+    for word, kind in KINDS.items():
+        picture = kind.picture(*found[word]) if word in found else None
+        if picture is not None:
+            out[word] = picture
     return out
 
 

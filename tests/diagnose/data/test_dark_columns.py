@@ -10,8 +10,7 @@ import pytest
 
 from bfsensor.diagnose.data.bench_nuisances import assumed_errors
 from bfsensor.diagnose.data.dark_channels import DarkChannels, count_groups
-from bfsensor.diagnose.detect.scans import _darks
-from bfsensor.diagnose.model.linear_terms import linear_columns
+from bfsensor.diagnose.kinds import KINDS
 
 ROWS, COLUMNS, NOISE, BIASES, DARKS = 64, 128, 3.0, 10, 4
 
@@ -85,7 +84,11 @@ def test_every_column_is_looked_at_also_with_one_amplifier(amplifiers):
         "amp": amp, "x": np.tile(np.arange(3), amplifiers), "after": np.zeros(len(amp)),
         "what": np.full(len(amp), "column"),
     }  # fmt: skip
-    found = [p for p in _darks(SimpleNamespace(axes=axes)) if p[0] == "dark columns"]
+    found = [
+        p
+        for p in KINDS["dark_map"].patterns(SimpleNamespace(axes=axes))
+        if p[0] == "dark columns"
+    ]
     assert [(w["amp"], w["x"]) for _, _, w in found] == [
         (n, (x, x + 1)) for n in range(amplifiers) for x in range(3)
     ]
@@ -175,7 +178,7 @@ def test_levels_of_darks_are_held_against_the_dark_current_of_usual_sensors(
         assert not np.char.startswith(what.astype(str), "usual").any()
         return
     # 20 e- in 60 s are 0.33 e-/s; both amplifiers have a dark current of their own.
-    columns = linear_columns(channel, {}, None)
+    columns = KINDS["dark_map"].columns(channel, {}, None)
     known = np.isin(what, ("level", "usual", "usual offset"))
     design = channel.whiten(np.column_stack(list(columns.values())))[known]
     data = channel.whiten(channel.values)[known]
@@ -192,7 +195,7 @@ def test_darks_of_two_temperatures_have_one_dark_current() -> None:
     channel = darks_of(
         images, [60.0] * 4, temperature=[173.15] * 2 + [193.15] * 2
     ).channels((2.0, 2.0))[0]
-    columns = linear_columns(channel, {}, None)
+    columns = KINDS["dark_map"].columns(channel, {}, None)
     level = np.isin(channel.axes["what"], ("level", "usual", "usual offset"))
     design = channel.whiten(np.column_stack(list(columns.values())))[level]
     data = channel.whiten(channel.values)[level]

@@ -7,7 +7,7 @@ from scipy.sparse import csr_array
 from bfsensor.diagnose.data.channels import Channel, Common, join_channels
 from bfsensor.diagnose.data.map_channels import block_side
 from bfsensor.diagnose.data.map_noise import block_noise
-from bfsensor.diagnose.model.map_shapes import Places
+from bfsensor.diagnose.kinds.map_shapes import Places
 from bfsensor.errors import DiagnosisError
 
 DRAWS = 6000

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bfsensor.diagnose.data.code_channels import CodeChannels
-from bfsensor.diagnose.model.linear_terms import linear_columns
+from bfsensor.diagnose.kinds import KINDS
 
 
 def codes_of(rounded, seed=4):
@@ -25,7 +25,7 @@ def codes_of(rounded, seed=4):
 )
 def test_rounding_to_even_is_one_parameter(rounded, prefers):
     channel = codes_of(rounded)
-    (name, column), *more = linear_columns(channel, {}, None).items()
+    (name, column), *more = KINDS[channel.word].columns(channel, {}, None).items()
     assert name == "codes even 0" and not more
     left, shape = channel.whiten(channel.values), channel.whiten(column)
     found = shape @ left / (shape @ shape)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bfsensor.diagnose.data.bias_channels import ROW_ERROR, BiasChannels
-from bfsensor.diagnose.model.linear_terms import linear_columns
+from bfsensor.diagnose.kinds import KINDS
 from bfsensor.effects.bias_instability import BiasByRow
 
 ROWS, COLUMNS, AMPLIFIERS = 64, 120, 2
@@ -48,7 +48,9 @@ def changes(channels):
         if channel.word == "bias_level":
             told = told / x["white"]
         effect.append(channel.whiten(np.where(here, told, 0.0)))
-        column.append(channel.whiten(linear_columns(channel, {}, None)["row noise 1"]))
+        column.append(
+            channel.whiten(KINDS[channel.word].columns(channel, {}, None)["row noise 1"])
+        )
     return np.concatenate(effect), np.concatenate(column)
 
 

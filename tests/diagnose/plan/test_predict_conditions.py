@@ -1,11 +1,16 @@
 """Predictions for exposures that were not fitted, compared with those recorded."""
 
+from copy import copy
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from astropy.table import Table
 
 from bfsensor.diagnose.fit.baseline_fit import fit_bounded
 from bfsensor.diagnose.fit.fitted_model import Model
+from bfsensor.diagnose.plan.forecast import Forecaster
+from bfsensor.diagnose.plan.planned_exposures import Planned
 from bfsensor.diagnose.plan.predict_conditions import (
     predict_conditions,
     read_conditions,
@@ -187,3 +192,18 @@ def test_conditions_that_the_baseline_does_not_hold():
     refuse_unheld(
         read_conditions(["level=40000,wavelength=480,back_bias=-60"]), virtual_baseline()
     )
+
+
+def test_planned_exposures_have_the_error_of_the_campaigns_own_lamp(campaign):
+    """A planned mean scatters by the monitor's stated error, whatever the campaign's is."""
+    before, *_ = campaign
+    planned = Planned("flat", 1, level=4e4)
+    found = {}
+    for error in (1e-4, 1e-3):
+        predictor = copy(before.predictor)
+        predictor.measured = replace(predictor.measured, lamp_error=error)
+        told = Forecaster(predictor, before.fit).forecasts([planned])
+        mean = next(f.channel for f in told if f.channel.word == "flat_mean")
+        found[error] = mean.blocks[0][0, 0], mean.values[0]
+    (less, level), (more, _) = found[1e-4], found[1e-3]
+    assert more - less == pytest.approx((1e-6 - 1e-8) * level**2, rel=1e-2)

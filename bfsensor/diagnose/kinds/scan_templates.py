@@ -55,8 +55,10 @@ def middle(values: FloatArray, weights: FloatArray) -> tuple[float, float]:
 class Group:
     """All channels of one name (folds, conditions) as one table."""
 
-    def __init__(self, word: str, members: list[tuple[Channel, int]]) -> None:
-        self.word, self.members = word, members
+    def __init__(
+        self, word: str, members: list[tuple[Channel, int]], level: str = "level"
+    ) -> None:
+        self.word, self.members, self._level = word, members, level
         names = [n for n in members[0][0].axes if all(n in c.axes for c, _ in members)]
         self.axes = {n: np.concatenate([c.axes[n] for c, _ in members]) for n in names}
         self.size = sum(len(c) for c, _ in members)
@@ -88,7 +90,6 @@ class Group:
         yield from self._whitened(some)
 
     def _whitened(self, patterns: list[_Sparse]) -> Iterator[Template]:
-        flux = "flux" if self.word == "spot" else "level"
         for one, (rows, weights) in zip(
             patterns, self._whitener.whiten(patterns), strict=True
         ):
@@ -98,8 +99,10 @@ class Group:
                 continue
             rows, weights = rows[used], weights[used]
             told = dict(one.where)
-            if "level" in told and flux in self.axes:
-                told["level"] = middle(self.axes[flux][rows].astype(float), weights**2)
+            if "level" in told and self._level in self.axes:
+                told["level"] = middle(
+                    self.axes[self._level][rows].astype(float), weights**2
+                )
             yield Template(one.family, self.word, self.rows[rows], weights, told)
 
 

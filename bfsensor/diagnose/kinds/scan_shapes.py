@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor.diagnose.detect.scan_templates import Group, Pattern
-from bfsensor.diagnose.model.map_shapes import Places
+from bfsensor.diagnose.kinds.map_shapes import Places
+from bfsensor.diagnose.kinds.scan_templates import Group, Pattern
 from bfsensor.typing import FloatArray
 
 OCTAVES = 4
@@ -163,3 +163,10 @@ def boxes(
                     "map": name, "what": "block", "x": (int(low[0]), int(low[0] + wide)),
                     "y": (int(low[1]), int(low[1] + tall)),
                 }  # fmt: skip
+
+
+def amplifiers(x: Mapping[str, NDArray]) -> list[tuple[object, NDArray[np.bool_]]]:
+    """Masks of all amplifiers together, and of each alone."""
+    amps = np.unique(x["amp"])
+    out: list[tuple[object, NDArray[np.bool_]]] = [("all", np.ones(len(x["amp"]), bool))]
+    return out + ([(int(a), x["amp"] == a) for a in amps] if len(amps) > 1 else [])
