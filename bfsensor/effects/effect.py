@@ -380,8 +380,8 @@ class Effect:
     """With what :meth:`light_map`, :meth:`displacements` and :meth:`pattern` change: 'nothing', equal
     in all flats; 'condition', wavelength, back bias and temperature; 'exposure', also time or level."""
     response: ClassVar[str] = "linear"
-    """Dependence of the changes of channels on the amplitude: 'linear'; 'quadratic', with a part of either
-    order; 'rough', not smooth, so that amplitudes at starting points are kept."""
+    """Dependence of the changes of channels on the amplitude: 'linear'; 'quadratic', with a part of
+    either order; 'rough', not smooth, so that amplitudes at starting points are kept."""
     scatters: ClassVar[tuple[str, ...]] = ()
     """Channels whose scatter constrains the amplitude: :meth:`modes` are proportional to it there."""
 
