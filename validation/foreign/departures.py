@@ -6,6 +6,7 @@ signal, a gain with a kink, four nuisances together, sixteen amplifiers with hea
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import NamedTuple
 
@@ -50,10 +51,12 @@ def make_departures(out: Path, sealed: Path) -> list[str]:
     made : list of str
         Their names.
     """
-    made = []
+    made, known = [], {}
     for one in DEPARTURES:
         if not (out / one.name).exists():
             drawn = draw_campaign(one.wish, 0, "", one.name, one.layout)
             write_campaign(out / one.name, drawn, "", sealed / f"{one.name}.json")
             made.append(one.name)
+        known[one.name] = (out / one.name / "commitment.txt").read_text().strip()
+    (out / "commitments.json").write_text(json.dumps(known, indent=2) + "\n")
     return made
