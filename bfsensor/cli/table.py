@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
@@ -28,6 +28,9 @@ from bfsensor.cli.common import (
 )
 from bfsensor.errors import BFSensorError, DeviceError, TableError
 from bfsensor.files import written_whole
+
+if TYPE_CHECKING:
+    from bfsensor.table.table import DistortionTable
 
 
 def _numbers(
@@ -475,17 +478,18 @@ def _effort(plan: Any, result: Any) -> dict[str, Any]:
 
 def _start_assessment(
     plan: Any, executor: Executor | None, checkpoint: Path
-) -> Callable[[], dict[str, float]]:
+) -> Callable[[DistortionTable], dict[str, float]]:
     """Start to measure the errors of a table; they are kept beside its finished levels."""
-    from bfsensor.table.assess import assess
+    from bfsensor.table.assess import assess_sums, mesh_errors
 
     kept = checkpoint / plan.key / "errors.json"
     if kept.exists():
-        return lambda: dict(json.loads(kept.read_text()))
-    pending = executor.submit(assess, plan) if executor is not None else None
+        return lambda table: dict(json.loads(kept.read_text()))
+    pending = executor.submit(assess_sums, plan) if executor is not None else None
 
-    def finish() -> dict[str, float]:
-        errors = pending.result() if pending is not None else assess(plan)
+    def finish(table: DistortionTable) -> dict[str, float]:
+        sums = pending.result() if pending is not None else assess_sums(plan)
+        errors = {**mesh_errors(plan, table), **sums}
         with written_whole(kept, TableError) as beside:
             beside.write_text(json.dumps(errors))
         return errors

@@ -36,7 +36,7 @@ def build_table(
     executor: Executor | None = None,
     checkpoint: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
-    errors: Callable[[], dict[str, float]] | None = None,
+    errors: Callable[[DistortionTable], dict[str, float]] | None = None,
     provenance: dict[str, str] | None = None,
 ) -> DistortionTable:
     """Compute the distortion table of a plan.
@@ -64,8 +64,8 @@ def build_table(
     progress : callable, optional
         Function that is called with (levels done, levels in all).
     errors : callable, optional
-        Function that is called when all levels are solved and returns error estimates for the
-        header, such as :func:`bfsensor.table.assess.assess`.
+        Function that is called with the table when all levels are solved and returns error
+        estimates for its header, such as :func:`bfsensor.table.assess.mesh_errors` of a plan.
     provenance : dict of str to str, optional
         Further entries for the header.
 
@@ -142,7 +142,7 @@ def _solve_table(
     executor: Executor | None,
     checkpoint: Path | None,
     progress: Callable[[int, int], None] | None,
-    errors: Callable[[], dict[str, float]] | None,
+    errors: Callable[[DistortionTable], dict[str, float]] | None,
     provenance: dict[str, str],
 ) -> DistortionTable:
     """Solve every level of a plan and assemble the table."""
@@ -153,7 +153,7 @@ def _solve_table(
             [[getattr(levels[q, b], name) for b in plan.backgrounds] for q in plan.charges]
         )
 
-    return DistortionTable(
+    table = DistortionTable(
         charges=np.array(plan.charges),
         backgrounds=np.array(plan.backgrounds),
         depths=np.array(plan.depths),
@@ -170,7 +170,6 @@ def _solve_table(
             * max(level.error_volts for level in levels.values()),
             "images removed at the corner [%]": 100
             * max(lv.image_share for lv in levels.values()),
-            **(errors() if errors is not None else {}),
         },
         device_text=plan.device.to_toml(),
         provenance={
@@ -185,6 +184,9 @@ def _solve_table(
         symmetric=True,
         drift_field=mean_drift_field(plan.device),
     )
+    if errors is None:
+        return table
+    return dataclasses.replace(table, errors={**table.errors, **errors(table)})
 
 
 def _solve_levels(

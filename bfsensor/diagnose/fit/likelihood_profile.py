@@ -156,7 +156,8 @@ def settle(
     model : Model
         The same, or the one fitted again from a lower point.
     profiles : dict of str to Profile
-        Profiles of that model by the name of the parameter.
+        Profiles of that model by the name of the parameter; none where a fit from their lowest
+        point is not lower, which refutes them, so that linear intervals stand.
     """
     for _ in range(RESTARTS):
         if model.effects[n].changes("modes"):
@@ -174,7 +175,8 @@ def settle(
         except ConvergenceError:
             return model, profiles
         if lower.fit.total > model.fit.total - 0.5 * LOWER:
-            return model, profiles
+            # The whole model is not lower there: moving all others linearly was wrong.
+            return model, {}
         model = lower
     return model, find_profiles(model, n, widths)
 

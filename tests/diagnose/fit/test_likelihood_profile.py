@@ -194,6 +194,15 @@ def test_a_fit_that_cannot_go_on_stays(valleys):
     assert found
 
 
+def test_profiles_that_the_whole_fit_refutes_are_not_reported(valleys):
+    """A fit from the lowest point of a profile that ends where it was: linear errors stand."""
+    began = Fitted([2.6, 1.5])
+    began.with_values = lambda amp, shape: began
+    settled, found = settle(began, 0, WIDTHS)
+    assert settled is began
+    assert found == {}
+
+
 def test_the_lowest_point_is_kept():
     here = valley(bent, [2.6, 1.5])
     assert here.lowest.square == here.square
