@@ -54,22 +54,19 @@ points, at 0.19 (-35 V) none did; the value lies between these."""
 BISECTION = 1e-5
 """Width of the interval at which the bisection of a boundary point ends [um].
 
-Derived: a fiftieth of the tracing error of 5e-4 um that is promised, so that it does not count."""
+Derived: a thirtieth of the tracing error of 3e-4 um that is promised, so that it does not count."""
 
-COARSENESS = 0.35
+COARSENESS = 0.25
 """Step of the forward trace relative to the scale of the field, 0.3 um + 0.12 (z - 1 um).
 
 Measured together with :data:`RATIO`: with steps a sixth as long vertices move by less than
-5e-4 um (``tests/simulate/test_boundaries.py``).  Area changes are then within 0.05 % at lag 1 of
-those with steps a sixth as long, at all depths (ITL and E2V, empty and on 44,000 e-); with 0.5
-within 0.3 %, and single vertices 1e-3 um off, in three quarters of the CPU time; with 0.25 within
-0.02 % (0.08 % of 5,000 e-), in a quarter more."""
+3e-4 um (``tests/simulate/test_boundaries.py``)."""
 
 RATIO = 0.10
 """Step of the backward trace relative to the height above the gates.
 
 Measured together with :data:`COARSENESS`: with steps a sixth as long vertices move by less than
-5e-4 um (``tests/simulate/test_boundaries.py``)."""
+3e-4 um (``tests/simulate/test_boundaries.py``)."""
 
 TURN = 0.3
 """Largest change of the unit vector along the drift within a step, for derivatives of boundaries.
@@ -335,7 +332,7 @@ def find_boundaries(
         Points of a line per pixel, denser towards the corners.
     coarseness, ratio : float
         Relative steps of the forward and backward traces (:data:`COARSENESS`, :data:`RATIO`);
-        the defaults give a tracing error below 5e-4 um.
+        the defaults give a tracing error below 3e-4 um.
     precision : float
         Width [um] of the interval at which the bisection ends; differences between devices need a
         finer one than the default.

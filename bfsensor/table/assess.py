@@ -19,7 +19,7 @@ from bfsensor.simulate.boundaries import (
     find_boundaries,
 )
 from bfsensor.simulate.hole_layer import hole_layer_error
-from bfsensor.simulate.mesh import make_mesh
+from bfsensor.simulate.mesh import array_cells, make_mesh
 from bfsensor.simulate.poisson import Electrostatics, Potential
 from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 from bfsensor.table.levels import _workshop, solve_level
@@ -86,7 +86,8 @@ def mesh_errors(plan: TablePlan, table: DistortionTable | None = None) -> dict[s
         ``mesh (i,j) [%]`` for the centre and the three nearest lags, and
         ``mesh (0,0) on a background [%]`` for a quarter of the full well in all pixels.
     """
-    coarse = replace(plan, cells=plan.cells // 2)
+    x, y = array_cells(plan.device, plan.cells)
+    coarse = replace(plan, cells=(x // 2, y // 2))
     out = {}
     for background, label in ((0.0, ""), (plan.full_well / 4, " on a background")):
         charge, level = plan.full_well / 2, background

@@ -16,6 +16,7 @@ from bfsensor.device.depletion import check_depleted
 from bfsensor.errors import TableError
 from bfsensor.response.light import conversion_depths, storage_height
 from bfsensor.response.periodic_images import PERIOD
+from bfsensor.simulate.mesh import Cells, array_cells
 from bfsensor.simulate.well import full_well
 
 if TYPE_CHECKING:
@@ -57,8 +58,8 @@ class TablePlan:
         Vertices a side between the corners.
     reach : int
         Largest pixel offset.
-    cells : int
-        Mesh cells a pixel.
+    cells : int or tuple of int
+        Mesh cells a pixel, in x, or in x and y (:func:`~bfsensor.simulate.mesh.array_cells`).
     refine_z : int
         Further halvings of the mesh in z.
     full_well : float
@@ -77,7 +78,7 @@ class TablePlan:
     depths: tuple[float, ...]
     vertices: int
     reach: int
-    cells: int
+    cells: Cells
     refine_z: int
     full_well: float
 
@@ -93,7 +94,7 @@ class TablePlan:
                 self.depths,
                 self.vertices,
                 self.reach,
-                self.cells,
+                *array_cells(self.device, self.cells),
                 self.refine_z,
             ]
         )

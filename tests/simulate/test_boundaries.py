@@ -9,7 +9,7 @@ from bfsensor.device.device import Device
 from bfsensor.errors import ConvergenceError, TableError
 from bfsensor.response.vertices import vertex_fractions
 from bfsensor.simulate import boundaries
-from bfsensor.simulate.boundaries import COARSENESS, RATIO, find_boundaries, lowest_depth
+from bfsensor.simulate.boundaries import find_boundaries, lowest_depth
 from bfsensor.simulate.far_field import FarField, image_shifts
 from bfsensor.simulate.mesh import Surfaces, make_mesh
 from bfsensor.simulate.poisson import Electrostatics
@@ -113,19 +113,14 @@ def test_areas_do_not_depend_on_the_number_of_vertices(lines):
 
 def test_tracing_error_is_below_its_bound(solution, lines):
     finer = find_boundaries(
-        solution,
-        [5.0, 10.0, 95.0],
-        reach=3,
-        samples=24,
-        coarseness=COARSENESS / 6,
-        ratio=RATIO / 6,
+        solution, [5.0, 10.0, 95.0], reach=3, samples=24, coarseness=0.25 / 6, ratio=0.1 / 6
     )
     for usual, fine in zip(
         lines.vertices(16, vertex_fractions(16)),
         finer.vertices(16, vertex_fractions(16)),
         strict=True,
     ):
-        assert np.abs(usual - fine).max() < 5e-4
+        assert np.abs(usual - fine).max() < 3e-4
 
 
 def test_whole_and_mirrored_domains_give_the_same_boundaries(device, solution, lines):
