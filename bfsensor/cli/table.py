@@ -340,10 +340,7 @@ def _print_fitted(summary: dict[str, Any], as_json: bool) -> None:
 
 def _describe(plan: Any, model: Any) -> str:
     """Describe the size and the mesh of the table that will be built."""
-    how = "image charges"
-    if model is None:
-        across, along = _cells(plan)
-        how = f"{across} x {along} cells a pixel"
+    how = f"{plan.cells} cells a pixel" if model is None else "image charges"
     return (
         f"{plan.device.name}: full well {plan.full_well:,.0f} e-, {len(plan.charges)} charges x "
         f"{len(plan.backgrounds)} backgrounds x {len(plan.depths)} depths, {how}"
@@ -469,17 +466,10 @@ def _write(
     write_galsim(result, galsim, charge=charge, depth=depth, overwrite=overwrite)
 
 
-def _cells(plan: Any) -> list[int]:
-    """Mesh cells a pixel of a plan, in x and in y."""
-    from bfsensor.simulate.mesh import array_cells
-
-    return list(array_cells(plan.device, plan.cells))
-
-
 def _effort(plan: Any, result: Any) -> dict[str, Any]:
     """Mesh and iterations of the solver, for the summary."""
     return {
-        "cells_a_pixel": _cells(plan),
+        "cells_a_pixel": plan.cells,
         "nodes": result.provenance.get("nodes"),
         "newton_steps": int(result.provenance["newton steps"]),
         "linear_iterations": int(result.provenance["linear iterations"]),

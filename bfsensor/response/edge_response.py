@@ -184,8 +184,7 @@ def solve_response(
     charge : float
         Electrons of the central pixel above the level [e-], not 0; shifts are divided by it.
     cells : int
-        Mesh cells per pixel in x, even, at least 8, to which those in y follow
-        (:func:`~bfsensor.simulate.mesh.array_cells`).
+        Mesh cells per pixel in x and in y, even, at least 8.
     refine_z : int
         Number of times that the mesh in z is halved (:data:`REFINE_Z`), 0 or more.
     period : int

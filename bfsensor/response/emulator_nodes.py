@@ -71,7 +71,7 @@ class Node:
     def key(self) -> str:
         """Digest of everything that determines the result."""
         text = "\n".join([
-            "node 4", bfsensor.__version__, self.device, self.laid_for,
+            "node 3", bfsensor.__version__, self.device, self.laid_for,
             f"{self.level:.9g} {self.cells} {self.refine_z} {self.precision:g}",
             f"{CHARGE} {VERTICES} {REACH}",
             *(f"{n} {s:.9g}" for n, s in zip(self.names, self.steps, strict=True)),

@@ -49,8 +49,8 @@ class Field:
         """
         mesh = potential.mesh
         phi = np.moveaxis(potential.phi, 0, 1)
-        phi, y = _pad(phi, mesh.y, 0, mesh.side_y, mesh.period[1], mesh.cells[1])
-        phi, x = _pad(phi, mesh.x, 2, mesh.side_x, mesh.period[0], mesh.cells[0])
+        phi, y = _pad(phi, mesh.y, 0, mesh.side_y, mesh.period[1], mesh.cells)
+        phi, x = _pad(phi, mesh.x, 2, mesh.side_x, mesh.period[0], mesh.cells)
         phi, z = _pad_z(phi, mesh.z)
         device = potential.device
         surfaces = Surfaces.of(device)

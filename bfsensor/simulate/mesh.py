@@ -20,17 +20,6 @@ if TYPE_CHECKING:
     from bfsensor.device.device import Device
 
 Side = Literal["mirror", "periodic"]
-Cells = int | tuple[int, int]
-"""Mesh cells a pixel: the same number in x and y, or one for each."""
-
-FEWER_IN_Y = 32
-"""Cells a pixel in x from which arrays without dots take half as many in y.
-
-Measured against 64 x 64 cells (three ITL devices, 100,000 e- on an empty array and 96,000 on 44,000
-e-): with 32 x 16, areas up to lag 2 are within 1.1 % from 8 um on (itl_sta3800c within 0.7 %), with 32 x
-32 within 1.3 % (0.5 %), in twice the time of the solver; E2V's dots, which end within a column, need
-the cells: with 48 x 24 its (1, 0) is 3 % off.
-Chosen: from half as many on, 16 x 8 cells are used, which are too few."""
 
 FINE_ABOVE = 0.4
 """Height above the highest silicon surface up to which planes are at their finest [um].
@@ -82,7 +71,7 @@ class Mesh:
         Periodic: the node after the last is the first.
     pitch : tuple of float
         Pixel pitch in x and y [um].
-    cells : tuple of int
+    cells : int
         Mesh cells per pixel in x and in y.
 
     Attributes
@@ -99,7 +88,7 @@ class Mesh:
     side_x: Side
     side_y: Side
     pitch: tuple[float, float]
-    cells: tuple[int, int]
+    cells: int
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -149,7 +138,7 @@ def make_mesh(
     device: Device,
     *,
     pixels: tuple[int, int] = (14, 14),
-    cells: Cells = 16,
+    cells: int = 16,
     symmetric: bool = True,
     centre: tuple[Literal["pixel", "edge"], Literal["pixel", "edge"]] = ("pixel", "pixel"),
     refine_z: int = 0,
@@ -162,8 +151,8 @@ def make_mesh(
         Device to resolve: nodes fall on its gate edges, stops and surfaces.
     pixels : tuple of int
         Period in x and y [pixel], at least 1 each.
-    cells : int or tuple of int
-        Mesh cells per pixel, in x and in y, even, at least 8.
+    cells : int
+        Mesh cells per pixel in x and in y, even, at least 8.
     symmetric : bool
         Mirror planes through the centre (see ``centre``) and half a period from it, a
         quarter of the period; else the whole period with periodic sides and pixel (0, 0)
@@ -197,15 +186,14 @@ def make_mesh(
             f"{device.name}: ripples, an edge or dots off centre leave no mirror planes; solve "
             "the whole period (symmetric=False)"
         )
-    both = (cells, cells) if isinstance(cells, int) else cells
-    if min(both) < 8 or any(n % 2 for n in both):
+    if cells < 8 or cells % 2:
         raise DeviceError(
             f"cells = {cells} must be an even number of at least 8 cells a pixel"
         )
     pitch = (device.pixel.pitch_x, device.pixel.pitch_y)
     axes = []
     for axis in (0, 1):
-        half = _half_pixel_nodes(_segments(device, axis), both[axis] // 2)
+        half = _half_pixel_nodes(_segments(device, axis), cells // 2)
         if symmetric:
             start = 0.0 if centre[axis] == "pixel" else pitch[axis] / 2
             axes.append(
@@ -221,34 +209,7 @@ def make_mesh(
                 ]
             )
     side: Side = "mirror" if symmetric else "periodic"
-    return Mesh(axes[0], axes[1], _z_nodes(device, refine_z), side, side, pitch, both)
-
-
-def array_cells(device: Device, cells: Cells) -> tuple[int, int]:
-    """Cells a pixel, in x and in y, with which arrays of a device are solved.
-
-    Parameters
-    ----------
-    device : Device
-        Device of the array.
-    cells : int or tuple of int
-        Cells in x, to which those in y follow; or both, which are taken as they are.
-
-    Returns
-    -------
-    cells : tuple of int
-        Half as many in y as in x from :data:`FEWER_IN_Y` on, where there are no dots; else equal.
-
-    Examples
-    --------
-    >>> from bfsensor.device.device import Device
-    >>> [array_cells(Device.load(name), 32) for name in ("itl_sta3800c", "e2v_ccd250")]
-    [(32, 16), (32, 32)]
-    """
-    if not isinstance(cells, int):
-        return cells
-    few = cells >= FEWER_IN_Y and cells % 4 == 0 and device.channel_stop.dots is None
-    return cells, cells // 2 if few else cells
+    return Mesh(axes[0], axes[1], _z_nodes(device, refine_z), side, side, pitch, cells)
 
 
 def _segments(device: Device, axis: int) -> list[tuple[float, float]]:

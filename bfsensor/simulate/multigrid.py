@@ -210,8 +210,7 @@ def _coarsen(fine: Coefficients) -> Coefficients | None:
     nz, ny, nx = mesh.shape
     if not (_can_halve(nx, mesh.side_x) and _can_halve(ny, mesh.side_y)):
         return None
-    cells = mesh.cells[0] // 2, mesh.cells[1] // 2
-    coarse_mesh = replace(mesh, x=mesh.x[::2], y=mesh.y[::2], cells=cells)
+    coarse_mesh = replace(mesh, x=mesh.x[::2], y=mesh.y[::2], cells=mesh.cells // 2)
     weights = interpolation_weights(mesh.x, mesh.side_x, mesh.period[0])
     conductor = np.zeros((fine.cx.shape[0], nz, len(coarse_mesh.x) + 2), bool)
     conductor[:, :, 1:-1] = fine.conductor[:, :, 1:-1][:, :, ::2]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bfsensor.simulate.mesh import Cells, Mesh, array_cells, make_mesh
+from bfsensor.simulate.mesh import Mesh, make_mesh
 from bfsensor.simulate.moved_mesh import move_mesh
 from bfsensor.simulate.poisson import TOLERANCE, Electrostatics, Potential
 from bfsensor.simulate.unit_cell import tile
@@ -49,9 +49,8 @@ class PixelArray:
         Mirror-symmetric device.
     period : int
         Pixels from a charge to its periodic image; half of them are solved, between mirror planes.
-    cells : int or tuple of int
-        Mesh cells per pixel in x, even, at least 8, to which those in y follow
-        (:func:`~bfsensor.simulate.mesh.array_cells`); or in x and in y.
+    cells : int
+        Mesh cells per pixel in x and in y, even, at least 8.
     refine_z : int
         Number of times that every interval of the mesh in z is halved, 0 or more.
     laid_for : Device, optional
@@ -84,31 +83,27 @@ class PixelArray:
         device: Device,
         *,
         period: int,
-        cells: Cells,
+        cells: int,
         refine_z: int = 0,
         laid_for: Device | None = None,
     ) -> None:
         model = device if laid_for is None else laid_for
 
-        both = array_cells(model, cells)
-
-        def solver(pixels: int) -> Electrostatics:
-            mesh = make_mesh(model, pixels=(pixels, pixels), cells=both, refine_z=refine_z)
+        def solver(pixels: int, cells: int) -> Electrostatics:
+            mesh = make_mesh(model, pixels=(pixels, pixels), cells=cells, refine_z=refine_z)
             return Electrostatics(device, move_mesh(mesh, model, device))
 
-        self.solver, self.unit_solver = solver(period), solver(1)
+        self.solver, self.unit_solver = solver(period, cells), solver(1, cells)
         self.mesh = self.solver.mesh
         self._units: dict[float, Potential] = {}
         self._coarse: PixelArray | None = None
-        self._near = solver(NEAR) if period > NEAR else None
+        self._near = solver(NEAR, cells) if period > NEAR else None
         self._added: tuple[tuple[float, float], FloatArray] | None = None
-        few = both[0] < _FEWEST_CELLS or both[0] % 4
-        if self._near is not None and not few:
+        if self._near is not None and cells % 4 == 0 and cells >= _FEWEST_CELLS:
             self._coarse = PixelArray(
                 device,
                 period=period,
-                # As many in x as in y first.
-                cells=(both[0] // 2, min(both[0] // 2, both[1])),
+                cells=cells // 2,
                 refine_z=refine_z,
                 laid_for=laid_for,
             )

@@ -74,7 +74,7 @@ class SweepPoint:
     def key(self) -> str:
         """Digest of all inputs of the response: device, charges, mesh, constants, version."""
         text = "\n".join([
-            "sweep 3", bfsensor.__version__, self.device_text,
+            "sweep 2", bfsensor.__version__, self.device_text,
             f"{self.level:.9g} {self.full_pixel:.9g} {self.cells} {CHARGE} {REACH} {VERTICES} "
             f"{self.with_table}",
         ])  # fmt: skip

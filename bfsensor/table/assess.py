@@ -19,7 +19,7 @@ from bfsensor.simulate.boundaries import (
     find_boundaries,
 )
 from bfsensor.simulate.hole_layer import hole_layer_error
-from bfsensor.simulate.mesh import array_cells, make_mesh
+from bfsensor.simulate.mesh import make_mesh
 from bfsensor.simulate.poisson import Electrostatics, Potential
 from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 from bfsensor.table.levels import _workshop, solve_level
@@ -69,10 +69,8 @@ def mesh_errors(plan: TablePlan, table: DistortionTable | None = None) -> dict[s
     """Estimate the mesh error of the nearest area changes, on an empty and a filled array.
 
     Half a full well is solved on the plan's mesh and on one with half as many cells; for an
-    error of second order the finer result is off by a third of the difference.  Where the plan's
-    mesh has fewer cells in y than in x, only those in x are halved, and four thirds of the
-    difference from twice as many in y are added.  On a background the shifts come from the
-    difference of two charge clouds, and the error need not be smooth.
+    error of second order the finer result is off by a third of the difference.  On a background
+    the shifts come from the difference of two charge clouds, and the error need not be smooth.
 
     Parameters
     ----------
@@ -88,9 +86,7 @@ def mesh_errors(plan: TablePlan, table: DistortionTable | None = None) -> dict[s
         ``mesh (i,j) [%]`` for the centre and the three nearest lags, and
         ``mesh (0,0) on a background [%]`` for a quarter of the full well in all pixels.
     """
-    x, y = array_cells(plan.device, plan.cells)
-    coarse = replace(plan, cells=(x // 2, min(x // 2, y)))
-    finer = replace(plan, cells=(x, 2 * y)) if y < x else None
+    coarse = replace(plan, cells=plan.cells // 2)
     out = {}
     for background, label in ((0.0, ""), (plan.full_well / 4, " on a background")):
         charge, level = plan.full_well / 2, background
@@ -101,14 +97,12 @@ def mesh_errors(plan: TablePlan, table: DistortionTable | None = None) -> dict[s
             _area_changes(coarse, charge, level),
             _area_changes(plan, charge, level, table if held is not None else None),
         ]
-        error = np.abs(changes[1] - changes[0]) / 3
-        if finer is not None:
-            error += 4 / 3 * np.abs(_area_changes(finer, charge, level) - changes[1])
-        error *= 100 / np.abs(changes[1])
         lags = ((0, 0), (1, 0), (0, 1), (1, 1)) if background == 0 else ((0, 0),)
         for i, j in lags:
-            at = plan.reach + j, plan.reach + i
-            out[f"mesh ({i},{j}){label} [%]"] = float(error[at])
+            rough, fine = (a[plan.reach + j, plan.reach + i] for a in changes)
+            out[f"mesh ({i},{j}){label} [%]"] = float(
+                100 * abs(fine - rough) / 3 / abs(fine)
+            )
     return out
 
 

@@ -16,7 +16,7 @@ from bfsensor.errors import TableError
 from bfsensor.response.periodic_images import PERIOD
 from bfsensor.simulate.charge_field import ImageCharge
 from bfsensor.simulate.mean_field import mean_drift_field
-from bfsensor.simulate.mesh import array_cells, make_mesh
+from bfsensor.simulate.mesh import make_mesh
 from bfsensor.simulate.poisson import AREA_PER_VOLT
 from bfsensor.table.build_image_charge import build_image_charge_table
 from bfsensor.table.levels import Level, solve_level
@@ -174,7 +174,7 @@ def _solve_table(
         device_text=plan.device.to_toml(),
         provenance={
             "version": bfsensor.__version__,
-            "cells": " x ".join(map(str, array_cells(plan.device, plan.cells))),
+            "cells": str(plan.cells),
             "refine_z": str(plan.refine_z),
             "period": str(PERIOD),
             **_effort(plan, levels.values()),
@@ -235,9 +235,8 @@ def _solve_levels(
 def _effort(plan: TablePlan, levels: Collection[Level]) -> dict[str, str]:
     """Effort of the solver (nodes, CPU time, steps), for the header."""
     nz, ny, nx = make_mesh(
-        plan.device, pixels=(PERIOD, PERIOD), cells=array_cells(plan.device, plan.cells),
-        refine_z=plan.refine_z,
-    ).shape  # fmt: skip
+        plan.device, pixels=(PERIOD, PERIOD), cells=plan.cells, refine_z=plan.refine_z
+    ).shape
     return {
         "nodes": str(nx * ny * nz),
         "levels cpu [s]": f"{sum(level.cpu_seconds for level in levels):.1f}",

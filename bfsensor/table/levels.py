@@ -23,7 +23,7 @@ from bfsensor.response.periodic_images import PERIOD, SAMPLES, without_images
 from bfsensor.response.vertices import vertex_fractions
 from bfsensor.simulate.boundaries import find_boundaries
 from bfsensor.simulate.far_field import FarField
-from bfsensor.simulate.mesh import Cells, Surfaces
+from bfsensor.simulate.mesh import Surfaces
 from bfsensor.simulate.pixel_array import PixelArray
 from bfsensor.table.table_plan import TablePlan
 from bfsensor.typing import FloatArray
@@ -76,7 +76,7 @@ class Level:
 
 
 @lru_cache(maxsize=1)
-def _workshop(device_text: str, cells: Cells, refine_z: int) -> tuple[Any, PixelArray]:
+def _workshop(device_text: str, cells: int, refine_z: int) -> tuple[Any, PixelArray]:
     """Build device and solvers; cached, so that a process does it once for all its levels."""
     from bfsensor.device.device import Device
 

@@ -16,7 +16,6 @@ from bfsensor.device.depletion import check_depleted
 from bfsensor.errors import TableError
 from bfsensor.response.light import conversion_depths, storage_height
 from bfsensor.response.periodic_images import PERIOD
-from bfsensor.simulate.mesh import Cells, array_cells
 from bfsensor.simulate.well import full_well
 
 if TYPE_CHECKING:
@@ -58,8 +57,8 @@ class TablePlan:
         Vertices a side between the corners.
     reach : int
         Largest pixel offset.
-    cells : int or tuple of int
-        Mesh cells a pixel, in x, or in x and y (:func:`~bfsensor.simulate.mesh.array_cells`).
+    cells : int
+        Mesh cells a pixel.
     refine_z : int
         Further halvings of the mesh in z.
     full_well : float
@@ -78,7 +77,7 @@ class TablePlan:
     depths: tuple[float, ...]
     vertices: int
     reach: int
-    cells: Cells
+    cells: int
     refine_z: int
     full_well: float
 
@@ -94,7 +93,7 @@ class TablePlan:
                 self.depths,
                 self.vertices,
                 self.reach,
-                *array_cells(self.device, self.cells),
+                self.cells,
                 self.refine_z,
             ]
         )

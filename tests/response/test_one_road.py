@@ -27,7 +27,6 @@ CODE = {p: p.read_text() for p in Path(bfsensor.__file__).parent.rglob("*.py")}
         ("height of the stored charge", r"^STORAGE_DEPTH = "),
         ("solution of a response", r"^def solve_response\("),
         ("start of an array", r"^class PixelArray"),
-        ("cells of an array in x and y", r"^def array_cells\("),
     ],
 )
 def test_there_is_one_definition(what, pattern):

@@ -218,9 +218,7 @@ def test_mesh_errors_of_a_table_are_of_its_own_levels(plan, monkeypatch):
     monkeypatch.setattr("bfsensor.table.assess.solve_level", solve)
     found = mesh_errors(small, table)
     # The table has no background, of which the error is still said.
-    half, whole = (8, 8), 16
-    assert solved[0] == (half, 8e4, 0.0)
-    assert [cells for cells, *_ in solved[1:]] == [half, whole]
+    assert solved[0] == (8, 8e4, 0.0) and [cells for cells, *_ in solved[1:]] == [8, 16]
     rough, fine = (
         _area_changes(dataclasses.replace(small, cells=c), 8e4, 0.0) for c in (8, 16)
     )

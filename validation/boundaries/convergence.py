@@ -2,8 +2,7 @@
 
 ``python -m validation.boundaries.convergence [--device NAME] [--finest 64] [-o OUT.ecsv]`` solves
 one pixel with 100,000 e- on a period of 6 pixels (up to 64 cells a pixel) and of 12 pixels with the
-images taken out (up to 32, as tables have them), on up to three z meshes, prints the table and
-writes it.
+images taken out (up to 32), on up to three z meshes, prints the table and writes it.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from astropy.table import Table
 from bfsensor.device.device import Device
 from bfsensor.response.vertices import vertex_fractions
 from bfsensor.simulate.boundaries import find_boundaries
-from bfsensor.simulate.mesh import Cells, array_cells, make_mesh
+from bfsensor.simulate.mesh import make_mesh
 from bfsensor.simulate.poisson import Electrostatics
 from bfsensor.simulate.unit_cell import solve_unit_cell, tile
 from bfsensor.table.levels import solve_level
@@ -32,7 +31,7 @@ DEPTHS = (10.0, 50.0, 95.0)
 VERTICES = 16
 
 
-def small_period(device: Device, cells: Cells, refine_z: int) -> list[dict[str, float]]:
+def small_period(device: Device, cells: int, refine_z: int) -> list[dict[str, float]]:
     """Area changes of the centre and the nearest lags on a period of 6 pixels."""
     mesh = make_mesh(device, pixels=(6, 6), cells=cells, refine_z=refine_z)
     solver = Electrostatics(device, mesh)
@@ -41,7 +40,7 @@ def small_period(device: Device, cells: Cells, refine_z: int) -> list[dict[str, 
     start = tile(solve_unit_cell(device, 0.0, cells=cells, refine_z=refine_z), mesh)
     lines = find_boundaries(solver.solve(charges, start=start), DEPTHS, reach=1)
     arrays = lines.vertices(VERTICES, vertex_fractions(VERTICES))
-    return _rows(device, lines.reach, arrays, 6, mesh.cells, refine_z)
+    return _rows(device, lines.reach, arrays, 6, cells, refine_z)
 
 
 def whole_table(device: Device, cells: int, refine_z: int) -> list[dict[str, float]]:
@@ -55,8 +54,9 @@ def whole_table(device: Device, cells: int, refine_z: int) -> list[dict[str, flo
         accuracy=0.05,
     )
     level = solve_level(replace(plan, cells=cells, refine_z=refine_z), CHARGE, 0.0)
-    arrays = level.corners, level.horizontal, level.vertical
-    return _rows(device, 4, arrays, 12, array_cells(device, cells), refine_z)
+    return _rows(
+        device, 4, (level.corners, level.horizontal, level.vertical), 12, cells, refine_z
+    )
 
 
 def _rows(device, reach, arrays, period, cells, refine_z) -> list[dict[str, float]]:
@@ -70,8 +70,7 @@ def _rows(device, reach, arrays, period, cells, refine_z) -> list[dict[str, floa
         row = {
             "device": device.name,
             "period": period,
-            "cells": cells[0],
-            "cells_y": cells[1],
+            "cells": cells,
             "refine_z": refine_z,
             "depth_um": depth,
         }
@@ -97,8 +96,6 @@ def main() -> None:
         meshes = [
             (small_period, cells, 0) for cells in (8, 16, 32, 64) if cells <= args.finest
         ]
-        tables = array_cells(device, 32)
-        meshes += [(small_period, tables, 0)] if tables != (32, 32) else []
         meshes += [(small_period, 16, refine) for refine in (1, 2)]
         meshes += [(whole_table, cells, 0) for cells in (8, 16, 32) if cells <= args.finest]
         meshes += [(whole_table, 16, 1)]
@@ -121,10 +118,7 @@ def _orders(table: Table) -> None:
     """Observed order of each area change on the small period, and the error that is left."""
     for depth in DEPTHS:
         use = (
-            (table["period"] == 6)
-            & (table["refine_z"] == 0)
-            & (table["depth_um"] == depth)
-            & (table["cells"] == table["cells_y"])
+            (table["period"] == 6) & (table["refine_z"] == 0) & (table["depth_um"] == depth)
         )
         part = table[use]
         part.sort("cells")
