@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bfsensor._kernels import carriers as carrier_kernels
-from bfsensor._kernels import relaxation
 from bfsensor.errors import ConvergenceError, DeviceError
 from bfsensor.simulate.discretise import discretise
+from bfsensor.simulate.linear_system import LinearSystem, PixelNodes
 from bfsensor.simulate.mesh import Mesh
 from bfsensor.simulate.multigrid import Multigrid
 from bfsensor.typing import FloatArray
@@ -45,12 +45,6 @@ _MAX_NEWTON = 60
 """Largest number of Newton steps; beyond it a ConvergenceError is raised.
 
 Chosen: twice as many only make a failure take twice as long."""
-
-_MAX_CG = 200
-"""Largest number of conjugate-gradient iterations of a Newton step; the next step goes on from there.
-
-Chosen: a multigrid cycle about halves the error, so that the factor of 1e3 that is asked for takes
-some ten; twice as many change only systems that hardly converge."""
 
 _FORCING = (1e-3, 0.1)
 """Smallest and largest relative error, in the energy norm, of the linear system of a Newton step.
@@ -177,39 +171,27 @@ class Electrostatics:
     def __init__(self, device: Device, mesh: Mesh, *, n_front: int | None = None) -> None:
         self.device = device
         self.mesh = mesh
-        self.coefficients = discretise(device, mesh)
+        coefficients = discretise(device, mesh)
         if n_front is not None:
-            self.coefficients = replace(self.coefficients, n_front=n_front)
-        self.multigrid = Multigrid(self.coefficients)
+            coefficients = replace(coefficients, n_front=n_front)
+        self.coefficients = coefficients
         temperature = device.operating_point.temperature
         self._kt = device.material.thermal_voltage(temperature)
         self._ni = device.material.intrinsic_density(temperature)
         self._fermi_h = device.operating_point.hole_quasi_fermi_level
-        self._pixels_x, self._share_x = _pixel_of_node(
-            mesh.x, mesh.pitch[0], mesh.pixels("x"), mesh.side_x
-        )
-        self._pixels_y, self._share_y = _pixel_of_node(
-            mesh.y, mesh.pitch[1], mesh.pixels("y"), mesh.side_y
-        )
-        nz, ny, nx = mesh.shape
-        self._shape = (ny + 2, nz, nx + 2)
-        front = (ny + 2, self.coefficients.n_front, nx + 2)
-        self._electrons = np.zeros(front)
-        self._holes = np.zeros(front)
-        self._stiffness = np.zeros(front)
-        self._residual = np.zeros(self._shape)
-        self._step = np.zeros(self._shape)
-        self._direction = np.zeros(self._shape)
-        self._product = np.zeros(self._shape)
-        self._preconditioned = np.zeros(self._shape)
-        self._linearised: Potential | None = (
-            None  # whose carriers multigrid and fields hold
-        )
+        self.pixels = PixelNodes(mesh)
+        self.system = LinearSystem(coefficients, self.pixels, self._kt)
+        self._linearised: Potential | None = None  # whose carriers the linear system holds
+
+    @property
+    def multigrid(self) -> Multigrid:
+        """Preconditioner of the linear systems, which counts its cycles."""
+        return self.system.multigrid
 
     @property
     def pixel_shape(self) -> tuple[int, int]:
         """Number of pixels of the domain in y and in x."""
-        return len(self._share_y), len(self._share_x)
+        return self.pixels.shape
 
     def solve(
         self,
@@ -259,11 +241,7 @@ class Electrostatics:
         error = self._newton(phi, count, history, tolerance)
         fermi = self._fermi_levels(phi, count)
         c = self.coefficients
-        carrier_kernels.mobile_charge(
-            phi, c.silicon[:, : c.n_front], c.kind, c.dy, self._pixels_y, self._pixels_x,
-            len(self._share_x), fermi, count > 0, self._fermi_h, self._ni, self._kt,
-            self._electrons, self._holes,
-        )  # fmt: skip
+        self._set_carriers(phi, fermi, count > 0)
         self._check_hole_region()
 
         def inner(a: FloatArray) -> FloatArray:
@@ -275,8 +253,8 @@ class Electrostatics:
             mesh=self.mesh,
             charges=charges,
             phi=inner(phi),
-            electrons=inner(self._electrons),
-            holes=inner(self._holes),
+            electrons=inner(self.system.electrons),
+            holes=inner(self.system.holes),
             silicon=np.moveaxis(silicon[:, :, 1:-1], 1, 0).copy(),
             quasi_fermi=np.where(count > 0, fermi, np.nan).reshape(self.pixel_shape),
             error_volts=error,
@@ -300,19 +278,9 @@ class Electrostatics:
         """
         self._linearised = None
         padded, count = self._padded(phi), self._counts(charges)
-        c = self.coefficients
-        carrier_kernels.mobile_charge(
-            padded, c.silicon[:, : c.n_front], c.kind, c.dy, self._pixels_y, self._pixels_x,
-            len(self._share_x), self._fermi_levels(padded, count), count > 0, self._fermi_h,
-            self._ni, self._kt, self._electrons, self._holes,
-        )  # fmt: skip
-        self._stiffness[...] = 0.0
-        out = np.zeros(self._shape)
-        relaxation.residual(
-            padded, c.source, self._stiffness, c.cx, c.cy, c.cz, c.cd, c.kind, c.north,
-            c.south, c.dy, out,
-        )  # fmt: skip
-        out[:, : c.n_front] += self._holes - self._electrons
+        self._set_carriers(padded, self._fermi_levels(padded, count), count > 0)
+        out = np.zeros(self.system.shape)
+        self.system.unbalance(padded, out)
         return out
 
     def respond(
@@ -345,29 +313,16 @@ class Electrostatics:
         iterations : int
             Number of conjugate-gradient iterations.
         """
-        c = self.coefficients
-        count = self._counts(at.charges)
+        system, count = self.system, self._counts(at.charges)
         if self._linearised is not at:
             self.imbalance(at.phi, at.charges)
-            np.add(self._electrons, self._holes, out=self._stiffness)
-            self._stiffness /= self._kt
-            self.multigrid.set_carriers(self._stiffness)
+            system.linearise()
             self._linearised = at
-        self._residual[...] = unbalanced
+        system.residual[...] = unbalanced
         if start is not None:
-            known = self._padded(start)
-            relaxation.apply_operator(
-                known, self._stiffness, c.cx, c.cy, c.cz, c.cd, c.kind, c.north, c.south, c.dy,
-                self._product,
-            )  # fmt: skip
-            if np.any(count > 0):
-                carrier_kernels.subtract_common_shift(
-                    self._electrons, self._pixels_y, self._pixels_x, len(self._share_x), count,
-                    self._kt, known, np.zeros(count.size), self._product,
-                )  # fmt: skip
-            self._residual -= self._product
-        iterations = self._linear_solve(count, tolerance)
-        change = np.moveaxis(self._step[1:-1, :, 1:-1], 1, 0)
+            system.subtract(self._padded(start), count)
+        iterations = system.solve(count, tolerance)
+        change = np.moveaxis(system.step[1:-1, :, 1:-1], 1, 0)
         return (change.copy() if start is None else change + start), iterations
 
     # -- the pieces ------------------------------------------------------------------
@@ -375,46 +330,37 @@ class Electrostatics:
     def _counts(self, charges: ArrayLike) -> FloatArray:
         """Electrons of each pixel inside the domain."""
         whole = np.broadcast_to(np.asarray(charges, float), self.pixel_shape)
-        return np.asarray(whole * self._share_y[:, None] * self._share_x[None, :]).ravel()
+        shares = self.pixels.share_y[:, None], self.pixels.share_x[None, :]
+        return np.asarray(whole * shares[0] * shares[1]).ravel()
+
+    def _set_carriers(
+        self, phi: FloatArray, levels: FloatArray, filled: NDArray[np.bool_]
+    ) -> None:
+        """Count the carriers of a potential at quasi-Fermi levels, for the linear system."""
+        c, p = self.coefficients, self.pixels
+        carrier_kernels.mobile_charge(
+            phi, c.silicon[:, : c.n_front], c.kind, c.dy, p.y, p.x, len(p.share_x), levels,
+            filled, self._fermi_h, self._ni, self._kt, self.system.electrons,
+            self.system.holes,
+        )  # fmt: skip
 
     def _padded(self, a: FloatArray) -> FloatArray:
         """Copy a field ``[z, y, x]`` into the layout of the kernels, ``[y, z, x]`` with halo."""
-        out = np.zeros(self._shape)
+        out = np.zeros(self.system.shape)
         out[1:-1, :, 1:-1] = np.moveaxis(a, 0, 1)
-        self._fill_halo(out)
+        self.system.fill_halo(out)
         return out
-
-    def _fill_halo(self, a: FloatArray) -> None:
-        relaxation.fill_halo(
-            a, self.mesh.side_x == "periodic", self.mesh.side_y == "periodic"
-        )
 
     def _empty_start(self) -> FloatArray:
         """A first guess without carriers: linear solution, held above the hole level."""
-        c = self.coefficients
-        self._stiffness[...] = 0.0
-        # The multigrid cycles still hold the carriers of the last solution: take them out.
-        self.multigrid.set_carriers(self._stiffness)
-        phi = np.zeros(self._shape)
+        c, system = self.coefficients, self.system
+        system.without_carriers()
+        phi = np.zeros(system.shape)
         conductor = c.conductor[c.kind[1:-1]]
         phi[1:-1] = np.where(conductor, c.source[1:-1] / c.dy[1:-1, None, None], 0.0)
-        self._electrons[...] = 0.0
-        relaxation.residual(
-            phi,
-            c.source,
-            self._stiffness,
-            c.cx,
-            c.cy,
-            c.cz,
-            c.cd,
-            c.kind,
-            c.north,
-            c.south,
-            c.dy,
-            self._residual,
-        )
-        self._linear_solve(np.zeros(1), 1e-3)
-        phi += self._step
+        system.unbalance(phi, system.residual)
+        system.solve(np.zeros(1), 1e-3)
+        phi += system.step
         floor = self._fermi_h - self._kt * np.log(1e3 / self._ni)
         front = phi[:, : c.n_front]
         silicon = c.silicon[c.kind][:, : c.n_front] > 0
@@ -429,24 +375,26 @@ class Electrostatics:
         to start from, or None if there is no such well.
         """
         c = self.coefficients
-        n_px = len(self._share_x)
+        n_px = len(self.pixels.share_x)
         top = np.zeros(charges.size)
         carrier_kernels.highest_potential(
             phi,
             c.silicon[:, : c.n_front],
             c.kind,
-            self._pixels_y,
-            self._pixels_x,
+            self.pixels.y,
+            self.pixels.x,
             n_px,
             top,
         )
         level = top - self._kt * np.log(1e4 / self._ni)
         # A cloud is a plateau: its maximum is within a few kT of the level.  An empty well
         # would hold many times its charge at the level that this density needs.
-        count = charges * (self._share_y[:, None] * self._share_x[None, :]).ravel()
+        count = (
+            charges * (self.pixels.share_y[:, None] * self.pixels.share_x[None, :]).ravel()
+        )
         held = np.zeros(charges.size)
         carrier_kernels.count_electrons(
-            phi, c.silicon[:, : c.n_front], c.kind, c.dy, self._pixels_y, self._pixels_x, n_px,
+            phi, c.silicon[:, : c.n_front], c.kind, c.dy, self.pixels.y, self.pixels.x, n_px,
             level, self._kt, held,
         )  # fmt: skip
         held *= self._ni
@@ -457,7 +405,7 @@ class Electrostatics:
         level = top - _WELL_PER_ELECTRON * charges
         fermi = np.where(new, level, fermi)
         ceiling = level + self._kt * np.log(3e3 / self._ni)
-        py, px = self._pixels_y, self._pixels_x
+        py, px = self.pixels.y, self.pixels.x
         for p in np.nonzero(new)[0]:
             rows = np.nonzero(py == p // n_px)[0]
             columns = np.nonzero(px == p % n_px)[0]
@@ -465,17 +413,17 @@ class Electrostatics:
             here = (c.silicon[c.kind[rows]][:, : c.n_front][:, :, columns]) > 0
             values = phi[block]
             phi[block] = np.where(here, np.minimum(values, ceiling[p]), values)
-        self._fill_halo(phi)
+        self.system.fill_halo(phi)
         return fermi
 
     def _fermi_levels(self, phi: FloatArray, count: FloatArray) -> FloatArray:
         """Quasi-Fermi level [V] at which each pixel holds its count."""
         c = self.coefficients
-        n_px = len(self._share_x)
+        n_px = len(self.pixels.share_x)
         reference = np.zeros(count.size)
         front = c.silicon[:, : c.n_front]
         carrier_kernels.highest_potential(
-            phi, front, c.kind, self._pixels_y, self._pixels_x, n_px, reference
+            phi, front, c.kind, self.pixels.y, self.pixels.x, n_px, reference
         )
         total = np.zeros(count.size)
         carrier_kernels.count_electrons(
@@ -483,8 +431,8 @@ class Electrostatics:
             front,
             c.kind,
             c.dy,
-            self._pixels_y,
-            self._pixels_x,
+            self.pixels.y,
+            self.pixels.x,
             n_px,
             reference,
             self._kt,
@@ -506,8 +454,8 @@ class Electrostatics:
         fermi: FloatArray | None = None,
     ) -> float:
         """Newton's method in place; with ``fermi`` at fixed levels, else at fixed counts."""
-        c = self.coefficients
-        n_px = len(self._share_x)
+        c, system = self.coefficients, self.system
+        n_px = len(self.pixels.share_x)
         front = c.silicon[:, : c.n_front]
         fixed = fermi is not None
         conserved = np.zeros(count.size) if fixed else count
@@ -515,28 +463,18 @@ class Electrostatics:
         expected = np.inf
         for _ in range(_MAX_NEWTON):
             levels = fermi if fermi is not None else self._fermi_levels(phi, count)
-            carrier_kernels.mobile_charge(
-                phi, front, c.kind, c.dy, self._pixels_y, self._pixels_x, n_px, levels, filled,
-                self._fermi_h, self._ni, self._kt, self._electrons, self._holes,
-            )  # fmt: skip
-            self._stiffness[...] = 0.0
-            relaxation.residual(
-                phi, c.source, self._stiffness, c.cx, c.cy, c.cz, c.cd, c.kind, c.north,
-                c.south, c.dy, self._residual,
-            )  # fmt: skip
-            self._residual[:, : c.n_front] += self._holes - self._electrons
-            norm = float(np.sqrt(np.sum(self._residual**2)))
-            np.add(self._electrons, self._holes, out=self._stiffness)
-            self._stiffness /= self._kt
-            self.multigrid.set_carriers(self._stiffness)
+            self._set_carriers(phi, levels, filled)
+            system.unbalance(phi, system.residual)
+            norm = float(np.sqrt(np.sum(system.residual**2)))
+            system.linearise()
             forcing = self._forcing(expected, tolerance)
-            iterations = self._linear_solve(conserved, forcing)
+            iterations = system.solve(conserved, forcing)
             shift = np.zeros(count.size) if fixed else self._common_shift(count)
             taken, asked = carrier_kernels.damped_update(
-                phi, self._step, front, c.kind, self._pixels_y, self._pixels_x, n_px, levels, filled,
+                phi, system.step, front, c.kind, self.pixels.y, self.pixels.x, n_px, levels, filled,
                 self._fermi_h, shift, self._ni, self._kt, _DENSE,
             )  # fmt: skip
-            self._fill_halo(phi)
+            system.fill_halo(phi)
             history.append(NewtonStep(asked, taken, iterations, norm))
             if not np.isfinite(asked):
                 break
@@ -564,83 +502,27 @@ class Electrostatics:
 
     def _common_shift(self, count: FloatArray) -> FloatArray:
         """Mean step of each pixel's electrons [V], with which its quasi-Fermi level moves."""
-        weighted = np.zeros((len(self._share_y), len(self._share_x)))
+        weighted = np.zeros(self.pixel_shape)
+        system = self.system
         moved = np.einsum(
-            "jki,jki->ji", self._electrons, self._step[:, : self.coefficients.n_front]
+            "jki,jki->ji", system.electrons, system.step[:, : self.coefficients.n_front]
         )
-        rows, columns = self._pixels_y >= 0, self._pixels_x >= 0
+        rows, columns = self.pixels.y >= 0, self.pixels.x >= 0
         np.add.at(
             weighted,
-            (self._pixels_y[rows][:, None], self._pixels_x[columns][None, :]),
+            (self.pixels.y[rows][:, None], self.pixels.x[columns][None, :]),
             moved[np.ix_(rows, columns)],
         )
         out = np.zeros(count.size)
         return np.divide(weighted.ravel(), count, out=out, where=count > 0)
 
-    def _linear_solve(self, conserved: FloatArray, forcing: float) -> int:
-        """Conjugate gradients for the Newton step; residual is consumed."""
-        c = self.coefficients
-        n_px = len(self._share_x)
-        self._step[...] = 0.0
-        work = np.zeros(max(conserved.size, 1))
-        residual, direction, product, z = (
-            self._residual,
-            self._direction,
-            self._product,
-            self._preconditioned,
-        )
-        self.multigrid.cycle(residual, z)
-        rz = carrier_kernels.inner(residual, z)
-        if rz <= 0.0:
-            return 0
-        direction[...] = z
-        first = rz
-        has_electrons = bool(np.any(conserved > 0))
-        for iteration in range(1, _MAX_CG + 1):
-            self._fill_halo(direction)
-            curvature = relaxation.apply_operator(
-                direction, self._stiffness, c.cx, c.cy, c.cz, c.cd, c.kind, c.north, c.south,
-                c.dy, product,
-            )  # fmt: skip
-            if has_electrons:
-                curvature -= carrier_kernels.subtract_common_shift(
-                    self._electrons, self._pixels_y, self._pixels_x, n_px, conserved, self._kt,
-                    direction, work, product,
-                )  # fmt: skip
-            carrier_kernels.step_solution(
-                self._step, direction, residual, product, rz / curvature
-            )
-            self.multigrid.cycle(residual, z)
-            new = carrier_kernels.inner(residual, z)
-            if new <= forcing**2 * first:
-                return iteration
-            carrier_kernels.next_direction(direction, z, new / rz)
-            rz = new
-        return _MAX_CG
-
     def _check_hole_region(self) -> None:
         """Refuse holes that reach the plane where they are no longer counted."""
         c = self.coefficients
-        edge = self._holes[:, -1].max(initial=0.0)
-        if edge > 1e-3 * max(self._holes.max(), 1e-3):
+        edge = self.system.holes[:, -1].max(initial=0.0)
+        if edge > 1e-3 * max(self.system.holes.max(), 1e-3):
             raise DeviceError(
                 f"free holes reach z = {self.mesh.z[c.n_front - 1]:.2f} um: the silicon between "
                 "channel stops and back contact is not depleted (raise the back bias or lower "
                 "the background doping)"
             )
-
-
-def _pixel_of_node(
-    nodes: FloatArray, pitch: float, pixels: NDArray[np.int64], side: str
-) -> tuple[NDArray[np.int64], FloatArray]:
-    """Pixel number of every node (with halo; -1 on borders) and each pixel's share inside."""
-    offset = nodes / pitch + 0.5
-    border = np.abs(offset - np.round(offset)) < 1e-6
-    index = np.where(border, -1, np.floor(offset).astype(np.int64) - pixels[0])
-    if side == "periodic":
-        share = np.ones(len(pixels))
-    else:
-        low = np.maximum(nodes[0], (pixels - 0.5) * pitch)
-        high = np.minimum(nodes[-1], (pixels + 0.5) * pitch)
-        share = (high - low) / pitch
-    return np.concatenate([[-1], index, [-1]]), share
