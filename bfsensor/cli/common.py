@@ -33,6 +33,21 @@ def parse_settings(
     return out
 
 
+FIGURES = (".png", ".pdf", ".svg")
+"""Suffixes of figures that commands write."""
+
+
+def parse_figure(
+    ctx: click.Context, param: click.Parameter, value: Path | None
+) -> Path | None:
+    """Refuse a figure of another format before anything is solved."""
+    if value is not None and value.suffix.lower() not in FIGURES:
+        raise click.BadParameter(
+            f"{value.name!r}: a figure's name ends in {', '.join(FIGURES[:-1])} or {FIGURES[-1]}"
+        )
+    return value
+
+
 settings_option = click.option(
     "--set", "settings", multiple=True, callback=parse_settings, metavar="KEY=VALUE",
     help="Change one quantity of the device, with its unit: --set back_bias=-60V. Repeatable.",

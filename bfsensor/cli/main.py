@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from bfsensor.cli.check import check
-from bfsensor.cli.common import LOG, load_device, settings_option, start_log
+from bfsensor.cli.common import LOG, load_device, parse_figure, settings_option, start_log
 from bfsensor.cli.device import device
 from bfsensor.cli.diagnose import diagnose
 from bfsensor.cli.export import export
@@ -167,8 +167,8 @@ def _print_table(rows: Sequence[dict[str, Any]]) -> None:
 @main.command(short_help="Draw a distortion table or a device.")
 @click.argument("source")
 @settings_option
-@click.option("-o", "--output", type=click.Path(path_type=Path),
-              help="Figure to write, .png or .pdf.  [default: SOURCE.png]")  # fmt: skip
+@click.option("-o", "--output", type=click.Path(path_type=Path), callback=parse_figure,
+              help="Figure to write, .png, .pdf or .svg.  [default: SOURCE.png]")  # fmt: skip
 def show(source: str, settings: list[tuple[str, str]], output: Path | None) -> None:
     """Draw figures of SOURCE: a distortion table or a device.
 

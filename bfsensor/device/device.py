@@ -245,6 +245,11 @@ class Device:
             data = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
             raise DeviceError(f"{label}: not TOML: {error}") from None
+        except RecursionError:
+            raise DeviceError(
+                f"{label}: not a device file: values are nested deeper than a device's, which are "
+                "tables of tables of values"
+            ) from None
         try:
             return _parse(data)
         except DeviceError as error:

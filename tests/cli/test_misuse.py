@@ -135,3 +135,37 @@ def test_a_folder_is_to_be_given_as_its_files(run, tmp_path, words):
     found = run("measure", *words, "run_12")
     assert found.exit_code == 2
     assert "run_12 is a folder" in found.output and "run_12/flat_*.fits" in found.output
+
+
+def test_a_figure_of_another_format_is_refused_before_anything_is_solved(run):
+    result = run("show", "itl_sta3800c", "-o", "boundaries.zzz")
+    assert result.exit_code == 2
+    assert "'boundaries.zzz': a figure's name ends in .png, .pdf or .svg" in result.output
+
+
+@pytest.mark.parametrize(
+    ("over", "said"),
+    [
+        (("back_bias=-30V:-70V:1000000000",), "1000000000 values"),
+        ((f"back_bias=-30V:-70V:{'9' * 5000}",), "(5000 digits) values"),
+        (
+            ("back_bias=-30V:-70V:1000", "wavelength=400nm:900nm:1000"),
+            "1000 x 1000 = 1,000,000 points",
+        ),
+    ],
+)
+def test_a_sweep_of_more_points_than_anyone_can_wait_for_is_refused(run, over, said):
+    options = [word for axis in over for word in ("--over", axis)]
+    result = run("sweep", "itl_sta3800c", *options)
+    assert result.exit_code == 1, result.output
+    assert said in result.output and "a sweep has at most 100,000" in result.output
+    assert len(result.output) < 300
+
+
+def test_a_device_file_of_endless_brackets_is_refused(tmp_path):
+    file = tmp_path / "deep.toml"
+    file.write_text("a = " + "[" * 100_000 + "]" * 100_000)
+    with pytest.raises(
+        DeviceError, match=r"deep\.toml: not a device file: values are nested"
+    ):
+        Device.load(str(file))
