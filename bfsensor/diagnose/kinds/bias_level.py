@@ -11,9 +11,7 @@ from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.kinds.bias_cov import row_columns
 from bfsensor.diagnose.kinds.channel_kind import ChannelKind
-from bfsensor.diagnose.kinds.scan_shapes import (
-    amplifiers,
-)
+from bfsensor.diagnose.kinds.scan_shapes import amplifiers
 from bfsensor.diagnose.kinds.scan_templates import Group, Pattern
 from bfsensor.effects.effect import Axes
 from bfsensor.typing import FloatArray

@@ -10,9 +10,7 @@ from bfsensor.diagnose.data.channel_rows import Rows
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.kinds.channel_kind import ChannelKind
-from bfsensor.diagnose.kinds.scan_shapes import (
-    amplifiers,
-)
+from bfsensor.diagnose.kinds.scan_shapes import amplifiers
 from bfsensor.diagnose.kinds.scan_templates import Group, Pattern
 from bfsensor.typing import FloatArray
 

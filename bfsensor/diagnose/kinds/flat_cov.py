@@ -12,9 +12,7 @@ from bfsensor.diagnose.data.channels import PER_ELECTRON, Channel, step_of
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.kinds.bias_cov import noise_columns
 from bfsensor.diagnose.kinds.channel_kind import ChannelKind, ChannelModel, Picture
-from bfsensor.diagnose.kinds.scan_shapes import (
-    own_shapes,
-)
+from bfsensor.diagnose.kinds.scan_shapes import own_shapes
 from bfsensor.diagnose.kinds.scan_templates import Group, Pattern
 from bfsensor.plots import residuals as show
 from bfsensor.typing import FloatArray

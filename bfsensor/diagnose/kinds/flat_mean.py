@@ -12,9 +12,7 @@ from bfsensor.diagnose.data.exposure_info import label_of
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.kinds.channel_kind import ChannelKind, Picture
 from bfsensor.diagnose.kinds.overscan import in_overscan
-from bfsensor.diagnose.kinds.scan_shapes import (
-    amplifiers,
-)
+from bfsensor.diagnose.kinds.scan_shapes import amplifiers
 from bfsensor.diagnose.kinds.scan_templates import Group, Pattern
 from bfsensor.effects.effect import Axes, Effect, Layout
 from bfsensor.plots import residuals as show

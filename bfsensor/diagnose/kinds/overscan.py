@@ -9,9 +9,7 @@ import numpy as np
 from bfsensor.diagnose.data.channels import Channel, step_of
 from bfsensor.diagnose.data.flat_channels import TAIL
 from bfsensor.diagnose.kinds.channel_kind import ChannelKind, Picture
-from bfsensor.diagnose.kinds.scan_shapes import (
-    amplifiers,
-)
+from bfsensor.diagnose.kinds.scan_shapes import amplifiers
 from bfsensor.diagnose.kinds.scan_templates import Group, Pattern
 from bfsensor.effects.effect import Axes, Effect, Layout
 from bfsensor.plots import residuals as show
