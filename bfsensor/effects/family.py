@@ -11,7 +11,7 @@ import hashlib
 import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 from bfsensor.effects.effect import Effect, Layout, Parameter, Seen
 
@@ -87,8 +87,6 @@ class TemplateEffect(Effect):
     """
 
     of: TemplateFamily
-
-    needs: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         for name in ("word", "variant", "source", "parameters"):

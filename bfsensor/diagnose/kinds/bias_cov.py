@@ -66,23 +66,19 @@ class BiasCovariances(ChannelKind):
 
 
 def noise_columns(channel: Channel) -> dict[str, FloatArray]:
-    """Pulses of each amplifier's noise, and levels of its rows, in covariances."""
-    return _pulse_columns(channel) | row_columns(channel)
-
-
-def _pulse_columns(channel: Channel) -> dict[str, FloatArray]:
-    """Covariance of the pulses of each amplifier's noise, where biases show any."""
-    x, shape = channel.axes, channel.axes.get("pulse")
-    if shape is None:
-        return {}
-    own = {int(a): np.where(x["amp"] == a, shape, 0.0) for a in np.unique(x["amp"])}
-    return {f"pulses {amp}": column for amp, column in own.items() if column.any()}
+    """Covariance of the pulses of each amplifier's noise, where biases show any; levels of its rows."""
+    return _by_amplifier(channel, "pulse", "pulses") | row_columns(channel)
 
 
 def row_columns(channel: Channel) -> dict[str, FloatArray]:
     """Variance of the levels of each amplifier's rows, which values of usual sensors hold near 0."""
-    x, shape = channel.axes, channel.axes.get("same_row")
+    return _by_amplifier(channel, "same_row", "row noise")
+
+
+def _by_amplifier(channel: Channel, axis: str, name: str) -> dict[str, FloatArray]:
+    """Columns, one for each amplifier, of the shape that an axis of the channel holds."""
+    x, shape = channel.axes, channel.axes.get(axis)
     if shape is None:
         return {}
     own = {int(a): np.where(x["amp"] == a, shape, 0.0) for a in np.unique(x["amp"])}
-    return {f"row noise {amp}": column for amp, column in own.items() if column.any()}
+    return {f"{name} {amp}": column for amp, column in own.items() if column.any()}
