@@ -87,12 +87,12 @@ def accuracy_rows() -> list[dict[str, Any]]:
 
 
 def faults_of(rows: list[dict[str, Any]]) -> list[str]:
-    """Rows that break the criterion: 0.2 % in variance, 1.5 % in covariances, second order."""
+    """Rows that break the criterion: 0.05 % in variance, 0.4 % in covariances, second order."""
     out = []
     for usual, twice in zip(rows[::2], rows[1::2], strict=True):
         for name in LAGS:
             where = f"{usual['device']} at {usual['mu']:.0f} e-, {name}"
-            limit = 0.002 if name == "variance" else 0.015
+            limit = 0.0005 if name == "variance" else 0.004
             if abs(usual[name]) > limit:
                 out.append(f"{where}: off by {usual[name]:.2%}, more than {limit:.1%}")
             if abs(twice[name]) > 0.35 * abs(usual[name]) + 1e-7:

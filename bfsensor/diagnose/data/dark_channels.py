@@ -363,8 +363,12 @@ def count_tails(
     -------
     counts : list of int
     """
-    away = _away(frames, bias, read_noise, biases)
-    return [int(((a > OUTLIER) & (a < TRACK)).sum()) for a in map(np.abs, away)]
+    counts = []
+    for away in _away(frames, bias, read_noise, biases):
+        tails = (np.abs(away) > OUTLIER) & (np.abs(away) < TRACK)
+        # Pulses of the noise that are as long as tracks are counted with these in darks.
+        counts.append(_count(tails, tails & (away > 0))[0])
+    return counts
 
 
 def count_groups(

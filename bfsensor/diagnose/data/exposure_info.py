@@ -15,6 +15,10 @@ from bfsensor.units import to_celsius
 NUMBERS = ("wavelength", "back_bias", "temperature")
 """Axes of a channel that hold the condition of its values [nm, V, K]; nan where not known."""
 
+REPEATS = 8
+"""Degrees of freedom from which the scatter of repeated measurements is their error.  Chosen: it is then
+known to 25 %; with 16, to 18 %."""
+
 LAMP_ERROR = 1e-3
 """Relative error of a lamp monitor reading, of recordings and of planned ones, where none is stated.
 Chosen, to be derived: twice as large halves the significance of nonlinearity, drift and loss in the

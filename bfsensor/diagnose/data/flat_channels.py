@@ -17,6 +17,7 @@ from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.cosmetics import with_defects
 from bfsensor.diagnose.data.exposure_info import (
     NUMBERS,
+    REPEATS,
     Axes,
     ExposureInfo,
     Frame,
@@ -39,19 +40,18 @@ deferred by more pixels is taken for zero level; with 16, overscans up to 16 pix
 profile."""
 
 CHANCE = 0.01
-"""Probability by white noise alone of the scatter of all overscan profiles between exposures, below
-which that scatter scales their errors.  Chosen: in one of a hundred campaigns errors are wrong by what
-scatter itself is uncertain by; with 0.02, in two."""
+"""Probability by the assumed noise of the scatter between exposures, of overscan profiles or of repeated
+levels, below which that scatter is their error.  Chosen: in one of a hundred campaigns it is, although
+noise is as assumed; with 0.02, in two."""
 
 LAMP_UNKNOWN = 0.02
 """Relative error of the light of an exposure without a lamp monitor, where too few levels are repeated
 to show it.  Chosen, to be derived from shutters and lamps: deviations from linearity below 2 % are then
 no findings; with 0.04, those below 4 %."""
 
-REPEATS = 8
-"""Degrees of freedom from which the scatter of repeated levels is the lamp's error.  Chosen: it is then
-known to 25 %; with 16, to 18 %."""
-
+ALONG = 12
+"""Number of lines of an overscan over which its noise is correlated.  Chosen: pulses of 6 pixels on
+average have 89 % of their correlation there; with 24 it is known 1.4 times less well."""
 
 STRUCK = 10.0
 """Departure of a pixel of a flat from its partner, or in a single flat from the median of its 5 x 5
@@ -443,10 +443,10 @@ class FlatChannels:
         return (mean, matrix) if len(mean) == size else None
 
     def _unevenness(self, name: str) -> dict[int, float]:
-        """Variance of profiles between exposures over that of white noise, by amplifier.
+        """Variance of profiles over that of white noise, by amplifier.
 
-        Rows that fluctuate together, and noise correlated from pixel to pixel, make profiles
-        scatter more than white noise; 1 where no excess of all amplifiers is significant.
+        Pulses of the noise are several pixels long; where profiles scatter more than that between
+        exposures, as where rows fluctuate together, that scatter counts.
         """
         seen: dict[int, list[tuple[float, int]]] = {}
         for (_, _, amp, _), group in self._groups.items():
@@ -455,9 +455,16 @@ class FlatChannels:
                 tied = self._lines[name, amp].correlation
                 seen.setdefault(amp, []).append(_scatter(np.array(profiles), tied))
         out = {amp: 1.0 for _, _, amp, _ in self._groups}
-        every = {amp: np.sum(both, axis=0) for amp, both in seen.items()}
+        if self._pulses.any():
+            out |= {
+                n: lines.length for (word, n), lines in self._lines.items() if word == name
+            }
+        every = {amp: np.sum(both, axis=0) / (out[amp], 1) for amp, both in seen.items()}
         if every and chi2.sf(*np.sum(list(every.values()), axis=0)) < CHANCE:
-            out |= {a: max(float(total / n), 1.0) for a, (total, n) in every.items()}
+            out |= {
+                amp: out[amp] * max(float(total / n), 1.0)
+                for amp, (total, n) in every.items()
+            }
         return out
 
 
@@ -467,10 +474,12 @@ def _mean_time(group: _FlatGroup) -> float:
 
 
 class _Lines:
-    """Accumulates the covariance of the pixels along the depth of an overscan."""
+    """Accumulates the covariance of the pixels of an overscan: along its depth, and between lines."""
 
     def __init__(self) -> None:
         self._sum: FloatArray | float = 0.0
+        self._beside = np.zeros(ALONG + 1)
+        self._count = 0
 
     def add(self, strip: NDArray[np.float32]) -> None:
         """Add an overscan, shape (lines, depth)."""
@@ -480,6 +489,23 @@ class _Lines:
             usual = 1.4826 * float(np.median(np.abs(away)))
             away = np.where(np.abs(away) > STRUCK * max(usual, 0.3), 0.0, away)
             self._sum = self._sum + away.T @ away
+            self._count = len(away)
+            for k in range(min(ALONG + 1, len(away))):
+                self._beside[k] += float((away[: len(away) - k] * away[k:]).sum())
+
+    @property
+    def length(self) -> float:
+        """Variance of a mean over all lines in units of that by white noise.
+
+        Pulses of the noise are several pixels long, which are neighbouring lines of an overscan.
+        """
+        n, products = self._count, self._beside
+        if n <= 4 * ALONG or not products[0] > 0:
+            return 1.0
+        seen = 1.0 + 2.0 * float(products[1:].sum() / products[0])
+        # Lines less the mean of all n are anticorrelated by 1 / (n - 1) where noise is white.
+        pairs = 2.0 * float((1.0 - np.arange(1, ALONG + 1) / n).sum())
+        return seen / (1.0 - (1.0 + pairs - seen) / n)
 
     @property
     def correlation(self) -> FloatArray:

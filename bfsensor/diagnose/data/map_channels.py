@@ -105,6 +105,9 @@ class MapChannels:
         amplifiers: Sequence[tuple[slice, slice]] = (),
     ) -> None:
         self._shape, self._longest, self.fold = shape, longest, fold
+        # Brighter-fatter covariances that leave a box are nearly in proportion to the inverse of
+        # its side: of what a box of LOW has beyond one half as wide, a block has a part more.
+        self._outside = max(1.0 - LOW / block_side(shape), 0.0)
         self._amplifiers = tuple(amplifiers)
         self.sightings: tuple[Mapping[str, Any], ...] = ()
         self._borders: dict[tuple[int, int], Border] = {}
@@ -164,11 +167,9 @@ class MapChannels:
             self._filled |= filled
         noise[~own] = 0.0
         part = max(float(own.mean()), 1e-30)
-        number = _blocks(own, LOW).sum((1, 3))
-        boxes = _blocks(noise, LOW).sum((1, 3), dtype=np.float64)[number > 0]
-        group.low += (
-            float((boxes / np.sqrt(number[number > 0])).var()) if len(boxes) else 0.0
-        )
+        low, near = (_box_variance(noise, own, side) for side in (LOW, LOW // 2))
+        group.low += low
+        group.wide += low + (low - near) * self._outside
         group.high += float(_steps(noise, own).var(dtype=np.float64)) / 2
         modes = rfft2(noise)
         group.power += spectrum_rings(modes, self._shape) / part
@@ -315,11 +316,18 @@ class MapChannels:
             border.cut(image)
             self._keep(border)
         pairs = sum(g.pairs for g in groups)
-        ratio = sum(g.low / max(g.high, 1e-30) * g.pairs for g in groups) / pairs
+        # Pixels' response is smoothed in each flat, so that both ratios follow the flats' weights.
+        ratio, wide = (
+            sum(w * a / max(b, 1e-30) for w, a, b in zip(weights, up, down, strict=True))
+            for up, down in (
+                ([g.low for g in groups], [g.high for g in groups]),
+                ([g.wide for g in groups], [g.low for g in groups]),
+            )
+        )
         long = self._long(groups, weights)
         return _Map(
             image, float(low) + common, np.asarray(power) + common, float(ratio), pairs,
-            max(long - float(low), 0.0),
+            max(long - float(low), 0.0), float(wide),
         )  # fmt: skip
 
     def _long(self, groups: list[_MapGroup], weights: FloatArray) -> float:
@@ -379,7 +387,8 @@ class MapChannels:
         noise = block_noise(good, side)
         mean, x, y = (v.ravel()[noise.kept] for v in (mean, x, y))
         told = {"what": "block", "k": -1.0, "x": x, "y": y}
-        out.append((mean, sigma**2 * noise.covariance, told))
+        of_blocks = single**2 * image.wide + image.long
+        out.append((mean, of_blocks * noise.covariance, told))
         free = without_steps(without_shape(filled), self._amplifiers)
         # Pixels that are filled in go on smoothly: zeros would mix columns and rows into the rings.
         power = ring_power(free) / max(float(measured.mean()), 1e-30)
@@ -425,6 +434,7 @@ class _MapGroup:
     condition: Condition
     time: float
     low: float = 0.0
+    wide: float = 0.0
     high: float = 0.0
     long: float = 0.0
     power: FloatArray = field(default_factory=lambda: np.zeros(RINGS))
@@ -452,7 +462,7 @@ class _Map:
 
     ``ratio``: that variance over the one between neighbours.  The brighter-fatter effect smooths
     the response of single pixels as it does their noise, to first order.  ``long``: excess of the
-    noise in waves of several blocks.
+    noise in waves of several blocks.  ``wide``: noise over a block in units of ``low``.
     """
 
     values: NDArray[np.float32]
@@ -461,6 +471,7 @@ class _Map:
     ratio: float
     pairs: int
     long: float = 0.0
+    wide: float = 1.0
 
     def over(self, other: _Map) -> _Map:
         """Ratio of two maps, less one."""
@@ -468,6 +479,7 @@ class _Map:
             (self.values - other.values) / (1 + other.values), self.low + other.low,
             self.power + other.power, self.ratio, min(self.pairs, other.pairs),
             self.long + other.long,
+            (self.wide * self.low + other.wide * other.low) / max(self.low + other.low, 1e-30),
         )  # fmt: skip
 
 
@@ -485,6 +497,13 @@ def _weights(groups: list[_MapGroup]) -> FloatArray:
 def _steps(image: NDArray, own: NDArray[np.bool_]) -> NDArray:
     """Differences of neighbours along rows, of those that both have values of their own."""
     return np.asarray(np.diff(image, axis=1)[own[:, 1:] & own[:, :-1]])
+
+
+def _box_variance(noise: NDArray, own: NDArray[np.bool_], side: int) -> float:
+    """Noise over boxes of some side [pixel], as a pixel's variance; 0 without a box."""
+    number = _blocks(own, side).sum((1, 3))
+    boxes = _blocks(noise, side).sum((1, 3), dtype=np.float64)[number > 0]
+    return float((boxes / np.sqrt(number[number > 0])).var()) if len(boxes) else 0.0
 
 
 def _blocks(image: NDArray, side: int) -> NDArray:

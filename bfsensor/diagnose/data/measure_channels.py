@@ -341,7 +341,9 @@ def measure_channels(
         np.mean([noise.get(f.name, 0.0) * g for f, g in zip(layout, rough, strict=True)])
     )
     spots = SpotChannels(read_noise=mean_noise, lamp_error=source.lamp_error, start=start)
-    crosstalk, late_crosstalk = CrosstalkChannels(), CrosstalkChannels("held-out")
+    crosstalk, late_crosstalk = (
+        CrosstalkChannels(fold, biases=biases.frames) for fold in ("fit", "held-out")
+    )
     for n, exposure in enumerate(kinds.get("spot", [])):
         held = is_held_out(n, len(kinds["spot"]))
         spot_frames = read(exposure)

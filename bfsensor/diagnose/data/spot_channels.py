@@ -9,8 +9,15 @@ from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
 from bfsensor.device.condition import Condition
+from bfsensor.diagnose.data.bias_channels import STANDS_OUT
 from bfsensor.diagnose.data.channels import FOLDS, Channel
-from bfsensor.diagnose.data.exposure_info import NUMBERS, Axes, ExposureInfo, condition_of
+from bfsensor.diagnose.data.exposure_info import (
+    NUMBERS,
+    REPEATS,
+    Axes,
+    ExposureInfo,
+    condition_of,
+)
 from bfsensor.diagnose.data.flat_channels import LAMP_UNKNOWN
 from bfsensor.diagnose.data.lamp_settings import smoothed_levels
 from bfsensor.diagnose.data.spot_places import PlacedSpots
@@ -26,10 +33,6 @@ STAMP = 11
 WING = 21
 """Side of the larger stamps whose sum is a spot's flux [pixel].  Chosen: with 41 those of
 neighbours 30 pixels apart overlap."""
-
-REPEATS = 8
-"""Degrees of freedom (exposures of equal light less one per group) above which the fluxes' scatter
-between exposures is their error.  Chosen: the scatter is then known to 25 %; with 16, to 18 %."""
 
 CLIP = 8.0
 """Median deviations above which a pixel of a stamp's rim has no part in the background.  Chosen:
@@ -67,10 +70,16 @@ and 6 e-5, which is 3 and 4 standard deviations in two of them if each exposure'
 its own; wings were then named beside three of seven other effects.  Twice as large, wings must hold
 twice the light to be found in many exposures."""
 
+MOMENTS = "skew_x", "skew_y", "wings"
+"""Moments of spots whose mean over an exposure's spots has the error of their scatter."""
+
+PLACES = {name: n for n, name in enumerate(("sigma_x", "sigma_y", *MOMENTS))}
+"""Place of each value in the covariance of an exposure's spots."""
+
 EQUAL = 0.01
-"""Relative difference of exposure times up to which exposures are of equal light.  Chosen: shutters
-differ by less than 2 ms in a second; series of levels differ by more.  With 0.02, series of small
-steps are taken for repeated exposures, and a nonlinear response for scatter."""
+"""Relative difference of exposure time and lamp up to which exposures are of equal light.  Chosen:
+shutters differ by less than 2 ms in a second; series of levels differ by more.  With 0.02, series of
+small steps are taken for repeated exposures, and a nonlinear response for scatter."""
 
 
 class SpotChannels:
@@ -101,6 +110,7 @@ class SpotChannels:
         self._backgrounds: dict[int, float] = {}
         self._zeros: dict[int, float] = {}
         self._counting: dict[int, float] = {}
+        self._scatter: dict[int, tuple[int, FloatArray]] = {}
         self.dropped: dict[str, int] = {}
         self._grids: list[tuple[float, float]] = []
         self.placed: list[PlacedSpots] = []
@@ -171,6 +181,10 @@ class SpotChannels:
         self._counting[exposure.number] = _counting_variance(total, wide) / int(n)
         for name, column in values.items():
             out[name] = (float(column.mean()), float(column.std(ddof=1) / np.sqrt(n)))
+        spread = np.diag([1e-30, 1e-30, *(n * out[name][1] ** 2 for name in MOMENTS)])
+        # Light in a corner of the stamps widens a spot in x and in y.
+        spread[:2, :2] += n * fit.scatter_covariance[:2, :2]
+        self._scatter[exposure.number] = int(n), spread
         phases = np.stack([fit.centre_x[used], fit.centre_y[used]], axis=1)
         self._rows.append((exposure, out, phases, fold))
         self._grids.append(_grid(inside))
@@ -193,7 +207,7 @@ class SpotChannels:
 
     def _channel(self, fold: str) -> Channel:
         values, variances, axes = [], [], Axes()
-        repeat = self._flux_scatter()
+        repeat, scatter_of = self._flux_scatter(), self._pooled()
         # Wings come last, in one block: they have an error in common.
         rows = [
             (exposure, found, what)
@@ -204,13 +218,14 @@ class SpotChannels:
         ]
         for exposure, found, what in rows:
             lamp = exposure.lamp
-            light = (exposure.exposure_time or 0.0) * (1.0 if lamp is None else lamp)
+            light = _light_of(exposure)
             mjd = np.nan if exposure.mjd is None else exposure.mjd
             # Noise that is skew, as of random telegraph signals, has another mean than without
             # its largest values, which count in a flux and not in its background.
             zero = self._zeros[exposure.number]
             value, error = found[what]
-            variance = error**2
+            own = scatter_of[exposure.number]
+            variance = own[PLACES[what], PLACES[what]] if what in PLACES else error**2
             if what == "flux":
                 # Pinholes differ in brightness, and the same ones are seen in all exposures:
                 # the scatter between exposures of equal light beyond what counting makes is the
@@ -242,33 +257,64 @@ class SpotChannels:
             within=1 + EQUAL,
         )  # fmt: skip
         columns["flux"] = fluxes[[place[int(n)] for n in columns["exposure"]]]
-        singles = int(np.sum(columns["what"] != "wings"))
-        blocks = [np.array([[v]]) for v in variances[:singles]]
-        if wings := variances[singles:]:
-            blocks.append(np.diag(wings) + WINGS_ALIKE**2)
+        singles = columns["what"] != "wings"
+        blocks = [
+            scatter_of[int(n)][:2, :2] if kind == "sigma_x" else np.array([[v]])
+            for kind, n, v in zip(
+                columns["what"], columns["exposure"], variances, strict=True
+            )
+            if kind not in ("sigma_y", "wings")
+        ]
+        if not singles.all():
+            blocks.append(np.diag(np.array(variances)[~singles]) + WINGS_ALIKE**2)
         return Channel("spot", np.array(values), tuple(blocks), columns, "", fold)
 
-    def _flux_scatter(self) -> float | None:
-        """Relative scatter of fluxes of equal light beyond that of counting; None with too few.
-
-        Exposure times that differ by less than :data:`EQUAL` are of equal light.
-        """
-        by_condition: dict[Condition, list[tuple[float, float, float]]] = {}
-        for exposure, found, *_ in self._rows:
-            seconds, flux = exposure.exposure_time or 0.0, found["flux"][0]
-            light = (seconds or 1.0) * (exposure.lamp or 1.0)
+    def _alike(self) -> list[list[int]]:
+        """Indices of exposures of one condition whose light differs by less than EQUAL."""
+        by_condition: dict[Condition, list[tuple[float, int]]] = {}
+        for n, (exposure, *_) in enumerate(self._rows):
             rows = by_condition.setdefault(condition_of(exposure), [])
-            rows.append((seconds, flux / light, self._counting[exposure.number] / flux**2))
-        square, number = 0.0, 0
+            rows.append((_light_of(exposure), n))
+        out = []
         for rows in by_condition.values():
-            seconds_of, rate, counting = np.array(sorted(rows)).T
-            longer = np.diff(seconds_of) > EQUAL * seconds_of[1:]
-            for own in np.split(np.arange(len(rate)), np.flatnonzero(longer) + 1):
-                left = len(own) - 1
-                square += float(((rate[own] / rate[own].mean() - 1) ** 2).sum())
-                square -= left * float(counting[own].mean())
-                number += left
+            light, order = (np.array(column) for column in zip(*sorted(rows), strict=True))
+            more = np.diff(light) > EQUAL * light[1:]
+            out += [p.tolist() for p in np.split(order, np.flatnonzero(more) + 1)]
+        return out
+
+    def _flux_scatter(self) -> float | None:
+        """Relative scatter of fluxes of equal light beyond that of counting; None with too few."""
+        square, number = 0.0, 0
+        for group in self._alike():
+            rate, counting = [], []
+            for exposure, found, *_ in (self._rows[n] for n in group):
+                flux = found["flux"][0]
+                rate.append(flux / (_light_of(exposure) or 1.0))
+                counting.append(self._counting[exposure.number] / flux**2)
+            square += float(np.square(np.array(rate) / np.mean(rate) - 1).sum())
+            square -= (len(group) - 1) * float(np.mean(counting))
+            number += len(group) - 1
         return float(np.sqrt(max(square, 0.0) / number)) if number >= REPEATS else None
+
+    def _pooled(self) -> dict[int, FloatArray]:
+        """Covariance of the means of widths and moments over the spots of each exposure.
+
+        Spots of equal light scatter alike, so that their exposures are taken together; one whose
+        spots scatter significantly more, as where particles struck them, has its own.
+        """
+        out = {}
+        for group in self._alike():
+            numbers = [self._rows[n][0].number for n in group]
+            count = np.array([self._scatter[n][0] for n in numbers])
+            spreads = np.array([self._scatter[n][1] for n in numbers])
+            sizes = np.diagonal(spreads, axis1=1, axis2=2)
+            more = 1 + STANDS_OUT * np.sqrt(2.0 / (count - 1))
+            apart = (sizes > more[:, None] * np.median(sizes, axis=0)).any(1)
+            free = np.where(apart, 0.0, count - 1.0)
+            alike = np.tensordot(free, spreads, 1) / max(free.sum(), 1.0)
+            for number, n, own, alone in zip(numbers, count, spreads, apart, strict=True):
+                out[number] = (own if alone else alike) / n
+        return out
 
     @property
     def phases(self) -> list[FloatArray]:
@@ -285,6 +331,13 @@ class SpotChannels:
             return np.inf, 0.0
         pitch, share = np.median(self._grids, axis=0)
         return float(pitch), float(share)
+
+
+def _light_of(exposure: ExposureInfo) -> float:
+    """Exposure time [s] times the lamp's reading, if any; 0 where the time is not known."""
+    return (exposure.exposure_time or 0.0) * (
+        1.0 if exposure.lamp is None else exposure.lamp
+    )
 
 
 def _counting_variance(flux: float, wide: FloatArray) -> float:

@@ -80,8 +80,9 @@ class FlatMaps(ChannelKind):
             ring = here & (x["what"] == "ring")
             if ring.any():
                 # Pixel sizes have power at high frequency, and brighter-fatter feedback relaxes the
-                # pixels' response by amounts that differ between levels and conditions.
-                for power in (2, 4):
+                # pixels' response by amounts that differ between levels and conditions: in long
+                # waves in proportion to k, as area changes fall with the third power of distance.
+                for power in (1, 2, 4):
                     out[f"map {name} rings k{power}"] = np.where(ring, x["k"] ** power, 0.0)
             for n, one in enumerate(_bad_lines(measured)):
                 # Charge that a bad column lacks leaves its neighbours more area, at each level and

@@ -97,3 +97,32 @@ def test_the_far_side_of_a_wide_spot_is_no_crosstalk(width) -> None:
     for channel in out.channels():
         assert np.all(np.abs(channel.values) < 4 * channel.errors)
     assert bool(out.channels()) == (width < 1.5)
+
+
+@pytest.mark.parametrize("biases", [0, 4])
+def test_noise_of_the_mean_bias_counts_once_for_all_exposures(biases: int) -> None:
+    """It is the same in all exposures, whose spots are in the same places."""
+    edge = np.arange(SIZE + 1) - 0.5
+    pulls = []
+    for seed in range(24):
+        rng = np.random.default_rng(8681 + seed)
+        out = CrosstalkChannels(biases=biases)
+        shared = NOISE / 2 * rng.standard_normal((2, SIZE, SIZE))
+
+        def light(start: float, rng=rng) -> np.ndarray:
+            places = np.arange(start, SIZE - 8, PITCH)
+            places += rng.uniform(-0.4, 0.4, len(places))
+            return np.diff(ndtr((edge - places[:, None]) / 1.1), axis=1).sum(0)
+
+        frames = [6e4 * np.outer(light(15.0), light(x)) for x in (12.0, 22.0)]
+        for _ in range(12):
+            images = [
+                f + s + NOISE * rng.standard_normal(f.shape)
+                for f, s in zip(frames, shared, strict=True)
+            ]
+            out.add(images, [NOISE, NOISE])
+        (channel,) = out.channels()
+        pulls += (channel.values / channel.errors).tolist()
+    # With 12 exposures and 4 biases the mean bias has up to three quarters of the variance.
+    assert (np.std(pulls) < 1.3) == bool(biases)
+    assert np.std(pulls) > 0.75

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
+from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.channels import Channel, Common, join_channels
-from bfsensor.diagnose.data.map_channels import block_side
+from bfsensor.diagnose.data.map_channels import LOW, MapChannels, block_side
 from bfsensor.diagnose.data.map_noise import block_noise
 from bfsensor.diagnose.kinds.map_shapes import Places
 from bfsensor.errors import DiagnosisError
@@ -143,3 +144,33 @@ def test_refuses_what_does_not_match():
     with pytest.raises(DiagnosisError, match=r"flat_map: .* 3 values, not 2"):
         Channel("flat_map", np.zeros(2), (np.eye(2),), {"x": np.arange(2)}, "",
                 common=Common.none(3))  # fmt: skip
+
+
+def test_noise_over_blocks_is_larger_than_over_boxes_where_charge_repels_charge() -> None:
+    """Area changes fall with the third power of distance: noise of long waves is the largest."""
+    side = 256
+    here = Condition(wavelength=620.0, back_bias=-60.0, temperature=173.0)
+    fy, fx = np.fft.fftfreq(side)[:, None], np.fft.fftfreq(side)[None]
+    rest = 1 - 0.9 * np.hypot(fy, fx)
+
+    def over(size: int) -> float:
+        """Variance of a box's mean times its pixels, from the spectrum."""
+        box = np.zeros((side, side))
+        box[:size, :size] = 1.0 / size
+        return float(np.mean(np.abs(np.fft.fft2(box)) ** 2 * rest**2))
+
+    maps = MapChannels((side, side), {here: 10.0})
+    rng = np.random.default_rng(8660)
+    for _ in range(40):
+        pair = [
+            np.fft.ifft2(
+                np.fft.fft2(rng.normal(0.0, 5e-3, (side, side))) * rest
+            ).real.astype(np.float32)
+            for _ in range(2)
+        ]
+        maps.add_pair(here, 10.0, *pair, level=1e4)
+    (group,) = maps._groups
+    wanted = over(block_side((side, side))) / over(LOW)
+    # The third power leaves a quarter of the excess: its sum over a box ends slowly.
+    assert group.wide / group.low - 1 == pytest.approx(0.75 * (wanted - 1), abs=0.01)
+    assert wanted > 1.05

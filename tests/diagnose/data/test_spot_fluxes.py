@@ -150,3 +150,41 @@ def test_many_exposures_do_not_make_wings_of_spots_at_the_same_places_surer():
     # The error of a departure that all have alike.
     assert alike @ alike < WINGS_ALIKE**-2
     assert (np.diff(np.flatnonzero(wings)) == 1).all() and wings.sum() == 12
+
+
+def test_widths_have_the_covariance_of_their_scatter():
+    """Light beside spots widens them along x and along y; few spots tell their scatter badly."""
+    rng = np.random.default_rng(1620)
+    channels = SpotChannels(read_noise=4.0, lamp_error=1e-3)
+    y, x = np.indices((SIDE, SIDE))
+    for number in range(60):
+        image = exposure_of(rng, 0.0)
+        # In each exposure half of the spots have a faint neighbour on a diagonal.
+        for cy in range(20, SIDE - 15, PITCH):
+            for cx in range(20, SIDE - 15, PITCH):
+                far = (x - cx - 3) ** 2 + (y - cy - 3) ** 2
+                image += rng.integers(2) * 400.0 * np.exp(-far / 2)
+        assert channels.add(shot_of(number), image) is None
+    (channel,) = channels.channels()
+    kinds = channel.axes["what"]
+    sizes = [channel.values[kinds == w] for w in ("sigma_x", "sigma_y")]
+    told = np.mean([b for b in channel.blocks if len(b) == 2], axis=0)
+    seen = np.cov(sizes)
+    assert told[0, 1] / told[0, 0] == pytest.approx(seen[0, 1] / seen[0, 0], abs=0.2)
+    np.testing.assert_allclose(np.diag(told), np.diag(seen), rtol=0.5)
+
+
+def test_an_exposure_that_scatters_more_has_errors_of_its_own():
+    rng = np.random.default_rng(1621)
+    channels = SpotChannels(read_noise=4.0, lamp_error=1e-3)
+    for number in range(6):
+        image = exposure_of(rng, 0.0)
+        if number == 3:
+            struck = image[20::PITCH, 22::PITCH]
+            struck += 6000.0 * rng.random(struck.shape)
+        assert channels.add(shot_of(number), image) is None
+    (channel,) = channels.channels()
+    errors = channel.errors[channel.axes["what"] == "skew_x"]
+    others = np.delete(errors, 3)
+    assert errors[3] > 3 * others.max()
+    np.testing.assert_allclose(others, others[0], rtol=0.05)
