@@ -13,6 +13,7 @@ import difflib
 import json
 import logging
 import os
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -60,6 +61,11 @@ _OPTIONAL = ("material", "well", "transport", "edge", "image_charge")
 there is no edge and no image-charge model."""
 
 
+PARTS = 64
+"""Largest number of parts of a dotted key in a device file.  Chosen: keys of devices have at most 3, and
+50,000 parts take minutes to parse; with 128 nothing changes for a reader."""
+
+_DOTTED = re.compile(rf"(?:[\w-]+[ \t]*\.[ \t]*){{{PARTS}}}")
 _LOG = logging.getLogger("bfsensor")
 
 _EINSTEIN: set[str] = set()
@@ -241,6 +247,12 @@ class Device:
                 text = path.read_text(encoding="utf-8")
             except (OSError, ValueError) as error:
                 raise DeviceError(f"{path}: cannot be read: {error}") from None
+        # The parser takes a time in proportion to the square of a dotted key's parts.
+        if long := _DOTTED.search(text):
+            raise DeviceError(
+                f"{label}: not a device file: the key {long.group()[:30]}... has more than {PARTS} "
+                "parts; a device's have at most 3"
+            )
         try:
             data = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:

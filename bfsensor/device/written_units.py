@@ -61,6 +61,10 @@ def to_internal(text: str, kind: str) -> float:
     try:
         times, over = _ratio(quantity.unit, unit)
         return float(quantity.value) * times / over
+    except OverflowError:
+        raise DeviceError(
+            f"{text!r} has a unit of no finite size; expected one of {kind}, such as {_name(kind)}"
+        ) from None
     except u.UnitConversionError:
         expected = f"a unit such as {_name(kind)}" if kind != "number" else "no unit"
         raise DeviceError(f"{text!r} is not a {kind}; expected {expected}") from None
@@ -73,6 +77,8 @@ def _ratio(given: u.UnitBase, wanted: u.UnitBase) -> tuple[float, float]:
     1e-8 is not a float, 1e8 is: '1e12 cm-2' becomes 1e4 only by a division.
     """
     size = float(given.to(wanted))
+    if not 0 < size < np.inf:
+        raise OverflowError
     power = round(np.log10(size))
     if abs(power) <= 22 and np.isclose(size, 10.0**power, rtol=1e-13, atol=0):
         return (10.0**power, 1.0) if power >= 0 else (1.0, 10.0**-power)

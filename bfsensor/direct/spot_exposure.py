@@ -110,7 +110,11 @@ class SpotPlan(ExposurePlan):
 
     def __post_init__(self) -> None:
         """Refuse values outside their limits."""
-        self._check(peak=(1.0, 1e7), sigma=(0.1, 1000.0))
+        limits = {"peak": (1.0, 1e7), "sigma": (0.1, 1000.0)}
+        if self.wavelength is not None:
+            # The range in which silicon's absorption is known.
+            limits["wavelength"] = (250.0, 1450.0)
+        self._check(**limits)
         pitch = max(self.device.pixel.pitch_x, self.device.pixel.pitch_y)
         if self.pixels * pitch < 6.0 * self.sigma + pitch:
             raise DeviceError(

@@ -25,6 +25,12 @@ Axes = Mapping[str, NDArray]
 Seen = Mapping[str, Any]
 
 
+STRONG = 100.0
+"""Factor on the top of an amplitude's plausible range up to which fits may go.  Chosen: the strongest
+effects of campaigns by another bench are 13 times (loss of charge) and 22 times (coupling) the top;
+with 1000, fits of other classes would run to strengths at which predictions overflow."""
+
+
 class Parameter(NamedTuple):
     """One parameter of an effect: name, unit and plausible range.
 
@@ -72,6 +78,24 @@ class Parameter(NamedTuple):
     step: float = 0.0
     plain: float | None = None
     ends: tuple[float, float] = (-np.inf, np.inf)
+
+    @property
+    def widest(self) -> tuple[float, float]:
+        """Range of the value in fits: that of ``low`` and ``high`` widened, within the ends."""
+        if self.law == "log":
+            low = (
+                -STRONG * self.high
+                if self.signed
+                else 0.0
+                if self.amplitude
+                else 0.3 * self.low
+            )
+            high = STRONG * self.high if self.amplitude else 3 * self.high
+            range_ = self.neutral + low, self.neutral + high
+        else:
+            reach = 0.5 * (self.high - self.low)
+            range_ = self.low - reach, self.high + reach
+        return max(range_[0], self.ends[0]), min(range_[1], self.ends[1])
 
 
 class Segment(NamedTuple):

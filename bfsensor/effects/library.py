@@ -46,6 +46,7 @@ from bfsensor.effects.trap_serial import GradualTrap, TrapSerial, TwoTimesTrap
 from bfsensor.effects.tree_rings import RadialTreeRings, TreeRings, UnevenTreeRings
 from bfsensor.effects.voltage_dependence import VoltageDependence
 from bfsensor.errors import EffectError
+from bfsensor.text_files import one_line
 
 LIBRARY: tuple[type[Effect], ...] = (
     AdcBits,
@@ -152,7 +153,10 @@ def make_effect(word: str, values: Mapping[str, float], variant: str = "") -> Ef
     for kind in LIBRARY:
         if (kind.word, kind.variant) == (word, variant):
             return kind(values)
-    known = ", ".join(sorted({f"{k.word}:{k.variant}".rstrip(":") for k in LIBRARY}))
+    known = sorted({f"{k.word}:{k.variant}".rstrip(":") for k in LIBRARY})
+    own = [name for name in known if name.partition(":")[0] == word]
+    given = one_line(f"{word}{':' * bool(variant)}{variant}", 60)
     raise EffectError(
-        f"effect {word}{':' * bool(variant)}{variant} is not in the library, which has {known}"
+        f"effect {given} is not in the library, which has "
+        + (", ".join(own) if own else f"{len(known)} others: see bfsensor.effects.LIBRARY")
     )

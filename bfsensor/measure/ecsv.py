@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
 import numpy as np
 from astropy.table import Column, Table
-from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 
 from bfsensor.errors import MeasurementError
 from bfsensor.files import refuse_existing, written_whole
+from bfsensor.text_files import UnreadableTextError
+from bfsensor.text_files import read_ecsv as read_any
 
 
 def same_fields(one: Any, other: Any) -> bool:
@@ -98,16 +98,9 @@ def read_ecsv(
         the message names.
     """
     try:
-        with warnings.catch_warnings():
-            # astropy only warns of a column whose type does not exist.
-            warnings.simplefilter("error", AstropyUserWarning)
-            table = Table.read(path, format="ascii.ecsv")
-    # astropy raises several classes of exception for damaged headers.
-    except (
-        OSError, ValueError, TypeError, KeyError, AttributeError, AstropyUserWarning
-    ) as error:  # fmt: skip
-        line = " ".join(str(error).split())[:200]
-        raise MeasurementError(f"{path}: not readable as ECSV: {line}") from None
+        table = read_any(path)
+    except UnreadableTextError as error:
+        raise MeasurementError(f"{path}: not readable as ECSV: {error}") from None
     # Older files of curves and fits have the schema under 'kind'.
     found = table.meta.get("schema", table.meta.get("kind"))
     if found != schema:

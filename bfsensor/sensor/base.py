@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -25,6 +26,10 @@ from bfsensor.typing import FloatArray
 
 _EMPTY = np.zeros(0)
 """Array in place of slopes or wavelengths that photons do not carry (by definition empty)."""
+
+MOST_FLUX = 1e15
+"""Largest flux of one photon [e-].  Chosen: ten orders of magnitude above full wells, and far below what
+overflows single precision; with 2e15 images of such photons are still finite."""
 
 _BAND = 512 * 512
 """Number of pixels whose areas are computed together, in double precision.
@@ -339,6 +344,15 @@ class EngineSensor(galsim.SiliconSensor):
             )  # fmt: skip
             times_pattern_areas(moved, self._physics.edges, out)
             areas[first : first + len(out)] = out
+        if areas.size and not areas.min() > 0:
+            y, x = np.unravel_index(int(np.argmin(areas)), areas.shape)
+            warnings.warn(
+                f"areas: pixel ({x + image.xmin}, {y + image.ymin}) has the area {areas[y, x]:g}: "
+                f"charge of {np.abs(array).max():g} e- displaces a boundary beyond the opposite one, "
+                "where shifts in proportion to charge mean nothing",
+                galsim.GalSimWarning,
+                stacklevel=2,
+            )
         return galsim.Image(
             areas,
             xmin=image.bounds.xmin,
@@ -469,6 +483,14 @@ def _light(photons: galsim.PhotonArray) -> tuple[Light, int]:
                 f"{photons.flux[first]} ({np.count_nonzero(wrong)} of {len(array)} photons)"
             )
         kept = good if kept is None else kept & good
+    flux = arrays["flux"]
+    # One product of a vector with itself costs less than a search for its largest value.
+    if not float(flux @ flux) < MOST_FLUX**2 and np.abs(flux).max(initial=0.0) > MOST_FLUX:
+        first = int(np.argmax(np.abs(flux)))
+        raise SensorError(
+            f"photon {first}: flux = {flux[first]:g} e- must be at most {MOST_FLUX:g} e-, which no "
+            "pixel holds"
+        )
     dropped = 0
     if kept is not None:
         dropped = int(np.count_nonzero(~kept))

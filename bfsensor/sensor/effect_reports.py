@@ -12,6 +12,7 @@ from typing import Any
 from bfsensor.effects.effect import STAGES, Effect, Layout, Segment, Shot
 from bfsensor.errors import EffectError, SensorError
 from bfsensor.sensor.options import shown, to_float
+from bfsensor.text_files import one_line
 from bfsensor.units import to_celsius, to_kelvin
 
 SCHEMA = "bfsensor-diagnosis-1"
@@ -91,8 +92,9 @@ def _read_report(path: str) -> dict[str, Any]:
         raise SensorError(
             f"effects: {path}: cannot be read: {error.strerror or error}"
         ) from None
-    except ValueError as error:
-        raise SensorError(f"{path}: not a report.json: {error}") from None
+    # Endless brackets leave no stack, whole numbers of thousands of digits are ValueErrors.
+    except (ValueError, RecursionError) as error:
+        raise SensorError(f"{path}: not a report.json: {one_line(error)}") from None
     if not isinstance(report, dict):
         raise SensorError(f"{path}: not a report.json: it holds no object")
     return report
@@ -125,9 +127,19 @@ def _make(entry: Any, where: str) -> Effect:
         ]  # fmt: skip
         variant = own[0] if len(own) == 1 else ""
     try:
-        return make_effect(word, values, variant)
+        effect = make_effect(word, values, variant)
     except EffectError as error:
         raise SensorError(f"{where}: {error}") from None
+    for p in effect.parameters:
+        low, high = p.widest
+        # Reports hold numbers of 12 digits, also at the end of a range.
+        more = 1e-9 * max(abs(low), abs(high))
+        if not low - more <= effect[p.name] <= high + more:
+            raise SensorError(
+                f"{where}: {effect.name}: {p.name} = {effect[p.name]:g} must be from {low:g} to "
+                f"{high:g}, the range of fits"
+            )
+    return effect
 
 
 def write_entries(effects: Iterable[Effect]) -> list[dict[str, Any]]:

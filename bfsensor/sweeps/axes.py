@@ -146,7 +146,8 @@ def _number(name: str, text: str, kind: str, unit: str) -> float:
         if not kind:
             return float(int(text))
         # Raises the error that names the fault of the text.
-        to_internal(text, kind)
+        if not np.isfinite(to_internal(text, kind)):
+            raise DeviceError(f"{text!r} must be a finite value")
         # Fifteen digits remove the round-off of the conversion: 0.08 mm are 80 um, not
         # 80.00000000000001 um.
         return float(f"{u.Quantity(text).to_value(u.Unit(unit)):.15g}")

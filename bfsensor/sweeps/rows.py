@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from bfsensor.errors import SweepError
 from bfsensor.files import refuse_existing, written_whole
 from bfsensor.sweeps.axes import Swept
+from bfsensor.text_files import UnreadableTextError, read_ecsv
 from bfsensor.typing import FloatArray
 
 LAGS = 3
@@ -236,8 +237,8 @@ class DeviceSweep:
             No such file, not ECSV, or of another schema; the message names the file.
         """
         try:
-            rows = Table.read(path, format="ascii.ecsv")
-        except (OSError, ValueError) as error:
+            rows = read_ecsv(path)
+        except UnreadableTextError as error:
             raise SweepError(f"{path}: not a sweep: {error}") from None
         if rows.meta.get("schema") != SCHEMA:
             raise SweepError(

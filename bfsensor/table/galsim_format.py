@@ -368,6 +368,13 @@ def _read_outlines(dat: Path, n: int, nv: int, pitch: tuple[float, float]) -> Fl
             f"{dat}: pixels are not listed column by column, {pitch[0]:g} x "
             f"{pitch[1]:g} um apart"
         )
+    far = (np.abs(rows[:, 3:] - rows[:, :2]) >= pitch).any(1)
+    if far.any():
+        line = int(np.argmax(far))
+        raise TableError(
+            f"{dat}: line {line + 2}: the vertex ({rows[line, 3]:g}, {rows[line, 4]:g}) um lies a "
+            f"pixel or more from the middle of its pixel ({int(far.sum())} of {count} vertices)"
+        )
     return np.roll(grid[..., 3:] - centre, -(nv // 2), axis=2)
 
 

@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from scipy.ndimage import gaussian_filter
 
 from bfsensor.diagnose.data.bias_channels import _row_excess
-from bfsensor.diagnose.model.effect_parameters import fitted, widened
+from bfsensor.diagnose.model.effect_parameters import fitted
 from bfsensor.diagnose.model.flat_predictions import periodic_covariances
 from bfsensor.effects.dark_pixels import usual_noise
 from bfsensor.effects.effect import Layout, Segment, Shot
@@ -513,7 +513,7 @@ def test_predictions_are_numbers_at_the_ends_of_ranges(kind):
     for start in kind.starts(LAYOUT)[:1]:
         plain = kind(start)
         for p in fitted(plain):
-            for end in widened(p):
+            for end in p.widest:
                 if p.amplitude or not np.isfinite(end):
                     continue
                 effect = plain.with_values(**{p.name: end})

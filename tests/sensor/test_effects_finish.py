@@ -119,7 +119,7 @@ def test_variants_are_known_by_their_parameters(monkeypatch):
             "q = .* has no number",
         ),
         ([entry("charge_loss", q=float("nan"))], "q = nan is not finite"),
-        ([entry("charge_loss", q=-1e-7)], "a loss of at least 0"),
+        ([entry("charge_loss", q=-1e-7)], r"q = -1e-07 must be from 0 to"),
         ([entry("tearing")], "tearing.*layout="),
         (
             [Shade({"dt": 1.0}), Rough({"amp": 0.1})],

@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.detect.scatter import scatter_of
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
-from bfsensor.diagnose.model.effect_parameters import fitted, widened
+from bfsensor.diagnose.model.effect_parameters import fitted
 from bfsensor.diagnose.model.map_predictions import lines_of_map
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.effect import Effect, Layout, Parameter
@@ -399,7 +399,7 @@ class Screen:
         """Fit all parameters of a candidate from where it is."""
         names = fitted(effect)
         scales = np.array([_scale(effect, p) for p in names])
-        low, high = np.array([widened(p) for p in names]).T
+        low, high = np.array([p.widest for p in names]).T
         start = np.array([effect[p.name] for p in names])
         start = np.clip(start, low + 1e-9 * scales, high - 1e-9 * scales)
         # least_squares steps by 2 % of a value.  A parameter with a step of its own is scaled by
@@ -527,7 +527,7 @@ def _inside(effect: Effect) -> Effect:
     """Copy with all parameters clipped to the range of fits."""
     values = {}
     for p in fitted(effect):
-        low, high = widened(p)
+        low, high = p.widest
         values[p.name] = float(np.clip(effect[p.name], low, high))
     return effect.with_values(**values)
 

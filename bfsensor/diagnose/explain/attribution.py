@@ -16,7 +16,6 @@ from bfsensor.diagnose.detect.model_error import charge
 from bfsensor.diagnose.explain.nonparametric import OpenWorld
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 from bfsensor.diagnose.fit.likelihood_profile import Profile, linear_interval
-from bfsensor.diagnose.model.effect_parameters import widened
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.effects.effect import Effect, Parameter
 
@@ -146,7 +145,7 @@ class Found:
         low, high = min(low, self.effect[p.name]), max(high, self.effect[p.name])
         told: dict[str, Any] = dict(zip(keys, (low, high), strict=True))
         open_ = [k for k, c in zip(("lo", "hi"), closed, strict=True) if not c]
-        limits = dict(zip(("lo", "hi"), widened(p), strict=True))
+        limits = dict(zip(("lo", "hi"), p.widest, strict=True))
         near = 1e-6 * (limits["hi"] - limits["lo"])
         stopped = [k for k in open_ if abs(told[f"{k}{level}"] - limits[k]) > near]
         return (

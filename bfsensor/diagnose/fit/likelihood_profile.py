@@ -14,7 +14,7 @@ import numpy as np
 
 from bfsensor.diagnose.fit.fitted_model import Model
 from bfsensor.diagnose.fit.gauss_newton import Steps
-from bfsensor.diagnose.model.effect_parameters import fitted, reach_of, widened
+from bfsensor.diagnose.model.effect_parameters import fitted, reach_of
 from bfsensor.effects.effect import Parameter
 from bfsensor.errors import ConvergenceError
 from bfsensor.inference.bounded_lsq import span
@@ -39,7 +39,7 @@ def ranged(p: Parameter) -> Ranged:
     logarithmic = p.law == "log" and not p.signed
     width = p.high - p.low
     return Ranged(
-        p.name, *widened(p), logarithmic, p.neutral, p.low, width, partial(reach_of, p)
+        p.name, *p.widest, logarithmic, p.neutral, p.low, width, partial(reach_of, p)
     )
 
 

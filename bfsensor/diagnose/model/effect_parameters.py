@@ -10,11 +10,6 @@ from bfsensor.effects.effect import Effect, Parameter
 from bfsensor.inference.parameters import FreeParameter, ParameterSpace
 from bfsensor.typing import FloatArray
 
-STRONG = 100.0
-"""Factor on the top of an amplitude's plausible range up to which fits may go.  Chosen: the strongest
-effects of campaigns by another bench are 13 times (loss of charge) and 22 times (coupling) the top;
-with 1000, fits of other classes would run to strengths at which predictions overflow."""
-
 
 def parameters_of(effects: Sequence[Effect]) -> ParameterSpace:
     """Make the free parameters of several effects, which belong to the effect's place among them.
@@ -33,7 +28,7 @@ def parameters_of(effects: Sequence[Effect]) -> ParameterSpace:
         tuple(
             FreeParameter(
                 f"effect {n} {e.name} {p.name}", "effect", n, e[p.name], _step(e, p), False,
-                *widened(p),
+                *p.widest,
             )
             for n, e in enumerate(effects)
             for p in fitted(e)
@@ -54,21 +49,6 @@ def fitted(effect: Effect) -> list[Parameter]:
     return [p for p in effect.parameters if p.law != "whole"]
 
 
-def widened(p: Parameter) -> tuple[float, float]:
-    """Range of a parameter in fits: :data:`STRONG` times the plausible one, or half its width beyond it.
-
-    It ends where what physics allows does.
-    """
-    if p.law == "log":
-        low = -STRONG * p.high if p.signed else (0.0 if p.amplitude else 0.3 * p.low)
-        high = STRONG * p.high if p.amplitude else 3 * p.high
-        range_ = p.neutral + low, p.neutral + high
-    else:
-        reach = 0.5 * (p.high - p.low)
-        range_ = p.low - reach, p.high + reach
-    return max(range_[0], p.ends[0]), min(range_[1], p.ends[1])
-
-
 def reach_of(p: Parameter, value: float) -> tuple[float, float]:
     """Smallest and largest step of a fit from a parameter's value.
 
@@ -77,7 +57,7 @@ def reach_of(p: Parameter, value: float) -> tuple[float, float]:
     derivative predicts larger changes badly.
     """
     away, far = value - p.neutral, 0.25 * (p.high - p.low)
-    range_ = np.array(widened(p)) - value
+    range_ = np.array(p.widest) - value
     step = np.array([-0.5, 1.0]) * away if p.law == "log" else far * np.array([-1, 1])
     held = p.amplitude or (p.law == "log" and p.signed)
     low, high = range_ if held else np.clip(step, *range_)

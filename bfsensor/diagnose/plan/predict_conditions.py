@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from astropy.table import Table
 
 from bfsensor.diagnose.data.exposure_info import condition_at, numbers_of
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
@@ -19,6 +18,7 @@ from bfsensor.diagnose.plan.forecast import Forecaster, say_condition
 from bfsensor.diagnose.plan.planned_exposures import Forecast, Planned
 from bfsensor.errors import DiagnosisError
 from bfsensor.measure.ecsv import write_ecsv
+from bfsensor.text_files import UnreadableTextError, read_ecsv
 from bfsensor.units import to_celsius, to_kelvin
 
 SCHEMA = "bfsensor-predicted-1"
@@ -94,8 +94,8 @@ def read_conditions(texts: Sequence[str]) -> list[Planned]:
 
 def _of_file(path: str) -> list[Planned]:
     try:
-        table = Table.read(path, format="ascii.ecsv")
-    except (OSError, ValueError) as error:
+        table = read_ecsv(path)
+    except UnreadableTextError as error:
         raise DiagnosisError(f"{path}: not an ECSV table: {error}") from None
     return [
         _planned({n: row[n] for n in table.colnames if row[n] is not np.ma.masked},

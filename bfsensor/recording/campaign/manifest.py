@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from astropy.io.ascii import InconsistentTableError
-from astropy.table import Table
 
 from bfsensor.errors import RecordingError
 from bfsensor.recording.campaign.exposures import LIT, TOLERANCES
 from bfsensor.recording.campaign.settings import CampaignSettings
 from bfsensor.recording.raw.headers import FileScan, file_sha256, is_fits, scan_file
 from bfsensor.recording.raw.keywords import MEANINGS, Override, kind_in_name, translate
+from bfsensor.text_files import UnreadableTextError, read_ecsv
 
 COLUMNS = {
     "file": ("file", "filename", "path"), "kind": ("imgtype", "kind", "type"),
@@ -115,10 +114,9 @@ def read_manifest(
         The file is not ECSV, or has no column of file names.
     """
     try:
-        table = Table.read(path, format="ascii.ecsv")
-    except (OSError, ValueError, InconsistentTableError) as error:
-        line = " ".join(str(error).split())[:200]
-        raise RecordingError(f"{path}: not readable as ECSV: {line}") from None
+        table = read_ecsv(path)
+    except UnreadableTextError as error:
+        raise RecordingError(f"{path}: not readable as ECSV: {error}") from None
     lower = {name.lower(): name for name in table.colnames}
     there = {
         name: next(lower[word] for word in words if word in lower)

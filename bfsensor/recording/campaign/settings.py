@@ -8,12 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from bfsensor.errors import RecordingError
 from bfsensor.recording.campaign.exposures import PAIR_TOLERANCE
 from bfsensor.recording.raw.headers import SECTION_ENTRIES
 from bfsensor.recording.raw.keywords import AMPLIFIER_UNITS, Override, parse_overrides
+from bfsensor.text_files import load_yaml, one_line
 
 SCHEMA = "bfsensor-campaign-1"
 """Value of the entry ``schema``; a file with another one is refused."""
@@ -124,10 +123,9 @@ def read_settings(folder: Path) -> CampaignSettings:
         manifest = folder / "manifest.ecsv"
         return CampaignSettings(manifest=manifest if manifest.is_file() else None)
     try:
-        given = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        line = " ".join(str(error).split())[:200]
-        raise RecordingError(f"{path}: not readable as YAML: {line}") from None
+        given = load_yaml(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise RecordingError(f"{path}: not readable as YAML: {one_line(error)}") from None
     given = {} if given is None else given
     if not isinstance(given, Mapping):
         raise RecordingError(

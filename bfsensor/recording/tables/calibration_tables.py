@@ -17,12 +17,12 @@ from astropy.io import fits
 from astropy.io.fits.verify import VerifyWarning
 from astropy.table import Table
 from astropy.units import UnitsWarning
-from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 
 from bfsensor.errors import RecordingError
 from bfsensor.files import refuse_existing, written_whole
 from bfsensor.recording.raw.open_fits import open_fits
+from bfsensor.text_files import UnreadableTextError, read_ecsv
 
 Columns = Mapping[str, NDArray[Any]]
 Sides = Mapping[str, int]
@@ -234,16 +234,9 @@ def read_tables(path: str | os.PathLike[str]) -> list[Table]:
 def _from_ecsv(path: str | os.PathLike[str]) -> Table:
     """Read an ECSV table; empty cells of floats become nan, those of text ''."""
     try:
-        with warnings.catch_warnings():
-            # astropy only warns of a column whose type does not exist.
-            warnings.simplefilter("error", AstropyUserWarning)
-            table = Table.read(path, format="ascii.ecsv")
-    # astropy raises several classes of exception for damaged headers.
-    except (
-        OSError, ValueError, TypeError, KeyError, AttributeError, AstropyUserWarning
-    ) as error:  # fmt: skip
-        line = " ".join(str(error).split())[:200]
-        raise RecordingError(f"{path}: cannot be read: {line}") from None
+        table = read_ecsv(path)
+    except UnreadableTextError as error:
+        raise RecordingError(f"{path}: cannot be read: {error}") from None
     for name in table.colnames:
         if not np.any(getattr(table[name], "mask", False)):
             continue

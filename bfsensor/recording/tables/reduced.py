@@ -18,7 +18,12 @@ from bfsensor.errors import RecordingError
 from bfsensor.recording.campaign.manifest import list_files
 from bfsensor.recording.raw.headers import is_fits
 from bfsensor.recording.tables.area_changes import AreaChangeTable, read_area_changes
-from bfsensor.recording.tables.covariance_tables import CovarianceTable, read_covariances
+from bfsensor.recording.tables.covariance_tables import (
+    CovarianceTable,
+    floats,
+    read_covariances,
+)
+from bfsensor.text_files import one_line, read_ecsv
 from bfsensor.typing import FloatArray
 
 SPOT_COLUMNS = {
@@ -32,6 +37,9 @@ SPOT_COLUMNS = {
 Flux and peak [e-], sigma_x, sigma_y, x and y [pixel], size T = Ixx + Iyy [pixel^2], wavelength [nm],
 back bias [V].
 """
+
+POSITIVE = ("sigma_x", "sigma_y", "size", "wavelength")
+"""Quantities of a spot table that are above 0."""
 
 LABELS = ("amp", "amplifier", "segment", "state", "region")
 """Columns whose words divide a spot table into groups."""
@@ -159,10 +167,10 @@ def read_spots(path: str | os.PathLike[str]) -> SpotTable:
         column = next((word for word in words if word in table.colnames), None)
         if column is None:
             continue
-        values[name] = np.asarray(table[column], float)
+        values[name] = _numbers(path, table, column, positive=name in POSITIVE)
         for end in ("error", "err", "sigma"):
             if f"{column}_{end}" in table.colnames:
-                errors[name] = np.asarray(table[f"{column}_{end}"], float)
+                errors[name] = _numbers(path, table, f"{column}_{end}", positive=True)
     if not {"flux", "peak"} & set(values):
         raise RecordingError(
             f"{path}: no column flux or peak [e-] among {', '.join(table.colnames)}"
@@ -189,6 +197,23 @@ def read_spots(path: str | os.PathLike[str]) -> SpotTable:
             "of a pixel cannot be tested"
         )
     return SpotTable(path, values, errors, group, tuple(warnings))
+
+
+def _numbers(path: Path, table: Table, column: str, *, positive: bool) -> FloatArray:
+    """Column of finite numbers, above 0 where it is ``positive``; the first other cell is refused."""
+    try:
+        values = floats(table, column)
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from None
+    wrong = ~np.isfinite(values) | (positive & (values <= 0))
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise RecordingError(
+            f"{path}: row {row + 1}: {column} = {values[row]:g} must be "
+            f"{'a number above 0' if positive else 'a finite number'} ({int(wrong.sum())} of "
+            f"{len(values)} rows); leave out spots that were not measured"
+        )
+    return values
 
 
 def read_profile(path: str | os.PathLike[str], *, unit: str = "") -> RadialProfile:
@@ -226,8 +251,8 @@ def read_profile(path: str | os.PathLike[str], *, unit: str = "") -> RadialProfi
     path = Path(path)
     if path.suffix == ".ecsv":
         table = _read_text(path)
-        columns = [np.asarray(table[c], float) for c in ("radius", "value", "error")
-                   if c in table.colnames]  # fmt: skip
+        columns = [_numbers(path, table, c, positive=c == "error")
+                   for c in ("radius", "value", "error") if c in table.colnames]  # fmt: skip
         unit = unit or str(table["value"].unit or "") if "value" in table.colnames else unit
     else:
         try:
@@ -361,9 +386,8 @@ def _is_photon_transfer(path: Path) -> bool:
 
 def _read_text(path: Path) -> Table:
     try:
-        return text_tables.read(
-            path, format="ecsv" if path.suffix == ".ecsv" else "csv", comment="#"
-        )
+        if path.suffix == ".ecsv":
+            return read_ecsv(path)
+        return text_tables.read(path, format="csv", comment="#")
     except (OSError, ValueError, InconsistentTableError) as error:
-        line = " ".join(str(error).split())[:200]
-        raise RecordingError(f"{path}: cannot be read: {line}") from None
+        raise RecordingError(f"{path}: cannot be read: {one_line(error)}") from None

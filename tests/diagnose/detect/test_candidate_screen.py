@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from bfsensor.diagnose.detect.candidate_screen import _best_factor
-from bfsensor.diagnose.model.effect_parameters import widened
 from bfsensor.effects.effect import Parameter
 from bfsensor.effects.persistence import TwoTimesPersistence
 
@@ -25,9 +24,9 @@ def test_amplitude_of_a_template_that_is_straight_but_for_rounding(bend, amplitu
 
 def test_no_fit_goes_beyond_what_physics_allows():
     slow = next(p for p in TwoTimesPersistence.parameters if p.name == "slow")
-    assert widened(slow) == (0.0, 1.0)
-    assert widened(slow._replace(ends=(-np.inf, np.inf))) == pytest.approx((-0.46, 1.46))
-    assert widened(Parameter("reach", "e-", 0.0, 10.0, law="flat", ends=(0.0, np.inf))) == (
+    assert slow.widest == (0.0, 1.0)
+    assert slow._replace(ends=(-np.inf, np.inf)).widest == pytest.approx((-0.46, 1.46))
+    assert Parameter("reach", "e-", 0.0, 10.0, law="flat", ends=(0.0, np.inf)).widest == (
         0.0,
         15.0,
     )

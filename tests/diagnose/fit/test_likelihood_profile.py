@@ -8,7 +8,6 @@ import pytest
 from bfsensor.diagnose.explain.attribution import WIDENED, Found
 from bfsensor.diagnose.fit import likelihood_profile as profile
 from bfsensor.diagnose.fit.likelihood_profile import LOWER, linear_interval, ranged, settle
-from bfsensor.diagnose.model.effect_parameters import widened
 from bfsensor.effects.effect import Parameter
 from bfsensor.effects.psf_wings import PsfWings
 from bfsensor.errors import ConvergenceError
@@ -134,7 +133,7 @@ def test_intervals_of_a_found_effect_use_profiles_and_state_open_ends():
     low, high = linear_interval(0.01, WIDENED * 0.001, PsfWings.parameters[0])
     assert (told["frac"]["lo68"], told["frac"]["hi68"]) == (low, high)
     assert "open68" not in told["frac"]
-    assert "stopped68" not in told["sigma"] and widened(effect.parameters[1])[1] == 24.0
+    assert "stopped68" not in told["sigma"] and effect.parameters[1].widest[1] == 24.0
     x = np.linspace(3.0, 20.0, 43)
     profile = Profile(x, np.where(x < 5.0, 4.0 * (x - 5.0) ** 2, 0.0))
     told = Found(effect, 20.0, errors, {}, (), (), {"sigma": profile}).intervals()
