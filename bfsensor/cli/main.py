@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import signal
 import sys
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +41,7 @@ Example, from a built-in device to its distortion table and a figure of it:
 
 \b
 Exit status: 0 done, whatever the results are; 1 an error, described by one line on stderr; 2 a
-wrong option or argument; 130 interrupted.
+wrong option or argument; 130 interrupted, 143 by SIGTERM.
 
 \b
 Shell completion: eval "$(_BFSENSOR_COMPLETE=bash_source bfsensor)" in ~/.bashrc; zsh_source for
@@ -49,13 +52,14 @@ zsh in ~/.zshrc; for fish: _BFSENSOR_COMPLETE=fish_source bfsensor | source
 class _Commands(click.Group):
     """Group of commands whose errors end as one line on stderr and an exit status.
 
-    An error of the package or of a file: 1.  An interruption from the keyboard: 130.  A closed
-    pipe, as of ``| head``: no line, and click's status 1.
+    An error of the package or of a file: 1.  An interruption from the keyboard: 130, by SIGTERM:
+    143.  A closed pipe, as of ``| head``: no line, and click's status 1.
     """
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
-            return super().invoke(ctx)
+            with _terminated_as_interrupted():
+                return super().invoke(ctx)
         except BFSensorError as error:
             LOG.debug("where it happened:", exc_info=True)
             click.echo(f"bfsensor: {error}", err=True)
@@ -67,12 +71,33 @@ class _Commands(click.Group):
             where = f"{error.filename}: " if error.filename else ""
             click.echo(f"bfsensor: {where}{error.strerror or error}", err=True)
             ctx.exit(1)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as error:
             click.echo(
                 "bfsensor: interrupted; what is finished is kept, run again to go on",
                 err=True,
             )
-            ctx.exit(130)
+            ctx.exit(143 if isinstance(error, _TerminatedError) else 130)
+
+
+class _TerminatedError(KeyboardInterrupt):
+    """The process was asked to end by SIGTERM, as by batch systems."""
+
+
+@contextlib.contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """Let SIGTERM interrupt as Ctrl-C does; only the main thread may choose."""
+
+    def end(number: int, frame: object) -> None:
+        raise _TerminatedError
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @click.group(

@@ -9,8 +9,13 @@ killed continues with the points that are missing.
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
+import os
+import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, as_completed
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -103,6 +108,21 @@ def run_points(
     return [done[n] for n in range(len(points))]
 
 
+def _end_with_parent() -> None:
+    """End this process as soon as the one that made it has ended, whatever the task does."""
+    # A forked process has the handlers of the one that made it.
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch(sentinel: int) -> None:
+        wait([sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, args=(parent.sentinel,), daemon=True).start()
+
+
 @contextlib.contextmanager
 def open_executor(kind: str, workers: int) -> Iterator[Executor | None]:
     """Open an executor with local workers, for a ``with`` statement.
@@ -136,9 +156,15 @@ def open_executor(kind: str, workers: int) -> Iterator[Executor | None]:
             return
         from concurrent.futures import ProcessPoolExecutor
 
-        pool = ProcessPoolExecutor(workers)
+        others = set(multiprocessing.active_children())
+        pool = ProcessPoolExecutor(workers, initializer=_end_with_parent)
         try:
             yield pool
+        except KeyboardInterrupt:
+            # Points that have begun would be worked out, and then lost.
+            for worker in set(multiprocessing.active_children()) - others:
+                worker.terminate()
+            raise
         finally:
             pool.shutdown(cancel_futures=True)
     elif kind == "dask":

@@ -1,5 +1,8 @@
 """Points of work on every executor: the same results, kept, resumed."""
 
+import signal
+import subprocess
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -93,3 +96,48 @@ def test_refuses_unknown_executors():
         open_executor("mpi", 2),
     ):
         pass
+
+
+PROGRAM = """
+import multiprocessing, pathlib, sys, time
+from bfsensor.sweeps.executors import open_executor
+
+def task(seconds):
+    pathlib.Path(str(multiprocessing.current_process().pid)).touch()
+    time.sleep(seconds)
+
+if __name__ == "__main__":
+    with open_executor("process", 2) as executor:
+        list(executor.map(task, [60, 60]))
+"""
+
+
+def is_alive(pid):
+    # An ended process whose parent has not asked for its status is no longer running.
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are listed in /proc")
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT])
+def test_workers_end_with_the_process_that_made_them(tmp_path, end):
+    (tmp_path / "program.py").write_text(PROGRAM)
+    process = subprocess.Popen(
+        [sys.executable, "program.py"], cwd=tmp_path, stderr=subprocess.DEVNULL
+    )
+    workers = []
+    for _ in range(600):
+        workers = [int(p.name) for p in tmp_path.iterdir() if p.name.isdigit()]
+        if len(workers) == 2:
+            break
+        time.sleep(0.1)
+    assert all(map(is_alive, workers)) and len(workers) == 2
+    process.send_signal(end)
+    process.wait(20)
+    for _ in range(100):
+        if not any(map(is_alive, workers)):
+            break
+        time.sleep(0.1)
+    assert not any(map(is_alive, workers))
