@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 from collections.abc import Callable, Hashable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -71,8 +72,9 @@ def refuse_existing(
 def written_whole(path: str | os.PathLike[str], error: type[Exception]) -> Iterator[Path]:
     """Yield a temporary path beside a file; it is renamed to the file once all is written.
 
-    A reader finds the old file or the new one, never a part; processes that write the same file
-    do not disturb one another, because the temporary name holds the number of the process.
+    A reader finds the old file or the new one, never a part; processes, threads and hosts that write
+    the same file do not disturb one another, because the temporary name is random.  Where the path is
+    a link, the file that it leads to is replaced.
 
     Parameters
     ----------
@@ -102,12 +104,14 @@ def written_whole(path: str | os.PathLike[str], error: type[Exception]) -> Itera
     >>> target.read_text()
     'all of it'
     """
-    target = Path(path)
-    beside = target.with_name(f"{target.name}.{os.getpid()}.part")
+    target = Path(os.path.realpath(path))
+    beside = target.with_name(f"{target.name}.{secrets.token_hex(4)}.part")
     try:
         yield beside
         os.replace(beside, target)
     except OSError as fault:
-        raise error(f"{target}: cannot be written: {fault}") from None
+        raise error(f"{path}: cannot be written: {fault}") from None
     finally:
-        beside.unlink(missing_ok=True)
+        # A name that is too long is neither there nor can be removed.
+        with contextlib.suppress(OSError):
+            beside.unlink(missing_ok=True)

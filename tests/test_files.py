@@ -1,6 +1,7 @@
 """Files are written whole or not at all, whatever fails and wherever; a cache holds its keys."""
 
 import pickle
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.errors import BFSensorError, SweepError, TableError
 from bfsensor.files import Cache, refuse_existing, written_whole
+from bfsensor.table.build import _level_name
 
 
 def test_the_old_file_stays_until_the_new_one_is_whole(tmp_path):
@@ -115,3 +117,52 @@ def test_pickled_with_its_owners_a_cache_knows_them():
     assert same is not channel
     assert again.get(same, lambda: "made") == "kept"
     assert again.get(channel, lambda: "made") == "made"
+
+
+def test_threads_that_write_one_file_leave_one_of_their_texts(tmp_path):
+    path = tmp_path / "note.txt"
+
+    def write(n):
+        with written_whole(path, TableError) as beside:
+            beside.write_text(str(n) * 100_000)
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(write, range(64)))
+    text = path.read_text()
+    assert len(set(text)) <= 2 and len(text) in (100_000, 200_000)
+    assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
+
+
+def test_a_link_keeps_leading_to_its_file(tmp_path):
+    (tmp_path / "far.txt").write_text("old")
+    (tmp_path / "link.txt").symlink_to(tmp_path / "far.txt")
+    with written_whole(tmp_path / "link.txt", TableError) as beside:
+        beside.write_text("new")
+    assert (tmp_path / "link.txt").is_symlink()
+    assert (tmp_path / "far.txt").read_text() == "new"
+
+
+def test_a_name_that_is_too_long_is_one_clear_error(tmp_path):
+    with (
+        pytest.raises(TableError, match="cannot be written"),
+        written_whole(tmp_path / ("n" * 300), TableError) as beside,
+    ):
+        beside.write_text("text")
+
+
+def test_figures_are_written_whole(tmp_path):
+    pytest.importorskip("matplotlib")
+    from matplotlib.figure import Figure
+
+    from bfsensor.plots.style import save_figure
+
+    for end in ("png", "pdf", "svg"):
+        save_figure(Figure(), tmp_path / f"a.{end}")
+    with pytest.raises(BFSensorError, match="cannot be written"):
+        save_figure(Figure(), tmp_path / "absent" / "a.png")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.pdf", "a.png", "a.svg"]
+
+
+def test_levels_of_charges_that_differ_in_the_last_digit_have_two_files():
+    names = {_level_name(q, 1e5) for q in (1e5, 100_000.4, np.nextafter(1e5, 2e5))}
+    assert len(names) == 3 and "level_100000_100000.npz" in names

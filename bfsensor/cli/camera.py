@@ -195,6 +195,7 @@ def write_fit(device: Device, found: CameraFit, stem: Path, figure: bool) -> lis
     found.fit.write(written[1], overwrite=True)
     if figure:
         from bfsensor.plots.camera import figure_for_camera
+        from bfsensor.plots.style import save_figure
 
         fit = found.fit
         title = f"{device.name}: {found.areas.source}"
@@ -204,7 +205,7 @@ def write_fit(device: Device, found: CameraFit, stem: Path, figure: bool) -> lis
             click.echo(f"bfsensor: no figure: {error}", err=True)
         else:
             written.append(stem.with_name(f"{stem.name}_fit.png"))
-            drawn.savefig(written[-1], dpi=120)
+            save_figure(drawn, written[-1])
     return [str(path) for path in written]
 
 

@@ -351,6 +351,7 @@ def _write(result: FitResult, folder: Path) -> list[str]:
     """Write the result, the fitted device and the figure; without matplotlib no figure."""
     from bfsensor.device.device import Device
     from bfsensor.fit.fit_figures import figure_for_fit
+    from bfsensor.plots.style import save_figure
 
     folder.mkdir(parents=True, exist_ok=True)
     result.write(folder / "fit.json")
@@ -361,5 +362,5 @@ def _write(result: FitResult, folder: Path) -> list[str]:
     except BFSensorError as error:
         click.echo(f"bfsensor: no figure: {error}", err=True)
         return written
-    figure.savefig(folder / "fit.png", dpi=120)
+    save_figure(figure, folder / "fit.png")
     return [*written, "fit.png"]

@@ -211,6 +211,7 @@ def show(source: str, settings: list[tuple[str, str]], output: Path | None) -> N
       bfsensor show itl_sta3800c -o device.png
     """
     from bfsensor.plots import table as figures
+    from bfsensor.plots.style import save_figure
     from bfsensor.table.galsim_format import read_galsim
     from bfsensor.table.table import DistortionTable
 
@@ -229,7 +230,7 @@ def show(source: str, settings: list[tuple[str, str]], output: Path | None) -> N
         target = output or Path(f"{loaded.name}.png")
     for name, figure in drawn.items():
         where = target.with_name(f"{target.stem}_{name}{target.suffix}") if name else target
-        figure.savefig(where, dpi=120)
+        save_figure(figure, where)
         click.echo(str(where))
 
 

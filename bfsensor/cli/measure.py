@@ -363,10 +363,11 @@ def _draw(
 ) -> str:
     """Draw the photon transfer curve to a file and return its path."""
     from bfsensor.plots.photon_transfer import figure_for_photon_transfer
+    from bfsensor.plots.style import save_figure
 
     try:
         drawn = figure_for_photon_transfer(curves, fits)
-        drawn.savefig(target, dpi=120)
+        save_figure(drawn, target)
     except (
         BFSensorError,
         ValueError,

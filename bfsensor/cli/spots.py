@@ -175,10 +175,11 @@ def _report(plan: Any, made: list[Any], output: Path, as_json: bool) -> None:
 def _draw(plan: Any, made: list[Any], growth: Any, path: Path) -> None:
     """Draw the growth of the spots; without matplotlib a message on stderr."""
     from bfsensor.plots.spots import figure_for_spots
+    from bfsensor.plots.style import save_figure
 
     try:
         figure = figure_for_spots(plan, made, growth)
     except BFSensorError as error:
         click.echo(f"bfsensor: no figure: {error}", err=True)
         return
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path)

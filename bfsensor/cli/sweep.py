@@ -177,7 +177,8 @@ def _draw(made: Any, path: Path | None) -> list[str]:
     if made.refused.all():
         click.echo("bfsensor: no figure: no point has an answer", err=True)
         return []
+    from bfsensor.plots.style import save_figure
     from bfsensor.plots.sweep import figure_for_sweep
 
-    figure_for_sweep(made).savefig(path, dpi=120)
+    save_figure(figure_for_sweep(made), path)
     return [str(path)]

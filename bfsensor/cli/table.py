@@ -510,13 +510,14 @@ def _plain(value: Any) -> str:
 def _draw(result: Any, path: Path) -> list[str]:
     """Draw a figure beside the table; without matplotlib a message on stderr."""
     from bfsensor.plots import table as show
+    from bfsensor.plots.style import save_figure
 
     try:
         figure = show.figure_for_table(result)
     except BFSensorError as error:
         click.echo(f"bfsensor: no figure: {error}", err=True)
         return []
-    figure.savefig(path, dpi=120)
+    save_figure(figure, path)
     return [str(path)]
 
 

@@ -5,11 +5,14 @@ Colours are those of Okabe & Ito (2008), which the colour-blind can distinguish.
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bfsensor.errors import BFSensorError
+from bfsensor.files import written_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,6 +25,34 @@ PURPLE, SKY, BLACK, GREY = "#CC79A7", "#56B4E9", "#222222", "#B5B5B5"
 SHOWN_CHARGE = 80_000.0
 """Stored charge of the example figures [e-]: published, that of the figures of Lage, Bradshaw &
 Tyson (2017)."""
+
+
+def save_figure(figure: Figure, path: str | os.PathLike[str], dots: int = 120) -> Path:
+    """Write a figure to a file, whole or not at all.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+        The figure.
+    path : path-like
+        File to write, .png, .pdf or .svg; one that exists is replaced.
+    dots : int
+        Dots per inch of a .png.
+
+    Returns
+    -------
+    path : Path
+        The file.
+
+    Raises
+    ------
+    BFSensorError
+        The file cannot be written.
+    """
+    path = Path(path)
+    with written_whole(path, BFSensorError) as beside:
+        figure.savefig(beside, dpi=dots, format=path.suffix[1:] or "png")
+    return path
 
 
 def import_matplotlib() -> Any:

@@ -189,6 +189,11 @@ def _solve_table(
     return dataclasses.replace(table, errors={**table.errors, **errors(table)})
 
 
+def _level_name(charge: float, background: float) -> str:
+    """Name of a level's file, by all digits: charges that differ in the last one are two levels."""
+    return f"level_{charge:.17g}_{background:.17g}.npz"
+
+
 def _solve_levels(
     plan: TablePlan,
     executor: Executor | None,
@@ -203,14 +208,14 @@ def _solve_levels(
         folder = checkpoint / plan.key
         folder.mkdir(parents=True, exist_ok=True)
         for q, b in wanted:
-            path = folder / f"level_{q:.6g}_{b:.6g}.npz"
+            path = folder / _level_name(q, b)
             if path.exists():
                 levels[q, b] = Level.read(path)
 
     def keep(q: float, b: float, level: Level) -> None:
         levels[q, b] = level
         if folder is not None:
-            level.write(folder / f"level_{q:.6g}_{b:.6g}.npz")
+            level.write(folder / _level_name(q, b))
         if progress is not None:
             progress(len(levels), len(wanted))
 

@@ -23,6 +23,8 @@ from bfsensor.diagnose.report.class_words import (
 from bfsensor.diagnose.report.diagnosis_result import Diagnosis
 from bfsensor.diagnose.report.report_figures import Drawn, draw_figures
 from bfsensor.diagnose.report.report_style import STYLE
+from bfsensor.errors import DiagnosisError
+from bfsensor.files import written_whole
 
 WHERE_WORDS = {
     "amp": ("amplifier", ""), "other": ("against amplifier", ""), "lags": ("lags (x, y)", ""),
@@ -479,7 +481,6 @@ def _describe(where: Mapping[str, Any], channel: str) -> str:
 
 
 def _write(path: Path, text: str) -> Path:
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(text)
-    os.replace(temporary, path)
+    with written_whole(path, DiagnosisError) as beside:
+        beside.write_text(text, encoding="utf-8")
     return path

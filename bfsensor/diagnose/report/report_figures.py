@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -15,6 +14,7 @@ from bfsensor.diagnose.kinds.channel_kind import Picture
 from bfsensor.diagnose.report.class_words import NAMES
 from bfsensor.diagnose.report.diagnosis_result import Diagnosis
 from bfsensor.plots import residuals as show
+from bfsensor.plots.style import save_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -73,7 +73,9 @@ def draw_figures(diagnosis: Diagnosis, folder: Path) -> list[Drawn]:
     out = []
     for name, picture in _summary(diagnosis).items():
         figure = _figure(picture)
-        out.append(Drawn(name, picture.caption, _save(figure, folder / f"{name}.png")))
+        out.append(
+            Drawn(name, picture.caption, save_figure(figure, folder / f"{name}.png", DOTS))
+        )
     attribution = diagnosis.attribution
     before = _pictures(diagnosis.fit, diagnosis.mismatch.chi2)
     after: Mapping[str, Picture] = {}
@@ -87,7 +89,7 @@ def draw_figures(diagnosis: Diagnosis, folder: Path) -> list[Drawn]:
         if len(figures) == 2:
             _share(*figures)
         paths = [
-            _save(f, folder / f"{name}{end}.png")
+            save_figure(f, folder / f"{name}{end}.png", DOTS)
             for f, end in zip(figures, ("", "_with_effects"), strict=False)
         ]
         out.append(Drawn(name, picture.caption, *paths))
@@ -200,10 +202,3 @@ def _share(one: Figure, other: Figure) -> None:
             both = min(ends_a[0], ends_b[0]), max(ends_a[1], ends_b[1])
             for ax in (a, b):
                 getattr(ax, f"set_{axis}lim")(*both)
-
-
-def _save(figure: Figure, path: Path) -> Path:
-    temporary = path.with_suffix(".tmp.png")
-    figure.savefig(temporary, dpi=DOTS)
-    os.replace(temporary, path)
-    return path
