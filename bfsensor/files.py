@@ -69,6 +69,64 @@ def refuse_existing(
 
 
 @contextlib.contextmanager
+def held(folder: str | os.PathLike[str], error: type[Exception]) -> Iterator[None]:
+    """Hold a folder of unfinished work, so that a second process refuses before it works.
+
+    Parameters
+    ----------
+    folder : path-like
+        The folder, which is made, and removed if it is empty at the end; a file ``.in_use`` in it
+        is locked.  The lock ends with the process, however that ends.
+    error : type
+        Exception class to raise.
+
+    Raises
+    ------
+    Exception
+        The given class: another process holds the folder, or it cannot be written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from bfsensor.errors import TableError
+    >>> folder = Path(tempfile.mkdtemp(), "t.fits.levels")
+    >>> with held(folder, TableError):
+    ...     [path.name for path in folder.iterdir()]
+    ['.in_use']
+    """
+    path = Path(folder, ".in_use")
+    new = not path.parent.exists()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("a+")
+    except OSError as fault:
+        raise error(f"{folder}: cannot be written: {fault}") from None
+    with file:
+        # Systems without this module do without the lock.
+        with contextlib.suppress(ImportError):
+            import fcntl
+
+            try:
+                fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                file.seek(0)
+                raise error(
+                    f"{folder}: another process works on this output (number {file.read(20).strip()}): "
+                    "wait until it ends, or name another output"
+                ) from None
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+                if new:
+                    path.parent.rmdir()  # only where nothing is in it
+
+
+@contextlib.contextmanager
 def written_whole(path: str | os.PathLike[str], error: type[Exception]) -> Iterator[Path]:
     """Yield a temporary path beside a file; it is renamed to the file once all is written.
 

@@ -1,5 +1,6 @@
 """Files are written whole or not at all, whatever fails and wherever; a cache holds its keys."""
 
+import multiprocessing
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 
@@ -8,7 +9,7 @@ import pytest
 
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.errors import BFSensorError, SweepError, TableError
-from bfsensor.files import Cache, refuse_existing, written_whole
+from bfsensor.files import Cache, held, refuse_existing, written_whole
 from bfsensor.table.build import _level_name
 
 
@@ -166,3 +167,40 @@ def test_figures_are_written_whole(tmp_path):
 def test_levels_of_charges_that_differ_in_the_last_digit_have_two_files():
     names = {_level_name(q, 1e5) for q in (1e5, 100_000.4, np.nextafter(1e5, 2e5))}
     assert len(names) == 3 and "level_100000_100000.npz" in names
+
+
+def hold(folder, ready, done):
+    with held(folder, TableError):
+        ready.set()
+        done.wait(60)
+
+
+def test_a_second_process_is_refused_while_the_first_works(tmp_path):
+    folder = tmp_path / "t.fits.levels"
+    context = multiprocessing.get_context("spawn")
+    ready, done = context.Event(), context.Event()
+    process = context.Process(target=hold, args=(folder, ready, done))
+    process.start()
+    assert ready.wait(60)
+    number = process.pid
+    with (
+        pytest.raises(
+            TableError, match=rf"t\.fits\.levels: another process .* \(number {number}\)"
+        ),
+        held(folder, TableError),
+    ):
+        pass
+    process.kill()
+    process.join()
+    with held(folder, TableError):
+        (folder / "level").touch()
+    assert [p.name for p in folder.iterdir()] == ["level"]
+
+
+def test_a_folder_that_stays_empty_is_removed(tmp_path):
+    with held(tmp_path / "new" / "one", TableError):
+        pass
+    (tmp_path / "old").mkdir()
+    with held(tmp_path / "old", TableError):
+        pass
+    assert not (tmp_path / "new" / "one").exists() and (tmp_path / "old").is_dir()

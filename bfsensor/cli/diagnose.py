@@ -10,6 +10,8 @@ from pathlib import Path
 import click
 
 from bfsensor.cli.common import Bar, parse_conditions
+from bfsensor.errors import DiagnosisError
+from bfsensor.files import held
 
 
 @click.command("diagnose", short_help="Compare recordings with a baseline.")
@@ -130,6 +132,7 @@ def diagnose(
     wanted = read_conditions(asked)
     first = campaign[0]
     folder = output or first.with_name(first.resolve().stem + "_diagnosis")
+    click.get_current_context().with_resource(held(folder, DiagnosisError))
     reduced = find_reduced_recordings(campaign, conditions)
     found = None if reduced is not None else read_campaign(first, progress=Bar("headers"))
     named = baseline or (None if found is None else found.baseline)

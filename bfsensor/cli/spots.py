@@ -17,7 +17,7 @@ from bfsensor.cli.common import (
     summary_option,
 )
 from bfsensor.errors import BFSensorError, SimulationError
-from bfsensor.files import written_whole
+from bfsensor.files import held, written_whole
 
 
 def _spot_path(folder: Path, key: str, number: int) -> Path:
@@ -106,7 +106,7 @@ def spots(
         transport=Transport(diffusion=diffusion), seed=seed,
     )  # fmt: skip
     plan.check_full_well()  # before any worker starts
-    output.mkdir(parents=True, exist_ok=True)
+    click.get_current_context().with_resource(held(output, SimulationError))
 
     def write(spot: Spot, path: Path) -> None:
         spot.write(path)

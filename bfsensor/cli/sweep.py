@@ -21,6 +21,7 @@ from bfsensor.cli.common import (
     summary_option,
 )
 from bfsensor.errors import SweepError
+from bfsensor.files import held
 
 
 @click.command(short_help="Compute a_ij over voltages and more.")
@@ -100,6 +101,7 @@ def sweep(
     target = output or Path(f"{loaded.name}_sweep.ecsv")
     check_targets([target, *([plot] if plot else [])], overwrite, SweepError)
     work = target.with_name(target.name + ".points")
+    context.with_resource(held(work, SweepError))
     with (
         progress_bar("point") as progress,
         open_executor(executor, min(workers, count + 2)) as pool,

@@ -27,7 +27,7 @@ from bfsensor.cli.common import (
     summary_option,
 )
 from bfsensor.errors import BFSensorError, DeviceError, TableError
-from bfsensor.files import written_whole
+from bfsensor.files import held, written_whole
 
 if TYPE_CHECKING:
     from bfsensor.table.table import DistortionTable
@@ -243,6 +243,8 @@ def table(
     )  # fmt: skip
     click.echo(_describe(plan, model), err=True)
     checkpoint = targets[0].with_name(targets[0].name + ".levels")
+    if model is None:
+        click.get_current_context().with_resource(held(checkpoint, TableError))
     assessed = galsim is None if assess is None else assess
     result = _build(plan, model, workers, assessed, checkpoint)
     _write(result, plan, galsim, targets[0], overwrite)
