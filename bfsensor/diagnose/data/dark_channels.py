@@ -213,6 +213,11 @@ class DarkChannels:
                         self._fold)]  # fmt: skip
 
     @property
+    def zero_drift(self) -> FloatArray | None:
+        """Covariance of the zeros of frames without overscan [ADU^2]; None with overscan or no dark."""
+        return self._drift() if self._unzeroed and self._rows else None
+
+    @property
     def notes(self) -> list[str]:
         """Sentences that say what these darks do not show."""
         times = {row[0].exposure_time or 0.0 for row in self._rows}

@@ -113,6 +113,12 @@ class FlatChannels:
     pulses : ndarray, optional
         Covariance by lag of pulses of the amplifiers' noise, from
         :meth:`bfsensor.diagnose.data.bias_channels.BiasChannels.pulses`.
+
+    Attributes
+    ----------
+    zero_drift : ndarray or None
+        Covariance of the zeros of flats without overscan by amplifier [ADU^2], from
+        :attr:`bfsensor.diagnose.data.dark_channels.DarkChannels.zero_drift`.
     """
 
     def __init__(
@@ -129,6 +135,7 @@ class FlatChannels:
     ) -> None:
         self._pulses = np.zeros(1) if pulses is None else pulses
         self._bias, self._noise, self._start = bias, read_noise, start
+        self.zero_drift: FloatArray | None = None
         self._zeros = zeros or {}
         self._steps = steps or {}
         self._lamp_error, self._lags = lamp_error, lags
@@ -161,7 +168,7 @@ class FlatChannels:
         """
         condition = condition_of(first[0])
         step = self._step(first[0])
-        means: list[list[tuple[float, float, int]]] = [[], []]
+        means: list[list[tuple[float, float, float, int]]] = [[], []]
         for n, frames in enumerate(zip(first[1], second[1], strict=True)):
             name = frames[0].name
             images = [self.clean(f) for f in frames]
@@ -187,8 +194,7 @@ class FlatChannels:
             for k in (0, 1):
                 m, count = self._whole_mean(frames[k], found.means[k], found.pixels)
                 read = self._noise.get(name, 0.0) ** 2
-                zero = read / max(zero_pixels(frames[k]).size, 1) + read / count
-                means[k].append((m, zero, count))
+                means[k].append((m, *self._zero_error(frames[k], count), count))
                 self._ratios.setdefault(n, []).append(
                     (m, (found.covariances[0, 0] - read) / m)
                 )
@@ -217,11 +223,9 @@ class FlatChannels:
             away = image - median_filter(np.where(good, image, np.nanmedian(image)), 5)
             usual = float(np.median(np.abs(away[good]))) if good.any() else 0.0
             good &= np.abs(away) <= STRUCK * max(usual, 1e-300)
-            read = self._noise.get(frame.name, 0.0) ** 2
             m = float(image[good].mean()) if good.any() else 0.0
             m, count = self._whole_mean(frame, m, max(int(good.sum()), 1))
-            zero = read / max(zero_pixels(frame).size, 1) + read / count
-            values.append((m, zero, count))
+            values.append((m, *self._zero_error(frame, count), count))
         if all(m > 0 for m, *_ in values):
             self._means.setdefault(fold, []).append(
                 (exposure, condition_of(exposure), values)
@@ -253,6 +257,14 @@ class FlatChannels:
         values = self._less_bias(frame, image)[others][~struck]
         total = count + len(values)
         return float(mean * count + values.sum()) / total, total
+
+    def _zero_error(self, frame: Frame, count: int) -> tuple[float, float]:
+        """Variance by read noise of the mean of pixels above the overscan [ADU^2], and of the zero.
+
+        The latter is 0 with an overscan.  Without one it is that of a pixel, if darks show no drift.
+        """
+        read, size = self._noise.get(frame.name, 0.0) ** 2, zero_pixels(frame).size
+        return read / count + (read / size if size else 0.0), 0.0 if size else read
 
     def _hours(self, exposure: ExposureInfo) -> float:
         """Time since the first exposure of the campaign [h]; nan where not known."""
@@ -320,16 +332,20 @@ class FlatChannels:
         for fold, rows in self._means.items():
             values, blocks, axes = [], [], Axes()
             for exposure, condition, amplifiers in rows:
-                m, zero, pixels = np.array(amplifiers).T
+                m, zero, unknown_zero, pixels = np.array(amplifiers).T
                 # The brighter-fatter effect moves charge between pixels but conserves it: the sum
                 # of many has Poisson noise, although a pixel's variance is less.
                 variance = m * [self._poisson(n) for n in range(len(m))] / pixels + zero
                 setting, lamp = self._lamps.get(exposure.number, (0, 1.0))
                 error = unknown if exposure.lamp is None else self._lamp_error
                 values.append(m)
-                blocks.append(np.diag(variance) + error**2 * np.outer(m, m))
+                drift = (
+                    np.diag(unknown_zero) if self.zero_drift is None else self.zero_drift
+                )
+                blocks.append(np.diag(variance) + error**2 * np.outer(m, m) + drift)
                 axes.add(
                     len(m), condition, amp=np.arange(len(m)), time=exposure.exposure_time,
+                    zeroed=self.zero_drift is None,
                     step=self._step(exposure),
                     lamp=lamp, setting=setting,
                     monitored=exposure.lamp is not None, exposure=exposure.number, level=m,

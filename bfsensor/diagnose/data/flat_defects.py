@@ -219,7 +219,9 @@ def bad_columns(image: FloatArray, light: FloatArray | None = None) -> list[BadC
         sides = off[max(start - QUIET, 0) : start], off[stop : stop + QUIET]
         alone = not any(s.any() for s in sides) and sum(map(len, sides)) >= QUIET
         # An excess is dark current of a hot column, which the diagnosis explains.
-        lost = -float(mean[own].sum()) > LOST * float(np.abs(mean[own]).sum())
+        # Neighbours that a dust spot crosses depart in its rows only.
+        light_of = mean[own] * count[own]
+        lost = -float(light_of.sum()) > LOST * float(np.abs(light_of).sum())
         span = range(int(first[own].min()), int(last[own].max()))
         lost &= _part_lost(even[span.start : span.stop], off, start, stop, scatter) > LOST
         sure = int((size[own] > 1.0).sum())

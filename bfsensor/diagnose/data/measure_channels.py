@@ -364,6 +364,7 @@ def measure_channels(
         )
         if reason:
             notes.append(f"spots {exposure.number}: {reason}")
+    flats.zero_drift = darks.zero_drift
     channels = [
         *flats.channels(), *found_maps, *codes.channels(), *biases.channels(),
         *darks.channels(known), *spots.channels(), *crosstalk.channels(),

@@ -56,8 +56,12 @@ class FlatMeans(ChannelKind):
                 here = (setting == n) & np.isin(np.arange(len(channel)), own)
                 column = np.where(here, x["level"], 0.0)
                 out[f"lamp {int(n)} {label_of(condition)}"] = column
+        # Without an overscan the bias level of flats is another than that of biases.
+        unknown = ~x.get("zeroed", np.ones(len(channel))).astype(bool)
         for amp in np.unique(x["amp"]):
             out[f"dark {int(amp)}"] = np.where(x["amp"] == amp, x["time"], 0.0)
+            if unknown.any():
+                out[f"zero {int(amp)}"] = np.where((x["amp"] == amp) & unknown, 1.0, 0.0)
         return out | _drift_columns(channel, measured)
 
     def patterns(self, g: Group) -> Iterator[Pattern]:

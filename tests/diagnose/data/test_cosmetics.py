@@ -443,3 +443,16 @@ def test_a_shallow_grain_of_dust_is_listed():
     assert 123 in rows
     assert 103 in columns
     assert 4 < z < 5
+
+
+def test_a_column_beside_a_grain_of_dust_at_an_amplifiers_end_is_found():
+    """Its neighbours, which the dust crosses, seem to have more light in the dust's rows."""
+    rng = np.random.default_rng(8674)
+    image = 3e-3 * rng.standard_normal((128, 128))
+    y, x = np.indices(image.shape)
+    away = np.hypot(x - 114.0, y - 121.0)
+    image -= 0.027 * np.clip(10.5 - away, 0.0, 1.0)
+    image[:, 103] -= 0.033
+    (one,) = [c for c in bad_columns(image) if 103 in c.columns]
+    assert one.rows == range(128)
+    assert np.allclose(one.change[:, 103 - one.columns.start], -0.033, atol=0.004)

@@ -9,6 +9,7 @@ import pytest
 
 from bfsensor.diagnose.data.dark_channels import count_tails
 from bfsensor.diagnose.data.flat_channels import FlatChannels
+from bfsensor.diagnose.kinds.flat_mean import FlatMeans
 
 ROWS, COLUMNS, SERIAL, PARALLEL = 64, 128, 24, 16
 
@@ -65,3 +66,36 @@ def test_tails_of_biases_and_of_darks_are_counted_alike() -> None:
     mean = {"amp": np.mean([f.image for f in biases], axis=0)}
     tails = [count_tails([f], mean, {"amp": 5.0}, len(biases)) for f in biases]
     assert np.mean(tails) < 6.0
+
+
+def test_means_of_flats_without_overscan_have_a_zero_of_their_own() -> None:
+    """The bias level of flats is another than that of biases; darks show by how much it drifts."""
+    flats = FlatChannels({}, {"amp": 5.0}, lamp_error=1e-3)
+    flats.zero_drift = np.array([[9.0]])
+    rng = np.random.default_rng(8657)
+    for number in range(8):
+        shots = [
+            SimpleNamespace(
+                number=2 * number + k, exposure_time=1.0 + number, lamp=1.0, wavelength=None,
+                back_bias=None, temperature=None, mjd=None, kind="flat",
+            )
+            for k in (0, 1)
+        ]  # fmt: skip
+        frames = [frame_of(rng, 1000.0 * (1 + number), 0) for _ in shots]
+        for frame in frames:
+            frame.serial_overscan = frame.parallel_overscan = np.zeros(
+                (ROWS, 0), np.float32
+            )
+        flats.add_pair(*((s, [f]) for s, f in zip(shots, frames, strict=True)), fold="fit")
+    (channel,) = (c for c in flats.channels() if c.word == "flat_mean")
+    assert (channel.errors >= 3.0).all()
+    columns = FlatMeans().columns(channel, {}, SimpleNamespace(channels=(channel,)))
+    assert (columns["zero 0"] == 1.0).all()
+    # Light is known to 1e-3 and the mean of a flat of 1000 ADU to 0.4 ADU.
+    assert channel.errors.min() < 3.3
+    flats.zero_drift = None
+    (channel,) = (c for c in flats.channels() if c.word == "flat_mean")
+    assert channel.errors.min() > 5.0
+    assert "zero 0" not in FlatMeans().columns(
+        channel, {}, SimpleNamespace(channels=(channel,))
+    )
