@@ -249,7 +249,7 @@ def test_keys_of_campaigns_are_those_that_are_read(folder, monkeypatch):
     asked = defaultdict(set)
     names = ("lamp_monitor", "spots", "pairs")
     monkeypatch.setattr(
-        settings_module.yaml, "safe_load",
+        settings_module, "load_yaml",
         lambda text: {n: Watched({"other": 1}, n, asked) for n in names},
     )  # fmt: skip
     read(folder, "")

@@ -99,7 +99,7 @@ def test_refuses_unknown_executors():
 
 
 PROGRAM = """
-import multiprocessing, pathlib, sys, time
+import multiprocessing, pathlib, signal, time
 from bfsensor.sweeps.executors import open_executor
 
 def task(seconds):
@@ -107,6 +107,8 @@ def task(seconds):
     time.sleep(seconds)
 
 if __name__ == "__main__":
+    # Processes in the background of a shell ignore it, and so do theirs.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with open_executor("process", 2) as executor:
         list(executor.map(task, [60, 60]))
 """
@@ -135,7 +137,11 @@ def test_workers_end_with_the_process_that_made_them(tmp_path, end):
         time.sleep(0.1)
     assert all(map(is_alive, workers)) and len(workers) == 2
     process.send_signal(end)
-    process.wait(20)
+    try:
+        process.wait(20)
+    finally:
+        process.kill()
+        process.wait()
     for _ in range(100):
         if not any(map(is_alive, workers)):
             break
