@@ -168,7 +168,7 @@ class FlatChannels:
         """
         condition = condition_of(first[0])
         step = self._step(first[0])
-        means: list[list[tuple[float, float, float, int]]] = [[], []]
+        means: list[list[tuple[float, float, bool, int]]] = [[], []]
         for n, frames in enumerate(zip(first[1], second[1], strict=True)):
             name = frames[0].name
             images = [self.clean(f) for f in frames]
@@ -258,13 +258,13 @@ class FlatChannels:
         total = count + len(values)
         return float(mean * count + values.sum()) / total, total
 
-    def _zero_error(self, frame: Frame, count: int) -> tuple[float, float]:
-        """Variance by read noise of the mean of pixels above the overscan [ADU^2], and of the zero.
+    def _zero_error(self, frame: Frame, count: int) -> tuple[float, bool]:
+        """Variance by read noise of the mean of ``count`` pixels [ADU^2]; whether it has an overscan.
 
-        The latter is 0 with an overscan.  Without one it is that of a pixel, if darks show no drift.
+        With one, the noise of the overscan's mean is part of the variance.
         """
         read, size = self._noise.get(frame.name, 0.0) ** 2, zero_pixels(frame).size
-        return read / count + (read / size if size else 0.0), 0.0 if size else read
+        return read / count + (read / size if size else 0.0), size > 0
 
     def _hours(self, exposure: ExposureInfo) -> float:
         """Time since the first exposure of the campaign [h]; nan where not known."""
@@ -332,20 +332,23 @@ class FlatChannels:
         for fold, rows in self._means.items():
             values, blocks, axes = [], [], Axes()
             for exposure, condition, amplifiers in rows:
-                m, zero, unknown_zero, pixels = np.array(amplifiers).T
+                m, zero, zeroed, pixels = np.array(amplifiers, float).T
                 # The brighter-fatter effect moves charge between pixels but conserves it: the sum
                 # of many has Poisson noise, although a pixel's variance is less.
                 variance = m * [self._poisson(n) for n in range(len(m))] / pixels + zero
                 setting, lamp = self._lamps.get(exposure.number, (0, 1.0))
                 error = unknown if exposure.lamp is None else self._lamp_error
                 values.append(m)
+                # Without darks that show a drift, a zero is taken to be known as one pixel is.
+                lacking = 1.0 - zeroed
                 drift = (
-                    np.diag(unknown_zero) if self.zero_drift is None else self.zero_drift
+                    np.diag(zero * pixels) if self.zero_drift is None else self.zero_drift
                 )
+                drift = drift * np.outer(lacking, lacking)
                 blocks.append(np.diag(variance) + error**2 * np.outer(m, m) + drift)
                 axes.add(
                     len(m), condition, amp=np.arange(len(m)), time=exposure.exposure_time,
-                    zeroed=self.zero_drift is None,
+                    zeroed=zeroed > 0 if self.zero_drift is not None else True,
                     step=self._step(exposure),
                     lamp=lamp, setting=setting,
                     monitored=exposure.lamp is not None, exposure=exposure.number, level=m,

@@ -105,8 +105,9 @@ class MapChannels:
         amplifiers: Sequence[tuple[slice, slice]] = (),
     ) -> None:
         self._shape, self._longest, self.fold = shape, longest, fold
-        # Brighter-fatter covariances that leave a box are nearly in proportion to the inverse of
-        # its side: of what a box of LOW has beyond one half as wide, a block has a part more.
+        # A box lacks the brighter-fatter covariances with pixels outside of it, nearly in proportion
+        # to the inverse of its side.  By that law the noise over a block exceeds that over LOW pixels
+        # by this part of what the latter exceeds the noise over LOW / 2 pixels by.
         self._outside = max(1.0 - LOW / block_side(shape), 0.0)
         self._amplifiers = tuple(amplifiers)
         self.sightings: tuple[Mapping[str, Any], ...] = ()

@@ -33,6 +33,17 @@ def frame_of(rng: np.random.Generator, level: float, length: int) -> SimpleNames
     )  # fmt: skip
 
 
+def shots_of(number: int) -> list[SimpleNamespace]:
+    """Headers of a pair of flats, of another level for each number."""
+    return [
+        SimpleNamespace(
+            number=2 * number + k, exposure_time=1.0 + number, lamp=1.0, wavelength=None,
+            back_bias=None, temperature=None, mjd=None, kind="flat",
+        )
+        for k in (0, 1)
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize("length", [0, 6])
 def test_profiles_scatter_as_their_errors_say(length: int) -> None:
     """A row's mean has the noise of fewer pixels where pulses are several pixels long."""
@@ -40,13 +51,7 @@ def test_profiles_scatter_as_their_errors_say(length: int) -> None:
     pulses = np.array([1.0, 1.0, 0.5]) if length else None
     flats = FlatChannels({}, {"amp": 5.0}, lamp_error=1e-3, pulses=pulses)
     for number in range(24):
-        shots = [
-            SimpleNamespace(
-                number=2 * number + k, exposure_time=1.0 + number, lamp=1.0, wavelength=None,
-                back_bias=None, temperature=None, mjd=None, kind="flat",
-            )
-            for k in (0, 1)
-        ]  # fmt: skip
+        shots = shots_of(number)
         pair = [(s, [frame_of(rng, 1000.0, length)]) for s in shots]
         flats.add_pair(*pair, fold="fit")
     (channel,) = (c for c in flats.channels() if c.word == "parallel_overscan")
@@ -74,13 +79,7 @@ def test_means_of_flats_without_overscan_have_a_zero_of_their_own() -> None:
     flats.zero_drift = np.array([[9.0]])
     rng = np.random.default_rng(8657)
     for number in range(8):
-        shots = [
-            SimpleNamespace(
-                number=2 * number + k, exposure_time=1.0 + number, lamp=1.0, wavelength=None,
-                back_bias=None, temperature=None, mjd=None, kind="flat",
-            )
-            for k in (0, 1)
-        ]  # fmt: skip
+        shots = shots_of(number)
         frames = [frame_of(rng, 1000.0 * (1 + number), 0) for _ in shots]
         for frame in frames:
             frame.serial_overscan = frame.parallel_overscan = np.zeros(
@@ -96,6 +95,18 @@ def test_means_of_flats_without_overscan_have_a_zero_of_their_own() -> None:
     flats.zero_drift = None
     (channel,) = (c for c in flats.channels() if c.word == "flat_mean")
     assert channel.errors.min() > 5.0
+    assert "zero 0" not in FlatMeans().columns(
+        channel, {}, SimpleNamespace(channels=(channel,))
+    )
+
+
+def test_flats_with_an_overscan_know_their_zero_whatever_darks_lack() -> None:
+    flats = FlatChannels({}, {"amp": 5.0}, lamp_error=1e-3)
+    flats.zero_drift = np.array([[9.0]])
+    rng = np.random.default_rng(8658)
+    flats.add_pair(*((s, [frame_of(rng, 1000.0, 0)]) for s in shots_of(0)), fold="fit")
+    (channel,) = (c for c in flats.channels() if c.word == "flat_mean")
+    assert channel.errors.max() < 2.0
     assert "zero 0" not in FlatMeans().columns(
         channel, {}, SimpleNamespace(channels=(channel,))
     )
