@@ -220,6 +220,8 @@ def _bridge(image: FloatArray, ranges: Sequence[tuple[int, int]]) -> FloatArray:
     out = np.array(image)
     columns = np.arange(image.shape[1])
     clear = ~np.any([(columns >= a) & (columns < b) for a, b in ranges], axis=0)
+    # A row's own light, as at a rim where the field rolls off, is not averaged with its neighbours'.
+    rows = np.median(image[:, clear], axis=1) if clear.any() else np.zeros(len(image))
     for start, stop in ranges:
         low, high = columns[clear & (columns < start)], columns[clear & (columns >= stop)]
         # At an amplifier's border the light's slope goes on from one side.
@@ -233,7 +235,8 @@ def _bridge(image: FloatArray, ranges: Sequence[tuple[int, int]]) -> FloatArray:
         middle = near.mean()
         away = near - middle
         # Over some rows, so that their noise is hardly seen in the bridge.
-        lines = uniform_filter1d(image[:, near], QUIET, axis=0, mode="nearest")
+        lines = image[:, near] - rows[:, None]
+        lines = uniform_filter1d(lines, QUIET, axis=0, mode="nearest") + rows[:, None]
         slope = lines @ away / (away @ away)
         out[:, start:stop] = lines.mean(1)[:, None] + np.outer(
             slope, columns[start:stop] - middle

@@ -31,15 +31,20 @@ LEAST = 0.004
 scatter of columns of 256 pixels whose responses scatter by 0.3 %; with twice as much, columns of up
 to 0.8 % stay in the maps as findings."""
 
+COMMON = 20.0
+"""Number of bad columns for each boundary between columns that displaces light.  Chosen: tested sensors
+have many bad columns, and tears at borders of amplifiers at most.  With 40, the excess beside a defect
+of 16 standard deviations must be 0.2 of its own larger to be taken for displaced light."""
+
 WIDEST, QUIET = 8, 3
 """Most columns of one defect, and number of columns on either side of it that must be like the
 others.  Chosen: patterns of light and of pixel edges (roll-off at the rim, tearing at a border of
 amplifiers, rings) are wider or have no quiet side; with 16 and 3, narrow rings are taken for defects."""
 
 LOST = 0.5
-"""Part of the summed magnitudes of the departures that is lacking in all, and part of what is lacking in
-dust that whole rows and columns do not lack.  Chosen: where edges between columns are displaced the
-sum is 0, where response is lacking it is the whole; at 0.25, tearing of unequal sides passes."""
+"""Part of the summed magnitudes of the departures that is lacking in all.  Chosen: where edges between
+columns are displaced the sum is 0, where response is lacking it is the whole; at 0.25, tearing of
+unequal sides passes."""
 
 FEW = 0.1
 """Part of an amplifier's columns, or of a column's pixels, above which none is a defect: they are a
@@ -223,7 +228,8 @@ def bad_columns(image: FloatArray, light: FloatArray | None = None) -> list[BadC
         light_of = mean[own] * count[own]
         lost = -float(light_of.sum()) > LOST * float(np.abs(light_of).sum())
         span = range(int(first[own].min()), int(last[own].max()))
-        lost &= _part_lost(even[span.start : span.stop], off, start, stop, scatter) > LOST
+        error = scatter * np.sqrt(ny / max(len(span), 1))
+        lost &= not _is_displaced(even[span.start : span.stop], off, start, stop, error)
         sure = int((size[own] > 1.0).sum())
         if alone and lost and sure and stop - start <= WIDEST:
             number += sure
@@ -236,15 +242,14 @@ def bad_columns(image: FloatArray, light: FloatArray | None = None) -> list[BadC
     return found if number <= FEW * nx else []
 
 
-def _part_lost(
-    image: FloatArray, off: NDArray[np.bool_], start: int, stop: int, scatter: float
-) -> float:
-    """Calculate the fraction of a defect's missing response that neighbouring columns do not hold.
+def _is_displaced(
+    image: FloatArray, off: NDArray[np.bool_], start: int, stop: int, error: float
+) -> bool:
+    """Whether the light that a defect lacks is more probably in the neighbouring columns than lost.
 
     Defect and neighbours are compared with columns farther away.  Displaced edges only move light:
     what the columns of a tear lack, their neighbours have more.  Columns that are other defects, and
-    those beside them, are left out; at the rim, one side stands for both.  An excess within what
-    columns of a ``scatter`` have by chance is none.
+    those beside them, are left out; at the rim, one side stands for both.  A column has the ``error``.
     """
     profile, reach = np.median(image, axis=0), 2 * QUIET
     # Columns beside other defects lack the light that these draw from them.
@@ -256,20 +261,22 @@ def _part_lost(
         far = clear[side & (away >= reach) & (away < reach + WIDEST)]
         if (side & (away < reach)).any() and len(far) >= QUIET:
             near.append(clear[side & (away < reach)])
-            bases.append((float(far.mean()), float(np.median(profile[far]))))
+            bases.append((float(far.mean()), float(np.median(profile[far])), len(far)))
     if not bases:
-        return 1.0
+        return False
     # Light is a straight line between the columns farther away, level where one side stands for both.
-    (x, low), (y, high) = bases[0], bases[-1]
+    (x, low, _), (y, high, _) = bases[0], bases[-1]
     slope = (high - low) / (y - x) if len(bases) == 2 else 0.0
     beside = sum(float((profile[c] - low - slope * (c - x)).sum()) for c in near)
     own = profile[start:stop] - low - slope * (np.arange(start, stop) - x)
     lacking = -float(np.minimum(own, 0.0).sum())
-    beside *= 2 * reach / sum(map(len, near))
-    if beside < SURE * scatter * np.sqrt(2 * reach):
-        return 1.0
-    gained = float(np.maximum(own, 0.0).sum()) + beside
-    return (lacking - gained) / lacking if lacking > 0 else 0.0
+    count = sum(map(len, near))
+    gained = float(np.maximum(own, 0.0).sum()) + beside * 2 * reach / count
+    # Errors of the neighbours' sum: their own, and that of the medians beneath them, pi / 2 of a mean's.
+    base = np.pi / 2 * sum(1 / n for *_, n in bases) / len(bases) ** 2
+    variance = (2 * reach * error) ** 2 * (1 / count + base)
+    # Gaussian errors: displaced light has an expected gain of all that is lacking, lost light of none.
+    return bool(lacking * (gained - lacking / 2) > variance * np.log(COMMON))
 
 
 def _lacking_rows(
@@ -378,9 +385,12 @@ def dust_spots(image: FloatArray) -> list[tuple[range, range, FloatArray, float]
     if min(ny, nx) < WIDE:
         return []
     boxes = image[:ny, :nx].reshape(ny // BIN, BIN, nx // BIN, BIN).mean((1, 3))
-    light = median_filter(boxes, WIDE, mode="nearest")
-    # A second time with the light beneath the first dust spots, which pulled the median down.
+    light = _median_around(boxes)
+    every = np.zeros(boxes.shape, bool)
+    # A second time with the light beneath the first dust spots, which pulled the medians down.
     for _ in range(2):
+        # Towards a rim of the sensor the field rolls off along all of it, which is no dust.
+        light += _whole_lines(boxes - light, every)
         chosen, bright = _dark_patches(boxes - light)
         every = (
             np.any([w for w, _ in chosen], axis=0) if chosen else np.zeros_like(boxes, bool)
@@ -393,10 +403,7 @@ def dust_spots(image: FloatArray) -> list[tuple[range, range, FloatArray, float]
     if sum(z > usual for z in bright) > len(chosen) // 4:
         return []
     found = []
-    # Medians of the columns and rows of boxes beside dust; none where dust covers all of one.
-    clear = np.ma.array(boxes, mask=every)
-    across, down = (np.ma.median(clear, axis=k).filled(0.0) for k in (0, 1))
-    rims = across + down[:, None] - float(np.ma.median(clear))
+    light += _whole_lines(boxes - light, every)
     change = image[:ny, :nx] - np.kron(light, np.ones((BIN, BIN)))
     smooth = gaussian_filter(change, SMOOTH)
     usual = float(smooth[~np.kron(every, np.ones((BIN, BIN), bool))].std())
@@ -409,9 +416,6 @@ def dust_spots(image: FloatArray) -> list[tuple[range, range, FloatArray, float]
         if not fine.any():
             continue
         rows, columns = (np.flatnonzero(fine.any(k)) for k in (1, 0))
-        # Towards a rim of the sensor the field rolls off along all of it, which is no dust.
-        if (boxes - rims)[whole].sum() > LOST * (boxes - light)[whole].sum():
-            continue
         part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         dark = _round_shade(change[part], smooth[part], fine[part])
         # Grains that touch, or are not round, are averaged over the pixels around each instead.
@@ -455,11 +459,29 @@ def _round_shade(
     return out
 
 
+def _median_around(boxes: FloatArray) -> FloatArray:
+    """Median of WIDE x WIDE boxes around each; at rims of the outermost ones that are all there."""
+    half = WIDE // 2
+    y, x = (np.clip(np.arange(n), half, n - 1 - half) for n in boxes.shape)
+    return np.asarray(median_filter(boxes, WIDE)[np.ix_(y, x)])
+
+
+def _whole_lines(boxes: FloatArray, dusty: NDArray[np.bool_]) -> FloatArray:
+    """Medians of the columns and rows of boxes beside dust; 0 for those that noise can have made."""
+    clear = np.ma.array(boxes, mask=dusty)
+    middle = float(np.ma.median(clear))
+    scatter = 1.4826 * float(np.ma.median(np.abs(clear - middle)))
+    across, down = (np.ma.median(clear, axis=k).filled(middle) - middle for k in (0, 1))
+    for line, count in ((across, len(down)), (down, len(across))):
+        line[np.abs(line) < DARK * scatter * np.sqrt(np.pi / 2 / count)] = 0.0
+    return np.asarray(across + down[:, None])
+
+
 def _beneath(boxes: FloatArray, dusty: NDArray[np.bool_]) -> FloatArray:
     """Median of the boxes around each that hold no dust."""
     high = 1.0 + float(np.abs(boxes).max())
-    out = median_filter(np.where(dusty, high, boxes), WIDE, mode="nearest")
-    low = median_filter(np.where(dusty, -high, boxes), WIDE, mode="nearest")
+    out = _median_around(np.where(dusty, high, boxes))
+    low = _median_around(np.where(dusty, -high, boxes))
     # With as many boxes above as below, the mean of both medians is that of the clear ones.
     known = (np.abs(out) < high) & (np.abs(low) < high)
     return np.asarray(np.where(known, 0.5 * (out + low), np.median(boxes[~dusty])))

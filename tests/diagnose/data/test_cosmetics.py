@@ -14,6 +14,7 @@ from bfsensor.diagnose.data.cosmetics import (
     Repair,
     RepairedFrame,
     _repair_response,
+    bridged,
     find_cosmetics,
 )
 from bfsensor.diagnose.data.exposure_info import overscan_level
@@ -456,3 +457,64 @@ def test_a_column_beside_a_grain_of_dust_at_an_amplifiers_end_is_found():
     (one,) = [c for c in bad_columns(image) if 103 in c.columns]
     assert one.rows == range(128)
     assert np.allclose(one.change[:, 103 - one.columns.start], -0.033, atol=0.004)
+
+
+def test_a_weak_tear_is_no_bad_column():
+    """Two columns lack what their neighbours have more; lost light stays lost."""
+    image = np.random.default_rng(28).standard_normal((128, 256)) * 3.5e-3
+    edges = np.arange(257) - 78
+    area = np.diff(-0.0066 * np.sign(edges) * np.exp(-np.abs(edges) / 2.3))
+    assert bad_columns(image + area) == []
+    (one,) = bad_columns(image + np.minimum(area, 0.0))
+    assert list(one.columns) == [77, 78]
+
+
+def test_a_bridge_keeps_the_light_of_its_row():
+    """Rows at the rim of the sensor have other sizes than the next ones."""
+    image = 2.5e-3 * np.random.default_rng(29).standard_normal((128, 128))
+    image[0] += 0.025
+    image[1] -= 0.016
+    none = np.zeros(image.shape, bool)
+    frame = RepairedFrame(
+        "", image, none, image, image[:, :0], image[:, :0], image[:0], False, False, None,
+        none, none, ((60, 67),),
+    )  # fmt: skip
+    bridge = bridged(image, frame)
+    assert bridge[0, 60:67] == pytest.approx(0.025, abs=4e-3)
+    assert bridge[1, 60:67] == pytest.approx(-0.016, abs=4e-3)
+
+
+GRAINS = (
+    (60.7, 52.0, 8.37, 0.31, 0.0034), (55.9, 175.9, 11.24, 0.29, 0.0086),
+    (50.9, 75.8, 5.45, 0.29, 0.0161), (2.8, 53.5, 10.3, 0.01, 0.0120),
+    (221.4, 157.4, 15.64, 0.12, 0.0289), (155.4, 222.0, 4.02, 0.49, 0.0045),
+    (237.5, 73.2, 15.45, 0.25, 0.0197), (16.0, 9.5, 15.46, 0.21, 0.0064),
+)  # fmt: skip
+"""Place, radius, hole and depth of grains of an independent campaign, one of them across a corner."""
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_wide_dust_across_a_corner_is_dust(seed):
+    """It covers most of the boxes of the corner, whose median is the light elsewhere."""
+    y, x = np.indices((256, 256))
+    image = 4e-3 * np.random.default_rng(seed).standard_normal(y.shape)
+    for cx, cy, radius, hole, depth in GRAINS:
+        away = np.hypot(x - cx, y - cy) / radius
+        image -= depth * ((away < 1) & (away > hole))
+    frame = SimpleNamespace(image=image, origin=None, flip_x=False, flip_y=False)
+    found = _repair_response([Repair.none(image.shape)], [frame], [image], image.shape)
+    assert any(
+        c.kind == "dust" and c.x[0] <= 16 < c.x[1] and c.y[0] <= 9 < c.y[1] for c in found
+    )
+
+
+def test_a_rim_beside_dust_is_no_dust():
+    """All edges roll off by a few per cent, and one grain lies inside."""
+    y, x = np.indices((256, 256))
+    image = 3e-3 * np.random.default_rng(10).standard_normal(y.shape)
+    image -= 0.01 * (np.hypot(x - 90, y - 120) < 9)
+    for line in (x, y, 255 - x, 255 - y):
+        image += np.select([line == 0, line == 1, line == 2], [0.024, -0.016, -0.005])
+    ((rows, columns, _, _),) = dust_spots(image)
+    assert 120 in rows
+    assert 90 in columns
