@@ -108,8 +108,12 @@ class Saturation(Effect):
                 s.level for s, r in zip(flats, rates, strict=True) if r < 0.97 * rates.max()
             ]
             # Levels in electrons are as uncertain as the gain: some per cent to either side.
+            # Without one, a part of the brightest flats' pixels may be full: seen within 2 % of it.
+            brightest = max(s.level for s in flats)
             places = (
-                [f * float(np.median(full)) for f in (0.93, 1.0, 1.07)] if full else places
+                [f * float(np.median(full)) for f in (0.93, 1.0, 1.07)]
+                if full
+                else places + [f * brightest for f in 1 + np.arange(-4, 5) * 5e-3]
             )
         return [{"full_well": float(v)} for v in places]
 

@@ -356,7 +356,10 @@ class Screen:
                 # One amplitude in all channels.
                 found[n] += float(template @ left)
                 length[n] += max(float(template @ template) - float(along @ along), 0.0)
-        gains = found**2 / np.where(length > 0, length, np.inf)
+        # A change that is not in proportion to an amplitude is taken as it is.
+        rough = np.array([effect.response == "rough" for effect in starts])
+        best = found**2 / np.where(length > 0, length, np.inf)
+        gains = np.where(rough, 2 * found - length, best)
         order = np.argsort(gains)[::-1][:LIKELY]
         return [starts[n] for n in order]
 
