@@ -27,6 +27,10 @@ Result = TypeVar("Result")
 EXECUTORS = ("process", "dask", "parsl")
 """Kinds of executors that :func:`open_executor` opens."""
 
+SILENT = 5
+"""Seconds without a message from Parsl's interchange after which its workers end.  Chosen: messages come
+every second; with 10, workers whose interchange has ended are orphans for ten seconds."""
+
 
 def run_points(
     task: Callable[[Point], Result],
@@ -224,8 +228,13 @@ def _parsl(workers: int) -> Iterator[Any]:
                     address="127.0.0.1",
                     interchange_launch_cmd=[
                         sys.executable,
+                        "-m",
+                        "bfsensor.sweeps.end_with_parent",
                         str(scripts / "interchange.py"),
                     ],
+                    # Workers end once they have not heard of the interchange for so long.
+                    heartbeat_period=1,
+                    heartbeat_threshold=SILENT,
                     provider=LocalProvider(
                         worker_init=f'export PATH={shlex.quote(str(scripts))}:"$PATH"'
                     ),

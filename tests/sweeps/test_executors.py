@@ -99,18 +99,21 @@ def test_refuses_unknown_executors():
 
 
 PROGRAM = """
-import multiprocessing, pathlib, signal, time
+import os, signal, sys
 from bfsensor.sweeps.executors import open_executor
 
-def task(seconds):
-    pathlib.Path(str(multiprocessing.current_process().pid)).touch()
+def task(folder, seconds):
+    import os, pathlib, time
+    pathlib.Path(folder, str(os.getpid())).touch()
     time.sleep(seconds)
 
 if __name__ == "__main__":
     # Processes in the background of a shell ignore it, and so do theirs.
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    with open_executor("process", 2) as executor:
-        list(executor.map(task, [60, 60]))
+    with open_executor(sys.argv[1], 2) as executor:
+        tasks = [executor.submit(task, os.getcwd(), seconds) for seconds in (60, 61)]
+        for one in tasks:
+            one.result()
 """
 
 
@@ -123,11 +126,19 @@ def is_alive(pid):
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="processes are listed in /proc")
-@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT])
-def test_workers_end_with_the_process_that_made_them(tmp_path, end):
+@pytest.mark.parametrize(
+    ("kind", "end"),
+    [
+        ("process", signal.SIGKILL),
+        ("process", signal.SIGINT),
+        pytest.param("dask", signal.SIGKILL, marks=pytest.mark.slow),
+        pytest.param("parsl", signal.SIGKILL, marks=pytest.mark.slow),
+    ],
+)
+def test_workers_end_with_the_process_that_made_them(tmp_path, kind, end):
     (tmp_path / "program.py").write_text(PROGRAM)
     process = subprocess.Popen(
-        [sys.executable, "program.py"], cwd=tmp_path, stderr=subprocess.DEVNULL
+        [sys.executable, "program.py", kind], cwd=tmp_path, stderr=subprocess.DEVNULL
     )
     workers = []
     for _ in range(600):
@@ -135,7 +146,7 @@ def test_workers_end_with_the_process_that_made_them(tmp_path, end):
         if len(workers) == 2:
             break
         time.sleep(0.1)
-    assert all(map(is_alive, workers)) and len(workers) == 2
+    assert all(map(is_alive, workers)) and len(workers) == 2, workers
     process.send_signal(end)
     try:
         process.wait(20)
