@@ -8,11 +8,13 @@ campaign whose truth lies open in its folder is refused.
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import json
 import os
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -27,6 +29,15 @@ from validation.concealed.score import check_report
 
 SUBMISSIONS = "submissions.json"
 OPENED = "opened.json"
+
+
+PR_SET_PDEATHSIG = 1
+"""Number of Linux' request for a signal at the end of the parent.  Published: prctl(2)."""
+
+
+def _end_with_parent() -> None:
+    """Have the kernel kill this process when the one that started it ends, however that ends."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def digest(path: Path) -> str:
@@ -204,6 +215,7 @@ def _run_one(words: Sequence[str], campaign: Path, results: Path) -> bool:
             stdin=subprocess.DEVNULL,
             stdout=said,
             stderr=subprocess.STDOUT,
+            preexec_fn=_end_with_parent if sys.platform == "linux" else None,
         )
         try:
             _, status, usage = os.wait4(process.pid, 0)
