@@ -114,9 +114,11 @@ def held(folder: str | os.PathLike[str], error: type[Exception]) -> Iterator[Non
                     f"{folder}: another process works on this output (number {file.read(20).strip()}): "
                     "wait until it ends, or name another output"
                 ) from None
-        file.truncate(0)
-        file.write(str(os.getpid()))
-        file.flush()
+        # The number only helps to find the process: a full disk is told by what is worth keeping.
+        with contextlib.suppress(OSError):
+            file.truncate(0)
+            file.write(str(os.getpid()))
+            file.flush()
         try:
             yield
         finally:

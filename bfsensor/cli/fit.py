@@ -117,6 +117,7 @@ def fit(
       bfsensor fit itl_sta3800c slopes.csv --hold itl.csv --free silicon.background_doping
     """
     from bfsensor.device.quantities import with_priors
+    from bfsensor.files import held
     from bfsensor.fit.fit import fit_device
     from bfsensor.fit.linear_predictors import make_tangents
     from bfsensor.recording.tables.measured import read_measured
@@ -130,6 +131,8 @@ def fit(
     names = [prior.name for prior in priors]
     chosen = [_resolve(name, names) for name in profiles]
     folder = output or Path(f"{loaded.name}_fit")
+    # A folder that cannot be written is told before minutes of solving.
+    click.get_current_context().with_resource(held(folder, FitError))
     known = with_priors(loaded, priors)
     response = _Response.of(
         known, priors, sets, folder, cells=cells, finer=finer, curved=curved, draws=draws
@@ -353,7 +356,6 @@ def _write(result: FitResult, folder: Path) -> list[str]:
     from bfsensor.fit.fit_figures import figure_for_fit
     from bfsensor.plots.style import save_figure
 
-    folder.mkdir(parents=True, exist_ok=True)
     result.write(folder / "fit.json")
     Device.from_toml(result.fitted_device).write(folder / "device.toml")
     written = ["fit.json", "device.toml"]
