@@ -98,7 +98,7 @@ def held(folder: str | os.PathLike[str], error: type[Exception]) -> Iterator[Non
     new = not path.parent.exists()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = path.open("a+")
+        file = path.open("a+b", buffering=0)
     except OSError as fault:
         raise error(f"{folder}: cannot be written: {fault}") from None
     with file:
@@ -111,14 +111,14 @@ def held(folder: str | os.PathLike[str], error: type[Exception]) -> Iterator[Non
             except OSError:
                 file.seek(0)
                 raise error(
-                    f"{folder}: another process works on this output (number {file.read(20).strip()}): "
+                    f"{folder}: another process works on this output "
+                    f"(number {file.read(20).decode().strip()}): "
                     "wait until it ends, or name another output"
                 ) from None
         # The number only helps to find the process: a full disk is told by what is worth keeping.
         with contextlib.suppress(OSError):
             file.truncate(0)
-            file.write(str(os.getpid()))
-            file.flush()
+            file.write(str(os.getpid()).encode())
         try:
             yield
         finally:
