@@ -4,9 +4,38 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+LONGEST = 560
+"""Largest number of characters of a message.  Chosen: with the words that a command puts before it,
+seven lines of a terminal; with 1120 a text that is quoted takes up to fourteen."""
+
+
+def in_one_line(text: object, most: int = LONGEST) -> str:
+    """Text in one line of printable characters; of one that is too long the middle is left out.
+
+    A message begins with its place and ends with what is allowed: both stay.
+
+    Examples
+    --------
+    >>> in_one_line("device.toml: name = " + "x" * 1000 + " must be short", 46)
+    'device.toml: name = x ... xxxxx must be short'
+    """
+    line = " ".join(str(text).split())
+    if not line.isprintable():
+        line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+    half = (most - 5) // 2
+    return (
+        line if len(line) <= most else f"{line[:half].rstrip()} ... {line[-half:].lstrip()}"
+    )
+
 
 class BFSensorError(Exception):
-    """Base class of all exceptions that bfsensor raises on purpose."""
+    """Base class of all exceptions that bfsensor raises on purpose.
+
+    Its text is one line of at most :data:`LONGEST` printable characters, whatever input it quotes.
+    """
+
+    def __str__(self) -> str:
+        return in_one_line(super().__str__())
 
 
 class DeviceError(BFSensorError, ValueError):

@@ -170,7 +170,8 @@ def written_whole(path: str | os.PathLike[str], error: type[Exception]) -> Itera
         yield beside
         os.replace(beside, target)
     except OSError as fault:
-        raise error(f"{path}: cannot be written: {fault}") from None
+        # The system's error repeats the path.
+        raise error(f"{path}: cannot be written: {fault.strerror or fault}") from None
     finally:
         # A name that is too long is neither there nor can be removed.
         with contextlib.suppress(OSError):

@@ -25,7 +25,7 @@ from bfsensor.cli.spots import spots
 from bfsensor.cli.sweep import sweep
 from bfsensor.cli.table import table
 from bfsensor.cli.warm import warm
-from bfsensor.errors import BFSensorError
+from bfsensor.errors import BFSensorError, in_one_line
 
 _EPILOG = """\b
 Results go to stdout and to files; messages and progress go to stderr, progress as a bar on a
@@ -60,6 +60,10 @@ class _Commands(click.Group):
         try:
             with _terminated_as_interrupted():
                 return super().invoke(ctx)
+        except click.ClickException as error:
+            # click declares the message final; it quotes what was given, of any length.
+            vars(error)["message"] = in_one_line(error.message, 500)
+            raise
         except BFSensorError as error:
             LOG.debug("where it happened:", exc_info=True)
             click.echo(f"bfsensor: {error}", err=True)
@@ -69,7 +73,7 @@ class _Commands(click.Group):
         except OSError as error:
             LOG.debug("where it happened:", exc_info=True)
             where = f"{error.filename}: " if error.filename else ""
-            click.echo(f"bfsensor: {where}{error.strerror or error}", err=True)
+            click.echo(in_one_line(f"bfsensor: {where}{error.strerror or error}"), err=True)
             ctx.exit(1)
         except KeyboardInterrupt as error:
             click.echo(
