@@ -65,7 +65,9 @@ PARTS = 64
 """Largest number of parts of a dotted key in a device file.  Chosen: keys of devices have at most 3, and
 50,000 parts take minutes to parse; with 128 nothing changes for a reader."""
 
-_DOTTED = re.compile(rf"(?:[\w-]+[ \t]*\.[ \t]*){{{PARTS}}}")
+# The search begins at the beginning of a word only: within one it would take a time in proportion
+# to the square of the word's length.
+_DOTTED = re.compile(rf"(?<![\w-])(?:[\w-]+[ \t]*\.[ \t]*){{{PARTS}}}")
 _LOG = logging.getLogger("bfsensor")
 
 _EINSTEIN: set[str] = set()

@@ -20,6 +20,7 @@ from bfsensor.device.parts import (
     Silicon,
 )
 from bfsensor.errors import DeviceError
+from bfsensor.text_files import nearly_equal
 
 PUBLISHED_MATERIAL = Material(
     permittivity_silicon=11.7,
@@ -55,11 +56,19 @@ def read_configuration(path: str | os.PathLike[str]) -> dict[str, str]:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise DeviceError(f"{path}: cannot be read: {error}") from None
-    out = {}
-    for line in text.splitlines():
-        match = _LINE.match(line.split("#", 1)[0])
-        if match:
-            out[match[1]] = match[2]
+    out: dict[str, str] = {}
+    for number, line in enumerate(text.split("\n"), 1):
+        given = line.split("#", 1)[0]
+        match = _LINE.match(given)
+        if match is None and out and given.strip():
+            raise DeviceError(
+                f"{path}: line {number}: {given.strip()[:80]!r} is neither KEY = VALUE nor a comment (#)"
+            )
+        if match and out.setdefault(match[1], match[2]) != match[2]:
+            raise DeviceError(
+                f"{path}: line {number}: {match[1]} = {match[2][:40]!r} contradicts an earlier line, "
+                f"{match[1]} = {out[match[1]][:40]!r}: leave out one of them"
+            )
     if not out:
         raise DeviceError(
             f"{path}: not a Poisson_CCD configuration: no line of the form key = value"
@@ -67,14 +76,22 @@ def read_configuration(path: str | os.PathLike[str]) -> dict[str, str]:
     return out
 
 
-_DEVICE_KEYS = re.compile(
-    r"(SensorThickness|PixelSize[XY]|BackgroundDoping|GateOxide|FieldOxide(Taper)?|GateGap|NumPhases"
-    r"|CollectingPhases|Vbb|Vparallel_(lo|hi)|qfh|CCDTemperature|NumberofFixedRegions"
-    r"|TreeRing(Amplitude|Period|Angle)"
-    r"|Channel(Stop|StopDot)?(Profile|Doping|Depth|SurfaceCharge|(Dose|Peak|Sigma)_\d+)"
-    r"|ChannelStop(Width|SideDiff|DotCenter|DotHeight))"
-)
-"""Keys of a configuration that a device takes over."""
+_DEVICE_KEYS = (
+    "SensorThickness", "PixelSizeX", "PixelSizeY", "BackgroundDoping", "GateOxide", "FieldOxide",
+    "FieldOxideTaper", "GateGap", "NumPhases", "CollectingPhases", "Vbb", "Vparallel_lo",
+    "Vparallel_hi", "qfh", "CCDTemperature", "NumberofFixedRegions", "TreeRingAmplitude",
+    "TreeRingPeriod", "TreeRingAngle", "ChannelStopWidth", "ChannelStopSideDiff",
+    "ChannelStopDotCenter", "ChannelStopDotHeight",
+    *(
+        f"{region}{key}"
+        for region in ("Channel", "ChannelStop", "ChannelStopDot")
+        for key in ("Profile", "Doping", "Depth", "SurfaceCharge", "Dose_", "Peak_", "Sigma_")
+    ),
+)  # fmt: skip
+"""Keys of a configuration that a device takes over; a number follows those that end in _."""
+
+_NUMBERED = re.compile(r"(?<=_)\d+$")
+"""Number of an implant at the end of its keys."""
 
 _DEVICE_LIKE = re.compile(
     r"(Channel|Gate|Field|Background|Vbb|Vpar|qf|Top|TreeRing|CCDTemp)"
@@ -83,14 +100,20 @@ _DEVICE_LIKE = re.compile(
 
 
 def _refuse_unknown(data: dict[str, str]) -> None:
-    """Refuse unknown keys that begin as keys of a device do."""
+    """Refuse unknown keys that begin as keys of a device do, or are one but for a letter."""
     for key in data:
-        if _DEVICE_LIKE.match(key) and not _DEVICE_KEYS.fullmatch(key):
-            if key in ("GatePotential", "TopAbsorptionProb", "GateGapPotential"):
-                continue  # they act on tracking, or on gaps that are refused themselves
+        name = _NUMBERED.sub("", key)
+        if name in _DEVICE_KEYS:
+            continue
+        if key in ("GatePotential", "TopAbsorptionProb", "GateGapPotential"):
+            continue  # they act on tracking, or on gaps that are refused themselves
+        meant = next((one for one in _DEVICE_KEYS if nearly_equal(name, one)), "")
+        if meant or _DEVICE_LIKE.match(key):
+            hint = (
+                f"did you mean {meant}?" if meant else "of another version of the program"
+            )
             raise DeviceError(
-                f"{key} is not a key that a device file can hold (misspelt, or of another "
-                "version of the program)"
+                f"{key} is not a key that a device file can hold (misspelt, or {hint})"
             )
 
 

@@ -24,6 +24,9 @@ _ROOM = 300.0
 _WAVELENGTHS = np.arange(250.0, 1451.0, 10.0)
 """Vacuum wavelengths of the measured absorption [nm]: Green (2008), table 1."""
 
+ABSORPTION_RANGE = (250.0, 1450.0)
+"""Range of wavelengths in which the absorption was measured [nm]: published, Green (2008), table 1."""
+
 _ABSORPTION = np.array([
     1.84e6, 1.97e6, 2.18e6, 2.37e6, 2.29e6, 1.77e6, 1.46e6, 1.30e6, 1.18e6, 1.10e6,
     1.06e6, 1.04e6, 7.37e5, 3.13e5, 1.43e5, 9.30e4, 6.95e4, 5.27e4, 4.02e4, 3.07e4,

@@ -21,6 +21,10 @@ INTERNAL = {
 }
 """Unit of each kind of quantity inside the package, by definition."""
 
+LONGEST = 100
+"""Largest number of characters of a quantity.  Chosen: a number of 17 digits and the longest unit of a
+device file have 30; units of 10,000 letters take a second to be refused, and of 200 nothing changes."""
+
 
 def to_internal(text: str, kind: str) -> float:
     """Convert a quantity such as ``'100 um'`` to a float in the internal unit.
@@ -48,7 +52,7 @@ def to_internal(text: str, kind: str) -> float:
     10000.0
     """
     try:
-        quantity = u.Quantity(text)
+        quantity = u.Quantity(text) if len(text) <= LONGEST else None
     except (TypeError, ValueError):
         quantity = None
     if quantity is None or not quantity.isscalar:

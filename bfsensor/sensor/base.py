@@ -530,9 +530,12 @@ def read_numbers(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def _number(text: str) -> Any:
     """Convert a text to int or float, or strip its quotes."""
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
+    try:
+        number = float(text)
+        # A whole number of hundreds of digits is no float.
+        return (
+            int(text) if math.isfinite(number) and text.lstrip("+-").isdecimal() else number
+        )
+    except ValueError:
+        pass
     return text.strip("'\"")

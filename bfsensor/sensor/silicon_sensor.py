@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from functools import lru_cache
 from pathlib import Path
@@ -55,7 +56,13 @@ _KEYS = (
     "CollectedCharge_0_0", "NumPhases", "CollectingPhases", "ChannelStopWidth",
     "FieldOxideTaper", "Vbb", "Vparallel_lo", "Vparallel_hi", "qfh", "CCDTemperature",
 )  # fmt: skip
-"""Keys that a .cfg file must hold, each with a number."""
+"""Keys that a .cfg file must hold, each with a finite number."""
+
+_ABOVE_0 = (
+    "NumVertices", "PixelBoundaryNx", "PixelBoundaryNy", "PixelSizeX", "SensorThickness",
+    "CollectedCharge_0_0", "NumPhases", "CCDTemperature",
+)  # fmt: skip
+"""Keys of which the number is above 0."""
 
 
 class SiliconSensor(EngineSensor):
@@ -316,10 +323,13 @@ def _find(name: str) -> tuple[str, str]:
 
 
 def _defaults(config: dict[str, Any], path: str) -> dict[str, Any]:
-    """Refuse a configuration in which a key of ``_KEYS`` holds no number."""
+    """Refuse a configuration in which a key of ``_KEYS`` holds no finite number, or one below 0."""
     if "PixelSizeX" not in config and "PixelSize" in config:
         config["PixelSizeX"] = config["PixelSize"]
     for key in _KEYS:
-        if not isinstance(config.get(key), int | float):
-            raise SensorError(f"{path}: {key} = {config.get(key)!r} is not a number")
+        value = config.get(key)
+        low = 0.0 if key in _ABOVE_0 else -math.inf
+        if not isinstance(value, int | float) or not low < value < math.inf:
+            kind = "above 0" if key in _ABOVE_0 else "finite"
+            raise SensorError(f"{path}: {key} = {shown(value)} must be a number, {kind}")
     return {}

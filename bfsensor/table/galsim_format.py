@@ -314,11 +314,14 @@ class _Numbers:
                 raise TableError(f"{self.cfg}: {key} is missing")
             return default
         try:
-            return float(self.data[key])
+            value = float(self.data[key])
         except ValueError:
+            value = float("nan")
+        if not np.isfinite(value):
             raise TableError(
-                f"{self.cfg}: {key} = {self.data[key]!r} is not a number"
-            ) from None
+                f"{self.cfg}: {key} = {self.data[key]!r} must be a finite number"
+            )
+        return value
 
     def whole(self, key: str) -> int:
         """Return the whole number, above 0, of a key."""
@@ -337,6 +340,8 @@ class _Numbers:
         if n != ny or n % 2 == 0:
             raise TableError(f"{self.cfg}: {n} x {ny} pixels must be square and odd")
         pitch = self.number("PixelSizeX")
+        if not pitch > 0:
+            raise TableError(f"{self.cfg}: PixelSizeX = {pitch:g} um must be above 0 um")
         return n, nv, (pitch, self.number("PixelSizeY", pitch))
 
 
