@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from bfsensor.errors import TableError
 from bfsensor.files import refuse_existing, written_whole
+from bfsensor.recording.raw.open_fits import limited_axes
 from bfsensor.typing import FloatArray
 
 SCHEMA = "bfsensor distortion table"
@@ -30,6 +31,12 @@ ARRAYS = ("corners", "horizontal", "vertical")
 
 AXES = ("charges", "backgrounds", "depths")
 """Axes of the arrays, each an image extension of that name in capitals."""
+
+UNITS = {
+    **{name.upper(): "um" for name in ARRAYS}, "CHARGES": "electron", "BACKGROUNDS": "electron",
+    "DEPTHS": "um", "DRIFT": "V/um",
+}  # fmt: skip
+"""BUNIT of the extensions; a file in which it is missing or empty is read, as it has these units."""
 
 
 def write_table(table: Any, path: str | os.PathLike[str], *, overwrite: bool) -> None:
@@ -90,9 +97,9 @@ def write_table(table: Any, path: str | os.PathLike[str], *, overwrite: bool) ->
         hdu = fits.ImageHDU(array.astype(np.float32), name=name.upper())
         hdu.header["BUNIT"] = "um"
         hdus.append(hdu)
-    for name, unit in zip(AXES, ("electron", "electron", "um"), strict=True):
+    for name in AXES:
         hdu = fits.ImageHDU(getattr(table, name), name=name.upper())
-        hdu.header["BUNIT"] = unit
+        hdu.header["BUNIT"] = UNITS[name.upper()]
         hdus.append(hdu)
     meta = json.dumps(
         {"errors": dict(table.errors), "provenance": dict(table.provenance)},
@@ -140,9 +147,13 @@ def read_fields(path: str | os.PathLike[str]) -> dict[str, Any]:
             # astropy only warns of a wrong checksum or a short file; here both are errors.
             warnings.simplefilter("error", AstropyWarning)
             # Opened here, because astropy does not close a file whose headers it cannot read.
-            with open(path, "rb") as stream, fits.open(stream, checksum=True) as hdus:
+            with (
+                open(path, "rb") as stream,
+                fits.open(limited_axes(stream), checksum=True) as hdus,
+            ):
                 header = hdus[0].header
                 _check_schema(header, path)
+                _check_extensions([(hdu.name, hdu.header) for hdu in hdus[1:]], path)
                 data = {hdu.name: hdu.data for hdu in hdus[1:]}
                 hdus[0].verify("exception")
     except TableError:
@@ -163,24 +174,57 @@ def read_fields(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise TableError(f"{path}: {error}") from None
 
 
+def _check_extensions(hdus: list[tuple[str, Mapping[str, Any]]], path: Path) -> None:
+    """Refuse two extensions of one name, and data in other units than this version reads."""
+    seen: set[str] = set()
+    for name, header in hdus:
+        if name in seen:
+            raise TableError(f"{path}: two extensions have the name {name!r}")
+        seen.add(name)
+        unit, given = UNITS.get(name, ""), header.get("BUNIT", "")
+        if given not in (unit, ""):
+            raise TableError(f"{path}: {name}: BUNIT = {given!r} must be {unit!r}")
+
+
+def _number(header: Mapping[str, Any], key: str) -> float:
+    """Return the number of a keyword; texts and logical values are none."""
+    value = header[key]
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{key} = {value!r} is not a number")
+    return value
+
+
+def _flag(header: Mapping[str, Any], key: str) -> bool:
+    """Return the logical value of a keyword."""
+    if not isinstance(header[key], bool):
+        raise ValueError(f"{key} = {header[key]!r} must be T or F")
+    return bool(header[key])
+
+
 def _fields(header: Mapping[str, Any], data: dict[str, Any]) -> dict[str, Any]:
     """Fields of a table from the primary header and the data of the extensions."""
     arrays = {}
     for name in ARRAYS:
         array = np.array(data[name.upper()], float)
-        arrays[name] = _whole(name, array) if header["QUADRANT"] else array
+        arrays[name] = _whole(name, array) if _flag(header, "QUADRANT") else array
+        pitch = min(_number(header, "PITCHX"), _number(header, "PITCHY"))
+        if array.size and not np.abs(array).max() < pitch:
+            raise ValueError(
+                f"{name.upper()}: a vertex is shifted by {np.abs(array).max():g} um, a pixel "
+                f"({pitch:g} um) or more"
+            )
     meta = json.loads(_text(data["META"]))
     return {
         **{name: np.array(data[name.upper()], float) for name in AXES},
-        "pitch": (header["PITCHX"], header["PITCHY"]),
-        "thickness": header["THICKNSS"],
-        "vertices": header["VERTICES"],
-        "reach": header["REACH"],
-        "full_well": header.get("FULLWELL", float("nan")),
+        "pitch": (_number(header, "PITCHX"), _number(header, "PITCHY")),
+        "thickness": _number(header, "THICKNSS"),
+        "vertices": _number(header, "VERTICES"),
+        "reach": _number(header, "REACH"),
+        "full_well": _number(header, "FULLWELL") if "FULLWELL" in header else float("nan"),
         "errors": meta["errors"],
         "provenance": meta["provenance"],
         "device_text": _text(data["DEVICE"]),
-        "symmetric": header["SYMMETRC"],
+        "symmetric": _flag(header, "SYMMETRC"),
         "drift_field": np.array(data.get("DRIFT", ()), float),
         **arrays,
     }
@@ -190,7 +234,9 @@ def _check_schema(header: Mapping[str, Any], path: Path) -> None:
     """Refuse a file that is no table of the schema that this version reads."""
     if header.get("SCHEMA") != SCHEMA:
         raise TableError(f"{path}: not a distortion table (no SCHEMA = '{SCHEMA}')")
-    if header.get("SCHEMAV") != SCHEMA_VERSION:
+    if header.get("BUNIT", "um") != "um":
+        raise TableError(f"{path}: BUNIT = {header['BUNIT']!r} must be 'um'")
+    if header.get("SCHEMAV") is True or header.get("SCHEMAV") != SCHEMA_VERSION:
         raise TableError(
             f"{path}: schema version {header.get('SCHEMAV')} is not {SCHEMA_VERSION}, the "
             "one this version of bfsensor reads"

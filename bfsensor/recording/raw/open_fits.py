@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import BinaryIO
 
 from astropy.io import fits
 from astropy.utils.exceptions import AstropyUserWarning
@@ -14,9 +16,13 @@ from astropy.utils.exceptions import AstropyUserWarning
 from bfsensor.errors import RecordingError
 
 BROKEN = (
-    OSError, EOFError, ValueError, TypeError, LookupError, zlib.error, fits.VerifyError,
+    OSError, EOFError, ValueError, TypeError, LookupError, OverflowError, AssertionError, zlib.error,
+    fits.VerifyError,
 )  # fmt: skip
 """Exceptions that astropy raises on damaged headers and damaged data."""
+
+MOST_AXES = 999
+"""Largest number of axes of a FITS file, published in the standard (version 4.0, section 4.4.1)."""
 
 
 @contextmanager
@@ -58,7 +64,7 @@ def open_fits(
             with (
                 open(path, "rb") as stream,
                 fits.open(
-                    stream, memmap=False, disable_image_compression=as_stored
+                    limited_axes(stream), memmap=False, disable_image_compression=as_stored
                 ) as hdus,
             ):
                 len(hdus)  # finds all extensions, and the end
@@ -75,6 +81,24 @@ def open_fits(
             if not isinstance(error, BROKEN) and type(error).__name__ != "CfitsioException":
                 raise
             raise RecordingError(f"{path}: cannot be read: {one_line(error)}") from None
+
+
+def limited_axes(stream: BinaryIO) -> BinaryIO:
+    """Return the stream of a file; refuse a first header with more axes than FITS allows.
+
+    astropy counts to NAXIS before it compares it with what is there.
+
+    Raises
+    ------
+    ValueError
+        NAXIS is above :data:`MOST_AXES`.
+    """
+    header = stream.read(2880)
+    stream.seek(0)
+    found = re.search(rb"NAXIS   = *(\d+)", header)
+    if found and len(found[1]) > 3:
+        raise ValueError(f"NAXIS = {found[1][:20].decode()} must be at most {MOST_AXES}")
+    return stream
 
 
 def one_line(error: object) -> str:
