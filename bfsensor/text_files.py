@@ -39,8 +39,9 @@ def load_yaml(text: str) -> Any:
     Raises
     ------
     UnreadableTextError
-        Not YAML, deeper than :data:`DEEPEST`, or a named part (``&name``) that holds names of others
-        (``*name``): ten of these within one another stand for billions of entries.
+        Not YAML, deeper than :data:`DEEPEST`, with a key that is given twice, or a named part
+        (``&name``) that holds names of others (``*name``): ten of these within one another stand for
+        billions of entries.
 
     Examples
     --------
@@ -83,9 +84,11 @@ def read_ecsv(path: str | os.PathLike[str]) -> Table:
     from astropy.utils.exceptions import AstropyUserWarning
 
     try:
-        with Path(path).open(encoding="utf-8", newline=None) as lines:
-            header = takewhile(lambda line: line.startswith("#"), lines)
-            load_yaml("".join(line[2:] or "\n" for line in header if line[1:2] == " "))
+        lines = read_lines(path)
+        if not lines[0].startswith("# %ECSV"):
+            raise UnreadableTextError("the first line must begin with '# %ECSV'")
+        header = takewhile(lambda line: line.startswith("#"), lines)
+        load_yaml("\n".join(line[2:] for line in header if line[1:2] in (" ", "")))
         with warnings.catch_warnings():
             # astropy only warns of a column whose type does not exist.
             warnings.simplefilter("error", AstropyUserWarning)
@@ -95,6 +98,21 @@ def read_ecsv(path: str | os.PathLike[str]) -> Table:
         OSError, ValueError, TypeError, LookupError, AttributeError, AstropyUserWarning
     ) as error:  # fmt: skip
         raise UnreadableTextError(one_line(error)) from None
+
+
+def read_lines(path: str | os.PathLike[str]) -> list[str]:
+    """Read the lines of a text in UTF-8, at least one, without their ends.
+
+    Raises
+    ------
+    OSError, ValueError
+        The file cannot be read, is not UTF-8, or holds the character NUL, at which readers end a word.
+    """
+    text = Path(path).read_text(encoding="utf-8")
+    if "\0" in text:
+        line = text.count("\n", 0, text.index("\0")) + 1
+        raise UnreadableTextError(f"line {line}: the character NUL is not text")
+    return text.split("\n")
 
 
 def one_line(message: object, most: int = 200) -> str:
@@ -110,18 +128,62 @@ def one_line(message: object, most: int = 200) -> str:
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
+def nearly_equal(one: str, other: str) -> bool:
+    """Whether two words are equal but for one letter, two that changed places, or capitals.
+
+    Words of one or two letters are so only by their capitals.
+
+    Examples
+    --------
+    >>> nearly_equal("wavelenqth", "wavelength"), nearly_equal("x", "y"), nearly_equal("X", "x")
+    (True, False, True)
+    """
+    a, b = one.lower(), other.lower()
+    if a == b:
+        return True
+    if min(len(a), len(b)) < 3 or abs(len(a) - len(b)) > 1:
+        return False
+    same = next(
+        (k for k, (p, q) in enumerate(zip(a, b, strict=False)) if p != q),
+        min(len(a), len(b)),
+    )
+    p, q = a[same:], b[same:]
+    exchanged = len(p) > 1 and p[:2] == q[1::-1] and p[2:] == q[2:]
+    return exchanged or p[1:] == q[1:] or p == q[1:] or p[1:] == q
+
+
 def _check(events: Iterator[yaml.Event]) -> None:
-    """Refuse depths beyond :data:`DEEPEST`, and names within named parts, without building them."""
+    """Refuse depths beyond :data:`DEEPEST`, keys given twice, and names within named parts.
+
+    Nothing is built.
+    """
     named: list[bool] = []
+    # Of each open part its keys so far, None for a list; whether its next entry is a key.
+    keys: list[set[str] | None] = []
+    key_next: list[bool] = []
     for event in events:
+        # An entry of a mapping: keys and values take turns, and a part is an entry as it begins.
+        if isinstance(event, yaml.NodeEvent) and keys and (known := keys[-1]) is not None:
+            if key_next[-1] and isinstance(event, yaml.ScalarEvent):
+                if event.value in known:
+                    raise UnreadableTextError(
+                        f"line {event.start_mark.line + 1}: {one_line(event.value, 60)!r} is given "
+                        "twice: leave out one of them"
+                    )
+                known.add(event.value)
+            key_next[-1] = not key_next[-1]
         if isinstance(event, yaml.CollectionStartEvent):
             named.append(event.anchor is not None)
+            keys.append(set() if isinstance(event, yaml.MappingStartEvent) else None)
+            key_next.append(True)
             if len(named) > DEEPEST:
                 raise UnreadableTextError(
                     f"line {event.start_mark.line + 1}: entries are nested deeper than {DEEPEST}"
                 )
         elif isinstance(event, yaml.CollectionEndEvent):
             named.pop()
+            keys.pop()
+            key_next.pop()
         elif isinstance(event, yaml.AliasEvent) and any(named):
             raise UnreadableTextError(
                 f"line {event.start_mark.line + 1}: a named part holds the name *{event.anchor} of "

@@ -96,7 +96,7 @@ def test_values_are_refused_before_anything_is_solved(said, args, why):
 @pytest.mark.parametrize(
     ("row", "why"),
     [
-        ("word,1.2,1.2", "column flux"),
+        ("word,1.2,1.2", "row 1: flux = 'word' is not a number"),
         ("nan,1.2,1.2", "row 1: flux = nan must be a finite number (1 of 3 rows)"),
         ("1e4,nan,1.2", "row 1: sigma_x = nan must be a number above 0"),
         ("1e4,1.2,-1", "row 1: sigma_y = -1 must be a number above 0"),

@@ -19,9 +19,14 @@ from bfsensor.measure.covariance_model import model_covariances
 from bfsensor.recording.raw.headers import is_fits
 from bfsensor.recording.tables.area_changes import read_area_changes
 from bfsensor.recording.tables.calibration_tables import require
-from bfsensor.recording.tables.covariance_tables import floats, warn_of_axes, whole_numbers
+from bfsensor.recording.tables.covariance_tables import warn_of_axes
 from bfsensor.recording.tables.measured import area_changes_of_amplifiers
-from bfsensor.recording.tables.setting_tables import read_text
+from bfsensor.recording.tables.text_tables import (
+    LARGEST_LAG,
+    floats,
+    read_text,
+    whole_numbers,
+)
 from bfsensor.typing import FloatArray
 
 AREAS = (
@@ -217,7 +222,7 @@ def _of_fit(path: Path) -> CameraAreas:
 def _to_electrons(path: Path, table: Table) -> None:
     """Convert level and covariances from ADU with the column gain [e-/ADU], in place."""
     require(str(path), table.colnames, ("gain",))
-    gain = floats(table, "gain")
+    gain = floats(path, table, "gain")
     if not np.all(gain > 0):
         raise RecordingError(f"{path}: gain must be above 0 e-/ADU in every row")
     for name, power in (
@@ -228,7 +233,7 @@ def _to_electrons(path: Path, table: Table) -> None:
         ("sigma", 2),
     ):
         if name in table.colnames:
-            table[name] = floats(table, name) * gain**power
+            table[name] = floats(path, table, name) * gain**power
 
 
 def _square(
@@ -270,13 +275,11 @@ def _of_covariances(path: Path, table: Table) -> CameraAreas:
             f"{path}: its covariances are in {', '.join(sorted(units))}, not electrons: measure "
             "them again with --gain"
         )
-    i, j = (whole_numbers(path, table, name) for name in COVARIANCES[:2])
-    level, value, error = (floats(table, name) for name in COVARIANCES[2:])
+    i, j = (whole_numbers(path, table, name, most=LARGEST_LAG) for name in COVARIANCES[:2])
+    level, value, error = (floats(path, table, name) for name in COVARIANCES[2:])
     for name, one in zip(COVARIANCES[2:], (level, value, error), strict=True):
         if not np.all(np.isfinite(one)):
             raise RecordingError(f"{path}: {name} holds values that are not finite")
-    if min(i.min(), j.min()) < 0:
-        raise RecordingError(f"{path}: lags below 0; average them into i >= 0, j >= 0")
     if not np.all(error > 0) or not np.all(level > 0):
         raise RecordingError(f"{path}: levels and errors must be above 0")
     amplifier = (

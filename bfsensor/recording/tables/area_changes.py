@@ -7,14 +7,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from astropy.io import ascii as text_tables
-from astropy.io.ascii import InconsistentTableError
 from numpy.typing import NDArray
 
 from bfsensor.errors import RecordingError
 from bfsensor.recording.tables.calibration_tables import require
-from bfsensor.recording.tables.covariance_tables import floats, warn_of_axes, whole_numbers
+from bfsensor.recording.tables.covariance_tables import warn_of_axes
+from bfsensor.recording.tables.text_tables import (
+    LARGEST_LAG,
+    numbers,
+    read_text,
+    whole_numbers,
+)
 from bfsensor.typing import FloatArray
+
+_ADVICE = (
+    "; leave out lags that were not measured, and average quadrants into i >= 0, j >= 0"
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +91,8 @@ def read_area_changes(
     Raises
     ------
     RecordingError
-        The file cannot be read, a column is missing, or a lag is given twice, below 0 or not
-        a whole number.
+        The file cannot be read, a column is missing, a lag is given twice, below 0 or not
+        a whole number, a value is not finite, or an error is not above 0.
 
     Notes
     -----
@@ -105,25 +113,17 @@ def read_area_changes(
     ((2, 1), 3e-07)
     """
     path = Path(path)
-    try:
-        form = "ecsv" if path.suffix == ".ecsv" else "csv"
-        table = text_tables.read(path, format=form, comment="#")
-    except (OSError, ValueError, InconsistentTableError) as error:
-        line = " ".join(str(error).split())[:200]
-        raise RecordingError(f"{path}: cannot be read: {line}") from None
+    table = read_text(path)
     require(str(path), table.colnames, columns)
-    i, j = (whole_numbers(path, table, name) for name in columns[:2])
-    if min(i.min(), j.min()) < 0:
-        raise RecordingError(
-            f"{path}: lags below 0 are not read; average the quadrants into i >= 0, j >= 0"
-        )
+    i, j = (whole_numbers(path, table, name, most=LARGEST_LAG) for name in columns[:2])
     a = np.full((j.max() + 1, i.max() + 1), np.nan)
     errors = a.copy()
     if len(set(zip(i.tolist(), j.tolist(), strict=True))) < len(i):
         raise RecordingError(
             f"{path}: a lag ({columns[0]}, {columns[1]}) is given twice; one row each is allowed"
         )
-    a[j, i], errors[j, i] = floats(table, columns[2]), floats(table, columns[3])
+    a[j, i] = numbers(path, table, columns[2], advice=_ADVICE)
+    errors[j, i] = numbers(path, table, columns[3], above=0.0, advice=_ADVICE)
     times = np.where(np.arange(a.shape[1]) > 0, 2, 1) * np.where(
         np.arange(a.shape[0]) > 0, 2, 1
     )[:, None]  # fmt: skip

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from bfsensor.errors import RecordingError
 from bfsensor.files import refuse_existing, written_whole
 from bfsensor.recording.raw.open_fits import open_fits
-from bfsensor.text_files import UnreadableTextError, read_ecsv
+from bfsensor.text_files import UnreadableTextError, one_line, read_ecsv
 
 Columns = Mapping[str, NDArray[Any]]
 Sides = Mapping[str, int]
@@ -51,6 +51,7 @@ class CalibrationTable:
     REQUIRED: ClassVar[tuple[str, ...]] = ()
     MATRICES: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     UNITS: ClassVar[Mapping[str, str]] = {}
+    POSITIVE: ClassVar[tuple[str, ...]] = ("GAIN",)
 
     def __post_init__(self) -> None:
         meta = dict(self.meta)
@@ -103,7 +104,21 @@ class CalibrationTable:
             raise RecordingError(
                 f"{path}: its OBSTYPE is {kind!r}, not {cls.OBSTYPE!r} as of {cls.__name__}"
             )
-        return cls._from_tables(str(path), tables)
+        try:
+            made = cls._from_tables(str(path), tables)
+        # Columns of another shape or type than the format's end in several kinds of exception.
+        except (RecordingError, ValueError, TypeError, LookupError, OverflowError) as error:
+            text = str(error) if isinstance(error, RecordingError) else one_line(error)
+            place = "" if text.startswith(f"{path}: ") else f"{path}: "
+            raise RecordingError(f"{place}{text}") from None
+        for name in cls.POSITIVE:
+            values = np.asarray(made.columns.get(name, ()), float)
+            wrong = np.isinf(values) | (values <= 0)
+            if wrong.any():
+                raise RecordingError(
+                    f"{path}: {name} = {values[wrong][0]:g} must be above 0 and finite (nan: not known)"
+                )
+        return made
 
     @classmethod
     def _from_tables(cls: type[_Kind], path: str, tables: list[Table]) -> _Kind:

@@ -14,10 +14,21 @@ from numpy.typing import ArrayLike, NDArray
 from bfsensor.errors import RecordingError
 from bfsensor.recording.tables.calibration_tables import read_tables, require, write_tables
 from bfsensor.recording.tables.lsst_datasets import PhotonTransferDataset
+from bfsensor.recording.tables.text_tables import (
+    LARGEST_LAG,
+    floats,
+    numbers,
+    refuse_misspelt,
+    whole_numbers,
+)
 from bfsensor.typing import FloatArray
 
 KIND = "bfsensor covariance table"
 """Value of the header entry ``kind`` in files that :meth:`CovarianceTable.write` makes."""
+
+COLUMNS = ("amp", "mu_e", "mu_adu", "gain", "i", "j", "cov", "sigma", "npix", "npair", "wavelength",
+           "vbb", "matrix")  # fmt: skip
+"""Columns of a table of covariances, by the names that are read."""
 
 UNIT_RANGE = (0.8, 1.25)
 """Range of C_00 over the level [e-] of an amplifier's dimmest flats without a warning.
@@ -169,13 +180,15 @@ def read_covariances(path: str | os.PathLike[str]) -> CovarianceTable:
     table = read_tables(path)[0]
     if str(table.meta.get("OBSTYPE", "")).strip() == "PTC":
         return from_photon_transfer(PhotonTransferDataset.read(path), path)
+    refuse_misspelt(path, table.colnames, COLUMNS)
+    refuse_misspelt(path, map(str, table.meta), ("gain", "unit", "difference"))
     require(str(path), table.colnames, ("i", "j", "cov"))
     n = len(table)
     gain = _gain(path, table)
     if "mu_e" in table.colnames:
-        level = floats(table, "mu_e")
+        level = numbers(path, table, "mu_e", above=0.0)
     elif "mu_adu" in table.colnames:
-        level = floats(table, "mu_adu") * gain
+        level = numbers(path, table, "mu_adu", above=0.0) * gain
     else:
         raise RecordingError(
             f"{path}: no column of the level, mu_e [e-] or mu_adu [ADU] with a gain"
@@ -192,7 +205,7 @@ def read_covariances(path: str | os.PathLike[str]) -> CovarianceTable:
     factor = factor / 2 if difference else factor
     warnings = []
     if "sigma" in table.colnames:
-        error = floats(table, "sigma") * factor
+        error = floats(path, table, "sigma") * factor
     else:
         raise RecordingError(
             f"{path}: sigma missing, the standard errors of cov, without which it cannot be fitted"
@@ -214,10 +227,12 @@ def read_covariances(path: str | os.PathLike[str]) -> CovarianceTable:
     return _checked(
         CovarianceTable(
             path=path, amplifier=np.array([str(v) for v in names]), level=level,
-            lag_x=whole_numbers(path, table, "i"), lag_y=whole_numbers(path, table, "j"),
-            covariance=floats(table, "cov") * factor, error=error,
+            lag_x=whole_numbers(path, table, "i", most=LARGEST_LAG),
+            lag_y=whole_numbers(path, table, "j", most=LARGEST_LAG),
+            covariance=floats(path, table, "cov") * factor, error=error,
             pixels=whole_numbers(path, table, "npix"), pairs=whole_numbers(path, table, "npair"),
-            wavelength=floats(table, "wavelength"), back_bias=floats(table, "vbb"),
+            wavelength=numbers(path, table, "wavelength", above=0.0, blank=True),
+            back_bias=numbers(path, table, "vbb", blank=True),
             matrix=matrix, warnings=tuple(warnings),
         )
     )  # fmt: skip
@@ -362,31 +377,20 @@ def warn_of_axes(x: float, y: float) -> str:
 def _gain(path: Path, table: Table) -> FloatArray:
     """Gain of each row [e-/ADU]; nan without one, which is an error for values in ADU."""
     if "gain" in table.colnames:
-        return floats(table, "gain")
+        return numbers(path, table, "gain", above=0.0)
     value = table.meta.get("gain")
     needed = "mu_e" not in table.colnames or table.meta.get("unit") == "adu"
     if value is None and needed:
         raise RecordingError(
             f"{path}: in ADU, and no gain [e-/ADU] in a column or header entry gain"
         )
-    return np.full(len(table), np.nan if value is None else float(value))
-
-
-def floats(table: Table, name: str) -> FloatArray:
-    """Column of a table as floats; nan where it is masked or missing."""
-    if name not in table.colnames:
+    if value is None:
         return np.full(len(table), np.nan)
-    try:
-        return np.asarray(np.ma.filled(np.ma.asarray(table[name], float), np.nan), float)
-    except ValueError as error:
+    number = (
+        value if isinstance(value, int | float) and not isinstance(value, bool) else np.nan
+    )
+    if not 0 < number < np.inf:
         raise RecordingError(
-            f"column {name}: {str(error)[:120]}; numbers are allowed"
-        ) from None
-
-
-def whole_numbers(path: Path, table: Table, name: str) -> NDArray[np.int64]:
-    """Column of a table as whole numbers; 0 where it is missing."""
-    values = floats(table, name) if name in table.colnames else np.zeros(len(table))
-    if not np.all(values == np.round(values)):
-        raise RecordingError(f"{path}: {name} must be whole numbers")
-    return values.astype(np.int64)
+            f"{path}: header entry gain = {str(value)[:80]!r} must be a number above 0 e-/ADU"
+        )
+    return np.full(len(table), float(number))

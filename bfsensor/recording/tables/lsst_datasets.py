@@ -66,6 +66,8 @@ class PhotonTransferDataset(CalibrationTable):
     ([5000.0], (1, 2, 2))
     """
 
+    # The pipeline writes gains of 0 for amplifiers that it could not fit; who needs a gain says so.
+    POSITIVE = ()
     OBSTYPE = "PTC"
     SCHEMA = "Gen3 Photon Transfer Curve"
     VERSION = 2.6

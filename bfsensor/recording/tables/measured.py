@@ -20,8 +20,8 @@ from bfsensor.recording.tables.setting_tables import (
     SettingTable,
     is_setting_table,
     read_setting_table,
-    read_text,
 )
+from bfsensor.recording.tables.text_tables import read_text
 
 CONDITIONS = {
     "back_bias": ("potential", 1.0),
@@ -34,6 +34,10 @@ CONDITIONS = {
 
 The factor is exact: 1 for internal units (V, K), and 1000 nm to an um for a wavelength.
 """
+
+HIGHEST_LEVEL = 1e9
+"""Highest charge in every pixel about which a response was measured [e-].  Chosen: a thousand full
+wells, as for sensors; at twice as much nothing changes."""
 
 FEWEST = 3
 """Smallest number of amplifiers from whose scatter the error of their mean is taken.
@@ -135,6 +139,8 @@ def parse_condition(given: Mapping[str, Any]) -> tuple[dict[str, Any], float | N
                 continue
             kind, factor = CONDITIONS[key]
             fields[key] = round(to_internal(text, kind) * factor, 9)
+            if not np.isfinite(fields[key]):
+                raise RecordingError(f"{key} = {text!r} must be finite")
         except KeyError:
             raise RecordingError(
                 f"{key!r} is not a condition; conditions are {', '.join(CONDITIONS)}, level, sigma"
@@ -155,9 +161,10 @@ def _electrons(text: str) -> float:
         level = float(text.removesuffix("e-").strip())
     except ValueError:
         level = -1.0
-    if not 0 <= level < np.inf:
+    if not 0 <= level <= HIGHEST_LEVEL:
         raise RecordingError(
-            f"level = {text!r} must be the charge in every pixel, 0 e- or more, such as 40000"
+            f"level = {text!r} must be the charge in every pixel, from 0 to {HIGHEST_LEVEL:g} e-, such "
+            "as 40000"
         )
     return level
 

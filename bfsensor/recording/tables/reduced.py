@@ -9,9 +9,6 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
-from astropy.io import ascii as text_tables
-from astropy.io.ascii import InconsistentTableError
-from astropy.table import Table
 from numpy.typing import NDArray
 
 from bfsensor.errors import RecordingError
@@ -20,10 +17,9 @@ from bfsensor.recording.raw.headers import is_fits
 from bfsensor.recording.tables.area_changes import AreaChangeTable, read_area_changes
 from bfsensor.recording.tables.covariance_tables import (
     CovarianceTable,
-    floats,
     read_covariances,
 )
-from bfsensor.text_files import one_line, read_ecsv
+from bfsensor.recording.tables.text_tables import numbers, read_text, refuse_misspelt
 from bfsensor.typing import FloatArray
 
 SPOT_COLUMNS = {
@@ -43,6 +39,11 @@ POSITIVE = ("sigma_x", "sigma_y", "size", "wavelength")
 
 LABELS = ("amp", "amplifier", "segment", "state", "region")
 """Columns whose words divide a spot table into groups."""
+
+ERROR_ENDS = ("error", "err", "sigma")
+"""Ends of the names of columns of standard errors, after a _."""
+
+_ADVICE = "; leave out spots that were not measured"
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,16 +162,22 @@ def read_spots(path: str | os.PathLike[str]) -> SpotTable:
     ([1.0, 1.1], 2)
     """
     path = Path(path)
-    table = _read_text(path)
+    table = read_text(path)
     values, errors = {}, {}
+    words_of = [word for words in SPOT_COLUMNS.values() for word in words]
+    ends = [f"{word}_{end}" for word in words_of for end in ERROR_ENDS]
+    refuse_misspelt(path, table.colnames, [*words_of, *ends, *LABELS])
     for name, words in SPOT_COLUMNS.items():
         column = next((word for word in words if word in table.colnames), None)
         if column is None:
             continue
-        values[name] = _numbers(path, table, column, positive=name in POSITIVE)
-        for end in ("error", "err", "sigma"):
+        low = 0.0 if name in POSITIVE else -np.inf
+        values[name] = numbers(path, table, column, above=low, advice=_ADVICE)
+        for end in ERROR_ENDS:
             if f"{column}_{end}" in table.colnames:
-                errors[name] = _numbers(path, table, f"{column}_{end}", positive=True)
+                errors[name] = numbers(
+                    path, table, f"{column}_{end}", above=0.0, advice=_ADVICE
+                )
     if not {"flux", "peak"} & set(values):
         raise RecordingError(
             f"{path}: no column flux or peak [e-] among {', '.join(table.colnames)}"
@@ -182,7 +189,13 @@ def read_spots(path: str | os.PathLike[str]) -> SpotTable:
         )
     labels = [name for name in LABELS if name in table.colnames]
     group = np.array(
-        [" ".join(str(table[name][k]) for name in labels) for k in range(len(table))], str
+        [
+            " ".join(
+                "" if np.ma.is_masked(c := table[name][k]) else str(c) for name in labels
+            )
+            for k in range(len(table))
+        ],
+        str,
     )
     warnings = []
     sizes = [name for name in ("sigma_x", "sigma_y", "size") if name in values]
@@ -197,23 +210,6 @@ def read_spots(path: str | os.PathLike[str]) -> SpotTable:
             "of a pixel cannot be tested"
         )
     return SpotTable(path, values, errors, group, tuple(warnings))
-
-
-def _numbers(path: Path, table: Table, column: str, *, positive: bool) -> FloatArray:
-    """Column of finite numbers, above 0 where it is ``positive``; the first other cell is refused."""
-    try:
-        values = floats(table, column)
-    except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from None
-    wrong = ~np.isfinite(values) | (positive & (values <= 0))
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        raise RecordingError(
-            f"{path}: row {row + 1}: {column} = {values[row]:g} must be "
-            f"{'a number above 0' if positive else 'a finite number'} ({int(wrong.sum())} of "
-            f"{len(values)} rows); leave out spots that were not measured"
-        )
-    return values
 
 
 def read_profile(path: str | os.PathLike[str], *, unit: str = "") -> RadialProfile:
@@ -250,9 +246,13 @@ def read_profile(path: str | os.PathLike[str], *, unit: str = "") -> RadialProfi
     """
     path = Path(path)
     if path.suffix == ".ecsv":
-        table = _read_text(path)
-        columns = [_numbers(path, table, c, positive=c == "error")
-                   for c in ("radius", "value", "error") if c in table.colnames]  # fmt: skip
+        table = read_text(path)
+        refuse_misspelt(path, table.colnames, ("radius", "value", "error"))
+        columns = [
+            numbers(path, table, c, above=0.0 if c == "error" else -np.inf)
+            for c in ("radius", "value", "error")
+            if c in table.colnames
+        ]
         unit = unit or str(table["value"].unit or "") if "value" in table.colnames else unit
     else:
         try:
@@ -349,7 +349,7 @@ def _read_known(path: Path) -> Reduced | None:
         return read_covariances(path) if _is_photon_transfer(path) else None
     if path.suffix not in (".ecsv", ".csv"):
         return read_profile(path) if path.suffix in (".txt", ".dat") else None
-    table = _read_text(path)
+    table = read_text(path)
     names = set(table.colnames)
     if str(table.meta.get("OBSTYPE", "")) == "PTC" or {"i", "j", "cov"} <= names:
         return read_covariances(path)
@@ -382,12 +382,3 @@ def _is_photon_transfer(path: Path) -> bool:
             )
     except (RecordingError, ValueError, TypeError, KeyError):
         return False
-
-
-def _read_text(path: Path) -> Table:
-    try:
-        if path.suffix == ".ecsv":
-            return read_ecsv(path)
-        return text_tables.read(path, format="csv", comment="#")
-    except (OSError, ValueError, InconsistentTableError) as error:
-        raise RecordingError(f"{path}: cannot be read: {one_line(error)}") from None

@@ -9,13 +9,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from astropy.io import ascii as text_tables
-from astropy.io.ascii import InconsistentTableError
-from astropy.table import Table
 
 from bfsensor.device.condition import Condition
 from bfsensor.errors import RecordingError
-from bfsensor.recording.tables.covariance_tables import floats
+from bfsensor.recording.tables.text_tables import numbers, read_text, refuse_misspelt
 from bfsensor.typing import FloatArray
 
 SETTINGS = {
@@ -148,20 +145,28 @@ def read_setting_table(path: str | os.PathLike[str]) -> SettingTable:
             f"{', '.join(table.colnames)}"
         )
     form = KINDS[kind]
-    values = floats(table, next(n for n in form.values if n in table.colnames))
-    errors = floats(table, next((n for n in form.errors if n in table.colnames), ""))
-    if not np.all(np.isfinite(values)):
-        raise RecordingError(
-            f"{path}: {int(np.sum(~np.isfinite(values)))} values are not finite; leave these rows out"
-        )
-    if np.any(errors <= 0):
-        raise RecordingError(f"{path}: errors must be above 0")
+    known = [*form.values, *form.errors, *(n for names in SETTINGS.values() for n in names)]
+    refuse_misspelt(path, table.colnames, [*known, "axis"])
+    values = numbers(
+        path, table, next(n for n in form.values if n in table.colnames),
+        advice="; leave these rows out",
+    )  # fmt: skip
+    errors = numbers(
+        path, table, next((n for n in form.errors if n in table.colnames), ""), above=0.0,
+        blank=True,
+    )  # fmt: skip
     axes = [str(a) for a in table["axis"]] if form.by_axis else [""] * len(table)
     wrong = sorted(set(axes) - {"x", "y", ""})
     if wrong:
         raise RecordingError(f"{path}: axis = {wrong[0]!r} is neither 'x' nor 'y'")
     columns = {
-        key: floats(table, next((n for n in names if n in table.colnames), ""))
+        key: numbers(
+            path,
+            table,
+            next((n for n in names if n in table.colnames), ""),
+            blank=True,
+            above=0.0 if key in ("wavelength", "temperature") else -np.inf,
+        )
         for key, names in SETTINGS.items()
     }
     kept: dict[tuple[object, ...], int] = {}
@@ -188,19 +193,3 @@ def read_setting_table(path: str | os.PathLike[str]) -> SettingTable:
         path, kind, values[rows], errors[rows], tuple(axes[row] for row in rows), conditions,
         dict(table.meta), tuple(warnings),
     )  # fmt: skip
-
-
-def read_text(path: Path) -> Table:
-    """Read a comma-separated table, in which lines that begin with # are comments, or ECSV.
-
-    Raises
-    ------
-    RecordingError
-        The file cannot be read as such a table.
-    """
-    try:
-        form = "ecsv" if path.suffix == ".ecsv" else "csv"
-        return text_tables.read(path, format=form, comment="#")
-    except (OSError, ValueError, InconsistentTableError) as error:
-        line = " ".join(str(error).split())[:200]
-        raise RecordingError(f"{path}: cannot be read: {line}") from None

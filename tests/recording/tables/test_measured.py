@@ -77,8 +77,11 @@ def test_repeated_measurements_are_read_once(tmp_path):
         ("a,b\n1,2\n", "i_serial.* are a, b$"),
         ("i,j,cov,mu_e\n0,0,1,1\n", "fit_covariances.*i_serial"),
         ("axis,slope\nz,1\n", "axis = 'z' .*'x' nor 'y'"),
-        ("saturation,saturation_error\n1e5,0\n", "errors must be above 0"),
-        ("saturation\nnan\n", "1 values are not finite"),
+        (
+            "saturation,saturation_error\n1e5,0\n",
+            "saturation_error = 0 must be a number above 0",
+        ),
+        ("saturation\nnan\n", "saturation = nan must be a finite number"),
     ],
 )
 def test_refusals(tmp_path, text, message):
@@ -115,5 +118,7 @@ def test_a_recording_states_the_level_of_its_response(tmp_path):
     assert measured.at({"level": "0"}).condition.level == 0
     assert measured.at({"level": "2.5e4 e-"}).condition.level == 25_000
     for wrong in ("-1", "many", "inf", "nan"):
-        with pytest.raises(RecordingError, match=r"level = .* 0 e- or more, such as 40000"):
+        with pytest.raises(
+            RecordingError, match=r"level = .* from 0 to 1e.09 e-, such as 40000"
+        ):
             measured.at({"level": wrong})
