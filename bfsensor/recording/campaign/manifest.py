@@ -15,7 +15,7 @@ from bfsensor.recording.campaign.exposures import LIT, TOLERANCES
 from bfsensor.recording.campaign.settings import CampaignSettings
 from bfsensor.recording.raw.headers import FileScan, file_sha256, is_fits, scan_file
 from bfsensor.recording.raw.keywords import MEANINGS, Override, kind_in_name, translate
-from bfsensor.text_files import UnreadableTextError, read_ecsv
+from bfsensor.text_files import UnreadableTextError, nearly_equal, read_ecsv
 
 COLUMNS = {
     "file": ("file", "filename", "path"), "kind": ("imgtype", "kind", "type"),
@@ -123,6 +123,14 @@ def read_manifest(
         for name, words in COLUMNS.items()
         if any(word in lower for word in words)
     }
+    known = [word for words in COLUMNS.values() for word in words]
+    for name in lower:
+        meant = [words[0] for key, words in COLUMNS.items() if key not in there]
+        near = next((word for word in meant if nearly_equal(name, word)), None)
+        if name not in known and near is not None:
+            raise RecordingError(
+                f"{path}: column {name!r} is not known; did you mean {near!r}?"
+            )
     if "file" not in there:
         raise RecordingError(
             f"{path}: no column 'file' with the names of the exposures' files among "
@@ -147,6 +155,8 @@ def read_manifest(
             if name in MEANINGS and value is not None
         }
         said, problems = translate(cards, card_units=units, overrides=scales)
+        if plain.get("mjd") is not None and not _is_time(plain["mjd"]):
+            problems = (*problems, f"mjd = {plain.pop('mjd')!r} is no finite number")
         said.update({name: plain.get(name) for name in ("file", "mjd", "pair", "sha256")})
         said["problems"] = problems
         rows.append(said)
@@ -294,9 +304,14 @@ def _plain(value: Any) -> Any:
     if value is np.ma.masked:
         return None
     value = value.item() if isinstance(value, np.generic) else value
-    if isinstance(value, float) and not np.isfinite(value):
+    if isinstance(value, float) and np.isnan(value):
         return None
     return None if value == "" else value
+
+
+def _is_time(value: Any) -> bool:
+    """Whether a time stamp is a finite number."""
+    return isinstance(value, int | float) and bool(np.isfinite(value))
 
 
 def _short(value: Any) -> str:

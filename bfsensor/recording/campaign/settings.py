@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bfsensor.errors import RecordingError
+from bfsensor.errors import RecordingError, in_one_line
 from bfsensor.recording.campaign.exposures import PAIR_TOLERANCE
 from bfsensor.recording.raw.headers import SECTION_ENTRIES
 from bfsensor.recording.raw.keywords import AMPLIFIER_UNITS, Override, parse_overrides
@@ -42,6 +42,15 @@ ENTRIES = (
 - pairs: ``{tolerance: 1e-3}``, the largest relative difference of a pair's exposure times;
 - nuisances: a mapping that is kept and not used.
 """
+
+PARTS = {
+    "lamp_monitor": ("keyword", "relative_error"), "spots": ("grid_px",), "pairs": ("tolerance",),
+}  # fmt: skip
+"""Names in the entries that are mappings of a fixed form; others are ignored with a remark."""
+
+LONGEST_NAME = 200
+"""Largest number of characters of a name or text in campaign.yaml.  Chosen: file names have at most 255;
+with 400 reports would show longer names and nothing else would change."""
 
 
 @dataclass(frozen=True)
@@ -138,20 +147,24 @@ def read_settings(folder: Path) -> CampaignSettings:
             f"{path}: schema = {schema!r} is not {SCHEMA!r}, the only one that is read"
         )
     unknown = [str(key) for key in given if key not in ENTRIES]
+    for name, allowed in PARTS.items():
+        unknown += [
+            f"{name}: {key}" for key in _mapping(path, given, name) if key not in allowed
+        ]
     remarks = [
         f"campaign.yaml: {key} is not known and is ignored; entries are {', '.join(ENTRIES)}"
         for key in unknown
     ]
     lamp = _mapping(path, given, "lamp_monitor")
     overrides = parse_overrides(str(path), given.get("keywords"))
-    if lamp.get("keyword"):
-        overrides.setdefault("lamp", Override((str(lamp["keyword"]),)))
+    if keyword := _text(path, lamp, "keyword"):
+        overrides.setdefault("lamp", Override((keyword,)))
     return CampaignSettings(
-        name=str(given.get("name", "")),
-        sensor=str(given.get("sensor", given.get("instrument", ""))),
+        name=_text(path, given, "name"),
+        sensor=_text(path, given, "sensor") or _text(path, given, "instrument"),
         manifest=_file(folder, path, given, "manifest", "manifest.ecsv"),
         device_card=_file(folder, path, given, "device_card", None),
-        baseline=str(given.get("baseline") or ""),
+        baseline=_text(path, given, "baseline"),
         lamp_error=_number(path, lamp, "lamp_monitor", "relative_error"),
         spot_grid=_number(path, _mapping(path, given, "spots"), "spots", "grid_px"),
         overrides=overrides,
@@ -178,14 +191,29 @@ def _number(path: Path, given: Mapping[str, Any], entry: str, name: str) -> floa
     if value is None:
         return None
     try:
-        number = float(value)  # YAML reads 1e-4, without a decimal point, as a word
-    except (TypeError, ValueError):
+        # YAML reads 1e-4, without a decimal point, as a word.
+        number = float("nan") if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
         number = float("nan")
-    if not number > 0:
+    if not 0 < number < float("inf"):
         raise RecordingError(
-            f"{path}: {entry}: {name} = {value!r} must be a number above 0"
+            f"{path}: {entry}: {name} = {in_one_line(repr(value), 60)} must be a finite number above 0"
         )
     return number
+
+
+def _text(path: Path, given: Mapping[str, Any], name: str) -> str:
+    """Text of an entry, also one that YAML reads as a number; '' where it is not given."""
+    value = given.get(name)
+    if value is None:
+        return ""
+    text = str(value) if isinstance(value, int | float) else value
+    if isinstance(value, bool) or not isinstance(text, str) or len(text) > LONGEST_NAME:
+        raise RecordingError(
+            f"{path}: {name} = {in_one_line(repr(value), 60)} must be a text of at most {LONGEST_NAME} "
+            "characters"
+        )
+    return text
 
 
 def _file(
@@ -239,7 +267,12 @@ def _amplifiers(path: Path, given: Any) -> tuple[Mapping[str, Any], ...]:
                 f"{path}: amplifiers: {entry!r} must have a name and no entries but "
                 f"{', '.join(sorted(allowed))}"
             )
-        names.append(str(entry["name"]))
+        names.append(_text(path, entry, "name"))
+        hdu = entry.get("hdu", 0)
+        if isinstance(hdu, bool) or not isinstance(hdu, int) or hdu < 0:
+            raise RecordingError(
+                f"{path}: amplifiers: hdu = {in_one_line(repr(hdu), 60)} must be a whole number from 0"
+            )
     if len(set(names)) < len(names):
         raise RecordingError(
             f"{path}: amplifiers: the names {', '.join(names)} must differ from one another"

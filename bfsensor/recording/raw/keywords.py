@@ -18,7 +18,7 @@ import numpy as np
 from astropy.io import fits
 from astropy.time import Time
 
-from bfsensor.errors import RecordingError
+from bfsensor.errors import RecordingError, in_one_line
 
 
 @dataclass(frozen=True)
@@ -121,6 +121,10 @@ KINDS = {
 }  # fmt: skip
 """Kind of exposure by the header's word, in small letters; 'light' is any exposure to light."""
 
+_LONGEST_UNIT = 60
+"""Largest number of characters of a unit.  Chosen: the longest in use has 8, and astropy takes a
+second to refuse one of thousands; with 120 nothing changes."""
+
 _SAYS_MORE = ("sflat", "spot", "qe", "ppump", "fe55")
 """Kinds that a test's name states where the exposure type is only 'flat' or 'light'."""
 
@@ -203,8 +207,20 @@ def parse_overrides(where: str, entries: Mapping[str, Any] | None) -> dict[str, 
                 "of keywords, or a mapping with some of keyword, unit, scale, value, values"
             )
         words = entry.get("keyword", ())
-        words = (words,) if isinstance(words, str) else tuple(str(w) for w in words)
-        unit, meaning = str(entry.get("unit", "")), MEANINGS[name]
+        words = (words,) if isinstance(words, str) else words
+        if not isinstance(words, list | tuple) or not all(
+            isinstance(w, str) and w for w in words
+        ):
+            raise RecordingError(
+                f"{where}: keywords: {name}: keyword = {words!r} must be a keyword of the headers or a "
+                "list of them, as texts"
+            )
+        words, meaning = tuple(words), MEANINGS[name]
+        unit = entry.get("unit", "")
+        if not isinstance(unit, str) or len(unit) > _LONGEST_UNIT:
+            raise RecordingError(
+                f"{where}: keywords: {name}: unit = {unit!r} must be a unit"
+            )
         if unit and np.isnan(_convert(1.0, unit, meaning.unit)):
             raise RecordingError(
                 f"{where}: keywords: {name}: unit {unit!r} does not convert to "
@@ -212,12 +228,12 @@ def parse_overrides(where: str, entries: Mapping[str, Any] | None) -> dict[str, 
             )
         try:
             scale = float(entry.get("scale", 1.0))
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             scale = np.nan
-        if not np.isfinite(scale):
+        if not np.isfinite(scale) or scale == 0 or isinstance(entry.get("scale"), bool):
             raise RecordingError(
-                f"{where}: keywords: {name}: scale = {entry['scale']!r} is not a number; give a "
-                "finite one, such as -1"
+                f"{where}: keywords: {name}: scale = {in_one_line(repr(entry['scale']), 60)} is not a "
+                "number; give a finite one other than 0, such as -1"
             )
         values = _word_map(where, name, entry.get("values"))
         out[name] = Override(words, unit, scale, entry.get("value"), values)
@@ -232,6 +248,10 @@ def _word_map(where: str, name: str, given: Any) -> tuple[tuple[str, str], ...]:
         raise RecordingError(
             f"{where}: keywords: {name}: values = {given!r} must be a mapping such as "
             f"{{offset: bias}}; only {', '.join(WORDS)} have values"
+        )
+    if not all(isinstance(word, str) for word in given.values()):
+        raise RecordingError(
+            f"{where}: keywords: {name}: values = {given!r} must map to texts"
         )
     for word in given.values() if name == "kind" else ():
         if str(word).lower() not in KINDS:

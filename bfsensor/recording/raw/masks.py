@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -58,9 +59,19 @@ def read_masks(
     sensor = np.zeros((height, width), bool)
     for text in masks:
         if text.strip().startswith("["):
-            section = parse_section(text, f"{folder}: masks")
+            section = parse_section(text, f"{folder / 'campaign.yaml'}: masks")
+            if section.rows.stop > height or section.columns.stop > width:
+                raise RecordingError(
+                    f"{folder / 'campaign.yaml'}: masks: {text} does not lie on the sensor of {width} x "
+                    f"{height} pixels"
+                )
             sensor[section.rows, section.columns] = True
             continue
+        if not os.path.isfile(folder / text):
+            raise RecordingError(
+                f"{folder / 'campaign.yaml'}: masks: {text!r} is neither a section such as "
+                "'[1:2,1:495]' nor a file of the folder"
+            )
         image = _read_mask(folder / text)
         if image.shape != sensor.shape:
             raise RecordingError(

@@ -131,6 +131,10 @@ def _cut(
         :: -1 if layout.stored_flip_y else 1, :: -1 if layout.stored_flip_x else 1
     ]
     limit = end if layout.saturation is None else min(layout.saturation, end)
+    with np.errstate(
+        over="ignore"
+    ):  # Of what single precision does not hold: not finite, masked.
+        values = np.ascontiguousarray(values, dtype)
     bad = np.zeros(values.shape, bool)
     if np.isfinite(limit):
         np.greater_equal(values, limit, out=bad)
@@ -138,4 +142,4 @@ def _cut(
         bad |= ~np.isfinite(values)
     if mask is not None:
         bad[layout.data] |= mask
-    return AmplifierPixels(layout, np.ascontiguousarray(values, dtype), bad, limit)
+    return AmplifierPixels(layout, values, bad, limit)
