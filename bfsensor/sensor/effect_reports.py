@@ -11,9 +11,9 @@ from typing import Any
 
 from bfsensor.effects.effect import STAGES, Effect, Layout, Segment, Shot
 from bfsensor.errors import EffectError, SensorError
-from bfsensor.sensor.options import shown, to_float
+from bfsensor.sensor.options import check_shape, shown, to_float
 from bfsensor.text_files import one_line
-from bfsensor.units import to_celsius, to_kelvin
+from bfsensor.units import ZERO_CELSIUS, to_celsius, to_kelvin
 
 SCHEMA = "bfsensor-diagnosis-1"
 """Schema of the report.json that ``bfsensor diagnose`` writes."""
@@ -26,6 +26,9 @@ _INTERNAL = ("type", "index_key", "rng_num", "rng_index_key")
 
 _LAYOUT = ("shape", "segments", "reference", "pixel", "thickness", "front")
 _NUMBERS = tuple(n for n in Shot._fields if n != "kind")
+_LOWEST = {"wavelength": 0.0, "seconds": 0.0, "temperature": -ZERO_CELSIUS}
+"""Lowest wavelength [nm], exposure time [s] and temperature [C] of conditions, by definition."""
+
 _KINDS = ("bias", "dark", "flat", "spot")
 
 
@@ -118,7 +121,7 @@ def _make(entry: Any, where: str) -> Effect:
             raise SensorError(
                 f"{where}: {word}: {name} = {given!r} has no number as 'value'"
             )
-        values[name] = float(value)
+        values[name] = to_float(value)
     variant = entry.get("variant")
     if variant is None:
         own = [
@@ -185,24 +188,33 @@ def make_layout(given: Any, usual: Mapping[str, Any]) -> Layout:
         if name not in _LAYOUT:
             raise SensorError(f"layout: {name!r} must be one of {', '.join(_LAYOUT)}")
     try:
-        ny, nx = (int(n) for n in values["shape"])
+        ny, nx = check_shape("layout: shape", values["shape"])
         segments = tuple(
-            Segment(**s) if isinstance(s, Mapping) else Segment(*s)
+            _whole(Segment(**s) if isinstance(s, Mapping) else Segment(*s))
             for s in values.get("segments") or ()
         )
-        reference = tuple(float(n) for n in values.get("reference", usual["reference"]))
+        reference = tuple(_plain(n) for n in values.get("reference", usual["reference"]))
         pixel, thickness, front = (
-            float(values.get(k, usual[k])) for k in ("pixel", "thickness", "front")
+            _plain(values.get(k, usual[k])) for k in ("pixel", "thickness", "front")
         )
+    except SensorError:
+        raise
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise SensorError(f"layout = {values!r} is no layout: {error!r}") from None
-    if ny < 1 or nx < 1 or len(reference) != 3:
-        raise SensorError(
-            f"layout: shape = {ny, nx} must be rows and columns, reference = {reference} "
-            "wavelength [nm], back bias [V] and temperature [C]"
-        )
-    if "reference" in values:
+        raise SensorError(f"layout = {shown(values)} is no layout: {error!r}") from None
+    if "reference" in values and len(reference) == 3:
         reference = (*reference[:2], to_kelvin(reference[2]))
+    if len(reference) != 3 or not (
+        all(map(math.isfinite, reference)) and reference[0] > 0 and reference[2] > 0
+    ):
+        raise SensorError(
+            f"layout: reference = {shown(values['reference'])} must be wavelength [nm], back bias [V] "
+            "and temperature [C]"
+        )
+    for name, number in (("pixel", pixel), ("thickness", thickness), ("front", front)):
+        if not 0 < number < math.inf:
+            raise SensorError(
+                f"layout: {name} = {shown(values[name])} must be a number above 0"
+            )
     for s in segments:
         if s.x < 0 or s.y < 0 or s.x + s.columns > nx or s.y + s.rows > ny:
             raise SensorError(f"layout: {s} does not lie in {ny} rows x {nx} columns")
@@ -215,6 +227,23 @@ def make_layout(given: Any, usual: Mapping[str, Any]) -> Layout:
         front=front,
         absorption=usual.get("absorption", {}),
     )
+
+
+def _plain(value: Any) -> float:
+    """Number as a float; nan for anything else, also for texts."""
+    return math.nan if isinstance(value, str) else to_float(value)
+
+
+def _whole(segment: Segment) -> Segment:
+    """Segment with whole numbers of pixels, of at least 1 column and row; refuse any other."""
+    numbers = [_plain(n) for n in segment[:4]]
+    if not all(n.is_integer() for n in numbers) or min(numbers[2:]) < 1:
+        raise SensorError(
+            f"layout: segment {shown(tuple(segment))} must be whole numbers: x, y, columns and rows, "
+            "of these at least 1"
+        )
+    x, y, columns, rows = map(int, numbers)
+    return segment._replace(x=x, y=y, columns=columns, rows=rows)
 
 
 def make_conditions(given: Any) -> dict[str, Any]:
@@ -250,7 +279,12 @@ def make_conditions(given: Any) -> dict[str, Any]:
         number = math.nan if isinstance(value, bool | str) else to_float(value)
         if name == "kind" and isinstance(value, str) and value in _KINDS:
             out[name] = value
-        elif name in _NUMBERS and math.isfinite(number):
+        elif (
+            name in _NUMBERS
+            and math.isfinite(number)
+            and number >= _LOWEST.get(name, number)
+            and (name != "number" or number.is_integer())
+        ):
             out[name] = int(number) if name == "number" else number
         else:
             raise SensorError(
