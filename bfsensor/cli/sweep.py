@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import sys
 from pathlib import Path
@@ -152,8 +153,10 @@ def _cells(cells: int | None, accuracy: float | None) -> int:
     if accuracy is None:
         return CELLS if cells is None else cells
     fitting = [n for limit, n in ACCURACIES.items() if limit <= accuracy * (1 + 1e-9)]
-    if not fitting:
-        raise SweepError(f"accuracy = {accuracy:g} must be at least {min(ACCURACIES):g}")
+    if not fitting or not math.isfinite(accuracy):
+        raise SweepError(
+            f"accuracy = {accuracy:g} must be finite and at least {min(ACCURACIES):g}"
+        )
     return min(fitting)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from bfsensor.device.depletion import check_depleted
 from bfsensor.direct import light
 from bfsensor.direct.build_up import build_up
-from bfsensor.errors import DeviceError, SimulationError
+from bfsensor.errors import DeviceError, SimulationError, in_one_line
 from bfsensor.files import written_whole
 from bfsensor.simulate.well import full_well
 from bfsensor.typing import FloatArray
@@ -101,7 +101,7 @@ class ExposurePlan:
             value = self.conversion_height if name == "depth" else getattr(self, name)
             if not low <= value <= high:
                 raise DeviceError(
-                    f"{self.KIND}: {name} = {value:g} must be from {low:g} to {high:g}"
+                    f"{self.KIND}: {name} = {in_one_line(value, 40)} must be from {low:g} to {high:g}"
                 )
             if name in ("steps", "pixels", "cells", "seed") and int(value) != value:
                 raise DeviceError(f"{self.KIND}: {name} = {value} must be a whole number")

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 
 Side = Literal["mirror", "periodic"]
 
+MOST_CELLS = 128
+"""Largest number of cells a pixel.  Chosen: responses converge with 48 to 64, and with 128 that of a
+device takes 10 GB of memory (measured); with 256 it would take 80 GB."""
+
 FINE_ABOVE = 0.4
 """Height above the highest silicon surface up to which planes are at their finest [um].
 
@@ -186,9 +190,9 @@ def make_mesh(
             f"{device.name}: ripples, an edge or dots off centre leave no mirror planes; solve "
             "the whole period (symmetric=False)"
         )
-    if cells < 8 or cells % 2:
+    if not 8 <= cells <= MOST_CELLS or cells % 2:
         raise DeviceError(
-            f"cells = {cells} must be an even number of at least 8 cells a pixel"
+            f"cells = {cells} must be an even number from 8 to {MOST_CELLS} cells a pixel"
         )
     pitch = (device.pixel.pitch_x, device.pixel.pitch_y)
     axes = []

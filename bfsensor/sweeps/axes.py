@@ -11,6 +11,7 @@ import astropy.units as u
 import numpy as np
 
 from bfsensor.device.device import Device
+from bfsensor.device.silicon import ABSORPTION_RANGE
 from bfsensor.device.written_units import to_internal
 from bfsensor.errors import DeviceError, SweepError
 
@@ -81,7 +82,8 @@ def parse_swept(key: str, text: str, device: Device) -> Swept:
     ------
     DeviceError
         No such quantity (the message lists all), a missing or wrong unit, a fraction where a
-        whole number is wanted, or a wavelength that is not above 0.
+        whole number is wanted, or a wavelength outside
+        :data:`bfsensor.device.silicon.ABSORPTION_RANGE`.
     SweepError
         The text is neither a list nor first:last:number, or has too many values.
 
@@ -111,8 +113,12 @@ def parse_swept(key: str, text: str, device: Device) -> Swept:
         first, last = (_number(name, end, kind, unit) for end in ends[:2])
         # Twelve digits remove the round-off of linspace: -35 V, not -35.00000000000001 V.
         numbers = [float(f"{v:.12g}") for v in np.linspace(first, last, int(count))]
-    if name == WAVELENGTH and not all(v > 0 for v in numbers):
-        raise DeviceError(f"wavelength: {min(numbers):g} nm must be above 0 nm")
+    low, high = ABSORPTION_RANGE
+    if name == WAVELENGTH and (wrong := [v for v in numbers if not low <= v <= high]):
+        raise DeviceError(
+            f"wavelength: {wrong[0]:g} nm must be from {low:g} to {high:g} nm, where silicon's "
+            "absorption is known"
+        )
     if not kind:
         if any(v != round(v) for v in numbers):
             raise DeviceError(f"{name}: {text!r} must give whole numbers")

@@ -24,6 +24,7 @@ import bfsensor
 from bfsensor.device.device import Device
 from bfsensor.errors import BFSensorError, SweepError
 from bfsensor.response.edge_response import CHARGE, LEVEL
+from bfsensor.simulate.mesh import MOST_CELLS
 from bfsensor.sweeps.axes import WAVELENGTH, Swept, combine
 from bfsensor.sweeps.executors import run_points
 from bfsensor.sweeps.points import (
@@ -169,9 +170,9 @@ def _check_request(level: float, full_pixel: float, cells: int) -> None:
             f"level = {level:g} e- and full pixel = {full_pixel:g} e- must be finite and at "
             "least 0 e-"
         )
-    if cells < 8 or cells % 2:
+    if not 8 <= cells <= MOST_CELLS or cells % 2:
         raise SweepError(
-            f"cells = {cells} must be an even number of at least 8 cells a pixel"
+            f"cells = {cells} must be an even number from 8 to {MOST_CELLS} cells a pixel"
         )
 
 

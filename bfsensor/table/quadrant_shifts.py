@@ -182,7 +182,7 @@ def _conversion(
 ) -> tuple[FloatArray, FloatArray]:
     """Heights [um], the table's depths and others between, and their weights for the light."""
     from bfsensor.device.device import Device
-    from bfsensor.device.silicon import absorption_length
+    from bfsensor.device.silicon import ABSORPTION_RANGE, absorption_length
 
     if temperature is None:
         if not table.device_text:
@@ -199,6 +199,10 @@ def _conversion(
         raise TableError("photons must be finite, not negative, and not all 0")
     if len(table.depths) == 1:
         raise TableError("a table of one depth has no shifts by wavelength")
+    low, high = ABSORPTION_RANGE
+    # Above the range silicon is transparent, which is refused below.
+    if not np.all((waves >= low) & np.isfinite(waves)):
+        raise TableError(f"wavelengths = {waves} nm must be from {low:g} to {high:g} nm")
     converts = -np.expm1(
         -table.thickness / np.asarray(absorption_length(waves, temperature), float)
     )

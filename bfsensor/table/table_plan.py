@@ -167,9 +167,18 @@ def plan_table(
     fitting = [
         cells for limit, cells in ACCURACIES.items() if limit <= accuracy * (1 + 1e-9)
     ]
-    if not fitting:
-        raise TableError(f"accuracy = {accuracy:g} must be at least {min(ACCURACIES):g}")
+    if not fitting or not np.isfinite(accuracy):
+        raise TableError(
+            f"accuracy = {accuracy:g} must be finite and at least {min(ACCURACIES):g}"
+        )
     cells = min(fitting)
+    # What needs no solution is refused before the full well is solved.
+    for name, values, most in (
+        ("charge", charges, np.inf),
+        ("background", backgrounds, np.inf),
+        ("depth", depths, device.silicon.thickness),
+    ):
+        _check_levels(name, values, most)
     check_depleted(device, depths or ())
     well = full_well(device)
     if charges is None:
@@ -184,8 +193,6 @@ def plan_table(
                     f"{device.name}, {well:.6g} e-, where the barrier along the column "
                     f"falls to {device.well.spill_barrier:g} V"
                 )
-        if len(values) < 1 or any(b <= a for a, b in pairwise(values)):
-            raise TableError(f"{name}s {list(values)} must ascend")
     if depths is None:
         depths = conversion_depths(device)
     low, high = storage_height(device), device.silicon.thickness
@@ -195,12 +202,24 @@ def plan_table(
                 f"depth = {depth:g} um must lie in the silicon of {device.name}, from "
                 f"{low:g} um, where charge is stored, to {high:g} um, the back surface"
             )
-    if any(b <= a for a, b in pairwise(depths)):
-        raise TableError(f"depths {list(depths)} must ascend")
     return TablePlan(
         device, tuple(map(float, charges)), tuple(map(float, backgrounds)),
         tuple(map(float, depths)), vertices, pixels // 2, cells, refine_z, well,
     )  # fmt: skip
+
+
+def _check_levels(name: str, values: Sequence[float] | None, most: float) -> None:
+    """Refuse levels of a table that are not finite, do not ascend, or leave their range."""
+    if values is None:
+        return
+    for value in values:
+        if not (0 <= value <= most and np.isfinite(value)):
+            ends = (
+                "from 0 on" if most == np.inf else f"from 0 to {most:g} um, the thickness"
+            )
+            raise TableError(f"{name} = {value:g} must be a finite number {ends}")
+    if len(values) < 1 or any(b <= a for a, b in pairwise(values)):
+        raise TableError(f"{name}s {list(values)} must ascend")
 
 
 def _round(charge: float) -> float:
