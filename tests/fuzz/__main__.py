@@ -43,7 +43,9 @@ def main(given: list[str] | None = None) -> int:
 
 def _print(name: str, counts: Counter[Outcome], seconds: float) -> None:
     cells = [str(counts[one]).rjust(len(word) + 1) for one, word in HEADS.items()]
-    print(name.ljust(14), str(counts.total()).rjust(7), *cells, f"{seconds:6.1f}", flush=True)
+    print(
+        name.ljust(14), str(counts.total()).rjust(7), *cells, f"{seconds:6.1f}", flush=True
+    )
 
 
 if __name__ == "__main__":

@@ -46,7 +46,9 @@ period = "0.1 mm"
 """
 """Sections that shipped devices lack."""
 
-QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*", re.DOTALL)
+QUANTITY = re.compile(
+    r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*", re.DOTALL
+)
 INTERNAL = {
     "length": u.um, "potential": u.V, "temperature": u.K, "angle": u.rad, "field": u.V / u.um,
     "density": u.um**-3, "dose": u.um**-2, "number": u.dimensionless_unscaled,
@@ -95,7 +97,9 @@ def judge_device(made: Device, data: bytes) -> str:
 
 def _judge_part(part: Any, given: Any, where: str, provenance: Any) -> str:
     """Compare a part with its table, key by key, and what the table lacks with the defaults."""
-    lists = {entry: name for (owner, name), (entry, _) in LISTS.items() if owner is type(part)}
+    lists = {
+        entry: name for (owner, name), (entry, _) in LISTS.items() if owner is type(part)
+    }
     fields = {f.name: f for f in dataclasses.fields(part)}
     for key, value in given.items():
         name = lists.pop(key, key)
@@ -143,7 +147,9 @@ def _judge_quantity(own: float, given: Any, at: str, metadata: Any, provenance: 
         if "uncertainty" in given:
             if not 0 <= known.uncertainty < np.inf:
                 return f"{at}: uncertainty {known.uncertainty}"
-            if not close(known.uncertainty, convert(given["uncertainty"], metadata["kind"])):
+            if not close(
+                known.uncertainty, convert(given["uncertainty"], metadata["kind"])
+            ):
                 return f"{at}: uncertainty {known.uncertainty} for {given['uncertainty']}"
     if not isinstance(text, str):
         return f"{at}: {short(text)} is no text with a unit"
@@ -200,7 +206,8 @@ class PoissonFile(Door):
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
         self.texts = [
-            (SHIPPED / f"{stem}.cfg").read_text() for stem in ("lsst_itl_50_8", "lsst_e2v_50_8")
+            (SHIPPED / f"{stem}.cfg").read_text()
+            for stem in ("lsst_itl_50_8", "lsst_e2v_50_8")
         ]
         path = self.folder / "camera.cfg"
         self.made = []
@@ -262,7 +269,7 @@ def judge_configuration(made: Device, data: bytes, original: str) -> str:
 def _pairs(text: str) -> dict[str, list[str]]:
     """Values by key of the lines KEY = VALUE."""
     out: dict[str, list[str]] = {}
-    for line in text.splitlines():
+    for line in text.split("\n"):
         key, sign, value = line.split("#")[0].partition("=")
         if sign and key.strip():
             out.setdefault(key.strip(), []).append(value.strip())
@@ -271,5 +278,5 @@ def _pairs(text: str) -> dict[str, list[str]]:
 
 def _loose(text: str) -> set[str]:
     """Lines that are neither KEY = VALUE nor empty."""
-    lines = (line.split("#")[0].strip() for line in text.splitlines())
+    lines = (line.split("#")[0].strip() for line in text.split("\n"))
     return {line[:40] for line in lines if line and "=" not in line}

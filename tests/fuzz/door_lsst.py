@@ -13,8 +13,6 @@ from astropy.table import Table
 
 from bfsensor.recording.tables.covariance_tables import from_photon_transfer
 from bfsensor.recording.tables.lsst_datasets import (
-    BrighterFatterKernel,
-    DistortionMatrix,
     PhotonTransferDataset,
 )
 from bfsensor.table.lsst_format import make_distortion_matrix, make_kernel
@@ -99,7 +97,9 @@ def _change(rng: np.random.Generator, data: bytes) -> tuple[str, bytes]:
             with np.errstate(all="ignore"), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 values.flat[int(rng.integers(values.size))] = (
-                    new if values.dtype.kind == "f" or np.isfinite(new) and new < 1e9 else -1
+                    new
+                    if values.dtype.kind == "f" or (np.isfinite(new) and new < 1e9)
+                    else -1
                 )
             table.data[column] = values
         words = f"a value of {column} changes"
@@ -110,7 +110,9 @@ def _change(rng: np.random.Generator, data: bytes) -> tuple[str, bytes]:
         table.data = table.data[: int(rng.integers(len(table.data) + 1))]
         words = f"{len(table.data)} rows are left"
     else:
-        key = pick(rng, ("OBSTYPE", "KERNEL_DX", "KERNEL_DY", "PTC_VERSION", "TDIM9", "TFORM5"))
+        key = pick(
+            rng, ("OBSTYPE", "KERNEL_DX", "KERNEL_DY", "PTC_VERSION", "TDIM9", "TFORM5")
+        )
         value = pick(rng, (0, -1, 3, 99999999, "word", "", "(2,2)", "1E", True))
         if key in table.header:
             table.header[key] = value
@@ -132,11 +134,16 @@ def _judge(made: Any, said: str, path: Path) -> str:
         try:
             if path.suffix == ".ecsv":
                 table = Table.read(path, format="ascii.ecsv")
-                read = {name: np.ma.filled(np.ma.asarray(table[name].data)) for name in table.colnames}
+                read = {
+                    name: np.ma.filled(np.ma.asarray(table[name].data))
+                    for name in table.colnames
+                }
             else:
                 with fits.open(path) as hdus:
                     hdus.verify("silentfix")
-                    read = {name: np.array(hdus[1].data[name]) for name in hdus[1].columns.names}
+                    read = {
+                        name: np.array(hdus[1].data[name]) for name in hdus[1].columns.names
+                    }
         except Exception as error:
             return f"astropy does not read it: {short(str(error))}"
     for name, there in read.items():
@@ -144,9 +151,9 @@ def _judge(made: Any, said: str, path: Path) -> str:
         there = there if own.size else own
         if own.dtype.kind in "fib":
             a, b = (np.sort(np.asarray(v, float).ravel()) for v in (own, there))
-            if a.shape != b.shape or not np.array_equal(a, b, equal_nan=True):
-                if not np.isnan(a).any():  # empty cells are nan
-                    return f"column {name} differs"
+            # Empty cells are nan.
+            if not np.array_equal(a, b, equal_nan=True) and not np.isnan(a).any():
+                return f"column {name} differs"
     gains = np.asarray(made.columns.get("GAIN", np.ones(1)), float)
     # Amplifiers that a dataset of photon transfer curves has no gain for are named.
     if "no gain for" not in said and (np.any(gains <= 0) or np.any(np.isinf(gains))):

@@ -30,7 +30,12 @@ REPORT = {
 }  # fmt: skip
 """A report of the schema, with entries that sensors do not read."""
 
-USUAL = {"reference": (620.0, -50.0, 173.0), "pixel": 10.0, "thickness": 100.0, "front": 1.0}
+USUAL = {
+    "reference": (620.0, -50.0, 173.0),
+    "pixel": 10.0,
+    "thickness": 100.0,
+    "front": 1.0,
+}
 
 
 def usable() -> dict[str, Any]:
@@ -68,7 +73,11 @@ class Report(Door):
             words, report = mutate_tree(rng, self.report, plain)
             data = json.dumps(report).encode()
         elif rng.random() < 0.1:
-            words, data, keeps = "other spaces", json.dumps(self.report, indent=3).encode(), True
+            words, data, keeps = (
+                "other spaces",
+                json.dumps(self.report, indent=3).encode(),
+                True,
+            )
         else:
             words, data, keeps = mutate_text(rng, json.dumps(self.report, indent=1))
         path = self.write("report.json", data)
@@ -99,16 +108,27 @@ def _judge_report(made: Any, path: Path) -> str:
             name: value["value"] if isinstance(value, dict) else value
             for name, value in entry.get("parameters", {}).items()
         }
-        if dict(effect.values) != stated:
+        # A parameter that the file lacks has its neutral value.
+        usual = {p.name: p.neutral for p in effect.parameters}
+        if dict(effect.values) != {**usual, **stated}:
             return f"{effect.word}: {short(dict(effect.values))} for {short(stated)}"
         for p in effect.parameters:
             low, high = p.widest
             if not low <= effect[p.name] * (1 - 1e-8) and not low <= effect[p.name] <= high:
-                return f"{effect.word}: {p.name} = {effect[p.name]} is outside {low} to {high}"
+                return (
+                    f"{effect.word}: {p.name} = {effect[p.name]} is outside {low} to {high}"
+                )
     if given.get("layout") is None:
         return "" if layout is None else "a layout"
     stated = given["layout"]
-    if extra := set(stated) - {"shape", "segments", "reference", "pixel", "thickness", "front"}:
+    if extra := set(stated) - {
+        "shape",
+        "segments",
+        "reference",
+        "pixel",
+        "thickness",
+        "front",
+    }:
         return f"layout: {short(extra)} were ignored"
     if list(layout.shape) != stated["shape"] or not all(_whole(n) for n in layout.shape):
         return f"layout: shape = {layout.shape} for {short(stated['shape'])}"
@@ -126,12 +146,20 @@ def _judge_report(made: Any, path: Path) -> str:
     wavelength, bias, celsius = stated.get("reference", (620.0, -50.0, -100.15))
     kelvin = celsius + 273.15
     if not all(
-        type(a) is float and math.isfinite(a) and close(a, b, 1e-6) and not isinstance(c, str | bool)
+        type(a) is float
+        and math.isfinite(a)
+        and close(a, b, 1e-6)
+        and not isinstance(c, str | bool)
         for a, b, c in zip(
-            layout.reference, (wavelength, bias, kelvin), (wavelength, bias, celsius), strict=True
+            layout.reference,
+            (wavelength, bias, kelvin),
+            (wavelength, bias, celsius),
+            strict=True,
         )
     ):
-        return f"layout: reference = {layout.reference} for {short(stated.get('reference'))}"
+        return (
+            f"layout: reference = {layout.reference} for {short(stated.get('reference'))}"
+        )
     if wavelength <= 0 or kelvin <= 0:
         return f"layout: reference = {short(stated['reference'])} was accepted"
     return ""
@@ -182,7 +210,7 @@ ARGUMENTS: dict[str, tuple[float | str | bool | None, Any]] = {
     "beyond": ("error", _words("hold", "error")), "conversion_depth": (2.0, _range(0.0, 100.0)),
     "surroundings": ("mirrored", lambda v, o: (v == o and v in ("none", "mirrored"))
                      or _range(0.0, 1e9)(v, o)),
-    "threads": (1, _range(1, 1e9, whole=True, none=True)),
+    "threads": (1, _range(1, math.inf, whole=True, none=True)),
 }  # fmt: skip
 """Arguments of the sensor: a valid value, and a test of a value and the attribute."""
 
@@ -197,7 +225,16 @@ MORE = (
 )  # fmt: skip
 """Objects in place of an argument."""
 
-CONDITIONS = ("level", "number", "wavelength", "back_bias", "temperature", "seconds", "kind", "hour")
+CONDITIONS = (
+    "level",
+    "number",
+    "wavelength",
+    "back_bias",
+    "temperature",
+    "seconds",
+    "kind",
+    "hour",
+)
 
 
 class Arguments(Door):
@@ -227,7 +264,10 @@ class Arguments(Door):
 
         what = "galsim's" if kind is SiliconSensor else "own"
         return Case(
-            f"{what} sensor: {name} = {short(value)}", lambda: kind(**{name: value}), judge, (name,),
+            f"{what} sensor: {name} = {short(value)}",
+            lambda: kind(**{name: value}),
+            judge,
+            (name,),
         )
 
     def _conditions(self, rng: np.random.Generator) -> Case:
@@ -250,5 +290,8 @@ class Arguments(Door):
             return "" if right else f"{name} = {short(made.get(name))} for {short(value)}"
 
         return Case(
-            f"conditions: {name} = {short(value)}", lambda: make_conditions(given), judge, (name,)
+            f"conditions: {name} = {short(value)}",
+            lambda: make_conditions(given),
+            judge,
+            (name,),
         )

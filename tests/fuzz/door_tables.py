@@ -53,6 +53,10 @@ def rows_of(data: bytes, *, ecsv: bool) -> tuple[Rows, dict[str, Any]]:
     return [dict(zip(names, row, strict=True)) for row in full], meta
 
 
+BLANK = ("", "nan")
+"""Texts of cells in which nothing was measured."""
+
+
 def number(text: str | None) -> float:
     """Number of a cell; nan for an empty or missing one, ValueError for anything else."""
     if text and text.lower().startswith("0x"):
@@ -104,6 +108,8 @@ class TableDoor(Door):
             entries = header.get("meta") or {}
             # YAML's ordered mapping is a list of pairs.
             entries = dict(entries)
+            if not rows:
+                return "a table without rows was accepted"
             return self.compare(made, rows, entries)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             return f"no such table was accepted: {type(error).__name__} {short(str(error))}"
@@ -126,7 +132,7 @@ def differing(rows: Rows, column: str, own: Any, *, above: float = -np.inf) -> s
     return ""
 
 
-I, J = (grid.ravel() for grid in np.meshgrid(np.arange(4), np.arange(3)))
+LAG_X, LAG_Y = (grid.ravel() for grid in np.meshgrid(np.arange(4), np.arange(3)))
 
 
 class Areas(TableDoor):
@@ -134,8 +140,9 @@ class Areas(TableDoor):
 
     name = "areas"
     columns = {  # noqa: RUF012
-        "i_serial": I, "j_parallel": J, "cov_per_e": -2e-6 / (1 + 9.0 * (I**2 + J**2)) + 1e-9,
-        "err_per_e": 1e-9 * (2.0 + I),
+        "i_serial": LAG_X, "j_parallel": LAG_Y,
+        "cov_per_e": -2e-6 / (1 + 9.0 * (LAG_X**2 + LAG_Y**2)) + 1e-9,
+        "err_per_e": 1e-9 * (2.0 + LAG_X),
     }  # fmt: skip
     read = staticmethod(read_area_changes)
 
@@ -173,20 +180,46 @@ class Covariances(TableDoor):
         """Convert every row again."""
         gain, unit = meta.get("gain"), meta.get("unit", "electron")
         difference = meta.get("difference", False)
-        if extra := set(meta) - {"gain", "unit", "difference", "kind", "__serialized_columns__"}:
+        if extra := set(meta) - {
+            "gain",
+            "unit",
+            "difference",
+            "kind",
+            "__serialized_columns__",
+        }:
             return f"the unknown header entries {short(extra)} were ignored"
         if type(difference) is not bool or unit not in ("electron", "adu"):
             return f"unit {unit}, difference {difference}"
-        if "gain" not in rows[0] and (isinstance(gain, bool) or not 0 < float(gain) < np.inf):
+        if "gain" not in rows[0] and (
+            isinstance(gain, bool) or not 0 < float(gain) < np.inf
+        ):
             return f"gain = {short(gain)} was accepted"
-        names = {"wavelength": 0.0, "vbb": -np.inf, "npix": -1.0, "npair": -1.0, "i": -1, "j": -1}
-        if extra := set(rows[0]) - set(names) - {"amp", "mu_adu", "mu_e", "cov", "sigma", "gain"}:
+        names = {
+            "wavelength": 0.0,
+            "vbb": -np.inf,
+            "npix": -1.0,
+            "npair": -1.0,
+            "i": -1,
+            "j": -1,
+        }
+        if (
+            extra := set(rows[0])
+            - set(names)
+            - {"amp", "mu_adu", "mu_e", "cov", "sigma", "gain"}
+        ):
             return f"the unknown columns {short(extra)} were ignored"
         own = {"i": made.lag_x, "j": made.lag_y, "npix": made.pixels, "npair": made.pairs,
                "wavelength": made.wavelength, "vbb": made.back_bias}  # fmt: skip
         for name, above in names.items():
-            there = name in rows[0]
-            if there and (wrong := differing(rows, name, own[name], above=above)):
+            if name not in rows[0]:
+                continue
+            blank = [
+                name in ("wavelength", "vbb") and row[name].lower() in BLANK for row in rows
+            ]
+            if any(blank) and not np.array_equal(np.isnan(own[name]), blank):
+                return f"{name} = {own[name]}"
+            filled = [row for row, one in zip(rows, blank, strict=True) if not one]
+            if wrong := differing(filled, name, own[name][~np.array(blank)], above=above):
                 return wrong
         if [row.get("amp", "all") for row in rows] != made.amplifier.tolist():
             return "the names of the amplifiers changed"
@@ -267,17 +300,19 @@ class SettingRows(TableDoor):
             if name not in rows[0]:
                 continue
             own = [getattr(one, name) for one in made.conditions]
-            filled = [row for row in kept if row[name] != ""]
-            if any((row[name] == "") != (v is None) for row, v in zip(kept, own, strict=True)):
+            filled = [row for row in kept if row[name].lower() not in BLANK]
+            empty = [row[name].lower() in BLANK for row in kept]
+            if empty != [v is None for v in own]:
                 return f"{name} = {own}"
             values = [v for v in own if v is not None]
             if wrong := differing(filled, name, values, above=above):
                 return wrong
         if "slope_error" in rows[0]:
-            filled = [row for row in kept if row["slope_error"] != ""]
-            values = [
-                v for row, v in zip(kept, made.errors, strict=True) if row["slope_error"] != ""
-            ]
+            empty = [row["slope_error"].lower() in BLANK for row in kept]
+            if any(empty) and "without errors" not in " ".join(made.warnings):
+                return "errors are missing, and no warning says so"
+            filled = [row for row, one in zip(kept, empty, strict=True) if not one]
+            values = [v for v, one in zip(made.errors, empty, strict=True) if not one]
             if wrong := differing(filled, "slope_error", values, above=0.0):
                 return wrong
         return differing(kept, "slope", made.values)

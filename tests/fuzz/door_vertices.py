@@ -44,7 +44,10 @@ class Stem(Door):
         self.write("stem.cfg", self.cfg.encode())
         self.write("stem.dat", self.dat.encode())
         SiliconSensor(str(folder / "stem"))
-        assert judge_stem(read_galsim(folder / "stem"), self.cfg, self.dat, folder / "stem") == ""
+        assert (
+            judge_stem(read_galsim(folder / "stem"), self.cfg, self.dat, folder / "stem")
+            == ""
+        )
 
     def make(self, rng: np.random.Generator) -> Case:
         """Mutate one of the two files."""
@@ -86,7 +89,7 @@ def _set_key(rng: np.random.Generator, text: str) -> tuple[str, bytes]:
 def judge_stem(made: Any, cfg: str, dat: str, stem: Path) -> str:
     """Compare a table or a sensor with the numbers and vertices of its files."""
     given: dict[str, set[str]] = {}
-    for line in cfg.splitlines():
+    for line in cfg.split("\n"):
         key, sign, value = line.split("#")[0].partition("=")
         if sign:
             given.setdefault(key.strip(), set()).add(value.strip())
@@ -148,7 +151,7 @@ def _nominal(values: dict[str, float], inner: Any) -> tuple[Any, Any]:
 def _judge_vertices(lines: tuple[Any, Any], dat: str, n: int, pitch: float) -> str:
     """Find every vertex of each side among those of the pixel nearer to the charge."""
     rows = []
-    for line in dat.splitlines()[1:]:
+    for line in dat.split("\n")[1:]:
         try:
             rows.append([float(word) for word in line.split("#")[0].split()])
         except ValueError:
@@ -172,7 +175,9 @@ def _judge_vertices(lines: tuple[Any, Any], dat: str, n: int, pitch: float) -> s
                 there = at[near, m] if axis == 0 else at[m, near]
                 far = np.abs(own[:, None] - there[None]).max(-1).min(1).max()
                 if far > 1e-4:
-                    return f"a vertex of line {k} at pixel {m} is {far:g} um from the file's"
+                    return (
+                        f"a vertex of line {k} at pixel {m} is {far:g} um from the file's"
+                    )
     return ""
 
 
@@ -235,7 +240,9 @@ class TableFile(Door):
     def _card(self, rng: np.random.Generator) -> tuple[str, bytes, Any]:
         """Change a keyword of a header."""
         hdus = fits.open(io.BytesIO(self.data))
-        key = pick(rng, (*SCALARS, *FLAGS, "QUADRANT", "BUNIT", "SCHEMA", "SCHEMAV", "UNKNOWN"))
+        key = pick(
+            rng, (*SCALARS, *FLAGS, "QUADRANT", "BUNIT", "SCHEMA", "SCHEMAV", "UNKNOWN")
+        )
         number = int(rng.integers(7)) if key == "BUNIT" else 0
         value = pick(rng, CARDS)
         if key in hdus[number].header and repr(value) == repr(hdus[number].header[key]):
@@ -255,16 +262,24 @@ class TableFile(Door):
             if key in FLAGS:
                 right = isinstance(value, bool) and FLAGS[key](made) is value
                 return "" if right else f"{key} is {FLAGS[key](made)} for {short(value)}"
+            if key == "BUNIT" and value in (None, ""):
+                return self._unchanged(made)  # a unit that is not stated is the schema's
             if key == "UNKNOWN" or value is True or (key == "FULLWELL" and value is None):
                 return "" if key == "FULLWELL" else self._unchanged(made)
             return f"{key} = {short(value)} was accepted"
 
-        return f"keyword {key} of HDU {number} becomes {short(value)}", self._signed(hdus), judge
+        return (
+            f"keyword {key} of HDU {number} becomes {short(value)}",
+            self._signed(hdus),
+            judge,
+        )
 
     def _array(self, rng: np.random.Generator) -> tuple[str, bytes, Any]:
         """Change the data of an extension."""
         hdus = fits.open(io.BytesIO(self.data))
-        name = pick(rng, ("CORNERS", "HORIZONTAL", "VERTICAL", "CHARGES", "BACKGROUNDS", "DEPTHS"))
+        name = pick(
+            rng, ("CORNERS", "HORIZONTAL", "VERTICAL", "CHARGES", "BACKGROUNDS", "DEPTHS")
+        )
         old = np.array(hdus[name].data)
         factor = float(pick(rng, (-1.0, 1.1, 1e-3, 1e3, 1e6, 1e30, np.nan, np.inf)))
         way = int(rng.integers(5))
@@ -280,7 +295,13 @@ class TableFile(Door):
                 new = np.concatenate([new, new[-1:]])
             else:
                 new = new[::-1].copy()
-        what = (f"times {factor:g}", f"one value times {factor:g}", "shorter", "longer", "reversed")
+        what = (
+            f"times {factor:g}",
+            f"one value times {factor:g}",
+            "shorter",
+            "longer",
+            "reversed",
+        )
         hdus[name].data = new
 
         def judge(made: DistortionTable) -> str:
@@ -288,7 +309,9 @@ class TableFile(Door):
             if not np.isfinite(own).all():
                 return "values that are not finite were accepted"
             if name in ("CHARGES", "BACKGROUNDS", "DEPTHS"):
-                right = np.array_equal(own, new) and own[0] >= 0 and (np.diff(own) > 0).all()
+                right = (
+                    np.array_equal(own, new) and own[0] >= 0 and (np.diff(own) > 0).all()
+                )
                 return "" if right else f"{name} = {own}"
             ny, nx = own.shape[3:5]
             stored = own[:, :, :, ny // 2 :, nx // 2 :]
@@ -305,7 +328,10 @@ class TableFile(Door):
         hdus = fits.open(io.BytesIO(self.data))
         at, other = (int(k) for k in rng.integers(1, len(hdus), size=2))
         way = int(rng.integers(4))
-        name = hdus[at].name
+        name, second = hdus[at].name, hdus[other].name
+        # Arrays of one shape that changed places cannot be told apart but by their physics.
+        if way == 3 and np.shape(hdus[at].data) == np.shape(hdus[other].data):
+            way = 0
         if way == 0:
             del hdus[at]
         elif way == 1:
@@ -314,8 +340,13 @@ class TableFile(Door):
                 again.data = again.data[::-1].copy()
             hdus.append(again)
         elif way == 2:
-            hdus[at].header["EXTNAME"] = pick(rng, ("OTHER", "", hdus[other].name))
+            hdus[at].header["EXTNAME"] = pick(rng, ("OTHER", "", second))
         else:
             hdus[at].data, hdus[other].data = hdus[other].data, hdus[at].data
-        what = ("deleted", "repeated with other data", "renamed", f"exchanged with {hdus[-1].name}")
+        what = (
+            "deleted",
+            "repeated with other data",
+            "renamed",
+            f"exchanged with {second}",
+        )
         return f"extension {name} is {what[way]}", self._signed(hdus), self._unchanged

@@ -120,7 +120,8 @@ def _line(rng: Rng, text: str, first: int) -> Mutated:
         words = f"cut before line {a + 1}"
     elif way == 5:
         new = pick(
-            rng, ("unknown_key = 3", "unknown_key: 3", "[" * 20_000, "a." * 3000, "x" * 100_000)
+            rng,
+            ("unknown_key = 3", "unknown_key: 3", "[" * 20_000, "a." * 3000, "x" * 100_000),
         )
         lines.insert(a, new)
         words = f"line {a + 1} is put in: {short(new)}"
@@ -153,7 +154,10 @@ def mutate_bytes(rng: Rng, data: bytes) -> Mutated:
         new = bytes([int(rng.integers(256))])
         words = f"byte {at} becomes {new!r}"
     elif way == 3:
-        new = data[at : at + 1] + pick(rng, ("\x00", "\x1b", "\u00e9", "\ufeff", "\u2028")).encode()
+        new = (
+            data[at : at + 1]
+            + pick(rng, ("\x00", "\x1b", "\u00e9", "\ufeff", "\u2028")).encode()
+        )
         words = f"{new[1:]!r} is put in after byte {at}"
     else:
         return Mutated(f"byte {at} is deleted", data[:at] + data[at + 1 :])
@@ -185,7 +189,9 @@ def mutate_tree(rng: Rng, tree: Any, values: Any = VALUES) -> tuple[str, Any]:
         del parent[key]
         return f"{where} is deleted", tree
     if way == 1 and isinstance(parent, dict):
-        new = pick(rng, (f"{key}x", str(key)[:-1], str(key).upper(), "", "\x1b[0m", "k" * 3000))
+        new = pick(
+            rng, (f"{key}x", str(key)[:-1], str(key).upper(), "", "\x1b[0m", "k" * 3000)
+        )
         parent[new] = parent.pop(key)
         return f"{where} is renamed to {short(new)}", tree
     if way == 2 and isinstance(parent, list):
