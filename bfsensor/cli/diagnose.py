@@ -57,7 +57,7 @@ from bfsensor.files import held
     "--seed",
     default=1,
     show_default=True,
-    type=click.IntRange(min=0),
+    type=click.IntRange(0, 2**63 - 1),
     help="Seed of the simulated noise from which p-values are computed.",
 )
 @click.option(

@@ -202,11 +202,15 @@ class _Response:
         from bfsensor.device.quantities import DIFFUSION
         from bfsensor.fit.finer_mesh import FINER
         from bfsensor.fit.linear_predictors import SPILL
+        from bfsensor.simulate.mesh import check_cells
 
         if not {"areas", "slopes"} & {data.kind for data in sets}:
             return cls()
+        check_cells(cells)
         if finer is None:
             finer = FINER if cells < FINER else 0
+        if finer:
+            check_cells(finer, "finer")
         moving = tuple(prior for prior in priors if prior.name not in (SPILL, DIFFUSION))
         emulator = linearise = solved = None
         if curved:

@@ -18,6 +18,7 @@ from click.core import ParameterSource
 
 from bfsensor.cli import camera
 from bfsensor.cli.common import (
+    MOST_WORKERS,
     check_targets,
     load_device,
     overwrite_option,
@@ -108,7 +109,7 @@ def _numbers(
 @click.option("--accuracy", default=0.01, show_default=True,
               help="Relative accuracy of area changes that chooses the mesh: 0.05, 0.02, 0.01 or "
               "0.005. Only for --engine poisson.")  # fmt: skip
-@click.option("--workers", type=click.IntRange(min=1), default=2, show_default=True,
+@click.option("--workers", type=click.IntRange(1, MOST_WORKERS), default=2, show_default=True,
               help="Processes that work at the same time. Only for --engine poisson.")  # fmt: skip
 @click.option(
     "-o",

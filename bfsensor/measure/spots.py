@@ -316,14 +316,14 @@ def _check_search(
         raise MeasurementError(
             f"saturation = {saturation:g} e- must be above the threshold, {threshold:g} e-"
         )
+    if stamp < 3 or stamp % 2 == 0:
+        raise MeasurementError(f"stamp = {stamp} pixels must be odd, 3 or more")
     if separation < 2:
         raise MeasurementError(f"separation = {separation} pixels must be 2 or more")
     if int(separation) != separation:
         raise MeasurementError(
             f"separation = {separation} must be a whole number of pixels"
         )
-    if stamp < 3 or stamp % 2 == 0:
-        raise MeasurementError(f"stamp = {stamp} pixels must be odd, 3 or more")
     if min(data.shape) < stamp:
         raise MeasurementError(
             f"an image of {data.shape} pixels is smaller than a stamp of {stamp} x {stamp}"

@@ -138,6 +138,27 @@ class Mesh:
         return np.arange(first, last + 1)
 
 
+def check_cells(cells: int, name: str = "cells") -> None:
+    """Refuse a number of cells a pixel of which no mesh is made.
+
+    Parameters
+    ----------
+    cells : int
+        The number, even, from 8 to :data:`MOST_CELLS`.
+    name : str
+        Its name in the message.
+
+    Raises
+    ------
+    DeviceError
+        The number is another one.
+    """
+    if not 8 <= cells <= MOST_CELLS or cells % 2:
+        raise DeviceError(
+            f"{name} = {cells} must be an even number from 8 to {MOST_CELLS} cells a pixel"
+        )
+
+
 def make_mesh(
     device: Device,
     *,
@@ -190,10 +211,7 @@ def make_mesh(
             f"{device.name}: ripples, an edge or dots off centre leave no mirror planes; solve "
             "the whole period (symmetric=False)"
         )
-    if not 8 <= cells <= MOST_CELLS or cells % 2:
-        raise DeviceError(
-            f"cells = {cells} must be an even number from 8 to {MOST_CELLS} cells a pixel"
-        )
+    check_cells(cells)
     pitch = (device.pixel.pitch_x, device.pixel.pitch_y)
     axes = []
     for axis in (0, 1):

@@ -114,7 +114,9 @@ def _planned(given: Mapping[str, Any], where: str) -> Planned:
         try:
             values[name] = float(value)
         except (TypeError, ValueError):
-            raise DiagnosisError(f"{where}: {name}={value} is not a number") from None
+            values[name] = np.nan
+        if not np.isfinite(values[name]):
+            raise DiagnosisError(f"{where}: {name}={value} is not a finite number")
         if name in ("level", "seconds", "flux", "lamp", "count") and not values[name] > 0:
             raise DiagnosisError(f"{where}: {name}={value} must be above 0")
     kind = str(given.get("kind", "spot" if "flux" in values else "flat"))

@@ -268,6 +268,10 @@ def _amplifiers(path: Path, given: Any) -> tuple[Mapping[str, Any], ...]:
                 f"{', '.join(sorted(allowed))}"
             )
         names.append(_text(path, entry, "name"))
+        if not names[-1]:
+            raise RecordingError(
+                f"{path}: amplifiers: every entry needs a name that is not empty"
+            )
         hdu = entry.get("hdu", 0)
         if isinstance(hdu, bool) or not isinstance(hdu, int) or hdu < 0:
             raise RecordingError(

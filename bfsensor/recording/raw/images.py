@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bfsensor.errors import RecordingError
 from bfsensor.recording.raw.headers import FileScan
+from bfsensor.recording.raw.keywords import MEANINGS
 from bfsensor.recording.raw.overscan import OVERSCANS, SKIP, subtract_overscan
 from bfsensor.recording.raw.pixels import read_pixels
 from bfsensor.typing import FloatArray
@@ -78,7 +79,7 @@ def read_images(
     scan : FileScan
         The file's headers and layout (:func:`bfsensor.recording.raw.headers.scan_file`).
     gain : float, optional
-        Gain of all amplifiers [e-/ADU], above 0; by default each one's by campaign.yaml or
+        Gain of all amplifiers [e-/ADU], 1e-4 to 1e4; by default each one's by campaign.yaml or
         header, as :func:`bfsensor.recording.raw.keywords.amplifier_quantity` finds it.  Without
         a gain the image stays in ADU, and its ``unit`` is 'adu'.
     overscan : {'row median', 'row mean', 'median', None}
@@ -127,8 +128,9 @@ def read_images(
         )
     if skip < 0:
         raise RecordingError(f"skip = {skip} columns must be 0 or more")
-    if gain is not None and not 0 < gain < np.inf:
-        raise RecordingError(f"gain = {gain:g} e-/ADU must be above 0")
+    low, high = MEANINGS["gain"].low, MEANINGS["gain"].high
+    if gain is not None and not low <= gain <= high:
+        raise RecordingError(f"gain = {gain:g} e-/ADU must be from {low:g} to {high:g}")
     amplifiers = []
     for pixels, wrong in zip(
         read_pixels(scan.path, scan.amplifiers, masks, dtype=np.float64),

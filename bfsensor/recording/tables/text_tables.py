@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -69,7 +70,9 @@ def refuse_misspelt(path: Path, given: Iterable[str], known: Iterable[str]) -> N
     given, known = list(given), list(known)
     lacking = [name for name in known if name not in given]
     for name in given:
-        meant = next((one for one in lacking if nearly_equal(name, one)), None)
+        # A unit or a sign after the word, as in 'flux [e-]', is a misspelling too.
+        words = {name, re.match(r"\w*", name)[0]}  # type: ignore[index]
+        meant = next((o for o in lacking if any(nearly_equal(w, o) for w in words)), None)
         if name not in known and meant is not None:
             raise RecordingError(f"{path}: {name!r} is not known; did you mean {meant!r}?")
 

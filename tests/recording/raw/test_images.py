@@ -265,5 +265,7 @@ def test_refusals_without_a_frame(tmp_path):
     with pytest.raises(RecordingError, match="overscan = 'rows' is not one of row median"):
         read_raw(path, overscan="rows")
     for gain in (float("nan"), 0.0, float("inf")):
-        with pytest.raises(RecordingError, match=f"gain = {gain:g} e-/ADU must be above 0"):
+        with pytest.raises(
+            RecordingError, match=f"gain = {gain:g} e-/ADU must be from 0.0001"
+        ):
             read_raw(path, gain=gain)
