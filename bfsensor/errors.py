@@ -17,7 +17,7 @@ def in_one_line(text: object, most: int = LONGEST) -> str:
     Examples
     --------
     >>> in_one_line("device.toml: name = " + "x" * 1000 + " must be short", 46)
-    'device.toml: name = x ... xxxxx must be short'
+    'device.toml: name = ... xxxxxx must be short'
     """
     line = " ".join(str(text).split())
     if not line.isprintable():

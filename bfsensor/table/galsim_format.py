@@ -316,7 +316,9 @@ class _Numbers:
         try:
             value = float(self.data[key])
         except ValueError:
-            value = float("nan")
+            raise TableError(
+                f"{self.cfg}: {key} = {self.data[key]!r} is not a number"
+            ) from None
         if not np.isfinite(value):
             raise TableError(
                 f"{self.cfg}: {key} = {self.data[key]!r} must be a finite number"

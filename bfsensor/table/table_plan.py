@@ -173,12 +173,19 @@ def plan_table(
         )
     cells = min(fitting)
     # What needs no solution is refused before the full well is solved.
-    for name, values, most in (
-        ("charge", charges, np.inf),
-        ("background", backgrounds, np.inf),
-        ("depth", depths, device.silicon.thickness),
+    for name, values in (
+        ("charge", charges),
+        ("background", backgrounds),
+        ("depth", depths),
     ):
-        _check_levels(name, values, most)
+        _check_levels(name, values)
+    low, high = storage_height(device), device.silicon.thickness
+    for depth in depths or ():
+        if not low - 1e-9 <= depth <= high:
+            raise TableError(
+                f"depth = {depth:g} um must lie in the silicon of {device.name}, from "
+                f"{low:g} um, where charge is stored, to {high:g} um, the back surface"
+            )
     check_depleted(device, depths or ())
     well = full_well(device)
     if charges is None:
@@ -195,29 +202,19 @@ def plan_table(
                 )
     if depths is None:
         depths = conversion_depths(device)
-    low, high = storage_height(device), device.silicon.thickness
-    for depth in depths:
-        if not low - 1e-9 <= depth <= high:
-            raise TableError(
-                f"depth = {depth:g} um must lie in the silicon of {device.name}, from "
-                f"{low:g} um, where charge is stored, to {high:g} um, the back surface"
-            )
     return TablePlan(
         device, tuple(map(float, charges)), tuple(map(float, backgrounds)),
         tuple(map(float, depths)), vertices, pixels // 2, cells, refine_z, well,
     )  # fmt: skip
 
 
-def _check_levels(name: str, values: Sequence[float] | None, most: float) -> None:
-    """Refuse levels of a table that are not finite, do not ascend, or leave their range."""
+def _check_levels(name: str, values: Sequence[float] | None) -> None:
+    """Refuse levels of a table that are not finite, below 0, or do not ascend."""
     if values is None:
         return
     for value in values:
-        if not (0 <= value <= most and np.isfinite(value)):
-            ends = (
-                "from 0 on" if most == np.inf else f"from 0 to {most:g} um, the thickness"
-            )
-            raise TableError(f"{name} = {value:g} must be a finite number {ends}")
+        if not 0 <= value < np.inf:
+            raise TableError(f"{name} = {value:g} must be a finite number from 0 on")
     if len(values) < 1 or any(b <= a for a, b in pairwise(values)):
         raise TableError(f"{name}s {list(values)} must ascend")
 

@@ -140,7 +140,7 @@ def test_saturation_alone_needs_no_emulator(tmp_path):
         (("itl_sta3800c", "F", "--free", "thicknes"), "no quantity 'thicknes'"),
         (("itl_sta3800c", "F", "--profile", "thickness"), "--profile thickness"),
         (("itl_sta3800c", "F", "--at", "g.csv:back_bias=-50V"), "--at g.csv"),
-        (("itl_sta3800c", "F", "--finer", "17"), "finer = 17 cells per pixel must be even"),
+        (("itl_sta3800c", "F", "--finer", "17"), "finer = 17 must be an even number from 8 to 128"),
         (("itl_sta3800c", "F", "--at", "back_bias=50nm"), "'50nm' is not a potential"),
     ],
 )  # fmt: skip

@@ -139,7 +139,7 @@ def test_damaged_galsim_files_are_refused(exported, tmp_path):
     assert refusal(read_galsim, stem).startswith(f"{dat}: not a vertex file: ")
     text = cfg.read_text()
     for key, value, message in (
-        ("NumVertices", "nan", "NumVertices = 'nan' is not a whole number above 0"),
+        ("NumVertices", "nan", "NumVertices = 'nan' must be a finite number"),
         ("PixelBoundaryNx", "0", "PixelBoundaryNx = '0' is not a whole number above 0"),
         ("PixelBoundaryNx", "7", "7 x 9 pixels must be square and odd"),
         ("NumVertices", "six", "NumVertices = 'six' is not a number"),

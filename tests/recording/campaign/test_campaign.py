@@ -179,7 +179,7 @@ def test_sums_of_the_manifest_are_held_against_the_files(copied):
         ("[1, 2]", "must be a mapping"),
         ("a: [", "not readable as YAML"),
         ("manifest: list.ecsv", "list.ecsv is not there"),
-        ("spots: {grid_px: wide}", "grid_px = 'wide' must be a number above 0"),
+        ("spots: {grid_px: wide}", "grid_px = 'wide' must be a finite number above 0"),
         ("keywords: {gian: GAIN}", "'gian' is not one of"),
         ("masks: ['[1:9]']", "is not like"),
         ("amplifiers: [{data: '[1:2,1:2]'}]", "must have a name"),
