@@ -118,7 +118,7 @@ def test_default_plan_covers_the_well(device):
         ({"depths": [140.0]}, r"depth = 140 um must lie in the silicon.*100 um, the back surface"),
         ({"pixels": 8}, r"pixels = 8 must be odd and from 3 to 11"),
         ({"vertices": 1}, r"vertices = 1 must be at least 2"),
-        ({"accuracy": 1e-5}, r"accuracy = 1e-05 must be at least 0.005"),
+        ({"accuracy": 1e-5}, r"accuracy = 1e-05 must be finite and at least 0.005"),
     ],
 )  # fmt: skip
 def test_requests_that_cannot_be_met(device, request_, message):
