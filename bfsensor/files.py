@@ -115,7 +115,7 @@ def held(folder: str | os.PathLike[str], error: type[Exception]) -> Iterator[Non
                     f"(number {file.read(20).decode().strip()}): "
                     "wait until it ends, or name another output"
                 ) from None
-        # The number only helps to find the process: a full disk is told by what is worth keeping.
+        # The number only helps to find the process: a full disk is an error where results are written.
         with contextlib.suppress(OSError):
             file.truncate(0)
             file.write(str(os.getpid()).encode())

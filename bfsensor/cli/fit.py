@@ -131,7 +131,7 @@ def fit(
     names = [prior.name for prior in priors]
     chosen = [_resolve(name, names) for name in profiles]
     folder = output or Path(f"{loaded.name}_fit")
-    # A folder that cannot be written is told before minutes of solving.
+    # A folder that cannot be written is refused before minutes of solving.
     click.get_current_context().with_resource(held(folder, FitError))
     known = with_priors(loaded, priors)
     response = _Response.of(
