@@ -103,6 +103,31 @@ def test_traps_without_delay_and_with_power_one_are_the_plain_law():
     assert np.abs(both[0]).max() > 0.05
 
 
+@pytest.mark.parametrize("flip", [False, True])
+@pytest.mark.parametrize(
+    ("word", "values", "axis", "share"),
+    [
+        # A charge at column c has c + 1 transfers after the prescan: 3 + 20.5 in the mean of 40.
+        ("cti_serial", {"cti": 1e-4}, 2, 1e-4 * (PRESCAN + 20.5)),
+        ("cti_parallel", {"cti": 1e-4}, 1, 1e-4 * 15.5),
+        ("electronic_memory", {"alpha": 2e-3}, 2, 2e-3 / 1.002),
+    ],
+)
+def test_centroids_of_spots_move_along_the_register_only(word, values, axis, share, flip):
+    """The first moment is exact: a share of the charge is read one pixel later, none is lost."""
+    segment = SEGMENTS[0]._replace(**{"flip_x" if axis == 2 else "flip_y": flip})
+    layout = replace(LAYOUT, segments=(segment,))
+    spot = np.zeros((1, 15, 15))
+    spot[0, 5:10, 6:9] = np.random.default_rng(77).uniform(100, 200, (5, 3))
+    moved = make_effect(word, values).spot_image(spot, {}, layout)
+    assert moved.sum() == pytest.approx(spot.sum(), rel=1e-12)
+    for along in (1, 2):
+        place = np.arange(15.0).reshape((-1, 1) if along == 1 else -1)
+        change = ((moved - spot) * place).sum() / spot.sum()
+        wanted = share * (-1 if flip else 1) if along == axis else 0.0
+        assert change == pytest.approx(wanted, rel=1e-9, abs=1e-12)
+
+
 @pytest.mark.parametrize("strength", STRENGTHS)
 def test_fluctuations_of_flats_are_delayed_by_the_slope_of_the_loss(strength):
     """White noise through traps, against the predicted correlations."""

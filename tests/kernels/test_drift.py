@@ -64,17 +64,18 @@ def test_gradient_error_falls_with_the_square_of_the_mesh_or_faster():
 
 
 def test_trace_up_follows_the_analytic_field_line():
-    # phi = x^2 / 2 - z^2: dx/dz = x / (-2 z), so x = x0 sqrt(z0 / z).
+    # phi = x^2 / 2 + y^2 / 2 - z^2: dx/dz = x / (-2 z), so x = x0 sqrt(z0 / z), and y alike.
     nodes = np.linspace(-2.0, 12.0, 57)
-    phi = grid(lambda x, y, z: 0.5 * x**2 - z**2 + 0 * y, nodes, nodes, nodes)
+    phi = grid(lambda x, y, z: 0.5 * (x**2 + y**2) - z**2, nodes, nodes, nodes)
     seeds = np.array([[1.0, 0.3, 1.0], [0.5, 0.0, 2.0]])
     depths = np.array([4.0, 9.0])
     out = np.zeros((2, 2, 2))
     drift.trace_up(phi, nodes, nodes, nodes, seeds, depths, 0.1, out)
-    expected = seeds[:, :1] * np.sqrt(seeds[:, 2:] / depths[None, :])
+    falling = np.sqrt(seeds[:, 2:] / depths[None, :])
     # RK4 with 10 % steps: local error 1e-5/120, about 25 steps.
-    assert np.allclose(out[:, :, 0], expected, atol=3e-6)
-    assert np.allclose(out[:, :, 1], seeds[:, 1:2], atol=1e-12)
+    for axis in (0, 1):
+        at_seed = seeds[:, axis, None]
+        assert np.allclose(out[:, :, axis], at_seed * falling, atol=3e-6)
 
 
 def test_bisection_finds_the_watershed_of_two_wells():

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
-from bfsensor.diagnose.detect.candidate_screen import _best_factor
-from bfsensor.effects.effect import Parameter
+from bfsensor.diagnose.detect.candidate_screen import _best_factor, evidence
+from bfsensor.effects.effect import Effect, Parameter
 from bfsensor.effects.persistence import TwoTimesPersistence
 
 
@@ -20,6 +21,44 @@ def test_amplitude_of_a_template_that_is_straight_but_for_rounding(bend, amplitu
     if bend < 0.1:
         only = _best_factor((one, two), left, signed=False)
         assert only == pytest.approx(max(amplitude, 0.0), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("law", "value"),
+    [
+        ("flat", 0.4),
+        ("flat", 1.5),
+        ("flat", -0.6),
+        ("log", 0.4),
+        ("log", 8.0),
+        ("log", 0.02),
+    ],
+)
+def test_evidence_is_the_integral_over_prior_and_likelihood(law, value):
+    """One parameter of a linear model with an error of 2 %, inside and beyond its range."""
+    low, high = (0.0, 1.0) if law == "flat" else (0.1, 2.0)
+
+    class Line(Effect):
+        word = "line"
+        parameters = (Parameter("value", "", low, high, law=law),)
+
+    def prior(
+        v,
+    ):  # as documented: beyond the range a Gaussian, in the value or its logarithm
+        if law == "flat":
+            return np.exp(-0.5 * (max(low - v, v - high, 0.0) / 0.25) ** 2)
+        near = min(max(v, low), high)
+        return np.exp(-0.5 * np.log2(v / near) ** 2) / (near * np.log(high / low))
+
+    error = 0.02 * abs(value)
+    gain = (value / error) ** 2  # the chi-square that the best value takes off
+    around = quad(
+        lambda t: prior(value + error * t) * np.exp(-0.5 * t**2) * error, -8, 8, limit=200
+    )[0]
+    found = evidence(Line({"value": value}), Line.parameters, gain, np.array([[1 / error]]))
+    # Laplace's approximation has the prior constant across the likelihood: at 1.5 and -0.6 its
+    # logarithm changes by 8 x 0.03 per error, half the square of that is 0.03 and less.
+    assert found == pytest.approx(0.5 * gain + np.log(around), abs=0.05)
 
 
 def test_no_fit_goes_beyond_what_physics_allows():

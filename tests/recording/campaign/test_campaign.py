@@ -13,8 +13,9 @@ from astropy.table import Table
 
 from bfsensor.errors import RecordingError
 from bfsensor.recording.campaign.campaign import read_campaign
+from bfsensor.recording.campaign.frame_statistics import PairStatistics
 from bfsensor.recording.campaign.inspection import inspect_campaign
-from bfsensor.recording.campaign.level_checks import measure_gains
+from bfsensor.recording.campaign.level_checks import check_saturation, measure_gains
 from bfsensor.recording.raw.headers import scan_file
 from tests.broken_campaigns import (
     BREAKAGES,
@@ -343,6 +344,20 @@ def test_a_ladder_that_climbs_with_time(copied):
     (one,) = read_campaign(copied).warnings
     assert one.topic == "time"
     assert "exposure times" in one.message and "nonlinearity" in one.closes
+
+
+@pytest.mark.parametrize(("fall", "reported"), [(4.5, False), (5.5, True)])
+def test_a_variance_that_falls_by_five_errors_is_a_full_well(whole, fall, reported):
+    """The error is the scatter of variances of simulated pairs, known to 1 %."""
+    rng = np.random.default_rng(31)
+    pixels, before, after = 1000, 400.0, 290.0
+    noise = rng.standard_normal((2, 4000, pixels)).var(axis=2)
+    error = (before * noise[0] - after * noise[1]).std()
+    pairs = [
+        PairStatistics(0, 1, "C0", 1e4, before, pixels, 0.0),
+        PairStatistics(2, 3, "C0", 2e4, before - fall * error, pixels, 0.0),
+    ]
+    assert bool(check_saturation(read_campaign(whole), [], pairs)) is reported
 
 
 def test_part_of_a_practice_campaign(tmp_path):
