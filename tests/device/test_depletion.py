@@ -182,6 +182,9 @@ def test_tables_of_undepleted_devices_are_refused_within_a_second(
     assert stated == pytest.approx(-needed, abs=1.0 + 0.01 * needed)
     advised = message.partition("give ")[2].split("'")[1]
     check_depleted(undepleted.with_value("back_bias", advised))
+    # A whole number of volts beyond the estimate and its error of 1 V, and none more.
+    beyond = find_depletion(undepleted).full_depletion_voltage - float(advised.split()[0])
+    assert 1.0 <= beyond < 2.0
 
 
 def test_depths_in_undepleted_silicon_are_refused_by_name():

@@ -137,16 +137,18 @@ def run(mutant: Mutant, copy: Path, durations: dict[str, float]) -> tuple[str, s
 
 
 def tests_of(file: str, seconds: dict[str, float]) -> list[str]:
-    """Test files of a module's room that import it, quickest first, and the module's examples.
+    """Test files for a module, quickest first, after the module's examples.
 
-    A test file counts where at most :data:`FARTHEST` imports lead from it to the module; all of the
-    room count where none does.
+    They are those of its room from which at most :data:`FARTHEST` imports lead to the module, or all
+    of the room where there is none; and those of other rooms that import it themselves.
     """
     room = file.split("/")[1].strip("_")
     module = file.removesuffix(".py").replace("/", ".")
     places = [*ROOT.glob(f"tests/{room}/**/test_*.py")]
     places += ROOT.glob(f"tests/validation/{room}/**/test_*.py")
     found = [path for path in places if _imports_at_most(path, module, FARTHEST)] or places
+    others = sorted(set(ROOT.glob("tests/*/**/test_*.py")) - set(places))
+    found += [path for path in others if module in _names(path)]
     names = [path.relative_to(ROOT).as_posix() for path in found]
     names.sort(key=lambda name: seconds.get(name, len((ROOT / name).read_bytes()) / 1000))
     examples = [file] if ">>>" in (ROOT / file).read_text(encoding="utf-8") else []

@@ -11,7 +11,7 @@ from bfsensor.diagnose.fit.likelihood_profile import LOWER, linear_interval, ran
 from bfsensor.effects.effect import Parameter
 from bfsensor.effects.psf_wings import PsfWings
 from bfsensor.errors import ConvergenceError
-from bfsensor.inference.likelihood_profile import Profile, profiles_in
+from bfsensor.inference.likelihood_profile import Profile, Scale, profiles_in
 from bfsensor.inference.local_likelihood import LocalLikelihood
 
 AMP = Parameter("amp", "", 0.1, 10.0, signed=True, amplitude=True)
@@ -209,3 +209,12 @@ def test_the_lowest_point_is_kept():
     assert here.lowest.square < here.square
     left = bent(here.lowest.values)
     assert here.lowest.square == pytest.approx(float(left @ left))
+
+
+@pytest.mark.parametrize("best", [0.05, 0.5, 50.0])
+def test_a_scale_and_its_inverse_agree_far_below_the_plausible_range(best):
+    """Lower ends of weak effects lie there; a scale that stops at the range would hide them."""
+    own = ranged(Parameter("amp", "", 0.1, 10.0, amplitude=True))
+    scale = Scale.of(own, best)
+    for value in best * np.array([0.01, 0.3, 1.0, 40.0]):
+        assert scale.value(scale.place(value)) == pytest.approx(value, rel=1e-12)
