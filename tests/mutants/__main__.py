@@ -32,8 +32,9 @@ ROWS = ROOT / "tests" / "data" / "mutants.ecsv"
 REASONS = ROOT / "tests" / "data" / "mutant_reasons.ecsv"
 
 MOST_CPU = 200
-"""Largest CPU time [s] of the tests of one mutant; beyond it the mutant is undecided.  Chosen: with
-twice as much, mutants of the diagnosis that nothing notices take up to an hour more in 120."""
+"""Largest CPU time [s] of the tests of one mutant, unless ``--most`` says another; beyond it the mutant
+is undecided, and counts as one that survived.  Chosen: with twice as much, mutants of the diagnosis
+that nothing notices take up to an hour more in 120."""
 
 FARTHEST = 2
 """Largest number of imports from a test file to the changed module.  Chosen: at 1 a module behind
@@ -52,6 +53,9 @@ def main() -> None:
     parser.add_argument("--room")
     parser.add_argument(
         "--numbers", help="such as 3,17; they run again where they have rows"
+    )
+    parser.add_argument(
+        "--most", type=int, default=MOST_CPU, help="CPU seconds of a mutant"
     )
     parser.add_argument(
         "--check", action="store_true", help="run what killed, nothing changed"
@@ -83,7 +87,7 @@ def main() -> None:
         for number, mutant in chosen.items():
             outcome, test, seconds = "equivalent", "", 0.0
             if mutant.content not in reasons:
-                outcome, test, seconds = run(mutant, copy, durations)
+                outcome, test, seconds = run(mutant, copy, durations, given.most)
             rows.append({
                 "seed": given.seed if number > len(known()) else 0, "number": number,
                 "room": mutant.room, "file": mutant.file, "line": mutant.line,
@@ -109,7 +113,9 @@ def copy_checkout(copy: Path) -> None:
             shutil.copy2(ROOT / name, copy / name)
 
 
-def run(mutant: Mutant, copy: Path, durations: dict[str, float]) -> tuple[str, str, float]:
+def run(
+    mutant: Mutant, copy: Path, durations: dict[str, float], most: int
+) -> tuple[str, str, float]:
     """Outcome, the test that failed and CPU seconds of one mutant, in a copy of the checkout.
 
     ``durations``, seconds of test files, gets those of the files that passed.
@@ -121,7 +127,7 @@ def run(mutant: Mutant, copy: Path, durations: dict[str, float]) -> tuple[str, s
     report.unlink(missing_ok=True)
     spent = _cpu_of_children()
     try:
-        status = _pytest(files, copy, "-x", f"--junitxml={report}")
+        status = _pytest(files, copy, "-x", f"--junitxml={report}", most=most)
     finally:
         (copy / mutant.file).write_bytes(before)
     seconds = _cpu_of_children() - spent
@@ -174,7 +180,7 @@ def _names(path: Path) -> frozenset[str]:
     return frozenset(_imports(path))
 
 
-def _pytest(files: list[str], copy: Path, *options: str) -> int:
+def _pytest(files: list[str], copy: Path, *options: str, most: int = MOST_CPU) -> int:
     """Run test files in a copy of the checkout within the CPU time allowed; give the exit status."""
     environment = os.environ | {
         "PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg",
@@ -188,13 +194,13 @@ def _pytest(files: list[str], copy: Path, *options: str) -> int:
     ]  # fmt: skip
 
     def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_CPU, (MOST_CPU, MOST_CPU + 5))
+        resource.setrlimit(resource.RLIMIT_CPU, (most, most + 5))
 
     started = subprocess.Popen(
         command, cwd=copy, env=environment, preexec_fn=limit, start_new_session=True,
         stdout=(copy.parent / "output.txt").open("w"), stderr=subprocess.STDOUT,
     )  # fmt: skip
-    end = time.monotonic() + 4 * MOST_CPU  # a mutant that waits for itself uses no CPU time
+    end = time.monotonic() + 4 * most  # a mutant that waits for itself uses no CPU time
     while started.poll() is None and time.monotonic() < end:
         time.sleep(0.2)
     if started.poll() is None:

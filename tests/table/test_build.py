@@ -1,6 +1,8 @@
 """From device to table: plans, levels, resuming, error estimates."""
 
 import dataclasses
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ from bfsensor.table.assess import (
     mesh_errors,
     superposition_error,
 )
-from bfsensor.table.build import build_table
+from bfsensor.table.build import build_table, peak_memory
 from bfsensor.table.levels import Level, _workshop, solve_level
 from bfsensor.table.table_plan import plan_table
 
@@ -233,3 +235,12 @@ def test_displacements_between_three_charges_are_nearly_exact(plan):
     found = _singles(plan, (2e4, 3e4, 5e4, 9e4), 0.0)
     for part, exact in zip(found[3e4], _single(plan, 3e4, 0.0), strict=True):
         assert np.linalg.norm(part - exact) < 0.012 * np.linalg.norm(exact)
+
+
+def test_peak_memory_is_that_of_the_largest_process():
+    """A child holds 0.2 GB more than this process, or as the largest child, ever did."""
+    before = peak_memory()
+    assert before > 0.05  # this process alone, before it has had a child
+    size = int(1e9 * before + 2e8)
+    subprocess.run([sys.executable, "-c", f"b'1' * {size}"], check=True)
+    assert before + 0.18 < peak_memory() < before + 0.4
