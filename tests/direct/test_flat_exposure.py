@@ -55,9 +55,13 @@ def test_pixels_that_are_ahead_fall_behind(flat):
 def test_the_same_plan_gives_the_same_bits():
     few = plan(level=500.0, steps=2)
     a, b = simulate_flat(few, 3), simulate_flat(few, 3)
+    other = simulate_flat(few, 4)
     assert np.array_equal(a.on, b.on) and np.array_equal(a.off, b.off)
-    assert not np.array_equal(a.off, simulate_flat(few, 4).off)
+    assert not np.array_equal(a.off, other.off)
     assert few.key != plan().key
+    # Light falls on all pixels alike: a chi-square of 2 x 25 Poisson counts, 5 sigma.
+    counts = np.stack([a.off[-1], other.off[-1]])
+    assert abs(((counts - 500.0) ** 2 / 500.0).sum() - 50) < 5 * np.sqrt(2 * 50)
 
 
 def test_covariances_of_periodic_images():

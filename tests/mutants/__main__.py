@@ -212,7 +212,8 @@ def _failed(report: Path) -> str:
     """Name of the test that failed, from pytest's report."""
     for case in ElementTree.parse(report).iter("testcase"):
         if case.find("failure") is not None or case.find("error") is not None:
-            return f"{case.get('classname', '').replace('.', '/')}.py::{case.get('name')}"
+            file = case.get("classname", "").replace(".", "/")
+            return f"{file}.py::{case.get('name')}" if file else f"{case.get('name')}"
     return ""
 
 

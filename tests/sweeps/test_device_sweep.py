@@ -9,7 +9,7 @@ from bfsensor.device.device import Device
 from bfsensor.errors import SweepError
 from bfsensor.response.edge_response import CHARGE, LEVEL, REFINE_Z
 from bfsensor.sweeps.axes import parse_swept
-from bfsensor.sweeps.device_sweep import sweep_device
+from bfsensor.sweeps.device_sweep import partner_cells, sweep_device
 from bfsensor.sweeps.points import (
     PointResponse,
     SweepPoint,
@@ -34,6 +34,13 @@ def swept(tmp_path_factory):
         full_pixel=80_000.0, work=folder / "work", tables=folder / "tables",
     )  # fmt: skip
     return made, folder
+
+
+@pytest.mark.parametrize("cells", [8, 12, 16, 24, 32, 48])
+def test_the_mesh_that_measures_the_error_has_half_or_twice_the_cells(cells):
+    """An error of second order is then 4 times as large, or 3 / 4 of the difference is the own."""
+    ratio = partner_cells(cells) / cells
+    assert ratio == (2.0 if cells < 16 else 0.5)
 
 
 def test_a_row_for_every_point(swept):
