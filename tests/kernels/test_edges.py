@@ -7,6 +7,7 @@ from bfsensor._kernels import hot as hot_kernel
 from bfsensor._kernels.charge import TILE
 from bfsensor._kernels.compile_options import from_python
 from bfsensor._kernels.hot import FENCES
+from bfsensor._kernels.shifts import find_layer
 from tests.kernels.plain_edges import (
     IMAGES,
     Truth,
@@ -344,3 +345,18 @@ def test_electrons_outside_or_lost_have_no_pixel():
     assert (i == -1).all()
     i, j = find_pixels(sensor, exposure, np.array([5.5]), np.array([5.5]), np.array([0.0]))
     assert (i[0], j[0]) == (5, 5)
+
+
+@pytest.mark.kernels
+def test_heights_lie_between_their_layers():
+    """Layers of a table have a constant ratio of heights: 5 to 80 um in 4 steps of 2."""
+    find = from_python(find_layer)
+    log_z0, per_log = np.float32(np.log(5.0)), np.float32(1 / np.log(2.0))
+    for height in (5.0, 7.3, 20.0, 39.0, 79.0):
+        layer, part = find(log_z0, per_log, 5, np.float32(height))
+        assert 0 <= layer <= 3 and 0.0 <= part <= 1.0
+        # Logarithms in single precision: a few 1e-7 of log2(80).
+        assert 5.0 * 2.0 ** (layer + part) == pytest.approx(height, rel=5e-6)
+    for height, end in ((2.0, 0.0), (95.0, 4.0)):  # below the lowest and above the highest
+        assert sum(find(log_z0, per_log, 5, np.float32(height))) == end
+    assert find(log_z0, per_log, 1, np.float32(20.0)) == (0, 0.0)

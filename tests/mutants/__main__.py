@@ -58,6 +58,9 @@ def main() -> None:
         "--most", type=int, default=MOST_CPU, help="CPU seconds of a mutant"
     )
     parser.add_argument(
+        "--tests", nargs="+", help="test files to run, in place of those that import"
+    )
+    parser.add_argument(
         "--check", action="store_true", help="run what killed, nothing changed"
     )
     parser.add_argument("--list", action="store_true", help="print the mutants only")
@@ -87,7 +90,13 @@ def main() -> None:
         for number, mutant in chosen.items():
             outcome, test, seconds = "equivalent", "", 0.0
             if mutant.content not in reasons:
-                outcome, test, seconds = run(mutant, copy, durations, given.most)
+                outcome, test, seconds = run(
+                    mutant,
+                    copy,
+                    given.tests or tests_of(mutant.file, durations),
+                    given.most,
+                )
+                durations |= durations_in(copy)
             rows.append({
                 "seed": given.seed if number > len(known()) else 0, "number": number,
                 "room": mutant.room, "file": mutant.file, "line": mutant.line,
@@ -113,14 +122,8 @@ def copy_checkout(copy: Path) -> None:
             shutil.copy2(ROOT / name, copy / name)
 
 
-def run(
-    mutant: Mutant, copy: Path, durations: dict[str, float], most: int
-) -> tuple[str, str, float]:
-    """Outcome, the test that failed and CPU seconds of one mutant, in a copy of the checkout.
-
-    ``durations``, seconds of test files, gets those of the files that passed.
-    """
-    files = tests_of(mutant.file, durations)
+def run(mutant: Mutant, copy: Path, files: list[str], most: int) -> tuple[str, str, float]:
+    """Outcome, the test that failed and CPU seconds of one mutant, in a copy of the checkout."""
     before = (copy / mutant.file).read_bytes()
     mutant.apply(copy)
     report = copy.parent / "report.xml"
@@ -131,7 +134,6 @@ def run(
     finally:
         (copy / mutant.file).write_bytes(before)
     seconds = _cpu_of_children() - spent
-    durations |= _durations(report) if report.exists() else {}
     if status == 0:
         return "survived", "", seconds
     if status in (1, 2) and report.exists():
@@ -217,9 +219,11 @@ def _failed(report: Path) -> str:
     return ""
 
 
-def _durations(report: Path) -> dict[str, float]:
-    """Seconds of the test files all of whose tests ran, from pytest's report."""
-    total: dict[str, float] = {}
+def durations_in(copy: Path) -> dict[str, float]:
+    """Seconds of the test files all of whose tests ran for the last mutant, from pytest's report."""
+    report, total = copy.parent / "report.xml", dict[str, float]()
+    if not report.exists():
+        return {}
     failed = _failed(report).partition("::")[0]
     for case in ElementTree.parse(report).iter("testcase"):
         name = f"{case.get('classname', '').replace('.', '/')}.py"
