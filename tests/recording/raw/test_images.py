@@ -11,7 +11,7 @@ from bfsensor.measure.flat_pairs import flat_covariances
 from bfsensor.recording.raw.headers import scan_file
 from bfsensor.recording.raw.images import read_images
 from bfsensor.recording.raw.overscan import find_overscan
-from bfsensor.recording.raw.sections import layout_of
+from bfsensor.recording.raw.sections import layout_of, overlaps
 
 NX, NY, OVER = 60, 50, 16
 LEVEL, GAIN = 900.0, 1.5
@@ -269,3 +269,20 @@ def test_refusals_without_a_frame(tmp_path):
             RecordingError, match=f"gain = {gain:g} e-/ADU must be from 0.0001"
         ):
             read_raw(path, gain=gain)
+
+
+def test_amplifiers_overlap_where_they_share_a_pixel():
+    """Windows of a sensor drawn at random, beside, above and across each other; pixel by pixel."""
+    rng = np.random.default_rng(47)
+    layouts, covered = [], np.zeros((30, 12, 12), bool)
+    for n, pixels in enumerate(covered):
+        x, y = rng.integers(0, 8, 2)
+        nx, ny = rng.integers(1, 5, 2)
+        pixels[y : y + ny, x : x + nx] = True
+        section = f"[{x + 1}:{x + nx},{y + 1}:{y + ny}]"
+        layouts.append(layout_of("x", f"{n}", 1, (ny, nx), {"DETSEC": section}))
+    shared = {
+        (f"{a}", f"{b}")
+        for a in range(30) for b in range(a + 1, 30) if (covered[a] & covered[b]).any()
+    }  # fmt: skip
+    assert set(overlaps(layouts)) == shared and 20 < len(shared) < 400

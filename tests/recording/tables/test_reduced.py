@@ -7,13 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from astropy.table import Table
 
 from bfsensor.errors import RecordingError
 from bfsensor.recording.tables.area_changes import read_area_changes
 from bfsensor.recording.tables.covariance_tables import read_covariances
 from bfsensor.recording.tables.lsst_datasets import PhotonTransferDataset
-from bfsensor.recording.tables.reduced import find_reduced, read_profile, read_spots
+from bfsensor.recording.tables.reduced import (
+    find_reduced,
+    holds_images,
+    read_profile,
+    read_spots,
+)
 
 DATA = Path(__file__).parents[2] / "data"
 SHARED = Path(__file__).parents[3].parent / "shared"
@@ -270,3 +276,16 @@ def test_measured_tree_rings():
         rms[volts] = float(np.std(np.diff(profile.value)[50:-50]))
     # The drift field of 70 V carries electrons past the rings: weaker by a factor of 2 to 5.
     assert 2 < rms[0] / rms[70] < 5
+
+
+@pytest.mark.parametrize(
+    ("names", "images"),
+    [((), False), (("dataset",), False), (("image",), True), (("dataset", "image"), True)],
+)
+def test_a_folder_of_datasets_holds_no_images(tmp_path, names, images):
+    dataset = fits.table_to_hdu(Table({"PAIR": np.arange(9.0)}))
+    dataset.header["OBSTYPE"] = "PTC"
+    for name in names:
+        hdu = dataset if name == "dataset" else fits.ImageHDU(np.zeros((90, 90)))
+        fits.HDUList([fits.PrimaryHDU(), hdu]).writeto(tmp_path / f"{name}.fits")
+    assert holds_images(tmp_path) is images
