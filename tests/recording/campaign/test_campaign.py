@@ -12,10 +12,15 @@ from astropy.io import fits
 from astropy.table import Table
 
 from bfsensor.errors import RecordingError
+from bfsensor.recording.campaign import questions
 from bfsensor.recording.campaign.campaign import read_campaign
-from bfsensor.recording.campaign.frame_statistics import PairStatistics
+from bfsensor.recording.campaign.frame_statistics import FrameStatistics, PairStatistics
 from bfsensor.recording.campaign.inspection import inspect_campaign
-from bfsensor.recording.campaign.level_checks import check_saturation, measure_gains
+from bfsensor.recording.campaign.level_checks import (
+    check_pedestals,
+    check_saturation,
+    measure_gains,
+)
 from bfsensor.recording.raw.headers import scan_file
 from tests.broken_campaigns import (
     BREAKAGES,
@@ -358,6 +363,38 @@ def test_a_variance_that_falls_by_five_errors_is_a_full_well(whole, fall, report
         PairStatistics(2, 3, "C0", 2e4, before - fall * error, pixels, 0.0),
     ]
     assert bool(check_saturation(read_campaign(whole), [], pairs)) is reported
+
+
+@pytest.mark.parametrize(("step", "reported"), [(2.5, False), (4.0, True)])
+def test_a_pedestal_steps_where_it_moves_by_more_than_three_times_the_noise(
+    whole, step, reported
+):
+    """Twelve overscans of a scatter of 0.02 and a noise of 5 ADU; the second half is higher."""
+    campaign, noise = read_campaign(whole), 5.0
+    rng = np.random.default_rng(32)
+    frames = [
+        FrameStatistics(
+            exposure=one.number, amplifier="C0", pedestal=pedestal, noise=noise, level=0.0,
+            not_finite=0.0, saturated=0.0, top=0.0,
+        )
+        for one, pedestal in zip(
+            campaign.exposures[:12],
+            1000 + np.repeat([0.0, step * noise], 6) + 0.02 * rng.standard_normal(12),
+            strict=True,
+        )
+    ]  # fmt: skip
+    found = check_pedestals(campaign, frames)
+    assert [one.exposures for one in found] == [(frames[6].exposure,)] * reported
+
+
+def test_as_many_levels_as_asked_for_are_enough(whole, monkeypatch):
+    campaign = read_campaign(whole)
+    (condition,) = campaign.conditions()
+    levels = len(campaign.exposure_times(condition))
+    for asked, words in ((levels, []), (levels + 1, [f"pairs at {levels} levels"])):
+        monkeypatch.setattr(questions, "LEVELS", asked)
+        found = [one.because for one in questions.open_questions(campaign)]
+        assert [text for text in found if text.startswith("pairs at")] == words
 
 
 def test_part_of_a_practice_campaign(tmp_path):
