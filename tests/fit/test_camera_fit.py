@@ -165,6 +165,15 @@ def test_the_output_of_measure_flats_is_read(tmp_path):
     assert "4 levels, 8000 to 50000 e-" in found.source
 
 
+def test_variances_alone_become_a_00(tmp_path):
+    """A table of the lag (0, 0) only, whose sum of a_ij is a_00 itself."""
+    levels, noise, a = np.array([1e4, 2e4, 3e4, 5e4]), 25.0, np.array([[-2e-6]])
+    c = model_covariances(levels, a)[:, 0, 0] + noise
+    rows = [(0, 0, m, variance, 3.0) for m, variance in zip(levels, c, strict=True)]
+    found = read_camera_areas(write(tmp_path / "c.csv", "i,j,mu_e,cov,sigma", rows))
+    assert found.a[0, 0] == pytest.approx(a[0, 0], rel=1e-3) and found.used[0, 0]
+
+
 def test_one_level_says_nothing_of_a_00(tmp_path):
     a = truth(2)
     c = model_covariances([3e4], a)[0]

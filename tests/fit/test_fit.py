@@ -15,7 +15,7 @@ from bfsensor.device.quantities import choose_priors, quantities, with_priors
 from bfsensor.errors import DeviceError, FitError
 from bfsensor.fit.degeneracies import find_ties, principal
 from bfsensor.fit.fit import fit_device
-from bfsensor.fit.result import WELL_KNOWN, FitResult
+from bfsensor.fit.result import WELL_KNOWN, FitResult, FittedSet
 from tests.fit.test_least_squares import TRUTH
 from tests.fit.toys import MEANS, PRIORS, SPREADS, toy_data, toy_emulator
 from tests.response.linear_emulator import quadrant
@@ -266,3 +266,18 @@ def test_devices_drawn_from_the_posterior_widen_it():
     np.testing.assert_allclose(
         same.sets[1].after_error, plain.sets[1].after_error, rtol=1e-6
     )
+
+
+@pytest.mark.parametrize("fitted", [True, False])
+def test_pulls_scatter_by_one(fitted):
+    """Predictions of data that were not fitted have errors of their own: 4,000 normal numbers."""
+    n, scale, rng = 4000, 1.7, np.random.default_rng(640)
+    errors, own = rng.uniform(1, 3, n), rng.uniform(2, 4, n)
+    found = FittedSet(
+        name="", kind="areas", unit="", fitted=fitted, labels=("",) * n,
+        places=np.zeros((n, 2), int), values=scale * errors * rng.standard_normal(n),
+        errors=errors, before=np.zeros(n),
+        after=np.zeros(n) if fitted else own * rng.standard_normal(n), after_error=own,
+        chi2=0.0, chi2_before=0.0, scale=scale, scale_error=0.0, determined=0.0,
+    )  # fmt: skip
+    assert found.pulls.std() == pytest.approx(1.0, abs=4 / np.sqrt(2 * n))

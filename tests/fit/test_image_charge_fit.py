@@ -41,6 +41,15 @@ def test_noiseless_parameters_come_back(noiseless):
     assert fit.chi2 < 0.01 and fit.degrees_of_freedom == 18 and not fit.bounded
 
 
+def test_a_charge_between_the_two_highest_places_of_the_profile_is_found():
+    """The profile ends at 6 um, its last step but one is at 3.5 um, where chi2 is 4,000."""
+    true = dataclasses.replace(TRUE, charge_height=4.2, row_height=5.7, column_height=5.7)
+    a = area_changes(true, depth=100.0, reach=2)[2:, 2:]
+    fit = fit_image_charge(a, np.full(a.shape, 1e-10), base=true, free=["strength"])
+    assert fit.profile_heights[-2] < fit.model.charge_height < fit.profile_heights[-1]
+    assert fit.chi2 < 0.01 * fit.profile_chi2.min()
+
+
 def test_the_share_of_the_dipole_is_not_known(noiseless):
     """Errors of 3e-5 of a_00 and yet: chi2 hardly changes over heights of 0.1 to 1.5 um."""
     fit = noiseless
