@@ -8,7 +8,7 @@ from scipy.ndimage import label
 
 from bfsensor.diagnose.data.dark_channels import LEAST_PIXELS
 from bfsensor.diagnose.data.dark_channels import OUTLIER as MEASURED
-from bfsensor.effects import make_effect
+from bfsensor.effects import cosmic_rays, make_effect
 from bfsensor.effects.cosmic_rays import OUTLIER, TRACK_PIXELS
 from bfsensor.effects.effect import Layout, Segment, Shot
 
@@ -65,3 +65,24 @@ def test_dark_current_is_in_means_of_flats(variant: str, values: dict[str, float
     said = effect.flat_mean(x, LAYOUT)
     np.testing.assert_allclose(means, said, rtol=0.03, atol=0.02)
     assert said[1] > 50
+
+
+def test_without_clipping_tracks_add_their_own_autocorrelation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Image by image of 60 tracks; a clip of 1e4 standard deviations excludes no pixel."""
+    found = cosmic_rays.make_tracks(60, 100.0, 10.0, np.random.default_rng(651), (0, 0))
+    monkeypatch.setattr(cosmic_rays, "_tracks", lambda *_: found)
+    excess, _ = cosmic_rays._excess.__wrapped__(100.0, 10.0, (0, 0), 1e4, 2)
+    total = np.zeros((5, 5))
+    for n in range(60):
+        y, x, charge = (v[found.owner == n] for v in (found.y, found.x, found.charge))
+        image = np.zeros((np.ptp(y) + 5, np.ptp(x) + 5))
+        image[y - y.min() + 2, x - x.min() + 2] = charge
+        for j in range(-2, 3):
+            for i in range(-2, 3):
+                total[2 + j, 2 + i] += (image * np.roll(image, (-j, -i), (0, 1))).sum() / 60
+    # Directions are isotropic: the mean over the symmetries of the square is taken.
+    turned = [np.rot90(t, k) for t in (total, total.T) for k in range(4)]
+    for level in excess:
+        np.testing.assert_allclose(level, np.mean(turned, axis=0), rtol=1e-9)
