@@ -238,9 +238,14 @@ def _cpu_of_children() -> float:
 
 def check(rows: list[dict]) -> int:
     """Run the tests that killed mutants on the code as it is: each must pass."""
-    tests = {str(row["killed_by"]) for row in rows if "::test_" in str(row["killed_by"])}
-    tests = {re.sub(r"\[.*", "", test) for test in tests}
-    return _pytest(sorted(tests), ROOT, f"--basetemp={tempfile.mkdtemp()}")
+    found = {re.sub(r"\[.*", "", str(row["killed_by"])) for row in rows}
+    with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
+        copy = Path(folder) / "checkout"
+        copy_checkout(copy)
+        tests = sorted(test for test in found if "::test_" in test)
+        status = _pytest(tests, copy, most=len(tests) * MOST_CPU)
+        print((Path(folder) / "output.txt").read_text())
+    return status
 
 
 def read_rows(path: Path) -> tuple[list[dict], dict[str, float]]:
