@@ -518,3 +518,14 @@ def test_a_rim_beside_dust_is_no_dust():
     ((rows, columns, _, _),) = dust_spots(image)
     assert 120 in rows
     assert 90 in columns
+
+
+def test_a_round_shade_is_found_about_its_own_centre():
+    """The darkest part of the light lies 1.5 pixels beside the centre of a shade of 6 pixels."""
+    y, x = np.mgrid[:41, :41]
+    shade = -np.exp(-((y - 20.5) ** 2 + (x - 19.0) ** 2) / (2 * 6.0**2))
+    smooth = -np.exp(-((y - 21.5) ** 2 + (x - 20.0) ** 2) / (2 * 6.0**2))
+    inside = np.hypot(y - 20.5, x - 19.0) < 15
+    left = (shade - flat_defects._round_shade(shade, smooth, inside))[inside]
+    # Distances are counted to a pixel: half of the slope's rms, 0.06 at its steepest.
+    assert left.std() < 0.03 < 0.2 < shade[inside].std()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from bfsensor.diagnose.data import map_waves
 from bfsensor.diagnose.data.map_rings import WAFER, find_radial, find_rings
 from bfsensor.diagnose.data.map_waves import find_patterns
 from bfsensor.diagnose.model.map_predictions import area_change
@@ -71,3 +72,37 @@ def test_rings_have_their_centre_on_a_wafer(far):
     radial = find_radial(wave, x, y, [(-far, 90.0)], least=35.0)
     rings = find_rings(wave, x, y, (-far, 90.0, 43.0, 0.0))
     assert (radial is not None) == bool(rings) == (far < WAFER)
+
+
+BENT = map_waves.Wave(40.0, 30.0, 0.03, -0.02, 2e-4, -1.5e-4, 1e-4, 0.8, -0.5)
+
+
+def test_a_wave_is_the_same_about_any_point():
+    """Values at random points, and derivatives by differences of a phase of 1e-5 and less."""
+    x, y = np.random.default_rng(71).uniform(0, 80, (2, 50))
+    value, slopes = map_waves._model(BENT, x, y)
+    moved, _ = map_waves._model(BENT.about(12.0, 55.0), x, y)
+    np.testing.assert_allclose(moved, value, atol=1e-12)
+    for n, name in enumerate(("fx", "fy", "xx", "xy", "yy", "sine", "cosine")):
+        step = 1e-8
+        ends = [
+            map_waves._model(BENT._replace(**{name: getattr(BENT, name) + s}), x, y)[0]
+            for s in (-step, step)
+        ]
+        np.testing.assert_allclose(
+            slopes[:, n], (ends[1] - ends[0]) / (2 * step), rtol=1e-4, atol=1e-4
+        )
+
+
+@pytest.mark.parametrize("turn", [0.3, 2.0, 4.0, 5.7])
+def test_circles_of_one_period_have_their_centre(turn):
+    """A phase of r / 25 about a centre 300 pixels away, to second order at (40, 30)."""
+    ux, uy, period, radius = np.cos(turn), np.sin(turn), 25.0, 300.0
+    curved = 1 / (period * radius)
+    wave = map_waves.Wave(
+        40.0, 30.0, ux / period, uy / period, curved * uy * uy, -curved * ux * uy,
+        curved * ux * ux, 1.0, 0.0,
+    )  # fmt: skip
+    xc, yc, found, rate = map_waves._circles(wave, 5000.0)
+    assert (xc, yc) == pytest.approx((40 - radius * ux, 30 - radius * uy), rel=1e-9)
+    assert (found, rate) == pytest.approx((period, 0.0), abs=1e-9)
