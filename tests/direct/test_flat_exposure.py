@@ -78,9 +78,9 @@ def test_covariances_of_periodic_images():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"level": 0.0}, "level = 0 must be from 1"),
+        ({"level": 0.0}, "level = 0.0 must be from 1"),
         ({"pixels": 6}, "pixels = 6 must be odd"),
-        ({"depth": 1.0}, "depth = 1 must be from 2 to 100"),
+        ({"depth": 1.0}, "depth = 1.0 must be from 2 to 100"),
     ],
 )
 def test_refuses_impossible_plans(change, message):

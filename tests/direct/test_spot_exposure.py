@@ -129,11 +129,11 @@ def test_plans_are_told_apart():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"peak": 0.0}, "peak = 0 must be from 1"),
-        ({"sigma": -1.0}, "sigma = -1 must be"),
+        ({"peak": 0.0}, "peak = 0.0 must be from 1"),
+        ({"sigma": -1.0}, "sigma = -1.0 must be"),
         ({"steps": 0}, "steps = 0 must be"),
         ({"pixels": 4}, "pixels = 4 must be odd"),
-        ({"depth": 200.0}, "depth = 200 must be from 2 to 100"),
+        ({"depth": 200.0}, "depth = 200.0 must be from 2 to 100"),
         ({"sigma": 9.0}, "sigma = 9 um is too wide for 5 pixels"),
         ({"depth": 50.0, "wavelength": 620.0}, "a depth or a wavelength, not both"),
     ],

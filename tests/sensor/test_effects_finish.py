@@ -145,7 +145,7 @@ def test_what_is_no_report_gives_one_clear_error(tmp_path, given, message):
         ({"conditions": {"colour": 3.0}}, "conditions: colour = 3.0 must be one of"),
         ({"conditions": {"wavelength": "red"}}, "wavelength = 'red'"),
         ({"conditions": {"kind": "star"}}, "kind with one of"),
-        ({"layout": {"shape": 4}}, "is no layout"),
+        ({"layout": {"shape": 4}}, "shape = 4 must be rows and columns"),
         ({"layout": {"rows": 4}}, "'rows' must be one of shape"),
         (
             {"layout": {"shape": (4, 4), "segments": [(0, 0, 5, 4)]}},

@@ -282,7 +282,7 @@ def test_text_among_the_numbers_is_named(tmp_path):
     path.write_text(path.read_text() + "5,0,about 1e-8,1e-9\n")
     result = CliRunner().invoke(main, ["diagnose", str(path), "--baseline", "none"])
     assert result.exit_code == 1
-    assert "column cov_per_e" in result.output and "about 1e-8" in result.output
+    assert "row 26: cov_per_e" in result.output and "about 1e-8" in result.output
 
 
 def test_the_command_asks_the_quantities_of_a_device(tmp_path, monkeypatch):

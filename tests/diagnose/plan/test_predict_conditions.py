@@ -164,7 +164,7 @@ def test_spots_of_other_fluxes_grow_as_recorded(campaign):
     [
         ("colour=3", "colour must be one of kind, level"),
         ("level", "not NAME=VALUE"),
-        ("level=many", "level=many is not a number"),
+        ("level=many", "level=many is not a finite number"),
         ("wavelength=480", "flats need level or seconds"),
         ("seconds=-3", "must be above 0"),
         ("kind=moon,seconds=3", "kind=moon must be flat or spot"),
