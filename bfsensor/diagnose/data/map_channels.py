@@ -106,8 +106,8 @@ class MapChannels:
     ) -> None:
         self._shape, self._longest, self.fold = shape, longest, fold
         # A box lacks the brighter-fatter covariances with pixels outside of it, nearly in proportion
-        # to the inverse of its side.  By that law the noise over a block exceeds that over LOW pixels
-        # by this part of what the latter exceeds the noise over LOW / 2 pixels by.
+        # to the inverse of its side.  The noise grows from LOW / 2 to LOW pixels by a step that is
+        # measured; from LOW pixels to a block it grows, by that law, by this part of the step.
         self._outside = max(1.0 - LOW / block_side(shape), 0.0)
         self._amplifiers = tuple(amplifiers)
         self.sightings: tuple[Mapping[str, Any], ...] = ()

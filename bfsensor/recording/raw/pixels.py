@@ -131,9 +131,8 @@ def _cut(
         :: -1 if layout.stored_flip_y else 1, :: -1 if layout.stored_flip_x else 1
     ]
     limit = end if layout.saturation is None else min(layout.saturation, end)
-    with np.errstate(
-        over="ignore"
-    ):  # Of what single precision does not hold: not finite, masked.
+    # A value beyond single precision becomes infinite, and is masked below.
+    with np.errstate(over="ignore"):
         values = np.ascontiguousarray(values, dtype)
     bad = np.zeros(values.shape, bool)
     if np.isfinite(limit):
