@@ -47,8 +47,9 @@ Derived: a function whose second derivative is at most 0.4, the density of a Gau
 
 CLOSE = 5e-3 * np.arange(-4, 5)
 """Relative distances of first full wells from the level of the brightest flats.  Chosen: a part of the
-pixels of a flat is full within 2 % of the full well, and of starts 2 % apart none came near enough in a campaign
-of 148 standard deviations; with steps of 1 %, the nearest start gains 7 % of what the fit does there."""
+pixels of a flat is full within 2 % of the full well, and of starts 2 % apart none came near enough in
+a campaign of 148 standard deviations; with steps of 1 %, the nearest start gains 7 % of what the fit
+does there."""
 
 ROUNDS = 200
 """Largest number of rounds in which excess charge moves by one pixel; after them it is lost.
