@@ -144,6 +144,49 @@ def turns(a, b, c, d):
 
 
 @numba.njit(cache=True, error_model="numpy")
+def choose_step(phi, xs, ys, zs, coarseness, turn, scratch, cell):
+    """Length of a Runge-Kutta step of fourth order from ``scratch[0]``; its directions to ``scratch``.
+
+    The step is a part ``coarseness`` of the scale of the field, halved while the direction changes
+    by ``turn`` or more within it; ``scratch[2:6]`` get the unit vectors at its four points.
+    """
+    p = scratch[0]
+    q = scratch[1]
+    a = scratch[2]
+    b = scratch[3]
+    c = scratch[4]
+    d = scratch[5]
+    g = scratch[6]
+    weights = scratch[7:13]
+    h = coarseness * (0.3 + 0.12 * max(p[2] - 1.0, 0.0))
+    shortest = SHORTEST * h
+    _slope_along(phi, xs, ys, zs, p, 1.0, cell, weights, g, a)
+    while True:
+        for m in range(3):
+            q[m] = p[m] + 0.5 * h * a[m]
+        _slope_along(phi, xs, ys, zs, q, 1.0, cell, weights, g, b)
+        for m in range(3):
+            q[m] = p[m] + 0.5 * h * b[m]
+        _slope_along(phi, xs, ys, zs, q, 1.0, cell, weights, g, c)
+        for m in range(3):
+            q[m] = p[m] + h * c[m]
+        _slope_along(phi, xs, ys, zs, q, 1.0, cell, weights, g, d)
+        if turns(a, b, c, d) < turn * turn or h < shortest:
+            return h
+        h *= 0.5
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def advance(h, scratch, m):
+    """Way along axis ``m`` in a step whose directions :func:`choose_step` wrote."""
+    return (
+        h
+        / 6.0
+        * (scratch[2, m] + 2.0 * scratch[3, m] + 2.0 * scratch[4, m] + scratch[5, m])
+    )
+
+
+@numba.njit(cache=True, error_model="numpy")
 def find_well(
     phi,
     xs,
@@ -171,13 +214,6 @@ def find_well(
     not followed.
     """
     p = scratch[0]
-    q = scratch[1]
-    a = scratch[2]
-    b = scratch[3]
-    c = scratch[4]
-    d = scratch[5]
-    g = scratch[6]
-    weights = scratch[7:13]
     for m in range(3):
         p[m] = start[m]
     for _ in range(max_steps):
@@ -188,24 +224,9 @@ def find_well(
                 break
         if abs(p[axis] - edge) > leave:
             break
-        h = coarseness * (0.3 + 0.12 * max(p[2] - 1.0, 0.0))
-        shortest = SHORTEST * h
-        _slope_along(phi, xs, ys, zs, p, 1.0, cell, weights, g, a)
-        while True:
-            for m in range(3):
-                q[m] = p[m] + 0.5 * h * a[m]
-            _slope_along(phi, xs, ys, zs, q, 1.0, cell, weights, g, b)
-            for m in range(3):
-                q[m] = p[m] + 0.5 * h * b[m]
-            _slope_along(phi, xs, ys, zs, q, 1.0, cell, weights, g, c)
-            for m in range(3):
-                q[m] = p[m] + h * c[m]
-            _slope_along(phi, xs, ys, zs, q, 1.0, cell, weights, g, d)
-            if turns(a, b, c, d) < turn * turn or h < shortest:
-                break
-            h *= 0.5
+        h = choose_step(phi, xs, ys, zs, coarseness, turn, scratch, cell)
         for m in range(3):
-            p[m] += h / 6.0 * (a[m] + 2.0 * b[m] + 2.0 * c[m] + d[m])
+            p[m] += advance(h, scratch, m)
     for m in range(3):
         out[m] = p[m]
 
@@ -324,6 +345,24 @@ def bisect_edge(
 
 
 @numba.njit(cache=True, error_model="numpy")
+def step_over_height(phi, xs, ys, zs, x, y, z, h, cell, weights, g, out):
+    """Write where a field line is after a Runge-Kutta step ``h`` in height to ``out``, x and y."""
+    gradient(phi, xs, ys, zs, x, y, z, cell, weights, g)
+    ax = g[0] / g[2]
+    ay = g[1] / g[2]
+    half = 0.5 * h
+    gradient(phi, xs, ys, zs, x + half * ax, y + half * ay, z + half, cell, weights, g)
+    bx = g[0] / g[2]
+    by = g[1] / g[2]
+    gradient(phi, xs, ys, zs, x + half * bx, y + half * by, z + half, cell, weights, g)
+    cx = g[0] / g[2]
+    cy = g[1] / g[2]
+    gradient(phi, xs, ys, zs, x + h * cx, y + h * cy, z + h, cell, weights, g)
+    out[0] = x + h / 6.0 * (ax + 2.0 * bx + 2.0 * cx + g[0] / g[2])
+    out[1] = y + h / 6.0 * (ay + 2.0 * by + 2.0 * cy + g[1] / g[2])
+
+
+@numba.njit(cache=True, error_model="numpy")
 def trace_up(phi, xs, ys, zs, seeds, depths, ratio, out):
     """Follow field lines from seeds up to each depth, against the electron drift.
 
@@ -334,6 +373,7 @@ def trace_up(phi, xs, ys, zs, seeds, depths, ratio, out):
     cell = np.ones(3, np.int64)
     weights = np.zeros((6, 4))
     g = np.zeros(3)
+    end = np.zeros(2)
     for n in range(seeds.shape[0]):
         x = seeds[n, 0]
         y = seeds[n, 1]
@@ -346,44 +386,9 @@ def trace_up(phi, xs, ys, zs, seeds, depths, ratio, out):
                 factor = (depths[m] / z) ** (1.0 / steps)
                 for s in range(steps):
                     h = z * (factor - 1.0) if s < steps - 1 else depths[m] - z
-                    gradient(phi, xs, ys, zs, x, y, z, cell, weights, g)
-                    ax = g[0] / g[2]
-                    ay = g[1] / g[2]
-                    gradient(
-                        phi,
-                        xs,
-                        ys,
-                        zs,
-                        x + 0.5 * h * ax,
-                        y + 0.5 * h * ay,
-                        z + 0.5 * h,
-                        cell,
-                        weights,
-                        g,
-                    )
-                    bx = g[0] / g[2]
-                    by = g[1] / g[2]
-                    gradient(
-                        phi,
-                        xs,
-                        ys,
-                        zs,
-                        x + 0.5 * h * bx,
-                        y + 0.5 * h * by,
-                        z + 0.5 * h,
-                        cell,
-                        weights,
-                        g,
-                    )
-                    cx = g[0] / g[2]
-                    cy = g[1] / g[2]
-                    gradient(
-                        phi, xs, ys, zs, x + h * cx, y + h * cy, z + h, cell, weights, g
-                    )
-                    dx = g[0] / g[2]
-                    dy = g[1] / g[2]
-                    x += h / 6.0 * (ax + 2.0 * bx + 2.0 * cx + dx)
-                    y += h / 6.0 * (ay + 2.0 * by + 2.0 * cy + dy)
+                    step_over_height(phi, xs, ys, zs, x, y, z, h, cell, weights, g, end)
+                    x = end[0]
+                    y = end[1]
                     z += h
             out[n, m, 0] = x
             out[n, m, 1] = y

@@ -83,8 +83,11 @@ def relax_columns(
     inverse_dy,
     colour,
     work,
+    first_sweep,
 ):
     """Solve every column (fixed x, y) of one colour exactly along z, in place.
+
+    In the ``first_sweep`` the other columns count as zero, whatever they hold.
 
     ``rhs`` is the charge of each node, ``pivots`` what :func:`eliminate` wrote.  The links ``left``,
     ``right``, ``cy`` and ``cz`` are packed, ``[kind, odd or even, z, column]``: columns of odd number
@@ -105,17 +108,18 @@ def relax_columns(
             out = work[k]
             for m in range(n):
                 out[m] = rhs[j, k, first + 2 * m] * w
-            for m in range(n):
-                i = first + 2 * m
-                out[m] += cy[g, even, k, m] * (
-                    an * phi[j + 1, k, i] + as_ * phi[j - 1, k, i]
-                )
-            for m in range(n):
-                i = first + 2 * m
-                out[m] += (
-                    right[g, even, k, m] * phi[j, k, i + 1]
-                    + left[g, even, k, m] * phi[j, k, i - 1]
-                )
+            if not first_sweep:
+                for m in range(n):
+                    i = first + 2 * m
+                    out[m] += cy[g, even, k, m] * (
+                        an * phi[j + 1, k, i] + as_ * phi[j - 1, k, i]
+                    )
+                for m in range(n):
+                    i = first + 2 * m
+                    out[m] += (
+                        right[g, even, k, m] * phi[j, k, i + 1]
+                        + left[g, even, k, m] * phi[j, k, i - 1]
+                    )
             if k > 0:
                 for m in range(n):
                     out[m] += cz[g, even, k - 1, m] * work[k - 1, m]

@@ -20,9 +20,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bfsensor._kernels import drift
+from bfsensor._kernels import drift, line_sides
 from bfsensor.errors import ConvergenceError, TableError
-from bfsensor.simulate.field import Field
+from bfsensor.simulate import row_sheets
+from bfsensor.simulate.field import Field, PathSteps
 from bfsensor.simulate.mesh import Surfaces
 from bfsensor.simulate.poisson import Potential
 from bfsensor.typing import FloatArray
@@ -172,16 +173,15 @@ class PixelBoundaries:
         for d in range(nd):
             # A side is measured between its corners, which the lines across move in turn.
             for _ in range(_CORNER_PASSES):
-                new = np.zeros((n_lines, n_lines, 2))
-                for m in range(n_lines):
-                    ends = grid_x + corners[d, m, :, 0]
-                    fitted = fit.apply(self.rows[d, m], 0, ends, z[d]) - grid_y[m]
-                    new[m, :, 1] = fitted[:: vertices + 1]
-                    horizontal[d, m, :, :, 1] = _between(fitted, vertices)
-                    ends = grid_y + corners[d, :, m, 1]
-                    fitted = fit.apply(self.columns[d, m], 1, ends, z[d]) - grid_x[m]
-                    new[:, m, 0] = fitted[:: vertices + 1]
-                    vertical[d, :, m, :, 0] = _between(fitted, vertices)
+                ends = grid_x + corners[d, :, :, 0]
+                rows = fit.apply(self.rows[d], 0, ends, z[d]) - grid_y[:, None]
+                horizontal[d, ..., 1] = _between(rows, vertices)
+                ends = grid_y + corners[d, :, :, 1].T
+                columns = fit.apply(self.columns[d], 1, ends, z[d]) - grid_x[:, None]
+                vertical[d, ..., 0] = _between(columns, vertices).swapaxes(0, 1)
+                new = np.stack(
+                    [columns[:, :: vertices + 1].T, rows[:, :: vertices + 1]], axis=-1
+                )
                 moved = np.abs(new - corners[d]).max()
                 corners[d] = new
                 if moved < _CORNER_TOLERANCE:
@@ -196,8 +196,8 @@ class PixelBoundaries:
 
 
 def _between(fitted: FloatArray, vertices: int) -> FloatArray:
-    """The values of a fitted line at the vertices between the corners, pixel by pixel."""
-    return fitted[:-1].reshape(-1, vertices + 1)[:, 1:]
+    """The values of fitted lines at the vertices between the corners, pixel by pixel."""
+    return fitted[:, :-1].reshape(len(fitted), -1, vertices + 1)[..., 1:]
 
 
 def mirror_quadrant(
@@ -242,23 +242,22 @@ class _LineFit:
     points: FloatArray
     matrix: FloatArray
 
-    def apply(self, line: FloatArray, along: int, ends: FloatArray, z: float) -> FloatArray:
-        """Vertices of ``line`` (points (x, y)) at height ``z``; corners at ``ends`` along it."""
-        values = np.empty((len(ends) - 1, len(self.points)))
-        for p in range(len(ends) - 1):
-            # A line between rows jumps where it crosses a boundary between columns: only
-            # points of this pixel count, the outermost one up to the corner.
-            a, b = np.searchsorted(line[:, along], ends[p : p + 2])
-            if a >= b:
-                raise ConvergenceError(
-                    f"a boundary between {('rows', 'columns')[along]} at z = {z:g} um has no point "
-                    f"on the side of a pixel, {'xy'[along]} from {ends[p]:.4g} to "
-                    f"{ends[p + 1]:.4g} um: boundaries fold (is the silicon hardly depleted, or a "
-                    "pixel near its full well?)"
-                )
-            where = ends[p] + (ends[p + 1] - ends[p]) * self.points
-            values[p] = np.interp(where, line[a:b, along], line[a:b, 1 - along])
-        return self.matrix @ values.ravel()
+    def apply(
+        self, lines: FloatArray, along: int, ends: FloatArray, z: float
+    ) -> FloatArray:
+        """Vertices of lines (n, points, 2) at height ``z``, (n, vertices); corners at ``ends``."""
+        values = np.empty((len(lines), ends.shape[1] - 1, len(self.points)))
+        # A line between rows jumps where it crosses a boundary between columns: only
+        # points of this pixel count, the outermost one up to the corner.
+        n, p = line_sides.values_on_sides(lines, along, ends, self.points, values)
+        if n >= 0:
+            raise ConvergenceError(
+                f"a boundary between {('rows', 'columns')[along]} at z = {z:g} um has no point "
+                f"on the side of a pixel, {'xy'[along]} from {ends[n, p]:.4g} to "
+                f"{ends[n, p + 1]:.4g} um: boundaries fold (is the silicon hardly depleted, or a "
+                "pixel near its full well?)"
+            )
+        return values.reshape(len(lines), -1) @ self.matrix.T
 
 
 @lru_cache(maxsize=8)
@@ -393,6 +392,7 @@ def find_boundaries(
             "boundaries need the mirror planes through the centre of pixel (0, 0)"
         )
     split = _split_height(potential, surfaces)
+    steps = PathSteps(coarseness, turn, precision, _MAX_STEPS)
     lines = []
     for axis in (0, 1):
         pitch, along = mesh.pitch[axis], mesh.pitch[1 - axis]
@@ -408,9 +408,7 @@ def find_boundaries(
                 f"reach = {reach} pixels does not fit a period of {mesh.period[0]:g} x "
                 f"{mesh.period[1]:g} um"
             )
-        traced, below = _trace_lines(
-            field, axis, edges, seeds, levels, split, coarseness, ratio, precision, turn
-        )
+        traced, below = _trace_lines(field, axis, edges, seeds, levels, split, ratio, steps)
         lines.append(traced)
         if feet is not None:
             feet.append(Feet(axis, below))
@@ -472,54 +470,81 @@ def _trace_lines(
     along: FloatArray,
     depths: FloatArray,
     split: float,
-    coarseness: float,
     ratio: float,
-    precision: float,
-    turn: float,
+    steps: PathSteps,
 ) -> tuple[FloatArray, tuple[tuple[FloatArray, NDArray[np.bool_]], ...]]:
     """Points of the lines across ``axis`` at every depth, (nd, lines, seeds, 2), and their feet."""
     shape = (len(edges), len(along))
     out = np.zeros((len(depths), *shape, 2))
     high = depths >= split
-    heights = [split] if high.any() else []
-    heights += list(depths[~high])
+    heights = np.array([*([split] if high.any() else []), *depths[~high]])
+    seeds = np.zeros((len(heights), *shape, 3))
+    seeds[..., axis] = edges[:, None]
+    seeds[..., 1 - axis] = along
+    seeds[..., 2] = heights[:, None, None]
+    found = np.full(seeds.shape[:-1], np.nan)
+    if axis == 1:
+        _fall_to_sheets(field, edges, seeds, split, steps, found)
+    _bisect(field, axis, seeds, found, steps)
+    seeds[..., axis] = found
     feet = []
-    for number, z in enumerate(heights):
-        seeds = np.zeros((*shape, 3))
-        seeds[..., axis] = edges[:, None]
-        seeds[..., 1 - axis] = along[None, :]
-        seeds[..., 2] = z
-        position = np.zeros(shape[0] * shape[1])
-        near = np.full(position.size, BRACKET)
-        failed = drift.bisect_edge(
-            field.phi, field.x, field.y, field.z, seeds.reshape(-1, 3), axis,
-            np.broadcast_to(edges[:, None], shape).ravel().copy(),
-            -near, near, precision, field.zone, coarseness, _MAX_STEPS, position, turn,
+    for z, points in zip(heights, seeds, strict=True):
+        reached = high if z == split else depths == z
+        feet.append((points, reached))
+        if z < split:
+            out[reached] = points[..., :2]
+            continue
+        traced = np.zeros((points[..., 0].size, int(high.sum()), 2))
+        drift.trace_up(
+            field.phi, field.x, field.y, field.z, points.reshape(-1, 3), depths[high], ratio,
+            traced,
         )  # fmt: skip
-        if failed:
-            raise ConvergenceError(
-                f"{failed} of {position.size} boundary points at z = {z:g} um were not found: no "
-                "well on one side (is a pixel near its full well?)",
-                [],
-            )
-        seeds[..., axis] = position.reshape(shape)
-        feet.append((seeds, high if number == 0 and high.any() else depths == z))
-        if number == 0 and high.any():
-            traced = np.zeros((position.size, int(high.sum()), 2))
-            drift.trace_up(
-                field.phi,
-                field.x,
-                field.y,
-                field.z,
-                seeds.reshape(-1, 3),
-                depths[high],
-                ratio,
-                traced,
-            )
-            out[high] = np.moveaxis(traced.reshape(*shape, -1, 2), 2, 0)
-        else:
-            out[int(np.argmin(np.abs(depths - z)))] = seeds[..., :2]
+        out[high] = np.moveaxis(traced.reshape(*shape, -1, 2), 2, 0)
     return out, tuple(feet)
+
+
+def _fall_to_sheets(
+    field: Field,
+    edges: FloatArray,
+    seeds: FloatArray,
+    split: float,
+    steps: PathSteps,
+    found: FloatArray,
+) -> None:
+    """Find points of lines between rows, (heights, lines, seeds), from their sheets lower down."""
+    sheet = row_sheets.sheet_height(field, edges[-1], split - SPLIT_HEIGHT, split)
+    above = seeds[:, 0, 0, 2] > sheet
+    if not above.any():
+        return
+    landings = row_sheets.fall(field, seeds[above], sheet, steps)
+    together = np.concatenate(list(landings), axis=1)
+    sheets = row_sheets.find_sheets(field, edges, together, sheet, BRACKET, steps)
+    found[above] = [
+        row_sheets.meet(field, sheets, *one, steps)
+        for one in zip(seeds[above], landings, strict=True)
+    ]
+
+
+def _bisect(
+    field: Field, axis: int, seeds: FloatArray, found: FloatArray, steps: PathSteps
+) -> None:
+    """Bisect the points that are not found yet."""
+    missing = np.isnan(found)
+    points = seeds[missing]
+    position = np.zeros(len(points))
+    near = np.full(len(points), BRACKET)
+    failed = drift.bisect_edge(
+        field.phi, field.x, field.y, field.z, points, axis, points[:, axis].copy(), -near, near,
+        steps.precision, field.zone, steps.coarseness, steps.most, position, steps.turn,
+    )  # fmt: skip
+    if failed:
+        z = points[np.isnan(position), 2].max()
+        raise ConvergenceError(
+            f"{failed} of {found.size} boundary points, the highest at z = {z:g} um, were not "
+            "found: no well on one side (is a pixel near its full well?)",
+            [],
+        )
+    found[missing] = position
 
 
 def unfold(lines: FloatArray, axis: int) -> FloatArray:

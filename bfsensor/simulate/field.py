@@ -70,6 +70,28 @@ class Field:
         return cls(np.ascontiguousarray(phi), x, y, z, zone)
 
 
+@dataclass(frozen=True)
+class PathSteps:
+    """Steps in which paths are followed, and how closely a boundary between them is found.
+
+    Attributes
+    ----------
+    coarseness : float
+        Step relative to the scale of the field.
+    turn : float
+        Largest change of the unit vector of direction within a step.
+    precision : float
+        Width of the interval at which the search for a boundary ends [um].
+    most : int
+        Steps after which a path ends where it is.
+    """
+
+    coarseness: float
+    turn: float
+    precision: float
+    most: int
+
+
 def _pad(
     phi: FloatArray,
     nodes: FloatArray,

@@ -77,32 +77,33 @@ class Multigrid:
                 c["south"], c["inverse_dy"], level.pivots,
             )  # fmt: skip
 
-    def cycle(self, charge: FloatArray, out: FloatArray) -> None:
-        """Write the approximate solution of ``A out = charge`` to ``out``."""
+    def cycle(self, charge: FloatArray) -> NDArray[np.float32]:
+        """Solve ``A out = charge`` approximately; the next cycle writes to the same array."""
         self.cycles += 1
         top = self.levels[0]
         top.charge[...] = charge
         self._cycle(0)
-        out[...] = top.solution
+        return top.solution
 
-    def _relax(self, level: _Level, colour: int) -> None:
+    def _relax(self, level: _Level, colour: int, *, first: bool = False) -> None:
         c = level.coefficients
         relaxation.relax_columns(
             level.solution, level.charge, level.pivots, c["left"], c["right"], c["packed_cy"],
             c["packed_cz"], c["kind"], c["north"], c["south"], c["inverse_dy"], colour, level.work,
+            first,
         )  # fmt: skip
         relaxation.fill_halo(level.solution, *level.periodic)
 
     def _cycle(self, depth: int) -> None:
         level = self.levels[depth]
-        level.solution[...] = 0.0
         if depth == len(self.levels) - 1:
+            level.solution[...] = 0.0
             for first in (0, 1):
                 for _ in range(_COARSEST_SWEEPS):
                     self._relax(level, first)
                     self._relax(level, 1 - first)
             return
-        self._relax(level, 0)
+        self._relax(level, 0, first=True)
         self._relax(level, 1)
         c = level.coefficients
         relaxation.residual(

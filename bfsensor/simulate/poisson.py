@@ -22,9 +22,10 @@ from numpy.typing import ArrayLike, NDArray
 from bfsensor._kernels import carriers as carrier_kernels
 from bfsensor.errors import ConvergenceError, DeviceError
 from bfsensor.simulate.discretise import discretise
-from bfsensor.simulate.linear_system import LinearSystem, PixelNodes
+from bfsensor.simulate.linear_system import LinearSystem
 from bfsensor.simulate.mesh import Mesh
 from bfsensor.simulate.multigrid import Multigrid
+from bfsensor.simulate.pixel_nodes import PixelNodes
 from bfsensor.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -461,12 +462,13 @@ class Electrostatics:
         conserved = np.zeros(count.size) if fixed else count
         filled = count > 0
         expected = np.inf
+        asked = np.inf
         for _ in range(_MAX_NEWTON):
             levels = fermi if fermi is not None else self._fermi_levels(phi, count)
             self._set_carriers(phi, levels, filled)
             system.unbalance(phi, system.residual)
             norm = float(np.sqrt(np.sum(system.residual**2)))
-            system.linearise()
+            system.linearise(near=asked < self._kt)
             forcing = self._forcing(expected, tolerance)
             iterations = system.solve(conserved, forcing)
             shift = np.zeros(count.size) if fixed else self._common_shift(count)

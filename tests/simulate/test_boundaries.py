@@ -225,3 +225,30 @@ def test_a_low_back_bias_lifts_the_ridge_over_the_stops(monkeypatch):
             for line in [getattr(found, name)[0, 2]]
         ]
         assert np.abs(lines[0] - lines[1]).max() < 5e-3
+
+
+def test_sheets_give_the_bisected_lines(solution, monkeypatch):
+    """Points of lines between rows, where electrons fall onto a sheet, are those of a bisection."""
+    depths, fine = [3.0, 5.0, 95.0], {"precision": 1e-7, "turn": boundaries.TURN}
+    fallen = []
+    meet = boundaries.row_sheets.meet
+    monkeypatch.setattr(
+        boundaries.row_sheets, "meet", lambda *a: fallen.append(meet(*a)) or fallen[-1]
+    )
+    found = find_boundaries(solution, depths, reach=3, **fine)
+    assert len(fallen) == 2  # at the height of bisection, and at the depth below it
+    assert np.isfinite(fallen).mean() > 0.97
+    monkeypatch.setattr(boundaries, "_fall_to_sheets", lambda *a: None)
+    bisected = find_boundaries(solution, depths, reach=3, **fine)
+    np.testing.assert_array_equal(found.columns, bisected.columns)
+    difference = found.rows - bisected.rows
+    assert np.abs(difference).max() < 3e-4
+    assert np.sqrt(np.mean(difference**2)) < 1e-5
+
+
+def test_a_sheet_that_is_not_found_is_no_matter(solution, monkeypatch):
+    """Where the saddle is so high that depths lie below its sheet, lines are bisected."""
+    expected = find_boundaries(solution, [3.0, 95.0], reach=1)
+    monkeypatch.setattr(boundaries.row_sheets, "ABOVE_SADDLE", 100.0)
+    found = find_boundaries(solution, [3.0, 95.0], reach=1)
+    np.testing.assert_allclose(found.rows, expected.rows, atol=3e-4)
