@@ -218,9 +218,10 @@ class RadialTreeRings(_Rings):
     r is the distance from (``xc``, ``yc``) [pixel].  The profile g is the sum of waves that
     :func:`bfsensor.diagnose.data.map_rings.find_radial` detected in the map of all wavelengths, with
     the mean square of a sine: it is held by the layout and not fitted.  ``amp`` A [pixel];
-    ``period`` [pixel] is that of the strongest wave.  A radial field moves an electron in proportion
-    to the length d of its drift and inversely to the drift field, and so to the voltage V: ``drift`` e
-    and ``field`` f are 1; 0 if displacements are the same for all light and all voltages.
+    ``period`` [pixel] is that of a sine with as large displacements and slopes.  A radial field moves
+    an electron in proportion to the length d of its drift and inversely to the drift field, and so to
+    the voltage V: ``drift`` e and ``field`` f are 1; 0 if displacements are the same for all light and
+    all voltages.
 
     Parameters
     ----------

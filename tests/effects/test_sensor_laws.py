@@ -167,6 +167,19 @@ def test_rings_about_a_centre_on_the_sensor_are_found_with_all_their_periods():
     assert find_radial(noise, x, y, [], least=35.0) is None
 
 
+@pytest.mark.parametrize("seed", [8239, 8240, 8241])
+def test_the_period_of_rings_is_their_mean_spacing(seed):
+    """Rings of a changing spacing are many waves, of which single ones are large and cancel."""
+    y, x = np.mgrid[:256.0, :256.0]
+    r = np.hypot(x + 60.0, y - 300.0)
+    phase = r / 24 * (1 + 0.1 * np.sin(2 * np.pi * r / 400))
+    rings = np.sin(2 * np.pi * phase)
+    noise = np.random.default_rng(seed).standard_normal(r.shape)
+    found = find_radial(0.5 * rings + noise, x, y, [(-60.0, 300.0)], least=35.0)
+    assert found is not None and len(found["waves"]) > 2
+    assert found["period"] == pytest.approx(24.0, rel=0.12)
+
+
 @pytest.mark.parametrize("strength", STRENGTHS)
 def test_shades_of_a_shutter_reach_the_means_of_amplifiers(strength):
     dt, level, seconds = 0.02 * strength, 2e4, 2.0

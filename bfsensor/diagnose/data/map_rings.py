@@ -375,9 +375,10 @@ def find_radial(
     Returns
     -------
     dict or None
-        'xc', 'yc' [pixel]; 'period' of the strongest wave [pixel]; 'amp' A [pixel]; 'waves', tuple of
-        (f [1/pixel], s, c), of which the sum has the mean square of a sine; 'z', root of the decrease
-        of the chi-square.  None without a wave.
+        'xc', 'yc' [pixel]; 'period' of the sine that has the same mean squares of displacement and
+        slope along the radius [pixel]; 'amp' A [pixel]; 'waves', tuple of (f [1/pixel], s, c), of
+        which the sum has the mean square of a sine; 'z', root of the decrease of the chi-square.  None
+        without a wave.
 
     Examples
     --------
@@ -386,8 +387,8 @@ def find_radial(
     >>> flat = np.cos(2 * np.pi * r / 14) + np.cos(2 * np.pi * r / 23)
     >>> noise = np.random.default_rng(8231).standard_normal(r.shape)
     >>> found = find_radial(flat + noise, x, y, [], least=35.0)
-    >>> round(found["xc"]), round(found["yc"]), len(found["waves"]) >= 2
-    (30, 50, True)
+    >>> round(found["xc"]), round(found["yc"]), len(found["waves"]) >= 2, 14 < found["period"] < 23
+    (30, 50, True, True)
     """
     step = float(x[0, 1] - x[0, 0])
     symmetric = _symmetric(values)
@@ -418,14 +419,15 @@ def find_radial(
     waves, gained = _waves_of(place, mean, count, least, 2 * np.log(max(tried, 1.0)))
     if not waves:
         return None
-    u = sum(
-        s * np.sin(2 * np.pi * f * place) + c * np.cos(2 * np.pi * f * place)
-        for f, s, c in waves
-    )
+    f, s, c = (np.array(w)[:, None] for w in zip(*waves, strict=True))
+    turn = 2 * np.pi * f * place
+    u = (s * np.sin(turn) + c * np.cos(turn)).sum(axis=0)
+    slope = (2 * np.pi * f * (s * np.cos(turn) - c * np.sin(turn))).sum(axis=0)
     amp = float(np.sqrt(2 * np.average(np.square(u), weights=count)))
-    strongest = max(waves, key=lambda w: w[0] * np.hypot(w[1], w[2]))
+    period = 2 * np.pi * float(np.sqrt(np.square(u).sum() / np.square(slope).sum()))
+    # Of waves close to each other in frequency single ones may be of any size: they cancel.
     return {
-        "xc": xc, "yc": yc, "period": 1 / strongest[0], "amp": amp, "z": float(np.sqrt(gained)),
+        "xc": xc, "yc": yc, "period": period, "amp": amp, "z": float(np.sqrt(gained)),
         "waves": tuple((f, s / amp, c / amp) for f, s, c in waves),
     }  # fmt: skip
 

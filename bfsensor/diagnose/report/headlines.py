@@ -96,7 +96,7 @@ HEADLINES: Mapping[str, tuple[str, ...]] = {
     ),
     "lateral_diffusion": ("spots are wider by a variance of {var} pixel^2",),
     "tree_rings": (
-        "tree rings displace light by {amp} pixel, {period} pixels from ring to ring",
+        "tree rings displace light by {amp} pixel, on average {period} pixels from ring to ring",
         "tree rings displace light by {amp} pixel",
     ),
     "edge_rolloff": (
