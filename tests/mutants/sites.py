@@ -77,7 +77,7 @@ def known() -> list[Mutant]:
          "np.maximum(pairs[0], 1)"),
         ("recording/campaign/level_checks.py", "factor", "np.sqrt(2.0 / pair.pixels)", "2.0", "1.0"),
         ("diagnose/detect/candidate_screen.py", "sign", "prior -= 0.5 * beyond**2", "-=", "+="),
-        ("_kernels/drift.py", "factor", "y += h / 6.0 * (ay", "2.0 * cy", "1.9 * cy"),
+        ("_kernels/drift.py", "factor", "out[1] = y + h / 6.0 * (ay", "2.0 * cy", "1.9 * cy"),
     )  # fmt: skip
     found = []
     for name, kind, part, old, new in changes:
