@@ -24,7 +24,7 @@ from astropy.io import fits
 
 from bfsensor.sweeps.device_sweep import DeviceSweep
 from bfsensor.table.table import DistortionTable
-from tests.virtual import SMALL, make_effect, write_campaign
+from tests.virtual import make_effect, write_campaign
 
 KILLS = 20
 """Kills of each command.  Chosen: a moment that loses a twentieth of all runs is met in 64 % of the
@@ -184,7 +184,7 @@ def prepare(name: str, folder: Path) -> Path:
         effect = make_effect("cti_serial", {"cti": 3e-6})
         for one in ("one",) if name == "diagnose" else ("one", "two"):
             write_campaign(
-                folder / "campaigns" / one, seed=7301, size=SMALL, effects=[effect]
+                folder / "campaigns" / one, seed=7301, size="T", effects=[effect]
             )
     return folder
 
