@@ -184,8 +184,9 @@ def prepare(name: str, folder: Path) -> Path:
         effect = make_effect("cti_serial", {"cti": 3e-6})
         for one in ("one",) if name == "diagnose" else ("one", "two"):
             write_campaign(
-                folder / "campaigns" / one, seed=7301, size="T", effects=[effect]
-            )
+                folder / "campaigns" / one, seed=7301, size="T", effects=[effect],
+                truth_folder=folder / "truth",
+            )  # fmt: skip
     return folder
 
 
