@@ -68,7 +68,9 @@ def files(folder: Path) -> set[str]:
     return {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
 
 
-def without_costs(report: dict[str, Any]) -> dict[str, Any]:
+def report_of(path: Path, folder: Path) -> dict[str, Any]:
+    """A report without its costs, and without the folder that the campaign lies in."""
+    report = json.loads(path.read_text().replace(str(folder), ""))
     return {k: v for k, v in report.items() if k != "provenance"}
 
 
@@ -104,12 +106,12 @@ def of_fit(folder: Path) -> Any:
 
 
 def of_diagnosis(folder: Path) -> Any:
-    return without_costs(json.loads((folder / "out" / "report.json").read_text()))
+    return report_of(folder / "out" / "report.json", folder)
 
 
 def of_reports(folder: Path) -> Any:
     return {
-        p.parent.name: without_costs(json.loads(p.read_text()))
+        p.parent.name: report_of(p, folder)
         for p in sorted((folder / "out").glob("*/report.json"))
     }
 
