@@ -117,3 +117,5 @@ def meet_sheets(
             if abs(step) < tolerance:
                 out[n] = point[1]
                 break
+        if np.isnan(out[n]):
+            slope = np.nan  # that of a jump between sheets serves no other seed
