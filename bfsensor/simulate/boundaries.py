@@ -24,6 +24,7 @@ from bfsensor._kernels import drift, line_sides
 from bfsensor.errors import ConvergenceError, TableError
 from bfsensor.simulate import row_sheets
 from bfsensor.simulate.field import Field, PathSteps
+from bfsensor.simulate.line_points import LinePoints, line_points
 from bfsensor.simulate.mesh import Surfaces
 from bfsensor.simulate.poisson import Potential
 from bfsensor.typing import FloatArray
@@ -305,10 +306,13 @@ class Feet:
     below : tuple of (ndarray, ndarray)
         For each height of bisection the points (x, y, z) of the boundary [um], shape (lines,
         seeds, 3), and a mask of the conversion depths that were reached from them.
+    points : LinePoints
+        The points along the lines that were traced, and those on which lines are given.
     """
 
     axis: int
     below: tuple[tuple[FloatArray, NDArray[np.bool_]], ...]
+    points: LinePoints
 
 
 def find_boundaries(
@@ -335,7 +339,8 @@ def find_boundaries(
     reach : int
         Largest pixel offset, 0 or more.
     samples : int
-        Points of a line per pixel, denser towards the corners.
+        Points of a line per pixel, denser towards the corners; of those between columns at most
+        :data:`~bfsensor.simulate.line_points.SMOOTH_POINTS` are traced.
     coarseness, ratio : float
         Relative steps of the forward and backward traces (:data:`COARSENESS`, :data:`RATIO`);
         the defaults give a tracing error below 3e-4 um.
@@ -398,7 +403,8 @@ def find_boundaries(
         pitch, along = mesh.pitch[axis], mesh.pitch[1 - axis]
         first = 0 if symmetric else -reach - 1
         edges = np.array((np.arange(first, reach + 1) + 0.5) * pitch, np.float64)
-        seeds = _seed_positions(reach, along, samples, symmetric)
+        points = line_points(reach, along, samples, symmetric=symmetric, smooth=axis == 0)
+        seeds = points.traced
         half_period = mesh.period[axis] / 2
         if (
             edges[-1] + pitch / 2 > half_period + 1e-9
@@ -409,9 +415,9 @@ def find_boundaries(
                 f"{mesh.period[1]:g} um"
             )
         traced, below = _trace_lines(field, axis, edges, seeds, levels, split, ratio, steps)
-        lines.append(traced)
+        lines.append(points.spread(traced, 1 - axis))
         if feet is not None:
-            feet.append(Feet(axis, below))
+            feet.append(Feet(axis, below, points))
     columns, rows = lines
     if symmetric:
         columns, rows = unfold(columns, 0), unfold(rows, 1)
@@ -449,18 +455,6 @@ def lowest_depth(potential: Potential) -> float:
             / potential.electrons.sum()
         )
     return float(potential.mesh.z[np.argmax(potential.phi.max(axis=(1, 2)))])
-
-
-def _seed_positions(reach: int, pitch: float, samples: int, symmetric: bool) -> FloatArray:
-    """Positions along a line: Chebyshev points in each pixel, so denser at the corners."""
-    cheb = -0.5 * np.cos(np.pi * (np.arange(samples) + 0.5) / samples) * pitch
-    pixels = np.arange(-reach, reach + 1)
-    # A little of the next pixel, for the corner and its displacement.
-    margin = np.array([0.15, 0.4]) * pitch / 2 + (reach + 0.5) * pitch
-    out = np.concatenate(
-        [-margin[::-1], (pixels[:, None] * pitch + cheb[None, :]).ravel(), margin]
-    )
-    return out[out >= 0] if symmetric else out
 
 
 def _trace_lines(

@@ -113,6 +113,7 @@ def boundary_changes(
             moved[:, :, reached] = up.reshape(*shape, len(depths), n, 2)
         # Axes to (changes, nd, lines, seeds, 2).
         ordered = np.moveaxis(moved, (3, 2), (0, 1))
+        ordered = foot.points.spread(ordered, 1 - foot.axis)
         if lines.symmetric:
             ordered = np.stack([unfold(one, foot.axis) for one in ordered])
         out.append(ordered)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor._kernels import relaxation
+from bfsensor._kernels import colour_sweeps, relaxation
 from bfsensor.simulate.discretise import Coefficients, dual_widths, link_factors
 from bfsensor.typing import FloatArray
 
@@ -35,11 +35,11 @@ class _Level:
     carriers: NDArray[np.float32]
     solution: NDArray[np.float32]
     charge: NDArray[np.float32]
-    residual: NDArray[np.float32]
     pivots: NDArray[np.float32]
     work: NDArray[np.float32]
     weight_x: NDArray[np.float32]
     weight_y: NDArray[np.float32]
+    columns: int
     periodic: tuple[bool, bool]
 
 
@@ -59,6 +59,8 @@ class Multigrid:
             coarser = _coarsen(level)
             self.levels.append(_make_level(level))
             level = coarser
+        nz, ny, nx = fine.mesh.shape
+        self._out = np.zeros((ny + 2, nz, nx + 2), np.float32)
         self.set_carriers(np.zeros_like(self.levels[0].carriers))
         self.cycles = 0
 
@@ -72,60 +74,53 @@ class Multigrid:
             )
         for level in self.levels:
             c = level.coefficients
-            relaxation.eliminate(
-                level.carriers, c["packed_cy"], c["packed_cz"], c["centre"], c["kind"], c["north"],
-                c["south"], c["inverse_dy"], level.pivots,
+            colour_sweeps.eliminate(
+                level.carriers, c["cy"], c["cz"], c["centre"], c["kind"], c["north"], c["south"],
+                c["inverse_dy"], level.pivots,
             )  # fmt: skip
 
     def cycle(self, charge: FloatArray) -> NDArray[np.float32]:
         """Solve ``A out = charge`` approximately; the next cycle writes to the same array."""
         self.cycles += 1
         top = self.levels[0]
-        top.charge[...] = charge
+        colour_sweeps.packed(charge, top.charge)
         self._cycle(0)
-        return top.solution
-
-    def _relax(self, level: _Level, colour: int, *, first: bool = False) -> None:
-        c = level.coefficients
-        relaxation.relax_columns(
-            level.solution, level.charge, level.pivots, c["left"], c["right"], c["packed_cy"],
-            c["packed_cz"], c["kind"], c["north"], c["south"], c["inverse_dy"], colour, level.work,
-            first,
-        )  # fmt: skip
-        relaxation.fill_halo(level.solution, *level.periodic)
+        colour_sweeps.unpacked(top.solution, self._out)
+        return self._out
 
     def _cycle(self, depth: int) -> None:
         level = self.levels[depth]
+        c = level.coefficients
+        rows = c["kind"], c["north"], c["south"]
+        columns = (
+            level.solution, level.charge, level.pivots, c["left"], c["right"], c["cy"], c["cz"],
+        )  # fmt: skip
         if depth == len(self.levels) - 1:
             level.solution[...] = 0.0
             for first in (0, 1):
-                for _ in range(_COARSEST_SWEEPS):
-                    self._relax(level, first)
-                    self._relax(level, 1 - first)
+                for n in range(2 * _COARSEST_SWEEPS):
+                    colour_sweeps.relax(
+                        *columns, *rows, c["inverse_dy"], (first + n) % 2, level.columns,
+                        *level.periodic, level.work, False,
+                    )  # fmt: skip
             return
-        self._relax(level, 0, first=True)
-        self._relax(level, 1)
-        c = level.coefficients
-        relaxation.residual(
-            level.solution, level.charge, level.carriers, c["cx"], c["cy"], c["cz"],
-            c["cd"], c["kind"], c["north"], c["south"], c["dy"], level.residual,
-        )  # fmt: skip
-        relaxation.fill_halo(level.residual, *level.periodic)
         lower = self.levels[depth + 1]
-        relaxation.restrict(level.residual, level.weight_x, level.weight_y, lower.charge)
+        weights = level.weight_x, level.weight_y
+        colour_sweeps.descend(
+            *columns, *rows, c["dy"], c["inverse_dy"], level.columns, *weights, *level.periodic,
+            level.work, lower.charge,
+        )  # fmt: skip
         self._cycle(depth + 1)
-        relaxation.prolong_add(
-            lower.solution, level.weight_x, level.weight_y, level.solution
-        )
-        relaxation.fill_halo(level.solution, *level.periodic)
-        self._relax(level, 1)
-        self._relax(level, 0)
+        colour_sweeps.ascend(
+            *columns, *rows, c["inverse_dy"], level.columns, *weights, *level.periodic, level.work,
+            lower.solution,
+        )  # fmt: skip
 
 
 def _make_level(fine: Coefficients) -> _Level:
     mesh = fine.mesh
     nz, ny, nx = mesh.shape
-    shape = (ny + 2, nz, nx + 2)
+    half = (nx + 1) // 2
     single = np.float32
     cz_below = np.zeros_like(fine.cz)
     cz_below[:, 1:] = fine.cz[:, :-1]
@@ -135,15 +130,11 @@ def _make_level(fine: Coefficients) -> _Level:
     inverse_dy = np.zeros(ny + 2, single)
     inverse_dy[1:-1] = 1.0 / fine.dy[1:-1]
     coefficients: dict[str, NDArray] = {
-        "cx": fine.cx.astype(single),
-        "cy": fine.cy.astype(single),
-        "cz": fine.cz.astype(single),
-        "cd": fine.cd.astype(single),
         "centre": _packed(centre, 1.0),
         "left": _packed(cx_left),
         "right": _packed(fine.cx),
-        "packed_cy": _packed(fine.cy),
-        "packed_cz": _packed(fine.cz),
+        "cy": _packed(fine.cy),
+        "cz": _packed(fine.cz),
         "kind": fine.kind,
         "north": fine.north.astype(single),
         "south": fine.south.astype(single),
@@ -153,13 +144,13 @@ def _make_level(fine: Coefficients) -> _Level:
     return _Level(
         coefficients=coefficients,
         carriers=np.zeros((ny + 2, fine.n_front, nx + 2), single),
-        solution=np.zeros(shape, single),
-        charge=np.zeros(shape, single),
-        residual=np.zeros(shape, single),
-        pivots=np.zeros((2, ny + 2, nz, (nx + 1) // 2), single),
-        work=np.zeros((nz, (nx + 1) // 2), single),
+        solution=np.zeros((ny + 2, 2, nz, half + 2), single),
+        charge=np.zeros((ny + 2, 2, nz, half), single),
+        pivots=np.zeros((ny + 2, 2, nz, half), single),
+        work=np.zeros((nz, nx // 2 + 6), single),
         weight_x=interpolation_weights(mesh.x, mesh.side_x, mesh.period[0]).astype(single),
         weight_y=interpolation_weights(mesh.y, mesh.side_y, mesh.period[1]).astype(single),
+        columns=nx,
         periodic=(mesh.side_x == "periodic", mesh.side_y == "periodic"),
     )
 
@@ -168,7 +159,7 @@ def _packed(field: FloatArray, rest: float = 0.0) -> NDArray[np.float32]:
     """Columns of odd number, then of even; where there is none of the latter, ``rest``."""
     kinds, nz, nx = field.shape
     out = np.full((kinds, 2, nz, (nx - 1) // 2), rest, np.float32)
-    relaxation.packed(field.astype(np.float32), out)
+    colour_sweeps.packed(field.astype(np.float32), out)
     return out
 
 

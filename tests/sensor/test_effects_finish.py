@@ -278,8 +278,9 @@ def test_what_acts_once_acts_once():
     with pytest.raises(galsim.GalSimError, match="resume after finish"):
         sensor.accumulate(rest, image, resume=True)
     np.testing.assert_array_equal(image.array, kept)
-    # The image is exposed again, from the charge in it.
+    # The image is exposed again, from the charge in it, and that exposure goes on.
     sensor.accumulate(rest, image)
+    sensor.accumulate(first, image, resume=True)
     sensor.finish(image)
     # GalSim draws on a view of the image.
     star = galsim.Gaussian(sigma=1.0, flux=1000.0)

@@ -20,6 +20,7 @@ from bfsensor.device.parts import ElectronTransport
 from bfsensor.device.shipped import tables_dir
 from bfsensor.device.silicon import absorption_length
 from bfsensor.errors import SensorError
+from bfsensor.sensor.charge_response import factor_table
 from bfsensor.sensor.drift_field import solve_drift
 
 ITL = DistortionTable.read(tables_dir() / "itl_sta3800c" / "table.fits")
@@ -525,3 +526,30 @@ def test_strength_zero_moves_nothing():
 def test_bad_options(options, message):
     with pytest.raises(SensorError, match=message):
         BrighterFatterSensor(**options)
+
+
+def test_areas_of_tall_images_are_written_to_the_last_row():
+    """Rows are made in bands of 262,144 pixels."""
+    small, tall = galsim.ImageD(41, 41), galsim.ImageD(300, 1200)
+    small.array[20, 20] = tall.array[1100, 150] = 8e4
+    areas = [sensor().calculate_pixel_areas(image).array for image in (small, tall)]
+    assert abs(areas[0][20, 20] - 1) > 0.01
+    np.testing.assert_allclose(areas[1][1080:1121, 130:171], areas[0], rtol=0, atol=1e-6)
+
+
+def test_diffusion_is_that_of_galsim():
+    """GalSim steps its photons by this width times the square root of the way they have to go."""
+    ours = SiliconSensor(rng=galsim.BaseDeviate(1))
+    theirs = galsim.SiliconSensor(rng=galsim.BaseDeviate(1))
+    assert ours._diffusion() == pytest.approx(theirs._calculate_diff_step(), rel=1e-12)
+
+
+def test_a_linear_response_that_grows_is_the_same_on_any_background():
+    """Charges 0 to the top, on backgrounds: Q (1 + b Q / 2), whatever the background is."""
+    growth = 2e-6
+    found = factor_table(ITL, linear=True, growth=growth).response.first
+    alone = found[:, :1]
+    assert found.shape[1] > 2
+    np.testing.assert_allclose(
+        found, np.broadcast_to(alone, found.shape), rtol=3e-6, atol=1e-2
+    )

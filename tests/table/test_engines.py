@@ -9,6 +9,7 @@ from click.testing import CliRunner
 
 from bfsensor import Device, DistortionTable, build_table, plan_table
 from bfsensor.cli.main import main
+from bfsensor.cli.table import _image_charge
 from bfsensor.errors import TableError
 from bfsensor.simulate.charge_field import ImageCharge
 from bfsensor.table.build_image_charge import build_image_charge_table, default_depths
@@ -170,3 +171,13 @@ def test_faults_are_one_clear_line(tmp_path, arguments, code, message):
     assert result.exit_code == code
     assert message in result.output.splitlines()[-1]
     assert not list(tmp_path.iterdir())
+
+
+def test_the_pitch_is_the_devices_on_either_axis():
+    device = Device.load("itl_sta3800c")
+    tall = dataclasses.replace(
+        device, pixel=dataclasses.replace(device.pixel, pitch_y=12.0)
+    )
+    given = [text.partition("=")[::2] for text in GIVEN if "=" in text]
+    model = _image_charge(tall, given)
+    assert (model.pitch_x, model.pitch_y) == (tall.pixel.pitch_x, 12.0)

@@ -18,7 +18,12 @@ from bfsensor.diagnose.data.cosmetics import (
     find_cosmetics,
 )
 from bfsensor.diagnose.data.exposure_info import overscan_level
-from bfsensor.diagnose.data.flat_defects import bad_columns, dust_spots, smooth_light
+from bfsensor.diagnose.data.flat_defects import (
+    _round_shade,
+    bad_columns,
+    dust_spots,
+    smooth_light,
+)
 from bfsensor.diagnose.data.measure_channels import measure_channels
 from bfsensor.diagnose.diagnosis import diagnose_measured
 from tests.virtual import SMALL, Effect, Range, VirtualSource, make_effect, virtual_baseline
@@ -545,3 +550,17 @@ def test_a_round_shade_is_found_about_its_own_centre():
     left = (shade - flat_defects._round_shade(shade, smooth, inside))[inside]
     # Distances are counted to a pixel: half of the slope's rms, 0.06 at its steepest.
     assert left.std() < 0.03 < 0.2 < shade[inside].std()
+
+
+def test_a_round_shade_is_found_off_the_centre_of_its_darkness():
+    """Its centre lies half a pixel beyond the places that the first search tries."""
+    y, x = np.indices((31, 31))
+    centre = 15.5, 14.5
+    away = np.hypot(y - centre[0], x - centre[1])
+    shade = -0.02 / (1 + (away / 4.0) ** 2)
+    inside = away < 12
+    weight = np.zeros((31, 31))
+    weight[15, 14] = -1.0
+    found = _round_shade(np.where(inside, shade, 0.0), weight, inside)
+    # About its own centre every ring is one value, but for what lies between two rings.
+    assert np.abs(found - shade)[inside].max() < 0.05 * 0.02

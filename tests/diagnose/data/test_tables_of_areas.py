@@ -285,6 +285,29 @@ def test_text_among_the_numbers_is_named(tmp_path):
     assert "row 26: cov_per_e" in result.output and "about 1e-8" in result.output
 
 
+@pytest.mark.parametrize(("kelvin", "warming"), [((173, 173), False), ((173, 193), True)])
+def test_temperature_floats_where_recordings_differ_in_it(
+    tmp_path, monkeypatch, kelvin, warming
+):
+    import bfsensor.diagnose.model.open_baseline as sources
+
+    class Asked(Exception):
+        pass
+
+    def simulate(given, parameters, back_biases, *, keep, warming, progress):
+        raise Asked(warming)
+
+    monkeypatch.setattr(sources, "simulate_baseline", simulate)
+    command = ["diagnose", "--baseline", "itl_sta3800c_60", "-o", str(tmp_path / "out")]
+    for name, one in zip(("one", "two"), kelvin, strict=True):
+        path = tmp_path / f"{name}.csv"
+        write(path, table_of(areas_at(5e4), 41))
+        command += [str(path), "--at", f"{name}:back_bias=-60V,temperature={one}K"]
+    result = CliRunner().invoke(main, command)
+    assert isinstance(result.exception, Asked), result.output
+    assert result.exception.args == (warming,)
+
+
 def test_the_command_asks_the_quantities_of_a_device(tmp_path, monkeypatch):
     """Without --no-device all quantities float; conditions of --at reach the tables."""
     import bfsensor.diagnose.model.open_baseline as sources

@@ -210,3 +210,26 @@ def test_without_shapes_nothing_changes(judge: Locator) -> None:
     residuals = judge.scanner.fit.draw(np.random.default_rng(6), 1)[0]
     with_none, plain = judge.with_library([]).locate(residuals), judge.locate(residuals)
     assert with_none.p_value == plain.p_value and with_none.findings == plain.findings
+
+
+def test_parts_account_for_what_their_templates_explain(judge: Locator) -> None:
+    """Squares of the deviates of parts that overlap add up to the chi-square that both remove."""
+    scanner = judge.scanner
+    step, slope = np.arange(COLUMNS) > 30, np.exp(-np.arange(COLUMNS) / 20.0)
+    signal = pattern(scanner.fit, "flat_map", 1.0 * step, 25.0)
+    signal += pattern(scanner.fit, "flat_map", slope, 25.0)
+    left = a_fit(311, signal).residuals
+    parts = judge.locate(left).parts
+    assert len(parts) >= 2
+    z = scanner.templates_z(left)
+    rows = [
+        next(
+            n for n, t in enumerate(scanner.templates)
+            if (t.family, t.word, dict(t.where)) == (p.family, p.word, p.where)
+        )
+        for p in parts
+    ]  # fmt: skip
+    alike = np.array([scanner.correlations(n)[rows] for n in rows])
+    assert np.abs(alike - np.eye(len(rows))).max() > 0.2
+    removed = z[rows] @ np.linalg.solve(alike, z[rows])
+    assert sum(p.z**2 for p in parts) == pytest.approx(removed, rel=1e-6)
