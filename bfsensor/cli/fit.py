@@ -220,10 +220,10 @@ class _Response:
             linearise = make_linearise(device, moving, priors, sets, cells)
         if finer:
             solve = linearise or (lambda values, fixed=emulator: fixed)
-            linearise = make_finer(solve, device, priors, sets, finer, cells, folder)
-            emulator = None
+            carried = make_finer(solve, device, priors, sets, finer, cells, folder)
+            return cls(None, carried, carried.at_draw if draws else None)
         if draws:
-            solved = make_solved(device, priors, sets, cells, finer, folder)
+            solved = make_solved(device, priors, sets, cells, folder)
         return cls(emulator, linearise, solved)
 
 
@@ -289,17 +289,14 @@ def make_solved(
     priors: Sequence[Any],
     sets: Sequence[DataSet],
     cells: int,
-    finer: int,
     folder: Path,
 ) -> Any:
-    """Make the function that solves the device without derivatives, on the finer mesh if any."""
-    from bfsensor.fit.finer_mesh import REFINE_Z
+    """Make the function that solves the device without derivatives, on the mesh of the fit."""
     from bfsensor.fit.full_solutions import FullSolutions
-    from bfsensor.response.edge_response import REFINE_Z as OWN
+    from bfsensor.response.edge_response import REFINE_Z
 
-    mesh = (finer, REFINE_Z) if finer else (cells, OWN)
     return FullSolutions(
-        device, tuple(priors), responding(sets), *mesh, keep=folder / "finer"
+        device, tuple(priors), responding(sets), cells, REFINE_Z, keep=folder / "finer"
     )
 
 

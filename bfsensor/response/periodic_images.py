@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.response.vertices import nominal_positions
-from bfsensor.simulate.far_field import FarField, image_shifts
+from bfsensor.simulate.far_field import FarField
 from bfsensor.typing import FloatArray
 
 PERIOD = 12
@@ -59,22 +59,23 @@ class Images:
             np.abs(at.vertical[..., 1]) < 1.5 * pitch[1],
             np.abs(at.horizontal[..., 0]) < 1.5 * pitch[0],
         )
-        shifts: list[tuple[FloatArray, ...] | None] = []
-        models: list[tuple[FloatArray, ...] | None] = []
-        for d in range(len(far.depths)):
-            if far.shifts[d].max() <= 0:
-                shifts.append(None)
-                models.append(None)
-                continue
+        count = len(far.depths)
+        shifts: list[tuple[FloatArray, ...] | None] = [None] * count
+        models: list[tuple[FloatArray, ...] | None] = [None] * count
+        some = [d for d in range(count) if far.shifts[d].max() > 0]
+        places = (at.corners, at.horizontal, at.vertical)
+        together = np.concatenate([p.reshape(-1, 2) for p in places])
+        ends = np.cumsum([p.size // 2 for p in places])[:-1]
+        for d, found in zip(some, far.of_images(together, some, period), strict=True):
             images = tuple(
-                image_shifts(far, points, d, period)
-                for points in (at.corners, at.horizontal, at.vertical)
+                part.reshape(p.shape)
+                for part, p in zip(np.split(found, ends), places, strict=True)
             )
-            shifts.append(images)
-            models.append((
+            shifts[d] = images
+            models[d] = (
                 (far.vectors(at.vertical, d) + images[2])[..., 0],
                 (far.vectors(at.horizontal, d) + images[1])[..., 1],
-            ))  # fmt: skip
+            )
         return cls(shifts, models, near)
 
     def taken_off(
@@ -112,18 +113,3 @@ class Images:
                 ),
             )
         return (corners, horizontal, vertical), share
-
-
-def without_images(
-    far: FarField,
-    moved: tuple[FloatArray, ...],
-    pitch: tuple[float, float],
-    period: tuple[float, float],
-    fractions: FloatArray,
-) -> tuple[tuple[FloatArray, ...], float]:
-    """Remove the periodic images from displacements; returns also their share at the corner.
-
-    The amplitude is the one with which dipole and images together give the outermost
-    boundaries that face the source.
-    """
-    return Images.of(far, moved[1].shape[2] // 2, pitch, period, fractions).taken_off(moved)

@@ -20,7 +20,7 @@ from bfsensor.simulate.boundaries import (
     PixelBoundaries,
     unfold,
 )
-from bfsensor.simulate.field import Field
+from bfsensor.simulate.field import Field, pad
 from bfsensor.simulate.poisson import Potential
 from bfsensor.simulate.tangent import PotentialChange
 from bfsensor.typing import FloatArray
@@ -126,24 +126,23 @@ def _on_nodes(
     """Order in which the changes are passed to the kernels (nodes that stay first), and arrays."""
     still = [n for n, c in enumerate(changes) if not c.moves]
     moving = [n for n, c in enumerate(changes) if c.moves]
-    padded = [Field.of(replace(potential, phi=changes[n].at_nodes)).phi for n in still]
+    # Single precision would err by 0.1 % in the response two pixels away.
+    held = np.empty((*field.phi.shape, len(still)))
+    for k, n in enumerate(still):
+        pad(changes[n].at_nodes, potential.mesh, held[..., k])
     steps = np.array([changes[n].step for n in moving])
     mesh = potential.mesh
-    moved = []
-    for n, step in zip(moving, steps, strict=True):
+    moved = np.empty((len(moving), *field.phi.shape))
+    nodes = []
+    for k, (n, step) in enumerate(zip(moving, steps, strict=True)):
         vx, vy, vz = changes[n].velocity
-        nodes = replace(
+        there = replace(
             mesh, x=mesh.x + step * vx, y=mesh.y + step * vy, z=mesh.z + step * vz
         )
         phi = potential.phi + step * changes[n].at_nodes
-        moved.append(Field.of(replace(potential, mesh=nodes, phi=phi)))
-    shape = field.phi.shape
-    return still + moving, path_changes.Changes(
-        np.ascontiguousarray(np.stack(padded, -1)) if padded else np.zeros((*shape, 0)),
-        np.stack([f.phi for f in moved]) if moved else np.zeros((0, *shape)),
-        *(
-            np.stack([getattr(f, a) for f in moved]) if moved else np.zeros((0, 0))
-            for a in ("x", "y", "z")
-        ),
-        steps,
+        nodes.append(pad(phi, there, moved[k]))
+    positions = (
+        np.array(one) if nodes else np.zeros((0, 0))
+        for one in (zip(*nodes, strict=True) if nodes else [()] * 3)
     )
+    return still + moving, path_changes.Changes(held, moved, *positions, steps)

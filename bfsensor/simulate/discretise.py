@@ -414,7 +414,9 @@ def _dose(
     ``surface``: height of the silicon there, shape (nx,) [um].
     """
     z = section.mesh.z
-    total = np.zeros(section.conductor.shape)
+    # Pixels are alike: each height is computed once.
+    surface, column = np.unique(surface, return_inverse=True)
+    total = np.zeros((len(z), len(surface)))
     for implant in doped.implants:
         total += implant.cumulative(
             np.maximum(section.z_upper[:, None] - surface, 0.0)
@@ -427,7 +429,7 @@ def _dose(
         here = np.arange(len(surface))
         np.add.at(total, (cell, here), doped.surface_charge * (1 - part))
         np.add.at(total, (cell + 1, here), doped.surface_charge * part)
-    return total
+    return np.asarray(total[:, column])
 
 
 def _ripple(device: Device, mesh: Mesh, row: int) -> FloatArray | float:

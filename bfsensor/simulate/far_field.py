@@ -16,6 +16,7 @@ can be subtracted.  Only the amplitude C is unknown; the outermost boundaries gi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -126,23 +127,38 @@ class FarField:
             Shifts (x, y) away from the dipole, in the arbitrary unit of ``shifts``.
         """
         rho = np.hypot(points[..., 0], points[..., 1])
-        size = np.exp(
-            np.interp(
-                np.log(rho),
-                np.log(self.distances),
-                np.log(np.maximum(self.shifts[depth], 1e-300)),
-            )
+        return points * (self._sizes(np.log(rho), depth) / rho)[..., None]
+
+    def _sizes(self, log_rho: FloatArray, depth: int) -> FloatArray:
+        """Interpolate the size of the shifts in logarithms of distance and size."""
+        known = np.log(np.maximum(self.shifts[depth], 1e-300))
+        return np.exp(np.interp(log_rho, np.log(self.distances), known))
+
+    def of_images(
+        self, points: FloatArray, depths: Sequence[int], period: tuple[float, float]
+    ) -> FloatArray:
+        """Sum the unit shifts from all images but the one at the origin.
+
+        Parameters
+        ----------
+        points : ndarray, shape (n, 2)
+            Positions relative to the dipole at the origin [um].
+        depths : sequence of int
+            Indices into ``depths``.
+        period : tuple of float
+            Distance of the images in x and y [um].
+
+        Returns
+        -------
+        shifts : ndarray, shape (len(depths), n, 2)
+            Shifts in the arbitrary unit of ``shifts``.
+        """
+        number = np.arange(-_IMAGES, _IMAGES + 1)
+        places = np.stack(np.meshgrid(*(number * p for p in period)), -1).reshape(-1, 2)
+        away = points[None] - places[np.any(places != 0, axis=1), None]
+        rho = np.hypot(away[..., 0], away[..., 1])
+        away /= rho[..., None]
+        log_rho = np.log(rho)
+        return np.array(
+            [np.einsum("an,ani->ni", self._sizes(log_rho, d), away) for d in depths]
         )
-        return points * (size / rho)[..., None]
-
-
-def image_shifts(
-    far: FarField, points: FloatArray, depth: int, period: tuple[float, float]
-) -> FloatArray:
-    """Summed unit shifts at ``points`` (..., 2) from all images but the one at the origin."""
-    out = np.zeros_like(points)
-    for a in range(-_IMAGES, _IMAGES + 1):
-        for b in range(-_IMAGES, _IMAGES + 1):
-            if a or b:
-                out += far.vectors(points - np.array([a * period[0], b * period[1]]), depth)
-    return out

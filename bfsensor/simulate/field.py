@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bfsensor.simulate.mesh import Surfaces
+from bfsensor.simulate.mesh import Mesh, Surfaces
 from bfsensor.simulate.poisson import Potential
 from bfsensor.typing import FloatArray
 
@@ -48,10 +49,8 @@ class Field:
             either end in z.
         """
         mesh = potential.mesh
-        phi = np.moveaxis(potential.phi, 0, 1)
-        phi, y = _pad(phi, mesh.y, 0, mesh.side_y, mesh.period[1], mesh.cells)
-        phi, x = _pad(phi, mesh.x, 2, mesh.side_x, mesh.period[0], mesh.cells)
-        phi, z = _pad_z(phi, mesh.z)
+        phi = np.empty(padded_shape(mesh))
+        x, y, z = pad(potential.phi, mesh, phi)
         device = potential.device
         surfaces = Surfaces.of(device)
         channel = mesh.pitch[0] / 2 - surfaces.stop_half_width - surfaces.taper
@@ -67,7 +66,7 @@ class Field:
                 surfaces.silicon_channel + 1.0,
             ]
         )
-        return cls(np.ascontiguousarray(phi), x, y, z, zone)
+        return cls(phi, x, y, z, zone)
 
 
 @dataclass(frozen=True)
@@ -92,14 +91,51 @@ class PathSteps:
     most: int
 
 
-def _pad(
-    phi: FloatArray,
-    nodes: FloatArray,
-    axis: int,
-    side: str,
-    period: float,
-    cells: int,
-) -> tuple[FloatArray, FloatArray]:
+def padded_shape(mesh: Mesh) -> tuple[int, int, int]:
+    """Shape (y, z, x) of a padded field."""
+    counts = []
+    for nodes, side in ((mesh.y, mesh.side_y), (mesh.x, mesh.side_x)):
+        counts.append(len(_beyond(nodes, side, 0.0, mesh.cells)[2]))
+    return counts[0], len(mesh.z) + 4, counts[1]
+
+
+def pad(
+    field: FloatArray, mesh: Mesh, out: NDArray[np.floating]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Pad a field by its symmetry in x and y and by extrapolation in z.
+
+    Parameters
+    ----------
+    field : ndarray, shape (nz, ny, nx)
+        Values on the nodes of a mesh.
+    mesh : Mesh
+        The mesh.
+    out : ndarray, shape :func:`padded_shape`
+        Filled piece by piece, as touching new memory costs as much as the copy.
+
+    Returns
+    -------
+    x, y, z : ndarray
+        Positions of the padded nodes [um].
+    """
+    before_y, after_y, y = _beyond(mesh.y, mesh.side_y, mesh.period[1], mesh.cells)
+    before_x, after_x, x = _beyond(mesh.x, mesh.side_x, mesh.period[0], mesh.cells)
+    _, ny, nx = field.shape
+    rows = slice(len(before_y), len(before_y) + ny)
+    columns = slice(len(before_x), len(before_x) + nx)
+    out[rows, 2:-2, columns] = np.moveaxis(field, 0, 1)
+    whole = out[rows]
+    whole[..., : columns.start] = whole[..., columns.start + before_x]
+    whole[..., columns.stop :] = whole[..., columns.start + after_x]
+    out[: rows.start] = whole[before_y]
+    out[rows.stop :] = whole[after_y]
+    return x, y, _extrapolate(out, mesh.z)
+
+
+def _beyond(
+    nodes: FloatArray, side: str, period: float, cells: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+    """Nodes whose images lie before and after a domain, a pixel of each, and all positions."""
     count = len(nodes)
     if side == "mirror":
         width = min(cells, count - 1)
@@ -109,25 +145,24 @@ def _pad(
         width = min(cells, count)
         before, after = np.arange(count - width, count), np.arange(width)
         low, high = nodes[before] - period, nodes[after] + period
-    order = np.concatenate([before, np.arange(count), after])
-    return np.take(phi, order, axis=axis), np.concatenate([low, nodes, high])
+    return before, after, np.concatenate([low, nodes, high])
 
 
-def _pad_z(phi: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Two planes more at either end, from the parabola through the last three."""
-
-    def beyond(target: float, nodes: FloatArray, values: FloatArray) -> FloatArray:
-        a, b, c = nodes
-        return (
-            values[:, 0] * (target - b) * (target - c) / ((a - b) * (a - c))
-            + values[:, 1] * (target - a) * (target - c) / ((b - a) * (b - c))
-            + values[:, 2] * (target - a) * (target - b) / ((c - a) * (c - b))
-        )
-
+def _extrapolate(phi: NDArray[np.floating], z: FloatArray) -> FloatArray:
+    """Fill two planes at either end, from the parabola through the next three; all heights."""
     step0, step1 = z[1] - z[0], z[-1] - z[-2]
     low = [z[0] - 2 * step0, z[0] - step0]
     high = [z[-1] + step1, z[-1] + 2 * step1]
-    first = [beyond(t, z[:3], phi[:, :3]) for t in low]
-    last = [beyond(t, z[-3:], phi[:, -3:]) for t in high]
-    padded = np.concatenate([np.stack(first, 1), phi, np.stack(last, 1)], axis=1)
-    return padded, np.array([*low, *z, *high])
+    for planes, target, nodes, first in (
+        ((0, 1), low, z[:3], 2),
+        ((-2, -1), high, z[-3:], -5),
+    ):
+        a, b, c = nodes
+        one, two, three = (phi[:, first + n] for n in range(3))
+        for plane, t in zip(planes, target, strict=True):
+            phi[:, plane] = (
+                one * (t - b) * (t - c) / ((a - b) * (a - c))
+                + two * (t - a) * (t - c) / ((b - a) * (b - c))
+                + three * (t - a) * (t - b) / ((c - a) * (c - b))
+            )
+    return np.array([*low, *z, *high])

@@ -8,6 +8,7 @@ one multigrid cycle and shifts of whole pixels as preconditioner.
 from __future__ import annotations
 
 import contextlib
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,8 +55,6 @@ class LinearSystem:
 
     Attributes
     ----------
-    multigrid : Multigrid
-        Preconditioner.
     electrons, holes : ndarray, shape (ny + 2, n_front, nx + 2)
         Carriers of each node [e-], about which the system is linearised, ``[y, z, x]`` with halo.
     residual, step : ndarray, shape (ny + 2, nz, nx + 2)
@@ -64,7 +63,6 @@ class LinearSystem:
 
     def __init__(self, coefficients: Coefficients, pixels: PixelNodes, kt: float) -> None:
         self.coefficients, self.pixels, self._kt = coefficients, pixels, kt
-        self.multigrid = Multigrid(coefficients)
         nz, ny, nx = coefficients.mesh.shape
         self.shape = (ny + 2, nz, nx + 2)
         front = (ny + 2, coefficients.n_front, nx + 2)
@@ -74,6 +72,11 @@ class LinearSystem:
         self._shifts: PixelShifts | None = None
         self._direction = np.zeros(self.shape)
         self._product = np.zeros(self.shape)
+
+    @cached_property
+    def multigrid(self) -> Multigrid:
+        """Preconditioner, made when a system is first linearised."""
+        return Multigrid(self.coefficients)
 
     def fill_halo(self, a: FloatArray) -> None:
         """Fill the halo of an array by the symmetry of the domain, in place."""

@@ -19,7 +19,7 @@ import numpy as np
 from bfsensor.errors import TableError
 from bfsensor.files import written_whole
 from bfsensor.response.light import storage_height
-from bfsensor.response.periodic_images import PERIOD, SAMPLES, without_images
+from bfsensor.response.periodic_images import PERIOD, SAMPLES, Images
 from bfsensor.response.vertices import vertex_fractions
 from bfsensor.simulate.boundaries import find_boundaries
 from bfsensor.simulate.far_field import FarField
@@ -84,6 +84,17 @@ def _workshop(device_text: str, cells: int, refine_z: int) -> tuple[Any, PixelAr
     return device, PixelArray(device, period=PERIOD, cells=cells, refine_z=refine_z)
 
 
+@lru_cache(maxsize=8)
+def _images(plan: TablePlan, background: float) -> Images:
+    """Sum the periodic images of a charge's far field, which the levels of a background share."""
+    device, array = _workshop(plan.device.to_toml(), plan.cells, plan.refine_z)
+    mesh, ground = array.mesh, Surfaces.of(device).silicon_stop
+    depths = np.array(plan.depths)
+    far = FarField.of(array.unit(background), depths, ground, 5 * max(mesh.period))
+    fractions = vertex_fractions(plan.vertices)
+    return Images.of(far, plan.reach, mesh.pitch, mesh.period, fractions)
+
+
 def solve_level(plan: TablePlan, charge: float, background: float) -> Level:
     """Solve one level of a plan.
 
@@ -101,7 +112,6 @@ def solve_level(plan: TablePlan, charge: float, background: float) -> Level:
     """
     began = time.process_time()
     device, array = _workshop(plan.device.to_toml(), plan.cells, plan.refine_z)
-    unit, mesh = array.unit(background), array.mesh
     n = 2 * plan.reach + 1
     nd = len(plan.depths)
     fractions = vertex_fractions(plan.vertices)
@@ -127,9 +137,7 @@ def solve_level(plan: TablePlan, charge: float, background: float) -> Level:
             moved, lines.vertices(plan.vertices, fractions), strict=True
         ):
             whole[~fixed] = found
-    far = FarField.of(unit, depths, Surfaces.of(device).silicon_stop, 5 * max(mesh.period))
-    moved, share = without_images(far, moved, mesh.pitch, mesh.period, fractions)
-    corners, horizontal, vertical = moved
+    (corners, horizontal, vertical), share = _images(plan, background).taken_off(moved)
     return Level(
         corners, horizontal, vertical, len(potential.history), potential.linear_iterations,
         potential.error_volts, time.process_time() - began, share,

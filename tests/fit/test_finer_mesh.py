@@ -12,7 +12,7 @@ from bfsensor.fit import full_solutions as solving
 from bfsensor.fit.data import area_data
 from bfsensor.fit.finer_mesh import Finer
 from bfsensor.fit.fit import fit_device
-from bfsensor.fit.linear_response import Linearise
+from bfsensor.fit.linear_response import LinearEmulator, Linearise, LinearResponse
 from bfsensor.fit.result import FitResult
 from bfsensor.response.edge_response import CHARGE, LEVEL, area_matrix, solve_response
 from bfsensor.table.build import build_table
@@ -49,14 +49,15 @@ def kept(tmp_path_factory):
 @pytest.mark.slow
 def test_a_fit_ends_at_the_device_and_the_table_of_the_finer_mesh(tmp_path, kept):
     truth = np.array([prior.mean + 0.7 * prior.spread for prior in FREE])
-    x, y = make_finer(kept)._solved(truth)[HERE]
+    x, y = make_finer(kept)._solved(truth, 16)[HERE]
     areas = area_matrix(x, y)[5:-1, 5:-1]
     data = area_data("mock", areas, np.full(areas.shape, 0.002 * areas[0, 1]), scaled=False)
     exact = solving.FullSolutions(DEVICE, FREE, (HERE,), 16, finer.REFINE_Z, kept)
     there = exact(truth).predict(np.zeros(0), HERE)
     np.testing.assert_array_equal(there.areas, areas)
+    solve = make_finer(kept)
     found = fit_device(
-        DEVICE, [data], FREE, None, linearise=make_finer(kept), solved=exact, draws=2
+        DEVICE, [data], FREE, None, linearise=solve, solved=solve.at_draw, draws=2
     )
     # Noiseless and measured far better than the priors: with the coarse mesh's own a_ij the first
     # pull is -1.6, and chi2 2700.
@@ -121,3 +122,27 @@ def test_the_finer_mesh_must_be_finer_and_even(cells):
     nothing = Finer(lambda values: None, DEVICE, FREE, (HERE,), 32, 16)
     with pytest.raises(FitError, match="nothing was solved"):
         nothing.record(np.zeros(2))
+    with pytest.raises(FitError, match="nothing was solved"):
+        nothing.at_draw(np.zeros(2))
+
+
+def test_draws_on_fewer_cells_keep_what_the_finer_mesh_adds(monkeypatch):
+    """A mesh whose shifts err in proportion to the parameter and to the size of its cells."""
+
+    def solve(device, priors, values, conditions, *, cells, refine_z, keep, progress):
+        k = values[0] * (1 + 1 / cells) * pattern
+        return dict.fromkeys(conditions, (k, 2 * k))
+
+    monkeypatch.setattr(finer, "solve_shifts", solve)
+    pattern = np.random.default_rng(4).uniform(1.0, 2.0, (3, 3))
+    nothing = np.zeros((0, 3, 3))
+    own = LinearResponse(pattern, pattern, nothing, nothing)
+    free = FREE[:1]
+    linearise = lambda values: LinearEmulator((), np.zeros(0), {HERE: own})  # noqa: E731
+    both = Finer(linearise, DEVICE, free, (HERE,), 48, 16)
+    both(np.array([2.0]))
+    for value, error in ((2.0, 0.0), (2.5, 0.5 * (1 / finer.DRAWN - 1 / 48))):
+        found = both.at_draw(np.array([value])).predict(np.zeros(0), HERE)
+        expected = value * (1 + 1 / 48) + error
+        np.testing.assert_allclose(found.kx, expected * pattern, rtol=1e-13)
+        np.testing.assert_allclose(found.ky, 2 * expected * pattern, rtol=1e-13)

@@ -10,7 +10,7 @@ from bfsensor.errors import ConvergenceError, TableError
 from bfsensor.response.vertices import vertex_fractions
 from bfsensor.simulate import boundaries
 from bfsensor.simulate.boundaries import find_boundaries, lowest_depth
-from bfsensor.simulate.far_field import FarField, image_shifts
+from bfsensor.simulate.far_field import FarField
 from bfsensor.simulate.mesh import Surfaces, make_mesh
 from bfsensor.simulate.poisson import Electrostatics
 from bfsensor.simulate.unit_cell import solve_unit_cell, tile
@@ -165,12 +165,15 @@ def test_periodic_images_are_taken_out(device):
     points = at.vertical[3, -1]
     amplitude = np.mean(
         facing
-        / (far.vectors(points, 0) + image_shifts(far, points, 0, (100.0, 100.0)))[:, 0]
+        / (far.vectors(points, 0) + far.of_images(points, [0], (100.0, 100.0))[0])[:, 0]
     )
     arrays = [
         (
             getattr(table, name)[0, 0, 0]
-            - amplitude * image_shifts(far, getattr(at, name), 0, (100.0, 100.0))
+            - amplitude
+            * far.of_images(getattr(at, name).reshape(-1, 2), [0], (100.0, 100.0)).reshape(
+                getattr(at, name).shape
+            )
         )
         for name in ("corners", "horizontal", "vertical")
     ]

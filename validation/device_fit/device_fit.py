@@ -55,9 +55,8 @@ from bfsensor.device.quantities import (
 )
 from bfsensor.fit.data import DataSet, area_data, data_set, select
 from bfsensor.fit.degeneracies import name_combination
-from bfsensor.fit.finer_mesh import FINER, REFINE_Z, Finer
+from bfsensor.fit.finer_mesh import FINER, Finer
 from bfsensor.fit.fit import fit_device
-from bfsensor.fit.full_solutions import FullSolutions
 from bfsensor.fit.linear_response import Linearise
 from bfsensor.fit.prediction_error import DRAWS
 from bfsensor.fit.predictors import make_predictors
@@ -222,10 +221,9 @@ def areas(
     data = replace(data, conditions=tuple(replace(c, level=level) for c in data.conditions))
     at = (Condition(level=level),)
     begin = time.process_time()
+    solve = make_finer(device, priors, at, cells, finer, keep)
     result = fit_device(
-        device, [data], priors, None, draws=draws,
-        linearise=make_finer(device, priors, at, cells, finer, keep),
-        solved=make_solved(device, priors, at, finer, keep),
+        device, [data], priors, None, draws=draws, linearise=solve, solved=solve.at_draw,
         source=f"bfsensor fit of {data.name}, 24 lags; errors are correlated: fit.json",
     )  # fmt: skip
     seconds = time.process_time() - begin
@@ -244,17 +242,6 @@ def _doping(resistivity: bool) -> tuple[str, ...]:
 def kept_solutions(keep: Path) -> Path:
     """Where finished solutions are: the version alone does not tell those of two commits apart."""
     return keep / f"finer_{commit_here()}"
-
-
-def make_solved(
-    device: Device,
-    priors: tuple[Prior, ...],
-    at: tuple[Condition, ...],
-    finer: int,
-    keep: Path,
-) -> FullSolutions:
-    """What solves a device on the finer mesh alone."""
-    return FullSolutions(device, priors, at, finer, REFINE_Z, kept_solutions(keep))
 
 
 def make_finer(
@@ -303,10 +290,10 @@ def seed(
         sets[key] = seed_data(reference, key, less[key])
     fitted = tuple(SETTINGS) if every else ("A",)
     conditions = tuple(at[key] for key in fitted)
+    solve = make_finer(device, priors, conditions, cells, finer, keep)
     result = fit_device(
         device, [one for key in fitted for one in sets[key]], priors, None,
-        linearise=make_finer(device, priors, conditions, cells, finer, keep),
-        solved=make_solved(device, priors, conditions, finer, keep), draws=draws,
+        linearise=solve, solved=solve.at_draw, draws=draws,
         source="bfsensor fit of figure 9 of Lage, Bradshaw and Tyson (2017)",
     )  # fmt: skip
     run = "seed" + " as slopes" * slope + " every" * every
