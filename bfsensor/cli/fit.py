@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 @click.option(
     "--free", multiple=True, metavar="NAME[:[MEAN+-]SPREAD]",
     help="Fit this quantity; repeatable. Its prior is the file's value and uncertainty, unless "
-    "given as back_bias:5V or 'thickness:98um+-2um'; 'all' is every quantity with an uncertainty.  "
+    "given as back_bias:5V or 'thickness:98um+-2um'; 'all' is every quantity with an uncertainty; "
+    "light.absorption_length is a factor on that of silicon.  "
     "[default: those of origin 'guessed']",
 )  # fmt: skip
 @click.option(
@@ -161,7 +162,7 @@ def _choose_priors(
     device: Any, free: tuple[str, ...], sets: Sequence[DataSet]
 ) -> tuple[Prior, ...]:
     """Give the priors of the free quantities; saturation adds the spill barrier, widths diffusion."""
-    from bfsensor.device.quantities import DIFFUSION, choose_priors
+    from bfsensor.device.quantities import ABSORPTION, DIFFUSION, choose_priors
     from bfsensor.fit.linear_predictors import SPILL
 
     fitted = {data.kind for data in sets if data.fitted}
@@ -169,7 +170,14 @@ def _choose_priors(
         *([SPILL] if "saturation" in fitted else []),
         *([DIFFUSION] if "diffusion" in fitted else []),
     )
-    return choose_priors(device, free, more=more)
+    chosen = choose_priors(device, free, more=more)
+    coloured = any(c.wavelength is not None for data in sets for c in data.conditions)
+    if not coloured and ABSORPTION in [prior.name for prior in chosen]:
+        raise click.UsageError(
+            f"{ABSORPTION}: no recording states a wavelength; give it by --at, such as "
+            "wavelength=950nm"
+        )
+    return chosen
 
 
 @dataclass(frozen=True)
@@ -199,7 +207,7 @@ class _Response:
         draws: int,
     ) -> _Response:
         """Choose the functions by the options; none if no data set holds areas or slopes."""
-        from bfsensor.device.quantities import DIFFUSION
+        from bfsensor.device.quantities import ABSORPTION, DIFFUSION
         from bfsensor.fit.finer_mesh import FINER
         from bfsensor.fit.linear_predictors import SPILL
         from bfsensor.simulate.mesh import check_cells
@@ -215,6 +223,8 @@ class _Response:
         emulator = linearise = solved = None
         if curved:
             names = [prior.name for prior in moving]
+            if ABSORPTION in names:
+                raise click.UsageError(f"--curved: {ABSORPTION} is fitted without it only")
             emulator = build_emulator(device, names, sets, cells, folder)
         else:
             linearise = make_linearise(device, moving, priors, sets, cells)

@@ -9,7 +9,7 @@ from bfsensor.device.condition import Condition
 from bfsensor.device.device import Device
 from bfsensor.device.parameters import change_parameter
 from bfsensor.device.parts import ElectronTransport, Provenance
-from bfsensor.device.quantities import DIFFUSION, Prior, quantities
+from bfsensor.device.quantities import ABSORPTION, DIFFUSION, Prior, quantities
 from bfsensor.errors import BFSensorError, FitError
 from bfsensor.typing import FloatArray
 
@@ -58,6 +58,7 @@ def device_at(
         }
     # A device that does not state it has no value of which the difference could be taken.
     width = wanted.pop(DIFFUSION, None)
+    wanted.pop(ABSORPTION, None)  # the light's, not the device's
     for key in ("back_bias", "gate_high", "gate_low", "temperature"):
         stated = getattr(condition, key)
         if stated is not None:
@@ -78,6 +79,21 @@ def device_at(
     if width is not None:
         out = dataclasses.replace(out, transport=ElectronTransport(width))
     return out
+
+
+def stretch_at(priors: Sequence[Prior], values: FloatArray) -> float:
+    """Factor on the absorption length at values of free parameters; 1 where it is not one.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> stretch_at([Prior(ABSORPTION, 1.0, 0.1)], np.array([1.07]))
+    1.07
+    """
+    for prior, value in zip(priors, values, strict=True):
+        if prior.name == ABSORPTION:
+            return float(value)
+    return 1.0
 
 
 def fitted_device(
@@ -125,5 +141,6 @@ def fitted_device(
     out = device_at(device, Condition(), priors, values)
     known = dict(out.provenance)
     for prior, error in zip(priors, errors, strict=True):
-        known[prior.name] = Provenance(float(error), "fitted", source)
+        if prior.name != ABSORPTION:
+            known[prior.name] = Provenance(float(error), "fitted", source)
     return dataclasses.replace(out, name=f"{device.name}_fitted", provenance=known)

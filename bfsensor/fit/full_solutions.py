@@ -11,7 +11,7 @@ import numpy as np
 from bfsensor.device.condition import Condition
 from bfsensor.device.device import Device
 from bfsensor.device.quantities import Prior
-from bfsensor.fit.device_at import device_at
+from bfsensor.fit.device_at import device_at, stretch_at
 from bfsensor.fit.linear_response import LinearEmulator, LinearResponse, level_of
 from bfsensor.response.emulator_nodes import Node, solve_nodes
 from bfsensor.response.light import conversion_depths, mixed
@@ -77,7 +77,7 @@ def solve_shifts(
         kx, ky = found[nodes[key].at][0]
         out[condition] = mixed(
             kx, ky, np.array(conversion_depths(here)), condition.wavelength,
-            here.operating_point.temperature,
+            here.operating_point.temperature, stretch_at(priors, values),
         )  # fmt: skip
     return out
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from bfsensor.device.condition import Condition
 from bfsensor.device.device import Device
-from bfsensor.device.quantities import DIFFUSION, Prior
+from bfsensor.device.quantities import ABSORPTION, DIFFUSION, OFF_DEVICE, Prior
 from bfsensor.errors import FitError
 from bfsensor.fit.data import DataSet
 from bfsensor.fit.device_at import device_at
@@ -164,7 +164,7 @@ def _well_at(
         name = priors[n].name
         if name == SPILL:
             slopes[n] = 1 / by_charge
-        elif name != DIFFUSION:
+        elif name not in OFF_DEVICE:
             by = _slope(
                 lambda v: _barrier(device_at(device, condition, priors, v), well, cells),
                 middle, n, priors[n].spread, height,
@@ -209,7 +209,7 @@ def _depletion_at(
     by_bias = (field(None, voltage - BIAS_STEP) - here) / -BIAS_STEP
     slopes = np.zeros(len(priors))
     for n in _free(priors, replace(condition, back_bias=voltage)):
-        if priors[n].name not in (SPILL, DIFFUSION):
+        if priors[n].name not in (SPILL, *OFF_DEVICE):
             slopes[n] = -_slope(field, middle, n, priors[n].spread, here) / by_bias
     return voltage, slopes
 
@@ -236,6 +236,6 @@ def _width_at(
     for n in _free(priors, condition):
         if names[n] == DIFFUSION:
             slopes[n] = einstein
-        elif names[n] != SPILL:
+        elif names[n] not in (SPILL, ABSORPTION):
             slopes[n] = times * _slope(width, middle, n, priors[n].spread, einstein)
     return float(times * einstein), slopes

@@ -9,9 +9,9 @@ import numpy as np
 
 from bfsensor.device.condition import Condition
 from bfsensor.device.device import Device
-from bfsensor.device.quantities import Prior
+from bfsensor.device.quantities import ABSORPTION, Prior
 from bfsensor.errors import FitError
-from bfsensor.fit.device_at import device_at
+from bfsensor.fit.device_at import device_at, stretch_at
 from bfsensor.fit.predictors import PredictedEdges, held
 from bfsensor.response.edge_response import LEVEL, area_matrix, solve_response
 from bfsensor.response.light import mixed
@@ -133,7 +133,8 @@ class Linearise:
         def device(values: FloatArray) -> Device:
             return device_at(self.device, condition, self.priors, values)
 
-        changed, free = [], np.flatnonzero(~held(names, condition))
+        changed = []
+        free = np.flatnonzero(~held(names, condition) & (np.array(names) != ABSORPTION))
         for n in free.tolist():
             step = STEP * self.priors[n].spread * (np.arange(len(names)) == n)
             try:
@@ -146,10 +147,19 @@ class Linearise:
             here, level=level_of(condition), cells=self.cells, changed=changed,
             laid_for=device_at(self.device, condition),
         )  # fmt: skip
-        at = condition.wavelength, here.operating_point.temperature
-        kx, ky = found.edges(*at)
+        light = condition.wavelength, here.operating_point.temperature
+        stretch = stretch_at(self.priors, values)
+        kx, ky = mixed(found.kx, found.ky, found.depths, *light, stretch)
         dkx, dky = np.zeros((2, len(names), *kx.shape))
-        dkx[free], dky[free] = mixed(found.dkx, found.dky, found.depths, *at)
+        dkx[free], dky[free] = mixed(found.dkx, found.dky, found.depths, *light, stretch)
+        if ABSORPTION in names:
+            n = names.index(ABSORPTION)
+            step = STEP * self.priors[n].spread
+            two, one = (
+                mixed(found.kx, found.ky, found.depths, *light, stretch + side * step)
+                for side in (1, -1)
+            )
+            dkx[n], dky[n] = ((b - a) / (2 * step) for a, b in zip(one, two, strict=True))
         return LinearResponse(kx, ky, dkx, dky)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.device.device import Device
-from bfsensor.device.quantities import DIFFUSION, Quantity, describe, quantities
+from bfsensor.device.quantities import ABSORPTION, DIFFUSION, Quantity, describe, quantities
 from bfsensor.errors import FitError
 from bfsensor.files import written_whole
 from bfsensor.fit.degeneracies import name_combination
@@ -28,6 +28,13 @@ WELL_KNOWN = 0.5
 """Ratio of posterior to prior width below which a combination of parameters is printed.
 
 Chosen: fit.json holds all combinations; twice as large, all of them are printed."""
+
+
+_OFF_DEVICE = {
+    DIFFUSION: "diffusion over Einstein's",
+    ABSORPTION: "absorption length over silicon's",
+}
+"""Words for free parameters that are no quantity of a device file, as tables print them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,7 +313,7 @@ class FitResult:
             unit = known.get(name, Quantity(1.0, "number", "", 0.0, np.inf))
             rows.append(
                 (
-                    describe(name) if name != DIFFUSION else "diffusion over Einstein's",
+                    _OFF_DEVICE.get(name) or describe(name),
                     _with_error(unit, self.prior[k], self.spread[k]),
                     _with_error(unit, self.value[k], self.error[k]),
                     f"{self.pulls[k]:+.2f}",

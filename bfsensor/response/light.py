@@ -99,6 +99,7 @@ def conversion_weights(
     temperature: float,
     *,
     thickness: float | None = None,
+    stretch: float = 1.0,
 ) -> FloatArray:
     r"""Weights of depths for the mean, over converting light, of a response linear between them.
 
@@ -121,6 +122,8 @@ def conversion_weights(
     thickness : float, optional
         Height of the back surface [um]; by default the last depth.  Light that converts between the
         last depth and the back surface counts at the last depth.
+    stretch : float
+        Factor on the absorption length.
 
     Returns
     -------
@@ -136,7 +139,7 @@ def conversion_weights(
     if len(depths) == 1:
         return np.ones(1)
     # 1 m stands for an infinite length: the little light that converts is then uniform in depth.
-    length = min(float(silicon.absorption_length(wavelength, temperature)), 1e6)
+    length = min(stretch * float(silicon.absorption_length(wavelength, temperature)), 1e6)
     back = depths[-1] if thickness is None else thickness
     reaching = np.exp(-(back - depths) / length)
     converted = np.diff(reaching)
@@ -154,6 +157,7 @@ def mixed(
     depths: FloatArray,
     wavelength: float | None,
     temperature: float,
+    stretch: float = 1.0,
 ) -> Edges:
     """Average shifts over the conversion depths of light.
 
@@ -167,6 +171,8 @@ def mixed(
         Wavelength of the light [nm]; None: all of it converts at the back surface.
     temperature : float
         Temperature of the silicon [K].
+    stretch : float
+        Factor on the absorption length.
 
     Returns
     -------
@@ -181,7 +187,7 @@ def mixed(
     """
     if wavelength is None:
         return kx[..., -1, :, :], ky[..., -1, :, :]
-    weights = conversion_weights(depths, wavelength, temperature)
+    weights = conversion_weights(depths, wavelength, temperature, stretch=stretch)
     return (
         np.einsum("...dji,d->...ji", kx, weights),
         np.einsum("...dji,d->...ji", ky, weights),

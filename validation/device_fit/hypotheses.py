@@ -7,6 +7,7 @@ hypothesis, all else alike, with the same errors (:data:`SCALES`; the seed paper
 - 'zero level': the limit at no charge, which a fit of covariances against level gives (not of the seed
   paper's covariances, which are of one level);
 - 'red light': 950 nm;
+- 'light of unknown length': 900 nm, with a factor on the absorption length that is fitted;
 - 'doping by resistivity': the prior of :data:`~validation.device_fit.device_fit.RESISTIVITY`;
 - 'readout': lags (1, 0) to (4, 0) are the readout's as well, by a free term each;
 - 'all': zero level, doping by resistivity, readout.
@@ -30,7 +31,7 @@ from astropy.table import Table
 
 from bfsensor.device.condition import Condition
 from bfsensor.device.device import Device
-from bfsensor.device.quantities import choose_priors, with_priors
+from bfsensor.device.quantities import ABSORPTION, choose_priors, with_priors
 from bfsensor.fit.data import DataSet, apart_from_readout, data_set
 from bfsensor.fit.finer_mesh import FINER
 from bfsensor.fit.fit import fit_device
@@ -54,6 +55,7 @@ HYPOTHESES: dict[str, frozenset[str]] = {
     "flat of 40,000 e-": frozenset(),
     "zero level": frozenset({"level"}),
     "red light": frozenset({"light"}),
+    "light of unknown length": frozenset({"length"}),
     "doping by resistivity": frozenset({"doping"}),
     "readout": frozenset({"readout"}),
     "all": frozenset({"level", "doping", "readout"}),
@@ -71,10 +73,14 @@ READOUT_PRIOR = 1e-8
 """Standard deviation of a readout's term [1/e-].  Assumed: deferred charge of 5e-4 of the signal at
 50,000 e- adds 1e-8; twice as large, each term costs 1.4 more in twice the logarithm of the evidence."""
 
+LENGTHS = 0.5
+"""Spread of that factor.  Chosen: at 900 nm it stands for light from 850 to 935 nm; with twice the
+spread the factor reaches 0, where all light converts at the back, as without a wavelength."""
+
 NEAREST = ((1, 0), (0, 1), (1, 1), (2, 0), (0, 2))
 TOLD = (
     "silicon.background_doping", "operating_point.back_bias", "gates.gate_oxide",
-    "channel_stop.width", "operating_point.hole_quasi_fermi_level",
+    "channel_stop.width", "operating_point.hole_quasi_fermi_level", ABSORPTION,
 )  # fmt: skip
 
 
@@ -98,6 +104,8 @@ def data_of(reference: Path, which: str, asked: frozenset[str]) -> list[DataSet]
         changes["level"] = 0.0
     if "light" in asked:
         changes["wavelength"] = 950.0
+    if "length" in asked:
+        changes["wavelength"] = 900.0
     sets = [conditioned(one, **changes) for one in sets]
     if "readout" not in asked:
         return sets
@@ -141,10 +149,12 @@ def fit_one(
         voltages: tuple[str, ...] = ()
     else:
         device, voltages = Device.load(DEVICES[which]), VOLTAGES
-    doping = (RESISTIVITY,) if "doping" in asked else ()
+    more = (*voltages, *((RESISTIVITY,) if "doping" in asked else ()))
+    if "length" in asked:
+        more = (*more, f"{ABSORPTION}:{LENGTHS}")
     priors = tuple(
         p
-        for p in choose_priors(device, ("all", *voltages, *doping))
+        for p in choose_priors(device, ("all", *more))
         if which != "e2v" or p.name not in HELD
     )
     device = with_priors(device, priors)
