@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bfsensor.errors import FitError
+from bfsensor.response.edge_response import area_matrix
 from bfsensor.response.emulator_nodes import Solved
 from bfsensor.typing import FloatArray
 
@@ -98,6 +100,36 @@ class Expansion:
         )  # fmt: skip
 
 
+def steepest(
+    value: FloatArray, slopes: FloatArray, spreads: FloatArray, count: int
+) -> NDArray[np.int64]:
+    """Find the parameters that change a_ij most within their spreads.
+
+    Parameters
+    ----------
+    value, slopes : ndarray, shapes (2, nd, ny, nx) and (p, 2, nd, ny, nx)
+        Shifts and their derivatives [pixel/e-, and per internal unit].
+    spreads : ndarray, shape (p,)
+        Standard deviations of the parameters [internal units].
+    count : int
+        Number of parameters that are wanted.
+
+    Returns
+    -------
+    numbers : ndarray of int, shape (count,) or (p,)
+        By falling root mean square of the relative changes of the a_ij up to two pixels away, of
+        light that converts at the back surface.
+    """
+    middle = value.shape[-1] // 2
+    near = slice(middle, middle + 3)
+
+    def areas(k: FloatArray) -> FloatArray:
+        return area_matrix(k[..., 0, -1, :, :], k[..., 1, -1, :, :])[..., near, near]
+
+    changes = areas(slopes) * spreads[:, None, None] / areas(value)
+    return np.argsort(-np.sum(changes**2, axis=(1, 2)), kind="stable")[:count]
+
+
 def expand(
     solved: Mapping[tuple[int, int], Solved],
     free: NDArray[np.int64],
@@ -106,8 +138,9 @@ def expand(
 ) -> Expansion:
     """Make the expansion at one operating point from the device and its moved neighbours.
 
-    Second derivatives come from the values and derivatives of the neighbours one spread to either
-    side of each parameter, or to one side where the other has no solution.
+    Second derivatives by one parameter come from the values of its neighbours one spread to either
+    side, or to one side where the other has no solution; those by two from derivatives at a
+    neighbour of either.  Between parameters whose neighbours were not differentiated they are 0.
 
     Raises
     ------
@@ -121,6 +154,7 @@ def expand(
     value, slopes = solved[-1, 0]
     first = scaled(slopes)
     second = np.zeros((len(names), *first.shape))
+    turned = np.zeros(len(names), bool)
     for n, name in enumerate(names):
         sides = [side for side in (1, -1) if (n, side) in solved]
         if not sides:
@@ -131,17 +165,26 @@ def expand(
         for side in sides:
             there, steeper = solved[n, side]
             bends.append(2 * (there - value - side * first[n]))
-            turns.append(side * (scaled(steeper) - first))
-        second[n] = np.mean(turns, axis=0)
-        second[n, n] = _agreed(second[n, n], np.mean(bends, axis=0))
-    return Expansion(free, value, first, _agreed(second, np.swapaxes(second, 0, 1)))
+            if len(steeper):
+                turns.append(side * (scaled(steeper) - first))
+        bend = np.mean(bends, axis=0)
+        if turns:
+            turned[n] = True
+            second[n] = np.mean(turns, axis=0)
+            bend = _agreed(second[n, n], bend)
+        second[n, n] = bend
+    for n, m in itertools.combinations(range(len(names)), 2):
+        both = second[n, m], second[m, n]
+        second[n, m] = _agreed(*both) if turned[n] and turned[m] else both[0] + both[1]
+        second[m, n] = second[n, m]
+    return Expansion(free, value, first, second)
 
 
 def _agreed(one: FloatArray, other: FloatArray) -> FloatArray:
     """Smaller one of two estimates of the same derivative, 0 where they differ in sign.
 
-    Every second derivative is found twice, from the neighbours of either parameter, and on the
-    diagonal from their values and from their derivatives.  A boundary point that was not
+    Second derivatives are found twice, from differentiated neighbours of either parameter, and on
+    the diagonal from their values and from their derivatives.  A boundary point that was not
     differentiated well spoils only one of them, and usually makes it too large.
     """
     smaller = np.where(np.abs(one) < np.abs(other), one, other)

@@ -58,15 +58,18 @@ def solved_areas(device, laid_for, condition=None):
 
 
 def test_full_solutions_between_its_own(emulator):
-    """Parameters change areas by 2 to 9 % each; what second order leaves is the third."""
+    """Parameters change areas by 2 to 9 % each; what second order leaves is the third.
+
+    With derivatives on both sides of both parameters 0.4 % are left, on one side 0.7 %.
+    """
     values = emulator.nominal + np.array([0.7, -1.2]) * emulator.spread
     wanted = solved_areas(emulator.device_at(values), emulator.device, RED)
     found = emulator.predict(values, RED)
     plain = emulator.predict(emulator.nominal, RED).areas
     assert found.areas.shape == (5, 5)
     near = np.s_[:3, :3]
-    np.testing.assert_allclose(found.areas[near], wanted[near], rtol=0.004)
-    # Held at the device's own values it is wrong by ten times as much.
+    np.testing.assert_allclose(found.areas[near], wanted[near], rtol=0.008)
+    # Held at the device's own values it is wrong by five times as much.
     assert np.abs(plain / wanted - 1)[near].max() > 0.04
 
 
@@ -97,7 +100,7 @@ def test_finished_solutions_are_not_made_again(emulator, kept, tmp_path):
             emulator.device, NAMES, **MESH, keep=kept, executor=pool,
             progress=lambda *done: seen.append(done),
         )  # fmt: skip
-    assert seen == [(4, 5), (5, 5)]
+    assert seen == [(1, 1), (3, 4), (4, 4)]  # the device itself, then its neighbours
     assert [p.stat().st_mtime_ns for p in paths[1:]] == stamps[1:]
     path = tmp_path / "emulator.npz"
     again.write(path)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bfsensor.response.expansion import expand
+from bfsensor.response.expansion import expand, steepest
 
 NAMES, SPREADS = ("one", "two"), np.array([2.0, 0.5])
 SHAPE = 2, 1, 3, 3
@@ -52,3 +52,28 @@ def test_one_bad_derivative_of_a_neighbour_adds_nothing(lost):
     untouched = np.ones_like(found, bool)
     untouched[:, :, 0, 0, 1, 1] = False
     np.testing.assert_allclose(found[untouched], second[untouched], atol=1e-12)
+
+
+def test_neighbours_without_derivatives_give_their_own_second_order():
+    value, first, second = polynomial()
+    solved = solutions(value, first, second)
+    for side in (1, -1):
+        solved[1, side] = solved[1, side][0], np.zeros((0, *SHAPE))
+    # Derivatives by both are known beside the first parameter, on one side alone.
+    solved[0, -1] = solved[0, -1][0], np.zeros((0, *SHAPE))
+    found = expand(solved, np.arange(2), NAMES, SPREADS).second
+    np.testing.assert_allclose(found, second, atol=1e-12)
+    solved[0, 1] = solved[0, 1][0], np.zeros((0, *SHAPE))
+    found = expand(solved, np.arange(2), NAMES, SPREADS).second
+    np.testing.assert_allclose(found[[0, 1], [0, 1]], second[[0, 1], [0, 1]], atol=1e-12)
+    assert not found[0, 1].any() and not found[1, 0].any()
+
+
+def test_the_steepest_parameters_come_first():
+    rng = np.random.default_rng(6)
+    value = rng.uniform(1.0, 2.0, (2, 1, 9, 9))
+    slopes = np.stack(
+        [0.03 * value, -0.6 * value]
+    )  # times spreads of 2 and 0.5: 0.06, -0.3
+    assert steepest(value, slopes, SPREADS, 5).tolist() == [1, 0]
+    assert steepest(value, slopes, np.array([20.0, 0.5]), 1).tolist() == [0]

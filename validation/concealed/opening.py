@@ -134,7 +134,10 @@ def to_row(opened: Opened, level: str, group: str) -> dict[str, Any]:
     score = opened.score()
     truth = {k: opened.truth[k] for k in TRUTH_KEYS if k in opened.truth}
     if "nuisances" in opened.truth:
-        truth["nuisances"] = [n["kind"] for n in opened.truth["nuisances"]]
+        # The virtual sensor of this folder states their sizes by name, the independent bench lists them.
+        truth["nuisances"] = [
+            n if isinstance(n, str) else n["kind"] for n in opened.truth["nuisances"]
+        ]
     report = None
     if opened.report is not None:
         report = {k: opened.report[k] for k in SCORED if k in opened.report}

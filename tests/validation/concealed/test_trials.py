@@ -105,6 +105,19 @@ def test_rows_are_scored_by_the_snrs_of_now(calibration):
     assert trials.snr_of(make_effect(*told[0]), calibration) != 33.0 and not one
 
 
+@pytest.mark.parametrize(
+    ("nuisances", "kept"),
+    [
+        ([{"kind": "dust", "size": 3.0}], ["dust"]),
+        ({"gain": 2.0, "noise_e": 5.0}, ["gain", "noise_e"]),
+    ],
+)
+def test_nuisances_are_kept_by_name_from_either_bench(nuisances, kept):
+    truth = {"campaign": "c", "effects": [], "size": "S", "seed": 1, "nuisances": nuisances}
+    row = to_row(Opened(truth, report(), {}, "0"), "pixel", "set")
+    assert json.loads(row["truth_json"])["nuisances"] == kept
+
+
 def test_truths_are_drawn_again_the_same_and_even_in_the_logarithm(
     calibration, monkeypatch
 ):
