@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from bfsensor.sensor.flats import draw_flat
     from bfsensor.sensor.shift_maps import ShiftMap
     from bfsensor.sensor.silicon_sensor import SiliconSensor
+    from bfsensor.sensor.table_correction import correct_table
     from bfsensor.sweeps.device_sweep import sweep_device
     from bfsensor.sweeps.rows import DeviceSweep
     from bfsensor.table.build import build_table
@@ -129,6 +130,7 @@ else:
             "sensor.flats": ["draw_flat"],
             "sensor.shift_maps": ["ShiftMap"],
             "sensor.silicon_sensor": ["SiliconSensor"],
+            "sensor.table_correction": ["correct_table"],
             "sweeps.device_sweep": ["sweep_device"],
             "sweeps.rows": ["DeviceSweep"],
             "table.build": ["build_table"],
@@ -183,6 +185,7 @@ __all__ = [
     "builtin_devices",
     "correct_edges",
     "correct_kernel",
+    "correct_table",
     "cut_stamps",
     "diagnose_measured",
     "draw_flat",

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from bfsensor.sensor.focal_plane import FocalPlane
     from bfsensor.sensor.shift_maps import ShiftMap
     from bfsensor.sensor.silicon_sensor import SiliconSensor
+    from bfsensor.sensor.table_correction import correct_table
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
@@ -21,6 +22,7 @@ else:
             "flats": ["draw_flat", "iterate_flat"],
             "shift_maps": ["ShiftMap"],
             "silicon_sensor": ["SiliconSensor"],
+            "table_correction": ["correct_table"],
         },
     )
 
@@ -29,6 +31,7 @@ __all__ = [
     "FocalPlane",
     "ShiftMap",
     "SiliconSensor",
+    "correct_table",
     "draw_flat",
     "iterate_flat",
     "read_effects",
