@@ -472,7 +472,9 @@ def _numbers() -> dict[str, Callable[[Rows], str]]:
         ("empty edges", "whole", "edges"), ("empty kernel", "whole", "kernel"),
         ("charged edges", "whole", "edges, at 50 ke-"),
         ("charged kernel", "whole", "kernel, flats of 80 ke-"),
-        ("linear edges", "linear", "edges"),
+        ("linear edges", "linear", "edges"), ("table", "whole", "table"),
+        ("table of red light", "y light", "table, y band"),
+        ("surface table", "y light", "table"),
     ):  # fmt: skip
         numbers[f"left {short}"] = lambda r, s=sensor, n=name: correction_left(r, s, n)
     for short in QUOTED:
