@@ -4,9 +4,14 @@ import numpy as np
 import pytest
 
 from bfsensor import Device
-from bfsensor.device.parameters import change_parameter
+from bfsensor.device.parameters import change_parameter, device_parameters
 from bfsensor.errors import TableError
-from bfsensor.response.edge_response import PRECISION, area_matrix, solve_response
+from bfsensor.response.edge_response import (
+    CHARGE,
+    PRECISION,
+    area_matrix,
+    solve_response,
+)
 from bfsensor.simulate import boundary_tangent
 from bfsensor.simulate.boundaries import BISECTION
 
@@ -71,13 +76,16 @@ def test_derivatives(name, step):
         other = area_matrix(up.kx - down.kx, up.ky - down.ky)[depth] / (2 * step)
         assert np.abs(one - other).max() < 0.02 * np.abs(other).max()
         far = np.s_[1:3, 1:-1]  # rows at lags -4 and -3: images count there
-        assert np.abs(one - other)[far].max() < 0.05 * np.abs(other)[far].max()
+        # Boundary points are found to PRECISION, of which a side of a pixel has some 20.
+        noise = PRECISION / 10.0 / CHARGE / step / np.sqrt(20)
+        assert np.abs(one - other)[far].max() < 0.05 * np.abs(other)[far].max() + noise
 
 
 @pytest.mark.slow
 def test_points_that_jump_past_a_saddle_keep_their_earlier_derivative(monkeypatch):
     """On this mesh single points of a line jump: without the guard all of it is lost."""
-    device, name, spread = Device.load("itl_sta3800c"), "gates.field_oxide_taper", 0.2
+    device, name = Device.load("e2v_ccd250_70"), "silicon.background_doping"
+    spread = device_parameters(device)[name]
     small = 1e-4 * spread
     changed = [(change_parameter(device, name, small), small)]
     up, down = (
