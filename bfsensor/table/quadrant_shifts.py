@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import PchipInterpolator
 
 from bfsensor.errors import TableError
+from bfsensor.recording.tables.text_tables import LARGEST_LAG
 from bfsensor.response.light import conversion_weights
 from bfsensor.response.vertices import vertex_fractions
 from bfsensor.table.table import DistortionTable
@@ -93,7 +94,7 @@ def quadrant_shifts(
     temperature : float, optional
         Temperature for the absorption length [K], by default the device's.
     lags : int
-        Number of lags from 0 in x and in y, at least 2; 8 gives kernels of 17 x 17.
+        Number of lags from 0 in x and in y, 2 to 1000; 8 gives kernels of 17 x 17.
     tail_slope : float, optional
         Exponent p, below -1, of the tail beyond the table: areas change as
         :math:`(i^2 + j^2)^p`, shifts as :math:`x, y` times that, scaled to the table's outermost
@@ -125,8 +126,8 @@ def quadrant_shifts(
     >>> bool(-1.4e-6 < a[0, 0] < -1.2e-6), bool(a[1, 0] > 1.5 * a[0, 1] > 0)
     (True, True)
     """
-    if not (isinstance(lags, int | np.integer) and lags >= 2):
-        raise TableError(f"lags = {lags} must be a whole number from 2")
+    if not (isinstance(lags, int | np.integer) and 2 <= lags <= LARGEST_LAG):
+        raise TableError(f"lags = {lags} must be a whole number from 2 to {LARGEST_LAG}")
     if table.reach < 1:
         raise TableError("a table with reach = 0 has no shifts of neighbours to export")
     if tail_slope is not None and not tail_slope < -1:

@@ -248,3 +248,18 @@ def test_tables_that_cannot_serve():
         quadrant_shifts(make_table(reach=0))
     with pytest.raises(TableError, match="one depth"):
         quadrant_shifts(make_table(depths=[50.0]), wavelengths=[500.0], temperature=173.0)
+
+
+def test_kernels_of_many_lags_are_solved_and_more_refused():
+    """A thousand lags have a system of four million unknowns."""
+    areas = np.zeros((400, 400))
+    areas[0, 0] = -1e-6
+    kernel = solve_kernel(areas)
+    back = sum(np.roll(kernel, s, axis) for s in (1, -1) for axis in (0, 1)) - 4 * kernel
+    assert back[400, 400] == pytest.approx(1e-6, rel=1e-9)
+    back[400, 400] = 0.0
+    assert np.abs(back[1:-1, 1:-1]).max() < 1e-18
+    with pytest.raises(
+        TableError, match="lags = 1001 must be a whole number from 2 to 1000"
+    ):
+        quadrant_shifts(make_table(), lags=1001)
