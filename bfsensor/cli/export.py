@@ -142,7 +142,7 @@ def _common(command: Callable[..., None]) -> Callable[..., None]:
             click.option("--level", default=0.0, show_default=True, metavar="ELECTRONS",
                          help="Charge of all pixels at which the shifts by one more electron are "
                          "taken [e-], within the backgrounds of the table."),
-            click.option("--lags", default=8, show_default=True, type=click.IntRange(2, 1000),
+            click.option("--lags", default=8, show_default=True, type=click.IntRange(2, 64),
                          help="Number of lags from 0 on [pixel]; cp_pipe has 8."),
             click.option("--tail/--no-tail", default=True,
                          help="Beyond the table, let shifts fall off as in cp_pipe (areas as the "

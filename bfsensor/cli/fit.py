@@ -65,7 +65,7 @@ if TYPE_CHECKING:
     "are renewed in each round. Errors then come from posterior draws and need not be Gaussian.",
 )  # fmt: skip
 @click.option(
-    "--draws", default=12, show_default=True, type=click.IntRange(min=0),
+    "--draws", default=12, show_default=True, type=click.IntRange(0, 1_000_000),
     help="Number of devices drawn from the posterior and solved in full; the error of the "
     "predictions there is added to the errors of the fit. 0 skips this.",
 )  # fmt: skip
