@@ -82,7 +82,7 @@ def correct_kernel(
     >>> bool(np.allclose(correct_kernel(flat, kernel), flat))
     True
     """
-    given = _image(image)
+    given = check_image(image)
     k = to_floats(kernel, "kernel")
     if k.ndim != 2 or not all(side % 2 for side in k.shape):
         raise MeasurementError(f"kernel of shape {k.shape} must have two odd sides")
@@ -162,7 +162,7 @@ def correct_edges(image: ArrayLike, north: ArrayLike, east: ArrayLike) -> FloatA
     >>> bool(corrected[4, 4] > 1e5), bool(abs(corrected.sum() - 1e5) < 1e-6)
     (True, True)
     """
-    given = _image(image)
+    given = check_image(image)
     n, e = to_floats(north, "north"), to_floats(east, "east")
     if n.ndim != 2 or n.shape != e.shape or n.shape[0] != n.shape[1]:
         raise MeasurementError(
@@ -175,7 +175,7 @@ def correct_edges(image: ArrayLike, north: ArrayLike, east: ArrayLike) -> FloatA
     return given - _gains(moved_y, moved_x, given.shape)
 
 
-def _image(image: ArrayLike) -> FloatArray:
+def check_image(image: ArrayLike) -> FloatArray:
     """Image as floats, checked to be two-dimensional and finite."""
     array = to_floats(image, "image")
     if array.ndim != 2 or min(array.shape) < 2:

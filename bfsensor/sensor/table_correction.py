@@ -31,19 +31,20 @@ from scipy import fft
 from scipy.ndimage import correlate1d
 
 from bfsensor._kernels import correction as kernels
-from bfsensor.device.shipped import tables_dir
 from bfsensor.errors import SensorError
 from bfsensor.measure.arrays import to_floats
+from bfsensor.measure.correct import check_image
 from bfsensor.response.light import conversion_weights
 from bfsensor.sensor.charge_response import EffectiveCharge, factor_table
+from bfsensor.sensor.options import check_surroundings, outside_charge, read_device
 from bfsensor.table.table import DistortionTable
 from bfsensor.typing import FloatArray
 
 PASSES = 2
 """Number of times that the light is found from the charge, always the same.
 
-Measured on stars of 120,000 e- in the peak: the second pass takes off 0.2 to 0.6 % of their growth, a
-third less than 0.02 %; twice as many take twice the time."""
+Measured on stars of 120,000 e- in the peak: the first pass takes off 0.2 to 0.6 % of their growth
+too much, which the second gives back; a third changes less than 0.02 %, and four take twice the time."""
 
 STENCIL = 12
 """Pixels across a boundary whose charges give the light on it.
@@ -108,7 +109,7 @@ def correct_table(
     *,
     wavelengths: ArrayLike | None = None,
     photons: ArrayLike | None = None,
-    temperature: float = 173.0,
+    temperature: float | None = None,
     surroundings: float | str = "mirrored",
     charge_response: bool = True,
     background: bool = True,
@@ -127,10 +128,11 @@ def correct_table(
     wavelengths, photons : array_like, shape (n,), optional
         Wavelengths of the light [nm] and how many photons have each, by default equally many; without
         wavelengths light converts at the back surface.
-    temperature : float
-        Temperature of the silicon [K], for the depth in which light is absorbed.
-    surroundings : float or 'mirrored'
-        Charge of the pixels beyond the image [e-], or 'mirrored', those inside.  No light crosses the
+    temperature : float, optional
+        Temperature of the silicon [K], for the depth in which light is absorbed; by default the
+        device's.
+    surroundings : float, 'none' or 'mirrored'
+        Charge of the pixels beyond the image [e-], none, or that of those inside.  No light crosses the
         border of the image.
     charge_response, background : bool
         Whether the response depends on the charge of a pixel and on that around it, as in
@@ -146,14 +148,17 @@ def correct_table(
 
     Raises
     ------
+    MeasurementError
+        The image is not two-dimensional or holds values that are not finite.
     SensorError
-        The image is not two-dimensional or holds values that are not finite; the surroundings are
-        neither a charge nor 'mirrored'; wavelengths and photons do not belong together.
+        The surroundings are none of the above; wavelengths and photons do not belong together; the
+        table holds no device and no temperature is given.
 
     Notes
     -----
-    Charge that blooming moved, or that cosmic rays left, is taken for light.  Within a few pixels of
-    such charge the correction is wrong by as much as it would be for a star in its place.
+    Beyond the table's charges and backgrounds, or its full well, the last response is held; charges
+    below 0 respond like 0.  Charge that blooming moved, or that cosmic rays left, is taken for light:
+    there the correction is that of a star in its place.
 
     Examples
     --------
@@ -162,19 +167,12 @@ def correct_table(
     >>> bool(corrected[20, 20] > star[20, 20]), bool(abs(corrected.sum() - star.sum()) < 1e-4)
     (True, True)
     """
-    given = to_floats(image, "image")
-    if given.ndim != 2 or min(given.shape) < 2:
-        raise SensorError(
-            f"image of shape {given.shape} must have two sides of 2 pixels or more"
-        )
-    bad = np.count_nonzero(~np.isfinite(given))
-    if bad:
-        raise SensorError(
-            f"image holds {bad} values that are not finite: fill them, for instance from their "
-            "neighbours, before a correction"
-        )
+    given = check_image(image)
+    around = check_surroundings(surroundings)
     if isinstance(table, str):
-        table = DistortionTable.read(tables_dir() / table / "table.fits")
+        table = DistortionTable.load(table)
+    if temperature is None:
+        temperature = read_device(table, "the correction").operating_point.temperature
     factors = factor_table(table, linear=not charge_response, background=background)
     weights = _weights(factors, table, wavelengths, photons, temperature)
     patterns = _Patterns(
@@ -185,7 +183,7 @@ def correct_table(
         ]
     )
     margin = PASSES * (patterns.reach + STENCIL // 2 + 2)
-    padded = _padded(given, margin, surroundings)
+    padded = _padded(given, margin, around)
     out = np.empty_like(given)
     for top in range(0, len(given), BAND):
         rows = slice(top, min(top + BAND, len(given)))
@@ -250,11 +248,7 @@ def _padded(image: FloatArray, margin: int, surroundings: float | str) -> FloatA
     """Image with a margin of the charge beyond it."""
     if surroundings == "mirrored":
         return np.pad(image, margin, mode="symmetric")
-    if isinstance(surroundings, str) or not 0 <= float(surroundings) < np.inf:
-        raise SensorError(
-            f"surroundings = {surroundings!r} must be 'mirrored' or a charge [e-] of 0 or more"
-        )
-    return np.pad(image, margin, constant_values=float(surroundings))
+    return np.pad(image, margin, constant_values=outside_charge(surroundings))
 
 
 def _corrected(

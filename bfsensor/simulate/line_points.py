@@ -35,9 +35,9 @@ class LinePoints:
     traced : ndarray, shape (n,)
         Nominal coordinates along the line [um], from 0 on a mirror-symmetric domain.
     even, odd : ndarray, shape (m, n), or None
-        Matrices from values at ``traced`` to those at the given points, of what is even and odd
-        along the line on a mirror-symmetric domain; on others they are equal.  None where the line is
-        given on the points on which it is traced.
+        Matrices that interpolate from ``traced`` to the given points: ``even`` for coordinates that are
+        the same on both sides of the mirror plane, ``odd`` for those that change sign there.  Without
+        mirror planes both are equal.  None where all given points are traced.
     """
 
     traced: FloatArray

@@ -9,7 +9,7 @@ import pytest
 from bfsensor import BrighterFatterSensor, DistortionTable
 from bfsensor._kernels import correction
 from bfsensor.device.shipped import tables_dir
-from bfsensor.errors import SensorError
+from bfsensor.errors import BFSensorError
 from bfsensor.measure.correct import correct_kernel
 from bfsensor.measure.flat_pairs import flat_covariances
 from bfsensor.sensor import table_correction
@@ -203,8 +203,8 @@ def test_red_light_is_corrected_less():
     [
         ({"image": np.ones(5)}, r"image of shape \(5,\) must have two sides"),
         ({"image": np.full((4, 4), np.nan)}, "holds 16 values that are not finite"),
-        ({"surroundings": -1.0}, "surroundings = -1.0 must be 'mirrored' or a charge"),
-        ({"surroundings": "open"}, "surroundings = 'open' must be 'mirrored'"),
+        ({"surroundings": -1.0}, "surroundings = -1.0 must be 'none', 'mirrored'"),
+        ({"surroundings": "open"}, "surroundings = 'open' must be 'none'"),
         ({"photons": [1.0]}, "photons need wavelengths"),
         ({"wavelengths": [500.0, 600.0], "photons": [1.0]}, "the shapes"),
         ({"wavelengths": [500.0], "photons": [-1.0]}, "none below 0"),
@@ -212,5 +212,5 @@ def test_red_light_is_corrected_less():
 )
 def test_what_cannot_be_corrected_is_refused(given, message):
     image = given.pop("image", star(side=9))
-    with pytest.raises(SensorError, match=message):
+    with pytest.raises(BFSensorError, match=message):
         correct_table(image, ITL, **given)
