@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from bfsensor.cli.common import Bar, parse_conditions
-from bfsensor.errors import DiagnosisError
+from bfsensor.errors import ConvergenceError, DeviceError, DiagnosisError
 from bfsensor.files import held
 
 
@@ -30,8 +30,9 @@ from bfsensor.files import held
 )
 @click.option(
     "--device/--no-device", "device", default=True,
-    help="With tables of a_ij: fit every quantity of a baseline device within its stated "
-    "uncertainty, as --float all does, about half a minute the first time.  [default: --device]",
+    help="Fit every quantity of a baseline device within its stated uncertainty, as --float all does, "
+    "and seek physics that the device lacks; solves the device, about a minute the first time. With "
+    "--no-device its shipped table answers, and no quantity is fitted.  [default: --device]",
 )  # fmt: skip
 @click.option(
     "--at", "conditions", multiple=True, callback=parse_conditions,
@@ -113,9 +114,11 @@ def diagnose(
     from bfsensor.diagnose.data.reduced_channels import measure_reduced
     from bfsensor.diagnose.model.open_baseline import (
         CampaignSource,
+        asked_of,
         find_baseline,
         find_reduced_recordings,
         is_device,
+        reduced_states,
         simulate_baseline,
         with_physics,
     )
@@ -139,24 +142,33 @@ def diagnose(
     named = baseline or (None if found is None else found.baseline)
     if towards is not None and (floating or named is None):
         raise click.UsageError("--towards needs a --baseline, and none of --float")
-    if isinstance(reduced, list) and device and not floating and towards is None:
-        floating = ("all",) if is_device(named) else ()
+    asked_device = floating or (
+        ("all",) if device and towards is None and is_device(named) else ()
+    )
+    predicted, notes = None, []
     if towards is not None:
         predicted = with_operating_point(str(named), towards)
-    elif floating:
-        tables = reduced if isinstance(reduced, list) else []
+    elif asked_device:
         exposures = () if found is None else found.exposures
         states = [(e.back_bias, e.temperature) for e in exposures]
-        states += [(t.condition.back_bias, t.condition.temperature) for t in tables]
-        biases = sorted({b for b, _ in states if b is not None})
+        if reduced is not None:
+            states = reduced_states(reduced)
         warm = {round(t) for _, t in states if t is not None}
-        predicted = simulate_baseline(
-            named, floating, biases, keep=folder, warming=len(warm) > 1,
-            progress=Bar("simulations"),
-        )  # fmt: skip
-        if explain and named is not None and found is not None:
-            predicted = with_physics(predicted, named, keep=folder / "walks")
-    else:
+        try:
+            predicted = simulate_baseline(
+                named, asked_device, [b for b, _ in states], keep=folder, warming=len(warm) > 1,
+                progress=Bar("simulations"),
+            )  # fmt: skip
+            if explain and named is not None:
+                predicted = with_physics(predicted, named, keep=folder / "solutions")
+            notes.append(asked_of(predicted))
+        except (DeviceError, ConvergenceError) as error:
+            if floating:
+                raise
+            notes.append(
+                f"no quantity of the device was fitted, nor physics sought that it lacks: {error}"
+            )
+    if predicted is None:
         predicted = find_baseline(named, card=None if found is None else found.card)
     refuse_unheld(wanted, predicted)
     read = list(campaign) if found is None else found.files
@@ -171,6 +183,7 @@ def diagnose(
             predicted,
             campaign=first.resolve().stem,
             seed=seed,
+            notes=notes,
             explain=explain,
             scaled=errors == "scaled",
             keep=keep,
@@ -179,17 +192,17 @@ def diagnose(
         result = diagnosis.diagnose(
             CampaignSource(found), predicted, campaign=found.name, seed=seed, explain=explain,
             progress=Bar("pixels"), keep=keep,
-            notes=[f"{c.topic}: {c.message}" for c in found.warnings]
+            notes=notes + [f"{c.topic}: {c.message}" for c in found.warnings]
             + [f"set aside: {s.path.name}: {s.reason}" for s in found.set_aside],
         )  # fmt: skip
     command = " ".join(["bfsensor", *sys.argv[1:]])
     told = provenance_of(command, seed=seed, files=files, began=began)
     written = write_report(result, folder, provenance=told)
-    notes: tuple[str, ...] = ()
+    further = [*notes, *result.notes[result.read :]]
     predictor, fit = result.accepted
     if wanted and predictor is not None:
         prediction = predict_conditions(predictor, fit, wanted)
-        notes = prediction.notes
+        further += prediction.notes
         written.append(prediction.write(folder / "predicted.ecsv"))
     keep.clear()
     if as_json:
@@ -201,6 +214,6 @@ def diagnose(
         click.echo(f"{word:22s}{square:10.1f}{dof:8.1f}{square / max(dof, 1e-9):8.2f}")
     for advice in result.plan.said():
         click.echo(f"advised: {advice}")
-    for note in (*result.notes[result.read :], *notes):
+    for note in further:
         click.echo(f"note: {note}")
     click.echo(f"{folder}: {', '.join(p.name for p in written if p.suffix != '.png')}")

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
-from bfsensor.effects.effect import Layout, Parameter, Seen, Shot
-from bfsensor.effects.family import TemplateEffect, TemplateFamily
+from bfsensor.effects.changed_device import ChangedDevice, Quantity
+from bfsensor.effects.effect import Layout, Parameter, Seen
+from bfsensor.effects.family import TemplateFamily
 from bfsensor.errors import EffectError
-from bfsensor.typing import Edges, FloatArray
+from bfsensor.typing import Edges
 
 NEAREST, FARTHEST = 3.0, 16.0
 """Plausible distances of a parameter from its nominal value [standard deviations of its prior].
@@ -18,35 +18,25 @@ NEAREST, FARTHEST = 3.0, 16.0
 Chosen: below 3 the free parameters of every fit explain the difference.  With both twice as large,
 fits begin at 14 instead of 7 standard deviations, and detections below 6 lose their evidence."""
 
+UNKNOWN_UNIT = "unit of the device file"
+"""Unit of the quantities of a baseline whose file does not state their units."""
+
+SILICON = {
+    "operating_point.hole_quasi_fermi_level": "free_holes",
+    "channel_stop.side_diffusion": "stop_diffusion",
+    "channel.surface_charge": "oxide_charge",
+}
+"""Quantities by which a device has, or lacks, a piece of physics, and the name of the piece: they are of
+class 'silicon_physics', all others of class 'device_parameter'."""
+
 Conditions = Mapping[tuple[float, float], Edges]
 
 
-class Floating(NamedTuple):
-    """One parameter of a device, with the derivatives of the boundary shifts.
-
-    Attributes
-    ----------
-    name : str
-        Dotted name of the parameter in the device file.
-    nominal, spread : float
-        Nominal value and its standard deviation, in the unit of the device file.
-    slopes : tuple of ((float, float), (ndarray, ndarray))
-        Wavelength [nm] and back bias [V], and there the derivative of the shifts (kx, ky)
-        [pixel/e- per unit], arrays with odd sides.
-    """
-
-    name: str
-    nominal: float
-    spread: float
-    slopes: tuple[tuple[tuple[float, float], Edges], ...]
-
-
-class DeviceParameter(TemplateEffect):
+class DeviceParameter(ChangedDevice):
     """Boundary shifts of a device with another value of one parameter; one family for each parameter.
 
     The only parameter of the effect is the true value.  Unlike the free parameter of the same name
-    in a fit of the baseline, it has no Gaussian prior around the nominal value.  Shifts change
-    linearly with it.
+    in a fit of the baseline, it has no Gaussian prior around the nominal value.
 
     Parameters
     ----------
@@ -63,8 +53,6 @@ class DeviceParameter(TemplateEffect):
     """
 
     word = "device_parameter"
-    stage = "collect"
-    touches = ("flat_cov", "spot")
     source = (
         "Derivatives of a simulation by the parameters of its device, as Astier & Regnault "
         "2023, A&A 670, A118, fit theirs; range assumed"
@@ -75,43 +63,21 @@ class DeviceParameter(TemplateEffect):
         cls, of: TemplateFamily, layout: Layout, seen: Sequence[Seen]
     ) -> list[dict[str, float]]:
         del layout, seen
-        own: Floating = of.template
-        middle = np.sqrt(NEAREST * FARTHEST) * own.spread
-        return [{own.name: own.nominal + sign * float(middle)} for sign in (1.0, -1.0)]
-
-    def edges(self, kx: FloatArray, ky: FloatArray, shot: Shot, layout: Layout) -> Edges:
-        del layout
-        own: Floating = self.template
-        change = self[own.name] - own.nominal
-        if change == 0.0:
-            return kx, ky
-        slopes = nearest_edges(own.slopes, shot)
-        return add_edges((kx, ky), slopes, change)
-
-
-def nearest_edges(held: Sequence[tuple[tuple[float, float], Edges]], shot: Shot) -> Edges:
-    """Shifts held for the nearest back bias, and among those for the nearest wavelength."""
-    _, found = min(
-        held,
-        key=lambda s: (abs(s[0][1] - shot.back_bias), abs(s[0][0] - shot.wavelength)),
-    )
-    return found
-
-
-def add_edges(edges: Edges, more: Edges, factor: float) -> Edges:
-    """Add ``factor`` times other shifts, padded with 0 to the same reach."""
-    moved = []
-    for shifts, slope in zip(edges, more, strict=True):
-        reach = max(len(shifts), len(slope)) // 2
-        wide, slope = (np.pad(a, reach - len(a) // 2) for a in (shifts, slope))
-        moved.append(wide + factor * slope)
-    return moved[0], moved[1]
+        own: Quantity = of.template
+        low, high = of.parameters[0].ends
+        middle = float(np.sqrt(NEAREST * FARTHEST) * own.spread)
+        values = np.clip(own.nominal + middle * np.array([1.0, -1.0]), low, high)
+        # At an end of its range, as no dose changes its sign, a parameter varies to one side only.
+        return [{own.name: float(v)} for v in values if abs(v - own.nominal) > own.spread]
 
 
 def device_parameters(
     derivatives: Mapping[str, Conditions],
     spread: Mapping[str, float],
     nominal: Mapping[str, float],
+    *,
+    units: Mapping[str, str] = {},
+    bounds: Mapping[str, tuple[float, float]] = {},
 ) -> tuple[TemplateFamily, ...]:
     """Make the candidates of a baseline: one family of effects for each free parameter.
 
@@ -122,11 +88,16 @@ def device_parameters(
     spread, nominal : mapping of str to float
         Standard deviation and nominal value of each parameter.  A parameter without a nominal value
         is left out: its true value could not be stated.
+    units : mapping of str to str
+        Unit of each parameter, for reports, where it is known.
+    bounds : mapping of str to (float, float)
+        Least and greatest value, less the nominal one, of parameters that cannot lie outside.
 
     Returns
     -------
     kinds : tuple of TemplateFamily
-        Families of :class:`DeviceParameter`, named ``device_parameter:NAME``.
+        Families of :class:`DeviceParameter`, named ``device_parameter:NAME``, or
+        ``silicon_physics:PIECE`` for the quantities of :data:`SILICON`.
 
     Raises
     ------
@@ -151,21 +122,17 @@ def device_parameters(
             raise EffectError(
                 f"device_parameter: spread of {name} = {spread[name]!r} must be above 0"
             )
-        own = Floating(
+        own = Quantity(
             name, float(nominal[name]), float(spread[name]), tuple(slopes.items())
         )
+        low, high = bounds.get(name, (-np.inf, np.inf))
         value = Parameter(
-            name, "unit of the device file", NEAREST * own.spread, FARTHEST * own.spread,
-            neutral=own.nominal, signed=True, amplitude=True,
+            name, units.get(name, UNKNOWN_UNIT), NEAREST * own.spread,
+            FARTHEST * own.spread, neutral=own.nominal, signed=True, amplitude=True,
+            ends=(own.nominal + low, own.nominal + high),
         )  # fmt: skip
-        out.append(
-            TemplateFamily(
-                DeviceParameter,
-                DeviceParameter.word,
-                name,
-                own,
-                DeviceParameter.source,
-                (value,),
-            )
-        )
+        word = "silicon_physics" if name in SILICON else DeviceParameter.word
+        out.append(TemplateFamily(
+            DeviceParameter, word, SILICON.get(name, name), own, DeviceParameter.source, (value,)
+        ))  # fmt: skip
     return tuple(out)

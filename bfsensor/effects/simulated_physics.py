@@ -7,38 +7,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bfsensor.effects.device_parameter import add_edges, nearest_edges
+from bfsensor.effects.changed_device import (
+    ChangedDevice,
+    Key,
+    Quantity,
+    add_edges,
+    level_response,
+    nearest_edges,
+    nearest_value,
+)
 from bfsensor.effects.effect import Halo, Layout, Parameter, Seen, Shot
 from bfsensor.effects.family import TemplateEffect, TemplateFamily
 from bfsensor.effects.tree_rings import TreeRings
 from bfsensor.typing import Edges, FloatArray
-
-Key = tuple[float, float]
-Held = tuple[tuple[Key, Edges], ...]
-"""Shifts by condition: ((wavelength [nm], back bias [V]), (kx, ky))."""
 
 STRENGTH = Parameter("strength", "", -2.0, 2.0, law="flat", signed=True, amplitude=True)
 """Strength of the physics: 1 as simulated, 0 as in the baseline.
 
 Range chosen: flat, so that fits stay between -4 and 4; the linear template is not valid at ten times
 the simulated effect.  Twice as wide, evidence for an effect falls by a factor of two."""
-
-
-class QuadraticTemplate(NamedTuple):
-    """Derivative of the shifts by the charge at a level [e-], and half of the second derivative."""
-
-    level: float
-    slopes: Held
-    bends: Held
-
-
-class Moved(NamedTuple):
-    """Change of the shifts [pixel/e-] by the physics, with its temperature [per K] and charge terms."""
-
-    edges: Held
-    warming: Held = ()
-    temperature: float = np.nan
-    bent: QuadraticTemplate | None = None
 
 
 class DiffusionWidths(NamedTuple):
@@ -56,7 +43,7 @@ class Rings(NamedTuple):
 
     def size(self, period: float, shot: Shot) -> float:
         """Amplitude at strength 1 [pixel], for a period [pixel] and the condition of a shot."""
-        return float(np.interp(period, self.periods, _nearest(self.held, shot)))
+        return float(np.interp(period, self.periods, nearest_value(self.held, shot)))
 
 
 class Rim(NamedTuple):
@@ -99,7 +86,7 @@ class MovedEdges(LeftOut):
         self, shot: Shot, layout: Layout
     ) -> tuple[float, Edges, Edges] | None:
         del layout
-        return _response(self.template.bent, self["strength"], shot)
+        return level_response(self.template.bent, self["strength"], shot)
 
 
 class BentResponse(LeftOut):
@@ -111,17 +98,26 @@ class BentResponse(LeftOut):
         self, shot: Shot, layout: Layout
     ) -> tuple[float, Edges, Edges] | None:
         del layout
-        return _response(self.template, self["strength"], shot)
+        return level_response(self.template, self["strength"], shot)
 
 
-def _response(
-    told: QuadraticTemplate | None, strength: float, shot: Shot
-) -> tuple[float, Edges, Edges] | None:
-    """Response by level times ``strength``; None without a template or at strength 0."""
-    if told is None or strength == 0.0:
-        return None
-    (sx, sy), (bx, by) = (nearest_edges(h, shot) for h in (told.slopes, told.bends))
-    return told.level, (strength * sx, strength * sy), (strength * bx, strength * by)
+class SiliconPhysics(ChangedDevice):
+    """Boundary shifts of a device with physics that its baseline lacks, by the value of a quantity.
+
+    The quantity has no prior: at its nominal value the device lacks this physics.
+    """
+
+    word = "silicon_physics"
+
+    @classmethod
+    def template_starts(
+        cls, of: TemplateFamily, layout: Layout, seen: Sequence[Seen]
+    ) -> list[dict[str, float]]:
+        del layout, seen
+        own: Quantity = of.template
+        (value,) = of.parameters
+        ends = np.clip(own.nominal + own.spread * np.array([1.0, -1.0]), *value.ends)
+        return [{value.name: float(v)} for v in ends if v != own.nominal]
 
 
 class FieldDiffusion(LeftOut):
@@ -135,7 +131,7 @@ class FieldDiffusion(LeftOut):
         told = self.template
         heat = shot.temperature / told.temperature
         heat = heat if np.isfinite(heat) else 1.0
-        return self["strength"] * heat * _nearest(told.held, shot), ()
+        return self["strength"] * heat * nearest_value(told.held, shot), ()
 
 
 class DopingRings(LeftOut):
@@ -175,7 +171,7 @@ class EdgeFieldLeftOut(LeftOut):
         strength = self["strength"]
         if strength == 0.0:
             return None
-        inwards = strength * _nearest(self.template.held, shot)
+        inwards = strength * nearest_value(self.template.held, shot)
         ny, nx = layout.shape
         x, y = (_both_ends(inwards, n) for n in (nx, ny))
         return (
@@ -191,14 +187,6 @@ def _both_ends(inwards: FloatArray, n: int) -> FloatArray:
     out[:reach] += inwards[:reach]
     out[-reach:] -= inwards[:reach][::-1]
     return out
-
-
-def _nearest(held: Sequence[tuple[Key, Any]], shot: Shot) -> Any:
-    """Value held for the nearest back bias, and among those for the nearest wavelength."""
-    return min(
-        held,
-        key=lambda s: (abs(s[0][1] - shot.back_bias), abs(s[0][0] - shot.wavelength)),
-    )[1]
 
 
 def ring_parameters(size: float) -> tuple[Parameter, ...]:
@@ -251,9 +239,10 @@ def left_out(
 
     Examples
     --------
+    >>> from bfsensor.effects.changed_device import Moved
     >>> k = np.zeros((3, 3)); k[1, 1] = -1e-6
     >>> template = Moved((((620.0, -50.0), (k, k.T)),))
-    >>> family = left_out(MovedEdges, "free_holes", "", template, "a test")
+    >>> family = left_out(MovedEdges, "bf_chromatic", "simulated", template, "a test")
     >>> shot = Shot("flat", 0, 1.0, 620.0, -50.0, 173.15)
     >>> float(family({"strength": 0.5}).edges(k, k.T, shot, None)[0][1, 1])
     -1.5e-06

@@ -13,8 +13,8 @@ from tests.docs.pages import load
 FIGURES, PARTS = load("effect_figures"), load("effect_figures.parts")
 LONG = ("device_parameter", "charge_loss", "saturation")
 """Pictures that solve a device or draw with the sensor: seconds each."""
-OTHERWISE = ("outside_library", "free_holes", "stop_diffusion")
-"""Words that are no class of effects of their own: the last two are quantities of devices."""
+OTHERWISE = ("outside_library", "silicon_physics")
+"""Words that are no class of effects of their own: the last one is of quantities of devices."""
 
 
 def test_every_class_has_a_picture():

@@ -33,8 +33,9 @@ from numpy.typing import NDArray
 
 from bfsensor import Device
 from bfsensor.device.condition import Condition
-from bfsensor.device.parameters import change_parameter
+from bfsensor.device.parameters import change_parameter, parameter_value
 from bfsensor.device.parts import Provenance
+from bfsensor.device.quantities import quantities
 from bfsensor.diagnose.data.channels import Channel
 from bfsensor.diagnose.data.exposure_info import NUMBERS, Axes, numbers_of
 from bfsensor.diagnose.data.map_channels import MapChannels
@@ -47,9 +48,7 @@ from bfsensor.diagnose.fit.fitted_model import Model, compare_held_out
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.diagnose.model.device_baseline import baseline_of_device
 from bfsensor.diagnose.model.left_out_physics import (
-    HOLES,
-    LEVEL_OF_HOLES,
-    SPREAD_OF_STOPS,
+    PIECES,
     physics_left_out,
 )
 from bfsensor.diagnose.model.map_predictions import shot_at
@@ -116,8 +115,10 @@ RINGS = {
 
 CASES = (
     Case("control 1"),
-    Case("free holes", "free_holes", 1.0, card={LEVEL_OF_HOLES: -HOLES}),
-    Case("side diffusion", "stop_diffusion", 1.0, card={SPREAD_OF_STOPS: -1.1}),
+    *(
+        Case(label, f"silicon_physics:{piece.variant}", np.nan, card={piece.quantity: -piece.step})
+        for label, piece in zip(("free holes", "side diffusion"), PIECES, strict=False)
+    ),
     Case("levels", "bf_nonlinear:simulated", 1.0, lacks=("levels",)),
     Case("depths", "bf_chromatic:simulated", 1.0, lacks=("depths",)),
     Case("diffusion", "lateral_diffusion:simulated", 1.0, extra={"strength": 1.0}),
@@ -342,7 +343,10 @@ def run(case: Case, keep: Path) -> dict[str, Any]:
         effects = [kind(case.extra)]
     if case.off:
         name = next(iter(case.off))
-        value = baseline.nominal[name] + by[name]
+        value = quantities(own)[name].number(parameter_value(own, name))
+    elif case.card:
+        (name,) = case.card
+        value = quantities(own)[name].number(parameter_value(own, name))
     made = time.process_time()
     clean = record(truth, effects, case, noisy=False)
     predictor = Predictor(clean, baseline)

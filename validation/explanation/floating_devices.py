@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from bfsensor import Device
 from bfsensor.device.condition import Condition
 from bfsensor.device.parameters import change_parameter, device_parameters
-from bfsensor.diagnose.data.reduced_channels import measure_reduced
+from bfsensor.diagnose.data.reduced_channels import StatedTable, measure_reduced
 from bfsensor.diagnose.diagnosis import diagnose_measured
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.diagnose.model.open_baseline import simulate_baseline
@@ -91,7 +91,7 @@ def diagnose_drawn(
 ) -> Diagnosis:
     """Draw and diagnose once."""
     table = draw_table(areas, errors, np.random.default_rng(seed))
-    measured = measure_reduced(table, reach=LAGS - 1)
+    measured = measure_reduced([StatedTable(table, level=LEVEL)], reach=LAGS - 1)
     return diagnose_measured(measured, baseline, seed=seed, explain=False)
 
 

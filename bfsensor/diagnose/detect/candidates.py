@@ -52,8 +52,9 @@ the joint fits of one step take up to twice as long."""
 def candidates_of(baseline: Baseline) -> tuple[EffectFamily, ...]:
     """All candidates for a baseline: the library of effects, and the device's own parameters."""
     own = device_parameters(
-        baseline.derivatives_by_condition(), baseline.spread, baseline.nominal
-    )
+        baseline.derivatives_by_condition(), baseline.spread, baseline.nominal,
+        units=baseline.units, bounds=baseline.bounds,
+    )  # fmt: skip
     return (*LIBRARY, *own, *baseline.pieces)
 
 

@@ -15,6 +15,7 @@ from bfsensor.diagnose.detect.candidates import (
     candidates_of,
     concerned,
     further,
+    name_of,
     rank,
     refine,
     seen_of,
@@ -44,6 +45,7 @@ from bfsensor.diagnose.explain.nonparametric import (
     explain_outside,
 )
 from bfsensor.diagnose.explain.pursuit import Choice
+from bfsensor.diagnose.explain.solved_again import Resolver
 from bfsensor.diagnose.explain.terms import Scene
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 from bfsensor.diagnose.fit.fitted_model import Model, compare_held_out
@@ -121,7 +123,9 @@ def attribute(
     kinds = candidates_of(predictor.baseline) if kinds is None else kinds
     kinds = tellable(kinds, predictor, fit.channels)
     base = Model(predictor, fit)
-    search = _Search((*kinds, *NAMED), seed, mismatch, [])
+    notes: list[str] = []
+    resolver = Resolver(predictor.baseline.solver, notes)
+    search = _Search((*kinds, *NAMED), seed, mismatch, notes, resolver=resolver)
     empty = Explanation(base, base, mismatch, max(len(kinds), 1), search.locate)
     found, places = search.finished(*search.forward(empty))
     return _attribution(found, places, search)
@@ -145,6 +149,7 @@ class _Search:
     ends: float = field(default_factory=lambda: time.process_time() + LONGEST)
     joint: dict[Effect, Model] = field(default_factory=dict)
     before: dict[EffectFamily, Effect] = field(default_factory=dict)
+    resolver: Resolver = field(default_factory=lambda: Resolver(None))
 
     def locate(self, model: Model) -> Mismatch:
         """Find what stands out in a model's residuals, by scans and by effects not in it."""
@@ -251,7 +256,22 @@ class _Search:
 
     def _adding(self, now: Explanation, rival: Rival) -> Callable[[], Explanation]:
         """Addition of a candidate, by its joint fit where one was made."""
-        return partial(now.with_effect, rival.effect, self.joint.get(rival.effect))
+        return partial(self._added, now, rival.effect, self.joint.get(rival.effect))
+
+    def _added(
+        self, now: Explanation, effect: Effect, model: Model | None = None
+    ) -> Explanation:
+        """Add an effect; a quantity of the device is solved at its fitted value first."""
+        if self.resolver.acts(effect):
+            model = model or now.model.with_effects((*now.model.effects, effect))
+            model = self.resolver.model(model, len(model.effects) - 1)
+            effect = model.effects[-1]
+            self._renew(effect)
+        return now.with_effect(effect, model)
+
+    def _renew(self, effect: Effect) -> None:
+        """Let further fits of a quantity of the device begin from its newest solution."""
+        self.kinds = [effect.family if name_of(k) == effect.name else k for k in self.kinds]
 
     def _net(self, now: Explanation, rival: Rival) -> float:
         """Gain of a candidate that errors of what was added before cannot make."""
@@ -286,7 +306,29 @@ class _Search:
         others = [r for r in ranking if r not in good]
         self.joint.clear()
         good = refine(now.model, good, self.joint) if good else []
+        good = [self._solved(now, r) for r in good]
         return sorted([*good, *others], key=lambda r: -r.evidence)
+
+    def _solved(self, now: Explanation, rival: Rival) -> Rival:
+        """A candidate that was fitted jointly, with its gain after the device was solved there."""
+        model = self.joint.get(rival.effect)
+        if model is None or not self.resolver.acts(rival.effect):
+            return rival
+        try:
+            again = self.resolver.model(model, len(model.effects) - 1)
+        except ConvergenceError as error:
+            self.notes.append(f"{rival.effect.name}: {error}")
+            return rival
+        if again is model:
+            return rival
+        effect = again.effects[-1]
+        self.joint[effect] = again
+        self._renew(effect)
+        gain = now.model.fit.total - again.fit.total
+        return replace(
+            rival, effect=effect, gain=gain,
+            evidence=rival.evidence + 0.5 * (gain - rival.gain),
+        )  # fmt: skip
 
     def _tried(
         self, now: Explanation, add: Callable[[], Explanation]
@@ -364,7 +406,7 @@ class _Search:
         for rival in above[:REFITTED]:
             ranking = [r for r in ranking if r is not rival]
             try:
-                other = without.with_effect(rival.effect)
+                other = self._added(without, rival.effect)
                 # Without its laws: others come with what is added to the exchanged one.
                 if other.score < now.score + law:
                     other, _ = self.forward(other)
@@ -498,12 +540,12 @@ def _attribution(
 ) -> Attribution:
     """Settle the fit, and state what was found, what is left, and what is outside the library."""
     outside = [c for c, *_ in now.free if not now.same(c)]
-    last = now.model
+    last = search.resolver.settled(now.model)
     free: OpenWorld | None = None
     scales = [scale_of(sum(part.own.values())) for part in now.parts]
     model, profiles = _settled(last, scales)
     mismatch = (
-        now.mismatch if model is last else locate_mismatch(model.fit, seed=search.seed)
+        now.mismatch if model is now.model else locate_mismatch(model.fit, seed=search.seed)
     )
     if now.free:
         choices = tuple(c for c, *_ in now.free)

@@ -14,6 +14,7 @@ import numpy as np
 from bfsensor.checkpoints import digest_of
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose.data.exposure_info import numbers_of
+from bfsensor.diagnose.model.device_solver import DeviceSolver
 from bfsensor.effects.family import EffectFamily
 from bfsensor.errors import DiagnosisError
 from bfsensor.response.edge_response import area_matrix
@@ -102,6 +103,10 @@ class Baseline:
     temperature: float = np.nan
     spots_bend: bool = False
     pieces: tuple[EffectFamily, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    """Unit of each parameter in which the values above are, where it is known."""
+    solver: DeviceSolver | None = None
+    """Solver of the device with another value of a quantity; None where the baseline is no device."""
 
     def __post_init__(self) -> None:
         if not self.edges:
@@ -125,6 +130,7 @@ class Baseline:
             self.spots_bend, sorted(self.bounds.items()), sorted(self.spread.items()),
             sorted(self.nominal.items()),
             sorted(self.card.items(), key=str), [str(p) for p in self.pieces],
+            sorted(self.units.items()), "" if self.solver is None else self.solver.text,
         )  # fmt: skip
         tables: dict[str, Mapping[Any, Edges]] = {
             "edges": self.edges, "slopes": self.slopes, "bends": self.bends,
@@ -494,12 +500,19 @@ def read_edges(
     spread: dict[str, float] = {}
     nominal: dict[str, float] = {}
     known: dict[str, Any] = {}
+    units: dict[str, str] = {}
+    bounds: dict[str, tuple[float, float]] = {}
     if card is not None:
         try:
             told = json.loads(Path(card).read_text())
             spread = {k: float(v) for k, v in told["spread_1sigma"].items()}
             nominal = {k: float(v) for k, v in told.get("nominal", {}).items()}
             known = dict(told.get("card", {}))
+            units = {k: str(v) for k, v in told.get("units", {}).items()}
+            bounds = {
+                k: (float(low), float(high))
+                for k, (low, high) in told.get("bounds", {}).items()
+            }
             known |= {
                 name: nominal[key]
                 for name, key in (
@@ -522,6 +535,7 @@ def read_edges(
         str(path), edges, derivatives, spread, reference, nominal=nominal, card=known,
         held=held, slopes=slopes, bends=bends, level=level, warming=warming,
         temperature=to_kelvin(celsius), spots_bend=bool(text.get("spots_bend", False)),
+        units=units, bounds={k: v for k, v in bounds.items() if k in derivatives},
     )  # fmt: skip
 
 

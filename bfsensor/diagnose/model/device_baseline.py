@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from bfsensor.device.device import Device
-from bfsensor.device.parameters import change_parameter, device_parameters, parameter_value
+from bfsensor.device.parameters import change_parameter, device_parameters
+from bfsensor.device.quantities import quantities
 from bfsensor.diagnose.model.baseline import Baseline, Key
-from bfsensor.diagnose.model.cached_response import SPAN, Walk, walk
+from bfsensor.diagnose.model.cached_response import Walk, walk
+from bfsensor.diagnose.model.device_solver import BACKGROUNDS, COARSE, FINE, DeviceSolver
 from bfsensor.diagnose.model.table_baseline import WAVELENGTHS
 from bfsensor.errors import DeviceError, DiagnosisError
 from bfsensor.files import written_whole
@@ -22,13 +24,7 @@ from bfsensor.simulate.edge_field import front_plane
 from bfsensor.typing import Edges
 from bfsensor.units import to_celsius
 
-CELLS, FINE = 16, 32
-"""Mesh cells per pixel of solutions that give derivatives, and of the nominal device. Chosen: 32 is
-the mesh of the shipped tables; derivatives on 16 are right to 0.3 %
-(:class:`~bfsensor.fit.linear_response.Linearise`).  Twice as many cells take about three times as
-long."""
-
-TABLES = "nominal as shipped, derivatives linearised at 16 cells, at every back bias, with levels"
+TABLES = "derivatives on 16 cells at every back bias, by voltages too, in units of device files, levels"
 """Method of the shifts, part of the name of cached files: files of other methods are not read."""
 
 STEP = 1e-4
@@ -40,6 +36,15 @@ WARMER = 10.0
 """Temperature step for the derivative of shifts by temperature [K]. Chosen: twice as large doubles
 the error of curvature, for the difference is to one side; half as large doubles errors of the
 solutions."""
+
+VOLTAGES = {
+    "operating_point.back_bias": 5.0,
+    "operating_point.gate_high": 0.5,
+    "operating_point.gate_low": 0.5,
+}
+"""Voltages [V] that are candidates though no device file gives them an uncertainty, and their typical
+errors, from which fits begin.  Chosen, as in the fits of the a_ij of 2019: with twice the errors fits
+begin twice as far off."""
 
 PARTS = ("levels", "depths")
 """Parts of the physics that a baseline can be calculated without: change with level, and depths."""
@@ -66,7 +71,7 @@ def baseline_of_device(
         Dotted names of the parameters that are free in fits; ``('all',)`` for every quantity
         with an uncertainty in the device's file.
     back_biases : sequence of float
-        Back biases besides the device's own [V].
+        Back biases of the recordings [V]; without any, the device's own.
     lacks : sequence of str
         Parts of the physics that are left out, as simpler simulations do: 'levels', so that the
         response is the same at all levels; 'depths', so that all light converts at the back
@@ -113,10 +118,9 @@ def baseline_of_device(
                 "device's file"
             )
     own = float(device.operating_point.back_bias)
-    biases = [
-        own,
-        *(b for b in dict.fromkeys(map(float, back_biases)) if abs(b - own) > 0.5),
-    ]
+    # Readings of the device's own bias are its own: solutions are those of its shipped table.
+    given = [own if abs(b - own) <= 0.5 else float(b) for b in back_biases]
+    biases = sorted(dict.fromkeys(given or [own]), key=lambda b: abs(b - own))
     total, done = len(biases) * (1 + warming + bool(chosen)), 0
 
     def walked(changed: Device, cells: int, levels: Sequence[float] = (LEVEL,)) -> Walk:
@@ -128,7 +132,14 @@ def baseline_of_device(
         return found
 
     kelvin = device.operating_point.temperature
-    backgrounds = (LEVEL,) if "levels" in lacks else (LEVEL - SPAN, LEVEL, LEVEL + SPAN)
+    backgrounds = (LEVEL,) if "levels" in lacks else BACKGROUNDS
+    solver = DeviceSolver(
+        device.to_toml(), tuple(biases), WAVELENGTHS, "levels" not in lacks,
+        "depths" not in lacks, keep,
+    )  # fmt: skip
+    asked = [*chosen, *(n for n in VOLTAGES if n not in chosen)]
+    typical = {**VOLTAGES, **known}
+    per = {n: quantities(device)[n].number(1.0) for n in asked}
     colours = {w: None if "depths" in lacks else w for w in WAVELENGTHS}
     held: dict[Key, dict[str, Edges]] = {}
     edges: dict[Key, Edges] = {}
@@ -138,14 +149,14 @@ def baseline_of_device(
     for bias in biases:
         here = change_parameter(device, "operating_point.back_bias", bias - own)
         found = walked(here, cells, backgrounds)
-        slopes_of = _derivatives(here, {n: known[n] for n in chosen}) if chosen else None
+        slopes_of = _derivatives(here, {n: typical[n] for n in asked}) if chosen else None
         if slopes_of is not None:
             done += 1
             if progress is not None:
                 progress(done, total)
         if warming:
             hot = change_parameter(here, "operating_point.temperature", WARMER)
-            warm, cold = walked(hot, CELLS), walk(here, cells=CELLS, keep=keep)
+            warm, cold = walked(hot, COARSE), walk(here, cells=COARSE, keep=keep)
         for wavelength, colour in colours.items():
             key = wavelength, bias
             edges[key] = found.edges(colour, kelvin)
@@ -156,17 +167,24 @@ def baseline_of_device(
                 dkx, dky = mixed(
                     slopes_of.dkx, slopes_of.dky, slopes_of.depths, colour, kelvin
                 )
-                held[key] = dict(zip(chosen, zip(dkx, dky, strict=True), strict=True))
+                held[key] = {
+                    n: (x / per[n], y / per[n])
+                    for n, x, y in zip(asked, dkx, dky, strict=True)
+                }
             if warming:
                 warmer[key] = _slope(
                     warm.edges(colour, kelvin + WARMER), cold.edges(colour, kelvin), WARMER
                 )
-    reference = 620.0, own
+    reference = 620.0, biases[0]
+    nominal = {n: solver.nominal(n) for n in chosen}
+    ends = {n: solver.range(n) for n in chosen}
     return Baseline(
-        device.name, edges, held[reference], {n: known[n] for n in chosen}, reference,
-        nominal={n: parameter_value(device, n) for n in chosen}, held=held, slopes=slopes,
-        bends=bends, level=LEVEL if slopes else 0.0, spots_bend=bool(slopes), warming=warmer,
-        temperature=kelvin, card=_card(device),
+        device.name, edges, {n: held[reference][n] for n in chosen},
+        {n: known[n] * per[n] for n in chosen}, reference,
+        nominal=nominal, held=held, slopes=slopes, bends=bends, level=LEVEL if slopes else 0.0,
+        spots_bend=bool(slopes), warming=warmer, temperature=kelvin, card=_card(device),
+        units={n: solver.unit(n) for n in chosen}, solver=solver,
+        bounds={n: (low - nominal[n], high - nominal[n]) for n, (low, high) in ends.items()},
     )  # fmt: skip
 
 
@@ -183,7 +201,7 @@ def _derivatives(device: Device, spreads: Mapping[str, float]) -> EdgeResponse:
                 refused = str(error)
         else:
             raise DiagnosisError(f"{device.name}: {name!r} cannot be changed: {refused}")
-    return solve_response(device, cells=CELLS, changed=changed)
+    return solve_response(device, cells=COARSE, changed=changed)
 
 
 def _slope(up: Edges, down: Edges, apart: float) -> Edges:
@@ -235,6 +253,8 @@ def write_edges(baseline: Baseline, path: str | os.PathLike[str]) -> None:
         "temperature": to_celsius(baseline.temperature) if baseline.warming else None,
         "spread_1sigma": dict(baseline.spread),
         "nominal": dict(baseline.nominal),
+        "units": dict(baseline.units),
+        "bounds": {n: list(ends) for n, ends in baseline.bounds.items()},
         "card": dict(baseline.card),
     }  # fmt: skip
     with written_whole(Path(path), DiagnosisError) as beside:

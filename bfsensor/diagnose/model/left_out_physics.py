@@ -10,32 +10,41 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from bfsensor.device.device import Device
-from bfsensor.device.parameters import change_parameter
 from bfsensor.device.parts import Edge, EdgeStrip
 from bfsensor.diagnose.model.baseline import Baseline, Key
-from bfsensor.diagnose.model.cached_response import SPAN, Walk, walk
-from bfsensor.diagnose.model.device_baseline import FINE, WARMER
-from bfsensor.effects.family import EffectFamily
+from bfsensor.diagnose.model.cached_response import Walk, walk
+from bfsensor.diagnose.model.device_baseline import VOLTAGES, WARMER
+from bfsensor.diagnose.model.device_solver import (
+    BACKGROUNDS,
+    COARSE,
+    FINE,
+    PHASES,
+    DeviceSolver,
+    less,
+)
+from bfsensor.effects.changed_device import Moved, QuadraticTemplate, Quantity, Solution
+from bfsensor.effects.device_parameter import DeviceParameter
+from bfsensor.effects.effect import Parameter
+from bfsensor.effects.family import EffectFamily, TemplateFamily
 from bfsensor.effects.simulated_physics import (
     BentResponse,
     DiffusionWidths,
     DopingRings,
     EdgeFieldLeftOut,
     FieldDiffusion,
-    Moved,
     MovedEdges,
-    QuadraticTemplate,
     Rim,
     Rings,
+    SiliconPhysics,
     left_out,
     ring_parameters,
 )
-from bfsensor.errors import DeviceError
+from bfsensor.errors import ConvergenceError, DeviceError
 from bfsensor.response.edge_response import LEVEL
 from bfsensor.response.light import conversion_weights
 from bfsensor.simulate.edge_field import front_plane, solve_edge
@@ -44,23 +53,9 @@ from bfsensor.typing import Edges, FloatArray
 from bfsensor.units import VACUUM_PERMITTIVITY
 
 CELLS = FINE
-"""Mesh cells per pixel of the templates' solutions, those of the device's own. Measured (commit
-45435d9): with 16, templates of side diffusion and levels are off by more than 2 %, which an effect of
-70 standard deviations turns into a mismatch outside the library; with 8, the nearest areas are 5 to
-10 % off."""
-
-BACKGROUNDS = LEVEL - SPAN, LEVEL, LEVEL + SPAN
-"""Backgrounds of solutions whose change with level is needed [e-]."""
-
-HOLES = 3.0
-"""Rise of the quasi-Fermi level of the channel stops' holes at ``strength`` 1 [V]. Chosen: measured
-on the ITL device (commit 45435d9), holes leave the barrier gates and a_10 falls by 35 %; twice as
-large only halves the strength that is found, as long as the change is linear (at 5 V a_10 falls by 50
-%)."""
-
-SIDE = 1.1
-"""Side diffusion of the channel stops at ``strength`` 1 [um].  Fitted value of the shipped
-itl_sta3800c (its device.toml); twice as large only halves the strength that is found."""
+"""Mesh cells per pixel of templates with a strength. Measured (commit 45435d9): with 16, templates of
+levels are off by more than 2 %, which an effect of 70 standard deviations turns into a mismatch outside
+the library; with 8, the nearest areas are 5 to 10 % off."""
 
 RIPPLE = 0.01
 """Relative amplitude of the doping's ripple in the template of rings. Chosen: the displacements are
@@ -84,9 +79,44 @@ many change nothing."""
 if TYPE_CHECKING:
     from bfsensor.sensor.drift_field import Drift
 
-LEVEL_OF_HOLES = "operating_point.hole_quasi_fermi_level"
-SPREAD_OF_STOPS = "channel_stop.side_diffusion"
-"""Dotted names of the two quantities of a device that candidates change."""
+
+class Piece(NamedTuple):
+    """Physics of a quantity that devices may lack.
+
+    Attributes
+    ----------
+    variant : str
+        Name of the piece in reports.
+    quantity : str
+        Dotted name of the quantity.
+    step : float
+        Change [unit of device files] of the solution that candidates begin from.
+    source : str
+        Publication of the physics, and of the size of the step.
+    """
+
+    variant: str
+    quantity: str
+    step: float
+    source: str
+
+
+PIECES = (
+    Piece("free_holes", "operating_point.hole_quasi_fermi_level", 3.0,
+          "Free holes in channel stops: Lage, Bradshaw & Tyson 2017, section 3; 3 V make a_10 of "
+          "itl_sta3800c smaller by 35 %"),
+    Piece("stop_diffusion", "channel_stop.side_diffusion", 1.1,
+          "Implants of channel stops spread sideways: device file of itl_sta3800c, 1.1 um"),
+    Piece("oxide_charge", "channel.surface_charge", 2e11,
+          "Fixed charge at the interface of oxide and silicon, 1e10 to 1e12 a cm2: Sze & Ng 2007, "
+          "Physics of Semiconductor Devices, section 4.3.2"),
+)  # fmt: skip
+"""Pieces that a quantity of the device describes; twice the step doubles the first change that is
+solved for, and no fitted value, which is solved for again."""
+
+WIDEST = 5.0
+"""Largest plausible change of a quantity without a prior [steps of its piece].  Chosen: twice as large,
+evidence for the piece falls by a factor of two."""
 
 SOURCE = "Differences of simulated tables with and without: {}"
 """Source of a candidate, as printed in reports."""
@@ -105,103 +135,135 @@ def physics_left_out(
         From :func:`~bfsensor.diagnose.model.device_baseline.baseline_of_device`.  Templates are made at
         its conditions; physics that it includes (levels, depths) is no candidate.
     cells : int
-        Mesh cells per pixel.
+        Mesh cells per pixel of templates with a strength.
     keep : Path, optional
         Folder where solutions are cached.
 
     Returns
     -------
     tuple of type
-        Free holes, side diffusion of the stops, change with level and conversion depth (each where
-        the baseline lacks it), diffusion in the field, rings of the doping, field of the edge
-        (where the device allows it); for ``dataclasses.replace(baseline, pieces=...)``.
+        Quantities of :data:`PIECES`, and voltages, that are no parameters of the baseline, other
+        numbers of collecting gates, change with level and conversion depth (each where the
+        baseline lacks it), diffusion in the field, rings of the doping, field of the edge (where
+        the device allows it); for ``dataclasses.replace(baseline, pieces=...)``.
 
     Notes
     -----
-    Changes are linear in the strength, and exact at 1.  Diffusion widens spots; its smoothing of
+    Quantities are linear in their value until a diagnosis that names one solves the device there
+    (:mod:`bfsensor.diagnose.explain.solved_again`).  Diffusion widens spots; its smoothing of
     the shifts is left out.  Rings and edge need a depleted device.
     """
     plain = dataclasses.replace(
         device, edge=None, silicon=dataclasses.replace(device.silicon, ripples=())
     )
-    own = baseline.reference[1]
     kelvin = device.operating_point.temperature
-    colours = dict.fromkeys(w for w, _ in baseline.edges)
+    colours = list(dict.fromkeys(w for w, _ in baseline.edges))
+    biases = tuple(dict.fromkeys(b for _, b in baseline.edges))
     surface = len(colours) > 1 and all(
         np.array_equal(a, b)
-        for bias in dict.fromkeys(b for _, b in baseline.edges)
+        for bias in biases
         for a, b in zip(
             baseline.edges[min(colours), bias],
             baseline.edges[max(colours), bias],
             strict=True,
         )
     )
-    here = {
-        bias: change_parameter(plain, "operating_point.back_bias", bias - own)
-        for bias in dict.fromkeys(b for _, b in baseline.edges)
-    }
     seen = {w: None if surface else w for w in colours}
-
     bent = bool(baseline.slopes)
-
-    def walked(one: Device) -> Walk:
-        return walk(
-            one, cells=cells, backgrounds=BACKGROUNDS if bent else (LEVEL,), keep=keep
-        )
-
-    def changed(quantity: str, by: float) -> dict[float, Walk]:
-        return {b: walked(change_parameter(one, quantity, by)) for b, one in here.items()}
-
-    def differences(quantity: str, all_of_it: float) -> Moved:
-        """Differences of the shifts with a quantity raised, at every condition.
-
-        The quantity is lowered instead, and the sign changed, where the raised device is refused.
-        """
-        less = {b: walked(one) for b, one in here.items()}
-        sign = 1.0
-        try:
-            more = changed(quantity, all_of_it)
-        except DeviceError:
-            sign, more = -1.0, changed(quantity, -all_of_it)
-        edges: list[tuple[Key, Edges]] = []
-        levels: list[tuple[Key, tuple[Edges, Edges]]] = []
-        for bias in here:
-            for w, colour in seen.items():
-                (new, high), (old, low) = (
-                    (d[bias].edges(colour, kelvin), _bent(d[bias], colour, kelvin))
-                    for d in (more, less)
-                )
-                edges.append(((w, bias), _less(new, old, sign)))
-                if high is not None and low is not None:
-                    both = _less(high[0], low[0], sign), _less(high[1], low[1], sign)
-                    levels.append(((w, bias), both))
-        return Moved(tuple(edges), bent=_as_bent(levels))
-
-    found: list[EffectFamily] = [
-        left_out(
-            MovedEdges, "free_holes", "", differences(LEVEL_OF_HOLES, HOLES),
-            SOURCE.format(f"quasi-Fermi level of the stops' holes {HOLES:g} V higher"),
-        ),
-        left_out(
-            MovedEdges, "stop_diffusion", "", differences(SPREAD_OF_STOPS, SIDE),
-            SOURCE.format(f"side diffusion of the channel stops {SIDE:g} um more"),
-        ),
-    ]  # fmt: skip
-    if not baseline.slopes:
+    solver = DeviceSolver(plain.to_toml(), biases, tuple(colours), bent, not surface, keep)
+    here = {bias: solver.device_at(PHASES, solver.nominal(PHASES), bias) for bias in biases}
+    found = [
+        made
+        for piece in PIECES
+        if piece.quantity not in baseline.parameters
+        for made in [_changed(solver, piece, min(cells, COARSE))]
+        if made is not None
+    ]
+    found += _voltages(solver, baseline)
+    found += _phases(solver)
+    if not bent:
         found.append(_levels(here, seen, kelvin, cells, keep))
     if surface:
-        found.append(_depths(here, list(colours), kelvin, cells, keep, bent))
+        found.append(_depths(here, colours, kelvin, cells, keep, bent))
     drifts = {bias: _drift(one) for bias, one in here.items()}
-    found.append(_diffusion(drifts, list(colours), device))
-    found.append(_rings(drifts, list(colours), plain))
+    found.append(_diffusion(drifts, colours, device))
+    found.append(_rings(drifts, colours, plain))
     # Devices that the solver of the edge's field refuses have no such candidate.
     with contextlib.suppress(DeviceError):
-        found.append(_rim(device, here, list(colours)))
+        found.append(_rim(device, here, colours))
     return tuple(found)
 
 
-def _less(new: Edges, old: Edges, sign: float = 1.0) -> Edges:
-    return sign * (new[0] - old[0]), sign * (new[1] - old[1])
+def _changed(solver: DeviceSolver, piece: Piece, cells: int) -> EffectFamily | None:
+    """Candidate for a quantity without a prior; None for a device that cannot have it changed."""
+    nominal, (low, high) = solver.nominal(piece.quantity), solver.range(piece.quantity)
+    for value in (nominal + piece.step, nominal - piece.step):
+        try:
+            moved = solver.moved(piece.quantity, value, cells=cells)
+        except (DeviceError, ConvergenceError):
+            continue
+        wide = WIDEST * piece.step
+        ends = max(low, nominal - wide), min(high, nominal + wide)
+        return _family(solver, piece, Solution(value, moved), ends)
+    return None
+
+
+def _voltages(solver: DeviceSolver, baseline: Baseline) -> list[EffectFamily]:
+    """Candidates for voltages other than the device file states, by the baseline's derivatives."""
+    found: list[EffectFamily] = []
+    for name, typical in VOLTAGES.items():
+        if name in baseline.parameters or name not in baseline.held.get(
+            baseline.reference, {}
+        ):
+            continue
+        slopes = tuple((key, baseline.derivative(name, key)) for key in baseline.edges)
+        nominal, (low, high) = solver.nominal(name), solver.range(name)
+        ends = max(low, nominal - WIDEST * typical), min(high, nominal + WIDEST * typical)
+        value = Parameter(
+            name,
+            "V",
+            *ends,
+            neutral=nominal,
+            law="flat",
+            signed=True,
+            amplitude=True,
+            ends=ends,
+        )
+        found.append(TemplateFamily(
+            SiliconPhysics, DeviceParameter.word, name, Quantity(name, nominal, typical, slopes),
+            DeviceParameter.source, (value,),
+        ))  # fmt: skip
+    return found
+
+
+def _phases(solver: DeviceSolver) -> list[EffectFamily]:
+    """Candidates for charge that is stored under one gate fewer or more, a part of the time."""
+    nominal, (low, high) = solver.nominal(PHASES), solver.range(PHASES)
+    found: list[EffectFamily] = []
+    for variant, value in (("fewer_gates", nominal - 1), ("more_gates", nominal + 1)):
+        if not low <= value <= high:
+            continue
+        piece = Piece(variant, PHASES, 1.0, SOURCE.format(f"{value:g} collecting gates"))
+        with contextlib.suppress(DeviceError, ConvergenceError):
+            moved = solver.moved(PHASES, value)
+            ends = min(value, nominal), max(value, nominal)
+            found.append(_family(solver, piece, Solution(value, moved), ends))
+    return found
+
+
+def _family(
+    solver: DeviceSolver, piece: Piece, solved: Solution, ends: tuple[float, float]
+) -> EffectFamily:
+    """Family of effects by the value of a quantity, linear between nominal and solved value."""
+    nominal = solver.nominal(piece.quantity)
+    template = Quantity(piece.quantity, nominal, abs(solved.value - nominal), (), solved)
+    value = Parameter(
+        piece.quantity, solver.unit(piece.quantity), *ends, neutral=nominal, law="flat",
+        signed=True, amplitude=True, ends=ends,
+    )  # fmt: skip
+    return TemplateFamily(
+        SiliconPhysics, SiliconPhysics.word, piece.variant, template, piece.source, (value,)
+    )
 
 
 def _bent(walked: Walk, colour: float | None, kelvin: float) -> tuple[Edges, Edges] | None:
@@ -251,15 +313,15 @@ def _depths(
         top, above = walked.edges(None, kelvin), _bent(walked, None, kelvin)
         for w in colours:
             now, hot = walked.edges(w, kelvin), walked.edges(w, kelvin + WARMER)
-            edges.append(((w, bias), _less(now, top)))
-            warming.append(((w, bias), _less(hot, now, 1 / WARMER)))
+            edges.append(((w, bias), less(now, top)))
+            warming.append(((w, bias), less(hot, now, 1 / WARMER)))
             there = _bent(walked, w, kelvin)
             if there is not None and above is not None:
-                both = _less(there[0], above[0]), _less(there[1], above[1])
+                both = less(there[0], above[0]), less(there[1], above[1])
                 levels.append(((w, bias), both))
-    told = Moved(tuple(edges), tuple(warming), kelvin, _as_bent(levels))
+    template = Moved(tuple(edges), tuple(warming), kelvin, _as_bent(levels))
     return left_out(
-        MovedEdges, "bf_chromatic", "simulated", told,
+        MovedEdges, "bf_chromatic", "simulated", template,
         SOURCE.format("light converts where it is absorbed, not at the back surface"),
     )  # fmt: skip
 

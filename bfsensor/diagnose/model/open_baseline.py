@@ -15,6 +15,7 @@ from bfsensor.diagnose.data.exposure_info import LAMP_ERROR
 from bfsensor.diagnose.data.reduced_channels import StatedTable
 from bfsensor.diagnose.model.baseline import Baseline, read_edges
 from bfsensor.diagnose.model.device_baseline import TABLES, baseline_of_device, write_edges
+from bfsensor.diagnose.model.device_solver import DeviceSolver
 from bfsensor.diagnose.model.free_baseline import free_baseline
 from bfsensor.diagnose.model.left_out_physics import physics_left_out
 from bfsensor.diagnose.model.table_baseline import baseline_of_table
@@ -289,7 +290,7 @@ def find_baseline(
 def simulate_baseline(
     given: str | os.PathLike[str] | None,
     parameters: Sequence[str],
-    back_biases: Sequence[float],
+    back_biases: Sequence[float | None],
     *,
     keep: Path,
     warming: bool = False,
@@ -303,8 +304,8 @@ def simulate_baseline(
         Name of a built-in device, or a device file.
     parameters : sequence of str
         Dotted names of the free parameters; ('all',) for all with an uncertainty.
-    back_biases : sequence of float
-        Back biases of the recordings [V].
+    back_biases : sequence of float or None
+        Back biases of the recordings [V]; None: the device's own.
     keep : Path
         Folder where the shifts are cached as ``baseline_KEY.json``.
     warming : bool
@@ -339,6 +340,8 @@ def simulate_baseline(
         raise DiagnosisError(
             f"free parameters need a device as baseline: {error}"
         ) from None
+    own = device.operating_point.back_bias
+    back_biases = sorted({own if b is None else float(b) for b in back_biases})
     text = "\n".join([
         TABLES, device.to_toml(), *parameters, *(f"{b:g}" for b in back_biases), *["warming"] * warming,
     ])  # fmt: skip
@@ -349,11 +352,17 @@ def simulate_baseline(
             parameters=parameters,
             back_biases=back_biases,
             warming=warming,
+            keep=keep / "solutions",
             progress=progress,
         )
         keep.mkdir(parents=True, exist_ok=True)
         write_edges(baseline, path)
-    return read_edges(path, card=path)
+    found = read_edges(path, card=path)
+    solver = DeviceSolver(
+        device.to_toml(), tuple(dict.fromkeys(b for _, b in found.edges)),
+        tuple(dict.fromkeys(w for w, _ in found.edges)), bool(found.slopes), True, keep / "solutions",
+    )  # fmt: skip
+    return replace(found, solver=solver)
 
 
 def with_physics(
@@ -372,3 +381,28 @@ def with_physics(
     """
     pieces = physics_left_out(Device.load(given), baseline, keep=keep)
     return replace(baseline, pieces=pieces)
+
+
+def reduced_states(
+    recording: CovarianceTable | Sequence[StatedTable],
+) -> list[tuple[float | None, float | None]]:
+    """Back biases [V] and temperatures [K] of reduced recordings; None where they are not stated."""
+    if isinstance(recording, CovarianceTable):
+        biases = np.unique(recording.back_bias)
+        return [(float(b) if np.isfinite(b) else None, None) for b in biases]
+    return [(t.condition.back_bias, t.condition.temperature) for t in recording]
+
+
+def asked_of(baseline: Baseline) -> str:
+    """Sentence on the quantities of a device, and the physics, that a diagnosis compares.
+
+    Parameters
+    ----------
+    baseline : Baseline
+        From :func:`simulate_baseline`, with or without :func:`with_physics`.
+    """
+    pieces = [f"{k.word} {k.variant}".strip().replace("_", " ") for k in baseline.pieces]
+    text = f"fitted within their stated uncertainties: {', '.join(baseline.parameters)}"
+    if pieces:
+        text += f"; sought besides the library of effects: {', '.join(pieces)}"
+    return text

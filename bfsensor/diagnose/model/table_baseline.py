@@ -175,6 +175,7 @@ def with_operating_point(
         derivatives={BACK_BIAS: change},
         spread={BACK_BIAS: spread},
         nominal={BACK_BIAS: one.reference[1]},
+        units={BACK_BIAS: "V"},
     )
 
 

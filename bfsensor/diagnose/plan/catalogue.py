@@ -121,7 +121,7 @@ def _clouds(effect: Effect, layout: Layout, noise: float) -> float:
 IN_PIXEL = {
     **dict.fromkeys(
         ("charge_loss", "bf_nonlinear", "bf_chromatic", "bf_anisotropy", "bf_long_range",
-         "device_parameter", "voltage_dependence"), 0.5
+         "device_parameter", "silicon_physics", "voltage_dependence"), 0.5
     ),
     "saturation": 0.0,
 }  # fmt: skip

@@ -57,6 +57,7 @@ NEEDS: Mapping[str, Need] = {
     "bf_anisotropy": Need(("flat_cov", "spot"), _PAIRS),
     "bf_long_range": Need(("flat_cov",), _PAIRS),
     "device_parameter": Need(("flat_cov", "spot"), _PAIRS),
+    "silicon_physics": Need(("flat_cov", "spot"), _PAIRS),
     "voltage_dependence": Need(("flat_cov", "spot"), "pairs of flats at a second back bias",
                                vary="back_bias"),
     "lateral_diffusion": Need(("spot",), "spots at a second back bias, wavelength or temperature"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from bfsensor.device.quantities import describe
 from bfsensor.diagnose.detect.locate import ALARM
 from bfsensor.diagnose.explain.attribution import Attribution, Found
 from bfsensor.diagnose.model.exchanged_axes import AxesExchanged, says_exchanged
@@ -12,12 +13,15 @@ from bfsensor.diagnose.report.class_words import (
     LAW_WORDS,
     NAMES,
     PARAMETER_WORDS,
+    PIECE_WORDS,
     said_family_p,
     said_interval,
     said_p,
     said_value,
 )
 from bfsensor.diagnose.report.nonparametric_words import reported_freely, said_freely
+from bfsensor.effects.changed_device import ChangedDevice
+from bfsensor.effects.device_parameter import UNKNOWN_UNIT
 from bfsensor.effects.effect import Effect
 
 OUTSIDE = "outside_library"
@@ -51,6 +55,11 @@ def _effect(found: Found) -> dict[str, Any]:
     told: dict[str, Any] = {"class": found.effect.word, "parameters": found.intervals()}
     if found.effect.variant:
         told["variant"] = found.effect.variant
+    if isinstance(found.effect, ChangedDevice):
+        (known,) = found.effect.parameters
+        told["parameters"][known.name] |= {"unit": known.unit, "nominal": known.neutral}
+    if found.effect.variant in PIECE_WORDS:
+        told["piece"] = found.effect.variant
     law = law_of(found.effect)
     if law is not None:
         told["law"] = law[0]
@@ -112,6 +121,9 @@ def law_of(effect: Effect) -> tuple[str, str] | None:
     if effect.name in LAW_WORDS:
         name, said = LAW_WORDS[effect.name]
         return name, f"here {said}"
+    if isinstance(effect, ChangedDevice):
+        piece = PIECE_WORDS.get(effect.variant)
+        return effect.variant, describe(effect.template.name) if piece is None else piece
     if effect.law_name:
         return effect.law_name, f"law: {effect.law_name.replace('_', ' ')}"
     return None
@@ -128,12 +140,12 @@ def _said_effect(found: Found, verb: str) -> str:
         if name not in found.errors and told["value"] == plain[name]:
             # It was searched, and the plain law is the best.
             continue
-        # A device's own quantities are in the unit of its file, which the effect does not know.
-        unit = f" {units[name]}" if units[name] and name in words else ""
+        unit = f" {units[name]}" if units[name] and units[name] != UNKNOWN_UNIT else ""
+        spoken = describe(name) if isinstance(found.effect, ChangedDevice) else name
         interval = said_interval(told, "68")
         interval = f"68 %: {interval}" if name in found.errors else interval
         values.append(
-            f"{words.get(name, name)} = {said_value(word, name, told['value'])}{unit} ({interval})"
+            f"{words.get(name, spoken)} = {said_value(word, name, told['value'])}{unit} ({interval})"
         )
     meaning = CLASS_WORDS.get(word, word)
     law = law_of(found.effect)

@@ -48,11 +48,19 @@ CLASS_WORDS = {
     "psf_wings": "spots have an extended halo",
     "cosmic_rays": "tracks of charged particles",
     "illumination_turbulence": "the illumination changes from frame to frame",
-    "free_holes": "holes move in the channel stops and under the barrier gates",
-    "stop_diffusion": "implants of the channel stops spread sideways",
+    "silicon_physics": "physics of the silicon that the simulated device lacks",
     "outside_library": "none of the effects in the library",
 }
 """Plain words for each class of effects of report.json."""
+
+PIECE_WORDS = {
+    "free_holes": "holes in the channel stops and under the barrier gates follow the potential",
+    "stop_diffusion": "implants of the channel stops spread sideways",
+    "oxide_charge": "charge is fixed at the interface of oxide and silicon",
+    "fewer_gates": "charge is stored under fewer gates, always or a part of the time",
+    "more_gates": "charge is stored under more gates, always or a part of the time",
+}
+"""Plain words for each piece of physics of the class silicon_physics."""
 
 LAW_WORDS = {
     "adc_bits": ("bit_weight", "the bit has a wrong weight"),

@@ -7,9 +7,12 @@ from collections.abc import Mapping
 from string import Formatter
 from typing import Any
 
+from bfsensor.device.quantities import describe
 from bfsensor.diagnose.detect.model_error import SAME
 from bfsensor.diagnose.explain.attribution import Attribution, Found
-from bfsensor.diagnose.report.class_words import CLASS_WORDS
+from bfsensor.diagnose.report.class_words import CLASS_WORDS, PIECE_WORDS
+from bfsensor.effects.changed_device import ChangedDevice
+from bfsensor.effects.device_parameter import UNKNOWN_UNIT
 
 VAGUE = 1000.0
 """Error of a value, over the value, above which it is not constrained.  Chosen: the recordings then say
@@ -169,8 +172,12 @@ def headline(found: Found) -> str:
         values["amp"] = f"{found.effect['amp'] + 1:g}"
     if word == "mask_stitch":
         values["along"] = "rows" if found.effect.values.get("along") else "columns"
-    if word == "device_parameter":
-        return " and ".join(f"{n} of the device is {v}" for n, v in values.items())
+    if isinstance(found.effect, ChangedDevice):
+        (name, value), (known,) = next(iter(values.items())), found.effect.parameters
+        unit = "" if known.unit == UNKNOWN_UNIT else f" {known.unit}"
+        text = f"{describe(name)} of the device is {value}{unit}, nominally {known.neutral:.4g}{unit}"
+        piece = PIECE_WORDS.get(found.effect.variant, "")
+        return f"{piece}: {text}" if piece else text
     for text in HEADLINES.get(word, ()):
         if {name for _, name, _, _ in Formatter().parse(text) if name} <= set(values):
             return text.format(**values)

@@ -225,7 +225,8 @@ def test_a_rival_whose_joint_fit_scores_worse_is_behind_and_one_without_a_fit_is
     worse = rival(GainNonlinearity, {"c2": -5e-3, "c3": -8e-4}, 9e4, 4e4, [0, 1])
     lost = rival(InterpixelCoupling, {"ax": 1e-3, "ay": 1e-3}, 8e4, 3e4, [0, 1])
 
-    def exchange(effect):
+    def exchange(effect, model):
+        assert model is None
         if effect is lost.effect:
             raise ConvergenceError("no fit")
         return SimpleNamespace(score=1100.0)

@@ -57,7 +57,7 @@ def test_the_other_operating_point_is_named_with_its_back_bias(seed):
     # Backgrounds act a little otherwise at the two: a volt of the line between them.
     assert abs(one.effect[BACK_BIAS] + 70.0) < 4 * one.errors[BACK_BIAS] + 1.0
     assert len(found.attribution.found) == 1
-    assert f"{BACK_BIAS} = {one.effect[BACK_BIAS]:.3g}" in found.said()
+    assert f"back bias = {one.effect[BACK_BIAS]:.3g}" in found.said()
     # Recorded at the nominal back bias there is nothing to name.
     table = recorded("e2v_ccd250", seed=seed)
     found = diagnose_measured(measure_reduced(table, reach=4), baseline)
@@ -139,7 +139,7 @@ def test_the_command_line_lets_the_operating_point_move(tmp_path):
     given = ["diagnose", str(path), "--baseline", "e2v_ccd250", "-o", str(tmp_path / "out")]
     done = CliRunner().invoke(main, [*given, "--towards", "e2v_ccd250_70"])
     assert done.exit_code == 0
-    assert "operating_point.back_bias = -7" in done.stdout
+    assert "back bias = -7" in done.stdout
     other = CliRunner().invoke(main, [*given, "--towards", "itl_sta3800c"])
     assert other.exit_code == 1
     assert "are not of one device at two operating points" in other.stderr

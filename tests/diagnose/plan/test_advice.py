@@ -228,14 +228,14 @@ def test_recordings_cover_what_the_design_names(tied):
     names = [r.name for r in made]
     assert len(set(names)) == len(names) and set(RULES) <= set(names)
     assert all(r.exposures > 0 for r in made if not r.again)
-    known = {*KNOWN, "outside_library"}
+    known = {*KNOWN, "silicon_physics", "outside_library"}
     for rule in RULES.values():
         assert set(rule.keeps) <= known and rule.why and rule.source
 
 
 def test_what_cannot_be_seen_is_told(tied):
     measured = tied.predictor.measured
-    assert set(NEEDS) == set(KNOWN)
+    assert set(NEEDS) == {*KNOWN, "silicon_physics"}
     assert find_untested(measured) == ALWAYS
     kept = tuple(c for c in measured.channels if c.word not in ("serial_overscan", "spot"))
     less = replace(measured, channels=kept, lamp_known=False)

@@ -256,8 +256,8 @@ def test_classes_that_were_not_tested_are_listed(explained, tmp_path):
 
 
 def test_classes_have_plain_words():
-    # Parts of the simulated physics are classes of their own.
-    assert set(CLASS_WORDS) == {*EFFECTS, "free_holes", "stop_diffusion"}
+    # Physics of the silicon is sought with a device, not by the library.
+    assert set(CLASS_WORDS) == {*EFFECTS, "silicon_physics"}
 
 
 def test_figures_of_the_summary_draw_what_they_are_given():

@@ -9,6 +9,7 @@ import pytest
 from bfsensor import Device
 from bfsensor.device.condition import Condition
 from bfsensor.device.parameters import change_parameter, device_parameters
+from bfsensor.device.quantities import quantities
 from bfsensor.diagnose.model import device_baseline
 from bfsensor.diagnose.model.baseline import Baseline, read_edges
 from bfsensor.diagnose.model.cached_response import Walk
@@ -26,10 +27,14 @@ HERE = Condition(wavelength=620.0, back_bias=-50.0)
 @pytest.mark.slow
 def test_a_changed_parameter_is_predicted(tmp_path):
     device = Device.load("itl_sta3800c")
-    kept = simulate_baseline("itl_sta3800c", ["silicon.thickness"], [-60.0], keep=tmp_path)
+    kept = simulate_baseline(
+        "itl_sta3800c", ["silicon.thickness"], [-50.0, -60.0], keep=tmp_path
+    )
     (path,) = tmp_path.glob("baseline_*.json")
     before = path.stat().st_mtime_ns
-    again = simulate_baseline("itl_sta3800c", ["silicon.thickness"], [-60.0], keep=tmp_path)
+    again = simulate_baseline(
+        "itl_sta3800c", ["silicon.thickness"], [-50.0, -60.0], keep=tmp_path
+    )
     assert path.stat().st_mtime_ns == before
     for one, other in zip(kept.at(HERE)[0], again.at(HERE)[0], strict=True):
         np.testing.assert_array_equal(one, other)
@@ -157,11 +162,11 @@ def test_derivatives_at_every_back_bias_against_full_solutions():
     names = ["silicon.background_doping", "silicon.thickness"]
     there, key = Condition(wavelength=620.0, back_bias=-40.0), (620.0, -40.0)
     kept = baseline_of_device(
-        device, parameters=names, back_biases=[-40.0], lacks=["levels"], cells=16
+        device, parameters=names, back_biases=[-50.0, -40.0], lacks=["levels"], cells=16
     )
     for name in names:
         by = (0.2 if "doping" in name else 0.5) * kept.spread[name]
-        off = change_parameter(device, name, by)
+        off = change_parameter(device, name, by / quantities(device)[name].number(1.0))
         off = change_parameter(off, "operating_point.back_bias", 10.0)
         at = baseline_of_device(off, lacks=["levels"], cells=16)
         plain = area_matrix(*kept.at(there)[0])

@@ -80,10 +80,21 @@ def test_our_device_off_its_card_is_found(tmp_path: Path) -> None:
     table = Table([i, j, drawn.a.ravel(), drawn.errors.ravel()], names=columns)
     table.write(path, format="ascii.csv")
     said = {}
-    for word, more in (("floating", ["--float", name]), ("held", [])):
+    for word, more in (("floating", ["--float", name]), ("held", ["--no-device"])):
         out = tmp_path / word
         run = CliRunner().invoke(
-            main, ["diagnose", str(path), "--baseline", device, *more, "-o", str(out)]
+            main,
+            [
+                "diagnose",
+                str(path),
+                "--baseline",
+                device,
+                "--at",
+                "level=40000",
+                *more,
+                "-o",
+                str(out),
+            ],
         )
         assert run.exit_code == 0, run.output
         said[word] = json.loads((out / "report.json").read_text())

@@ -1,0 +1,150 @@
+"""Quantities of a device are solved at their fitted values, and fitted again."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bfsensor import Device
+from bfsensor.diagnose.data.channels import PER_ELECTRON
+from bfsensor.diagnose.explain.solved_again import MOST_SOLVED, Resolver
+from bfsensor.diagnose.model.device_solver import PHASES, DeviceSolver
+from bfsensor.effects.changed_device import Moved, Quantity, Solution
+from bfsensor.effects.device_parameter import device_parameters
+from bfsensor.effects.effect import Layout, Parameter, Shot
+from bfsensor.effects.family import TemplateFamily
+from bfsensor.effects.simulated_physics import SiliconPhysics
+from bfsensor.errors import DeviceError
+
+KEY = (620.0, -50.0)
+SHOT = Shot("flat", 0, 1.0, *KEY, 173.15)
+LAYOUT = Layout((8, 8), ())
+NOMINAL, TRUTH = 2.0, 5.0
+
+
+def shape(size):
+    k = np.zeros((3, 3))
+    k[1, 1] = size
+    return k, k.T
+
+
+def response(value):
+    """A shift that saturates with the quantity, as no straight line does."""
+    return 1e-6 * np.tanh((value - NOMINAL) / 4.0)
+
+
+def family(**solved):
+    (made,) = device_parameters(
+        {"silicon.thickness": {KEY: shape(1e-6 / 4.0)}}, {"silicon.thickness": 0.5},
+        {"silicon.thickness": NOMINAL}, units={"silicon.thickness": "um"},
+        bounds={"silicon.thickness": (-1.5, 8.0)},
+    )  # fmt: skip
+    return replace(made, template=made.template._replace(**solved))
+
+
+class Solver:
+    def __init__(self, refuses=np.inf):
+        self.asked, self.refuses = [], refuses
+
+    def moved(self, name, value, *, cells, levels):
+        self.asked.append((value, cells, levels))
+        if value > self.refuses:
+            raise DeviceError("not depleted")
+        return Moved(((KEY, shape(response(value))),))
+
+
+class Fit:
+    """Model of one number, the shift that was measured, which the effect is fitted to."""
+
+    def __init__(self, effects):
+        channel = SimpleNamespace(
+            word="flat_cov", unit=PER_ELECTRON, axes={"level": np.array([4e4, 4e4])}
+        )
+        self.fit = SimpleNamespace(channels=[channel])
+        self.effects = [self._fitted(effects[0])]
+
+    def _fitted(self, effect):
+        values = np.linspace(*effect.parameters[0].ends, 20001)
+        (name,) = effect.values
+        got = np.array([shift(effect.with_values(**{name: v})) for v in values])
+        best = values[np.argmin(abs(got - response(TRUTH)))]
+        return effect.with_values(**{name: float(best)})
+
+    def with_effects(self, effects):
+        return Fit(effects)
+
+
+def shift(effect):
+    return effect.edges(*shape(0.0), SHOT, LAYOUT)[0][1, 1]
+
+
+def test_a_template_is_that_of_the_derivative_and_of_the_solution():
+    solved = Solution(6.0, Moved(((KEY, shape(response(6.0))),)))
+    kind = family(solved=solved)
+    assert shift(kind({"silicon.thickness": 6.0})) == pytest.approx(response(6.0))
+    near = shift(kind({"silicon.thickness": NOMINAL + 1e-4}))
+    assert near == pytest.approx(1e-4 * 1e-6 / 4.0, rel=1e-3)
+    assert shift(kind({"silicon.thickness": NOMINAL})) == 0.0
+    # Without a derivative it is the straight line.
+    line = family(solved=solved, slopes=())
+    assert shift(line({"silicon.thickness": 4.0})) == pytest.approx(0.5 * response(6.0))
+
+
+def test_the_fitted_value_is_that_of_the_solved_device():
+    solver = Solver()
+    linear = Fit([family()({"silicon.thickness": 3.0})])
+    wrong = linear.effects[0]["silicon.thickness"]
+    assert wrong == pytest.approx(NOMINAL + 4.0 * np.tanh(0.75), abs=1e-3)
+    found = Resolver(solver).model(linear, 0).effects[0]
+    assert found["silicon.thickness"] == pytest.approx(TRUTH, abs=0.02)
+    assert 1 < len(solver.asked) <= MOST_SOLVED
+    # The last solution is on the mesh of the baseline.
+    again = Resolver(solver).settled(Fit([found])).effects[0]
+    assert solver.asked[-1][1:] == (32, False)
+    assert again["silicon.thickness"] == pytest.approx(TRUTH, abs=0.02)
+
+
+def test_what_has_no_solution_is_taken_by_its_derivative_and_noted():
+    resolver = Resolver(Solver(refuses=3.0))
+    linear = Fit([family()({"silicon.thickness": 3.0})])
+    assert resolver.model(linear, 0) is linear
+    (note,) = resolver.notes
+    assert "device_parameter:silicon.thickness: not solved at 4.5" in note
+
+
+def test_nothing_is_solved_without_a_device_or_between_numbers_of_gates():
+    linear = Fit([family()({"silicon.thickness": 3.0})])
+    assert Resolver(None).model(linear, 0) is linear
+    gates = Parameter(PHASES, "gates", 1.0, 2.0, neutral=2.0, law="flat", signed=True,
+                      amplitude=True, ends=(1.0, 2.0))  # fmt: skip
+    template = Quantity(PHASES, 2.0, 1.0, (), Solution(1.0, Moved(((KEY, shape(1e-7)),))))
+    kind = TemplateFamily(
+        SiliconPhysics, "silicon_physics", "fewer_gates", template, "", (gates,)
+    )
+    assert not Resolver(Solver()).acts(kind({PHASES: 1.5}))
+    assert shift(kind({PHASES: 1.5})) == pytest.approx(0.5e-7)
+
+
+def test_values_beyond_what_a_device_can_have_are_not_fitted():
+    kind = family()
+    assert kind.parameters[0].widest == (NOMINAL - 1.5, NOMINAL + 8.0)
+    assert [s["silicon.thickness"] for s in kind.starts(LAYOUT)] == pytest.approx(
+        [NOMINAL + 0.5 * 48**0.5, NOMINAL - 1.5]
+    )
+
+
+def test_a_solver_states_values_in_units_of_device_files():
+    device = Device.load("itl_sta3800c")
+    solver = DeviceSolver(device.to_toml(), (-50.0,), (620.0,), True, True)
+    name = "channel_stop.implant[0].dose"
+    assert solver.unit(name) == "cm-2" and solver.nominal(name) < -1e11
+    less = solver.device_at(name, 0.5 * solver.nominal(name), -60.0)
+    assert less.operating_point.back_bias == -60.0
+    assert less.channel_stop.implants[0].dose == pytest.approx(
+        0.5 * device.channel_stop.implants[0].dose
+    )
+    assert solver.device_at(PHASES, 1.0, -50.0).gates.collecting_phases == 1
+    # Acceptors cannot become donors, nor a stop have a negative diffusion.
+    assert solver.range(name)[1] == 0.0
+    assert solver.range("channel_stop.side_diffusion")[0] == 0.0

@@ -1,0 +1,1 @@
+"""Silicon physics that a simulated device lacks, concealed by engines other than the predictor's."""

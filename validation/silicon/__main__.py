@@ -1,0 +1,328 @@
+"""Conceal silicon physics in tables of a_ij, diagnose them by the command, and score what it says.
+
+``python -m validation.silicon make FOLDER --truths SEALED --count 24 --nulls 12 --seed 1`` draws devices
+with the scatter of the file of ``--device`` and writes a folder a case: a table of a_ij for each of two
+back biases and two wavelengths.  Truths go to SEALED, and their SHA-256 to FOLDER/commitment.json.
+``run FOLDER REPORTS`` diagnoses each by ``bfsensor diagnose`` with the device's file as baseline.
+``open FOLDER REPORTS SEALED --set NAME`` scores them into ``validation/results/silicon_cases.ecsv``.
+
+Cases: one change of a quantity, a third of them two, a fifth a change that no piece describes; sizes are
+log-uniform from 0.5 to 15 typical changes; the engines are those of :mod:`validation.silicon.truths`.
+Projected SNR: length of the change in errors after all quantities with an uncertainty have
+adapted within their priors, linearly.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from astropy.table import Table, vstack
+from numpy.typing import NDArray
+
+from bfsensor.device.device import Device
+from bfsensor.device.parameters import change_parameter, device_parameters, parameter_value
+from bfsensor.device.quantities import quantities
+from bfsensor.errors import BFSensorError
+from validation.common.run_header import commit_here
+from validation.common.write_results import write_results
+from validation.silicon.truths import (
+    BLUR,
+    DOTS,
+    GATES,
+    IMAGE_CHARGE,
+    areas,
+    blurred,
+    by_image_charges,
+    changed,
+    noise_matrix,
+)
+
+RESULTS = Path(__file__).parents[1] / "results" / "silicon_cases.ecsv"
+COMMAND = "python -m validation.silicon open FOLDER REPORTS SEALED"
+WAVELENGTHS = (620.0, 950.0)
+SMALLEST, LARGEST = 0.5, 15.0
+"""Range of the sizes of changes [typical changes].  Chosen: from invisible to far beyond the prior."""
+VOLTS = {"operating_point.back_bias": 1.0, "operating_point.gate_high": 0.3}
+"""Typical changes of voltages [V], of which device files state no uncertainty."""
+OUTSIDE = {DOTS: -100.0, BLUR: 2e-5}
+"""Typical changes that no piece describes: dose of dots [e/um2], share of charge that moves."""
+
+
+def draw_case(rng: np.random.Generator, device: Device, null: bool) -> dict[str, Any]:
+    """Draw the device's scatter and the concealed changes; sizes in internal units."""
+    known = device_parameters(device)
+    scatter = {
+        k: float(np.clip(rng.standard_normal(), -2, 2)) * s for k, s in known.items()
+    }
+    if null:
+        return {"scatter": scatter, "change": {}, "engine": "poisson", "outside": False}
+    outside = rng.random() < 0.2
+    typical = dict(OUTSIDE) if outside else {**known, **VOLTS, GATES: 1.0}
+    engine = "poisson"
+    if not outside and rng.random() < 0.5:
+        engine = "image charge"
+        typical = {k: v for k, v in typical.items() if k in IMAGE_CHARGE}
+    number = 2 if not outside and rng.random() < 1 / 3 else 1
+    names = rng.choice(sorted(typical), size=number, replace=False)
+    change = {}
+    for name in names:
+        size = np.exp(rng.uniform(np.log(SMALLEST), np.log(LARGEST)))
+        sign = 1.0 if name in OUTSIDE else rng.choice([-1.0, 1.0])
+        change[str(name)] = float(sign * size * typical[name])
+        if name == GATES:
+            change[GATES] = float(rng.choice([-1.0, 1.0]))
+    return {"scatter": scatter, "change": change, "engine": engine, "outside": outside}
+
+
+def tables_of(
+    device: Device, case: Mapping[str, Any], biases: tuple[float, ...]
+) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
+    """a_ij of the concealed device without and with the change, by bias and wavelength."""
+    plain, full = [], []
+    own = device.operating_point.back_bias
+    for bias in biases:
+        here = change_parameter(device, "operating_point.back_bias", bias - own)
+        here = changed(here, case["scatter"])
+        before = areas(here, WAVELENGTHS)
+        after = before
+        if case["engine"] == "image charge":
+            after = [
+                a * by_image_charges(here, case["change"], w)
+                for a, w in zip(before, WAVELENGTHS, strict=True)
+            ]
+        elif case["change"]:
+            after = areas(changed(here, case["change"]), WAVELENGTHS)
+            if BLUR in case["change"]:
+                after = [blurred(a, case["change"][BLUR]) for a in after]
+        plain += before
+        full += after
+    return plain, full
+
+
+def write_case(
+    folder: Path,
+    a: list[NDArray[np.float64]],
+    biases: tuple[float, ...],
+    rng: np.random.Generator,
+) -> None:
+    """Write the tables of a case with noise."""
+    folder.mkdir(parents=True)
+    places = [(b, w) for b in biases for w in WAVELENGTHS]
+    for (bias, wavelength), values in zip(places, a, strict=True):
+        matrix = noise_matrix(values)
+        noisy = values + rng.multivariate_normal(np.zeros(values.size), matrix).reshape(
+            values.shape
+        )
+        errors = np.sqrt(np.diag(matrix)).reshape(values.shape)
+        rows = ["i_serial,j_parallel,cov_per_e,err_per_e"]
+        for (j, i), value in np.ndenumerate(noisy):
+            rows.append(f"{i},{j},{value:.6e},{errors[j, i]:.4e}")
+        name = f"a_{abs(bias):.0f}_{wavelength:.0f}.csv"
+        (folder / name).write_text("\n".join(rows) + "\n")
+
+
+def whitened_change(
+    plain: list[NDArray[np.float64]],
+    full: list[NDArray[np.float64]],
+    baseline: Mapping[str, Any],
+    biases: tuple[float, ...],
+) -> float:
+    """Projected SNR of a change, with the derivatives and spreads of a baseline's file."""
+    parts, slopes, errors = [], [], []
+    for n, (bias, w) in enumerate((b, w) for b in biases for w in WAVELENGTHS):
+        parts.append((full[n] - plain[n]).ravel())
+        errors.append(np.sqrt(np.diag(noise_matrix(plain[n]))))
+        near = min(
+            (k for k in baseline if k.startswith("derivatives_")),
+            key=lambda k: _off(k.removeprefix("derivatives_"), w, bias),
+        )
+        own = []
+        for name, spread in baseline["spread_1sigma"].items():
+            kx, ky = (np.array(baseline[near][name][k]) for k in ("dkx", "dky"))
+            whole = kx - np.roll(kx, 1, 1) + ky - np.roll(ky, 1, 0)
+            m = len(whole) // 2
+            side = plain[n].shape[0]
+            own.append(spread * whole[m : m + side, m : m + side].ravel())
+        slopes.append(np.array(own).T)
+    error = np.concatenate(errors)
+    d = np.concatenate(parts) / error
+    matrix = np.concatenate(slopes) / error[:, None]
+    inner = np.eye(matrix.shape[1]) + matrix.T @ matrix
+    return float(
+        np.sqrt(max(d @ d - (d @ matrix) @ np.linalg.solve(inner, matrix.T @ d), 0.0))
+    )
+
+
+def _off(key: str, wavelength: float, bias: float) -> float:
+    w, b = (float(part) for part in key.replace("m", "-").split("_"))
+    return 1e3 * abs(b - bias) + abs(w - wavelength)
+
+
+@click.group()
+def main() -> None:
+    """Conceal silicon physics, diagnose it, and score what is said."""
+
+
+@main.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("--truths", type=click.Path(path_type=Path), required=True)
+@click.option("--count", default=24, show_default=True)
+@click.option("--nulls", default=12, show_default=True)
+@click.option("--seed", default=1, show_default=True)
+@click.option("--device", default="itl_sta3800c", show_default=True)
+def make(
+    folder: Path, truths: Path, count: int, nulls: int, seed: int, device: str
+) -> None:
+    """Make cases that are not there yet."""
+    card = Device.load(device)
+    own = float(card.operating_point.back_bias)
+    biases = (own, own + 15.0)
+    truths.mkdir(parents=True, exist_ok=True)
+    for n in range(count + nulls):
+        place = folder / f"case_{n:03d}"
+        if place.exists():
+            continue
+        for attempt in range(100):
+            rng = np.random.default_rng([seed, n, attempt])
+            case = draw_case(rng, card, n >= count)
+            try:
+                plain, full = tables_of(card, case, biases)
+            except (BFSensorError, ValueError):
+                # Not every draw is a device that is depleted and holds the charge.
+                continue
+            break
+        write_case(place, full, biases, rng)
+        case |= {"device": device, "seed": seed, "biases": biases}
+        case |= {"plain": [a.tolist() for a in plain], "full": [a.tolist() for a in full]}
+        (truths / f"{place.name}.json").write_text(json.dumps(case))
+        click.echo(f"{place.name}")
+    sums = {
+        p.name: hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in sorted(truths.glob("*.json"))
+    }
+    (folder / "commitment.json").write_text(json.dumps(sums, indent=1))
+
+
+@main.command()
+@click.argument("folder", type=click.Path(exists=True, path_type=Path))
+@click.argument("reports", type=click.Path(path_type=Path))
+@click.option("--device", default="itl_sta3800c", show_default=True)
+def run(folder: Path, reports: Path, device: str) -> None:
+    """Diagnose all cases that have no report yet."""
+    for place in sorted(folder.glob("case_*")):
+        out = reports / place.name
+        if (out / "report.json").exists():
+            continue
+        words = [sys.executable, "-m", "bfsensor", "diagnose"]
+        at = []
+        for table in sorted(place.glob("a_*.csv")):
+            _, bias, wavelength = table.stem.split("_")
+            words.append(str(table))
+            state = f"back_bias=-{bias}V,wavelength={wavelength}nm,level=40000"
+            at += ["--at", f"{table.stem}:{state}"]
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        done = subprocess.run(
+            [*words, "--baseline", device, *at, "-o", str(out)], capture_output=True, text=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+        )  # fmt: skip
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        (out / "cost.json").write_text(json.dumps({"cpu_s": cpu, "commit": commit_here()}))
+        click.echo(f"{place.name}: {cpu:.0f} CPU s; {(done.stdout or done.stderr)[:160]}")
+
+
+@main.command("open")
+@click.argument("folder", type=click.Path(exists=True, path_type=Path))
+@click.argument("reports", type=click.Path(exists=True, path_type=Path))
+@click.argument("truths", type=click.Path(exists=True, path_type=Path))
+@click.option("--set", "name", required=True, help="Name of the set in the rows.")
+def open_(folder: Path, reports: Path, truths: Path, name: str) -> None:
+    """Score all cases that have a report."""
+    sums = json.loads((folder / "commitment.json").read_text())
+    rows = []
+    for place in sorted(folder.glob("case_*")):
+        path = truths / f"{place.name}.json"
+        if hashlib.sha256(path.read_bytes()).hexdigest() != sums[path.name]:
+            raise click.ClickException(f"{path} is not the truth that was committed to")
+        if (reports / place.name / "report.json").exists():
+            rows.append(score(name, place.name, json.loads(path.read_text()), reports))
+    table = Table(rows)
+    if RESULTS.exists():
+        old = Table.read(RESULTS, format="ascii.ecsv")
+        table = vstack([old[old["set"] != name], table], metadata_conflicts="silent")
+    write_results(
+        table, RESULTS, COMMAND, added=True, cpu_s=float(sum(r["cpu_s"] for r in rows))
+    )
+    for row in rows:
+        click.echo(json.dumps(row))
+
+
+def score(name: str, case: str, truth: Mapping[str, Any], reports: Path) -> dict[str, Any]:
+    """One row: what was concealed, what was said."""
+    folder = reports / case
+    report = json.loads((folder / "report.json").read_text())
+    cost = json.loads((folder / "cost.json").read_text())
+    (baseline,) = folder.glob("baseline_*.json")
+    device = Device.load(truth["device"])
+    plain, full = ([np.array(a) for a in truth[k]] for k in ("plain", "full"))
+    snr = whitened_change(
+        plain, full, json.loads(baseline.read_text()), tuple(truth["biases"])
+    )
+    named = [next(iter(e["parameters"]), e["class"]) for e in report["effects"]]
+    values = {k: v for e in report["effects"] for k, v in e["parameters"].items()}
+    inside = []
+    for quantity in truth["change"]:
+        known = values.get(quantity)
+        if known is not None and "lo95" in known:
+            value = true_value(device, truth, quantity)
+            inside.append(bool(known["lo95"] <= value <= known["hi95"]))
+    classes = {class_of(q) for q in truth["change"]}
+    heldout = report["heldout"]
+    return {
+        "set": name, "case": case, "engine": truth["engine"], "outside": truth["outside"],
+        "concealed": " + ".join(truth["change"]) or "nothing",
+        "size": " ".join(f"{v:.4g}" for v in truth["change"].values()), "snr": snr,
+        "detected": bool(report["detected"]), "p": float(report["p_value"]),
+        "named": " + ".join(named) or "nothing", "first": bool(named) and named[0] in truth["change"],
+        "in_class": bool(classes & set(report["equivalence_class"])),
+        "class_size": len(report["equivalence_class"]), "open_world": bool(report["open_world"]),
+        "inside95": sum(inside), "intervals": len(inside),
+        "before": float(heldout.get("chi2dof_before") or np.nan),
+        "after": float(heldout.get("chi2dof_after") or np.nan),
+        "cpu_s": float(cost["cpu_s"]), "commit": cost["commit"],
+    }  # fmt: skip
+
+
+def true_value(device: Device, truth: Mapping[str, Any], name: str) -> float:
+    """Value of a concealed quantity, in the unit of device files."""
+    if name == GATES:
+        return float(device.gates.collecting_phases + truth["change"][name])
+    own = parameter_value(device, name) + truth["scatter"].get(name, 0.0)
+    return quantities(device)[name].number(own + truth["change"][name])
+
+
+def class_of(name: str) -> str:
+    """Class of report.json that a concealed change belongs to."""
+    silicon = (
+        "hole_quasi_fermi_level",
+        "side_diffusion",
+        "surface_charge",
+        "collecting_phases",
+    )
+    if name in OUTSIDE:
+        return "outside_library"
+    return "silicon_physics" if name.endswith(silicon) else "device_parameter"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""Measured a_ij of a device with concealed physics, by engines other than the predictor's.
+
+- 'poisson': the Poisson solver on 48 cells a pixel and in a longer period, boundaries of its own; the
+  predictor's shifts are those of 32 cells, its derivatives those of 16.  It shares the solver's code.
+- 'image charge': the change of the a_ij between two devices by the analytic engine of
+  :mod:`validation.concealed.electrostatics`, numpy of its own, applied to the a_ij of the Poisson
+  solver's device.  It shares nothing with the predictor but the device without the change.
+
+Noise has the covariance matrix of the covariances of flats (Bartlett's formula, here by numpy).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bfsensor.device.device import Device
+from bfsensor.device.parameters import change_parameter
+from bfsensor.device.parts import ChannelStopDots, Implant
+from bfsensor.response.edge_response import solve_response
+from bfsensor.response.light import mixed
+from validation.concealed.card import NOMINAL, absorption_length
+from validation.concealed.electrostatics import edge_shifts
+
+Array = NDArray[np.float64]
+
+LAGS = 5
+"""Lags from 0 in either direction of a table."""
+LEVEL = 40_000.0
+"""Level of the flats [e-]."""
+PAIRS, PIXELS = 300, 2048**2
+"""Pairs of flats of a table, and pixels of each.  Chosen: what a laboratory takes in a day."""
+CELLS, PERIOD = 48, 16
+"""Mesh of the truths: cells a pixel, and pixels from a charge to its image."""
+GATES, DOTS, BLUR = "gates.collecting_phases", "dots", "blur"
+"""Changes that are no quantity of a device file: gates; dots of implants in the channel stops, and
+charge that moves to neighbours after collection, neither of which a piece of the diagnosis describes."""
+IMAGE_CHARGE = {
+    "silicon.thickness": "thickness",
+    "silicon.background_doping": "doping",
+    "operating_point.back_bias": "vbb",
+}
+"""Quantities that the analytic engine has, by its own names."""
+
+
+def changed(device: Device, change: Mapping[str, float]) -> Device:
+    """Device with quantities changed [internal units]; raises DeviceError where there is none."""
+    for name, by in change.items():
+        if name == GATES:
+            gates = dataclasses.replace(
+                device.gates, collecting_phases=device.gates.collecting_phases + round(by)
+            )
+            device = dataclasses.replace(device, gates=gates)
+        elif name == DOTS:
+            dots = ChannelStopDots(
+                centre=0.5 * device.pixel.pitch_y, height=3.0,
+                implants=(Implant("gaussian", by, peak=0.5, sigma=0.4),),
+            )  # fmt: skip
+            stop = dataclasses.replace(device.channel_stop, dots=dots)
+            device = dataclasses.replace(device, channel_stop=stop)
+        elif name != BLUR:
+            device = change_parameter(device, name, by)
+    return device
+
+
+def areas(device: Device, wavelengths: tuple[float, ...]) -> list[Array]:
+    """a_ij [1/e-] by the Poisson solver for light of wavelengths [nm], (LAGS, LAGS) each, [j, i]."""
+    found = solve_response(device, level=LEVEL, cells=CELLS, period=PERIOD)
+    kelvin = device.operating_point.temperature
+    out = []
+    for w in wavelengths:
+        kx, ky = mixed(found.kx, found.ky, found.depths, w, kelvin)
+        whole = kx - np.roll(kx, 1, 1) + ky - np.roll(ky, 1, 0)
+        n = len(whole) // 2
+        out.append(whole[n : n + LAGS, n : n + LAGS])
+    return out
+
+
+def by_image_charges(
+    device: Device, change: Mapping[str, float], wavelength: float
+) -> Array:
+    """Ratio of the a_ij with and without a change, by the analytic engine."""
+    point = device.operating_point
+    own = dict(NOMINAL) | {
+        "pixel": device.pixel.pitch_x, "thickness": device.silicon.thickness,
+        "vfront": 8.0, "doping": -1e12 * device.silicon.background_doping,
+    }  # fmt: skip
+    other = dict(own)
+    bias, moved = point.back_bias, point.back_bias
+    for name, by in change.items():
+        if name == "operating_point.back_bias":
+            moved += by
+        elif name == "silicon.background_doping":
+            other["doping"] -= 1e12 * by
+        else:
+            other[IMAGE_CHARGE[name]] += by
+    both = []
+    for card, volts in ((own, bias), (other, moved)):
+        found = edge_shifts(card, absorption_length(wavelength), volts)
+        kx, ky = np.asarray(found.kx), np.asarray(found.ky)
+        whole = kx - np.roll(kx, 1, 1) + ky - np.roll(ky, 1, 0)
+        n = len(whole) // 2
+        both.append(whole[n : n + LAGS, n : n + LAGS])
+    return both[1] / both[0]
+
+
+def blurred(a: Array, share: float) -> Array:
+    """a_ij after a share of the charge of each pixel has moved to each of its four neighbours.
+
+    The white part of the variance, 1 / level, is in the a_ij that are measured as C / level^2.
+    """
+    side = 4 * LAGS
+    wide = np.zeros((side, side))
+    at = np.arange(-LAGS + 1, LAGS)
+    wide[np.ix_(at, at)] = a[np.ix_(abs(at), abs(at))]
+    wide[0, 0] += 1 / LEVEL
+    kernel = np.zeros((side, side))
+    kernel[0, 0] = 1 - 4 * share
+    for place in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        kernel[place] = share
+    power = np.fft.fft2(wide) * abs(np.fft.fft2(kernel)) ** 2
+    out = np.fft.ifft2(power).real
+    out[0, 0] -= 1 / LEVEL
+    return out[:LAGS, :LAGS]
+
+
+def noise_matrix(a: Array) -> Array:
+    """Covariance matrix of measured a_ij [1/e-^2], lags as in a.ravel(), by Bartlett's formula."""
+    side = 8 * LAGS
+    c = np.zeros((side, side))
+    at = np.arange(-LAGS + 1, LAGS)
+    c[np.ix_(at, at)] = LEVEL**2 * a[np.ix_(abs(at), abs(at))]
+    c[0, 0] += LEVEL
+    square = np.fft.ifft2(np.fft.fft2(c) ** 2).real
+    j, i = (index.ravel() for index in np.indices(a.shape))
+    less, more = (
+        square[(j[:, None] + s * j) % side, (i[:, None] + s * i) % side] for s in (-1, 1)
+    )
+    # A quadrant's lags (i, j) and (-i, j) are averaged: half of the variance off the axes.
+    twice = np.where((i > 0) & (j > 0), 2.0, 1.0)
+    scale = np.sqrt(np.outer(twice, twice))
+    return (less + more) / (PAIRS * PIXELS * LEVEL**4) / scale
