@@ -14,6 +14,7 @@ from bfsensor.diagnose.data.exposure_info import Source
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels, measure_channels
 from bfsensor.diagnose.detect.locate import Mismatch, locate_mismatch
 from bfsensor.diagnose.detect.matched_filters import locate_effects
+from bfsensor.diagnose.detect.silicon_or_readout import find_symmetry
 from bfsensor.diagnose.explain.single_value import explain_single_value
 from bfsensor.diagnose.explain.stepwise import attribute
 from bfsensor.diagnose.fit.baseline_fit import (
@@ -166,6 +167,7 @@ def diagnose_measured(
         *_of_free(measured, baseline, fit),
         *_of_level(baseline, fit),
         *_as_stated(stated, measured, baseline, seed),
+        *(_symmetries(fit) if mismatch.detected else []),
     ]
     attribution, advised = None, RecordingPlan()
     if mismatch.detected and explain:
@@ -249,6 +251,15 @@ def _as_stated(
         return []
     found = locate_mismatch(fit_bounded(stated, baseline)[1], seed=seed)
     return [f"with the errors as stated the family-wise p is {found.p_value:.2g}"]
+
+
+def _symmetries(fit: BaselineFit) -> list[str]:
+    """Note on the symmetries of what a_ij deviate by."""
+    parts = zip(fit.channels, fit.starts, strict=False)
+    left = [c.unwhiten(fit.residuals[start : start + len(c)]) for c, start in parts]
+    predicted = [c.values - r for c, r in zip(fit.channels, left, strict=True)]
+    found = find_symmetry(fit.channels, left, predicted)
+    return [] if found is None else [found.said()]
 
 
 def _of_free(measured: MeasuredChannels, baseline: Baseline, fit: BaselineFit) -> list[str]:

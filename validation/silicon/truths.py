@@ -1,7 +1,7 @@
 """Measured a_ij of a device with concealed physics, by engines other than the predictor's.
 
-- 'poisson': the Poisson solver on 48 cells a pixel and in a longer period, boundaries of its own; the
-  predictor's shifts are those of 32 cells, its derivatives those of 16.  It shares the solver's code.
+- 'poisson': the Poisson solver on 48 cells a pixel; the predictor's shifts are those of 32 cells, its
+  derivatives those of 16.  It shares the solver's code.
 - 'image charge': the change of the a_ij between two devices by the analytic engine of
   :mod:`validation.concealed.electrostatics`, numpy of its own, applied to the a_ij of the Poisson
   solver's device.  It shares nothing with the predictor but the device without the change.
@@ -33,8 +33,8 @@ LEVEL = 40_000.0
 """Level of the flats [e-]."""
 PAIRS, PIXELS = 300, 2048**2
 """Pairs of flats of a table, and pixels of each.  Chosen: what a laboratory takes in a day."""
-CELLS, PERIOD = 48, 16
-"""Mesh of the truths: cells a pixel, and pixels from a charge to its image."""
+CELLS = 48
+"""Cells of the truths' mesh a pixel."""
 GATES, DOTS, BLUR = "gates.collecting_phases", "dots", "blur"
 """Changes that are no quantity of a device file: gates; dots of implants in the channel stops, and
 charge that moves to neighbours after collection, neither of which a piece of the diagnosis describes."""
@@ -68,7 +68,7 @@ def changed(device: Device, change: Mapping[str, float]) -> Device:
 
 def areas(device: Device, wavelengths: tuple[float, ...]) -> list[Array]:
     """a_ij [1/e-] by the Poisson solver for light of wavelengths [nm], (LAGS, LAGS) each, [j, i]."""
-    found = solve_response(device, level=LEVEL, cells=CELLS, period=PERIOD)
+    found = solve_response(device, level=LEVEL, cells=CELLS)
     kelvin = device.operating_point.temperature
     out = []
     for w in wavelengths:

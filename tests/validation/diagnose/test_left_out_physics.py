@@ -207,7 +207,7 @@ def test_spots_follow_the_levels_whatever_reaches_farther(lacking, folder):
     channel = Channel("spot", np.ones(2), (np.eye(2),), axes.columns(), "")
     measured = _measured([channel], (), {})
     far = BrighterFatterLongRange({
-        p.name: 1e-3 * p.low if p.amplitude else p.low
+        p.name: 1e-5 * p.low if p.amplitude else p.low
         for p in BrighterFatterLongRange.parameters
     })  # fmt: skip
     levels = piece(lacking, "bf_nonlinear:simulated")({"strength": 1.0})
