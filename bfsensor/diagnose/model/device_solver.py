@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 from bfsensor.device.device import Device
 from bfsensor.device.parameters import change_parameter, parameter_value
 from bfsensor.device.quantities import quantities
 from bfsensor.diagnose.model.cached_response import SPAN, Walk, walk
-from bfsensor.effects.changed_device import Held, Key, Moved, QuadraticTemplate
+from bfsensor.effects.changed_device import Key, Moved, QuadraticTemplate
+from bfsensor.errors import DeviceError
 from bfsensor.response.edge_response import LEVEL
 from bfsensor.typing import Edges
 
@@ -155,18 +156,17 @@ class DeviceSolver:
         """Response of the changed and of the nominal device, on one mesh where it can be moved."""
         old = self.device_at(name, self.nominal(name), bias)
         new = self.device_at(name, value, bias)
-        laid_for = None if name == PHASES else old
-        return (
-            walk(new, cells=cells, backgrounds=backgrounds, keep=self.keep, laid_for=laid_for),
-            walk(old, cells=cells, backgrounds=backgrounds, keep=self.keep),
-        )  # fmt: skip
+        solve = partial(walk, cells=cells, backgrounds=backgrounds, keep=self.keep)
+        plain = solve(old)
+        if name == PHASES:
+            return solve(new), plain
+        try:
+            return solve(new, laid_for=old), plain
+        except DeviceError:
+            # Surfaces that change their order need another mesh, or there is no such device.
+            return solve(new), plain
 
 
 def less(new: Edges, old: Edges, factor: float = 1.0) -> Edges:
     """Difference of two shifts, times a factor."""
     return factor * (new[0] - old[0]), factor * (new[1] - old[1])
-
-
-def scaled(held: Held, factor: float) -> Held:
-    """Shifts of all conditions, times a factor."""
-    return tuple((key, (factor * kx, factor * ky)) for key, (kx, ky) in held)

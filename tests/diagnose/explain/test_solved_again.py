@@ -148,3 +148,21 @@ def test_a_solver_states_values_in_units_of_device_files():
     # Acceptors cannot become donors, nor a stop have a negative diffusion.
     assert solver.range(name)[1] == 0.0
     assert solver.range("channel_stop.side_diffusion")[0] == 0.0
+
+
+def test_a_device_whose_mesh_cannot_be_moved_is_solved_on_its_own(monkeypatch):
+    asked = []
+
+    def walk(device, *, cells, backgrounds, keep, laid_for=None):
+        asked.append(laid_for is not None)
+        if laid_for is not None:
+            raise DeviceError("not in the order of those that the mesh was laid for")
+        size = 1e-6 * device.silicon.thickness
+        return SimpleNamespace(edges=lambda wavelength, kelvin: shape(size))
+
+    monkeypatch.setattr("bfsensor.diagnose.model.device_solver.walk", walk)
+    device = Device.load("itl_sta3800c")
+    solver = DeviceSolver(device.to_toml(), (-50.0,), (620.0,), True, True)
+    ((key, (kx, _)),) = solver.moved("silicon.thickness", 103.0).edges
+    assert key == KEY and kx[1, 1] == pytest.approx(3e-6)
+    assert asked == [False, True, False]
