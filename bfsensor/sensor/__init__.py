@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from bfsensor.sensor.shift_maps import ShiftMap
     from bfsensor.sensor.silicon_sensor import SiliconSensor
     from bfsensor.sensor.table_correction import correct_table
+    from bfsensor.sensor.weight_maps import corrected_variance
 else:
     __getattr__, __dir__ = lazy_names(
         __name__,
@@ -23,6 +24,7 @@ else:
             "shift_maps": ["ShiftMap"],
             "silicon_sensor": ["SiliconSensor"],
             "table_correction": ["correct_table"],
+            "weight_maps": ["corrected_variance"],
         },
     )
 
@@ -32,6 +34,7 @@ __all__ = [
     "ShiftMap",
     "SiliconSensor",
     "correct_table",
+    "corrected_variance",
     "draw_flat",
     "iterate_flat",
     "read_effects",
