@@ -35,6 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
 from bfsensor._kernels import correction as kernels
+from bfsensor.device.silicon import absorption_length
 from bfsensor.errors import MeasurementError, SensorError
 from bfsensor.measure.arrays import to_floats
 from bfsensor.response.light import conversion_weights
@@ -48,6 +49,7 @@ from bfsensor.sensor.options import (
     load_table,
     outside_charge,
     read_device,
+    shown,
 )
 from bfsensor.table.table import DistortionTable
 from bfsensor.typing import FloatArray
@@ -195,8 +197,8 @@ def correct_table(
         what the nearest good pixels of their row and column suggest, so that what they hold does not
         spread.
     wavelengths, photons : array_like, shape (n,), optional
-        Wavelengths of the light [nm] and how many photons have each, by default equally many; without
-        wavelengths light converts at the back surface.
+        Wavelengths of the light [nm] and how many photons that enter the silicon have each, by default
+        equally many; without wavelengths light converts at the back surface.
     temperature : float, optional
         Temperature of the silicon [K], for the depth in which light is absorbed; by default the
         device's.
@@ -403,7 +405,14 @@ def _weights(
         conversion_weights(heights, w, temperature, thickness=table.thickness)
         for w in colours.tolist()
     ]
-    return np.asarray(counts @ np.array(each) / counts.sum())
+    # What crosses the silicon makes no charge: of red light the charge is bluer than the photons.
+    lengths = np.asarray(absorption_length(colours, temperature), float)
+    shares = -counts * np.expm1(-table.thickness / lengths)
+    if not shares.sum() > 1e-6 * counts.sum():
+        raise SensorError(
+            f"wavelengths = {shown(colours.tolist())} nm: none of this light converts in the silicon"
+        )
+    return np.asarray(shares @ np.array(each) / shares.sum())
 
 
 def _patterns(

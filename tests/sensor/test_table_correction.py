@@ -9,6 +9,7 @@ import pytest
 from bfsensor import BrighterFatterSensor, DistortionTable
 from bfsensor._kernels import correction
 from bfsensor.device.shipped import tables_dir
+from bfsensor.device.silicon import absorption_length
 from bfsensor.errors import BFSensorError
 from bfsensor.measure.correct import correct_kernel
 from bfsensor.measure.flat_pairs import flat_covariances
@@ -339,6 +340,18 @@ def test_red_light_is_corrected_less():
     assert blue.max() > mixed.max() > red.max()
 
 
+def test_light_that_crosses_the_silicon_makes_no_charge():
+    image, waves = star(), np.array([700.0, 1060.0])
+    one, two, both = (
+        correct_table(image, ITL, wavelengths=w) - image for w in (*waves, waves)
+    )
+    shares = -np.expm1(-ITL.thickness / absorption_length(waves, 173.15))
+    assert shares[1] < 0.3
+    middle = np.array([a[30, 30] for a in (one, two, both)])
+    assert middle[2] == pytest.approx(shares @ middle[:2] / shares.sum(), rel=1e-3)
+    assert abs(middle[2] / middle[:2].mean() - 1) > 0.02
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
@@ -354,6 +367,7 @@ def test_red_light_is_corrected_less():
         ({"photons": [1.0]}, "photons need wavelengths"),
         ({"wavelengths": [500.0, 600.0], "photons": [1.0]}, "the shapes"),
         ({"wavelengths": [500.0], "photons": [-1.0]}, "none below 0"),
+        ({"wavelengths": [1400.0]}, "none of this light converts"),
     ],
 )
 def test_what_cannot_be_corrected_is_refused(given, message):
