@@ -349,13 +349,15 @@ def _check_beyond(
     """Warn of good pixels beyond the table, or refuse them."""
     if len(table.charges) == 1:
         return
+    # A table of one background does not depend on it.
     most, most_around = float(table.charges[-1]), float(table.backgrounds[-1])
+    background = background and len(table.backgrounds) > 1
     count = 0
     for top in range(0, len(scene.image), BAND):
         rows = slice(top, min(top + BAND, len(scene.image)))
         source = scene.image if scene.charge is None else scene.charge
         charge = source[rows]
-        if not np.max(charge) > min(most, most_around):
+        if not np.max(charge) > (min(most, most_around) if background else most):
             continue
         out = charge > most
         if background:
