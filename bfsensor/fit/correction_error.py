@@ -1,4 +1,4 @@
-r"""What a camera's a_ij allow: the error of a star's growth that is computed from them.
+r"""Errors of a star's growth that is computed from a camera's a_ij.
 
 The growth of a star follows from the shifts of edges, these from the parameters p of the image-charge
 model, whose covariance is that of the fit:

@@ -4,8 +4,8 @@
 priors of :mod:`bfsensor.fit.camera_fit` and their measured a_ij, as
 ``validation.own_camera.camera_recovery`` does (noise and 5 % of scatter about the model), fits them, and
 compares the growth of a star with a sigma of 1.5 pixel by the fit with the true one.  A row a mock:
-what a correction by the fit leaves of the true growth [%], its error by the fit, the part of it that is noise, and the
-factor on the number of flat pairs that would halve the error.
+what a correction by the fit leaves of the true growth [%], its error by the fit, the part of it that is
+noise, and the factor on the number of flat pairs that would halve the error.
 """
 
 from __future__ import annotations
