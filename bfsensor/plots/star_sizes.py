@@ -69,6 +69,7 @@ def figure_for_star_sizes(
         axes.axhline(0.0, lw=0.8, color="0.5")
         axes.set_xlabel("charge in the peak [1000 e-]")
         axes.set_title(f"second moments in {axis}")
-        axes.legend(fontsize=8)
+        axes.legend(fontsize=8, loc="upper left")
+        axes.margins(y=0.2)
     panels[0].set_ylabel("size over the image's median [%]")
     return figure

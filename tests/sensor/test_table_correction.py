@@ -192,7 +192,7 @@ def test_a_saturated_neighbour_is_used_as_charge():
     near = np.hypot(*(np.indices(image.shape) - 30)) < 2
     known, lost = (np.abs(a - open_eyes)[near].max() for a in (masked, unknown))
     # Its charge pushes the star as before; without it 0.5 % of the correction are missing.
-    assert known < 0.1 * lost
+    assert known < 0.3 * lost
     assert lost > 0.004 * np.abs(open_eyes - image)[near].max()
 
 

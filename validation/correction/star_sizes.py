@@ -52,8 +52,12 @@ BANDS = {
 """Wavelengths [nm] that stand for a band, equally many photons each."""
 NEIGHBOUR = 1e9
 """Stands in the column of peaks for a star of 80 ke- beside a saturated one."""
-BESIDE = (9.0, 3.0)
+BESIDE = (8.0, 3.0)
 """Place of the saturated star [pixel], whose charge moves boundaries of the star's wings."""
+BESIDE_PEAK = 2.5e5
+"""Light in its brightest pixel [e-]: its charge bleeds."""
+CROP = 5
+"""Half side of the part of a stamp in which a star beside a saturated one is measured [pixel]."""
 SIDE = 25
 BLOCKS = 1000
 """Renewals of the boundaries in an exposure.  Chosen: with 75 they lag behind the charge by 2 % of it in
@@ -115,7 +119,7 @@ def light_of(
 
     parts = [star(8e4 if beside else peak, place)]
     if beside:
-        parts.append(star(6e5, np.array(BESIDE)))
+        parts.append(star(BESIDE_PEAK, np.array(BESIDE)))
     half = SIDE / 2
     parts.append(rng.uniform(-half, half, (2, rng.poisson(sky * more * SIDE**2))))
     x, y = rng.permutation(np.concatenate(parts, axis=1), axis=1)
@@ -156,9 +160,12 @@ def star_row(
         "device": device, "width": width, "peak": peak, "sky": sky, "band": band, "seed": seed,
         "masked": int(mask.sum()),
     }  # fmt: skip
-    without = size_of(off - sky)
+    middle = slice(None)
+    if peak == NEIGHBOUR:
+        middle = slice(SIDE // 2 - CROP, SIDE // 2 + CROP + 1)
+    without = size_of((off - sky)[middle, middle])
     for name, correct in corrections(device).items():
-        found = size_of(correct(on, mask, band) - sky)
+        found = size_of((correct(on, mask, band) - sky)[middle, middle])
         row[f"x {name}"], row[f"y {name}"] = 100 * (found[:2] / without[:2] - 1)
         row[f"e {name}"] = found[2] - without[2]
     row["cpu_s"] = round(time.process_time() - began, 2)
@@ -226,6 +233,26 @@ def left(rows: Table, name: str, what: str) -> tuple[float, float]:
     return 100 * float(ratio), 100 * float(error)
 
 
+def together(rows: Table, name: str, what: str) -> tuple[float, float]:
+    """Mean of what is left over all skies and bands of the rows [%], and its error among seeds."""
+    each = []
+    for seed in sorted(set(rows["seed"])):
+        before, after = 0.0, 0.0
+        for sky, band in itertools.product(SKIES, BANDS):
+            part = select(rows, seed=seed, sky=sky, band=band)
+            if len(part) == len(PEAKS):
+                before += float(slopes(part, "none", what)[0])
+                after += float(slopes(part, name, what)[0])
+        if before:
+            each.append((before, after))
+    if len(each) < 2:
+        return np.nan, np.nan
+    before, after = np.transpose(each)
+    ratio = after.sum() / before.sum()
+    error = np.std(after - ratio * before, ddof=1) / np.sqrt(len(each)) / before.mean()
+    return 100 * float(ratio), 100 * float(error)
+
+
 def shape_left(rows: Table, name: str) -> tuple[float, float]:
     """Ellipticity left at :data:`BRIGHT`, and its error."""
     found = BRIGHT * slopes(rows, name, "e")
@@ -263,6 +290,12 @@ def show(path: Path) -> None:
             e, error = shape_left(part, "table")
             m, c = bias_left(part, "table")
             print(f"{text} | e {e:+.1e} ({error:.0e}) m {m:+.1e} c {c:+.1e}")
+        part = select(rows, device=device, width=width)
+        text = f"{device[:3]} {width:.0f} all skies and bands"
+        for name in names:
+            (x, dx), (y, dy) = (together(part, name, axis) for axis in "xy")
+            text += f" | {name} {x:+.2f} {y:+.2f} ({dx:.2f} {dy:.2f})"
+        print(text)
         beside = rows[(rows["peak"] == NEIGHBOUR) & (rows["device"] == device)]
         beside = beside[beside["width"] == width]
         if len(beside):
