@@ -35,7 +35,7 @@ class _Task:
     """One file to correct, for any process."""
 
     path: str
-    output: str
+    work: str
     correction: Correction
     options: FileOptions
     history: str
@@ -156,9 +156,10 @@ def correct(
     targets = _targets(files, output)
     stars = None if measure is None else (measure, saturation, stamp)
     history = " ".join(["bfsensor", *sys.argv[1:]])
+    work = output.with_name(output.name + ".unfinished")
     tasks = [
-        _Task(os.path.abspath(path), os.path.abspath(target), correction, options, history, stars)
-        for path, target in zip(files, targets, strict=True)
+        _Task(os.path.abspath(path), os.path.abspath(work), correction, options, history, stars)
+        for path in files
     ]  # fmt: skip
     made = len(files) > 1 and not output.exists()
     if len(files) > 1 and output.is_file():
@@ -168,24 +169,33 @@ def correct(
     if not made:
         # Whether they exist is asked below, where it is known which of them are finished.
         check_targets(targets, True, RecordingError)
-    work = output.with_name(output.name + ".unfinished")
     context.with_resource(held(work, RecordingError))
-    missing = []
-    for task, target in zip(tasks, targets, strict=True):
-        note = _note_of(work, task)
-        if not (target.exists() and note.exists()):
-            note.unlink(missing_ok=True)
-            missing.append(target)
+    place = {_key(task): target for task, target in zip(tasks, targets, strict=True)}
+
+    def keep(result: dict[str, Any], note: Path) -> None:
+        """Keep that a file is done, then put it in its place: from either moment a run goes on."""
+        _write_note(result, note)
+        os.replace(note.with_suffix(".fits"), place[result["key"]])
+
     if made:
         output.mkdir()
+    missing = []
+    for task in tasks:
+        note, target = _note_of(task), place[_key(task)]
+        draft = note.with_suffix(".fits")
+        if note.exists() and draft.exists():
+            os.replace(draft, target)
+        if not (note.exists() and target.exists()):
+            note.unlink(missing_ok=True)
+            missing.append(target)
     check_targets(missing, overwrite, RecordingError)
     with (
         progress_bar("file") as progress,
         open_executor(executor, min(workers, len(tasks))) as pool,
     ):
         results = run_points(
-            _correct, tasks, path=lambda task: _note_of(work, task), read=_read_note,
-            write=_write_note, executor=pool, progress=progress,
+            _correct, tasks, path=_note_of, read=_read_note, write=keep, executor=pool,
+            progress=progress,
         )  # fmt: skip
     slopes = _slopes(results) if stars else {}
     if plot is not None:
@@ -241,8 +251,8 @@ def _correct(task: _Task) -> dict[str, Any]:
     from bfsensor.sensor.corrected_files import correct_file
 
     found = correct_file(
-        task.path, task.output, task.correction, task.options, history=task.history,
-        overwrite=True,
+        task.path, _note_of(task).with_suffix(".fits"), task.correction, task.options,
+        history=task.history, overwrite=True,
     )  # fmt: skip
     if task.stars is not None:
         found["stars"] = _measure(task, *task.stars)
@@ -300,9 +310,9 @@ def _key(task: _Task) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _note_of(work: Path, task: _Task) -> Path:
-    """File that says that a task is done."""
-    return work / f"{_key(task)}.json"
+def _note_of(task: _Task) -> Path:
+    """File that says that a task is done; until it is put in place the image lies beside it."""
+    return Path(task.work, f"{_key(task)}.json")
 
 
 def _read_note(path: Path) -> dict[str, Any]:

@@ -213,6 +213,10 @@ def test_many_files_go_on_after_an_interruption(tmp_path, monkeypatch):
     monkeypatch.setattr(command, "_correct", interrupted)
     assert run(*arguments).exit_code == 130
     assert len(list(out.glob("*.fits"))) == 2
+    # Killed before the second was put in its place.
+    note = next(p for p in (tmp_path / "corrected.unfinished").glob("*.json")
+                if json.loads(p.read_text())["name"] == "in_1.fits")  # fmt: skip
+    (out / "in_1.fits").rename(note.with_suffix(".fits"))
     first = (out / "in_0.fits").read_bytes()
     done.clear()
     result = run(*arguments)
