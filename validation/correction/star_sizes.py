@@ -58,7 +58,8 @@ BESIDE_PEAK = 2.5e5
 """Light in its brightest pixel [e-]: its charge bleeds."""
 CROP = 5
 """Half side of the part of a stamp in which a star beside a saturated one is measured [pixel]."""
-SIDE = 25
+SIDE, SIDE_IN_SKY = 25, 17
+"""Sides of the stamps [pixel], without and with the brightest sky, whose photons take most of the time."""
 BLOCKS = 1000
 """Renewals of the boundaries in an exposure.  Chosen: with 75 they lag behind the charge by 2 % of it in
 small stars, and the lag falls with their number."""
@@ -120,21 +121,28 @@ def light_of(
     parts = [star(8e4 if beside else peak, place)]
     if beside:
         parts.append(star(BESIDE_PEAK, np.array(BESIDE)))
-    half = SIDE / 2
-    parts.append(rng.uniform(-half, half, (2, rng.poisson(sky * more * SIDE**2))))
+    side = side_of(sky)
+    parts.append(rng.uniform(-side / 2, side / 2, (2, rng.poisson(sky * more * side**2))))
     x, y = rng.permutation(np.concatenate(parts, axis=1), axis=1)
     return galsim.PhotonArray(
         len(x), x, y, np.ones(len(x)), wavelength=rng.choice(BANDS[band], len(x))
     )
 
 
-def draw(device: str, strength: float, photons: galsim.PhotonArray, seed: int) -> NDArray:
+def side_of(sky: float) -> int:
+    """Side of the stamps in a sky [pixel]."""
+    return SIDE_IN_SKY if sky == max(SKIES) else SIDE
+
+
+def draw(
+    device: str, strength: float, photons: galsim.PhotonArray, seed: int, side: int
+) -> NDArray:
     """Draw a stamp; what is random is the same for all strengths."""
     camera = BrighterFatterSensor(
         table=table_of(device), strength=strength, rng=galsim.BaseDeviate(seed),
         nrecalc=max(photons.size() / BLOCKS, 20.0), surroundings="mirrored",
     )  # fmt: skip
-    image = galsim.ImageD(SIDE, SIDE)
+    image = galsim.ImageD(side, side)
     image.setCenter(0, 0)
     camera.accumulate(photons, image)
     return image.array
@@ -154,7 +162,9 @@ def star_row(
     """Draw one star with and without the effect and correct it every way."""
     began = time.process_time()
     photons = light_of(device, width, peak, sky, band, seed)
-    on, off = (draw(device, strength, photons, seed) for strength in (1.0, 0.0))
+    on, off = (
+        draw(device, strength, photons, seed, side_of(sky)) for strength in (1.0, 0.0)
+    )
     mask = on > 0.9 * table_of(device).full_well
     row: dict[str, object] = {
         "device": device, "width": width, "peak": peak, "sky": sky, "band": band, "seed": seed,
@@ -183,14 +193,14 @@ def cases(count: int) -> Iterator[dict[str, object]]:
                            "band": band, "seed": seed}  # fmt: skip
 
 
-def take(path: Path, count: int) -> None:
-    """Make the rows that are not there."""
+def take(path: Path, count: int, skies: tuple[float, ...] = SKIES) -> None:
+    """Make the rows that are not there, in some of the skies."""
     old = Table.read(path, format="ascii.ecsv") if path.exists() else None
     names = ("device", "width", "peak", "sky", "band", "seed")
     there = set() if old is None else {tuple(row[n] for n in names) for row in old}
     made: list[dict] = []
     for key in cases(count):
-        if tuple(key[n] for n in names) in there:
+        if key["sky"] not in skies or tuple(key[n] for n in names) in there:
             continue
         made.append(star_row(**key))
         if len(made) >= 4:
@@ -309,12 +319,13 @@ def show(path: Path) -> None:
 @click.command(help=__doc__)
 @click.argument("what", type=click.Choice(["take", "show"]))
 @click.option("--count", default=8, help="Stars of each kind.")
+@click.option("--sky", type=float, multiple=True, help="Skies [e-], by default all.")
 @click.option("--folder", default=str(RESULTS))
-def main(what: str, count: int, folder: str) -> None:
+def main(what: str, count: int, sky: tuple[float, ...], folder: str) -> None:
     """Take rows, or print what they say."""
     path = Path(folder) / STARS.name
     if what == "take":
-        take(path, count)
+        take(path, count, sky or SKIES)
     else:
         show(path)
 
