@@ -59,7 +59,7 @@ BESIDE_PEAK = 2.5e5
 CROP = 5
 """Half side of the part of a stamp in which a star beside a saturated one is measured [pixel]."""
 SIDE, SIDE_IN_SKY = 25, 17
-"""Sides of the stamps [pixel], without and with the brightest sky, whose photons take most of the time."""
+"""Sides of stamps [pixel], without and with the brightest sky, whose photons take most of the time."""
 BLOCKS = 1000
 """Renewals of the boundaries in an exposure.  Chosen: with 75 they lag behind the charge by 2 % of it in
 small stars, and the lag falls with their number."""
