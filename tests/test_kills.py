@@ -100,6 +100,12 @@ def of_spots(folder: Path) -> Any:
     return found
 
 
+def of_images(folder: Path) -> Any:
+    return {
+        p.name: fits.getdata(p).tobytes() for p in sorted((folder / "out").glob("*.fits"))
+    }
+
+
 def of_fit(folder: Path) -> Any:
     found = json.loads((folder / "out" / "fit.json").read_text())
     return {k: v for k, v in found.items() if k not in ("provenance", "cpu", "seconds")}
@@ -159,6 +165,14 @@ COMMANDS = {
         "out/fit.json",
         of_fit,
     ),
+    "correct": Killed(
+        (
+            "-m", "bfsensor", "correct", *(f"image_{n}.fits" for n in range(6)), "--table",
+            "itl_sta3800c", "--band", "r", "--workers", "2", "-o", "out",
+        ),
+        "out/image_5.fits",
+        of_images,
+    ),
     "diagnose": Killed(
         ("-m", "bfsensor", "diagnose", "campaigns/one", "-o", "out"),
         "out/report.json",
@@ -182,6 +196,10 @@ def prepare(name: str, folder: Path) -> Path:
     if name == "fit":
         rows = "axis,slope,slope_error\nx,2.0,0.1\ny,2.4,0.1\n"
         (folder / "slopes.csv").write_text(rows)
+    for n in range(6) if name == "correct" else ():
+        image = np.random.default_rng(n).uniform(0, 9e4, (700, 700)).astype(np.float32)
+        header = fits.Header({"BUNIT": "electron"})
+        fits.writeto(folder / f"image_{n}.fits", image, header)
     if name in ("diagnose", "concealed run"):
         effect = make_effect("cti_serial", {"cti": 3e-6})
         for one in ("one",) if name == "diagnose" else ("one", "two"):

@@ -21,6 +21,7 @@ import numpy as np
 from astropy.table import Row, Table
 
 from validation.concealed.goals import QUOTED, quoted_goal
+from validation.correction.quoted import CORRECTED
 from validation.index import Age, read_ages, read_claims
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -477,6 +478,7 @@ def _numbers() -> dict[str, Callable[[Rows], str]]:
         ("surface table", "y light", "table"),
     ):  # fmt: skip
         numbers[f"left {short}"] = lambda r, s=sensor, n=name: correction_left(r, s, n)
+    numbers.update(CORRECTED)
     for short in QUOTED:
         numbers[f"independent {short}"] = lambda r, s=short: quoted_goal(
             r("independent_goals"), s

@@ -122,12 +122,27 @@ def describe(found: CameraFit) -> dict[str, Any]:
         "lags": int(fit.used.sum()),
         "effective_parameters": found.effective,
         "error_scale": found.error_scale,
+        "correction": _correction(found),
         "misfits": [
             {"i": i, "j": j, "measured": float(fit.a[j, i]), "fitted": float(fit.predicted[j, i]),
              "pull": pull, "in_fit": bool(fit.used[j, i])}
             for i, j, pull in _misfits(found)
         ],
         "not_determined": not_determined(found),
+    }  # fmt: skip
+
+
+def _correction(found: CameraFit) -> dict[str, Any]:
+    """Errors that the calibration leaves to the growth of a star."""
+    from bfsensor.fit.correction_error import correction_error
+
+    known = correction_error(found)
+    return {
+        "sigma_pixel": 1.5,
+        "error_x": known.error[0], "error_y": known.error[1],
+        "error_x_by_noise": known.noise[0], "error_y_by_noise": known.noise[1],
+        # JSON has no infinity.
+        "pairs_for_half": known.pairs if np.isfinite(known.pairs) else None,
     }  # fmt: skip
 
 
@@ -183,6 +198,18 @@ def print_fit(summary: dict[str, Any]) -> None:
             )
             + (f" and {len(worst) - 8} more" if len(worst) > 8 else "")
         )
+    star = summary["correction"]
+    pairs = star["pairs_for_half"]
+    click.echo(
+        f"growth of a star with a sigma of {star['sigma_pixel']:g} pixel known to "
+        f"{100 * star['error_x']:.2g} % of it in x, {100 * star['error_y']:.2g} % in y "
+        f"({100 * star['error_x_by_noise']:.2g}, {100 * star['error_y_by_noise']:.2g} % by noise); "
+        + (
+            f"{pairs:.2g} times as many flat pairs would halve that"
+            if pairs is not None
+            else "no number of flat pairs would halve that"
+        )
+    )
     click.echo("not determined by these data:")
     for line in summary["not_determined"]:
         click.echo(f"  {line}")

@@ -16,6 +16,7 @@ import click
 
 from bfsensor.cli.check import check
 from bfsensor.cli.common import LOG, load_device, parse_figure, settings_option, start_log
+from bfsensor.cli.correct import correct
 from bfsensor.cli.device import device
 from bfsensor.cli.diagnose import diagnose
 from bfsensor.cli.export import export
@@ -244,6 +245,7 @@ main.add_command(sweep)
 main.add_command(spots)
 main.add_command(measure)
 main.add_command(check)
+main.add_command(correct)
 main.add_command(diagnose)
 main.add_command(fit)
 main.add_command(export)

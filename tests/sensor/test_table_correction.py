@@ -9,12 +9,14 @@ import pytest
 from bfsensor import BrighterFatterSensor, DistortionTable
 from bfsensor._kernels import correction
 from bfsensor.device.shipped import tables_dir
+from bfsensor.device.silicon import absorption_length
 from bfsensor.errors import BFSensorError
 from bfsensor.measure.correct import correct_kernel
 from bfsensor.measure.flat_pairs import flat_covariances
 from bfsensor.sensor import table_correction
 from bfsensor.sensor.flats import draw_flat
 from bfsensor.sensor.table_correction import correct_table
+from bfsensor.sensor.weight_maps import corrected_variance
 from bfsensor.table.lsst_format import solve_kernel
 from bfsensor.table.quadrant_shifts import quadrant_shifts
 
@@ -124,6 +126,146 @@ def test_mirror_images_are_corrected_alike():
         )
 
 
+# -- pixels that light did not fill ------------------------------------------------------
+
+
+def test_masked_pixels_get_the_light_of_the_nearest_good_ones():
+    rng = np.random.default_rng(12)
+    image = rng.uniform(0, 1e3, (9, 8))
+    mask = rng.random((9, 8)) < 0.5
+    mask[:, 0] = mask[0] = True
+    found = image.copy()
+    correction.fill_masked(image, mask, 3, found)
+    for y, x in np.argwhere(mask):
+        pairs = []
+        for ray, bad in (
+            (image[y, x + 1 :], mask[y, x + 1 :]), (image[y, :x][::-1], mask[y, :x][::-1]),
+            (image[y + 1 :, x], mask[y + 1 :, x]), (image[:y, x][::-1], mask[:y, x][::-1]),
+        ):  # fmt: skip
+            good = np.flatnonzero(~bad[:3])
+            if len(good):
+                pairs.append((ray[good[0]], 1 / (good[0] + 1)))
+        expected = sum(v * w for v, w in pairs) / sum(w for _, w in pairs) if pairs else 0
+        assert found[y, x] == pytest.approx(expected, rel=1e-12)
+    np.testing.assert_array_equal(found[~mask], image[~mask])
+
+
+def test_a_cosmic_ray_moves_boundaries_and_does_not_spread():
+    image = np.full((41, 41), 1e3)
+    image[20, 20:22] = 1e5
+    mask = image > 5e4
+    change = correct_table(image, ITL, mask=mask) - image
+    # The sky that its charge drove out of two pixels, and no more: by areas of the table.
+    areas = ITL.area_changes(charge=5e4, depth=float(ITL.depths[-1])) / np.prod(ITL.pitch)
+    assert change[19, 20] == pytest.approx(-1e3 * (areas[5, 4] + areas[5, 5]), rel=0.1)
+    assert change[20, 20] == pytest.approx(-1e3 * (areas[4, 4] + areas[4, 5]), rel=0.1)
+    assert abs(change.sum()) < 1e-6
+    assert np.abs(correct_table(image, ITL) - image)[~mask].max() > 20 * change[19, 20]
+
+
+def test_what_a_pixel_of_unknown_charge_holds_is_nowhere_seen():
+    image = star(sky=200.0)
+    whole = correct_table(image, ITL)
+    broken = image.copy()
+    broken[:, 31] = np.nan
+    broken[40:43, 20] = np.inf
+    given = ~np.isfinite(broken)
+    found = correct_table(broken, ITL)
+    np.testing.assert_array_equal(np.isfinite(found), ~given)
+    # Straight lines through a star of 3 pixels are wrong by a quarter of its light at 1 pixel.
+    change = np.abs(whole - image).max()
+    assert np.abs(found - whole)[~given].max() < 0.15 * change
+    far = np.abs(np.indices(image.shape)[1] - 31) > 4
+    assert np.abs(found - whole)[~given & far].max() < 0.01 * change
+    hidden = np.ma.array(image, mask=given)
+    same = correct_table(hidden, ITL)
+    np.testing.assert_array_equal(same, np.where(given, np.nan, found))
+
+
+def test_a_saturated_neighbour_is_used_as_charge():
+    """The star beside it is drawn wider by its charge, whatever light filled it."""
+    image = star(sky=100.0) + star(peak=1.4e5, sigma=1.5, at=(6.0, 2.0))
+    mask = image > 1e5
+    open_eyes = correct_table(image, ITL)
+    masked = correct_table(image, ITL, mask=mask)
+    unknown = correct_table(np.where(mask, np.nan, image), ITL)
+    near = np.hypot(*(np.indices(image.shape) - 30)) < 2
+    known, lost = (np.abs(a - open_eyes)[near].max() for a in (masked, unknown))
+    # Its charge pushes the star as before; without it 0.5 % of the correction are missing.
+    assert known < 0.3 * lost
+    assert lost > 0.004 * np.abs(open_eyes - image)[near].max()
+
+
+@pytest.mark.parametrize("kind", ["int32", ">u2", "float32", ">f4"])
+def test_images_of_any_real_type(kind):
+    image = np.rint(star(peak=5e4, sky=100.0))
+    np.testing.assert_allclose(
+        correct_table(image.astype(kind), ITL), correct_table(image, ITL), atol=1e-9
+    )
+
+
+def test_bands_of_memory_maps(tmp_path, monkeypatch):
+    rng = np.random.default_rng(18)
+    image = rng.uniform(0, 1e5, (90, 40)).astype(np.float32)
+    monkeypatch.setattr(table_correction, "BAND", 16)
+    np.save(tmp_path / "image.npy", image)
+    given = np.load(tmp_path / "image.npy", mmap_mode="r")
+    out = np.lib.format.open_memmap(
+        tmp_path / "out.npy", mode="w+", dtype=np.float32, shape=image.shape
+    )
+    assert correct_table(given, ITL, out=out, surroundings=50.0) is out
+    whole = correct_table(image, ITL, surroundings=50.0, threads=3)
+    np.testing.assert_array_equal(out, whole.astype(np.float32))
+
+
+def test_charge_beyond_the_table_is_said():
+    image = star(side=41)
+    image[5, 6] = 170e3
+    with pytest.warns(
+        galsim.GalSimWarning, match="^1 pixels hold more charge than the tab"
+    ):
+        correct_table(image, ITL)
+    with pytest.raises(BFSensorError, match=r"ends at 160000 e-.*: mask them"):
+        correct_table(image, ITL, beyond="error")
+    correct_table(image, ITL, beyond="error", mask=image > 1e5)
+    # A level of 150,000 e- is within the charges of the table, and beyond its backgrounds.
+    with pytest.warns(galsim.GalSimWarning, match="^400 pixels"):
+        correct_table(np.full((20, 20), 1.5e5), ITL)
+
+
+def test_variance_of_what_was_corrected():
+    flat = np.full((300, 300), 6e4)
+    noise = np.random.default_rng(77).normal(0, 30.0, flat.shape)
+    left = correct_table(flat + noise, ITL) - correct_table(flat, ITL)
+    left, noise = left[8:-8, 8:-8], noise[8:-8, 8:-8]
+    variance = corrected_variance(flat, ITL, read_noise=30.0)
+    # Both from the same noise, whose own scatter cancels; second order in the effect.
+    grown = np.mean(left**2) / np.mean(noise**2)
+    assert grown - 1 == pytest.approx((variance[0, 0] - 6e4) / 900 - 1, rel=0.1)
+    assert grown > 1.05
+    areas = quadrant_shifts(ITL, tail_slope=None).areas
+    moved = [np.mean(a[1:] * a[:-1]) / 900 for a in (left, noise)]
+    assert moved[0] - moved[1] == pytest.approx(-6e4 * areas[1, 0], rel=0.15)
+    assert np.isinf(corrected_variance(flat, ITL, mask=flat > 0)).all()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"corrected": [1.0]}, r"shape \(1,\), not \(ny, nx\)"),
+        ({"read_noise": -1.0}, "read_noise = -1.0 e- must be finite"),
+        ({"mask": [[True]]}, r"mask has the shape \(1, 1\), not \(2, 2\)"),
+    ],
+)
+def test_variances_that_make_no_sense_are_refused(given, message):
+    given = {"corrected": np.ones((2, 2)), **given}
+    with pytest.raises(BFSensorError, match=message):
+        corrected_variance(table=ITL, **given)
+
+
+# -- stars and flats of the sensor ---------------------------------------------------------
+
+
 def growth(image, without):
     """Growth of both second moments."""
     at = np.arange(len(image)) - len(image) // 2
@@ -164,6 +306,32 @@ def test_stars_of_the_sensor_come_back(name, table):
     assert np.all(by_kernel / before < -0.05)
 
 
+def test_stars_of_a_sensor_of_image_charges_come_back():
+    """A camera that was fitted to its covariances: one response, 15 um pixels, another engine."""
+    table = DistortionTable.load("hsc_hamamatsu")
+    before, after = [], []
+    for seed in range(8):
+        rng = np.random.default_rng([seed, 43])
+        x, y = rng.normal(0, 1.3, (2, rng.poisson(9e4 * 2 * np.pi * 1.3**2)))
+        light = galsim.PhotonArray(len(x), x + rng.uniform(-0.5, 0.5), y, np.ones(len(x)))
+        drawn = []
+        for strength in (1.0, 0.0):
+            sensor = BrighterFatterSensor(
+                table=table, strength=strength, nrecalc=800, rng=galsim.BaseDeviate(seed + 1),
+                diffusion=3.0,
+            )  # fmt: skip
+            image = galsim.ImageD(31, 31)
+            image.setCenter(0, 0)
+            sensor.accumulate(light, image)
+            drawn.append(image.array)
+        before.append(growth(*drawn))
+        after.append(growth(correct_table(drawn[0], table, surroundings=0.0), drawn[1]))
+    before, after = (np.mean(a, axis=0) for a in (before, after))
+    assert np.all(before > 0.008)
+    # 16 stars of three widths are left with at most 1.3 %, with errors of 0.3 to 0.7 %.
+    assert np.all(np.abs(after / before) < 0.03), after / before
+
+
 def test_flats_of_the_sensor_come_back_white():
     flats = [
         draw_flat(
@@ -198,16 +366,34 @@ def test_red_light_is_corrected_less():
     assert blue.max() > mixed.max() > red.max()
 
 
+def test_light_that_crosses_the_silicon_makes_no_charge():
+    image, waves = star(), np.array([700.0, 1060.0])
+    one, two, both = (
+        correct_table(image, ITL, wavelengths=w) - image for w in (*waves, waves)
+    )
+    shares = -np.expm1(-ITL.thickness / absorption_length(waves, 173.15))
+    assert shares[1] < 0.3
+    middle = np.array([a[30, 30] for a in (one, two, both)])
+    assert middle[2] == pytest.approx(shares @ middle[:2] / shares.sum(), rel=1e-3)
+    assert abs(middle[2] / middle[:2].mean() - 1) > 0.02
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
         ({"image": np.ones(5)}, r"image of shape \(5,\) must have two sides"),
-        ({"image": np.full((4, 4), np.nan)}, "holds 16 values that are not finite"),
+        ({"image": np.full((4, 4), np.nan)}, "of 4 x 4 pixels has none that is finite"),
         ({"surroundings": -1.0}, "surroundings = -1.0 must be 'none', 'mirrored'"),
         ({"surroundings": "open"}, "surroundings = 'open' must be 'none'"),
+        ({"mask": np.zeros((3, 3), bool)}, r"mask has the shape \(3, 3\), not \(9, 9\)"),
+        ({"mask": np.ones((9, 9))}, "none that is finite and not masked"),
+        ({"out": np.zeros((3, 3))}, r"out has the shape \(3, 3\), not \(9, 9\)"),
+        ({"beyond": "clip"}, "beyond = 'clip' must be one of hold, error"),
+        ({"threads": 0}, "threads = 0 must be at least 1"),
         ({"photons": [1.0]}, "photons need wavelengths"),
         ({"wavelengths": [500.0, 600.0], "photons": [1.0]}, "the shapes"),
         ({"wavelengths": [500.0], "photons": [-1.0]}, "none below 0"),
+        ({"wavelengths": [1400.0]}, "none of this light converts"),
     ],
 )
 def test_what_cannot_be_corrected_is_refused(given, message):
