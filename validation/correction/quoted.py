@@ -7,6 +7,7 @@ from functools import partial
 
 from astropy.table import Table
 
+from validation.correction.calibration_mocks import coverage
 from validation.correction.correction_round_trip import LEVELS, flat_residuals
 
 Rows = Callable[[str], Table]
@@ -33,7 +34,7 @@ def flats_left(device: str, i: int, j: int, rows: Rows) -> str:
 
 def mocks_covered(within: str, rows: Rows) -> str:
     """Part of the calibration mocks within their errors [%]."""
-    return f"{rows('calibration_mocks').meta['coverage'][within]:.0f}"
+    return f"{coverage(rows('calibration_mocks'))[within]:.0f}"
 
 
 CORRECTED: dict[str, Callable[[Rows], str]] = {
