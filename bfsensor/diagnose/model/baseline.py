@@ -107,6 +107,8 @@ class Baseline:
     """Unit of each parameter in which the values above are, where it is known."""
     solver: DeviceSolver | None = None
     """Solver of the device with another value of a quantity; None where the baseline is no device."""
+    expanded: Mapping[str, float] = field(default_factory=dict)
+    """Pulls of the parameters at which the shifts were solved and linearised; 0 for all others."""
 
     def __post_init__(self) -> None:
         if not self.edges:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -186,6 +187,53 @@ def baseline_of_device(
         units={n: solver.unit(n) for n in chosen}, solver=solver,
         bounds={n: (low - nominal[n], high - nominal[n]) for n, (low, high) in ends.items()},
     )  # fmt: skip
+
+
+def expand_at(baseline: Baseline, change: Mapping[str, float]) -> Baseline:
+    """Solve a baseline's device at fitted values of its parameters, and linearise it there.
+
+    Parameters
+    ----------
+    baseline : Baseline
+        From :func:`baseline_of_device`, with its solver.
+    change : mapping of str to float
+        Parameters less their nominal values, in their units.
+
+    Returns
+    -------
+    Baseline
+        The same parameters about the same nominal values; its shifts are those of the solutions at
+        the fitted values, to first order about these.
+
+    Raises
+    ------
+    DeviceError, ConvergenceError
+        There is no such device, or it could not be solved.
+    """
+    solver = baseline.solver
+    assert solver is not None
+    kelvin = solver.device.operating_point.temperature
+    known = quantities(solver.device)
+    spreads = {n: baseline.spread[n] / known[n].number(1.0) for n in change}
+    values = {n: baseline.nominal[n] + by for n, by in change.items()}
+    edges = dict(baseline.edges)
+    held = {key: dict(of_key) for key, of_key in baseline.held.items()}
+    for bias in solver.biases:
+        here = solver.device_with(values, bias)
+        found = walk(here, cells=FINE, keep=solver.keep)
+        slopes = _derivatives(here, spreads)
+        for w in solver.wavelengths:
+            colour = w if solver.depths else None
+            kx, ky = found.edges(colour, kelvin)
+            dkx, dky = mixed(slopes.dkx, slopes.dky, slopes.depths, colour, kelvin)
+            for n, name in enumerate(spreads):
+                per = known[name].number(1.0)
+                held[w, bias][name] = own = dkx[n] / per, dky[n] / per
+                kx, ky = kx - change[name] * own[0], ky - change[name] * own[1]
+            edges[w, bias] = kx, ky
+    first = held[baseline.reference]
+    derivatives = {n: first.get(n, old) for n, old in baseline.derivatives.items()}
+    return replace(baseline, edges=edges, held=held, derivatives=derivatives)
 
 
 def _derivatives(device: Device, spreads: Mapping[str, float]) -> EdgeResponse:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -95,6 +96,22 @@ class DeviceSolver:
             return dataclasses.replace(here, gates=gates)
         by = value - self.nominal(name)
         return change_parameter(here, name, by / quantities(self.device)[name].number(1.0))
+
+    def device_with(self, values: Mapping[str, float], bias: float) -> Device:
+        """Device with several quantities at given values, at one of the back biases [V].
+
+        Raises
+        ------
+        DeviceError
+            There is no such device.
+        """
+        own = self.device.operating_point.back_bias
+        here = change_parameter(self.device, "operating_point.back_bias", bias - own)
+        known = quantities(self.device)
+        for name, value in values.items():
+            by = (value - self.nominal(name)) / known[name].number(1.0)
+            here = change_parameter(here, name, by)
+        return here
 
     def moved(
         self, name: str, value: float, *, cells: int = COARSE, levels: bool = False

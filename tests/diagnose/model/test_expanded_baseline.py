@@ -1,0 +1,67 @@
+"""A device that is fitted far from its nominal values is solved and linearised there."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from bfsensor import Device
+from bfsensor.device.condition import Condition
+from bfsensor.diagnose import diagnosis
+from bfsensor.diagnose.model import device_baseline
+from bfsensor.diagnose.model.cached_response import Walk
+from bfsensor.diagnose.model.device_baseline import baseline_of_device, expand_at
+from bfsensor.errors import DeviceError
+from bfsensor.response.edge_response import EdgeResponse
+
+NAME = "silicon.thickness"
+HERE = Condition(wavelength=620.0, back_bias=-50.0)
+
+
+def shift(device):
+    """A response with a curvature that a straight line misses."""
+    return 1e-9 * (device.silicon.thickness - 90.0) ** 2
+
+
+@pytest.fixture
+def baseline(monkeypatch):
+    def walk(device, *, cells, backgrounds=(0.0,), keep=None, laid_for=None):
+        k = np.full((len(backgrounds), 2, 5, 5), shift(device))
+        return Walk(tuple(backgrounds), np.array([5.0, 100.0]), k, 0.0 * k)
+
+    def solve(device, *, cells, changed):
+        slopes = np.array([(shift(other) - shift(device)) / by for other, by in changed])
+        dkx = slopes[:, None, None, None] * np.ones((2, 5, 5))
+        return EdgeResponse(
+            np.array([5.0, 100.0]), dkx[0], dkx[0], dkx, 0.0 * dkx, (0.0, 0.0), 0.0
+        )
+
+    monkeypatch.setattr(device_baseline, "walk", walk)
+    monkeypatch.setattr(device_baseline, "solve_response", solve)
+    return baseline_of_device(Device.load("itl_sta3800c"), parameters=[NAME])
+
+
+def test_shifts_are_those_of_the_device_at_its_fitted_quantities(baseline):
+    truth = 1e-9 * 18.0**2
+    straight = baseline.at(HERE, {NAME: 8.0})[0][0][2, 2]
+    assert straight == pytest.approx(1e-9 * (10.0**2 + 2 * 10.0 * 8.0), rel=1e-3)
+    moved = expand_at(baseline, {NAME: 8.0})
+    assert moved.at(HERE, {NAME: 8.0})[0][0][2, 2] == pytest.approx(truth, rel=1e-3)
+    # It is the tangent there, about the same nominal value and with the same prior.
+    near = moved.at(HERE, {NAME: 9.0})[0][0][2, 2]
+    assert near - truth == pytest.approx(1e-9 * 2 * 18.0, rel=1e-3)
+    assert moved.nominal == baseline.nominal and moved.spread == baseline.spread
+
+
+def test_small_pulls_and_devices_without_a_solution_stay_as_they_are(baseline, monkeypatch):
+    assert diagnosis._expanded(baseline, SimpleNamespace(pulls={NAME: 0.2})) is None
+    once = diagnosis._expanded(baseline, SimpleNamespace(pulls={NAME: 1.6}))
+    assert once.expanded == {NAME: 1.6}
+    assert diagnosis._expanded(once, SimpleNamespace(pulls={NAME: 1.5})) is None
+    assert diagnosis._expanded(once, SimpleNamespace(pulls={NAME: 2.5})) is not None
+
+    def refuse(*_, **__):
+        raise DeviceError("not depleted")
+
+    monkeypatch.setattr(device_baseline, "walk", refuse)
+    assert diagnosis._expanded(baseline, SimpleNamespace(pulls={NAME: 1.6})) is None
