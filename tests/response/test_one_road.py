@@ -47,10 +47,12 @@ def test_all_who_ask_get_the_same_response(wavelength, answers):
         table, background=LEVEL, wavelengths=None if wavelength is None else [wavelength],
         temperature=173.0, lags=3, tail_slope=None,
     ).areas  # fmt: skip
-    # The bisection ends at 1e-5 um in all but fits, where (2, 2) counts a hundred times that.
-    np.testing.assert_allclose(diagnosis, sweep, rtol=1e-9)
-    np.testing.assert_allclose(fit[:2, :2], sweep[:2, :2], rtol=1e-3)
-    np.testing.assert_allclose(fit, sweep, rtol=6e-3)
+    # The bisection ends at 1e-5 um in sweeps and tables, where (2, 2) counts a hundred times that; it
+    # ends at 1e-6 in diagnoses and at 1e-7 in fits, which take differences of devices.
+    np.testing.assert_allclose(diagnosis, fit, rtol=1e-3)
+    for finer in (fit, diagnosis):
+        np.testing.assert_allclose(finer[:2, :2], sweep[:2, :2], rtol=1e-3)
+        np.testing.assert_allclose(finer, sweep, rtol=6e-3)
     # A table's mesh is not halved in z, 0.4 %, and it is cubic between depths instead of linear, 0.2 %.
     np.testing.assert_allclose(export[:2, :2], sweep[:2, :2], rtol=6e-3)
 
