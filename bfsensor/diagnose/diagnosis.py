@@ -178,6 +178,7 @@ def diagnose_measured(
         *_of_level(baseline, fit),
         *_as_stated(stated, measured, baseline, seed),
         *(_symmetries(fit) if mismatch.detected else []),
+        *(_not_expanded(predictor.baseline, fit) if mismatch.detected else []),
     ]
     attribution, advised = None, RecordingPlan()
     if mismatch.detected and explain:
@@ -233,12 +234,32 @@ def _located(
     return measured, predictor, fit, found
 
 
+def _far_from_solution(baseline: Baseline, fit: BaselineFit) -> bool:
+    """Whether a device's fitted quantities are far from those that it was solved at."""
+    far = [
+        abs(fit.pulls[n] - baseline.expanded.get(n, 0.0))
+        for n in baseline.units
+        if n in fit.pulls
+    ]
+    return baseline.solver is not None and max(far, default=0.0) >= STRAIGHT
+
+
+def _not_expanded(baseline: Baseline, fit: BaselineFit) -> list[str]:
+    """Note on a device that is predicted by derivatives far from where it was solved."""
+    if not _far_from_solution(baseline, fit):
+        return []
+    return [
+        "fitted quantities of the device are more than "
+        f"{STRAIGHT:g} of their uncertainties from where it was solved, as no such device could be "
+        f"solved or {EXPANDED} solutions did not settle: a curved response may look like other physics"
+    ]
+
+
 def _expanded(baseline: Baseline, fit: BaselineFit) -> Baseline | None:
     """Baseline linearised at its fitted quantities; None where that is no other one."""
-    pulls = {n: fit.pulls[n] for n in baseline.units if n in fit.pulls}
-    far = [abs(p - baseline.expanded.get(n, 0.0)) for n, p in pulls.items()]
-    if baseline.solver is None or max(far, default=0.0) < STRAIGHT:
+    if not _far_from_solution(baseline, fit):
         return None
+    pulls = {n: fit.pulls[n] for n in baseline.units if n in fit.pulls}
     change = {n: p * baseline.spread[n] for n, p in pulls.items()}
     try:
         return replace(expand_at(baseline, change), expanded=pulls)
@@ -290,7 +311,7 @@ def _as_stated(
 
 
 def _symmetries(fit: BaselineFit) -> list[str]:
-    """Note on the symmetries of what a_ij deviate by."""
+    """Note on the symmetries of the a_ij that deviate from the baseline."""
     parts = zip(fit.channels, fit.starts, strict=False)
     left = [c.unwhiten(fit.residuals[start : start + len(c)]) for c, start in parts]
     predicted = [c.values - r for c, r in zip(fit.channels, left, strict=True)]

@@ -1,4 +1,4 @@
-"""Symmetries of what a_ij deviate by, which separate physics of the silicon from that of the readout."""
+"""Symmetries of deviating a_ij, which separate physics of the silicon from that of the readout."""
 
 from __future__ import annotations
 

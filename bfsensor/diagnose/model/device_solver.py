@@ -89,13 +89,11 @@ class DeviceSolver:
         DeviceError
             There is no such device.
         """
-        own = self.device.operating_point.back_bias
-        here = change_parameter(self.device, "operating_point.back_bias", bias - own)
-        if name == PHASES:
-            gates = dataclasses.replace(here.gates, collecting_phases=round(value))
-            return dataclasses.replace(here, gates=gates)
-        by = value - self.nominal(name)
-        return change_parameter(here, name, by / quantities(self.device)[name].number(1.0))
+        if name != PHASES:
+            return self.device_with({name: value}, bias)
+        here = self.device_with({}, bias)
+        gates = dataclasses.replace(here.gates, collecting_phases=round(value))
+        return dataclasses.replace(here, gates=gates)
 
     def device_with(self, values: Mapping[str, float], bias: float) -> Device:
         """Device with several quantities at given values, at one of the back biases [V].

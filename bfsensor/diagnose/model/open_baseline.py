@@ -19,6 +19,7 @@ from bfsensor.diagnose.model.device_solver import DeviceSolver
 from bfsensor.diagnose.model.free_baseline import free_baseline
 from bfsensor.diagnose.model.left_out_physics import physics_left_out
 from bfsensor.diagnose.model.table_baseline import baseline_of_table
+from bfsensor.effects.device_parameter import SILICON
 from bfsensor.errors import DeviceError, DiagnosisError
 from bfsensor.recording.campaign.amplifiers import AmplifierFrame, read_exposure
 from bfsensor.recording.campaign.campaign import Campaign
@@ -405,4 +406,15 @@ def asked_of(baseline: Baseline) -> str:
     text = f"fitted within their stated uncertainties: {', '.join(baseline.parameters)}"
     if pieces:
         text += f"; sought besides the library of effects: {', '.join(pieces)}"
+        asked = {k.variant for k in baseline.pieces} | {
+            SILICON[n] for n in baseline.parameters if n in SILICON
+        }
+        lacking = [
+            v for v in (*SILICON.values(), "fewer_gates", "more_gates") if v not in asked
+        ]
+        if lacking:
+            names = ", ".join(lacking).replace("_", " ")
+            text += (
+                f"; not sought, as such a device cannot be or could not be solved: {names}"
+            )
     return text

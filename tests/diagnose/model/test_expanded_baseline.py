@@ -65,3 +65,10 @@ def test_small_pulls_and_devices_without_a_solution_stay_as_they_are(baseline, m
 
     monkeypatch.setattr(device_baseline, "walk", refuse)
     assert diagnosis._expanded(baseline, SimpleNamespace(pulls={NAME: 1.6})) is None
+
+
+def test_a_device_far_from_its_solution_is_noted(baseline):
+    far = SimpleNamespace(pulls={NAME: 1.6})
+    (note,) = diagnosis._not_expanded(baseline, far)
+    assert "curved response" in note
+    assert diagnosis._not_expanded(diagnosis._expanded(baseline, far), far) == []
