@@ -1,6 +1,6 @@
 """Measured a_ij of a device with concealed physics, by engines other than the predictor's.
 
-- 'poisson': the Poisson solver on 48 cells a pixel; the predictor's shifts are those of 32 cells, its
+- 'poisson': the Poisson solver on 64 cells a pixel; the predictor's shifts are those of 48 cells, its
   derivatives those of 16.  It shares the solver's code.
 - 'image charge': the change of the a_ij between two devices by the analytic engine of
   :mod:`validation.concealed.electrostatics`, numpy of its own, applied to the a_ij of the Poisson
@@ -33,7 +33,7 @@ LEVEL = 40_000.0
 """Level of the flats [e-]."""
 PAIRS, PIXELS = 300, 2048**2
 """Pairs of flats of a table, and pixels of each.  Chosen: what a laboratory takes in a day."""
-CELLS = 48
+CELLS = 64
 """Cells of the truths' mesh a pixel."""
 GATES, DOTS, BLUR = "gates.collecting_phases", "dots", "blur"
 """Changes that are no quantity of a device file: gates; dots of implants in the channel stops, and

@@ -71,7 +71,8 @@ def _device(fit: BaselineFit) -> Iterator[Template]:
 
     The fit moves these parameters against their priors.  A device far from nominal therefore
     leaves residuals along the derivative, in proportion to the pull, and noise a known amount.
-    A parameter that only has a bound has no nominal value to differ from.
+    A parameter that only has a bound has no nominal value to differ from, and an error of the
+    calculation is none of the device.
     """
     for n, name in enumerate(fit.names[: fit.slopes.shape[1]]):
         quantity = name.removeprefix("device ")

@@ -61,8 +61,8 @@ class BaselineFit:
     converged : bool
         Whether the fit ended at a minimum.
     unknown : tuple of str
-        Device parameters without a nominal value, which only have a bound: their pull says
-        nothing about the baseline.
+        Device parameters whose pull says nothing about the device: those without a nominal value,
+        which only have a bound, and errors of the calculation.
     """
 
     channels: tuple[Channel, ...]
@@ -197,7 +197,7 @@ def _as_fit(steps: Steps, *notes: str) -> BaselineFit:
         chance=float(np.linalg.slogdet(np.eye(chance) + steps.modes.T @ steps.modes)[1]),
         notes=(*predictor.notes, *notes, *(() if steps.converged else (UNSETTLED,))),
         converged=steps.converged,
-        unknown=predictor.baseline.not_below,
+        unknown=(*predictor.baseline.not_below, *predictor.baseline.accuracy),
     )
 
 

@@ -105,6 +105,8 @@ class Baseline:
     pieces: tuple[EffectFamily, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
     """Unit of each parameter in which the values above are, where it is known."""
+    accuracy: tuple[str, ...] = ()
+    """Parameters that stand for errors of the calculation, not for the device."""
     solver: DeviceSolver | None = None
     """Solver of the device with another value of a quantity; None where the baseline is no device."""
     expanded: Mapping[str, float] = field(default_factory=dict)
@@ -128,7 +130,7 @@ class Baseline:
     def digest(self) -> str:
         """SHA-256 of all that the baseline predicts with, 64 hexadecimal digits."""
         numbers = (
-            self.name, self.reference, self.not_below, self.level, self.temperature,
+            self.name, self.reference, self.not_below, self.accuracy, self.level, self.temperature,
             self.spots_bend, sorted(self.bounds.items()), sorted(self.spread.items()),
             sorted(self.nominal.items()),
             sorted(self.card.items(), key=str), [str(p) for p in self.pieces],
@@ -174,7 +176,10 @@ class Baseline:
         kept = {k: v for k, v in self.derivatives.items() if k not in gone}
         floors = tuple(n for n in self.not_below if n in kept)
         bounds = {n: ends for n, ends in self.bounds.items() if n in kept}
-        return replace(self, derivatives=kept, not_below=floors, bounds=bounds)
+        errors = tuple(n for n in self.accuracy if n in kept)
+        return replace(
+            self, derivatives=kept, not_below=floors, bounds=bounds, accuracy=errors
+        )
 
     def nearest(self, condition: Condition) -> tuple[float, float]:
         """Find the condition with shifts that is nearest in back bias, then in wavelength.
@@ -504,6 +509,7 @@ def read_edges(
     known: dict[str, Any] = {}
     units: dict[str, str] = {}
     bounds: dict[str, tuple[float, float]] = {}
+    accuracy: list[str] = []
     if card is not None:
         try:
             told = json.loads(Path(card).read_text())
@@ -511,6 +517,7 @@ def read_edges(
             nominal = {k: float(v) for k, v in told.get("nominal", {}).items()}
             known = dict(told.get("card", {}))
             units = {k: str(v) for k, v in told.get("units", {}).items()}
+            accuracy = [str(n) for n in told.get("accuracy", [])]
             bounds = {
                 k: (float(low), float(high))
                 for k, (low, high) in told.get("bounds", {}).items()
@@ -538,6 +545,7 @@ def read_edges(
         held=held, slopes=slopes, bends=bends, level=level, warming=warming,
         temperature=to_kelvin(celsius), spots_bend=bool(text.get("spots_bend", False)),
         units=units, bounds={k: v for k, v in bounds.items() if k in derivatives},
+        accuracy=tuple(n for n in accuracy if n in derivatives),
     )  # fmt: skip
 
 

@@ -16,6 +16,7 @@ from bfsensor.device.quantities import quantities
 from bfsensor.diagnose.model.baseline import Baseline, Key
 from bfsensor.diagnose.model.cached_response import Walk, walk
 from bfsensor.diagnose.model.device_solver import BACKGROUNDS, COARSE, FINE, DeviceSolver
+from bfsensor.diagnose.model.mesh_error import FINEST, mesh_errors, part_of
 from bfsensor.diagnose.model.table_baseline import WAVELENGTHS
 from bfsensor.errors import DeviceError, DiagnosisError
 from bfsensor.files import written_whole
@@ -25,7 +26,7 @@ from bfsensor.simulate.edge_field import front_plane
 from bfsensor.typing import Edges
 from bfsensor.units import to_celsius
 
-TABLES = "derivatives on 16 cells at every back bias, by voltages too, in units of device files, levels"
+TABLES = "derivatives on 16 cells at every back bias, by voltages too, in their units, levels, mesh"
 """Method of the shifts, part of the name of cached files: files of other methods are not read."""
 
 STEP = 1e-4
@@ -80,7 +81,8 @@ def baseline_of_device(
     warming : bool
         Whether shifts change with temperature, through absorption and the carriers' heat.
     cells : int
-        Mesh cells per pixel of the nominal device.
+        Mesh cells per pixel of the nominal device's change with the level.  Where parameters are free,
+        its shifts are those of half as many more, and their errors by the mesh are free too.
     keep : Path, optional
         Folder where solutions are cached.
     progress : callable, optional
@@ -122,7 +124,7 @@ def baseline_of_device(
     # Readings of the device's own bias are its own: solutions are those of its shipped table.
     given = [own if abs(b - own) <= 0.5 else float(b) for b in back_biases]
     biases = sorted(dict.fromkeys(given or [own]), key=lambda b: abs(b - own))
-    total, done = len(biases) * (1 + warming + bool(chosen)), 0
+    total, done = len(biases) * (1 + warming + 2 * bool(chosen)), 0
 
     def walked(changed: Device, cells: int, levels: Sequence[float] = (LEVEL,)) -> Walk:
         nonlocal done
@@ -147,20 +149,27 @@ def baseline_of_device(
     slopes: dict[Key, Edges] = {}
     bends: dict[Key, Edges] = {}
     warmer: dict[Key, Edges] = {}
+    errors: dict[str, float] = {}
     for bias in biases:
         here = change_parameter(device, "operating_point.back_bias", bias - own)
         found = walked(here, cells, backgrounds)
         slopes_of = _derivatives(here, {n: typical[n] for n in asked}) if chosen else None
+        finest = found
         if slopes_of is not None:
             done += 1
             if progress is not None:
                 progress(done, total)
+            finest = walked(here, cells * FINEST // FINE)
+            light = None if "depths" in lacks else WAVELENGTHS[0]
+            errors = errors or mesh_errors(
+                *(solved.edges(light, kelvin) for solved in (slopes_of, found, finest))
+            )
         if warming:
             hot = change_parameter(here, "operating_point.temperature", WARMER)
             warm, cold = walked(hot, COARSE), walk(here, cells=COARSE, keep=keep)
         for wavelength, colour in colours.items():
             key = wavelength, bias
-            edges[key] = found.edges(colour, kelvin)
+            edges[key] = finest.edges(colour, kelvin)
             if "levels" not in lacks:
                 slopes[key], bends[key] = found.bent(colour, kelvin)
             held[key] = {}
@@ -171,7 +180,7 @@ def baseline_of_device(
                 held[key] = {
                     n: (x / per[n], y / per[n])
                     for n, x, y in zip(asked, dkx, dky, strict=True)
-                }
+                } | {n: part_of(edges[key], n) for n in errors}
             if warming:
                 warmer[key] = _slope(
                     warm.edges(colour, kelvin + WARMER), cold.edges(colour, kelvin), WARMER
@@ -180,8 +189,8 @@ def baseline_of_device(
     nominal = {n: solver.nominal(n) for n in chosen}
     ends = {n: solver.range(n) for n in chosen}
     return Baseline(
-        device.name, edges, {n: held[reference][n] for n in chosen},
-        {n: known[n] * per[n] for n in chosen}, reference,
+        device.name, edges, {n: held[reference][n] for n in (*chosen, *errors)},
+        {n: known[n] * per[n] for n in chosen} | errors, reference, accuracy=tuple(errors),
         nominal=nominal, held=held, slopes=slopes, bends=bends, level=LEVEL if slopes else 0.0,
         spots_bend=bool(slopes), warming=warmer, temperature=kelvin, card=_card(device),
         units={n: solver.unit(n) for n in chosen}, solver=solver,
@@ -220,7 +229,7 @@ def expand_at(baseline: Baseline, change: Mapping[str, float]) -> Baseline:
     held = {key: dict(of_key) for key, of_key in baseline.held.items()}
     for bias in solver.biases:
         here = solver.device_with(values, bias)
-        found = walk(here, cells=FINE, keep=solver.keep)
+        found = walk(here, cells=FINEST, keep=solver.keep)
         slopes = _derivatives(here, spreads)
         for w in solver.wavelengths:
             colour = w if solver.depths else None
@@ -302,6 +311,7 @@ def write_edges(baseline: Baseline, path: str | os.PathLike[str]) -> None:
         "spread_1sigma": dict(baseline.spread),
         "nominal": dict(baseline.nominal),
         "units": dict(baseline.units),
+        "accuracy": list(baseline.accuracy),
         "bounds": {n: list(ends) for n, ends in baseline.bounds.items()},
         "card": dict(baseline.card),
     }  # fmt: skip

@@ -403,7 +403,16 @@ def asked_of(baseline: Baseline) -> str:
         From :func:`simulate_baseline`, with or without :func:`with_physics`.
     """
     pieces = [f"{k.word} {k.variant}".strip().replace("_", " ") for k in baseline.pieces]
-    text = f"fitted within their stated uncertainties: {', '.join(baseline.parameters)}"
+    own = [n for n in baseline.parameters if n not in baseline.accuracy]
+    text = f"fitted within their stated uncertainties: {', '.join(own)}"
+    if baseline.accuracy:
+        errors = [
+            f"{n.removeprefix('mesh.').replace('_', ' in ')} {100 * baseline.spread[n]:.2g} %"
+            for n in baseline.accuracy
+        ]
+        text += (
+            f"; errors of calculated shifts by the mesh, fitted too: {', '.join(errors)}"
+        )
     if pieces:
         text += f"; sought besides the library of effects: {', '.join(pieces)}"
         asked = {k.variant for k in baseline.pieces} | {

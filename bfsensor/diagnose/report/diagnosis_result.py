@@ -24,6 +24,11 @@ from bfsensor.diagnose.plan.advice import RecordingPlan
 from bfsensor.diagnose.plan.gaps import find_untested
 from bfsensor.diagnose.report.attribution_words import reported, said_of
 from bfsensor.diagnose.report.class_words import NAMES, SCAN_WORDS, said_family_p
+from bfsensor.diagnose.report.device_words import (
+    FittedQuantity,
+    fitted_quantities,
+    said_farthest,
+)
 from bfsensor.diagnose.report.headlines import headlines
 
 SCHEMA = "bfsensor-diagnosis-1"
@@ -101,6 +106,12 @@ class Diagnosis:
         """Predictor and fit with the effects found, or those of the baseline without attribution."""
         of = self.attribution or self
         return of.predictor, of.fit
+
+    @property
+    def quantities(self) -> list[FittedQuantity]:
+        """Fitted quantities of the device with all effects found, the farthest from nominal first."""
+        predictor, fit = self.accepted
+        return [] if predictor is None else fitted_quantities(fit, predictor.baseline)
 
     @property
     def gain(self) -> float:
@@ -234,13 +245,9 @@ class Diagnosis:
                 parts.append(f"It is also seen in: {', '.join(others)}.")
             if self.attribution is not None:
                 parts += said_of(self.attribution)
-        far = {k: v for k, v in self.accepted[1].pulls.items() if abs(v) > 3}
-        if far:
-            text = ", ".join(f"{k} {v:+.1f}" for k, v in far.items())
-            parts.append(
-                "Device parameters that the fit moved far from their nominal values, in standard "
-                f"deviations of their priors: {text}."
-            )
+        farthest = said_farthest(self.quantities)
+        if farthest:
+            parts.append(farthest)
         return " ".join(parts)
 
     def _elsewhere(self, first: Finding) -> list[str]:
@@ -301,6 +308,7 @@ class Diagnosis:
                 for f in _shown(self.mismatch.findings)
             ],
             "parameters": fitted,
+            "device": [q.to_report() for q in self.quantities],
             "exposures": dict(self.measured.counts),
             "unlike_flats": [
                 {k: float(v) for k, v in vars(p).items()} | {"rises": bool(p.rises)}

@@ -27,7 +27,7 @@ class Halo:
     prior = False
     effects = (PsfWings({"frac": 0.01, "sigma": 3.0}),)
     notes = ()
-    baseline = SimpleNamespace(not_below=())
+    baseline = SimpleNamespace(not_below=(), accuracy=())
 
     def __init__(self, start):
         frac, sigma = start
