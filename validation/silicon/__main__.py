@@ -5,6 +5,9 @@ with the scatter of the file of ``--device`` and writes a folder a case: a table
 back biases and two wavelengths.  Truths go to SEALED, and their SHA-256 to FOLDER/commitment.json.
 ``run FOLDER REPORTS`` diagnoses each by ``bfsensor diagnose`` with the device's file as baseline.
 ``open FOLDER REPORTS SEALED --set NAME`` scores them into ``validation/results/silicon_cases.ecsv``.
+``ladder FOLDER --truths SEALED`` makes a case for each of the ten quantities that change the a_ij most,
+by 1.5, 3 and 4.5 of its uncertainties, nothing else scattered.  ``run --shared`` starts each case with
+the solutions of the nominal device that another one has made, which are the same for all.
 
 Cases: one change of a quantity, a third of them two, a fifth a change that no piece describes; sizes are
 log-uniform from 0.5 to 15 typical changes; the engines are those of :mod:`validation.silicon.truths`.
@@ -18,6 +21,7 @@ import hashlib
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -33,6 +37,7 @@ from bfsensor.device.device import Device
 from bfsensor.device.parameters import change_parameter, device_parameters, parameter_value
 from bfsensor.device.quantities import quantities
 from bfsensor.errors import BFSensorError
+from bfsensor.response.edge_response import solve_response
 from validation.common.run_header import commit_here
 from validation.common.write_results import write_results
 from validation.silicon.truths import (
@@ -40,6 +45,7 @@ from validation.silicon.truths import (
     DOTS,
     GATES,
     IMAGE_CHARGE,
+    LEVEL,
     areas,
     blurred,
     by_image_charges,
@@ -54,6 +60,8 @@ SMALLEST, LARGEST = 0.5, 15.0
 """Range of the sizes of changes [typical changes].  Chosen: from invisible to far beyond the prior."""
 VOLTS = {"operating_point.back_bias": 1.0, "operating_point.gate_high": 0.3}
 """Typical changes of voltages [V], of which device files state no uncertainty."""
+SIZES, QUANTITIES, SMALL = (1.5, 3.0, 4.5), 10, 1e-3
+"""Of the ladder: sizes and step of derivatives [uncertainties], and number of quantities."""
 OUTSIDE = {DOTS: -100.0, BLUR: 2e-5}
 """Typical changes that no piece describes: dose of dots [e/um2], share of charge that moves."""
 
@@ -201,11 +209,31 @@ def make(
                 # Not every draw is a device that is depleted and holds the charge.
                 continue
             break
-        write_case(place, full, biases, rng)
-        case |= {"device": device, "seed": seed, "biases": biases}
-        case |= {"plain": [a.tolist() for a in plain], "full": [a.tolist() for a in full]}
-        (truths / f"{place.name}.json").write_text(json.dumps(case))
-        click.echo(f"{place.name}")
+        _write(place, truths, case, plain, full, biases, rng, device, seed)
+    _commit(folder, truths)
+
+
+def _write(
+    place: Path,
+    truths: Path,
+    case: dict[str, Any],
+    plain: list[NDArray[np.float64]],
+    full: list[NDArray[np.float64]],
+    biases: tuple[float, ...],
+    rng: np.random.Generator,
+    device: str,
+    seed: int,
+) -> None:
+    """Write a case and its truth."""
+    write_case(place, full, biases, rng)
+    case |= {"device": device, "seed": seed, "biases": biases}
+    case |= {"plain": [a.tolist() for a in plain], "full": [a.tolist() for a in full]}
+    (truths / f"{place.name}.json").write_text(json.dumps(case))
+    click.echo(f"{place.name}")
+
+
+def _commit(folder: Path, truths: Path) -> None:
+    """Write the sums of all truths beside the cases."""
     sums = {
         p.name: hashlib.sha256(p.read_bytes()).hexdigest()
         for p in sorted(truths.glob("*.json"))
@@ -214,15 +242,70 @@ def make(
 
 
 @main.command()
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("--truths", type=click.Path(path_type=Path), required=True)
+@click.option("--seed", default=1, show_default=True)
+@click.option("--device", default="itl_sta3800c", show_default=True)
+def ladder(folder: Path, truths: Path, seed: int, device: str) -> None:
+    """Make cases of one quantity at a time, by some of its uncertainties."""
+    card = Device.load(device)
+    own = float(card.operating_point.back_bias)
+    biases = (own, own + 15.0)
+    truths.mkdir(parents=True, exist_ok=True)
+    known = device_parameters(card)
+    steps = [
+        (change_parameter(card, name, SMALL * s), SMALL * s) for name, s in known.items()
+    ]
+    found = solve_response(card, level=LEVEL, cells=16, changed=steps)
+    sizes = {}
+    for (name, spread), dkx, dky in zip(known.items(), found.dkx, found.dky, strict=True):
+        x, y = spread * dkx[-1], spread * dky[-1]
+        sizes[name] = float(np.linalg.norm(x - np.roll(x, 1, 1) + y - np.roll(y, 1, 0)))
+    n = 0
+    for name in sorted(sizes, key=lambda q: -sizes[q])[:QUANTITIES]:
+        for size in SIZES:
+            place = folder / f"case_{n:03d}"
+            n += 1
+            if place.exists():
+                continue
+            rng = np.random.default_rng([seed, n])
+            for sign in rng.permutation([-1.0, 1.0]):
+                change = {name: float(sign * size * known[name])}
+                case = {
+                    "scatter": {},
+                    "change": change,
+                    "engine": "poisson",
+                    "outside": False,
+                }
+                try:
+                    plain, full = tables_of(card, case, biases)
+                except (BFSensorError, ValueError):
+                    # No such device, or it is not depleted: the other sign.
+                    continue
+                _write(place, truths, case, plain, full, biases, rng, device, seed)
+                break
+    _commit(folder, truths)
+
+
+@main.command()
 @click.argument("folder", type=click.Path(exists=True, path_type=Path))
 @click.argument("reports", type=click.Path(path_type=Path))
 @click.option("--device", default="itl_sta3800c", show_default=True)
-def run(folder: Path, reports: Path, device: str) -> None:
+@click.option("--shared", is_flag=True, help="Start with the solutions of another case.")
+def run(folder: Path, reports: Path, device: str, shared: bool) -> None:
     """Diagnose all cases that have no report yet."""
+    made = None
     for place in sorted(folder.glob("case_*")):
         out = reports / place.name
         if (out / "report.json").exists():
+            made = out
             continue
+        if shared and made is not None and not out.exists():
+            out.mkdir(parents=True)
+            for name in (*made.glob("baseline_*.json"), made / "solutions"):
+                copy = shutil.copytree if name.is_dir() else shutil.copy
+                copy(name, out / name.name)
+        made = out
         words = [sys.executable, "-m", "bfsensor", "diagnose"]
         at = []
         for table in sorted(place.glob("a_*.csv")):
@@ -296,11 +379,25 @@ def score(name: str, case: str, truth: Mapping[str, Any], reports: Path) -> dict
         "named": " + ".join(named) or "nothing", "first": bool(named) and named[0] in truth["change"],
         "in_class": bool(classes & set(report["equivalence_class"])),
         "class_size": len(report["equivalence_class"]), "open_world": bool(report["open_world"]),
-        "inside95": sum(inside), "intervals": len(inside),
+        "inside95": sum(inside), "intervals": len(inside), **farthest(truth, report),
         "before": float(heldout.get("chi2dof_before") or np.nan),
         "after": float(heldout.get("chi2dof_after") or np.nan),
         "cpu_s": float(cost["cpu_s"]), "commit": cost["commit"],
     }  # fmt: skip
+
+
+def farthest(truth: Mapping[str, Any], report: Mapping[str, Any]) -> dict[str, Any]:
+    """Place of the first concealed quantity in the report's list of the device, from 1, and its gain.
+
+    ``below``: what the first of the list gains above it.  0, nan: the list does not have it.
+    """
+    names = [q["name"] for q in report["device"]]
+    wanted = next(iter(truth["change"]), "")
+    if wanted not in names:
+        return {"place": 0, "gain": np.nan, "below": np.nan}
+    own = report["device"][names.index(wanted)]["gain"]
+    first = report["device"][0]["gain"]
+    return {"place": names.index(wanted) + 1, "gain": own, "below": first - own}
 
 
 def true_value(device: Device, truth: Mapping[str, Any], name: str) -> float:
